@@ -1,0 +1,279 @@
+"""The configuration: inert, typed data with a unit and a default for every value.
+
+The defaults are the paper's numbers (preset `paper`); a preset or a user's YAML file
+states only what differs. Angles are degrees here, at the YAML border, and carry `_deg`
+in their names; everywhere else they are radians. `load_config` is the one door.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from drakegrasp.errors import ConfigError
+
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1)]
+Angles = Annotated[tuple[Annotated[float, Field(allow_inf_nan=False)], ...], Field(min_length=1)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
+
+
+class ObjectConfig(_Section):
+    """Mass and meshes of the objects."""
+
+    mass: Positive = 1.0  # [kg], the same for every object (paper, "Object representation")
+    max_collision_faces: Annotated[int, Field(ge=12)] = 3000  # triangles of the collision mesh
+    min_diagonal: Positive = 0.01  # [m], a smaller bounding box diagonal is refused
+    max_diagonal: Positive = 2.0  # [m], a larger one is refused
+
+    @model_validator(mode="after")
+    def _ordered(self) -> ObjectConfig:
+        if self.min_diagonal >= self.max_diagonal:
+            raise ValueError(
+                f"min_diagonal must be less than max_diagonal, got {self.min_diagonal} "
+                f"and {self.max_diagonal}"
+            )
+        return self
+
+
+class PhysicsConfig(_Section):
+    """Contact and time stepping; reasons and sources in docs/physics.md."""
+
+    time_step: Annotated[float, Field(gt=0.0, le=0.02)] = 0.004  # [s]
+    friction_hand: Positive = 0.71  # effective coefficient between hand and object
+    friction_table: Positive = 0.71  # effective coefficient between table and object
+    fingertip_modulus: Annotated[float, Field(gt=0.0, le=1e8)] = 1e7  # hydroelastic [Pa]
+    link_modulus: Annotated[float, Field(gt=0.0, le=1e8)] = 1e7  # other hand links [Pa]
+    table_modulus: Annotated[float, Field(gt=0.0, le=1e8)] = 1e7  # [Pa]
+    dissipation: Annotated[float, Field(ge=0.0, le=500.0)] = 20.0  # Hunt-Crossley [s/m]
+    relaxation_time: Positive = 0.02  # [s], used by the solver `sap` in place of dissipation
+    solver: Literal["lagged", "similar", "sap"] = "lagged"  # Drake's contact approximation
+    contact_force: Positive = 0.05  # [N], a weaker contact does not count as one
+    max_speed: Positive = 10.0  # [m/s], a faster object means that the state exploded
+
+
+class SettleConfig(_Section):
+    """How the object comes to rest on the table."""
+
+    drop_height: NonNegative = 0.3  # [m], of the lowest point above the table (paper)
+    max_time: Positive = 15.0  # [s] of simulation (released code)
+    max_linear_speed: Positive = 1e-3  # [m/s], slower than this is at rest
+    max_angular_speed: Positive = 1e-2  # [rad/s], slower than this is at rest
+    rest_time: Positive = 0.2  # [s], at rest for this long
+
+
+class CandidateConfig(_Section):
+    """Which palm poses are tried."""
+
+    method: Literal["rotations", "normals"] = "rotations"
+    max: Count = 10_000  # kept per object, drawn with the seed (paper)
+    global_x_deg: Angles = tuple(range(0, 181, 30))  # paper, Table II
+    global_y_deg: Angles = tuple(range(0, 360, 30))
+    global_z_deg: Angles = tuple(range(0, 360, 45))
+    local_x_deg: Angles = tuple(range(0, 181, 20))
+    local_y_deg: Angles = tuple(range(0, 360, 20))
+    local_z_deg: Angles = tuple(range(0, 360, 45))
+    jitter_deg: NonNegative = 0.0  # each angle gets a whole number of degrees below this
+    standoffs: Annotated[tuple[Positive, ...], Field(min_length=1)] = (0.06, 0.09, 0.12)  # [m]
+    spreads_deg: Annotated[
+        tuple[Annotated[float, Field(ge=0.0, le=180.0)], ...], Field(min_length=1)
+    ] = (0.0, 11.25, 22.5)  # one is drawn per attempt (released code)
+
+
+class CloseConfig(_Section):
+    """Closing the fingers on the static object."""
+
+    max_time: Positive = 2.5  # [s], 140 degrees at 60 degrees per second and a little
+    stop_speed: Positive = 0.01  # [rad/s], slower fingers have stopped
+    check_period: Positive = 0.1  # [s] of simulation between two looks
+
+
+class LiftConfig(_Section):
+    """Freeing the object and moving the wrist to the target."""
+
+    p_TG: tuple[float, float, float] = (0.0, 0.0, 0.60)  # [m], target of the palm (paper)
+    max_speed: Positive = 0.5  # [m/s] of the wrist
+    max_acceleration: Positive = 1.0  # [m/s^2] of the wrist
+    hold_time: NonNegative = 0.3  # [s] at the target before the second judgement
+    check_period: Positive = 0.1  # [s] of simulation between two looks
+
+
+class CameraConfig(_Section):
+    """The two cameras; see docs/frames-and-units.md."""
+
+    distance: Positive = 0.25  # [m] behind the palm along -Gz (paper)
+    size: Annotated[int, Field(ge=8, le=2048)] = 128  # [px], square images
+    fov_y_deg: Annotated[float, Field(gt=0.0, lt=180.0)] = 50.0  # vertical field of view
+    near: Positive = 0.01  # [m]
+    far: Positive = 0.75  # [m]
+
+    @model_validator(mode="after")
+    def _ordered(self) -> CameraConfig:
+        if self.near >= self.far:
+            raise ValueError(f"near must be less than far, got {self.near} and {self.far}")
+        return self
+
+
+class FilterConfig(_Section):
+    """The paper's postprocessing; applied when the files are assembled, not when simulating."""
+
+    min_depth_variance: NonNegative = 1e-3  # [m^2], flatter otm depth images are removed
+    min_camera_height: float = 0.01  # [m] above the table; lower ones see it edge-on
+    outlier_sigma: NonNegative = 4.0  # per object and component of the grasp; 0 switches it off
+    max_surface_distance: Positive = 2e-3  # [m], of a contact point from the object's surface
+
+
+class SplitConfig(_Section):
+    """Who trains, validates and tests."""
+
+    valid_fraction: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.1
+    train_classes: tuple[str, ...] | None = None  # None: every class with two objects or more
+
+
+class Config(_Section):
+    """Everything that decides what is in a dataset, but for the meshes themselves."""
+
+    hand: str = "barrett"  # a hand in drakegrasp/models, or a path to a hand's YAML
+    seed: Annotated[int, Field(ge=0)] = 0
+    unit_candidates: Count = 50  # candidates in a work unit
+    attempt_seconds: Positive = 60.0  # [s] of wall clock before an attempt is a `timeout`
+    objects: ObjectConfig = ObjectConfig()
+    physics: PhysicsConfig = PhysicsConfig()
+    settle: SettleConfig = SettleConfig()
+    candidates: CandidateConfig = CandidateConfig()
+    close: CloseConfig = CloseConfig()
+    lift: LiftConfig = LiftConfig()
+    camera: CameraConfig = CameraConfig()
+    max_grasps: Count | None = None  # successes per object after which no more are tried
+    filters: FilterConfig = FilterConfig()
+    split: SplitConfig = SplitConfig()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the resolved values as plain JSON types."""
+        return self.model_dump(mode="json")
+
+    def simulation_hash(self) -> str:
+        """Return the hash of all that decides what a shard holds (16 hex digits).
+
+        Filters and split act later, on assembled shards, and are left out; so is
+        `max_grasps`, which only says where to stop, and the wall-clock limit.
+        """
+        values = self.to_dict()
+        for key in ("filters", "split", "max_grasps", "attempt_seconds"):
+            del values[key]
+        canonical = json.dumps(values, sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(canonical.encode()).hexdigest()[:16]
+
+
+def preset_names() -> list[str]:
+    """Return the names of the presets that come with the package."""
+    folder = resources.files("drakegrasp") / "presets"
+    return sorted(p.name.removesuffix(".yaml") for p in folder.iterdir() if p.name.endswith(".yaml"))
+
+
+def load_config(
+    source: str | Path | None = None,
+    overrides: Sequence[str] = (),
+    **values: Any,
+) -> Config:
+    """Return the configuration of a preset or YAML file with overrides on top.
+
+    Args:
+        source: A preset's name, or a path to a YAML file; None is the preset `paper`.
+        overrides: `"a.b=c"` strings, c read as YAML; later ones win.
+        values: Top-level fields, e.g. `seed=1`; they win over the overrides.
+
+    Raises:
+        ConfigError: If a key is unknown, or a value is of the wrong type or impossible;
+            one line with the key's path, what it must be, and what it was.
+    """
+    tree = _read_source("paper" if source is None else source)
+    for text in overrides:
+        _apply_override(tree, text)
+    tree.update({key: value for key, value in values.items() if value is not None})
+    return parse_config(tree)
+
+
+def parse_config(tree: dict[str, Any]) -> Config:
+    """Return the configuration that a tree of plain values describes.
+
+    Raises:
+        ConfigError: See `load_config`.
+    """
+    try:
+        return Config.model_validate(tree)
+    except ValidationError as error:
+        raise ConfigError("; ".join(_describe(e) for e in error.errors())) from None
+
+
+def _read_source(source: str | Path) -> dict[str, Any]:
+    preset = resources.files("drakegrasp") / "presets" / f"{source}.yaml"
+    if isinstance(source, str) and source in preset_names():
+        text, name = preset.read_text(encoding="utf-8"), source
+    else:
+        path = Path(source)
+        if not path.is_file():
+            raise ConfigError(
+                f"config must be a YAML file or one of the presets {', '.join(preset_names())}, "
+                f"got {str(source)!r}"
+            )
+        text, name = path.read_text(encoding="utf-8"), str(path)
+    try:
+        tree = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        first = str(error).splitlines()[0]
+        raise ConfigError(f"{name}: must be YAML, got text that is not ({first})") from None
+    if tree is None:
+        return {}
+    if not isinstance(tree, dict):
+        raise ConfigError(f"{name}: must be a mapping of keys to values, got {type(tree).__name__}")
+    return tree
+
+
+def _apply_override(tree: dict[str, Any], text: str) -> None:
+    path, separator, value = text.partition("=")
+    keys = path.strip().split(".")
+    if not separator or not all(keys):
+        raise ConfigError(f"--set must be KEY=VALUE with dots between keys, got {text!r}")
+    node = tree
+    for key in keys[:-1]:
+        child = node.setdefault(key, {})
+        if not isinstance(child, dict):
+            raise ConfigError(f"{path}: {key} must be a section, got the value {child!r}")
+        node = child
+    try:
+        node[keys[-1]] = yaml.safe_load(value)
+    except yaml.YAMLError:
+        raise ConfigError(f"{path}: must be a YAML value, got {value!r}") from None
+
+
+def _describe(error: Any) -> str:
+    """Return one pydantic error as `path: must ..., got ...`."""
+    path = ".".join(str(part) for part in error["loc"]) or "config"
+    if error["type"] == "extra_forbidden":
+        return f"{path}: must be a known key ({', '.join(_siblings(error['loc']))}), got an unknown one"
+    message = str(error["msg"]).removeprefix("Value error, ")
+    if error["type"] == "value_error":
+        return f"{path}: {message}"
+    must = message.removeprefix("Input should be ").removeprefix("Input should ")
+    if error["type"] == "too_short":
+        must = f"a list of at least {error['ctx']['min_length']}"
+    return f"{path}: must be {must}, got {error['input']!r}"
+
+
+def _siblings(loc: tuple[Any, ...]) -> list[str]:
+    section: type[BaseModel] = Config
+    for key in loc[:-1]:
+        section = section.model_fields[key].annotation  # type: ignore[assignment]
+    return list(section.model_fields)

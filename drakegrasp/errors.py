@@ -1,0 +1,36 @@
+"""The exception tree: everything that drakegrasp raises because of a caller's mistake.
+
+* DrakegraspError
+  * ConfigError          a configuration value, key or preset that cannot be used
+  * MeshError            a mesh that cannot become a simulated object
+  * HandError            a hand description (SDFormat and YAML) that cannot be used
+  * DataError            a dataset, shard or manifest that is missing, foreign or broken
+  * EnvironmentFailure   something that the machine lacks (EGL, a usable Drake, disk)
+
+Failures of the physics are not here: they are values, see `drakegrasp.outcomes`.
+Messages follow one pattern: what, what it must be, what it was.
+"""
+
+
+class DrakegraspError(Exception):
+    """Base class of all errors raised on purpose; catch this one."""
+
+
+class ConfigError(DrakegraspError, ValueError):
+    """A configuration value, key or preset that cannot be used."""
+
+
+class MeshError(DrakegraspError, ValueError):
+    """A mesh that cannot become a simulated object, with the reason."""
+
+
+class HandError(DrakegraspError, ValueError):
+    """A hand description that cannot be used."""
+
+
+class DataError(DrakegraspError, ValueError):
+    """A dataset, shard or manifest that is missing, foreign or broken."""
+
+
+class EnvironmentFailure(DrakegraspError, RuntimeError):
+    """Something that this machine lacks, with the line that mends it."""

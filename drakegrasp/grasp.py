@@ -1,0 +1,56 @@
+"""The grasp vector: k contact points, then k outward normals, as 6k numbers.
+
+For a three-finger hand these are the paper's 18 dimensions [p1 p2 p3 n1 n2 n3]
+(Veres et al., "Dataset overview"). Finger order is the hand file's. Points are in
+metres, normals are unit vectors that point out of the object.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.frames import Array, rotate_vectors, transform_points
+
+#: A normal whose length is off by more than this is refused instead of mended.
+NORMAL_LENGTH_TOLERANCE = 0.05
+
+
+def pack_grasp(p_AQ: npt.ArrayLike, nhat_Q_A: npt.ArrayLike) -> Array:
+    """Return the grasp vector (6k,) of points (k, 3) [m] and unit normals (k, 3) in one frame A.
+
+    Raises:
+        ValueError: If the two arrays are not both (k, 3) with the same k.
+    """
+    points, normals = np.asarray(p_AQ, dtype=float), np.asarray(nhat_Q_A, dtype=float)
+    if points.ndim != 2 or points.shape[1] != 3 or normals.shape != points.shape:
+        raise ValueError(
+            "points and normals must both be (k, 3) arrays, "
+            f"got {points.shape} and {normals.shape}"
+        )
+    return np.concatenate([points.ravel(), normals.ravel()])
+
+
+def unpack_grasp(grasp: npt.ArrayLike) -> tuple[Array, Array]:
+    """Return points (k, 3) [m] and normals (k, 3) of a grasp vector (6k,).
+
+    Raises:
+        ValueError: If the vector's length is not a positive multiple of six.
+    """
+    vector = np.asarray(grasp, dtype=float)
+    if vector.ndim != 1 or vector.size == 0 or vector.size % 6:
+        raise ValueError(
+            "a grasp must be a vector of 6 numbers per finger (18 for three fingers), "
+            f"got an array of shape {vector.shape}"
+        )
+    half = vector.size // 2
+    return vector[:half].reshape(-1, 3), vector[half:].reshape(-1, 3)
+
+
+def transform_grasp(X_AB: npt.ArrayLike, grasp_B: npt.ArrayLike) -> Array:
+    """Return the grasp vector (6k,) in frame A of one in frame B, under X_AB (4, 4).
+
+    Points are moved by the whole pose, normals by its rotation alone.
+    """
+    p_BQ, nhat_Q_B = unpack_grasp(grasp_B)
+    return pack_grasp(transform_points(X_AB, p_BQ), rotate_vectors(X_AB, nhat_Q_B))

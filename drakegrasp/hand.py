@@ -1,0 +1,417 @@
+"""The hand: what an SDFormat file and a YAML file say of it, and its forward kinematics.
+
+Nothing here knows a particular hand or a number of fingers. `load_hand` reads the YAML,
+has Drake parse the SDFormat file once, checks one against the other, and keeps each
+finger's joints as constants. After that the kinematics is NumPy and knows no Drake.
+
+The coordinates of a hand with k fingers are c = (spread, closing of finger 1..k) [rad];
+each joint is driven by exactly one of them: its angle is `gain @ c`. Frames: B palm link,
+G palm, Fi distal (fingertip) link of finger i, P a point on its pad.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, with_config
+from pydrake.math import RollPitchYaw
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex, RevoluteJoint, RigidBody, WeldJoint
+
+from drakegrasp.errors import HandError
+from drakegrasp.frames import Array, invert_pose, make_pose
+
+#: Where the hands that come with the package are, as `<name>_hand.yaml`.
+MODELS = Path(__file__).resolve().parent / "models"
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Name = Annotated[str, Field(min_length=1)]
+Vector = tuple[Finite, Finite, Finite]
+_STRICT = ConfigDict(frozen=True, extra="forbid")
+
+
+@with_config(_STRICT)
+@dataclass(frozen=True, kw_only=True)
+class Coupling:
+    """A joint that follows a finger's closing joint."""
+
+    joint: Name
+    ratio: Finite  # of its angle to the closing joint's; not zero
+
+    def __post_init__(self) -> None:
+        if self.ratio == 0.0:
+            raise ValueError("ratio must not be zero, got 0.0")
+
+
+@with_config(_STRICT)
+@dataclass(frozen=True, kw_only=True)
+class Finger:
+    """A finger as the YAML describes it; its kinematics is the hand's `Chain`."""
+
+    name: Name
+    fingertip: Name  # link, frame Fi
+    closing_joint: Name  # the driven joint; a positive angle closes
+    torque_limit: Positive  # at the closing joint [N m]
+    rotor_inertia: NonNegative = 0.0  # of the motor [kg m^2]
+    gear_ratio: Positive = 1.0  # motor angle / closing angle
+    coupled: tuple[Coupling, ...] = ()
+    pad_point: Vector  # nominal contact point on the pad, in Fi [m]
+    pad_normal: Vector  # outward normal of the pad there, in Fi; of any length
+
+    def __post_init__(self) -> None:
+        if not any(self.pad_normal):
+            raise ValueError(f"pad_normal must not be zero, got {self.pad_normal}")
+
+    @property
+    def p_FiP(self) -> Array:  # noqa: N802 (monogram notation)
+        """Nominal contact point on the pad (3,) in the fingertip link's frame [m]."""
+        return np.array(self.pad_point)
+
+    @property
+    def n_Fi(self) -> Array:  # noqa: N802 (monogram notation)
+        """Unit outward normal of the pad (3,) in the fingertip link's frame."""
+        n: Array = np.array(self.pad_normal)
+        return n / float(np.linalg.norm(n))
+
+
+@with_config(_STRICT)
+@dataclass(frozen=True, kw_only=True)
+class Spread:
+    """The joints that all turn by the spread angle; a hand may have none."""
+
+    joints: tuple[Name, ...] = ()
+    torque_limit: NonNegative = 0.0  # at each joint [N m]
+    rotor_inertia: NonNegative = 0.0  # of the motor [kg m^2]
+    gear_ratio: Positive = 1.0  # motor angle / spread angle
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Chain:
+    """The m revolute joints from the palm to one fingertip, as constants.
+
+    With angles q = gain @ c the pose of the fingertip link in the palm frame is
+    X_GFi = X_PJ[0] R(axis[0], q[0]) X_PJ[1] R(axis[1], q[1]) ... X_JFi.
+    """
+
+    X_PJ: Array  # (m, 4, 4), of each joint in the turning frame before it; the first in G
+    axis: Array  # (m, 3), unit, in the joint's frame J
+    gain: Array  # (m, 1 + k), angles per coordinate
+    X_JFi: Array  # (4, 4), fingertip link in the last joint's turning frame
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Hand:
+    """A hand with k fingers; made by `load_hand`."""
+
+    name: str
+    sdf_path: Path
+    palm_link: str  # frame B
+    X_BG: Array  # (4, 4), palm frame, +Gz out of the palm
+    fingers: tuple[Finger, ...]  # in grasp order
+    spread: Spread
+    closing_speed: float  # of the closing joints [rad/s]
+    fingertip_force_limit: float  # [N]
+    joint_names: tuple[str, ...]  # the n revolute joints
+    joint_gain: Array  # (n, 1 + k), angles per coordinate; one non-zero in each row
+    joint_limits: Array  # (n, 2), lower and upper [rad]
+    chains: tuple[Chain, ...]  # one per finger
+
+    @property
+    def num_fingers(self) -> int:
+        """Number of fingers, k."""
+        return len(self.fingers)
+
+    @property
+    def fingertip_links(self) -> tuple[str, ...]:
+        """Names of the fingertip links in grasp order."""
+        return tuple(finger.fingertip for finger in self.fingers)
+
+
+class _Palm(BaseModel):
+    model_config = _STRICT
+    link: Name
+    p_BG: Vector  # [m]
+    rpy_deg: Vector = (0.0, 0.0, 0.0)
+
+
+class _Description(BaseModel):
+    """The YAML file."""
+
+    model_config = _STRICT
+    model: Name  # the SDFormat file, relative to the YAML file
+    palm: _Palm
+    fingers: Annotated[tuple[Finger, ...], Field(min_length=1)]
+    spread: Spread = Spread()
+    closing_speed_deg: Positive  # [deg/s]
+    fingertip_force_limit: Positive  # [N]
+
+
+def hand_names() -> list[str]:
+    """Return the names of the hands that come with the package."""
+    return sorted(path.name.removesuffix("_hand.yaml") for path in MODELS.glob("*_hand.yaml"))
+
+
+def load_hand(name_or_yaml: str | Path = "barrett") -> Hand:
+    """Return a hand that comes with the package, or the one of a YAML file.
+
+    Args:
+        name_or_yaml: One of `hand_names()`, or the path of a YAML file with the keys of
+            `models/barrett_hand.yaml`, whose `model` is found relative to it.
+
+    Raises:
+        HandError: If there is no such hand, a key or value of the YAML cannot be used, or
+            the SDFormat model lacks a link or joint that the YAML names.
+    """
+    path = MODELS / f"{name_or_yaml}_hand.yaml" if name_or_yaml in hand_names() else None
+    path = path or Path(name_or_yaml)
+    if not path.is_file():
+        names = ", ".join(hand_names())
+        raise HandError(f"hand must be one of {names} or a YAML file, got {str(name_or_yaml)!r}")
+    description = _read_description(path)
+    sdf_path = path.parent.resolve() / description.model
+    try:
+        return _build_hand(path.stem.removesuffix("_hand"), description, sdf_path)
+    except HandError as error:
+        raise HandError(f"{path}: {error}") from None
+
+
+def coordinate_limits(hand: Hand) -> Array:
+    """Return the least and greatest value of each coordinate, (1 + k, 2) [rad].
+
+    Row 0 is the spread, row 1 + i the closing of finger i. A coordinate's limits are those
+    of all joints that it drives, couplings included. A hand without spread has 0, 0 there.
+    """
+    limits = np.tile([-np.inf, np.inf], (1 + hand.num_fingers, 1))
+    for gain, joint_limits in zip(hand.joint_gain, hand.joint_limits, strict=True):
+        (column,) = np.flatnonzero(gain)
+        lower, upper = np.sort(joint_limits / gain[column])
+        limits[column] = max(limits[column, 0], lower), min(limits[column, 1], upper)
+    if not hand.spread.joints:
+        limits[0] = 0.0
+    return limits
+
+
+def joint_positions(hand: Hand, spread: float, closing: npt.ArrayLike) -> dict[str, float]:
+    """Return each revolute joint's angle [rad] at a spread and closing angles (k,) [rad].
+
+    Raises:
+        ValueError: If `closing` is not one angle per finger.
+    """
+    q = hand.joint_gain @ _coordinates(hand, spread, closing)
+    return dict(zip(hand.joint_names, q.tolist(), strict=True))
+
+
+def fingertip_poses(hand: Hand, *, spread: npt.ArrayLike, closing: npt.ArrayLike) -> Array:
+    """Return the poses X_GFi (k, 4, 4) of the fingertip links in the palm frame.
+
+    Limits are not looked at.
+
+    Args:
+        hand: The hand.
+        spread: Angle of the spread joints [rad]; any shape (...,).
+        closing: Angle of each finger's closing joint (k,) [rad]; for many postures
+            (..., k), and the result is (..., k, 4, 4).
+
+    Raises:
+        ValueError: If `closing` is not one angle per finger.
+    """
+    c = _coordinates(hand, spread, closing)
+    return np.stack([_chain_pose(chain, c) for chain in hand.chains], axis=-3)
+
+
+def _coordinates(hand: Hand, spread: npt.ArrayLike, closing: npt.ArrayLike) -> Array:
+    """Return (..., 1 + k) of a spread (...,) and closing angles (..., k)."""
+    angles = np.asarray(closing, dtype=float)
+    k = hand.num_fingers
+    if angles.shape[-1:] != (k,):
+        raise ValueError(f"closing must have shape (..., {k}), got {angles.shape}")
+    first = np.asarray(spread, dtype=float)
+    shape = np.broadcast_shapes(first.shape, angles.shape[:-1])
+    return np.concatenate(
+        [np.broadcast_to(first, shape)[..., None], np.broadcast_to(angles, (*shape, k))], axis=-1
+    )
+
+
+def _chain_pose(chain: Chain, c: Array) -> Array:
+    q = c @ chain.gain.T
+    X = np.eye(4)
+    for j, (X_PJ, axis) in enumerate(zip(chain.X_PJ, chain.axis, strict=True)):
+        X = X @ X_PJ @ _turn(axis, q[..., j])
+    return X @ chain.X_JFi
+
+
+def _turn(axis: Array, angle: Array) -> Array:
+    """Return the poses (..., 4, 4) that turn by angles (...,) about an axis (Rodrigues)."""
+    x, y, z = axis
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    s, c = np.sin(angle)[..., None, None], np.cos(angle)[..., None, None]
+    X = np.zeros((*np.shape(angle), 4, 4))
+    X[..., :3, :3] = np.eye(3) + s * K + (1.0 - c) * (K @ K)
+    X[..., 3, 3] = 1.0
+    return X
+
+
+def _read_description(path: Path) -> _Description:
+    try:
+        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        first = str(error).splitlines()[0]
+        raise HandError(f"{path}: must be YAML, got text that is not ({first})") from None
+    try:
+        return _Description.model_validate(tree)
+    except ValidationError as error:
+        lines = "; ".join(_describe(e) for e in error.errors())
+        raise HandError(f"{path}: {lines}") from None
+
+
+def _describe(error: Any) -> str:
+    """Return one pydantic error as `path: must ..., got ...`."""
+    where = ".".join(str(part) for part in error["loc"]) or "hand"
+    kind, got = error["type"], error["input"]
+    if kind in ("extra_forbidden", "unexpected_keyword_argument"):
+        return f"{where}: must be a key of a hand file, got an unknown one"
+    if kind == "missing":
+        return f"{where}: must be given, got nothing"
+    message = str(error["msg"]).removeprefix("Value error, ")
+    if kind == "value_error":
+        return f"{where}: {message}"
+    return f"{where}: must be {message.removeprefix('Input should be ')}, got {got!r}"
+
+
+def _build_hand(name: str, description: _Description, sdf_path: Path) -> Hand:
+    plant, instance = _parse(sdf_path)
+    palm = description.palm
+    R_BG = RollPitchYaw(np.deg2rad(palm.rpy_deg)).ToRotationMatrix()
+    X_BG = make_pose(R_BG.matrix(), palm.p_BG)
+    joints = _joints(plant, instance)
+    revolute = {j.name(): j for j in joints if isinstance(j, RevoluteJoint)}
+    gains = _gains(description, list(revolute))
+    bodies = {body.name(): body for body in map(plant.get_body, plant.GetBodyIndices(instance))}
+    base = _body(bodies, palm.link, "palm.link")
+    chains = []
+    for i, finger in enumerate(description.fingers):
+        tip = _body(bodies, finger.fingertip, f"fingers.{i}.fingertip")
+        chain = _chain(joints, tip, base, gains, invert_pose(X_BG))
+        if not chain.gain[:, 1 + i].any():
+            raise HandError(
+                f"fingers.{i}.closing_joint: must lie between the palm link and the fingertip, "
+                f"got {finger.closing_joint!r}"
+            )
+        chains.append(chain)
+    return Hand(
+        name=name,
+        sdf_path=sdf_path,
+        palm_link=palm.link,
+        X_BG=X_BG,
+        fingers=description.fingers,
+        spread=description.spread,
+        closing_speed=float(np.deg2rad(description.closing_speed_deg)),
+        fingertip_force_limit=description.fingertip_force_limit,
+        joint_names=tuple(revolute),
+        joint_gain=np.array([gains[joint] for joint in revolute]),
+        joint_limits=np.array(
+            [(j.position_lower_limit(), j.position_upper_limit()) for j in revolute.values()]
+        ),
+        chains=tuple(chains),
+    )
+
+
+def _parse(sdf_path: Path) -> tuple[MultibodyPlant, ModelInstanceIndex]:
+    """Return the model alone in a plant, without its geometry and not finalized.
+
+    Finalizing would add a floating joint for the palm to the model's own joints.
+    """
+    if not sdf_path.is_file():
+        raise HandError(f"model: must be an SDFormat file, got {str(sdf_path)!r}")
+    plant = MultibodyPlant(0.0)
+    try:
+        (instance,) = Parser(plant).AddModels(sdf_path)
+    except (RuntimeError, ValueError) as error:
+        first = str(error).splitlines()[0]
+        raise HandError(f"model: must be a file of one model, got {first}") from None
+    return plant, instance
+
+
+def _joints(plant: MultibodyPlant, instance: ModelInstanceIndex) -> list[Any]:
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
+    for joint in joints:
+        if not isinstance(joint, RevoluteJoint | WeldJoint):
+            raise HandError(
+                f"model: joint {joint.name()!r} must be revolute or fixed, "
+                f"got {type(joint).__name__}"
+            )
+    return joints
+
+
+def _body(bodies: dict[str, RigidBody], name: str, key: str) -> RigidBody:
+    if name not in bodies:
+        raise HandError(f"{key}: must be a link of the model ({', '.join(bodies)}), got {name!r}")
+    return bodies[name]
+
+
+def _gains(description: _Description, joints: list[str]) -> dict[str, Array]:
+    """Return each revolute joint's angle per coordinate, (1 + k,)."""
+    drives = [(f"spread.joints.{n}", j, 0, 1.0) for n, j in enumerate(description.spread.joints)]
+    for i, finger in enumerate(description.fingers):
+        drives.append((f"fingers.{i}.closing_joint", finger.closing_joint, 1 + i, 1.0))
+        for n, coupling in enumerate(finger.coupled):
+            drives.append((f"fingers.{i}.coupled.{n}.joint", coupling.joint, 1 + i, coupling.ratio))
+    gains: dict[str, Array] = {}
+    for key, joint, column, ratio in drives:
+        if joint not in joints:
+            raise HandError(
+                f"{key}: must be a revolute joint of the model ({', '.join(joints)}), got {joint!r}"
+            )
+        if joint in gains:
+            raise HandError(f"{key}: must be a joint that nothing else drives, got {joint!r}")
+        gains[joint] = ratio * np.eye(1 + len(description.fingers))[column]
+    if idle := [joint for joint in joints if joint not in gains]:
+        raise HandError(
+            f"model: every revolute joint must be driven by a finger or the spread, "
+            f"got {', '.join(idle)} driven by nothing"
+        )
+    return gains
+
+
+def _chain(
+    joints: list[Any], tip: RigidBody, base: RigidBody, gains: dict[str, Array], X_GB: Array
+) -> Chain:
+    by_child = {joint.child_body().index(): joint for joint in joints}
+    path: list[Any] = []
+    body = tip
+    while body.index() != base.index():
+        # Taken out, so that a closed loop of links ends here as well.
+        joint = by_child.pop(body.index(), None)
+        if joint is None:
+            raise HandError(
+                f"model: link {tip.name()!r} must be joined to the palm link {base.name()!r}, "
+                f"got a chain that ends at {body.name()!r}"
+            )
+        path.insert(0, joint)
+        body = joint.parent_body()
+    X, X_PJ, axes = X_GB, [], []
+    for joint in path:
+        X = X @ joint.frame_on_parent().GetFixedPoseInBodyFrame().GetAsMatrix4()
+        if isinstance(joint, RevoluteJoint):
+            X_PJ.append(X)
+            axes.append(joint.revolute_axis())
+            X = np.eye(4)
+        else:
+            X = X @ joint.X_FM().GetAsMatrix4()
+        X = X @ invert_pose(joint.frame_on_child().GetFixedPoseInBodyFrame().GetAsMatrix4())
+    gain = [gains[joint.name()] for joint in path if isinstance(joint, RevoluteJoint)]
+    k = len(next(iter(gains.values())))
+    return Chain(
+        X_PJ=np.reshape(X_PJ, (-1, 4, 4)),
+        axis=np.reshape(axes, (-1, 3)),
+        gain=np.reshape(gain, (-1, k)),
+        X_JFi=X,
+    )

@@ -1,0 +1,63 @@
+"""How an attempt can end: the one enum that files, trials and verification share."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class Stage(IntEnum):
+    """How far an attempt came; what a row of `trials.hdf5` holds depends on it."""
+
+    PLACED = 0  # geometry only: nothing was simulated
+    CLOSED = 1  # the fingers were closed and judged
+    LIFTED = 2  # the object was freed, lifted and judged again
+
+
+class Outcome(IntEnum):
+    """The verdict on one attempt. Values are stored in files: never renumber them."""
+
+    SUCCESS = 0  # every fingertip holds the object at the lift's target, clear of the table
+    BELOW_TABLE = 1  # the palm's origin would lie below the table
+    RAY_MISS = 2  # the palm ray does not meet the object
+    START_COLLISION = 3  # the open hand meets the object or the table at the start pose
+    SCREENED = 4  # geometry shows that not every fingertip can meet the object
+    MISSING_FINGERTIP = 5  # after closing, a fingertip does not touch the object
+    HAND_CONTACT = 6  # after closing, a hand part that is no fingertip touches the object
+    TABLE_CONTACT = 7  # the hand touches the table, or the object still does after the lift
+    SLIPPED = 8  # lost a fingertip's contact during the lift, but not the object
+    DROPPED = 9  # lost the object during the lift
+    SOLVER_ERROR = 10  # Drake failed or the state exploded; says nothing about the grasp
+    TIMEOUT = 11  # the attempt's wall-clock limit passed; says nothing about the grasp
+    CRASHED = 12  # the attempt killed its process; says nothing about the grasp
+
+    @property
+    def label(self) -> str:
+        """The name as written in tables and on the command line, e.g. `ray_miss`."""
+        return self.name.lower()
+
+    @property
+    def says_nothing(self) -> bool:
+        """Whether the simulator failed, not the grasp: never count it as a negative."""
+        return self in (Outcome.SOLVER_ERROR, Outcome.TIMEOUT, Outcome.CRASHED)
+
+    @property
+    def stage(self) -> Stage:
+        """The last stage whose results exist for this outcome."""
+        return _STAGE[self]
+
+
+_STAGE = {
+    Outcome.SUCCESS: Stage.LIFTED,
+    Outcome.BELOW_TABLE: Stage.PLACED,
+    Outcome.RAY_MISS: Stage.PLACED,
+    Outcome.START_COLLISION: Stage.PLACED,
+    Outcome.SCREENED: Stage.PLACED,
+    Outcome.MISSING_FINGERTIP: Stage.CLOSED,
+    Outcome.HAND_CONTACT: Stage.CLOSED,
+    Outcome.TABLE_CONTACT: Stage.CLOSED,
+    Outcome.SLIPPED: Stage.LIFTED,
+    Outcome.DROPPED: Stage.LIFTED,
+    Outcome.SOLVER_ERROR: Stage.PLACED,
+    Outcome.TIMEOUT: Stage.PLACED,
+    Outcome.CRASHED: Stage.PLACED,
+}

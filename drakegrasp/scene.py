@@ -1,0 +1,453 @@
+"""The Drake diagram of one object, the table and, if given, one hand.
+
+A scene is built once per object and reset for each attempt: building costs more than
+simulating, and a reset context gives the same bits as a new one. It takes no decisions;
+`resting` and `trial` drive it.
+
+How the hand is held: world, three prismatic joints, then a frame whose rotation is set
+in the context and which is welded to the palm. The orientation is thus exact and
+constant, and the plant needs no rotational wrist joints (our own construction).
+
+Traps of Drake 1.51.1 that shape this module: geometry on the world body crashes as soon
+as a joint is locked, so the table is a body of its own; `AddMultibodyPlantSceneGraph`
+leaks the plant; sampled output ports report the contacts of the step before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import resources
+
+import numpy as np
+import numpy.typing as npt
+from pydrake.common import MemoryFile
+from pydrake.geometry import (
+    AddCompliantHydroelasticProperties,
+    AddContactMaterial,
+    AddRigidHydroelasticProperties,
+    CollisionFilterDeclaration,
+    GeometryId,
+    GeometrySet,
+    InMemoryMesh,
+    Mesh,
+    ProximityProperties,
+    RoleAssign,
+    SceneGraph,
+)
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import (
+    AddMultibodyPlant,
+    CoulombFriction,
+    MultibodyPlant,
+    MultibodyPlantConfig,
+)
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    ModelInstanceIndex,
+    PdControllerGains,
+    PrismaticJoint,
+    RigidBody,
+    RotationalInertia,
+    SpatialInertia,
+)
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, DiagramBuilder
+from pydrake.systems.primitives import TrajectorySource
+from pydrake.trajectories import BezierCurve, PiecewisePolynomial
+
+from drakegrasp.config import PhysicsConfig
+from drakegrasp.frames import X_WT, Array
+from drakegrasp.hand import Hand
+from drakegrasp.meshes import ObjectModel, obj_text
+
+#: Mass of each of the three bodies that carry the wrist [kg]; light beside the hand.
+WRIST_BODY_MASS = 0.02
+#: Wrist gains [N/m], [N s/m]: 2 kg sag by 0.02 mm, and the lag is one time step.
+WRIST_STIFFNESS, WRIST_DAMPING = 1e6, 1e4
+#: Damping of the velocity-controlled fingers [N m s/rad]: the torque limit is reached at a
+#: tenth of a radian per second of lag.
+FINGER_DAMPING = 20.0
+#: Drake demands a positive stiffness; this one adds less than a millionth of the torque.
+FINGER_STIFFNESS = 1e-6
+#: Resolution of the few hand parts that are cylinders [m]; boxes and meshes have none.
+RESOLUTION_HINT = 0.005
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HandHandles:
+    """Where the hand is in a scene's plant."""
+
+    hand: Hand
+    instance: ModelInstanceIndex
+    wrist_instance: ModelInstanceIndex
+    wrist_joints: tuple[PrismaticJoint, ...]
+    wrist_frame: FixedOffsetFrame
+    wrist_trajectory: TrajectorySource
+    fingertips: tuple[RigidBody, ...]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scene:
+    """A built diagram with its one context.
+
+    Attributes:
+        simulator: Owns the diagram's context.
+        plant, scene_graph: The two systems of the diagram.
+        object, table: The bodies.
+        handles: The hand's part, or None in a scene without a hand.
+        physics: The configuration that it was built with.
+    """
+
+    simulator: Simulator
+    plant: MultibodyPlant
+    scene_graph: SceneGraph
+    object: RigidBody
+    table: RigidBody
+    handles: HandHandles | None
+    physics: PhysicsConfig
+
+    @property
+    def context(self) -> Context:
+        """The plant's context."""
+        return self.plant.GetMyMutableContextFromRoot(self.simulator.get_mutable_context())
+
+    @property
+    def scene_graph_context(self) -> Context:
+        """The scene graph's context."""
+        return self.scene_graph.GetMyMutableContextFromRoot(self.simulator.get_mutable_context())
+
+    @property
+    def time(self) -> float:
+        """Simulated time since the last reset [s]."""
+        return float(self.simulator.get_context().get_time())
+
+    def pose(self, body: RigidBody) -> Array:
+        """Return the pose X_WB (4, 4) of a body now."""
+        return self.plant.EvalBodyPoseInWorld(self.context, body).GetAsMatrix4()
+
+
+def build_scene(model: ObjectModel, physics: PhysicsConfig, hand: Hand | None = None) -> Scene:
+    """Return the scene of an object and the table, with the hand if one is given.
+
+    The object is a rigid hydroelastic surface of its exact collision mesh; the table and
+    every part of the hand are compliant, so that each contact with the object is a
+    hydroelastic one.
+    """
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlant(_plant_config(physics), builder)
+    object_body = _add_object(plant, model, physics)
+    table = _add_table(plant, scene_graph, physics)
+    handles = None
+    if hand is not None:
+        trajectory = builder.AddSystem(
+            TrajectorySource(PiecewisePolynomial(np.zeros((3, 1))), output_derivative_order=1)
+        )
+        handles = _add_hand(plant, hand, trajectory)
+        _make_compliant_hand(plant, scene_graph, handles, physics)
+    plant.Finalize()
+    if handles is not None:
+        _filter_within_hand(plant, scene_graph, handles)
+        builder.Connect(
+            handles.wrist_trajectory.get_output_port(),
+            plant.get_desired_state_input_port(handles.wrist_instance),
+        )
+    simulator = Simulator(builder.Build())
+    scene = Scene(
+        simulator=simulator,
+        plant=plant,
+        scene_graph=scene_graph,
+        object=object_body,
+        table=table,
+        handles=handles,
+        physics=physics,
+    )
+    if handles is not None:
+        plant.get_desired_state_input_port(handles.instance).FixValue(
+            scene.context, _closing_command(handles.hand)
+        )
+    return scene
+
+
+def reset_object(scene: Scene, X_WO: npt.ArrayLike) -> None:
+    """Put the clock to zero and the object, free and at rest, at X_WO (4, 4)."""
+    scene.simulator.get_mutable_context().SetTime(0.0)
+    scene.object.Unlock(scene.context)
+    scene.plant.SetFreeBodyPose(scene.context, scene.object, RigidTransform(np.asarray(X_WO)))
+    scene.plant.SetVelocities(scene.context, np.zeros(scene.plant.num_velocities()))
+
+
+def reset_attempt(scene: Scene, X_WO: npt.ArrayLike, X_WG: npt.ArrayLike, spread: float) -> None:
+    """Put the open hand and the object at the start of an attempt; wrist and object static.
+
+    Args:
+        scene: A scene with a hand.
+        X_WO: Pose of the object (4, 4).
+        X_WG: Pose of the palm (4, 4).
+        spread: Angle of the spread joints [rad].
+    """
+    handles = _handles(scene)
+    context, plant = scene.context, scene.plant
+    for joint in handles.wrist_joints:
+        joint.Unlock(context)
+    reset_object(scene, X_WO)
+    X = np.asarray(X_WG, dtype=float)
+    R_WG = RotationMatrix(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]))
+    handles.wrist_frame.SetPoseInParentFrame(context, RigidTransform(R_WG, np.zeros(3)))
+    plant.SetPositions(
+        context, handles.instance, np.zeros(plant.num_positions(handles.instance))
+    )
+    for name in handles.hand.spread.joints:
+        plant.GetJointByName(name, handles.instance).set_angle(context, spread)
+    for joint, p in zip(handles.wrist_joints, X[:3, 3], strict=True):
+        joint.set_translation(context, float(p))
+        joint.Lock(context)
+    # The spread stays where it is put: one motor drives it, and the released code locks it too.
+    for name in handles.hand.spread.joints:
+        plant.GetJointByName(name, handles.instance).Lock(context)
+    scene.object.Lock(context)
+    handles.wrist_trajectory.UpdateTrajectory(PiecewisePolynomial(X[:3, 3:4]))
+    scene.simulator.Initialize()
+
+
+def release(scene: Scene) -> None:
+    """Free the object and the wrist for the lift."""
+    for joint in _handles(scene).wrist_joints:
+        joint.Unlock(scene.context)
+    scene.object.Unlock(scene.context)
+
+
+def move_wrist(scene: Scene, p_WG_target: npt.ArrayLike, duration: float) -> None:
+    """Command a straight minimum-jerk motion of the wrist from where it is, starting now.
+
+    Args:
+        scene: A scene with a hand.
+        p_WG_target: Where the palm's origin goes, (3,) [m]; it stays there afterwards.
+        duration: Of the motion [s].
+    """
+    handles = _handles(scene)
+    start = [joint.get_translation(scene.context) for joint in handles.wrist_joints]
+    # A quintic Bezier curve with threefold ends starts and stops with zero speed and
+    # acceleration: the minimum-jerk motion (Flash and Hogan, 1985).
+    points = np.column_stack([start] * 3 + [np.asarray(p_WG_target, dtype=float)] * 3)
+    handles.wrist_trajectory.UpdateTrajectory(
+        BezierCurve(scene.time, scene.time + duration, points)
+    )
+
+
+def advance(scene: Scene, duration: float) -> None:
+    """Simulate for a duration [s]."""
+    scene.simulator.AdvanceTo(scene.time + duration, interruptible=False)
+
+
+def finger_speed(scene: Scene) -> float:
+    """Return the largest speed of a closing joint [rad/s]."""
+    handles = _handles(scene)
+    joints = (
+        scene.plant.GetJointByName(finger.closing_joint, handles.instance)
+        for finger in handles.hand.fingers
+    )
+    return max(abs(float(joint.get_angular_rate(scene.context))) for joint in joints)
+
+
+def hand_positions(scene: Scene) -> Array:
+    """Return the positions of all joints of the hand in the plant's order [rad]."""
+    return scene.plant.GetPositions(scene.context, _handles(scene).instance)
+
+
+def hand_joint_names(scene: Scene) -> list[str]:
+    """Return the joints' names in the order of `hand_positions`."""
+    names = scene.plant.GetPositionNames(
+        _handles(scene).instance, add_model_instance_prefix=False, always_add_suffix=False
+    )
+    return list(names)
+
+
+def palm_pose(scene: Scene) -> Array:
+    """Return the pose X_WG (4, 4) of the palm now."""
+    handles = _handles(scene)
+    base = scene.plant.GetBodyByName(handles.hand.palm_link, handles.instance)
+    return scene.pose(base) @ handles.hand.X_BG
+
+
+def _plant_config(physics: PhysicsConfig) -> MultibodyPlantConfig:
+    return MultibodyPlantConfig(
+        time_step=physics.time_step,
+        contact_model="hydroelastic_with_fallback",
+        discrete_contact_approximation=physics.solver,
+        # Sampled ports would report the contacts of the step before.
+        use_sampled_output_ports=False,
+    )
+
+
+def _add_object(plant: MultibodyPlant, model: ObjectModel, physics: PhysicsConfig) -> RigidBody:
+    # Inertia.ReExpress and shifting are Drake's; the model gives it about Ocm, in O.
+    I = model.I_OOcm_O  # noqa: E741
+    inertia = SpatialInertia.MakeFromCentralInertia(
+        model.mass,
+        model.p_OOcm,
+        RotationalInertia(I[0, 0], I[1, 1], I[2, 2], I[0, 1], I[0, 2], I[1, 2]),
+    )
+    instance = plant.AddModelInstance("object")
+    body = plant.AddRigidBody("object", instance, inertia)
+    text = obj_text(model.collision_vertices, model.collision_faces, normals=False)
+    properties = ProximityProperties()
+    AddRigidHydroelasticProperties(properties)
+    _add_material(properties, _object_friction(physics), physics)
+    plant.RegisterCollisionGeometry(
+        body,
+        RigidTransform(),
+        Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", model.name))),
+        "surface",
+        properties,
+    )
+    return body
+
+
+def _add_table(
+    plant: MultibodyPlant, scene_graph: SceneGraph, physics: PhysicsConfig
+) -> RigidBody:
+    path = resources.files("drakegrasp") / "models" / "table.sdf"
+    (instance,) = Parser(plant).AddModels(str(path))
+    body = plant.GetBodyByName("table", instance)
+    plant.WeldFrames(plant.world_frame(), body.body_frame(), RigidTransform(X_WT))
+    properties = ProximityProperties()
+    AddCompliantHydroelasticProperties(RESOLUTION_HINT, physics.table_modulus, properties)
+    _add_material(properties, _partner_friction(physics.friction_table, physics), physics)
+    _assign_proximity(plant, scene_graph, body, properties)
+    return body
+
+
+def _object_friction(physics: PhysicsConfig) -> float:
+    # Drake combines two coefficients to 2 a b / (a + b). With the object at the larger of
+    # the two effective values, both can be met by a positive coefficient of the partner.
+    return max(physics.friction_hand, physics.friction_table)
+
+
+def _partner_friction(effective: float, physics: PhysicsConfig) -> float:
+    """Return the coefficient that gives the effective one against the object."""
+    mu = _object_friction(physics)
+    return effective * mu / (2.0 * mu - effective)
+
+
+def _add_material(properties: ProximityProperties, mu: float, physics: PhysicsConfig) -> None:
+    AddContactMaterial(
+        dissipation=physics.dissipation,
+        friction=CoulombFriction(mu, mu),
+        properties=properties,
+    )
+    properties.AddProperty("material", "relaxation_time", physics.relaxation_time)
+
+
+def _assign_proximity(
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    body: RigidBody,
+    properties: ProximityProperties,
+) -> None:
+    for geometry in plant.GetCollisionGeometriesForBody(body):
+        scene_graph.AssignRole(plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
+
+
+def _add_hand(plant: MultibodyPlant, hand: Hand, trajectory: TrajectorySource) -> HandHandles:
+    wrist_instance = plant.AddModelInstance("wrist")
+    joints = _add_wrist(plant, wrist_instance)
+    (instance,) = Parser(plant).AddModels(str(hand.sdf_path))
+    base = plant.GetBodyByName(hand.palm_link, instance)
+    palm = plant.AddFrame(
+        FixedOffsetFrame("palm", base.body_frame(), RigidTransform(hand.X_BG), instance)
+    )
+    wrist = plant.AddFrame(
+        FixedOffsetFrame("wrist", joints[-1].child_body().body_frame(), RigidTransform())
+    )
+    plant.WeldFrames(wrist, palm, RigidTransform())
+    _add_actuation(plant, hand, instance)
+    # Gravity on the hand is carried by the arm that is not simulated.
+    for weightless in (instance, wrist_instance):
+        plant.set_gravity_enabled(weightless, False)
+    return HandHandles(
+        hand=hand,
+        instance=instance,
+        wrist_instance=wrist_instance,
+        wrist_joints=joints,
+        wrist_frame=wrist,
+        wrist_trajectory=trajectory,
+        fingertips=tuple(plant.GetBodyByName(f.fingertip, instance) for f in hand.fingers),
+    )
+
+
+def _add_wrist(
+    plant: MultibodyPlant, instance: ModelInstanceIndex
+) -> tuple[PrismaticJoint, ...]:
+    parent = plant.world_body()
+    joints = []
+    for name, axis in zip("xyz", np.eye(3), strict=True):
+        inertia = SpatialInertia.SolidSphereWithMass(WRIST_BODY_MASS, 0.02)
+        body = plant.AddRigidBody(f"wrist_{name}", instance, inertia)
+        joint = plant.AddJoint(
+            PrismaticJoint(f"wrist_{name}", parent.body_frame(), body.body_frame(), axis)
+        )
+        actuator = plant.AddJointActuator(f"wrist_{name}", joint)
+        actuator.set_controller_gains(PdControllerGains(p=WRIST_STIFFNESS, d=WRIST_DAMPING))
+        joints.append(joint)
+        parent = body
+    return tuple(joints)
+
+
+def _add_actuation(plant: MultibodyPlant, hand: Hand, instance: ModelInstanceIndex) -> None:
+    for finger in hand.fingers:
+        joint = plant.GetJointByName(finger.closing_joint, instance)
+        actuator = plant.AddJointActuator(finger.name, joint, finger.torque_limit)
+        actuator.set_default_rotor_inertia(finger.rotor_inertia)
+        actuator.set_default_gear_ratio(finger.gear_ratio)
+        actuator.set_controller_gains(PdControllerGains(p=FINGER_STIFFNESS, d=FINGER_DAMPING))
+        for coupling in finger.coupled:
+            plant.AddCouplerConstraint(
+                plant.GetJointByName(coupling.joint, instance), joint, coupling.ratio
+            )
+
+
+def _closing_command(hand: Hand) -> Array:
+    """Return the constant [q_d; v_d] that closes all fingers at the hand's speed."""
+    return np.concatenate([np.zeros(hand.num_fingers), np.full(hand.num_fingers, hand.closing_speed)])
+
+
+def _make_compliant_hand(
+    plant: MultibodyPlant, scene_graph: SceneGraph, handles: HandHandles, physics: PhysicsConfig
+) -> None:
+    tips = {body.index() for body in handles.fingertips}
+    mu = _partner_friction(physics.friction_hand, physics)
+    for index in plant.GetBodyIndices(handles.instance):
+        modulus = physics.fingertip_modulus if index in tips else physics.link_modulus
+        properties = ProximityProperties()
+        AddCompliantHydroelasticProperties(RESOLUTION_HINT, modulus, properties)
+        _add_material(properties, mu, physics)
+        _assign_proximity(plant, scene_graph, plant.get_body(index), properties)
+
+
+def _filter_within_hand(
+    plant: MultibodyPlant, scene_graph: SceneGraph, handles: HandHandles
+) -> None:
+    """Let only fingertips of different fingers collide within the hand.
+
+    The other links' shapes overlap at their joints by design, and they cannot reach each
+    other before the fingertips do.
+    """
+    def geometries(body: RigidBody) -> list[GeometryId]:
+        return list(plant.GetCollisionGeometriesForBody(body))
+
+    bodies = [plant.get_body(i) for i in plant.GetBodyIndices(handles.instance)]
+    tips = {body.index() for body in handles.fingertips}
+    others = GeometrySet([g for b in bodies if b.index() not in tips for g in geometries(b)])
+    every_tip = GeometrySet([g for b in handles.fingertips for g in geometries(b)])
+    manager = scene_graph.collision_filter_manager()
+    manager.Apply(CollisionFilterDeclaration().ExcludeWithin(others))
+    manager.Apply(CollisionFilterDeclaration().ExcludeBetween(others, every_tip))
+    for tip in handles.fingertips:
+        manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(geometries(tip))))
+
+
+def _handles(scene: Scene) -> HandHandles:
+    if scene.handles is None:
+        raise ValueError("the scene must have a hand, got one without")
+    return scene.handles

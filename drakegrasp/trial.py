@@ -1,0 +1,197 @@
+"""One attempt, from its start pose to its verdict: the function that build, verify and
+replay all call.
+
+In: a scene, the object, its resting pose and an attempt. Out: a `TrialRecord` with the
+outcome and everything that was measured on the way. Failures of the physics are values;
+the one place where an error of Drake becomes an outcome is `run_attempt`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.candidates import Attempt
+from drakegrasp.config import Config
+from drakegrasp.contacts import Contacts, open_hand_collides, read_contacts
+from drakegrasp.frames import X_WT, Array, invert_pose, rotation_angle
+from drakegrasp.outcomes import Outcome
+from drakegrasp.scene import (
+    Scene,
+    advance,
+    finger_speed,
+    hand_positions,
+    move_wrist,
+    palm_pose,
+    release,
+    reset_attempt,
+)
+
+#: Peak speed of a minimum-jerk motion over its mean speed (Flash and Hogan, 1985).
+PEAK_SPEED = 15.0 / 8.0
+#: Peak acceleration of a minimum-jerk motion times duration squared over distance.
+PEAK_ACCELERATION = 10.0 / np.sqrt(3.0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrialRecord:
+    """The result of one attempt. What a stage did not reach is None.
+
+    Attributes:
+        outcome: The verdict.
+        X_TO, X_OG: Resting pose of the object and start pose of the palm, (4, 4).
+        closed, lifted: Contacts after closing and after the lift.
+        q_closed, q_lifted: Positions of the hand's joints then [rad], in the plant's order.
+        time_close, time_lift: Simulated seconds of the two stages.
+        X_TO_lifted: Pose of the object after the lift, (4, 4).
+        slip: Distance that {O} moved in {G} during the lift [m].
+        slip_angle: Angle that it turned in {G} [rad].
+        message: Text of the error for `solver_error`, else empty.
+    """
+
+    outcome: Outcome
+    X_TO: Array
+    X_OG: Array
+    closed: Contacts | None = None
+    lifted: Contacts | None = None
+    q_closed: Array | None = None
+    q_lifted: Array | None = None
+    time_close: float = 0.0
+    time_lift: float = 0.0
+    X_TO_lifted: Array | None = None
+    slip: float = np.nan
+    slip_angle: float = np.nan
+    message: str = field(default="")
+
+
+class _StateExploded(Exception):
+    """The state left the range in which it means anything."""
+
+
+def run_attempt(scene: Scene, X_TO: npt.ArrayLike, attempt: Attempt, config: Config) -> TrialRecord:
+    """Return what happens when the hand tries one attempt.
+
+    The palm is placed, the fingers close on the static object, the contacts are judged,
+    the object is freed and lifted to `lift.p_TG`, and the contacts are judged again. The
+    same scene, attempt and configuration give the same bits, whatever ran before.
+
+    Args:
+        scene: Of the object, with the hand.
+        X_TO: Resting pose of the object in the table-top frame, (4, 4).
+        attempt: What to try.
+        config: The rules.
+    """
+    X_TO = np.asarray(X_TO, dtype=float)
+    record = TrialRecord(outcome=Outcome.RAY_MISS, X_TO=X_TO, X_OG=attempt.X_OG)
+    if not attempt.ray_hits:
+        return record
+    if (X_TO @ attempt.X_OG)[2, 3] <= 0.0:
+        return replace(record, outcome=Outcome.BELOW_TABLE)
+    try:
+        return _simulate(scene, record, attempt, config)
+    # A failed assertion within Drake arrives as SystemExit, everything else as RuntimeError.
+    except (RuntimeError, SystemExit, _StateExploded) as error:
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        failed = TrialRecord(outcome=Outcome.SOLVER_ERROR, X_TO=X_TO, X_OG=attempt.X_OG)
+        return replace(failed, message=lines[0])
+
+
+def _simulate(scene: Scene, record: TrialRecord, attempt: Attempt, config: Config) -> TrialRecord:
+    X_WO = X_WT @ record.X_TO
+    reset_attempt(scene, X_WO, X_WO @ attempt.X_OG, attempt.spread)
+    if open_hand_collides(scene):
+        return replace(record, outcome=Outcome.START_COLLISION)
+    record = _close(scene, record, config)
+    assert record.closed is not None
+    verdict = judge_closed(record.closed)
+    if verdict is not None:
+        return replace(record, outcome=verdict)
+    return _lift(scene, record, config)
+
+
+def judge_closed(contacts: Contacts) -> Outcome | None:
+    """Return why a closed hand may not lift the object, or None if it may."""
+    if not contacts.touching.all():
+        return Outcome.MISSING_FINGERTIP
+    if contacts.other_links:
+        return Outcome.HAND_CONTACT
+    if contacts.hand_on_table:
+        return Outcome.TABLE_CONTACT
+    return None
+
+
+def judge_lifted(contacts: Contacts) -> Outcome:
+    """Return the verdict after the lift."""
+    if not contacts.touching.any() and not contacts.other_links:
+        return Outcome.DROPPED
+    if not contacts.touching.all():
+        return Outcome.SLIPPED
+    if contacts.object_on_table:
+        return Outcome.TABLE_CONTACT
+    return Outcome.SUCCESS
+
+
+def lift_duration(distance: float, config: Config) -> float:
+    """Return how long a minimum-jerk motion over a distance [m] takes within the limits [s]."""
+    at_speed_limit = PEAK_SPEED * distance / config.lift.max_speed
+    at_acceleration_limit = np.sqrt(PEAK_ACCELERATION * distance / config.lift.max_acceleration)
+    return float(max(at_speed_limit, at_acceleration_limit))
+
+
+def _close(scene: Scene, record: TrialRecord, config: Config) -> TrialRecord:
+    rules = config.close
+    while scene.time < rules.max_time:
+        advance(scene, rules.check_period)
+        if finger_speed(scene) < rules.stop_speed:
+            break
+    return replace(
+        record,
+        closed=read_contacts(scene),
+        q_closed=hand_positions(scene),
+        time_close=scene.time,
+    )
+
+
+def _lift(scene: Scene, record: TrialRecord, config: Config) -> TrialRecord:
+    X_GO_before = invert_pose(palm_pose(scene)) @ scene.pose(scene.object)
+    start = scene.time
+    target = X_WT[:3, 3] + config.lift.p_TG
+    duration = lift_duration(float(np.linalg.norm(target - palm_pose(scene)[:3, 3])), config)
+    release(scene)
+    move_wrist(scene, target, duration)
+    end = start + duration + config.lift.hold_time
+    contacts = None
+    while contacts is None:
+        remaining = end - scene.time
+        advance(scene, min(config.lift.check_period, remaining))
+        _refuse_explosion(scene, config)
+        now = read_contacts(scene)
+        lost = not now.touching.any() and not now.other_links
+        # The last look may fall short of the end by rounding, never by a step.
+        if lost or end - scene.time < 1e-9:
+            contacts = now
+    X_WO = scene.pose(scene.object)
+    X_GO = invert_pose(palm_pose(scene)) @ X_WO
+    moved = invert_pose(X_GO_before) @ X_GO
+    return replace(
+        record,
+        outcome=judge_lifted(contacts),
+        lifted=contacts,
+        q_lifted=hand_positions(scene),
+        time_lift=scene.time - start,
+        X_TO_lifted=invert_pose(X_WT) @ X_WO,
+        slip=float(np.linalg.norm(X_GO[:3, 3] - X_GO_before[:3, 3])),
+        slip_angle=rotation_angle(moved[:3, :3]),
+    )
+
+
+def _refuse_explosion(scene: Scene, config: Config) -> None:
+    velocity = scene.plant.EvalBodySpatialVelocityInWorld(scene.context, scene.object)
+    speed = float(np.linalg.norm(velocity.translational()))
+    if not speed <= config.physics.max_speed:
+        raise _StateExploded(
+            f"the object's speed must stay below {config.physics.max_speed:g} m/s, got {speed:.3g}"
+        )
+

@@ -1,0 +1,408 @@
+"""The Barrett Hand against its published figures, and any hand against its description."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+import yaml
+from pydrake.geometry import Box, Convex, Cylinder, Role, SceneGraph
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
+from pydrake.systems.framework import DiagramBuilder
+
+from drakegrasp.errors import HandError
+from drakegrasp.frames import Array
+from drakegrasp.hand import (
+    MODELS,
+    Coupling,
+    Hand,
+    coordinate_limits,
+    fingertip_poses,
+    hand_names,
+    joint_positions,
+    load_hand,
+)
+
+#: The palm's surface above the base [m]; the table below is given from there.
+PALM_SURFACE = 0.0793
+#: Tip of the official Denavit-Hartenberg table in the distal link's frame [m].
+P_FiT = np.array([0.050, 0.0095, 0.0])
+#: Spread, proximal angle [deg], finger; T, pad point [m], pad normal in base axes.
+TABLE = """
+0 0 F1 -0.0250 -0.1521 0.0385 -0.0250 -0.1438 0.0330 0.000 0.611 0.792
+0 0 F2 0.0250 -0.1521 0.0385 0.0250 -0.1438 0.0330 0.000 0.611 0.792
+0 0 F3 0.0000 0.1521 0.0385 0.0000 0.1438 0.0330 0.000 -0.611 0.792
+0 60 F1 -0.0250 -0.0491 0.0967 -0.0250 -0.0531 0.0876 0.000 0.886 -0.464
+0 60 F2 0.0250 -0.0491 0.0967 0.0250 -0.0531 0.0876 0.000 0.886 -0.464
+0 60 F3 0.0000 0.0491 0.0967 0.0000 0.0531 0.0876 0.000 -0.886 -0.464
+0 100 F1 -0.0250 0.0159 0.0608 -0.0250 0.0062 0.0586 0.000 0.157 -0.988
+0 100 F2 0.0250 0.0159 0.0608 0.0250 0.0062 0.0586 0.000 0.157 -0.988
+0 100 F3 0.0000 -0.0159 0.0608 0.0000 -0.0062 0.0586 0.000 -0.157 -0.988
+90 0 F1 -0.1771 0.0000 0.0385 -0.1688 0.0000 0.0330 0.611 0.000 0.792
+90 0 F2 0.1771 0.0000 0.0385 0.1688 0.0000 0.0330 -0.611 0.000 0.792
+90 0 F3 0.0000 0.1521 0.0385 0.0000 0.1438 0.0330 0.000 -0.611 0.792
+90 60 F1 -0.0741 0.0000 0.0967 -0.0781 0.0000 0.0876 0.886 0.000 -0.464
+90 60 F2 0.0741 0.0000 0.0967 0.0781 0.0000 0.0876 -0.886 0.000 -0.464
+90 60 F3 0.0000 0.0491 0.0967 0.0000 0.0531 0.0876 0.000 -0.886 -0.464
+90 100 F1 -0.0091 0.0000 0.0608 -0.0188 0.0000 0.0586 0.157 0.000 -0.988
+90 100 F2 0.0091 0.0000 0.0608 0.0188 0.0000 0.0586 -0.157 0.000 -0.988
+90 100 F3 0.0000 -0.0159 0.0608 0.0000 -0.0062 0.0586 0.000 -0.157 -0.988
+"""
+#: Mass [kg] and bounding box of the CAD mesh [m] of each kind of link.
+LINKS = {
+    "base": (0.60858, (-0.0445, -0.0445, 0.0), (0.0445, 0.0650, 0.0904)),
+    "spread": (0.14109, (-0.0123, -0.0123, -0.0389), (0.0650, 0.0123, 0.0150)),
+    "proximal": (0.062139, (-0.0125, -0.0125, -0.0105), (0.0794, 0.0150, 0.0105)),
+    "distal": (0.04166, (-0.0095, -0.0095, -0.0115), (0.0590, 0.01105, 0.0115)),
+}
+#: A gripper whose two fingers face each other along y, hinged at y = -+0.04, length 0.1.
+PINCER_SDF = """<sdf version="1.9"><model name="pincer">
+  <link name="palm"/>
+  <link name="mount"><pose>0 -0.04 0.02 0 0 0</pose></link>
+  <link name="left"><pose>0 -0.04 0.02 0 0 0</pose></link>
+  <link name="right"><pose>0 0.04 0.02 0 0 0</pose></link>
+  <joint name="fixed" type="fixed"><parent>palm</parent><child>mount</child></joint>
+  <joint name="left_hinge" type="revolute"><parent>mount</parent><child>left</child>
+    <axis><xyz>-1 0 0</xyz><limit><lower>-0.1</lower><upper>1</upper></limit></axis></joint>
+  <joint name="right_hinge" type="revolute"><parent>palm</parent><child>right</child>
+    <axis><xyz>1 0 0</xyz><limit><lower>0</lower><upper>1</upper></limit></axis></joint>
+</model></sdf>"""
+PINCER = {
+    "model": "pincer.sdf",
+    "palm": {"link": "palm", "p_BG": [0.0, 0.0, 0.01]},
+    "fingers": [
+        {
+            "name": side,
+            "fingertip": side,
+            "closing_joint": f"{side}_hinge",
+            "torque_limit": 1.0,
+            "pad_point": [0.0, 0.0, 0.1],
+            "pad_normal": [0, sign * 2, 0],
+        }
+        for side, sign in (("left", 1), ("right", -1))
+    ],
+    "closing_speed_deg": 90.0,
+    "fingertip_force_limit": 10.0,
+}
+
+
+@pytest.fixture(scope="module")
+def hand() -> Hand:
+    return load_hand()
+
+
+def link_kind(name: str) -> str:
+    return name.rpartition("_")[2]
+
+
+def parsed_plant(hand: Hand) -> MultibodyPlant:
+    plant = MultibodyPlant(0.0)
+    Parser(plant).AddModels(str(hand.sdf_path))
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(hand.palm_link))
+    plant.Finalize()
+    return plant
+
+
+def drake_fingertip_poses(hand: Hand, spread: float, closing: Array) -> Array:
+    plant = parsed_plant(hand)
+    context = plant.CreateDefaultContext()
+    for name, angle in joint_positions(hand, spread, closing).items():
+        plant.GetJointByName(name).set_angle(context, angle)
+    X_GB = RigidTransform(hand.X_BG).inverse()
+    return np.array(
+        [
+            (X_GB @ plant.GetBodyByName(f).EvalPoseInWorld(context)).GetAsMatrix4()
+            for f in hand.fingertip_links
+        ]
+    )
+
+
+def write_pincer(folder: Path, **changes: object) -> Path:
+    (folder / "pincer.sdf").write_text(PINCER_SDF)
+    path = folder / "pincer_hand.yaml"
+    path.write_text(yaml.safe_dump({**PINCER, **changes}))
+    return path
+
+
+def changed_finger(**changes: object) -> list[object]:
+    return [{**PINCER["fingers"][0], **changes}, PINCER["fingers"][1]]
+
+
+def test_barrett_is_the_only_hand_and_has_the_fields_of_its_file(hand: Hand) -> None:
+    assert hand_names() == ["barrett"]
+    assert hand.name == "barrett"
+    assert hand.num_fingers == 3
+    assert hand.fingertip_links == ("finger1_distal", "finger2_distal", "finger3_distal")
+    assert [finger.torque_limit for finger in hand.fingers] == [2.0, 2.0, 4.0]
+    assert hand.spread.joints == ("finger1_spread_joint", "finger2_spread_joint")
+    assert hand.closing_speed == pytest.approx(np.pi / 3)
+    np.testing.assert_allclose(hand.X_BG[:3, 3], [0.0, 0.0, 0.07795])
+
+
+@pytest.mark.parametrize("row", TABLE.strip().splitlines())
+def test_forward_kinematics_agrees_with_the_table(hand: Hand, row: str) -> None:
+    spread, proximal, name, *numbers = row.split()
+    T, pad, n = np.array(numbers, dtype=float).reshape(3, 3)
+    i = [finger.name for finger in hand.fingers].index(name)
+    closing = np.full(3, np.deg2rad(float(proximal)))
+    X_BFi = hand.X_BG @ fingertip_poses(hand, spread=np.deg2rad(float(spread)), closing=closing)[i]
+    # The table is rounded to 0.1 mm; the brief for the model is half a millimetre.
+    lift = [0.0, 0.0, PALM_SURFACE]
+    finger = hand.fingers[i]
+    assert np.linalg.norm(X_BFi[:3, :3] @ P_FiT + X_BFi[:3, 3] - lift - T) < 5e-4
+    assert np.linalg.norm(X_BFi[:3, :3] @ finger.p_FiP + X_BFi[:3, 3] - lift - pad) < 5e-4
+    np.testing.assert_allclose(X_BFi[:3, :3] @ finger.n_Fi, n, atol=1e-3)
+
+
+def test_numpy_and_drake_have_the_same_forward_kinematics(hand: Hand) -> None:
+    rng = np.random.default_rng(0)
+    limits = coordinate_limits(hand)
+    for _ in range(5):
+        c = rng.uniform(limits[:, 0], limits[:, 1])
+        X_GF = fingertip_poses(hand, spread=c[0], closing=c[1:])
+        np.testing.assert_allclose(X_GF, drake_fingertip_poses(hand, c[0], c[1:]), atol=1e-9)
+
+
+def test_many_postures_are_evaluated_as_one_by_one(hand: Hand) -> None:
+    rng = np.random.default_rng(1)
+    spread, closing = rng.random((4, 1)), rng.random((4, 2, 3))
+    X_GF = fingertip_poses(hand, spread=spread, closing=closing)
+    assert X_GF.shape == (4, 2, 3, 4, 4)
+    one = fingertip_poses(hand, spread=spread[3, 0], closing=closing[3, 1])
+    np.testing.assert_allclose(X_GF[3, 1], one, atol=1e-15)
+
+
+def test_distal_joints_turn_by_a_third_and_both_spread_joints_alike(hand: Hand) -> None:
+    q = joint_positions(hand, 0.4, [0.3, 0.6, 0.9])
+    assert q["finger1_spread_joint"] == q["finger2_spread_joint"] == 0.4
+    for i, angle in enumerate([0.3, 0.6, 0.9], start=1):
+        assert q[f"finger{i}_proximal_joint"] == angle
+        assert q[f"finger{i}_distal_joint"] == pytest.approx(angle / 3)
+
+
+def test_coordinate_limits_are_those_of_the_joints_that_stop_first(hand: Hand) -> None:
+    # 48 degrees of the distal joint are 144 of the proximal one, which stops at 140.
+    expected = np.deg2rad([[0, 180], [0, 140], [0, 140], [0, 140]])
+    np.testing.assert_allclose(coordinate_limits(hand), expected, atol=1e-8)
+
+
+def test_closing_must_be_one_angle_per_finger(hand: Hand) -> None:
+    with pytest.raises(ValueError, match=r"closing must have shape \(\.\.\., 3\), got \(2,\)"):
+        fingertip_poses(hand, spread=0.0, closing=[0.1, 0.2])
+
+
+def test_masses_are_the_published_ones_and_no_actuator_is_parsed(hand: Hand) -> None:
+    plant = parsed_plant(hand)
+    bodies = [plant.GetBodyByName(name) for name in body_names(plant)]
+    for body in bodies:
+        mass = LINKS[link_kind(body.name())][0]
+        assert body.default_mass() == mass
+        assert body.default_spatial_inertia().IsPhysicallyValid()
+    assert sum(body.default_mass() for body in bodies) == pytest.approx(1.2022, abs=1e-4)
+    assert plant.num_actuators() == 0
+
+
+def body_names(plant: MultibodyPlant) -> list[str]:
+    bodies = [
+        plant.get_body(i)
+        for i in plant.GetBodyIndices(plant.GetModelInstanceByName("barrett_hand"))
+    ]
+    return [body.name() for body in bodies]
+
+
+@pytest.mark.parametrize("path", sorted(MODELS.glob("barrett_*.obj")), ids=lambda p: p.stem)
+def test_parts_are_closed_convex_and_wound_outwards_with_normals(path: Path) -> None:
+    mesh = trimesh.load(path, process=False)
+    assert "vertex_normals" in mesh._cache  # read from the file, not computed
+    mesh.merge_vertices(merge_norm=True)
+    assert mesh.is_watertight
+    assert mesh.is_winding_consistent
+    assert mesh.is_convex
+    assert mesh.volume == pytest.approx(mesh.convex_hull.volume, rel=1e-6)
+
+
+def shape_points(shape: object) -> Array:
+    """Return points (n, 3) whose bounding box and hull are the shape's."""
+    if isinstance(shape, Box):
+        return trimesh.creation.box(shape.size()).vertices
+    if isinstance(shape, Cylinder):
+        return trimesh.creation.cylinder(shape.radius(), shape.length(), sections=64).vertices
+    assert isinstance(shape, Convex), f"collision shapes must be convex, got {shape}"
+    return trimesh.load(shape.source().path(), process=False).vertices
+
+
+def test_collision_shapes_are_convex_and_fill_the_cad_bounding_boxes(hand: Hand) -> None:
+    plant, scene_graph, _ = built_scene(hand)
+    inspector = scene_graph.model_inspector()
+    names = body_names(plant)
+    assert len(names) == 9
+    for name in names:
+        points = []
+        for geometry in plant.GetCollisionGeometriesForBody(plant.GetBodyByName(name)):
+            X_LG = inspector.GetPoseInFrame(geometry).GetAsMatrix4()
+            p = shape_points(inspector.GetShape(geometry))
+            points.append(p @ X_LG[:3, :3].T + X_LG[:3, 3])
+        p_L = np.concatenate(points)
+        _, lower, upper = LINKS[link_kind(name)]
+        np.testing.assert_allclose(p_L.min(axis=0), lower, atol=4e-3)
+        np.testing.assert_allclose(p_L.max(axis=0), upper, atol=4e-3)
+
+
+def test_the_shapes_are_drawn_as_they_collide_and_carry_no_contact_properties(hand: Hand) -> None:
+    plant, scene_graph, _ = built_scene(hand)
+    inspector = scene_graph.model_inspector()
+    for name in body_names(plant):
+        body = plant.GetBodyByName(name)
+        collisions = plant.GetCollisionGeometriesForBody(body)
+        assert len(collisions) == len(plant.GetVisualGeometriesForBody(body))
+        for geometry in collisions:
+            properties = inspector.GetProximityProperties(geometry)
+            assert not properties.HasGroup("hydroelastic")
+
+
+def built_scene(hand: Hand) -> tuple[MultibodyPlant, SceneGraph, object]:
+    builder = DiagramBuilder()
+    config = MultibodyPlantConfig(time_step=0.01)
+    plant, scene_graph = AddMultibodyPlant(config, builder)
+    Parser(plant).AddModels(str(hand.sdf_path))
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(hand.palm_link))
+    plant.Finalize()
+    return plant, scene_graph, builder.Build()
+
+
+@pytest.mark.parametrize("spread_deg", [0.0, 11.25, 22.5, 90.0])
+def test_open_fingers_do_not_touch_each_other(hand: Hand, spread_deg: float) -> None:
+    plant, scene_graph, diagram = built_scene(hand)
+    context = diagram.CreateDefaultContext()
+    angles = joint_positions(hand, np.deg2rad(spread_deg), np.zeros(3))
+    for name, angle in angles.items():
+        plant.GetJointByName(name).set_angle(plant.GetMyContextFromRoot(context), angle)
+    query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
+    inspector = scene_graph.model_inspector()
+
+    def link(geometry: object) -> str:
+        return inspector.GetName(inspector.GetFrameId(geometry)).rpartition("::")[2]
+
+    pairs = {
+        tuple(sorted((link(p.id_A), link(p.id_B)))) for p in query.ComputePointPairPenetration()
+    }
+    fingers = {(a.partition("_")[0], b.partition("_")[0]) for a, b in pairs}
+    assert not {(a, b) for a, b in fingers if a != b and "base" not in (a, b)}
+    assert inspector.NumGeometriesWithRole(Role.kProximity) == 28
+
+
+def test_a_hand_of_two_fingers_without_spread_loads(tmp_path: Path) -> None:
+    pincer = load_hand(write_pincer(tmp_path))
+    assert (pincer.name, pincer.num_fingers) == ("pincer", 2)
+    assert pincer.spread.joints == ()
+    np.testing.assert_array_equal(coordinate_limits(pincer), [[0, 0], [-0.1, 1], [0, 1]])
+    # Each finger leans inwards by its own angle about its hinge, 10 mm above the palm frame.
+    X_GF = fingertip_poses(pincer, spread=0.0, closing=[0.2, 0.5])
+    for X, finger, y, angle in zip(X_GF, pincer.fingers, (-0.04, 0.04), (0.2, 0.5), strict=True):
+        inward = -np.sign(y)
+        p_GP = X[:3, :3] @ finger.p_FiP + X[:3, 3]
+        expected = [0.0, y + inward * 0.1 * np.sin(angle), 0.01 + 0.1 * np.cos(angle)]
+        np.testing.assert_allclose(p_GP, expected, atol=1e-12)
+        n_G = X[:3, :3] @ finger.n_Fi
+        np.testing.assert_allclose(n_G, [0.0, inward * np.cos(angle), -np.sin(angle)], atol=1e-12)
+    np.testing.assert_allclose(
+        X_GF, drake_fingertip_poses(pincer, 0.0, np.array([0.2, 0.5])), atol=1e-12
+    )
+
+
+def test_a_coupling_that_stops_first_limits_its_finger(tmp_path: Path) -> None:
+    coupled = [{"joint": "right_hinge", "ratio": -2.0}]
+    fingers = changed_finger(coupled=coupled)[:1]
+    pincer = load_hand(write_pincer(tmp_path, fingers=fingers))
+    assert pincer.fingers[0].coupled == (Coupling(joint="right_hinge", ratio=-2.0),)
+    # right_hinge, 0..1, turns by -2 times the closing angle, -0.1..1.
+    np.testing.assert_allclose(coordinate_limits(pincer)[1], [-0.1, 0.0])
+
+
+def test_an_unknown_hand_is_refused_with_the_hands_there_are() -> None:
+    with pytest.raises(
+        HandError, match=r"hand must be one of barrett or a YAML file, got 'shadow'"
+    ):
+        load_hand("shadow")
+
+
+REFUSALS = {
+    "unknown key": ({"colour": "red"}, r"colour: must be a key of a hand file"),
+    "unknown nested key": (
+        {"fingers": changed_finger(nail=1)},
+        r"fingers\.0\.nail: must be a key of a hand file",
+    ),
+    "missing key": ({"palm": {"link": "palm"}}, r"palm\.p_BG: must be given"),
+    "bad type": (
+        {"fingers": changed_finger(torque_limit="strong")},
+        r"fingers\.0\.torque_limit: must be a valid number.*got 'strong'",
+    ),
+    "not positive": ({"closing_speed_deg": 0}, r"closing_speed_deg: must be greater than 0, got 0"),
+    "no fingers": ({"fingers": []}, r"fingers: must .* at least 1 item"),
+    "zero normal": (
+        {"fingers": changed_finger(pad_normal=[0, 0, 0])},
+        r"fingers\.0: pad_normal must not be zero",
+    ),
+    "zero ratio": (
+        {"fingers": changed_finger(coupled=[{"joint": "right_hinge", "ratio": 0}])},
+        r"fingers\.0\.coupled\.0: ratio must not be zero",
+    ),
+    "missing file": ({"model": "gone.sdf"}, r"model: must be an SDFormat file, got '.*gone\.sdf'"),
+    "not a model": ({"model": "pincer_hand.yaml"}, r"model: must be a file of one model"),
+    "missing palm": (
+        {"palm": {"link": "wrist", "p_BG": [0, 0, 0]}},
+        r"palm\.link: must be a link of the model \(palm, .*right\), got 'wrist'",
+    ),
+    "missing link": (
+        {"fingers": changed_finger(fingertip="thumb")},
+        r"fingers\.0\.fingertip: must be a link of the model \(palm, .*right\), got 'thumb'",
+    ),
+    "missing joint": (
+        {"fingers": changed_finger(closing_joint="knee")},
+        r"fingers\.0\.closing_joint: .* \(left_hinge, right_hinge\), got 'knee'",
+    ),
+    "joint driven twice": (
+        {"spread": {"joints": ["left_hinge"]}},
+        r"fingers\.0\.closing_joint: must be a joint that nothing else drives",
+    ),
+    "joint driven by nothing": (
+        {"fingers": changed_finger()[:1]},
+        r"every revolute joint must be driven .* got right_hinge driven by nothing",
+    ),
+    "closing joint elsewhere": (
+        {"fingers": [{**PINCER["fingers"][0], "fingertip": "right"}, PINCER["fingers"][1]]},
+        r"fingers\.0\.closing_joint: must lie between the palm link and the fingertip",
+    ),
+    "palm not inward": (
+        {"palm": {"link": "right", "p_BG": [0, 0, 0]}},
+        r"link 'left' must be joined to the palm link 'right', got a chain that ends at 'palm'",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSALS)
+def test_a_bad_description_is_refused_in_one_line(tmp_path: Path, case: str) -> None:
+    changes, message = REFUSALS[case]
+    with pytest.raises(HandError, match=message) as info:
+        load_hand(write_pincer(tmp_path, **changes))
+    assert "\n" not in str(info.value)
+    assert str(tmp_path / "pincer_hand.yaml") in str(info.value)
+
+
+@pytest.mark.parametrize("text", ["a: [", "- 1", ""])
+def test_text_that_is_no_mapping_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "odd.yaml"
+    path.write_text(text)
+    with pytest.raises(HandError, match=r"odd\.yaml: .*must be"):
+        load_hand(path)
+
+
+def test_a_sliding_joint_is_refused(tmp_path: Path) -> None:
+    path = write_pincer(tmp_path)
+    (tmp_path / "pincer.sdf").write_text(PINCER_SDF.replace("revolute", "prismatic"))
+    with pytest.raises(HandError, match=r"'left_hinge' must be revolute or fixed, got Prismatic"):
+        load_hand(path)
