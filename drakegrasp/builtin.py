@@ -127,6 +127,7 @@ _CLASSES: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, dict[str, Any]]]
                 neck_radius=0.020,
                 lip_radius=0.030,
                 height=0.190,
+                edge=0.007,
             ),
         },
     ),
@@ -173,6 +174,7 @@ _CLASSES: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, dict[str, Any]]]
                 handle_reach=0.026,
                 handle_radius=0.007,
                 lip=0.018,
+                edge=0.008,
             ),
         },
     ),
@@ -194,7 +196,7 @@ _CLASSES: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, dict[str, Any]]]
         shapes.spray_bottle,
         {
             "small": dict(width=0.064, depth=0.046, height=0.170),
-            "large": dict(width=0.084, depth=0.056, height=0.220),
+            "large": dict(width=0.084, depth=0.056, height=0.220, edge=0.007),
         },
     ),
     (
@@ -237,7 +239,9 @@ _CLASSES: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, dict[str, Any]]]
 
 def _number_objects() -> tuple[BuiltinObject, ...]:
     rows = [
-        (shape, variant, sizes) for shape, variants in _CLASSES for variant, sizes in variants.items()
+        (shape, variant, sizes)
+        for shape, variants in _CLASSES
+        for variant, sizes in variants.items()
     ]
     return tuple(
         BuiltinObject(

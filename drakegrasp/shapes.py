@@ -12,12 +12,16 @@ Booleans are Manifold's, by trimesh. No function draws random numbers.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import numpy.typing as npt
 import trimesh
 from scipy.interpolate import PchipInterpolator
 
 from drakegrasp.frames import Array
+
+Faces = npt.NDArray[np.int64]
 
 #: Usual edge length where fingers touch [m]: below the width of a fingertip.
 EDGE = 0.006
@@ -35,6 +39,12 @@ DECIMALS = 7
 #: How far a part that must cut through or overlap another goes beyond it [m].
 OVERLAP = 0.001
 
+#: Triangles lower than this [m] are mended after a boolean: contact normals mean little there.
+SLIVER = 0.0005
+
+#: Bound on those mends; a seam needs some dozens.
+MAX_REPAIRS = 1000
+
 #: A point nearer to the axis than this lies on it [m].
 ON_AXIS = 1e-9
 
@@ -46,7 +56,7 @@ def resample(points: npt.ArrayLike, step: float) -> Array:
     """Return a polyline (n, d) with its corners kept and no piece longer than `step` [m]."""
     corners = np.asarray(points, dtype=float)
     pieces = [corners[:1]]
-    for start, end in zip(corners[:-1], corners[1:], strict=True):
+    for start, end in pairwise(corners):
         count = max(1, int(np.ceil(np.linalg.norm(end - start) / step - 1e-6)))
         fractions = np.linspace(0.0, 1.0, count + 1)[1:, None]
         pieces.append(start + fractions * (end - start))
@@ -234,7 +244,7 @@ def grid_box(extents: npt.ArrayLike, *, centre: npt.ArrayLike, edge: float) -> t
     size = np.asarray(extents, dtype=float)
     counts = np.maximum(1, np.round(size / edge).astype(int))
     vertices: list[Array] = []
-    faces: list[npt.NDArray[np.int64]] = []
+    faces: list[Faces] = []
     total = 0
     for axis in range(3):
         u, v = (axis + 1) % 3, (axis + 2) % 3
@@ -262,12 +272,87 @@ def cut(body: trimesh.Trimesh, *tools: trimesh.Trimesh) -> trimesh.Trimesh:
     return _from_boolean(trimesh.boolean.difference([body, *tools], engine="manifold"))
 
 
+def stand(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return the mesh moved along z until its lowest point is at z = 0."""
+    return solid(mesh.vertices - [0.0, 0.0, mesh.bounds[0, 2]], mesh.faces)
+
+
 def _from_boolean(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    return solid(mesh.vertices, mesh.faces)
+    """Return the result of a boolean without the slivers along its seams."""
+    # Another order first: the mending below depends on it.
+    tidy = solid(mesh.vertices, mesh.faces)
+    points, faces = tidy.vertices.copy(), tidy.faces.copy()
+    refused: set[tuple[int, ...]] = set()
+    for _ in range(MAX_REPAIRS):
+        lengths, heights = _edge_lengths(points, faces), _heights(points, faces)
+        slivers = [
+            k for k in np.flatnonzero(heights < SLIVER) if tuple(faces[k].tolist()) not in refused
+        ]
+        if not slivers:
+            break
+        k = min(slivers, key=lambda face: float(heights[face]))
+        sliver = tuple(faces[k].tolist())
+        if lengths[k].min() < 2.0 * SLIVER:
+            short = int(lengths[k].argmin())
+            a, b = sliver[short], sliver[(short + 1) % 3]
+            mended = _collapse(faces, a, b)
+            if mended is not None:
+                points[a] = (points[a] + points[b]) / 2.0
+        else:
+            long = int(lengths[k].argmax())
+            mended = _flip(points, faces, sliver[long], sliver[(long + 1) % 3])
+        if mended is None:
+            refused.add(sliver)
+        else:
+            faces = mended
+    return solid(points, faces)
+
+
+def _edge_lengths(points: Array, faces: Faces) -> Array:
+    """Return the lengths (n, 3) [m] of the edges that start at each corner of each face."""
+    corners = points[faces]
+    return np.asarray(np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2))
+
+
+def _heights(points: Array, faces: Faces) -> Array:
+    """Return the height (n,) [m] of each face above its longest edge."""
+    p, q, r = np.moveaxis(points[faces], 1, 0)
+    doubled = np.linalg.norm(np.cross(q - p, r - p), axis=1)
+    return np.asarray(doubled / np.maximum(_edge_lengths(points, faces).max(axis=1), ON_AXIS))
+
+
+def _collapse(faces: Faces, a: int, b: int) -> Faces | None:
+    """Return the faces with vertex `b` made one with `a`, None if that would pinch the surface."""
+    around_a = set(faces[(faces == a).any(axis=1)].ravel().tolist())
+    around_b = set(faces[(faces == b).any(axis=1)].ravel().tolist())
+    if len((around_a & around_b) - {a, b}) != 2:
+        return None
+    joined = np.where(faces == b, a, faces)
+    return joined[(joined != np.roll(joined, 1, axis=1)).all(axis=1)]
+
+
+def _flip(points: Array, faces: Faces, a: int, b: int) -> Faces | None:
+    """Return the faces with the edge from `a` to `b` turned, None if that mends nothing."""
+    pair = np.flatnonzero((faces == a).any(axis=1) & (faces == b).any(axis=1))
+    left, right = (
+        next(
+            int(face[(i + 2) % 3])
+            for face in faces[pair]
+            for i in range(3)
+            if face[i] == start and face[(i + 1) % 3] == end
+        )
+        for start, end in ((a, b), (b, a))
+    )
+    if ((faces == left).any(axis=1) & (faces == right).any(axis=1)).any():
+        return None
+    turned = faces.copy()
+    turned[pair] = [(a, right, left), (right, b, left)]
+    before, after = (_heights(points, either[pair]).min() for either in (faces, turned))
+    return turned if after > before else None
 
 
 def _skin(rings: list[Array], *, closed: bool) -> trimesh.Trimesh:
-    """Return the surface through rings (n_i, 3) that start at the same angle; one point is a tip."""
+    """Return the surface through rings (n_i, 3) that start alike; one point is a tip."""
     starts = np.cumsum([0, *(len(ring) for ring in rings)])
     faces: list[tuple[int, int, int]] = []
     pairs = [(k, k + 1) for k in range(len(rings) - 1)]
@@ -391,19 +476,26 @@ def _trimmed(part: trimesh.Trimesh, core: trimesh.Trimesh) -> trimesh.Trimesh:
 
 def _bevelled(radius: float, height: float, bevel: float) -> list[tuple[float, float]]:
     """Return corners (r, z) of an upright wall with a bevelled foot and head, off the axis."""
-    return [(radius - bevel, 0.0), (radius, bevel), (radius, height - bevel),
-            (radius - bevel, height)]
+    return [
+        (radius - bevel, 0.0),
+        (radius, bevel),
+        (radius, height - bevel),
+        (radius - bevel, height),
+    ]
 
 
-# The classes, in the order of the table. All lengths are in metres.
+# The classes, in the order of the table.
 
 
 def mug(
     *, radius: float, height: float, handle_reach: float, handle_radius: float, wall: float = 0.005
 ) -> trimesh.Trimesh:
-    """Return a hollow straight mug with a handle at +x; `handle_reach` is how far it stands out."""
+    """Return a hollow straight mug with a handle at +x; `handle_reach` is how far it stands out.
+
+    All lengths are in [m].
+    """
     shell, core = vessel(
-        resample(_bevelled(radius, height, 0.004)[:2] + [(radius, height)], EDGE),
+        resample([*_bevelled(radius, height, 0.004)[:2], (radius, height)], EDGE),
         wall=wall,
         floor=0.007,
     )
@@ -420,7 +512,10 @@ def mug(
 def cup(
     *, top_radius: float, bottom_radius: float, height: float, wall: float = 0.0045
 ) -> trimesh.Trimesh:
-    """Return a hollow tapered cup without a handle."""
+    """Return a hollow tapered cup without a handle.
+
+    All lengths are in [m].
+    """
     side = resample([(bottom_radius, 0.0), (top_radius, height)], EDGE)
     return vessel(side, wall=wall, floor=0.006)[0]
 
@@ -428,7 +523,10 @@ def cup(
 def bowl(
     *, radius: float, height: float, foot_radius: float, wall: float = 0.005
 ) -> trimesh.Trimesh:
-    """Return a hollow bowl on a ring foot."""
+    """Return a hollow bowl on a ring foot.
+
+    All lengths are in [m].
+    """
     side = smooth(
         [
             (foot_radius, 0.0),
@@ -450,8 +548,12 @@ def vase(
     lip_radius: float,
     height: float,
     wall: float = 0.005,
+    edge: float = EDGE,
 ) -> trimesh.Trimesh:
-    """Return a hollow vase with a belly, a neck and a lip."""
+    """Return a hollow vase with a belly, a neck and a lip.
+
+    All lengths are in [m].
+    """
     side = smooth(
         [
             (foot_radius, 0.0),
@@ -459,9 +561,9 @@ def vase(
             (neck_radius, 0.82 * height),
             (lip_radius, height),
         ],
-        EDGE,
+        edge,
     )
-    return vessel(side, wall=wall, floor=0.008)[0]
+    return vessel(side, wall=wall, floor=0.008, edge=edge)[0]
 
 
 def wineglass(
@@ -474,7 +576,10 @@ def wineglass(
     stem_height: float,
     wall: float = 0.0045,
 ) -> trimesh.Trimesh:
-    """Return a wineglass: a solid foot and stem, a hollow cup."""
+    """Return a wineglass: a solid foot and stem, a hollow cup.
+
+    All lengths are in [m].
+    """
     cup_height = height - stem_height
     outer = smooth(
         [
@@ -497,9 +602,10 @@ def wineglass(
         ],
         EDGE,
     )
-    profile = np.vstack([foot, stem[1:], outer[1:], inner, (0.0, floor)])
+    bottom = resample([inner[-1], (0.0, floor)], COARSE * EDGE)[1:]
+    profile = np.vstack([foot, stem[1:], outer[1:], inner, bottom])
     edges = np.full(len(profile), EDGE)
-    edges[len(profile) - len(inner) - 1 :] *= COARSE
+    edges[len(profile) - len(inner) - len(bottom) :] *= COARSE
     return revolve(profile, edge=edges)
 
 
@@ -514,9 +620,12 @@ def pitcher(
     handle_radius: float,
     lip: float,
     wall: float = 0.005,
+    edge: float = 0.007,
 ) -> trimesh.Trimesh:
-    """Return a hollow pitcher with a handle at +x and a lip pulled out by `lip` at -x."""
-    edge = 1.2 * EDGE
+    """Return a hollow pitcher with a handle at +x and a lip pulled out by `lip` at -x.
+
+    All lengths are in [m].
+    """
     side = smooth(
         [
             (foot_radius, 0.0),
@@ -547,10 +656,13 @@ def pitcher(
 def saucepan(
     *, radius: float, height: float, handle_length: float, wall: float = 0.005
 ) -> trimesh.Trimesh:
-    """Return a hollow saucepan with a straight handle along +x."""
+    """Return a hollow saucepan with a straight handle along +x.
+
+    All lengths are in [m].
+    """
     edge = 1.2 * EDGE
     shell, core = vessel(
-        resample(_bevelled(radius, height, 0.005)[:2] + [(radius, height)], edge),
+        resample([*_bevelled(radius, height, 0.005)[:2], (radius, height)], edge),
         wall=wall,
         floor=0.007,
         edge=edge,
@@ -568,7 +680,10 @@ def saucepan(
 
 
 def bottle(*, radius: float, height: float, neck_radius: float) -> trimesh.Trimesh:
-    """Return a closed bottle, solid, with a shoulder, a neck and a cap."""
+    """Return a closed bottle, solid, with a shoulder, a neck and a cap.
+
+    All lengths are in [m].
+    """
     shoulder, neck, cap = 0.58 * height, 0.78 * height, 0.9 * height
     side = np.vstack(
         [
@@ -592,12 +707,18 @@ def bottle(*, radius: float, height: float, neck_radius: float) -> trimesh.Trime
 
 
 def can(*, radius: float, height: float) -> trimesh.Trimesh:
-    """Return a closed can: a cylinder with bevelled rims."""
+    """Return a closed can: a cylinder with bevelled rims.
+
+    All lengths are in [m].
+    """
     return _lathe(resample(_bevelled(radius, height, 0.002), EDGE))
 
 
 def jar(*, radius: float, height: float, lid_radius: float, lid_height: float) -> trimesh.Trimesh:
-    """Return a closed jar, solid: a body, a short neck and a lid."""
+    """Return a closed jar, solid: a body, a short neck and a lid.
+
+    All lengths are in [m].
+    """
     shoulder = height - lid_height - 0.018
     neck = min(lid_radius - 0.004, radius - 0.008)
     side = np.vstack(
@@ -626,7 +747,10 @@ def jar(*, radius: float, height: float, lid_radius: float, lid_height: float) -
 
 
 def candlestick(*, foot_radius: float, stem_radius: float, height: float) -> trimesh.Trimesh:
-    """Return a candlestick with a wide foot, a knob and a drip cup with a socket."""
+    """Return a candlestick with a wide foot, a knob and a drip cup with a socket.
+
+    All lengths are in [m].
+    """
     cup, socket = 2.6 * stem_radius, 0.010
     outline = [
         (foot_radius, 0.0),
@@ -649,7 +773,10 @@ def candlestick(*, foot_radius: float, stem_radius: float, height: float) -> tri
 def flashlight(
     *, head_radius: float, body_radius: float, height: float, head_height: float
 ) -> trimesh.Trimesh:
-    """Return a flashlight that stands on its lens, with a switch at +x."""
+    """Return a flashlight that stands on its lens, with a switch at +x.
+
+    All lengths are in [m].
+    """
     taper = head_height + 0.022
     side = resample(
         [
@@ -676,18 +803,29 @@ def flashlight(
 def funnel(
     *, radius: float, spout_radius: float, cone_height: float, height: float, wall: float = 0.0045
 ) -> trimesh.Trimesh:
-    """Return a funnel, open at both ends, that stands on its wide end."""
+    """Return a funnel, open at both ends, that stands on its wide end.
+
+    All lengths are in [m].
+    """
     outer = resample(
-        [(radius, 0.0), (radius, 0.008), (spout_radius + 0.002, cone_height),
-         (spout_radius, height)],
+        [
+            (radius, 0.0),
+            (radius, 0.008),
+            (spout_radius + 0.002, cone_height),
+            (spout_radius, height),
+        ],
         EDGE,
     )
     # Across a sloping wall the thickness is measured along r: wall / sin(slope).
     slope = np.arctan2(cone_height - 0.008, radius - spout_radius)
     step = wall / np.sin(slope)
     inner = resample(
-        [(spout_radius - wall, height), (spout_radius + 0.002 - wall, cone_height),
-         (radius - step, 0.008), (radius - step, 0.0)],
+        [
+            (spout_radius - wall, height),
+            (spout_radius + 0.002 - wall, cone_height),
+            (radius - step, 0.008),
+            (radius - step, 0.0),
+        ],
         COARSE * EDGE,
     )
     profile = np.vstack([outer, inner])
@@ -695,48 +833,68 @@ def funnel(
     return revolve(profile, edge=edges, closed=True)
 
 
-def box(*, width: float, depth: float, height: float, edge: float = 0.009) -> trimesh.Trimesh:
-    """Return an upright box: `width` along x, `depth` along y."""
+def box(*, width: float, depth: float, height: float, edge: float = 1.2 * EDGE) -> trimesh.Trimesh:
+    """Return an upright box: `width` along x, `depth` along y.
+
+    All lengths are in [m].
+    """
     return grid_box((width, depth, height), centre=(0.0, 0.0, height / 2.0), edge=edge)
 
 
-def book(*, width: float, length: float, thickness: float) -> trimesh.Trimesh:
-    """Return a closed book that lies flat, its round spine along y at -x."""
-    cover, inlay, edge = 0.004, 0.004, 0.011
-    middle = thickness / 2.0
-    boards = [
-        grid_box((width, length, cover), centre=(0.0, 0.0, z), edge=edge)
-        for z in (cover / 2.0, thickness - cover / 2.0)
-    ]
-    pages = grid_box(
-        (width - 2.0 * inlay, length - 2.0 * inlay, thickness - cover),
-        centre=(0.0, 0.0, middle),
-        edge=edge,
-    )
-    spine = bar(
-        (-width / 2.0, length / 2.0, middle),
-        (-width / 2.0, -length / 2.0, middle),
-        ellipse(0.009, middle, edge=EDGE),
-        normal=(0.0, 0.0, 1.0),
-        scale=((0.0, 1.25), (0.1, 1.0), (0.9, 1.0), (1.0, 1.25)),
-        edge=edge,
-    )
-    return fuse(*boards, pages, spine)
+def book(*, width: float, length: float, thickness: float, edge: float = 0.011) -> trimesh.Trimesh:
+    """Return a closed book that lies flat, its round spine along y at -x.
+
+    All lengths are in [m].
+    """
+    cover, inlay, bulge = 0.004, 0.005, 0.008
+    x, y, hinge = width / 2.0, length / 2.0, 0.006 - width / 2.0
+
+    def ring(z: float, *, setback: float, scale: float = 1.0) -> Array:
+        """Return the outline at height `z`, the pages `setback` behind the cover's edge."""
+        level = 2.0 * z / thickness - 1.0
+        back = -x - bulge * np.sqrt(1.0 - level**2)
+        right, front = x - setback, y - setback
+        corners = [(right, front), (hinge, front), (hinge, y), (back, y)]
+        corners = [(right, -front), *corners, *((u, -v) for u, v in reversed(corners[1:]))]
+        corners.append(corners[0])
+        # The same number of pieces at every height, whatever their length.
+        sizes = [length, width, 0.0, bulge, length, bulge, 0.0, width]
+        outline = []
+        for start, end, size in zip(corners[:-1], corners[1:], sizes, strict=True):
+            count = max(1, round(size / edge))
+            outline.append(np.linspace(start, end, count, endpoint=False))
+        flat = scale * np.concatenate(outline)
+        return np.column_stack([flat, np.full(len(flat), z)])
+
+    scales = np.linspace(0.0, 1.0, max(2, round(x / edge)), endpoint=False)[1:]
+    board = [ring(0.0, setback=0.0), ring(cover, setback=0.0)]
+    heights = resample([[cover], [thickness - cover]], 0.7 * edge)[:, 0]
+    pages = [ring(z, setback=inlay) for z in heights]
+    lid = [ring(thickness - cover, setback=0.0), ring(thickness, setback=0.0)]
+    under = [ring(0.0, setback=0.0, scale=scale) for scale in scales]
+    over = [ring(thickness, setback=0.0, scale=scale) for scale in scales[::-1]]
+    tips = [np.array([[0.0, 0.0, z]]) for z in (0.0, thickness)]
+    return _skin([tips[0], *under, *board, *pages, *lid, *over, tips[1]], closed=False)
 
 
-def spray_bottle(*, width: float, depth: float, height: float) -> trimesh.Trimesh:
-    """Return a spray bottle, solid: an oval body, a neck, a head and a trigger towards +x."""
+def spray_bottle(
+    *, width: float, depth: float, height: float, edge: float = EDGE
+) -> trimesh.Trimesh:
+    """Return a spray bottle, solid: an oval body, a neck, a head and a trigger towards +x.
+
+    All lengths are in [m].
+    """
     body_height = 0.68 * height
-    neck, section = 0.013, rounded_rectangle(width, depth, 0.45 * depth, edge=EDGE)
+    neck, section = 0.013, rounded_rectangle(width, depth, 0.45 * depth, edge=edge)
     foot = [(0.0, 0.0), (0.5, 0.0), (0.94, 0.0), (1.0, 0.004)]
-    side = resample([(0.0, 0.004), (0.0, 0.72 * body_height)], EDGE)[1:]
+    side = resample([(0.0, 0.004), (0.0, 0.72 * body_height)], edge)[1:]
     shoulder = smooth(
         [
             (width / 2.0, 0.72 * body_height),
             (0.42 * width, 0.85 * body_height),
             (neck, body_height),
         ],
-        EDGE,
+        edge,
     )[1:] / [width / 2.0, 1.0]
     profile = [*foot, *((1.0, z) for z in side[:, 1]), *shoulder, (0.0, body_height)]
     body = extrude(section, profile)
@@ -744,16 +902,21 @@ def spray_bottle(*, width: float, depth: float, height: float) -> trimesh.Trimes
     head_z = height - 0.014
     collar = revolve(
         resample(
-            [(0.0, body_height - 0.01), (neck + 0.002, body_height - 0.01),
-             (neck + 0.002, body_height + 0.014), (0.011, body_height + 0.018),
-             (0.011, head_z), (0.0, head_z)],
-            EDGE,
+            [
+                (0.0, body_height - 0.01),
+                (neck + 0.002, body_height - 0.01),
+                (neck + 0.002, body_height + 0.014),
+                (0.011, body_height + 0.018),
+                (0.011, head_z),
+                (0.0, head_z),
+            ],
+            edge,
         )
     )
     head = bar(
         (-0.028, 0.0, head_z),
         (0.048, 0.0, head_z),
-        rounded_rectangle(0.028, 0.024, 0.007, edge=EDGE),
+        rounded_rectangle(0.028, 0.024, 0.007, edge=edge),
         normal=(0.0, 1.0, 0.0),
         scale=((0.0, 0.75), (0.35, 1.0), (0.75, 0.9), (1.0, 0.55)),
     )
@@ -763,9 +926,9 @@ def spray_bottle(*, width: float, depth: float, height: float) -> trimesh.Trimes
             np.column_stack(
                 [0.026 + 0.014 * np.sin(1.6 * reach), 0.0 * reach, head_z - 0.055 * reach]
             ),
-            EDGE,
+            edge,
         ),
-        rounded_rectangle(0.008, 0.014, 0.003, edge=EDGE),
+        rounded_rectangle(0.008, 0.014, 0.003, edge=edge),
         normal=(0.0, 1.0, 0.0),
         scale=1.0,
     )
@@ -778,6 +941,7 @@ def hammer(
     """Return a hammer that lies on its side, handle along -x, head along y.
 
     With `claw` one half of the head is a bent claw, else the head is a square mallet.
+    All lengths are in [m].
     """
     half = head_thickness / 2.0
     up = (0.0, 0.0, 1.0)
@@ -814,8 +978,11 @@ def hammer(
     else:
         section = rounded_rectangle(1.1 * head_thickness, head_thickness, 0.006, edge=EDGE)
         head = bar(
-            (0.0, reach, half), (0.0, -reach, half), section, normal=up,
-            scale=((0.0, 1.1), (0.1, 1.0), (0.9, 1.0), (1.0, 1.1)),
+            (0.0, reach, half),
+            (0.0, -reach, half),
+            section,
+            normal=up,
+            scale=((0.0, 1.0), (1.0, 1.0)),
         )
     return fuse(handle, head)
 
@@ -823,22 +990,22 @@ def hammer(
 def dumbbell(
     *, length: float, head_width: float, head_length: float, grip_radius: float
 ) -> trimesh.Trimesh:
-    """Return a dumbbell along x with six-sided heads of `head_width` between flats."""
+    """Return a dumbbell along x with six-sided heads of `head_width` between flats.
+
+    All lengths are in [m].
+    """
     apothem = head_width / 2.0
-    turns = 2.0 * np.pi * (np.arange(6) + 0.5) / 6.0 - np.pi / 2.0
+    turns = 2.0 * np.pi * (np.arange(6) + 0.5) / 6.0
     corners = apothem / np.cos(np.pi / 6.0) * np.column_stack([np.cos(turns), np.sin(turns)])
     hexagon = rounded_polygon(corners, 0.15 * head_width, edge=EDGE)
     across = (0.0, 1.0, 0.0)
     start, end = -length / 2.0, length / 2.0
     heads = []
     for low, high in ((start, start + head_length), (end - head_length, end)):
-        path = np.zeros((0, 3))
         stations = resample([[low], [low + 0.005], [high - 0.005], [high]], 1.4 * EDGE)[:, 0]
         path = np.column_stack([stations, 0.0 * stations, np.full_like(stations, apothem)])
-        scale = np.interp(
-            stations, [low, low + 0.005, high - 0.005, high], [0.86, 1.0, 1.0, 0.86]
-        )
-        # Section coordinates are (in the plane of the path = z, y): flats face the table.
+        scale = np.interp(stations, [low, low + 0.005, high - 0.005, high], [0.86, 1.0, 1.0, 0.86])
+        # The section's first coordinate runs along -z: two of the flats are level.
         heads.append(sweep(path, hexagon, normal=across, scale=scale))
     grip = bar(
         (start + head_length / 2.0, 0.0, apothem),
@@ -851,12 +1018,21 @@ def dumbbell(
 
 
 def banana(*, bend_radius: float, angle: float, thickness: float) -> trimesh.Trimesh:
-    """Return a banana that lies on its side, bent by `angle` [rad] about `bend_radius`."""
+    """Return a banana that lies on its side, bent by `angle` [rad] about `bend_radius`.
+
+    All lengths are in [m].
+    """
     theta = np.linspace(-angle / 2.0, angle / 2.0, round(bend_radius * angle / EDGE) + 1)
     knots = np.array(
         [
-            (0.0, 0.34), (0.03, 0.38), (0.12, 0.36), (0.26, 0.85), (0.5, 1.0),
-            (0.78, 0.85), (0.95, 0.42), (1.0, 0.24),
+            (0.0, 0.34),
+            (0.03, 0.38),
+            (0.12, 0.36),
+            (0.26, 0.85),
+            (0.5, 1.0),
+            (0.78, 0.85),
+            (0.95, 0.42),
+            (1.0, 0.24),
         ]
     )
     scale = PchipInterpolator(knots[:, 0], knots[:, 1])(np.linspace(0.0, 1.0, len(theta)))
@@ -877,7 +1053,10 @@ def banana(*, bend_radius: float, angle: float, thickness: float) -> trimesh.Tri
 
 
 def apple(*, radius: float, height: float) -> trimesh.Trimesh:
-    """Return an apple with a stem; `height` is without the stem."""
+    """Return an apple with a stem; `height` is without the stem.
+
+    All lengths are in [m].
+    """
     side = smooth(
         [
             (0.0, 0.07 * height),
@@ -899,11 +1078,14 @@ def apple(*, radius: float, height: float) -> trimesh.Trimesh:
         ellipse(0.0025, 0.0025, edge=0.002),
         normal=(0.0, 1.0, 0.0),
     )
-    return fuse(revolve(side), stem)
+    return stand(fuse(revolve(side), stem))
 
 
 def pear(*, radius: float, neck_radius: float, height: float) -> trimesh.Trimesh:
-    """Return a pear that stands on its wide end, with a stem; `height` is without the stem."""
+    """Return a pear that stands on its wide end, with a stem; `height` is without the stem.
+
+    All lengths are in [m].
+    """
     side = smooth(
         [
             (0.0, 0.04 * height),
@@ -924,7 +1106,7 @@ def pear(*, radius: float, neck_radius: float, height: float) -> trimesh.Trimesh
         ellipse(0.0025, 0.0025, edge=0.002),
         normal=(0.0, 1.0, 0.0),
     )
-    return fuse(revolve(side), stem)
+    return stand(fuse(revolve(side), stem))
 
 
 def _lathe(side: Array) -> trimesh.Trimesh:

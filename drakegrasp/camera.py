@@ -1,0 +1,96 @@
+"""Where the two cameras are and how they map points to pixels; NumPy only.
+
+Both stand 0.25 m behind the palm and look along +Gz (Veres et al., "Vision sensors").
+`oto` (one-to-one) is rolled with the palm; `otm` (one-to-many) keeps world up at the top
+of the image. Camera axes are Drake's and OpenCV's; pixel centres have integer
+coordinates, as in Drake's `CameraInfo`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.config import CameraConfig
+from drakegrasp.frames import Array, make_pose
+
+#: Below this sine of the angle between view and vertical, up is taken from +Ty (0.1 degree).
+LOOKS_VERTICALLY = 1e-3
+
+
+def intrinsics(config: CameraConfig) -> Array:
+    """Return the camera matrix K (3, 3) [px]: square pixels, centre in the image's middle."""
+    focal = config.size / (2.0 * np.tan(np.deg2rad(config.fov_y_deg) / 2.0))
+    centre = (config.size - 1) / 2.0
+    return np.array([[focal, 0.0, centre], [0.0, focal, centre], [0.0, 0.0, 1.0]])
+
+
+def camera_pose_oto(X_TG: npt.ArrayLike, config: CameraConfig) -> Array:
+    """Return X_TC (4, 4) of the camera that is rolled with the palm: R_GC is the identity."""
+    return np.asarray(X_TG) @ make_pose(np.eye(3), [0.0, 0.0, -config.distance])
+
+
+def camera_pose_otm(X_TG: npt.ArrayLike, config: CameraConfig) -> Array:
+    """Return X_TC (4, 4) of the camera whose image up is world up.
+
+    A camera that looks straight up or down has no such direction; its image up is +Ty.
+    """
+    X_TC = camera_pose_oto(X_TG, config)
+    z = X_TC[:3, 2]
+    up = np.array([0.0, 0.0, 1.0])
+    if np.linalg.norm(np.cross(z, up)) < LOOKS_VERTICALLY:
+        up = np.array([0.0, 1.0, 0.0])
+    y = -(up - (up @ z) * z)
+    y /= np.linalg.norm(y)
+    X_TC[:3, 0], X_TC[:3, 1] = np.cross(y, z), y
+    return X_TC
+
+
+def project(K: npt.ArrayLike, p_CQ: npt.ArrayLike) -> Array:
+    """Return pixel coordinates (n, 2), (u to the right, v down), of points (n, 3) [m]."""
+    points = np.asarray(p_CQ, dtype=float) @ np.asarray(K, dtype=float).T
+    return points[:, :2] / points[:, 2:]
+
+
+def unproject(K: npt.ArrayLike, pixels: npt.ArrayLike, depth: npt.ArrayLike) -> Array:
+    """Return points p_CQ (n, 3) [m] of pixels (n, 2) at depths (n,) [m]."""
+    uv = np.asarray(pixels, dtype=float)
+    homogeneous = np.column_stack([uv, np.ones(len(uv))])
+    rays = np.linalg.solve(np.asarray(K, dtype=float), homogeneous.T).T
+    return rays * np.asarray(depth, dtype=float)[:, None]
+
+
+def image_frame(K: npt.ArrayLike, mask: npt.ArrayLike, depth: npt.ArrayLike) -> Array:
+    """Return X_CI (4, 4), the object's frame as one image shows it.
+
+    The origin is the mask's centroid unprojected with the depth there (of the object pixel
+    nearest to the centroid). Iz is the first principal axis of the mask's pixels, Iy the
+    second, both unprojected at that depth, so they lie in a plane parallel to the image.
+    Signs: Iz points to the image's right (straight down if it is vertical), and Ix = Iy x Iz
+    points away from the camera (+Cz). A mask of one pixel has Iz along +Cx.
+
+    Args:
+        K: Camera matrix (3, 3).
+        mask: (S, S), 1 where the object is.
+        depth: (S, S) [m].
+
+    Raises:
+        ValueError: If the mask is empty.
+    """
+    rows, columns = np.nonzero(np.asarray(mask))
+    if len(rows) == 0:
+        raise ValueError("the mask must have at least one object pixel, got none")
+    pixels = np.column_stack([columns, rows]).astype(float)
+    centroid = pixels.mean(axis=0)
+    nearest = np.argmin(np.sum((pixels - centroid) ** 2, axis=1))
+    z = float(np.asarray(depth)[rows[nearest], columns[nearest]])
+    centred = pixels - centroid
+    _, vectors = np.linalg.eigh(centred.T @ centred)
+    first = vectors[:, -1] if len(pixels) > 1 else np.array([1.0, 0.0])
+    if first[0] < -1e-9 or (abs(first[0]) <= 1e-9 and first[1] < 0.0):
+        first = -first
+    # Square pixels at one depth: a direction in pixels is a direction in Cx, Cy.
+    Iz = np.array([first[0], first[1], 0.0])
+    Ix = np.array([0.0, 0.0, 1.0])
+    R_CI = np.column_stack([Ix, np.cross(Iz, Ix), Iz])
+    return make_pose(R_CI, unproject(K, centroid[None], [z])[0])

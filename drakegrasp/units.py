@@ -1,0 +1,243 @@
+"""Work units: a range of one object's candidates, tried one after the other, to one shard.
+
+A work unit is plain data, so it can cross a process border; diagrams are built where it
+runs and kept for the next unit of the same object. What a shard holds depends on its
+header and the configuration alone: not on who runs it, nor on what ran before.
+"""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drakegrasp.camera import camera_pose_oto, camera_pose_otm, image_frame, intrinsics
+from drakegrasp.candidates import Attempt, make_attempts
+from drakegrasp.config import Config, parse_config
+from drakegrasp.contacts import Contacts
+from drakegrasp.frames import pack_pose
+from drakegrasp.hand import load_hand
+from drakegrasp.outcomes import Outcome
+from drakegrasp.prepared import PreparedObject, load_prepared
+from drakegrasp.render import Renderer, build_renderer, look
+from drakegrasp.scene import Scene, build_scene, hand_joint_names
+from drakegrasp.schema import CAMERAS, LOOK_FIELDS, sizes
+from drakegrasp.shards import AnyArray, Shard, ShardHeader, trial_columns, write_shard
+from drakegrasp.trial import TrialRecord, run_attempt
+
+#: Objects whose diagrams a process keeps; a unit follows units of the same object.
+KEPT_OBJECTS = 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkUnit:
+    """What one task does: plain data.
+
+    Attributes:
+        out: Directory of the dataset, seen by every worker.
+        header: Object and range of candidates.
+        config: `Config.to_dict()`.
+    """
+
+    out: str
+    header: ShardHeader
+    config: dict[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class UnitSummary:
+    """What comes back from a unit; the data itself went into its shard.
+
+    Attributes:
+        header: Of the unit.
+        outcomes: Number of attempts by outcome.
+        seconds: Wall clock by stage (`build`, `try`, `look`, `write`) [s]; for logs only.
+    """
+
+    header: ShardHeader
+    outcomes: dict[Outcome, int]
+    seconds: dict[str, float]
+
+    @property
+    def attempts(self) -> int:
+        """Number of attempts that were resolved."""
+        return sum(self.outcomes.values())
+
+    @property
+    def grasps(self) -> int:
+        """Number of successes."""
+        return self.outcomes.get(Outcome.SUCCESS, 0)
+
+
+@dataclass(eq=False)
+class Workbench:
+    """The diagrams of one object in this process; the renderer is made when first needed."""
+
+    prepared: PreparedObject
+    config: Config
+    scene: Scene
+    _renderer: Renderer | None = None
+
+    @property
+    def renderer(self) -> Renderer:
+        """The object's renderer."""
+        if self._renderer is None:
+            self._renderer = build_renderer(self.prepared.model, self.config.camera)
+        return self._renderer
+
+
+_workbenches: dict[tuple[str, str, str], Workbench] = {}
+
+
+def workbench(out: Path, name: str, config: Config) -> Workbench:
+    """Return the diagrams of an object, built now or kept from an earlier unit."""
+    prepared = load_prepared(out, name, config)
+    key = (config.simulation_hash(), name, prepared.model.mesh_sha256)
+    if key not in _workbenches:
+        while len(_workbenches) >= KEPT_OBJECTS:
+            del _workbenches[next(iter(_workbenches))]
+            # Diagrams sit in reference cycles and own memory that Python does not count.
+            gc.collect()
+        scene = build_scene(prepared.model, config.physics, load_hand(config.hand))
+        _workbenches[key] = Workbench(prepared=prepared, config=config, scene=scene)
+    return _workbenches[key]
+
+
+def run_unit(unit: WorkUnit) -> UnitSummary:
+    """Try all attempts of a unit, look at the successes, and write the shard."""
+    config, out, header = parse_config(unit.config), Path(unit.out), unit.header
+    seconds: dict[str, float] = {}
+    bench = _timed(seconds, "build", lambda: workbench(out, header.object_name, config))
+    attempts = list(unit_attempts(bench.prepared, header, config))
+    records = _timed(seconds, "try", lambda: [try_on(bench, attempt) for attempt in attempts])
+    looks = _timed(seconds, "look", lambda: look_at_successes(bench, records))
+    shard = Shard(header=header, trials=trial_rows(bench, attempts, records), looks=looks)
+    _timed(seconds, "write", lambda: write_shard(out, shard))
+    return UnitSummary(header=header, outcomes=count_outcomes(shard), seconds=seconds)
+
+
+def unit_attempts(
+    prepared: PreparedObject, header: ShardHeader, config: Config
+) -> Sequence[Attempt]:
+    """Return the attempts of a unit in the order of its rows."""
+    return list(
+        make_attempts(
+            prepared.candidates,
+            range(header.start, header.stop),
+            config.candidates,
+            name=prepared.model.name,
+            seed=config.seed,
+        )
+    )
+
+
+def try_on(bench: Workbench, attempt: Attempt) -> TrialRecord:
+    """Run one attempt; a scene in which Drake failed is replaced, never used again."""
+    record = run_attempt(bench.scene, bench.prepared.X_TO, attempt, bench.config)
+    if record.outcome is Outcome.SOLVER_ERROR:
+        hand = load_hand(bench.config.hand)
+        bench.scene = build_scene(bench.prepared.model, bench.config.physics, hand)
+    return record
+
+
+def count_outcomes(shard: Shard) -> dict[Outcome, int]:
+    """Return the number of a shard's attempts by outcome."""
+    values, counts = np.unique(shard.trials["outcome"], return_counts=True)
+    return {Outcome(int(v)): int(n) for v, n in zip(values, counts, strict=True)}
+
+
+def trial_rows(
+    bench: Workbench, attempts: Sequence[Attempt], records: Sequence[TrialRecord]
+) -> dict[str, AnyArray]:
+    """Return the columns of `/trials` of attempts and their records."""
+    shape = _sizes(bench)
+    columns = {f.name: f.empty(len(records), shape) for f in trial_columns()}
+    for row, (attempt, record) in enumerate(zip(attempts, records, strict=True)):
+        for name, value in _row(bench.prepared, attempt, record).items():
+            columns[name][row] = value
+    return columns
+
+
+def look_at_successes(bench: Workbench, records: Sequence[TrialRecord]) -> dict[str, AnyArray]:
+    """Return the columns of `/looks`: both images of every success."""
+    rows = [i for i, record in enumerate(records) if record.outcome is Outcome.SUCCESS]
+    columns = {f.name: f.empty(len(rows), _sizes(bench)) for f in LOOK_FIELDS}
+    camera = bench.config.camera
+    poses = {"oto": camera_pose_oto, "otm": camera_pose_otm}
+    for k, row in enumerate(rows):
+        record = records[row]
+        columns["row"][k] = row
+        for name in CAMERAS:
+            X_TC = poses[name](record.X_TO @ record.X_OG, camera)
+            seen = look(bench.renderer, record.X_TO, X_TC)
+            columns[f"image_{name}"][k] = seen.image
+            columns[f"mask_{name}"][k] = seen.mask
+            columns[f"X_TC_{name}"][k] = pack_pose(X_TC)
+            # Where the object is out of sight the frame stays NaN, and a filter removes the row.
+            if name == "otm" and seen.mask.any():
+                X_CI = image_frame(intrinsics(camera), seen.mask, seen.image[3])
+                columns["X_CI_otm"][k] = pack_pose(X_CI)
+    return columns
+
+
+def _row(prepared: PreparedObject, attempt: Attempt, record: TrialRecord) -> dict[str, Any]:
+    row: dict[str, Any] = {
+        "candidate": attempt.candidate,
+        "standoff_index": attempt.standoff_index,
+        "spread": attempt.spread,
+        "seed": attempt.seed,
+        "outcome": record.outcome,
+        "X_TO": pack_pose(record.X_TO),
+        "X_OG": pack_pose(record.X_OG),
+    }
+    if record.closed is not None:
+        row |= {"time_close": record.time_close, "closed_q": record.q_closed}
+        row |= _contact_values("closed", record.closed)
+    if record.lifted is not None and record.closed is not None and record.X_TO_lifted is not None:
+        row |= {"time_lift": record.time_lift, "lifted_q": record.q_lifted}
+        row |= _contact_values("lifted", record.lifted)
+        row |= {"slip": record.slip, "slip_angle": record.slip_angle}
+        row["X_TO_lifted"] = pack_pose(record.X_TO_lifted)
+        _, distance, _ = prepared.model.visual.nearest.on_surface(record.closed.p_OQ)
+        row["surface_distance"] = distance
+    return row
+
+
+def _contact_values(prefix: str, contacts: Contacts) -> dict[str, Any]:
+    names = (
+        "touching",
+        "p_OQ",
+        "nhat_Q_O",
+        "f_Q_O",
+        "area",
+        "penetration",
+        "other_links",
+        "hand_on_table",
+        "object_on_table",
+        "point_contacts",
+    )
+    return {f"{prefix}_{name}": getattr(contacts, name) for name in names}
+
+
+def _sizes(bench: Workbench) -> dict[str, int]:
+    handles = bench.scene.handles
+    assert handles is not None
+    return sizes(
+        fingers=handles.hand.num_fingers,
+        joints=len(hand_joint_names(bench.scene)),
+        image=bench.config.camera.size,
+    )
+
+
+def _timed(seconds: dict[str, float], stage: str, step: Callable[[], Any]) -> Any:
+    start = time.perf_counter()
+    result = step()
+    seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start
+    return result
+
+
