@@ -205,6 +205,18 @@ def load_config(
     return parse_config(tree)
 
 
+def override_config(config: Config, overrides: Sequence[str]) -> Config:
+    """Return a configuration with `"a.b=c"` strings applied, see `load_config`.
+
+    Raises:
+        ConfigError: See `load_config`.
+    """
+    tree = config.to_dict()
+    for text in overrides:
+        _apply_override(tree, text)
+    return parse_config(tree)
+
+
 def parse_config(tree: dict[str, Any]) -> Config:
     """Return the configuration that a tree of plain values describes.
 

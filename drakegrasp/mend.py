@@ -52,18 +52,33 @@ SMALL_RIM = 0.15
 MAX_DROPPED = 0.01
 #: Inner walls are found by trying all subsets of patches; 2^12 take milliseconds.
 MAX_PATCHES = 12
-#: Part of the volume in which the surface may pass through itself ...
+#: Part of the volume in which a surface may pass through itself and still be trusted ...
+MAX_TANGLED = 0.10
+#: ... what may be left of that after it was untangled ...
 MAX_OVERLAP = 0.02
-#: ... and from which that is worth a note.
+#: ... how much of the volume untangling may change by mistake ...
+MAX_CHANGED = 0.01
+#: ... from where it is worth new triangles, and from where a note.
+NOTICED_OVERLAP = 0.01
 NOTED_OVERLAP = 0.002
+#: Untangling cuts a body in two at most so often in a row, and not quite in the middle,
+#: where modelled objects like to have a face.
+MAX_CUTS = 6
+CUT = 0.4871
+#: Bodies smaller than this [m^3] are rounding.
+NOTHING = 1e-15
 #: Pieces of a union below this part of its volume are rounding, not geometry.
 CHIP = 1e-6
 #: Points of the winding-number check, and its budget of point-triangle pairs.
 CHECK_POINTS = 2000
+CELL_POINTS = 300
 CHECK_BUDGET = 20_000_000
-ENOUGH_POINTS = 100
+#: Distance from the faces at which thin objects are checked, as a part of the diagonal.
+NEAR = 3e-4
 #: Aggressiveness of the quadric decimation, best quality first.
 DECIMATION_STEPS = (2.0, 3.0, 5.0, 7.0)
+#: Deviation, as a part of the diagonal, from which a second decimation is tried.
+FAITHFUL = 2e-3
 #: Volume that a decimated mesh may gain or lose.
 MAX_VOLUME_CHANGE = 0.05
 #: Points on each surface at which the deviation of two surfaces is measured.
@@ -141,34 +156,40 @@ def winding_numbers(p_OQ: Array, vertices: Array, faces: Faces) -> Array:
     return out
 
 
-def overlap_share(vertices: Array, faces: Faces) -> float:
+def overlap_share(vertices: Array, faces: Faces, *, points: int = CHECK_POINTS) -> float:
     """Return the part of the volume that a surface encloses more than once or backwards.
 
     Measured at a fixed set of evenly spread points of the bounding box, or, if the
     object fills little of it, on both sides of its faces.
     """
-    count = int(np.clip(CHECK_BUDGET // len(faces), 200, CHECK_POINTS))
+    count = int(np.clip(CHECK_BUDGET // len(faces), min(points, 200), points))
+    spread = _even_points(count)
     low, size = vertices.min(axis=0), np.ptp(vertices, axis=0)
-    # The R3 sequence: the roots of x^4 = x + 1 spread points evenly and repeatably.
-    root = 1.2207440846057596
-    spread = (0.5 + np.arange(1, count + 1)[:, None] / root ** np.arange(1, 4)) % 1.0
-    picked = np.linspace(0, len(faces) - 1, min(len(faces), count // 4)).astype(np.int64)
-    a, b, c = np.moveaxis(vertices[faces[picked]], 1, 0)
-    normals = np.cross(b - a, c - a)
-    lengths = np.linalg.norm(normals, axis=1)
-    picked_ok = lengths > 0.0
-    centres = ((a + b + c) / 3.0)[picked_ok]
-    offsets = 1e-3 * size.max() * normals[picked_ok] / lengths[picked_ok, None]
-
-    inside = wrong = 0
-    for points in (low + spread * size, np.vstack((centres - offsets, centres + offsets))):
-        w = winding_numbers(points, vertices, faces)
-        inside = int((np.abs(w) > 0.5).sum())
-        wrong = int((np.minimum(np.abs(w), np.abs(w - 1.0)) > 0.05).sum())
-        # Few points of the box are inside a thin object; then those at its faces decide.
-        if inside >= ENOUGH_POINTS:
-            break
+    inside, wrong = _count_wrong(low + spread * size, vertices, faces)
+    if inside < count // 20:
+        areas = face_areas(vertices, faces)
+        picked = np.searchsorted(np.cumsum(areas), spread[: count // 2, 2] * areas.sum())
+        a, b, c = np.moveaxis(vertices[faces[np.minimum(picked, len(faces) - 1)]], 1, 0)
+        root, part = np.sqrt(spread[: count // 2, :1]), spread[: count // 2, 1:2]
+        on_face = (1.0 - root) * a + root * (1.0 - part) * b + root * part * c
+        normals = np.cross(b - a, c - a)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        offsets = NEAR * float(np.linalg.norm(size)) * normals
+        both_sides = np.vstack((on_face - offsets, on_face + offsets))
+        inside, wrong = _count_wrong(both_sides, vertices, faces)
     return wrong / max(1, inside)
+
+
+def _count_wrong(points: Array, vertices: Array, faces: Faces) -> tuple[int, int]:
+    w = winding_numbers(points, vertices, faces)
+    wrong = np.minimum(np.abs(w), np.abs(w - 1.0)) > 0.05
+    return int((np.abs(w) > 0.5).sum()), int(wrong.sum())
+
+
+def _even_points(count: int) -> Array:
+    """Return points (count, 3) that fill the unit cube evenly and are always the same."""
+    root = 1.2207440846057596  # of x^4 = x + 1: the R3 sequence
+    return np.asarray((0.5 + np.arange(1, count + 1)[:, None] / root ** np.arange(1, 4)) % 1.0)
 
 
 # Topology
@@ -497,23 +518,68 @@ def _tidy(solid: manifold3d.Manifold, size: float) -> tuple[Array, Faces]:
     pieces = solid.decompose()
     kept = [p for p in pieces if abs(p.volume()) > CHIP * abs(solid.volume())]
     if 0 < len(kept) < len(pieces):
-        parts = [_from_manifold(p) for p in kept]
-        offsets = np.cumsum([0] + [len(v) for v, _ in parts[:-1]])
-        vertices = np.vstack([v for v, _ in parts])
-        return vertices, np.vstack([f + o for (_, f), o in zip(parts, offsets, strict=True)])
+        tidied = _stack([_from_manifold(p) for p in kept])
+        return tidied.vertices, tidied.faces
     return _from_manifold(solid)
 
 
-def _unite(bodies: list[tuple[Array, Faces]], size: float, notes: list[str]) -> tuple[Array, Faces]:
-    """Return the union of closed bodies; cavities are kept, other inside-out bodies turned."""
+def _stack(parts: list[tuple[Array, Faces]]) -> Solid:
+    offsets = np.cumsum([0] + [len(vertices) for vertices, _ in parts[:-1]])
+    faces = [faces + offset for (_, faces), offset in zip(parts, offsets, strict=True)]
+    return Solid(vertices=np.vstack([vertices for vertices, _ in parts]), faces=np.vstack(faces))
+
+
+def _shells(bodies: list[tuple[Array, Faces]], notes: list[str]) -> list[manifold3d.Manifold]:
+    """Return closed bodies as solids: cavities cut out, other inside-out bodies turned."""
     volumes = [signed_volume(*body) for body in bodies]
     if volumes[int(np.argmax(np.abs(volumes)))] < 0.0:
         # The largest body decides: the whole file is inside out, cavities included.
         notes.append("the surface was inside out and was turned")
         bodies = [(v, f[:, ::-1]) for v, f in bodies]
         volumes = [-volume for volume in volumes]
+    solids = [
+        _to_manifold(v, f if volume > 0.0 else f[:, ::-1])
+        for (v, f), volume in zip(bodies, volumes, strict=True)
+    ]
+    boxes = [(v.min(axis=0), v.max(axis=0)) for v, _ in bodies]
+    outer = [i for i, volume in enumerate(volumes) if volume > 0.0]
+    inverted = [i for i, volume in enumerate(volumes) if volume <= 0.0]
+    cavities: dict[int, list[int]] = {}
+    for i in inverted:
+        around = [
+            j
+            for j in outer
+            if (boxes[j][0] <= boxes[i][0]).all()
+            and (boxes[i][1] <= boxes[j][1]).all()
+            and (solids[j] ^ solids[i]).volume() > (1.0 - 1e-6) * abs(volumes[i])
+        ]
+        if around:
+            cavities.setdefault(min(around, key=lambda j: volumes[j]), []).append(i)
+    hollow = sum(len(holes) for holes in cavities.values())
+    if turned := len(inverted) - hollow:
+        notes.append(f"{turned} of {len(bodies)} bodies were inside out and were turned")
+    if hollow:
+        notes.append(f"{hollow} sealed cavities were kept hollow")
+    # A cavity is cut from the body around it only, so that a body inside it survives.
+    cut = {i for holes in cavities.values() for i in holes}
+    return [
+        manifold3d.Manifold.batch_boolean(
+            [solids[i], *(solids[j] for j in cavities[i])], manifold3d.OpType.Subtract
+        )
+        if i in cavities
+        else solids[i]
+        for i in range(len(bodies))
+        if i not in cut
+    ]
+
+
+def _unite(bodies: list[tuple[Array, Faces]], size: float, notes: list[str]) -> tuple[Array, Faces]:
+    """Return the surface of the union of closed bodies."""
     if len(bodies) == 1:
         vertices, faces = bodies[0]
+        if signed_volume(vertices, faces) < 0.0:
+            notes.append("the surface was inside out and was turned")
+            faces = faces[:, ::-1]
         a, b, c = np.moveaxis(vertices[faces], 1, 0)
         longest = np.linalg.norm(np.stack((b - a, c - b, a - c)), axis=2).max(axis=0)
         low = 2.0 * face_areas(vertices, faces) < SLIVER * size * longest
@@ -521,45 +587,86 @@ def _unite(bodies: list[tuple[Array, Faces]], size: float, notes: list[str]) -> 
             return vertices, faces
         notes.append("degenerate triangles were collapsed")
         return _tidy(_to_manifold(vertices, faces), size)
-
-    solids = [
-        _to_manifold(v, f if s > 0.0 else f[:, ::-1])
-        for (v, f), s in zip(bodies, volumes, strict=True)
-    ]
-    boxes = [(v.min(axis=0), v.max(axis=0)) for v, _ in bodies]
-    outer = [i for i, volume in enumerate(volumes) if volume > 0.0]
-    holes: dict[int, list[manifold3d.Manifold]] = {}
-    turned = cavities = 0
-    for i, volume in enumerate(volumes):
-        if volume > 0.0:
-            continue
-        around = [
-            j
-            for j in outer
-            if (boxes[j][0] <= boxes[i][0]).all()
-            and (boxes[i][1] <= boxes[j][1]).all()
-            and (solids[j] ^ solids[i]).volume() > (1.0 - 1e-6) * abs(volume)
-        ]
-        if around:
-            holes.setdefault(min(around, key=lambda j: volumes[j]), []).append(solids[i])
-            cavities += 1
-        else:
-            outer.append(i)
-            turned += 1
-    if turned:
-        notes.append(f"{turned} of {len(bodies)} bodies were inside out and were turned")
-    if cavities:
-        notes.append(f"{cavities} sealed cavities were kept hollow")
-    # A cavity is cut from the body around it only, so that a body inside it survives.
-    shells = [
-        manifold3d.Manifold.batch_boolean([solids[i], *holes[i]], manifold3d.OpType.Subtract)
-        if i in holes
-        else solids[i]
-        for i in sorted(outer)
-    ]
+    shells = _shells(bodies, notes)
     if len(shells) > 1:
         notes.append(f"{len(shells)} bodies were united into one solid")
     return _tidy(manifold3d.Manifold.batch_boolean(shells, manifold3d.OpType.Add), size)
+
+
+def _untangle(solid: manifold3d.Manifold, depth: int) -> list[manifold3d.Manifold]:
+    """Return pieces that do not pass through themselves and together make up the solid.
+
+    A surface that passes through itself falls apart into separate bodies when it is
+    cut small enough, and separate bodies can be united. Only what is still tangled is
+    cut again, so that the rest keeps its large triangles. Where the surface lies
+    inside out there is no material: such places are dents deeper than the wall is thick.
+    """
+    pieces = [piece for piece in solid.decompose() if abs(piece.volume()) > NOTHING]
+    if any(piece.volume() < 0.0 for piece in pieces):
+        pieces = [piece for piece in pieces if not _is_dent(piece, pieces)]
+        # What is left of negative volume is a cavity, or too tangled to tell: it stays
+        # together with what is around it.
+        pieces = [manifold3d.Manifold.compose(pieces)] if pieces else []
+    done: list[manifold3d.Manifold] = []
+    for piece in pieces:
+        vertices, faces = _from_manifold(piece)
+        if overlap_share(vertices, faces, points=CELL_POINTS) == 0.0:
+            done.append(piece)
+        elif depth == 0:
+            done += [part for part in piece.decompose() if part.volume() > 0.0]
+        else:
+            low, size = vertices.min(axis=0), np.ptp(vertices, axis=0)
+            axis = int(np.argmax(size))
+            normal = [float(axis == i) for i in range(3)]
+            for half in piece.split_by_plane(normal, float(low[axis] + CUT * size[axis])):
+                done += _untangle(half, depth - 1)
+    return done
+
+
+def _is_dent(piece: manifold3d.Manifold, pieces: list[manifold3d.Manifold]) -> bool:
+    """Return whether a piece is inside out throughout and in no other piece."""
+    if piece.volume() > 0.0:
+        return False
+    vertices, faces = _from_manifold(piece)
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    for other in pieces:
+        box = np.array(other.bounding_box())
+        if other.volume() > 0.0 and (box[:3] <= low).all() and (high <= box[3:]).all():
+            return False
+    return overlap_share(vertices, faces[:, ::-1], points=CELL_POINTS) == 0.0
+
+
+def _separate(vertices: Array, faces: Faces, notes: list[str]) -> tuple[Array, Faces]:
+    """Return a surface that does not pass through itself, counting every place once."""
+    tangled = left = overlap_share(vertices, faces)
+    if NOTICED_OVERLAP < tangled <= MAX_TANGLED:
+        solid = _to_manifold(vertices, faces)
+        pieces = _untangle(solid, MAX_CUTS)
+        united = manifold3d.Manifold.batch_boolean(pieces, manifold3d.OpType.Add)
+        candidate = _tidy(united, diagonal(vertices))
+        left_then = overlap_share(*candidate)
+        if left_then < tangled and _changed_share(candidate, vertices, faces) < MAX_CHANGED:
+            (vertices, faces), left = candidate, left_then
+            notes.append(
+                f"the surface passed through itself in {tangled:.1%} of its volume, "
+                "which now counts once"
+            )
+    if left > MAX_OVERLAP:
+        raise MeshError(
+            f"the surface must not pass through itself, got {left:.1%} of its volume "
+            "enclosed twice or backwards"
+        )
+    if left > NOTED_OVERLAP:
+        notes.append(f"the surface passes through itself in {left:.1%} of its volume")
+    return vertices, faces
+
+
+def _changed_share(candidate: tuple[Array, Faces], vertices: Array, faces: Faces) -> float:
+    """Return the part of a solid's volume that a candidate has lost or added."""
+    points = vertices.min(axis=0) + np.ptp(vertices, axis=0) * _even_points(CHECK_POINTS)
+    before = winding_numbers(points, vertices, faces) > 0.5
+    after = winding_numbers(points, *candidate) > 0.5
+    return float((before != after).sum() / max(1, before.sum()))
 
 
 def mend_solid(vertices: Array, faces: Faces) -> Solid:
@@ -612,18 +719,10 @@ def mend_solid(vertices: Array, faces: Faces) -> Solid:
     if holes:
         notes.append(f"{holes} open rims were closed, {share:.1%} of the surface: solid there now")
 
-    vertices, faces = _unite(closed, size, notes)
+    vertices, faces = _separate(*_unite(closed, size, notes), notes)
     if not len(faces) or not is_solid_surface(faces) or signed_volume(vertices, faces) <= 0.0:
         raise MeshError("the mended surface must be watertight with outward normals, got gaps")
     _drop_fragments(fragments, vertices, faces, total, notes)
-    overlap = overlap_share(vertices, faces)
-    if overlap > MAX_OVERLAP:
-        raise MeshError(
-            "the surface must not pass through itself, got "
-            f"{overlap:.1%} of its volume enclosed twice"
-        )
-    if overlap > NOTED_OVERLAP:
-        notes.append(f"the surface passes through itself in about {overlap:.1%} of its volume")
     return Solid(vertices=vertices, faces=faces, notes=tuple(notes))
 
 
@@ -692,28 +791,39 @@ def decimate(solid: Solid, max_faces: int) -> tuple[Solid, float]:
     """Return a solid with at most `max_faces` faces, and its deviation from the given one [m].
 
     Quadric decimation keeps the shape better, but promises no closed surface;
-    manifold3d's simplification does, and takes over where the first fails.
+    manifold3d's simplification does. The second is tried where the first fails or
+    leaves the surface by more than `FAITHFUL`; the closer one wins.
 
     Raises:
         MeshError: If neither gives a closed surface of about the same volume.
     """
     if len(solid.faces) <= max_faces:
         return solid, 0.0
-    volume = signed_volume(solid.vertices, solid.faces)
+    faithful = FAITHFUL * diagonal(solid.vertices)
+    best: tuple[Solid, float] | None = None
     for candidate in (_decimate_quadric, _simplify_manifold):
         reduced = candidate(solid, max_faces)
-        if (
-            reduced is not None
-            and len(reduced.faces) <= max_faces
-            and is_solid_surface(reduced.faces)
-            and abs(signed_volume(reduced.vertices, reduced.faces) / volume - 1.0)
-            < MAX_VOLUME_CHANGE
-            and overlap_share(reduced.vertices, reduced.faces) < MAX_OVERLAP
-        ):
-            return reduced, surface_deviation(solid, reduced)
-    raise MeshError(
-        f"the collision mesh must keep its shape with at most {max_faces} faces, got a broken one "
-        f"from {len(solid.faces)}: raise max_collision_faces"
+        if reduced is not None and _is_sound(reduced, solid):
+            error = surface_deviation(solid, reduced)
+            if best is None or error < best[1]:
+                best = reduced, error
+            if error <= faithful:
+                break
+    if best is None:
+        raise MeshError(
+            f"the collision mesh must keep its shape with at most {max_faces} faces, got a broken "
+            f"one from {len(solid.faces)}: raise max_collision_faces"
+        )
+    return best
+
+
+def _is_sound(reduced: Solid, solid: Solid) -> bool:
+    volume = signed_volume(solid.vertices, solid.faces)
+    change = signed_volume(reduced.vertices, reduced.faces) / volume - 1.0
+    return (
+        is_solid_surface(reduced.faces)
+        and abs(change) < MAX_VOLUME_CHANGE
+        and overlap_share(reduced.vertices, reduced.faces) < MAX_OVERLAP
     )
 
 
@@ -725,9 +835,11 @@ def _decimate_quadric(solid: Solid, max_faces: int) -> Solid | None:
             target_count=max_faces,
             agg=aggressiveness,
         )
-        if 0 < len(faces) <= max_faces:
-            vertices, faces = _compact(np.asarray(vertices, dtype=np.float64), np.asarray(faces))
-            return Solid(vertices=vertices, faces=faces)
+        if not 0 < len(faces) <= max_faces:
+            continue
+        # Walls that have come to touch share edges now; parting them closes both again.
+        bodies = _bodies(np.asarray(vertices, dtype=np.float64), np.asarray(faces, np.int64), [])
+        return _stack([(body.vertices, body.faces) for body in bodies])
     return None
 
 
@@ -743,7 +855,4 @@ def _simplify_manifold(solid: Solid, max_faces: int) -> Solid | None:
             best, high = reduced, middle
         else:
             low = middle
-    if best is None:
-        return None
-    vertices, faces = _from_manifold(best)
-    return Solid(vertices=vertices, faces=faces)
+    return None if best is None else _stack([_from_manifold(best)])

@@ -46,7 +46,6 @@ from drakegrasp.mend import (
     count_parts,
     decimate,
     diagonal,
-    face_areas,
     mend_solid,
     signed_volume,
     weld,
@@ -380,6 +379,15 @@ def _one_line(error: Exception) -> str:
 # Preparing
 
 
+def source_sha256(source: MeshSource) -> str:
+    """Return the hash of a mesh file's bytes and its scale, hexadecimal.
+
+    Raises:
+        MeshError: If the file cannot be read.
+    """
+    return hashlib.sha256(_read(source.path) + f"\nscale {source.scale!r}".encode()).hexdigest()
+
+
 def prepare_object(
     source: MeshSource,
     *,
@@ -433,7 +441,7 @@ def prepare_object(
     return ObjectModel(
         name=source.name,
         class_name=source.class_name,
-        mesh_sha256=hashlib.sha256(data + f"\nscale {source.scale!r}".encode()).hexdigest(),
+        mesh_sha256=source_sha256(source),
         visual_vertices=visual.vertices,
         visual_faces=visual.faces.astype(np.int32),
         collision_vertices=collision.vertices,
@@ -590,13 +598,16 @@ def _audit_one(source: MeshSource) -> AuditRow:
             vertices, faces = np.asarray(mesh.vertices) * source.scale, len(mesh.faces)
         except MeshError:
             vertices, faces = None, None
-    x, y, z = (None,) * 3 if vertices is None else np.ptp(vertices, axis=0).tolist()
+    extents: tuple[float, float, float] | None = None
+    if vertices is not None:
+        x, y, z = np.ptp(vertices, axis=0).tolist()
+        extents = (x, y, z)
     return AuditRow(
         name=source.name,
         class_name=source.class_name,
         status=status,
         notes=notes,
         faces=faces,
-        extents=None if vertices is None else (x, y, z),
+        extents=extents,
         volume=volume,
     )

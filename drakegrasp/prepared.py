@@ -18,6 +18,7 @@ from drakegrasp.candidates import Candidates, sample_candidates
 from drakegrasp.config import Config
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array
+from drakegrasp.manifest import model_path, plan_path
 from drakegrasp.meshes import MeshSource, ObjectModel, load_object, prepare_object, save_object
 from drakegrasp.resting import settle
 from drakegrasp.shards import atomic_hdf5
@@ -138,13 +139,3 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
         table_force=float(attributes["table_force"]),
         stopped=bool(attributes["stopped"]),
     )
-
-
-def model_path(out: Path, name: str) -> Path:
-    """Return where a dataset keeps an object's meshes and mass properties."""
-    return out / "objects" / f"{name}.npz"
-
-
-def plan_path(out: Path, name: str) -> Path:
-    """Return where a dataset keeps an object's resting pose and palm poses."""
-    return out / "objects" / f"{name}.plan.h5"

@@ -28,7 +28,6 @@ from pydrake.geometry import (
     RenderEngineVtkParams,
 )
 from pydrake.math import RigidTransform
-from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import RigidBody, SpatialInertia
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
@@ -38,7 +37,7 @@ from drakegrasp.candidates import object_key
 from drakegrasp.config import CameraConfig
 from drakegrasp.errors import EnvironmentFailure
 from drakegrasp.frames import X_WT
-from drakegrasp.hand import MODELS
+from drakegrasp.hand import MODELS, make_parser
 from drakegrasp.meshes import ObjectModel, obj_text
 
 #: Colour of what lies beyond the table.
@@ -85,7 +84,7 @@ def build_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
         "surface",
         np.array([*object_colour(model.name), 1.0]),
     )
-    (table,) = Parser(plant).AddModels(MODELS / "table.sdf")
+    (table,) = make_parser(plant).AddModels(MODELS / "table.sdf")
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("table", table), RigidTransform(X_WT))
     plant.Finalize()
     diagram = builder.Build()

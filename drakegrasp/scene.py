@@ -16,7 +16,6 @@ leaks the plant; sampled output ports report the contacts of the step before.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib import resources
 
 import numpy as np
 import numpy.typing as npt
@@ -35,7 +34,6 @@ from pydrake.geometry import (
     SceneGraph,
 )
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import (
     AddMultibodyPlant,
     CoulombFriction,
@@ -58,7 +56,7 @@ from pydrake.trajectories import BezierCurve, PiecewisePolynomial
 
 from drakegrasp.config import PhysicsConfig
 from drakegrasp.frames import X_WT, Array
-from drakegrasp.hand import Hand
+from drakegrasp.hand import MODELS, Hand, make_parser
 from drakegrasp.meshes import ObjectModel, obj_text
 
 #: Mass of each of the three bodies that carry the wrist [kg]; light beside the hand.
@@ -307,8 +305,7 @@ def _add_object(plant: MultibodyPlant, model: ObjectModel, physics: PhysicsConfi
 def _add_table(
     plant: MultibodyPlant, scene_graph: SceneGraph, physics: PhysicsConfig
 ) -> RigidBody:
-    path = resources.files("drakegrasp") / "models" / "table.sdf"
-    (instance,) = Parser(plant).AddModels(str(path))
+    (instance,) = make_parser(plant).AddModels(MODELS / "table.sdf")
     body = plant.GetBodyByName("table", instance)
     plant.WeldFrames(plant.world_frame(), body.body_frame(), RigidTransform(X_WT))
     properties = ProximityProperties()
@@ -352,7 +349,7 @@ def _assign_proximity(
 def _add_hand(plant: MultibodyPlant, hand: Hand, trajectory: TrajectorySource) -> HandHandles:
     wrist_instance = plant.AddModelInstance("wrist")
     joints = _add_wrist(plant, wrist_instance)
-    (instance,) = Parser(plant).AddModels(str(hand.sdf_path))
+    (instance,) = make_parser(plant).AddModels(hand.sdf_path)
     base = plant.GetBodyByName(hand.palm_link, instance)
     palm = plant.AddFrame(
         FixedOffsetFrame("palm", base.body_frame(), RigidTransform(hand.X_BG), instance)

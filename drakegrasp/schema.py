@@ -402,6 +402,22 @@ LOOK_FIELDS: tuple[Field, ...] = (
     ),
 )
 
+#: A row per success, in `/successes` of trials.hdf5.
+SUCCESS_FIELDS: tuple[Field, ...] = (
+    Field(
+        name="trial_id", shape=(), dtype="int64", unit="-", frame="-", meaning="row of /trials"
+    ),
+    Field(
+        name="removal",
+        shape=(),
+        dtype="uint8",
+        unit="-",
+        frame="-",
+        meaning="why it is no sample: 0 kept, 1 not_seen, 2 out_of_view, 3 bisects_table, "
+        "4 flat_depth, 5 off_surface, 6 outlier, 7 rejected",
+    ),
+)
+
 #: A row per object, in `/objects` of trials.hdf5.
 OBJECT_FIELDS: tuple[Field, ...] = (
     Field(name="name", shape=(), dtype="str", unit="-", frame="-", meaning="name of the object"),

@@ -108,7 +108,8 @@ def rounded_polygon(corners: npt.ArrayLike, radius: float, *, edge: float) -> Ar
         v = (after - corner) / np.linalg.norm(after - corner)
         half = np.arccos(np.clip(u @ v, -1.0, 1.0)) / 2.0
         centre = corner + radius / np.sin(half) * (u + v) / np.linalg.norm(u + v)
-        start = np.arctan2(*(corner + u * radius / np.tan(half) - centre)[::-1])
+        touch = corner + u * radius / np.tan(half) - centre
+        start = np.arctan2(touch[1], touch[0])
         turn = np.pi - 2.0 * half
         count = max(2, int(np.ceil(radius * turn / edge)))
         angles = start + np.linspace(0.0, turn, count + 1)
@@ -152,7 +153,9 @@ def solid(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> trimesh.Trimesh:
 
     The order depends on the shape alone, not on how a library numbered it.
     """
-    mesh = trimesh.Trimesh(np.round(vertices, DECIMALS) + 0.0, faces, process=False)
+    mesh = trimesh.Trimesh(
+        np.round(np.asarray(vertices, dtype=float), DECIMALS) + 0.0, faces, process=False
+    )
     mesh.merge_vertices(digits_vertex=DECIMALS)
     mesh.update_faces(mesh.nondegenerate_faces(height=0.0))
     mesh.remove_unreferenced_vertices()
@@ -231,10 +234,10 @@ def sweep(
 
 def extrude(section: npt.ArrayLike, profile: npt.ArrayLike) -> trimesh.Trimesh:
     """Return a section (n, 2) [m] raised along z by a profile (k, 2) of points (scale, z [m])."""
-    points = np.asarray(profile, dtype=float)
+    outline = np.asarray(section, dtype=float)
     rings = []
-    for scale, z in points:
-        ring = np.column_stack([scale * np.asarray(section, dtype=float), np.full(len(section), z)])
+    for scale, z in np.asarray(profile, dtype=float):
+        ring = np.column_stack([scale * outline, np.full(len(outline), z)])
         rings.append(ring if scale > 0.0 else np.array([[0.0, 0.0, z]]))
     return _skin(rings, closed=False)
 

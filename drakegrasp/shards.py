@@ -102,28 +102,34 @@ def sync_and_rename(temporary: Path, path: Path) -> None:
             os.close(descriptor)
 
 
-def write_field(group: h5py.Group, field: Field, values: AnyArray) -> h5py.Dataset:
-    """Write one field with its unit, frame and meaning as attributes.
+def create_field(group: h5py.Group, field: Field, shape: tuple[int, ...]) -> h5py.Dataset:
+    """Create an empty, growing dataset of a field whose rows have a shape.
 
-    Images get a chunk per sample, because loaders read them one by one in random order.
+    Unit, frame and meaning become attributes. Images get a chunk per sample, because
+    loaders read them one by one in random order.
     """
-    options: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-    rows = 1 if field.sample else COLUMN_CHUNK
-    options["chunks"] = (min(rows, max(1, len(values))), *values.shape[1:])
-    dtype = h5py.string_dtype() if field.dtype == "str" else np.dtype(field.dtype)
-    if field.dtype == "str":
-        options["shuffle"] = False
-    # Without a maximal shape an empty dataset could not be chunked.
+    text = field.dtype == "str"
     dataset = group.create_dataset(
-        field.name, data=values, dtype=dtype, maxshape=(None, *values.shape[1:]), **options
+        field.name,
+        shape=(0, *shape),
+        maxshape=(None, *shape),
+        dtype=h5py.string_dtype() if text else np.dtype(field.dtype),
+        chunks=(1 if field.sample else COLUMN_CHUNK, *shape),
+        compression="gzip",
+        compression_opts=1,
+        shuffle=not text,
     )
-    describe(dataset, field)
+    dataset.attrs.update({"unit": field.unit, "frame": field.frame, "meaning": field.meaning})
     return dataset
 
 
-def describe(dataset: h5py.Dataset, field: Field) -> None:
-    """Attach unit, frame and meaning of a field to its dataset."""
-    dataset.attrs.update({"unit": field.unit, "frame": field.frame, "meaning": field.meaning})
+def write_field(group: h5py.Group, field: Field, values: AnyArray) -> h5py.Dataset:
+    """Write all rows of one field, see `create_field`."""
+    dataset = create_field(group, field, values.shape[1:])
+    dataset.resize(len(values), axis=0)
+    if len(values):
+        dataset[...] = values
+    return dataset
 
 
 def write_shard(out: Path, shard: Shard) -> Path:

@@ -108,6 +108,12 @@ def workbench(out: Path, name: str, config: Config) -> Workbench:
     return _workbenches[key]
 
 
+def close_workbenches() -> None:
+    """Let go of all diagrams; a renderer must end in the thread that made it."""
+    _workbenches.clear()
+    gc.collect()
+
+
 def run_unit(unit: WorkUnit) -> UnitSummary:
     """Try all attempts of a unit, look at the successes, and write the shard."""
     config, out, header = parse_config(unit.config), Path(unit.out), unit.header

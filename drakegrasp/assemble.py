@@ -1,0 +1,384 @@
+"""Stage "build": from shards to trials.hdf5, grasping_oto.hdf5 and grasping_otm.hdf5.
+
+In: a directory whose work units are all done. Out: the three files, all or none. Two
+passes over the shards, so memory holds one shard's images and a few numbers per success,
+whatever the size of the dataset. No simulation, no Drake.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.camera import intrinsics, project
+from drakegrasp.errors import DataError
+from drakegrasp.filters import Removal, Successes, judge_successes, split_samples
+from drakegrasp.frames import X_WT, Array, invert_pose, pack_pose, transform_points, unpack_pose
+from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp
+from drakegrasp.manifest import Manifest, model_path, read_manifest
+from drakegrasp.meshes import ObjectModel, load_object
+from drakegrasp.outcomes import Outcome
+from drakegrasp.progress import Report, silent
+from drakegrasp.schema import (
+    CAMERAS,
+    CONVENTIONS,
+    DATA_FIELDS,
+    OBJECT_FIELDS,
+    SCHEMA_VERSION,
+    SPLITS,
+    SUCCESS_FIELDS,
+    TRIAL_FIELDS,
+    sizes,
+)
+from drakegrasp.shards import (
+    AnyArray,
+    Shard,
+    ShardHeader,
+    atomic_hdf5,
+    create_field,
+    read_shard,
+    trial_columns,
+    write_field,
+)
+
+TRIALS_FILE = "trials.hdf5"
+DATA_FILES = {camera: f"grasping_{camera}.hdf5" for camera in CAMERAS}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Assembly:
+    """What the files hold.
+
+    Attributes:
+        trials: Number of attempts.
+        grasps: Number of successes.
+        removed: Successes by reason of removal; `Removal.KEPT` are the samples.
+        samples: Samples by split.
+    """
+
+    trials: int
+    grasps: int
+    removed: dict[Removal, int]
+    samples: dict[str, int]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Part:
+    """A shard's place in the dataset: its first row, how many rows are taken, their shapes."""
+
+    header: ShardHeader
+    object: int
+    first: int
+    rows: int
+    shapes: Mapping[str, tuple[int, ...]]
+
+
+def assemble(
+    out: Path, *, rejected: Sequence[int] = (), progress: Report = silent
+) -> Assembly:
+    """Write the three files of a dataset whose work units are all done.
+
+    Args:
+        out: Directory of the dataset.
+        rejected: Ids of trials that inspection found wrong; they become no samples.
+        progress: Called with the number of shards read and to read.
+
+    Raises:
+        DataError: If a shard is missing or damaged; the old files stay as they were.
+    """
+    manifest = read_manifest(out)
+    K = intrinsics(manifest.config.camera)
+    total = len(manifest.headers())
+    parts, found = [], []
+    with ExitStack() as stack:
+        trials = stack.enter_context(atomic_hdf5(out / TRIALS_FILE))
+        _write_attributes(trials, manifest)
+        _write_objects(trials, manifest)
+        for part, shard in _walk(out, manifest):
+            _append_trials(trials, part, shard)
+            parts.append(part)
+            found.append(_successes(part, shard, K))
+            progress(len(parts), 2 * total)
+        successes = _concatenate(found)
+        removal = judge_successes(successes, manifest.config.filters, rejected)
+        _write_removal(trials, successes, removal)
+        ids = _split_ids(manifest, successes, removal)
+        files = {c: stack.enter_context(atomic_hdf5(out / DATA_FILES[c])) for c in CAMERAS}
+        for camera, file in files.items():
+            _write_attributes(file, manifest)
+            file.attrs["camera"] = camera
+            _create_splits(file, ids, parts[0].shapes)
+        for number, part in enumerate(parts):
+            _write_samples(files, out, manifest, part, ids)
+            progress(len(parts) + number + 1, 2 * len(parts))
+    return summarise(out)
+
+
+def summarise(out: Path) -> Assembly:
+    """Return what the files of a dataset hold.
+
+    Raises:
+        DataError: If they are missing or damaged.
+    """
+    try:
+        with h5py.File(out / TRIALS_FILE, "r") as trials, h5py.File(
+            out / DATA_FILES["oto"], "r"
+        ) as data:
+            removal = trials["successes/removal"][:]
+            reasons, counts = np.unique(removal, return_counts=True)
+            return Assembly(
+                trials=len(trials["trials/outcome"]),
+                grasps=len(removal),
+                removed={Removal(int(r)): int(n) for r, n in zip(reasons, counts, strict=True)},
+                samples={split: len(data[split]["trial_id"]) for split in SPLITS},
+            )
+    except (OSError, KeyError) as error:
+        raise DataError(f"{out}: must hold the files of a dataset, got none ({error})") from None
+
+
+def read_reject_list(path: Path) -> list[int]:
+    """Return the trial ids in a text file: one per line, # starts a comment.
+
+    Raises:
+        DataError: If a line is no id.
+    """
+    ids = []
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        text = line.partition("#")[0].strip()
+        if text and not text.isdecimal():
+            raise DataError(f"{path}, line {number}: must be the id of a trial, got {text!r}")
+        if text:
+            ids.append(int(text))
+    return ids
+
+
+def is_assembled(out: Path) -> bool:
+    """Return whether the three files are there and of the manifest's configuration and units."""
+    signature = _signature(read_manifest(out))
+    try:
+        for name in (TRIALS_FILE, *DATA_FILES.values()):
+            with h5py.File(out / name, "r") as file:
+                if file.attrs["signature"] != signature:
+                    return False
+    except (OSError, KeyError):
+        return False
+    return True
+
+
+def _walk(out: Path, manifest: Manifest) -> Iterator[tuple[_Part, Shard]]:
+    """Yield the shards in the order of their rows, each object's up to its last wanted grasp."""
+    index = {entry["name"]: i for i, entry in enumerate(manifest.objects)}
+    wanted = dict.fromkeys(index, manifest.config.max_grasps)
+    first = 0
+    for header in manifest.headers():
+        name = header.object_name
+        if wanted[name] == 0:
+            continue
+        shard = read_shard(header.path(out), header)
+        rows, wanted[name] = rows_within(shard, wanted[name])
+        shapes = {f.name: shard.trials[f.name].shape[1:] for f in trial_columns()}
+        shapes["image"] = shard.looks["mask_oto"].shape[1:]
+        yield (
+            _Part(header=header, object=index[name], first=first, rows=rows, shapes=shapes),
+            shard,
+        )
+        first += rows
+
+
+def rows_within(shard: Shard, wanted: int | None) -> tuple[int, int | None]:
+    """Return how many rows of a shard an object needs, and how many grasps it then wants.
+
+    The rows end with the last wanted grasp, so what is in a dataset does not depend on how
+    far work had gone when enough was found.
+    """
+    hits = np.flatnonzero(shard.trials["outcome"] == Outcome.SUCCESS)
+    if wanted is None or len(hits) < wanted:
+        return len(shard.trials["outcome"]), None if wanted is None else wanted - len(hits)
+    return int(hits[wanted - 1]) + 1, 0
+
+
+def _signature(manifest: Manifest) -> str:
+    """Return a hash of all that decides what the files hold, but for a reject list."""
+    content = [manifest.config.to_dict(), [repr(h) for h in manifest.headers()]]
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _write_attributes(file: h5py.File, manifest: Manifest) -> None:
+    camera = manifest.config.camera
+    file.attrs.update({f"convention_{key}": text for key, text in CONVENTIONS.items()})
+    file.attrs["schema_version"] = SCHEMA_VERSION
+    file.attrs["signature"] = _signature(manifest)
+    file.attrs["config"] = json.dumps(manifest.config.to_dict(), sort_keys=True)
+    file.attrs["config_hash"] = manifest.config.simulation_hash()
+    file.attrs["seed"] = manifest.config.seed
+    file.attrs["versions"] = json.dumps(manifest.versions, sort_keys=True)
+    file.attrs["K"] = intrinsics(camera)
+    file.attrs["near"], file.attrs["far"] = camera.near, camera.far
+
+
+def _write_objects(file: h5py.File, manifest: Manifest) -> None:
+    group = file.create_group("objects")
+    keys = {"class_name": "class"}
+    for field in OBJECT_FIELDS:
+        values = [entry[keys.get(field.name, field.name)] for entry in manifest.objects]
+        dtype = object if field.dtype == "str" else field.dtype
+        write_field(group, field, np.array(values, dtype=dtype))
+
+
+def _append_trials(file: h5py.File, part: _Part, shard: Shard) -> None:
+    group = file.require_group("trials")
+    columns = {f.name: shard.trials[f.name][: part.rows] for f in trial_columns()}
+    columns["trial_id"] = np.arange(part.first, part.first + part.rows, dtype=np.int64)
+    columns["object"] = np.full(part.rows, part.object, dtype=np.int32)
+    for field in TRIAL_FIELDS:
+        values = columns[field.name]
+        if field.name not in group:
+            create_field(group, field, values.shape[1:])
+        dataset = group[field.name]
+        dataset.resize(part.first + part.rows, axis=0)
+        dataset[part.first :] = values
+
+
+def _successes(part: _Part, shard: Shard, K: Array) -> Successes:
+    """Return what the filters must know of a shard's successes."""
+    taken = shard.looks["row"] < part.rows
+    rows = shard.looks["row"][taken]
+    trials = {name: values[rows] for name, values in shard.trials.items()}
+    looks = {name: values[taken] for name, values in shard.looks.items()}
+    X_TO = unpack_pose(trials["X_TO"])
+    grasps = [
+        transform_grasp(X, pack_grasp(p, n))
+        for X, p, n in zip(X_TO, trials["closed_p_OQ"], trials["closed_nhat_Q_O"], strict=True)
+    ]
+    length = 6 * trials["closed_touching"].shape[1]
+    in_view = [
+        all(_in_view(K, looks[f"mask_{c}"][i], looks[f"X_TC_{c}"][i], grasp) for c in CAMERAS)
+        for i, grasp in enumerate(grasps)
+    ]
+    return Successes(
+        trial_id=part.first + rows.astype(np.int64),
+        object=np.full(len(rows), part.object, dtype=np.int32),
+        grasp_T=np.array(grasps).reshape(-1, length),
+        seen=np.all([looks[f"mask_{c}"].any(axis=(1, 2)) for c in CAMERAS], axis=0),
+        in_view=np.array(in_view, dtype=bool),
+        # Both cameras stand at the same point.
+        camera_height=unpack_pose(looks["X_TC_otm"])[:, 2, 3],
+        depth_variance=looks["image_otm"][:, 3].astype(float).var(axis=(1, 2)),
+        surface_distance=trials["surface_distance"].max(axis=1, initial=0.0),
+    )
+
+
+def _in_view(K: Array, mask: AnyArray, X_TC: Array, grasp_T: Array) -> bool:
+    p_TQ, _ = unpack_grasp(grasp_T)
+    p_CQ = transform_points(invert_pose(unpack_pose(X_TC)), p_TQ)
+    uv = project(K, p_CQ)
+    return bool(np.all(p_CQ[:, 2] > 0.0) and np.all(uv >= 0.0) and np.all(uv <= len(mask) - 1))
+
+
+def _concatenate(found: Sequence[Successes]) -> Successes:
+    names = [f.name for f in dataclasses.fields(Successes)]
+    return Successes(**{n: np.concatenate([getattr(s, n) for s in found]) for n in names})
+
+
+def _write_removal(file: h5py.File, successes: Successes, removal: AnyArray) -> None:
+    """Keep beside the trials why each success is, or is not, a sample."""
+    group = file.create_group("successes")
+    for field, values in zip(SUCCESS_FIELDS, (successes.trial_id, removal), strict=True):
+        write_field(group, field, values)
+
+
+def _split_ids(
+    manifest: Manifest, successes: Successes, removal: AnyArray
+) -> dict[str, npt.NDArray[np.int64]]:
+    kept = np.flatnonzero(removal == Removal.KEPT)
+    split = split_samples(
+        successes.object[kept],
+        [entry["name"] for entry in manifest.objects],
+        [entry["class"] for entry in manifest.objects],
+        manifest.config.split,
+        manifest.config.seed,
+    )
+    return {name: successes.trial_id[kept[rows]] for name, rows in split.items()}
+
+
+def _create_splits(
+    file: h5py.File,
+    ids: Mapping[str, npt.NDArray[np.int64]],
+    shapes: Mapping[str, tuple[int, ...]],
+) -> None:
+    letters = sizes(
+        fingers=shapes["closed_touching"][0],
+        joints=shapes["closed_q"][0],
+        image=shapes["image"][0],
+    )
+    for split, rows in ids.items():
+        group = file.create_group(split)
+        for field in DATA_FIELDS:
+            dataset = create_field(group, field, field.row_shape(letters))
+            dataset.resize(len(rows), axis=0)
+
+
+def _write_samples(
+    files: Mapping[str, h5py.File],
+    out: Path,
+    manifest: Manifest,
+    part: _Part,
+    ids: Mapping[str, npt.NDArray[np.int64]],
+) -> None:
+    """Write the samples that come from one shard into their places in both files."""
+    bounds = {s: np.searchsorted(ids[s], [part.first, part.first + part.rows]) for s in SPLITS}
+    if all(start == stop for start, stop in bounds.values()):
+        return
+    shard = read_shard(part.header.path(out), part.header)
+    model = load_object(model_path(out, part.header.object_name))
+    look_of = {int(row): k for k, row in enumerate(shard.looks["row"])}
+    for split, (start, stop) in bounds.items():
+        for place in range(start, stop):
+            trial_id = int(ids[split][place])
+            row = trial_id - part.first
+            for camera, file in files.items():
+                sample = _sample(model, shard, row, look_of[row], camera)
+                sample["trial_id"] = trial_id
+                for field in DATA_FIELDS:
+                    file[split][field.name][place] = sample[field.name]
+
+
+def _sample(
+    model: ObjectModel, shard: Shard, row: int, k: int, camera: str
+) -> dict[str, Any]:
+    """Return a sample by the names of DATA_FIELDS, without its trial's id."""
+    trials, looks = shard.trials, shard.looks
+    X_TO = unpack_pose(trials["X_TO"][row])
+    X_TC = {c: unpack_pose(looks[f"X_TC_{c}"][k]) for c in CAMERAS}
+    grasp_O = pack_grasp(trials["closed_p_OQ"][row], trials["closed_nhat_Q_O"][row])
+    R_TO = X_TO[:3, :3]
+    properties = {
+        "object_name": model.name,
+        "class_name": model.class_name,
+        "work2com": transform_points(X_TO, model.p_OOcm[None])[0],
+        "work2inertia": (R_TO @ model.I_OOcm_O @ R_TO.T).ravel(),
+        "work2mass": [model.mass],
+        "frame_cam2img_otm": looks["X_CI_otm"][k],
+        "frame_cam2work_otm": pack_pose(invert_pose(X_TC["otm"])),
+        "frame_cam2work_oto": pack_pose(invert_pose(X_TC["oto"])),
+        "frame_work2cam_otm": pack_pose(X_TC["otm"]),
+        "frame_work2cam_oto": pack_pose(X_TC["oto"]),
+        "frame_world2obj": pack_pose(X_WT @ X_TO),
+        "frame_world2work": pack_pose(X_WT),
+    }
+    return {
+        "images": looks[f"image_{camera}"][k],
+        "masks": looks[f"mask_{camera}"][k],
+        "grasps": transform_grasp(invert_pose(X_TC[camera]) @ X_TO, grasp_O),
+        **{f"object_props/{name}": value for name, value in properties.items()},
+    }

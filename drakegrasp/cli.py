@@ -1,0 +1,281 @@
+"""The command line: thin, one function per command.
+
+Results go to standard output, progress and errors to standard error. Exit codes: 0 done,
+1 the work failed, 2 wrong usage. Heavy imports are within the commands, so that `--help`
+answers at once.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from rich.console import Console
+
+from drakegrasp import __version__
+from drakegrasp.errors import ConfigError, DrakegraspError, HandError, MeshError
+
+if TYPE_CHECKING:
+    from drakegrasp.build import BuildReport
+
+#: Errors of what was asked for, as against errors of what was done.
+WRONG_USAGE = (ConfigError, HandError, MeshError)
+#: Width of tables where standard output is not a terminal.
+WIDTH = 130
+
+
+class _Commands(click.Group):
+    """Commands in the order of their definition, and errors in one line."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(self.commands)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except DrakegraspError as error:
+            click.echo(f"error: {error}", err=True)
+            ctx.exit(2 if isinstance(error, WRONG_USAGE) else 1)
+        except OSError as error:
+            click.echo(f"error: {error}", err=True)
+            ctx.exit(1)
+
+
+out_argument = click.argument("out", type=click.Path(path_type=Path), metavar="OUT")
+units_option = click.option(
+    "--units", default="m", show_default=True, help="Unit of length of the meshes: m, cm or mm."
+)
+manifest_option = click.option(
+    "--manifest",
+    type=click.Path(path_type=Path),
+    help="YAML file with units and classes by mesh.  [default: objects.yaml beside the meshes]",
+)
+
+
+@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="drakegrasp")
+def main() -> None:
+    """Simulate multi-finger grasps of meshes, with the images of every grasp."""
+
+
+@main.command()
+@click.argument("directory", type=click.Path(path_type=Path), default=Path("."))
+def doctor(directory: Path) -> None:
+    """Say what this machine lacks, with the line that mends it.
+
+    DIRECTORY is where data would be written.
+    """
+    from drakegrasp.doctor import diagnose
+
+    findings = diagnose(directory)
+    for finding in findings:
+        mark = click.style("ok     ", fg="green") if finding.ok else click.style("MISSING", fg="red")
+        click.echo(f"{mark}  {finding.name:<18} {finding.what}")
+        if not finding.ok:
+            click.echo(f"         -> {finding.mend}")
+    if not all(finding.ok for finding in findings):
+        sys.exit(1)
+
+
+@main.group()
+def objects() -> None:
+    """List or export the built-in objects."""
+
+
+@objects.command("list")
+def list_objects() -> None:
+    """Print the name and class of every built-in object."""
+    from drakegrasp.builtin import BUILTIN_OBJECTS
+
+    for item in BUILTIN_OBJECTS:
+        click.echo(f"{item.name:<26} {item.class_name}")
+
+
+@objects.command("export")
+@click.argument("directory", type=click.Path(path_type=Path))
+def export_objects(directory: Path) -> None:
+    """Write the built-in objects' meshes (.obj, metres) to DIRECTORY."""
+    from drakegrasp.builtin import export_builtin
+
+    click.echo(f"{len(export_builtin(directory))} meshes in {directory}")
+
+
+@main.command()
+@click.argument("mesh_dir", type=click.Path(path_type=Path))
+@units_option
+@manifest_option
+def audit(mesh_dir: Path, units: str, manifest: Path | None) -> None:
+    """Say mesh by mesh: fit to simulate, mended, or refused, and why."""
+    from drakegrasp.meshes import audit as audit_meshes
+    from drakegrasp.tables import audit_table
+
+    rows = audit_meshes(mesh_dir, units=units, manifest=manifest)
+    _print(audit_table(rows))
+    if all(row.status == "refused" for row in rows):
+        sys.exit(1)
+
+
+@main.command()
+@click.option(
+    "--objects",
+    "mesh_dir",
+    required=True,
+    metavar="MESH_DIR|builtin",
+    help="Directory of .obj, .stl, .ply or .glb files, or the built-in objects.",
+)
+@click.option(
+    "--out",
+    required=True,
+    type=click.Path(path_type=Path),
+    help="Directory of the dataset; the same command goes on with what is there.",
+)
+@click.option(
+    "--config", metavar="YAML|PRESET", help="Configuration: a file, or paper or released.  [paper]"
+)
+@click.option(
+    "--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Set one value, e.g. lift.hold_time=1."
+)
+@click.option("--candidates", type=int, help="Palm poses per object.  [10000]")
+@click.option("--max-grasps", type=int, help="Grasps per object after which no more are tried.")
+@click.option("--seed", type=int, help="Of all random draws.  [0]")
+@units_option
+@manifest_option
+@click.option("--workers", type=int, help="Processes on this machine.  [one per core]")
+@click.option("--scheduler", metavar="ADDRESS", help="A running Dask scheduler to use instead.")
+@click.option(
+    "--scheduler-file", type=click.Path(path_type=Path), help="Its JSON file, instead of the address."
+)
+@click.option("--quiet", is_flag=True, help="Show no progress.")
+def build(
+    mesh_dir: str,
+    out: Path,
+    config: str | None,
+    overrides: tuple[str, ...],
+    candidates: int | None,
+    max_grasps: int | None,
+    seed: int | None,
+    units: str,
+    manifest: Path | None,
+    workers: int | None,
+    scheduler: str | None,
+    scheduler_file: Path | None,
+    quiet: bool,
+) -> None:
+    """Build the dataset of a directory of meshes."""
+    from drakegrasp.cluster import build_dataset
+    from drakegrasp.config import load_config
+
+    chosen = list(overrides)
+    if candidates is not None:
+        chosen.append(f"candidates.max={candidates}")
+    report = build_dataset(
+        mesh_dir,
+        out,
+        config=load_config(config, chosen, seed=seed, max_grasps=max_grasps),
+        units=units,
+        manifest=manifest,
+        workers=workers,
+        scheduler=scheduler,
+        scheduler_file=scheduler_file,
+        show=not quiet,
+    )
+    _print_report(report)
+
+
+@main.command()
+@out_argument
+@click.option(
+    "--reject",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="File with the ids of trials that are no samples, one per line; # starts a comment.",
+)
+@click.option(
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Set a value of the filters or the split, e.g. filters.outlier_sigma=3.",
+)
+def assemble(out: Path, reject: Path | None, overrides: tuple[str, ...]) -> None:
+    """Write the three files again from the shards: filters, split, samples."""
+    from drakegrasp.assemble import assemble as assemble_files
+    from drakegrasp.assemble import read_reject_list
+    from drakegrasp.manifest import change_postprocessing
+    from drakegrasp.progress import progress_bar
+
+    rejected = () if reject is None else read_reject_list(reject)
+    if overrides:
+        change_postprocessing(out, overrides)
+    with progress_bar("assemble", "shards") as progress:
+        assemble_files(out, rejected=rejected, progress=progress)
+    _print_stats(out)
+
+
+@main.command()
+@click.argument("path", type=click.Path(path_type=Path), metavar="OUT|FILE")
+def check(path: Path) -> None:
+    """Check every invariant of a dataset, or of one of its files."""
+    from drakegrasp.check import check_dataset
+    from drakegrasp.progress import progress_bar
+
+    with progress_bar("check", "steps") as progress:
+        violations = check_dataset(path, progress=progress)
+    for violation in violations:
+        click.echo(str(violation))
+    click.echo(f"{path}: {len(violations) or 'no'} broken invariants")
+    if violations:
+        sys.exit(1)
+
+
+@main.command()
+@out_argument
+def stats(out: Path) -> None:
+    """Print the funnel by object and the paper's Table III."""
+    _print_stats(out)
+
+
+@main.command()
+@out_argument
+@click.option("--trial", required=True, type=int, help="Row of trials.hdf5.")
+def replay(out: Path, trial: int) -> None:
+    """Run a trial again: the same outcome and contacts, or exit code 1."""
+    from drakegrasp.replay import replay_trial
+
+    again = replay_trial(out, trial)
+    click.echo(
+        f"trial {trial} of {again.object_name}: was {again.recorded.label}, is {again.found.label}"
+    )
+    for name, difference in again.differences.items():
+        click.echo(f"  {name} differs by up to {difference:.3g}")
+    for package, change in again.versions.items():
+        click.echo(f"  {package}: {change}")
+    if not again.same:
+        sys.exit(1)
+
+
+def _print(table: Any) -> None:
+    console = Console()
+    Console(width=None if console.is_terminal else WIDTH).print(table)
+
+
+def _print_stats(out: Path) -> None:
+    from drakegrasp.stats import count_funnel, count_splits
+    from drakegrasp.tables import funnel_table, split_table
+
+    _print(funnel_table(count_funnel(out)))
+    _print(split_table(count_splits(out)))
+
+
+def _print_report(report: BuildReport) -> None:
+    _print_stats(report.out)
+    if report.simulated:
+        reused = f" ({report.reused} had been done before)" if report.reused else ""
+        click.echo(f"{report.simulated} work units simulated{reused}")
+    else:
+        click.echo(f"all {report.reused} work units had been done before: nothing was simulated")
+    for entry in report.refused:
+        click.echo(f"refused: {entry['name']}: {entry['reason']}")
+    for name in ("grasping_oto.hdf5", "grasping_otm.hdf5", "trials.hdf5"):
+        click.echo(str(report.out / name))

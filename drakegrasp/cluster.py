@@ -1,0 +1,188 @@
+"""Running the work on Dask: the only module of the package that knows it.
+
+Tasks are work units of many attempts; their data goes through shards, and only a summary
+comes back. A few tasks per worker are in flight at a time, whatever their number.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from itertools import islice
+from pathlib import Path
+from typing import Any, TypeVar
+
+import dask
+from distributed import Client, Future, KilledWorker, LocalCluster, as_completed, wait
+
+from drakegrasp.build import BuildReport, build
+from drakegrasp.builtin import export_builtin
+from drakegrasp.config import Config, load_config
+from drakegrasp.errors import ConfigError, EnvironmentFailure
+from drakegrasp.manifest import BUILTIN_FOLDER, claim_directory
+from drakegrasp.meshes import find_meshes
+from drakegrasp.units import close_workbenches
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+#: Tasks in flight per worker: one that runs, and one so that it never waits.
+IN_FLIGHT = 2
+#: How long to wait for a scheduler to answer [s].
+CONNECT_SECONDS = 10
+#: What stands for the built-in objects in place of a directory.
+BUILTIN = "builtin"
+#: Environment of the workers. Software OpenGL would start threads of its own beside the
+#: one process per core, and nothing that a worker does may need the network.
+WORKER_ENVIRONMENT = {
+    "LP_NUM_THREADS": "0",
+    "DRAKE_ALLOW_NETWORK": "none",
+    "OMP_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+}
+#: Settings of Dask: a worker's process must not be a fork, because a fork after the first
+#: image hangs; its profiler costs time; a worker takes no task before it can start it.
+DASK_SETTINGS: dict[str, Any] = {
+    "distributed.worker.multiprocessing-method": "spawn",
+    "distributed.worker.profile.enabled": False,
+    "distributed.scheduler.worker-saturation": 1.0,
+    "distributed.nanny.pre-spawn-environ": WORKER_ENVIRONMENT,
+    "distributed.worker.memory.target": False,
+    "distributed.worker.memory.spill": False,
+}
+
+
+def build_dataset(
+    objects: str | Path,
+    out: str | Path,
+    *,
+    config: Config | None = None,
+    units: str = "m",
+    manifest: str | Path | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    scheduler_file: str | Path | None = None,
+    show: bool = True,
+) -> BuildReport:
+    """Build the dataset of a directory of meshes; the same as `drakegrasp build`.
+
+    What is complete in `out` already is kept, so the same call goes on where one stopped.
+
+    Args:
+        objects: Directory of meshes, or "builtin" for the built-in objects.
+        out: Directory of the dataset; every worker must see it.
+        config: All the rules; the preset `paper` if None.
+        units: Unit of length of the meshes: m, cm or mm.
+        manifest: YAML file with units and classes per mesh, if it is not beside the meshes.
+        workers: Processes on this machine; one per core if None.
+        scheduler: Address of a running Dask scheduler to use instead.
+        scheduler_file: Its JSON file, instead of the address.
+        show: Whether to show progress on standard error.
+
+    Raises:
+        MeshError: If there is no mesh.
+        ConfigError: If both workers and a scheduler are given.
+        DataError: If `out` cannot be used, or no mesh is fit to be simulated.
+    """
+    if workers is not None and (scheduler or scheduler_file):
+        raise ConfigError("workers must not be given with a scheduler, which has its own")
+    if workers is not None and workers < 1:
+        raise ConfigError(f"workers must be at least 1, got {workers}")
+    out, config = Path(out).absolute(), config or load_config()
+    directory = Path(objects)
+    if str(objects) == BUILTIN:
+        claim_directory(out, config)
+        directory = out / BUILTIN_FOLDER
+        export_builtin(directory)
+    sources = find_meshes(directory, units=units, manifest=manifest)
+    with connect(workers, scheduler, scheduler_file) as client:
+        try:
+            return build(sources, out, config, DaskExecutor(client), show=show)
+        finally:
+            _close_workbenches(client)
+
+
+@contextmanager
+def connect(
+    workers: int | None = None,
+    scheduler: str | None = None,
+    scheduler_file: str | Path | None = None,
+) -> Iterator[Client]:
+    """Connect to a running scheduler, or start a cluster on this machine, while the block runs.
+
+    Args:
+        workers: Processes of a cluster on this machine; one per core if None.
+        scheduler: Address of a running scheduler.
+        scheduler_file: Its JSON file, instead of the address.
+
+    Raises:
+        EnvironmentFailure: If there is no scheduler at the address.
+    """
+    with dask.config.set(DASK_SETTINGS):
+        if scheduler or scheduler_file:
+            file = None if scheduler_file is None else str(scheduler_file)
+            try:
+                client = Client(scheduler, scheduler_file=file, timeout=CONNECT_SECONDS)
+            except (OSError, ValueError) as error:
+                raise EnvironmentFailure(
+                    f"{scheduler or file}: must be a running Dask scheduler, got none ({error})"
+                ) from None
+            with client:
+                yield client
+        else:
+            count = workers or len(os.sched_getaffinity(0))
+            with (
+                LocalCluster(
+                    n_workers=count,
+                    threads_per_worker=1,
+                    dashboard_address=None,
+                    silence_logs=logging.ERROR,
+                ) as cluster,
+                Client(cluster) as client,
+            ):
+                yield client
+
+
+def _close_workbenches(client: Client) -> None:
+    """End the renderers in the thread that made them: the one that runs tasks."""
+    workers = list(client.scheduler_info(n_workers=-1)["workers"])
+    wait(
+        [client.submit(close_workbenches, workers=[w], pure=False) for w in workers],
+        timeout=CONNECT_SECONDS,
+    )
+
+
+class DaskExecutor:
+    """An `Executor` that keeps a few tasks per worker in flight on a Dask cluster."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+
+    def __call__(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+        """Yield function(item) of every item as they are done.
+
+        Raises:
+            EnvironmentFailure: If the workers died of an item again and again.
+            Exception: What the function raised.
+        """
+        waiting = iter(items)
+        running = as_completed(
+            [self._submit(function, item) for item in islice(waiting, self._room())]
+        )
+        for future in running:
+            try:
+                yield future.result()
+            except KilledWorker as error:
+                raise EnvironmentFailure(f"the workers must stay alive, got: {error}") from None
+            for item in islice(waiting, max(0, self._room() - running.count())):
+                running.add(self._submit(function, item))
+
+    def _room(self) -> int:
+        return IN_FLIGHT * max(1, len(self._client.scheduler_info(n_workers=-1)["workers"]))
+
+    def _submit(self, function: Callable[[T], R], item: T) -> Future:
+        # A task writes files, so it is never the same as one that was done before.
+        return self._client.submit(function, item, pure=False)

@@ -1,0 +1,107 @@
+"""Running a trial of a dataset again: the same outcome and the same contacts, or it says so."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from drakegrasp.assemble import TRIALS_FILE
+from drakegrasp.errors import DataError
+from drakegrasp.hand import load_hand
+from drakegrasp.manifest import installed_versions, read_manifest
+from drakegrasp.outcomes import Outcome
+from drakegrasp.prepared import load_prepared
+from drakegrasp.scene import build_scene
+from drakegrasp.shards import ShardHeader, trial_columns
+from drakegrasp.units import Workbench, trial_rows, try_on, unit_attempts
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay:
+    """A trial that was run again.
+
+    Attributes:
+        trial_id: Its row.
+        object_name: Its object.
+        recorded, found: The outcome in the file and the one now.
+        differences: Largest absolute difference of each field that is not the same.
+        versions: Packages whose versions differ, as "then -> now".
+    """
+
+    trial_id: int
+    object_name: str
+    recorded: Outcome
+    found: Outcome
+    differences: dict[str, float]
+    versions: dict[str, str]
+
+    @property
+    def same(self) -> bool:
+        """Whether every stored value came out bit for bit."""
+        return not self.differences
+
+
+def replay_trial(out: str | Path, trial_id: int) -> Replay:
+    """Run one trial of a dataset again, from its prepared object and its candidate.
+
+    The same machine and versions give the same bits. Other versions may not: `versions`
+    then says which differ.
+
+    Raises:
+        DataError: If the dataset or the trial is not there.
+    """
+    out = Path(out)
+    manifest = read_manifest(out)
+    config = manifest.config
+    stored, name = _stored_row(out, trial_id)
+    prepared = load_prepared(out, name, config)
+    scene = build_scene(prepared.model, config.physics, load_hand(config.hand))
+    bench = Workbench(prepared=prepared, config=config, scene=scene)
+    candidate = int(stored["candidate"])
+    header = ShardHeader(
+        config_hash=config.simulation_hash(),
+        mesh_sha256=prepared.model.mesh_sha256,
+        object_name=name,
+        start=candidate,
+        stop=candidate + 1,
+    )
+    attempt = unit_attempts(prepared, header, config)[int(stored["standoff_index"])]
+    again = trial_rows(bench, [attempt], [try_on(bench, attempt)])
+    now = installed_versions()
+    return Replay(
+        trial_id=trial_id,
+        object_name=name,
+        recorded=Outcome(int(stored["outcome"])),
+        found=Outcome(int(again["outcome"][0])),
+        differences={
+            field.name: _difference(stored[field.name], again[field.name][0])
+            for field in trial_columns()
+            if not np.array_equal(stored[field.name], again[field.name][0], equal_nan=True)
+        },
+        versions={
+            key: f"{then} -> {now.get(key)}"
+            for key, then in manifest.versions.items()
+            if now.get(key) != then
+        },
+    )
+
+
+def _stored_row(out: Path, trial_id: int) -> tuple[dict[str, np.ndarray], str]:
+    path = out / TRIALS_FILE
+    try:
+        with h5py.File(path, "r") as file:
+            count = len(file["trials/outcome"])
+            if not 0 <= trial_id < count:
+                raise DataError(f"{path}: trial must be 0 to {count - 1}, got {trial_id}")
+            row = {f.name: np.asarray(file["trials"][f.name][trial_id]) for f in trial_columns()}
+            name = file["objects/name"][int(file["trials/object"][trial_id])].decode()
+    except (OSError, KeyError) as error:
+        raise DataError(f"{path}: must be the trials of a dataset, got none ({error})") from None
+    return row, name
+
+
+def _difference(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.max(np.abs(np.asarray(a, dtype=float) - np.asarray(b, dtype=float))))

@@ -1,0 +1,91 @@
+"""What is counted, as tables for a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.table import Table
+
+from drakegrasp.filters import Removal
+from drakegrasp.meshes import AuditRow
+from drakegrasp.outcomes import Outcome
+from drakegrasp.stats import Funnel, SplitCount
+
+#: Short heads of the outcomes, in the order of the funnel.
+_OUTCOME_HEADS = {
+    Outcome.RAY_MISS: "ray miss",
+    Outcome.BELOW_TABLE: "below table",
+    Outcome.START_COLLISION: "start coll.",
+    Outcome.SCREENED: "screened",
+    Outcome.MISSING_FINGERTIP: "missing tip",
+    Outcome.HAND_CONTACT: "hand cont.",
+    Outcome.TABLE_CONTACT: "table cont.",
+    Outcome.DROPPED: "dropped",
+    Outcome.SLIPPED: "slipped",
+    Outcome.SOLVER_ERROR: "solver err.",
+    Outcome.TIMEOUT: "timeout",
+    Outcome.CRASHED: "crashed",
+    Outcome.SUCCESS: "success",
+}
+
+
+def funnel_table(funnel: Funnel) -> Table:
+    """Return the funnel: a row per object and one of all; columns that are all zero are left out."""
+    table = Table(title="From palm poses to samples", title_justify="left")
+    table.add_column("object", no_wrap=True, overflow="ellipsis", max_width=24)
+    shown = [o for o in _OUTCOME_HEADS if funnel.outcomes[:, o].any() or o is Outcome.SUCCESS]
+    removed = [r for r in Removal if r is not Removal.KEPT and funnel.removals[:, r].any()]
+    heads = ["poses", "attempts", *(_OUTCOME_HEADS[o] for o in shown)]
+    heads += [f"-{r.label.replace('_', ' ')}" for r in removed] + ["samples"]
+    for head in heads:
+        table.add_column(head, justify="right")
+
+    def row(outcomes: Sequence[int], removals: Sequence[int], poses: int) -> list[str]:
+        cells = [poses, sum(outcomes), *(outcomes[o] for o in shown)]
+        cells += [*(removals[r] for r in removed), removals[Removal.KEPT]]
+        return [f"{int(cell):,}" for cell in cells]
+
+    for i, name in enumerate(funnel.names):
+        table.add_row(
+            name, *row(funnel.outcomes[i], funnel.removals[i], int(funnel.candidates[i]))
+        )
+    table.add_section()
+    totals = (funnel.outcomes.sum(0), funnel.removals.sum(0), int(funnel.candidates.sum()))
+    table.add_row("all", *row(*totals))
+    return table
+
+
+def split_table(counts: Sequence[SplitCount]) -> Table:
+    """Return the paper's Table III with a column of objects."""
+    table = Table(title="Samples by split", title_justify="left")
+    table.add_column("split")
+    for head in ("samples", "objects", "classes"):
+        table.add_column(head, justify="right")
+    for count in counts:
+        table.add_row(
+            count.split, f"{count.samples:,}", f"{count.objects:,}", f"{count.classes:,}"
+        )
+    return table
+
+
+def audit_table(rows: Sequence[AuditRow]) -> Table:
+    """Return what would become of each mesh."""
+    table = Table(title="Meshes", title_justify="left")
+    table.add_column("object", no_wrap=True)
+    table.add_column("class", no_wrap=True)
+    table.add_column("status", no_wrap=True)
+    table.add_column("faces", justify="right")
+    table.add_column("size [mm]", justify="right", no_wrap=True)
+    table.add_column("notes", overflow="fold")
+    colours = {"fit": "green", "mended": "yellow", "refused": "red"}
+    for row in rows:
+        size = "-" if row.extents is None else "x".join(f"{1e3 * e:.0f}" for e in row.extents)
+        table.add_row(
+            row.name,
+            row.class_name,
+            f"[{colours[row.status]}]{row.status}[/]",
+            "-" if row.faces is None else f"{row.faces:,}",
+            size,
+            "; ".join(row.notes),
+        )
+    return table

@@ -1,0 +1,374 @@
+"""The configuration: presets are the published numbers, and a mistake names its key."""
+
+from __future__ import annotations
+
+import json
+import random
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from drakegrasp.config import Config, load_config, parse_config, preset_names
+from drakegrasp.errors import ConfigError, DrakegraspError
+
+DEFAULTS = "Defaults: {}"
+
+#: Every field of every section, none at its default.
+ONE_OF_EVERYTHING = """
+hand: /somewhere/hand.yaml
+seed: 7
+unit_candidates: 20
+attempt_seconds: 30.0
+max_grasps: 500
+objects:
+  mass: 0.5
+  max_collision_faces: 2000
+  min_diagonal: 0.02
+  max_diagonal: 1.5
+physics:
+  time_step: 0.002
+  friction_hand: 0.8
+  friction_table: 0.6
+  fingertip_modulus: 5.0e+6
+  link_modulus: 6.0e+6
+  table_modulus: 7.0e+6
+  dissipation: 10.0
+  relaxation_time: 0.01
+  solver: sap
+  contact_force: 0.1
+  max_speed: 5.0
+settle:
+  drop_height: 0.1
+  max_time: 10.0
+  max_linear_speed: 2.0e-3
+  max_angular_speed: 2.0e-2
+  rest_time: 0.3
+candidates:
+  method: normals
+  max: 100
+  global_x_deg: [0, 90]
+  global_y_deg: [0, 120, 240]
+  global_z_deg: [10]
+  local_x_deg: [0, 60]
+  local_y_deg: [0, 72]
+  local_z_deg: [20]
+  jitter_deg: 5
+  standoffs: [0.05]
+  spreads_deg: [0, 90]
+close:
+  max_time: 3.0
+  stop_speed: 0.02
+  check_period: 0.2
+lift:
+  p_TG: [0.1, 0.0, 0.5]
+  max_speed: 0.4
+  max_acceleration: 2.0
+  hold_time: 0.5
+  check_period: 0.05
+camera:
+  distance: 0.3
+  size: 64
+  fov_y_deg: 40.0
+  near: 0.02
+  far: 1.0
+filters:
+  min_depth_variance: 0.002
+  min_camera_height: 0.02
+  outlier_sigma: 3.0
+  max_surface_distance: 0.003
+split:
+  valid_fraction: 0.2
+  train_classes: [mug, bottle]
+"""
+
+#: Where the released code differs from the paper (original_system.md, 2.1); its hand's
+#: friction is the product of the object's 0.71 and the finger's 10.
+GRID_45 = [0.0, 45.0, 90.0, 135.0, 180.0, 225.0, 270.0, 315.0]
+RELEASED = {
+    "physics.friction_hand": 7.1,
+    "candidates.standoffs": [0.04, 0.07, 0.10],
+    "candidates.global_x_deg": GRID_45,
+    "candidates.global_y_deg": GRID_45,
+    "candidates.global_z_deg": GRID_45,
+    "candidates.local_x_deg": GRID_45,
+    "candidates.local_y_deg": GRID_45,
+    "candidates.local_z_deg": GRID_45,
+    "candidates.jitter_deg": 45.0,
+    "lift.p_TG": [0.0, 0.0, 0.50],
+    "lift.max_speed": 0.2,
+    "lift.max_acceleration": 0.05,
+    "camera.distance": 0.30,
+    "camera.far": 0.70,
+}
+
+#: The paper's numbers (design.md, 1): the defaults.
+PAPER = {
+    "objects.mass": 1.0,
+    "physics.friction_hand": 0.71,
+    "physics.friction_table": 0.71,
+    "settle.drop_height": 0.3,
+    "candidates.method": "rotations",
+    "candidates.max": 10_000,
+    "candidates.global_x_deg": [0, 30, 60, 90, 120, 150, 180],
+    "candidates.global_y_deg": [0, 30, 60, 90, 120, 150, 180, 210, 240, 270, 300, 330],
+    "candidates.global_z_deg": GRID_45,
+    "candidates.local_x_deg": [0, 20, 40, 60, 80, 100, 120, 140, 160, 180],
+    "candidates.local_y_deg": [20 * i for i in range(18)],
+    "candidates.local_z_deg": GRID_45,
+    "candidates.jitter_deg": 0.0,
+    "candidates.standoffs": [0.06, 0.09, 0.12],
+    "candidates.spreads_deg": [0.0, 11.25, 22.5],
+    "lift.p_TG": [0.0, 0.0, 0.60],
+    "camera.distance": 0.25,
+    "camera.size": 128,
+    "camera.fov_y_deg": 50.0,
+    "camera.near": 0.01,
+    "camera.far": 0.75,
+    "filters.min_depth_variance": 1e-3,
+    "filters.outlier_sigma": 4.0,
+    "split.valid_fraction": 0.1,
+    "split.train_classes": None,
+}
+
+#: They act on assembled shards, or say only where to stop.
+NOT_SIMULATED = ("filters", "split", "max_grasps", "attempt_seconds")
+
+
+def leaves(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield every value that is no section with its dotted key."""
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from leaves(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def fields(section: type[BaseModel], prefix: str = "") -> Iterator[str]:
+    """Yield every dotted key that a section's class has."""
+    for name, info in section.model_fields.items():
+        if isinstance(info.annotation, type) and issubclass(info.annotation, BaseModel):
+            yield from fields(info.annotation, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}"
+
+
+def write(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "config.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+EVERYTHING = dict(leaves(yaml.safe_load(ONE_OF_EVERYTHING)))
+DEFAULT_VALUES = dict(leaves(Config().to_dict()))
+
+
+def test_empty_mapping_and_empty_file_are_the_defaults(tmp_path: Path) -> None:
+    document = yaml.safe_load(DEFAULTS)
+    assert parse_config(document["Defaults"]) == Config()
+    assert load_config(write(tmp_path, "{}")) == Config()
+    assert load_config(write(tmp_path, "# nothing but a comment\n")) == Config()
+
+
+def test_one_of_everything_misses_no_field() -> None:
+    assert set(EVERYTHING) == set(fields(Config))
+
+
+def test_one_of_everything_has_no_default() -> None:
+    same = [key for key, value in EVERYTHING.items() if value == DEFAULT_VALUES[key]]
+    assert not same
+
+
+def test_one_of_everything_arrives_as_written(tmp_path: Path) -> None:
+    config = load_config(write(tmp_path, ONE_OF_EVERYTHING))
+    assert dict(leaves(config.to_dict())) == EVERYTHING
+
+
+def test_resolved_values_load_again_to_the_same(tmp_path: Path) -> None:
+    """The manifest keeps `to_dict` as JSON; that must be enough to go on from."""
+    config = load_config(write(tmp_path, ONE_OF_EVERYTHING))
+    assert parse_config(json.loads(json.dumps(config.to_dict()))) == config
+
+
+def test_presets_are_listed() -> None:
+    assert preset_names() == ["paper", "released"]
+
+
+def test_paper_is_the_default_and_states_the_papers_numbers() -> None:
+    assert load_config() == load_config("paper") == Config()
+    assert {key: DEFAULT_VALUES[key] for key in PAPER} == PAPER
+
+
+def test_released_differs_from_the_paper_in_exactly_the_published_numbers() -> None:
+    values = dict(leaves(load_config("released").to_dict()))
+    assert values == {**DEFAULT_VALUES, **RELEASED}
+
+
+def test_override_reaches_into_a_section_and_leaves_its_other_keys() -> None:
+    config = load_config("released", ["camera.size=64", "max_grasps=5", "split.train_classes=[a]"])
+    assert (config.camera.size, config.camera.far, config.max_grasps) == (64, 0.70, 5)
+    assert config.split.train_classes == ("a",)
+
+
+def test_later_override_wins_and_named_values_win_over_it() -> None:
+    overrides = ["seed=1", "objects.mass=2", "objects.mass=3", "seed=2"]
+    assert load_config(overrides=overrides).objects.mass == 3.0
+    assert load_config(overrides=overrides).seed == 2
+    assert load_config(overrides=overrides, seed=4).seed == 4
+    assert load_config(overrides=overrides, seed=None).seed == 2
+    assert load_config(overrides=overrides, seed=0).seed == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [("1e7", 1e7), ("1.0e7", 1e7), ("10_000_000", 1e7), (" 5 ", 5.0)]
+)
+def test_number_may_be_written_as_people_do(text: str, value: float) -> None:
+    """YAML 1.1 takes 1e7, without a point, for text; it must still be a number here."""
+    config = load_config(overrides=[f"physics.fingertip_modulus={text}"])
+    assert config.physics.fingertip_modulus == value
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("objects.weight=1", r"objects\.weight: must be a known key \(.*\bmass\b.*\), got an unk"),
+        ("camara.size=64", r"camara: must be a known key \(.*\bcamera\b.*\), got an unknown one"),
+        ("objects.mass=heavy", r"objects\.mass: must be a valid number.*, got 'heavy'"),
+        ("objects.mass=null", r"objects\.mass: must be a valid number, got None"),
+        ("objects.mass=[1, 2]", r"objects\.mass: must be a valid number, got \[1, 2\]"),
+        ("objects.mass=-1", r"objects\.mass: must be greater than 0, got -1"),
+        ("objects.mass=0", r"objects\.mass: must be greater than 0, got 0"),
+        ("objects.mass=.nan", r"objects\.mass: must be a finite number, got nan"),
+        ("objects.mass=.inf", r"objects\.mass: must be a finite number, got inf"),
+        ("objects.min_diagonal=3", r"objects: min_diagonal must be less than .*, got 3\.0 and 2\."),
+        ("physics.time_step=.nan", r"physics\.time_step: must be .*, got nan"),
+        ("physics.time_step=0.1", r"physics\.time_step: must be less than .* 0\.02, got 0\.1"),
+        ("physics.solver=tamsi", r"solver: must be 'lagged', 'similar' or 'sap', got 'tamsi'"),
+        ("seed=1.5", r"seed: must be a valid integer.*, got 1\.5"),
+        ("seed=-1", r"seed: must be greater than or equal to 0, got -1"),
+        ("hand=3", r"hand: must be a valid string, got 3"),
+        ("max_grasps=0", r"max_grasps: must be greater than or equal to 1, got 0"),
+        ("camera=3", r"camera: must be .*, got 3"),
+        ("camera=[1]", r"camera: must be .*, got \[1\]"),
+        ("camera.near=0.75", r"camera: near must be less than far, got 0\.75 and 0\.75"),
+        ("camera.far=0.001", r"camera: near must be less than far, got 0\.01 and 0\.001"),
+        ("camera.fov_y_deg=180", r"camera\.fov_y_deg: must be less than 180, got 180"),
+        ("camera.size.width=3", r"camera\.size: must be a valid integer, got \{'width': 3\}"),
+        ("candidates.standoffs=[]", r"candidates\.standoffs: must be a list of at least 1, got \["),
+        ("candidates.standoffs=[0.1, -1]", r"standoffs\.1: must be greater than 0, got -1"),
+        ("candidates.standoffs=0.1", r"candidates\.standoffs: must be .*, got 0\.1"),
+        ("candidates.global_x_deg=[.inf]", r"global_x_deg\.0: must be a finite number, got inf"),
+        ("candidates.spreads_deg=[.nan]", r"candidates\.spreads_deg\.0: must be .*, got nan"),
+        ("lift.p_TG=3", r"lift\.p_TG: must be .*, got 3"),
+        ("lift.p_TG=[0, 0]", r"lift\.p_TG.*: must be .*, got \[0, 0\]"),
+        ("lift.p_TG=[0, 0, 0, 1]", r"lift\.p_TG: must be .*, got \[0, 0, 0, 1\]"),
+        ("split.valid_fraction=1", r"split\.valid_fraction: must be less than 1, got 1"),
+        ("split.train_classes=mug", r"split\.train_classes: must be .*, got 'mug'"),
+        ("seed", r"--set must be KEY=VALUE with dots between keys, got 'seed'"),
+        ("=1", r"--set must be KEY=VALUE .*, got '=1'"),
+        ("camera..size=1", r"--set must be KEY=VALUE .*, got 'camera\.\.size=1'"),
+        ("seed=[1", r"seed: must be a YAML value, got '\[1'"),
+    ],
+)
+def test_mistake_is_refused_with_key_demand_and_value(override: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_config(overrides=[override])
+    assert "\n" not in str(caught.value)
+    assert isinstance(caught.value, DrakegraspError)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("- a\n- b\n", r"config\.yaml: must be a mapping of keys to values, got list"),
+        ("just words\n", r"config\.yaml: must be a mapping of keys to values, got str"),
+        ("a: [1\n", r"config\.yaml: must be YAML, got text that is not"),
+        ("camera: {size: 64\n", r"config\.yaml: must be YAML, got text that is not"),
+        ("camera: 5\n", r"camera: must be .*, got 5"),
+        ("camera:\n", r"camera: must be .*, got None"),
+        ("cameras: {size: 64}\n", r"cameras: must be a known key .*, got an unknown one"),
+        ("1: 2\n", r"1: must be .*, got 1"),
+    ],
+)
+def test_file_that_is_no_configuration_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load_config(write(tmp_path, text))
+
+
+@pytest.mark.parametrize("name", ["papper", "no/such.yaml", "."])
+def test_missing_file_is_refused_with_the_presets_there_are(name: str) -> None:
+    with pytest.raises(ConfigError, match=rf"presets paper, released, got '{re.escape(name)}'"):
+        load_config(name)
+
+
+def test_all_mistakes_are_told_at_once() -> None:
+    with pytest.raises(ConfigError, match=r"seed: must be .*; objects\.mass: must be "):
+        load_config(overrides=["seed=-1", "objects.mass=-1"])
+
+
+def test_override_into_a_value_of_the_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"camera\.size: camera must be a section, got the val"):
+        load_config(write(tmp_path, "camera: 5\n"), ["camera.size=64"])
+
+
+@pytest.mark.xfail(strict=True, raises=UnicodeDecodeError, reason="config.py: decode error leaks")
+def test_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "config.yaml"
+    path.write_bytes(b"hand: \xff\xfe")
+    with pytest.raises(ConfigError, match=r"config\.yaml: must be"):
+        load_config(path)
+
+
+@pytest.mark.xfail(strict=True, reason="config.py: these floats allow what is not finite")
+@pytest.mark.parametrize(
+    "override", ["lift.p_TG=[0, 0, .nan]", "filters.min_camera_height=.nan", "lift.p_TG=[.inf,0,0]"]
+)
+def test_number_that_is_not_finite_is_refused_everywhere(override: str) -> None:
+    with pytest.raises(ConfigError, match=r"must be a finite number, got (nan|inf)"):
+        load_config(overrides=[override])
+
+
+@pytest.mark.xfail(strict=True, reason="config.py: lax mode takes true for 1")
+@pytest.mark.parametrize("override", ["objects.mass=true", "seed=yes"])
+def test_truth_value_is_no_number(override: str) -> None:
+    with pytest.raises(ConfigError, match=r"must be .*, got True"):
+        load_config(overrides=[override])
+
+
+def test_configuration_is_inert() -> None:
+    with pytest.raises(ValidationError, match="frozen"):
+        Config().camera.size = 64  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("key", sorted(EVERYTHING))
+def test_simulation_hash_changes_with_what_is_simulated_and_nothing_else(key: str) -> None:
+    """A shard is reused when the hash agrees: a key too few mixes data, one too many wastes it."""
+    changed = load_config(overrides=[f"{key}={json.dumps(EVERYTHING[key])}"])
+    assert changed != Config()
+    same = changed.simulation_hash() == Config().simulation_hash()
+    assert same is (key.split(".")[0] in NOT_SIMULATED)
+
+
+def test_simulation_hash_does_not_depend_on_the_order_of_keys(tmp_path: Path) -> None:
+    def shuffled(tree: dict[str, Any], rng: random.Random) -> dict[str, Any]:
+        keys = rng.sample(list(tree), len(tree))
+        return {k: shuffled(tree[k], rng) if isinstance(tree[k], dict) else tree[k] for k in keys}
+
+    tree = yaml.safe_load(ONE_OF_EVERYTHING)
+    other = shuffled(tree, random.Random(0))
+    assert list(other) != list(tree)
+    text = yaml.safe_dump(other, sort_keys=False)
+    assert load_config(write(tmp_path, text)).simulation_hash() == (
+        parse_config(tree).simulation_hash()
+    )
+
+
+def test_simulation_hash_is_that_of_the_value_not_of_its_spelling() -> None:
+    one = load_config(overrides=["objects.mass=2", "candidates.standoffs=[1, 2]"])
+    two = load_config(overrides=["objects.mass=2.0", "candidates.standoffs=[1.0, 2e0]"])
+    assert one.simulation_hash() == two.simulation_hash()
+    assert re.fullmatch(r"[0-9a-f]{16}", one.simulation_hash())

@@ -1,0 +1,118 @@
+"""Poses compose as their letters say, and packing loses nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
+
+from drakegrasp.frames import (
+    P_WT,
+    X_WT,
+    Array,
+    invert_pose,
+    make_pose,
+    pack_pose,
+    rotate_vectors,
+    rotation_angle,
+    transform_points,
+    unpack_pose,
+)
+
+vectors = arrays(np.float64, 3, elements=st.floats(-3.0, 3.0))
+poses = st.builds(lambda r, p: make_pose(Rotation.from_rotvec(r).as_matrix(), p), vectors, vectors)
+points = arrays(np.float64, st.tuples(st.integers(0, 5), st.just(3)), elements=st.floats(-2.0, 2.0))
+
+#: Turns x to y, y to z, z to x.
+R_CYCLE = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+
+def test_table_top_is_065_m_above_the_world_and_level() -> None:
+    np.testing.assert_array_equal(P_WT, [0.0, 0.0, 0.65])
+    np.testing.assert_array_equal(X_WT, make_pose(np.eye(3), [0.0, 0.0, 0.65]))
+
+
+def test_pose_is_packed_as_its_first_three_rows_row_major() -> None:
+    packed = pack_pose(make_pose(R_CYCLE, [0.1, 0.2, 0.3]))
+    np.testing.assert_array_equal(packed, [0, 0, 1, 0.1, 1, 0, 0, 0.2, 0, 1, 0, 0.3])
+
+
+@given(poses)
+def test_packing_a_pose_loses_no_bit(X_AB: Array) -> None:
+    np.testing.assert_array_equal(unpack_pose(pack_pose(X_AB)), X_AB)
+
+
+@pytest.mark.parametrize("leading", [(), (1,), (4,), (2, 3), (0,)])
+def test_packing_keeps_the_leading_dimensions(leading: tuple[int, ...]) -> None:
+    X_AB = np.broadcast_to(make_pose(R_CYCLE, [1.0, 2.0, 3.0]), (*leading, 4, 4))
+    packed = pack_pose(X_AB)
+    assert packed.shape == (*leading, 12)
+    np.testing.assert_array_equal(unpack_pose(packed), X_AB)
+
+
+@given(poses)
+def test_pose_times_its_inverse_is_the_identity(X_AB: Array) -> None:
+    np.testing.assert_allclose(X_AB @ invert_pose(X_AB), np.eye(4), atol=1e-14)
+    np.testing.assert_allclose(invert_pose(X_AB) @ X_AB, np.eye(4), atol=1e-14)
+
+
+@given(st.lists(poses, min_size=1, max_size=4))
+def test_many_poses_are_inverted_as_each_of_them(many: list[Array]) -> None:
+    together = invert_pose(np.stack(many))
+    np.testing.assert_array_equal(together, np.stack([invert_pose(X) for X in many]))
+
+
+def test_inverse_in_closed_form() -> None:
+    """X_BA has the transposed rotation and -R_BA p_AB: here p = (0.1, 0.2, 0.3) cycled back."""
+    X_BA = invert_pose(make_pose(R_CYCLE, [0.1, 0.2, 0.3]))
+    np.testing.assert_array_equal(X_BA[:3, :3], R_CYCLE.T)
+    np.testing.assert_allclose(X_BA[:3, 3], [-0.2, -0.3, -0.1], atol=1e-15)
+
+
+@given(poses, poses, points)
+def test_composition_matches_neighbouring_letters(X_AB: Array, X_BC: Array, p_CQ: Array) -> None:
+    in_one_step = transform_points(X_AB @ X_BC, p_CQ)
+    in_two_steps = transform_points(X_AB, transform_points(X_BC, p_CQ))
+    np.testing.assert_allclose(in_one_step, in_two_steps, atol=1e-13)
+    assert in_one_step.shape == p_CQ.shape
+
+
+@given(poses, points)
+def test_vectors_turn_but_do_not_move(X_AB: Array, v_B: Array) -> None:
+    v_A = rotate_vectors(X_AB, v_B)
+    origin = transform_points(X_AB, np.zeros((1, 3)))
+    np.testing.assert_allclose(v_A, transform_points(X_AB, v_B) - origin, atol=1e-13)
+    np.testing.assert_allclose(
+        np.linalg.norm(v_A, axis=1), np.linalg.norm(v_B, axis=1), atol=1e-13
+    )
+
+
+def test_points_and_vectors_in_closed_form() -> None:
+    X_AB = make_pose(R_CYCLE, [1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(transform_points(X_AB, [[0.0, 0.0, 1.0]]), [[2.0, 2.0, 3.0]])
+    np.testing.assert_array_equal(rotate_vectors(X_AB, [[0.0, 0.0, 1.0]]), [[1.0, 0.0, 0.0]])
+
+
+@given(vectors, st.floats(0.0, np.pi))
+def test_rotation_angle_is_the_angle_about_any_axis(axis: Array, angle: float) -> None:
+    axis = axis + [0.0, 0.0, 4.0]  # never zero
+    R_AB = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
+    # The arc cosine is worth half the digits at its ends.
+    assert rotation_angle(R_AB) == pytest.approx(angle, abs=1e-7)
+
+
+@pytest.mark.parametrize(("scale", "angle"), [(1.0 + 1e-12, 0.0), (-1.0 / 3.0 - 1e-12, np.pi)])
+def test_rotation_angle_survives_rounding_at_its_ends(scale: float, angle: float) -> None:
+    """A trace a hair beyond 3 or -1 must give 0 or pi, never NaN."""
+    assert rotation_angle(scale * np.eye(3)) == pytest.approx(angle)
+
+
+def test_no_argument_is_changed() -> None:
+    X_AB = make_pose(R_CYCLE, [1.0, 2.0, 3.0])
+    for locked in (X_AB, q := np.ones((2, 3))):
+        locked.setflags(write=False)
+    for result in (invert_pose(X_AB), unpack_pose(pack_pose(X_AB)), transform_points(X_AB, q)):
+        assert not np.shares_memory(result, X_AB)

@@ -1,0 +1,58 @@
+"""The outcomes as files hold them: a number that changes here breaks every old dataset."""
+
+from __future__ import annotations
+
+import pytest
+
+from drakegrasp.outcomes import Outcome, Stage
+
+PLACED, CLOSED, LIFTED = Stage.PLACED, Stage.CLOSED, Stage.LIFTED
+
+#: Label, frozen number, last stage with results, whether it says nothing about the grasp.
+TABLE = [
+    ("success", 0, LIFTED, False),
+    ("below_table", 1, PLACED, False),
+    ("ray_miss", 2, PLACED, False),
+    ("start_collision", 3, PLACED, False),
+    ("screened", 4, PLACED, False),
+    ("missing_fingertip", 5, CLOSED, False),
+    ("hand_contact", 6, CLOSED, False),
+    ("table_contact", 7, CLOSED, False),
+    ("slipped", 8, LIFTED, False),
+    ("dropped", 9, LIFTED, False),
+    ("solver_error", 10, PLACED, True),
+    ("timeout", 11, PLACED, True),
+    ("crashed", 12, PLACED, True),
+]
+
+
+def test_numbers_in_files_are_frozen() -> None:
+    assert {o.label: o.value for o in Outcome} == {label: value for label, value, *_ in TABLE}
+
+
+def test_numbers_fit_the_files_byte() -> None:
+    assert 0 <= min(Outcome) <= max(Outcome) <= 255
+
+
+@pytest.mark.parametrize(("label", "value", "stage", "says_nothing"), TABLE)
+def test_number_from_a_file_tells_label_and_stage(
+    label: str, value: int, stage: Stage, says_nothing: bool
+) -> None:
+    outcome = Outcome(value)
+    assert outcome.label == label
+    assert outcome.stage is stage
+    assert outcome.says_nothing is says_nothing
+
+
+def test_every_outcome_has_a_stage() -> None:
+    assert {type(outcome.stage) for outcome in Outcome} == {Stage}
+
+
+def test_stages_are_ordered_and_frozen() -> None:
+    """Code compares stages with <: a lifted trial has everything that a closed one has."""
+    assert {s.name: s.value for s in Stage} == {"PLACED": 0, "CLOSED": 1, "LIFTED": 2}
+
+
+def test_number_of_no_outcome_is_refused() -> None:
+    with pytest.raises(ValueError, match="13"):
+        Outcome(13)
