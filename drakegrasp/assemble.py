@@ -83,9 +83,7 @@ class _Part:
     shapes: Mapping[str, tuple[int, ...]]
 
 
-def assemble(
-    out: Path, *, rejected: Sequence[int] = (), progress: Report = silent
-) -> Assembly:
+def assemble(out: Path, *, rejected: Sequence[int] = (), progress: Report = silent) -> Assembly:
     """Write the three files of a dataset whose work units are all done.
 
     Args:
@@ -131,9 +129,10 @@ def summarise(out: Path) -> Assembly:
         DataError: If they are missing or damaged.
     """
     try:
-        with h5py.File(out / TRIALS_FILE, "r") as trials, h5py.File(
-            out / DATA_FILES["oto"], "r"
-        ) as data:
+        with (
+            h5py.File(out / TRIALS_FILE, "r") as trials,
+            h5py.File(out / DATA_FILES["oto"], "r") as data,
+        ):
             removal = trials["successes/removal"][:]
             reasons, counts = np.unique(removal, return_counts=True)
             return Assembly(
@@ -178,7 +177,7 @@ def is_assembled(out: Path) -> bool:
 def _walk(out: Path, manifest: Manifest) -> Iterator[tuple[_Part, Shard]]:
     """Yield the shards in the order of their rows, each object's up to its last wanted grasp."""
     index = {entry["name"]: i for i, entry in enumerate(manifest.objects)}
-    wanted = dict.fromkeys(index, manifest.config.max_grasps)
+    wanted: dict[str, int | None] = dict.fromkeys(index, manifest.config.max_grasps)
     first = 0
     for header in manifest.headers():
         name = header.object_name
@@ -353,9 +352,7 @@ def _write_samples(
                     file[split][field.name][place] = sample[field.name]
 
 
-def _sample(
-    model: ObjectModel, shard: Shard, row: int, k: int, camera: str
-) -> dict[str, Any]:
+def _sample(model: ObjectModel, shard: Shard, row: int, k: int, camera: str) -> dict[str, Any]:
     """Return a sample by the names of DATA_FIELDS, without its trial's id."""
     trials, looks = shard.trials, shard.looks
     X_TO = unpack_pose(trials["X_TO"][row])

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from drakegrasp.config import CameraConfig
 from drakegrasp.frames import Array, make_pose
 
-#: Below this sine of the angle between view and vertical, up is taken from +Ty (0.1 degree).
+#: Below this sine of the angle between view and vertical, up is taken from +Ty (0.06 degree).
 LOOKS_VERTICALLY = 1e-3
 
 

@@ -162,7 +162,7 @@ def normal_candidates(model: ObjectModel, count: int, rng: np.random.Generator) 
     """Return poses (n, 4, 4) that look at random surface points against their normals.
 
     The points are spread evenly over the area, the roll about the normal is uniform, and
-    the palm starts at the distance of the box's corner, outside of the object.
+    the palm starts two of the box's half diagonals away, outside of the object.
     """
     mesh = model.visual
     points, faces = trimesh.sample.sample_surface(mesh, count, seed=int(rng.integers(2**31)))
@@ -175,7 +175,7 @@ def normal_candidates(model: ObjectModel, count: int, rng: np.random.Generator) 
     x = np.cos(roll) * x + np.sin(roll) * np.cross(z, x)
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, :3, 0], poses[:, :3, 1], poses[:, :3, 2] = x, np.cross(z, x), z
-    poses[:, :3, 3] = points - z * np.linalg.norm(model.half_extents)
+    poses[:, :3, 3] = points - 2.0 * z * np.linalg.norm(model.half_extents)
     return poses
 
 
@@ -192,8 +192,8 @@ def ray_meets_box(p_OG: Array, z_O: Array, half: Array) -> npt.NDArray[np.bool_]
     with np.errstate(divide="ignore", invalid="ignore"):
         t1, t2 = (-half - p_OG) / direction, (half - p_OG) / direction
     # 0/0, a ray within a slab's face, constrains nothing: fmax and fmin skip the NaN.
-    entry = np.fmax.reduce(np.fmin(t1, t2), axis=1)
-    leave = np.fmin.reduce(np.fmax(t1, t2), axis=1)
+    entry = np.fmax.reduce(np.minimum(t1, t2), axis=1)
+    leave = np.fmin.reduce(np.maximum(t1, t2), axis=1)
     return leave >= np.maximum(entry, 0.0)
 
 

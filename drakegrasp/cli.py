@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 #: Errors of what was asked for, as against errors of what was done.
 WRONG_USAGE = (ConfigError, HandError, MeshError)
-#: Width of tables where standard output is not a terminal.
-WIDTH = 130
+#: Width of tables where standard output is not a terminal [characters].
+WIDTH = 160
 
 
 class _Commands(click.Group):
@@ -71,7 +71,9 @@ def doctor(directory: Path) -> None:
 
     findings = diagnose(directory)
     for finding in findings:
-        mark = click.style("ok     ", fg="green") if finding.ok else click.style("MISSING", fg="red")
+        mark = (
+            click.style("ok     ", fg="green") if finding.ok else click.style("MISSING", fg="red")
+        )
         click.echo(f"{mark}  {finding.name:<18} {finding.what}")
         if not finding.ok:
             click.echo(f"         -> {finding.mend}")
@@ -135,7 +137,11 @@ def audit(mesh_dir: Path, units: str, manifest: Path | None) -> None:
     "--config", metavar="YAML|PRESET", help="Configuration: a file, or paper or released.  [paper]"
 )
 @click.option(
-    "--set", "overrides", multiple=True, metavar="KEY=VALUE", help="Set one value, e.g. lift.hold_time=1."
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Set one value, e.g. lift.hold_time=1.",
 )
 @click.option("--candidates", type=int, help="Palm poses per object.  [10000]")
 @click.option("--max-grasps", type=int, help="Grasps per object after which no more are tried.")
@@ -145,7 +151,9 @@ def audit(mesh_dir: Path, units: str, manifest: Path | None) -> None:
 @click.option("--workers", type=int, help="Processes on this machine.  [one per core]")
 @click.option("--scheduler", metavar="ADDRESS", help="A running Dask scheduler to use instead.")
 @click.option(
-    "--scheduler-file", type=click.Path(path_type=Path), help="Its JSON file, instead of the address."
+    "--scheduler-file",
+    type=click.Path(path_type=Path),
+    help="Its JSON file, instead of the address.",
 )
 @click.option("--quiet", is_flag=True, help="Show no progress.")
 def build(

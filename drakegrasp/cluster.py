@@ -20,7 +20,7 @@ from distributed import Client, Future, KilledWorker, LocalCluster, as_completed
 from drakegrasp.build import BuildReport, build
 from drakegrasp.builtin import export_builtin
 from drakegrasp.config import Config, load_config
-from drakegrasp.errors import ConfigError, EnvironmentFailure
+from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.manifest import BUILTIN_FOLDER, claim_directory
 from drakegrasp.meshes import find_meshes
 from drakegrasp.units import close_workbenches
@@ -119,7 +119,7 @@ def connect(
         scheduler_file: Its JSON file, instead of the address.
 
     Raises:
-        EnvironmentFailure: If there is no scheduler at the address.
+        MachineError: If there is no scheduler at the address.
     """
     with dask.config.set(DASK_SETTINGS):
         if scheduler or scheduler_file:
@@ -127,7 +127,7 @@ def connect(
             try:
                 client = Client(scheduler, scheduler_file=file, timeout=CONNECT_SECONDS)
             except (OSError, ValueError) as error:
-                raise EnvironmentFailure(
+                raise MachineError(
                     f"{scheduler or file}: must be a running Dask scheduler, got none ({error})"
                 ) from None
             with client:
@@ -165,7 +165,7 @@ class DaskExecutor:
         """Yield function(item) of every item as they are done.
 
         Raises:
-            EnvironmentFailure: If the workers died of an item again and again.
+            MachineError: If the workers died of an item again and again.
             Exception: What the function raised.
         """
         waiting = iter(items)
@@ -176,7 +176,7 @@ class DaskExecutor:
             try:
                 yield future.result()
             except KilledWorker as error:
-                raise EnvironmentFailure(f"the workers must stay alive, got: {error}") from None
+                raise MachineError(f"the workers must stay alive, got: {error}") from None
             for item in islice(waiting, max(0, self._room() - running.count())):
                 running.add(self._submit(function, item))
 

@@ -15,10 +15,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic_core import PydanticCustomError
 
 from drakegrasp.errors import ConfigError
 
+Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
@@ -26,7 +28,15 @@ Angles = Annotated[tuple[Annotated[float, Field(allow_inf_nan=False)], ...], Fie
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _no_truth_values(cls, value: Any) -> Any:
+        # YAML reads "yes" as true, and pydantic would take that for a 1.
+        if isinstance(value, bool):
+            raise PydanticCustomError("bool", "Input should be a number or text")
+        return value
 
 
 class ObjectConfig(_Section):
@@ -102,7 +112,11 @@ class CloseConfig(_Section):
 class LiftConfig(_Section):
     """Freeing the object and moving the wrist to the target."""
 
-    p_TG: tuple[float, float, float] = (0.0, 0.0, 0.60)  # [m], target of the palm (paper)
+    p_TG: Annotated[tuple[Number, ...], Field(min_length=3, max_length=3)] = (
+        0.0,
+        0.0,
+        0.60,
+    )  # [m], target of the palm (paper)
     max_speed: Positive = 0.5  # [m/s] of the wrist
     max_acceleration: Positive = 1.0  # [m/s^2] of the wrist
     hold_time: NonNegative = 0.3  # [s] at the target before the second judgement
@@ -129,7 +143,7 @@ class FilterConfig(_Section):
     """The paper's postprocessing; applied when the files are assembled, not when simulating."""
 
     min_depth_variance: NonNegative = 1e-3  # [m^2], flatter otm depth images are removed
-    min_camera_height: float = 0.01  # [m] above the table; lower ones see it edge-on
+    min_camera_height: Number = 0.01  # [m] above the table; lower ones see it edge-on
     outlier_sigma: NonNegative = 4.0  # per object and component of the grasp; 0 switches it off
     max_surface_distance: Positive = 2e-3  # [m], of a contact point from the object's surface
 
@@ -179,7 +193,9 @@ class Config(_Section):
 def preset_names() -> list[str]:
     """Return the names of the presets that come with the package."""
     folder = resources.files("drakegrasp") / "presets"
-    return sorted(p.name.removesuffix(".yaml") for p in folder.iterdir() if p.name.endswith(".yaml"))
+    return sorted(
+        p.name.removesuffix(".yaml") for p in folder.iterdir() if p.name.endswith(".yaml")
+    )
 
 
 def load_config(
@@ -226,7 +242,11 @@ def parse_config(tree: dict[str, Any]) -> Config:
     try:
         return Config.model_validate(tree)
     except ValidationError as error:
-        raise ConfigError("; ".join(_describe(e) for e in error.errors())) from None
+        # A bad item of a list also makes the list too short: say the first thing only.
+        first: dict[Any, Any] = {}
+        for found in error.errors():
+            first.setdefault(found["loc"][:2], found)
+        raise ConfigError("; ".join(_describe(e) for e in first.values())) from None
 
 
 def _read_source(source: str | Path) -> dict[str, Any]:
@@ -240,7 +260,10 @@ def _read_source(source: str | Path) -> dict[str, Any]:
                 f"config must be a YAML file or one of the presets {', '.join(preset_names())}, "
                 f"got {str(source)!r}"
             )
-        text, name = path.read_text(encoding="utf-8"), str(path)
+        try:
+            text, name = path.read_text(encoding="utf-8"), str(path)
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(f"{path}: must be a readable UTF-8 file, got: {error}") from None
     try:
         tree = yaml.safe_load(text)
     except yaml.YAMLError as error:
@@ -250,7 +273,14 @@ def _read_source(source: str | Path) -> dict[str, Any]:
         return {}
     if not isinstance(tree, dict):
         raise ConfigError(f"{name}: must be a mapping of keys to values, got {type(tree).__name__}")
-    return tree
+    # A section whose keys are all commented out is read as None.
+    empty = [key for key in Config.model_fields if tree.get(key, 0) is None and _is_section(key)]
+    return {**tree, **{key: {} for key in empty}}
+
+
+def _is_section(key: str) -> bool:
+    annotation = Config.model_fields[key].annotation
+    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
 
 
 def _apply_override(tree: dict[str, Any], text: str) -> None:
@@ -274,13 +304,16 @@ def _describe(error: Any) -> str:
     """Return one pydantic error as `path: must ..., got ...`."""
     path = ".".join(str(part) for part in error["loc"]) or "config"
     if error["type"] == "extra_forbidden":
-        return f"{path}: must be a known key ({', '.join(_siblings(error['loc']))}), got an unknown one"
+        known = ", ".join(_siblings(error["loc"]))
+        return f"{path}: must be a known key ({known}), got an unknown one"
     message = str(error["msg"]).removeprefix("Value error, ")
     if error["type"] == "value_error":
         return f"{path}: {message}"
     must = message.removeprefix("Input should be ").removeprefix("Input should ")
     if error["type"] == "too_short":
         must = f"a list of at least {error['ctx']['min_length']}"
+    if error["type"] == "too_long":
+        must = f"a list of at most {error['ctx']['max_length']}"
     return f"{path}: must be {must}, got {error['input']!r}"
 
 

@@ -200,4 +200,3 @@ def _faces(
 def _body_of(scene: Scene, geometry_id: object) -> BodyIndex:
     inspector = scene.scene_graph.model_inspector()
     return scene.plant.GetBodyFromFrameId(inspector.GetFrameId(geometry_id)).index()
-

@@ -1,8 +1,8 @@
 """Reading a dataset: h5py and NumPy only, no Drake, no trimesh, no Dask.
 
-    >>> data = GraspDataset("OUT/grasping_oto.hdf5", split="train")   # doctest: +SKIP
-    >>> data[0].image.shape, data[0].grasp.shape                      # doctest: +SKIP
-    ((4, 128, 128), (18,))
+>>> data = GraspDataset("OUT/grasping_oto.hdf5", split="train")   # doctest: +SKIP
+>>> data[0].image.shape, data[0].grasp.shape                      # doctest: +SKIP
+((4, 128, 128), (18,))
 """
 
 from __future__ import annotations

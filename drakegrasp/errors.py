@@ -5,7 +5,7 @@
   * MeshError            a mesh that cannot become a simulated object
   * HandError            a hand description (SDFormat and YAML) that cannot be used
   * DataError            a dataset, shard or manifest that is missing, foreign or broken
-  * EnvironmentFailure   something that the machine lacks (EGL, a usable Drake, disk)
+  * MachineError         something that the machine lacks (EGL, a usable Drake, disk)
 
 Failures of the physics are not here: they are values, see `drakegrasp.outcomes`.
 Messages follow one pattern: what, what it must be, what it was.
@@ -32,5 +32,5 @@ class DataError(DrakegraspError, ValueError):
     """A dataset, shard or manifest that is missing, foreign or broken."""
 
 
-class EnvironmentFailure(DrakegraspError, RuntimeError):
+class MachineError(DrakegraspError, RuntimeError):
     """Something that this machine lacks, with the line that mends it."""

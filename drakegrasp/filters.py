@@ -112,7 +112,8 @@ def split_samples(
 
     Args:
         objects: (n,), object index of each sample.
-        names, classes: By object index.
+        names: Of the objects, by index.
+        classes: Of the objects, by index.
         config: Share and classes.
         seed: Of the dataset.
     """

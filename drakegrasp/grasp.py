@@ -25,8 +25,7 @@ def pack_grasp(p_AQ: npt.ArrayLike, nhat_Q_A: npt.ArrayLike) -> Array:
     points, normals = np.asarray(p_AQ, dtype=float), np.asarray(nhat_Q_A, dtype=float)
     if points.ndim != 2 or points.shape[1] != 3 or normals.shape != points.shape:
         raise ValueError(
-            "points and normals must both be (k, 3) arrays, "
-            f"got {points.shape} and {normals.shape}"
+            f"points and normals must both be (k, 3) arrays, got {points.shape} and {normals.shape}"
         )
     return np.concatenate([points.ravel(), normals.ravel()])
 

@@ -72,12 +72,12 @@ class Finger:
             raise ValueError(f"pad_normal must not be zero, got {self.pad_normal}")
 
     @property
-    def p_FiP(self) -> Array:  # noqa: N802 (monogram notation)
+    def p_FiP(self) -> Array:
         """Nominal contact point on the pad (3,) in the fingertip link's frame [m]."""
         return np.array(self.pad_point)
 
     @property
-    def n_Fi(self) -> Array:  # noqa: N802 (monogram notation)
+    def n_Fi(self) -> Array:
         """Unit outward normal of the pad (3,) in the fingertip link's frame."""
         n: Array = np.array(self.pad_normal)
         return n / float(np.linalg.norm(n))

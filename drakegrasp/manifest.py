@@ -27,6 +27,8 @@ BUILTIN_FOLDER = "builtin"
 OWN_FOLDERS = (BUILTIN_FOLDER, "objects", "shards")
 #: Packages whose versions may change a result.
 VERSIONED = ("drakegrasp", "drake", "numpy", "scipy", "trimesh", "manifold3d", "embreex", "h5py")
+#: Those of them that a dataset is never continued with another version of.
+DECISIVE = ("drakegrasp", "drake")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,6 +156,13 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
             f"{out}: must be empty or hold this configuration's dataset, got one that differs in "
             f"{_differences(manifest.config, config)}; choose another --out"
         )
+    for name in DECISIVE:
+        then, now = manifest.versions.get(name), installed_versions()[name]
+        if then != now:
+            raise DataError(
+                f"{out}: must be continued with {name} {then}, which made it, got {now}; "
+                "choose another --out"
+            )
     return manifest
 
 

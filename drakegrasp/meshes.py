@@ -522,7 +522,7 @@ def load_object(path: str | Path) -> ObjectModel:
     """
     path = Path(path)
     try:
-        with np.load(path, allow_pickle=False) as content:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as content:
             values: dict[str, Any] = {f.name: content[f.name] for f in fields(ObjectModel)}
     except Exception as error:
         raise MeshError(

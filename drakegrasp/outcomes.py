@@ -42,7 +42,7 @@ class Outcome(IntEnum):
 
     @property
     def stage(self) -> Stage:
-        """The last stage whose results exist for this outcome."""
+        """The stage that every attempt with this outcome reached at least."""
         return _STAGE[self]
 
 

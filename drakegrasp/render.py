@@ -33,9 +33,10 @@ from pydrake.multibody.tree import RigidBody, SpatialInertia
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
+from drakegrasp.camera import intrinsics
 from drakegrasp.candidates import object_key
 from drakegrasp.config import CameraConfig
-from drakegrasp.errors import EnvironmentFailure
+from drakegrasp.errors import MachineError
 from drakegrasp.frames import X_WT
 from drakegrasp.hand import MODELS, make_parser
 from drakegrasp.meshes import ObjectModel, obj_text
@@ -85,7 +86,9 @@ def build_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
         np.array([*object_colour(model.name), 1.0]),
     )
     (table,) = make_parser(plant).AddModels(MODELS / "table.sdf")
-    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("table", table), RigidTransform(X_WT))
+    plant.WeldFrames(
+        plant.world_frame(), plant.GetFrameByName("table", table), RigidTransform(X_WT)
+    )
     plant.Finalize()
     diagram = builder.Build()
     return Renderer(
@@ -101,7 +104,7 @@ def look(renderer: Renderer, X_TO: npt.ArrayLike, X_TC: npt.ArrayLike) -> Look:
     """Return what a camera at X_TC (4, 4) sees of an object at X_TO (4, 4).
 
     Raises:
-        EnvironmentFailure: If the image is blank, which means that OpenGL failed.
+        MachineError: If the image is blank, which means that OpenGL failed.
     """
     plant, config = renderer.plant, renderer.config
     plant_context = plant.GetMyMutableContextFromRoot(renderer.context)
@@ -109,9 +112,11 @@ def look(renderer: Renderer, X_TO: npt.ArrayLike, X_TC: npt.ArrayLike) -> Look:
         plant_context, renderer.object, RigidTransform(X_WT @ np.asarray(X_TO, dtype=float))
     )
     X_WC = RigidTransform(X_WT @ np.asarray(X_TC, dtype=float))
+    K = intrinsics(config)
     core = RenderCameraCore(
         _ENGINE,
-        CameraInfo(config.size, config.size, np.deg2rad(config.fov_y_deg)),
+        # The engine measures the principal point from the corner of pixel (0, 0), not its centre.
+        CameraInfo(config.size, config.size, K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5),
         ClippingRange(config.near, config.far),
         RigidTransform(),
     )
@@ -123,7 +128,7 @@ def look(renderer: Renderer, X_TO: npt.ArrayLike, X_TC: npt.ArrayLike) -> Look:
     labels = query.RenderLabelImage(colour_camera, world, X_WC).data[:, :, 0]
     rgb = query.RenderColorImage(colour_camera, world, X_WC).data[:, :, :3]
     if not rgb.any() or not depth.any():
-        raise EnvironmentFailure(
+        raise MachineError(
             "the rendered image must not be blank, got all zeros: OpenGL works in one thread of a "
             "process only, and needs EGL (run `drakegrasp doctor`)"
         )
@@ -138,5 +143,3 @@ def object_colour(name: str) -> tuple[float, float, float]:
     """Return the RGB colour that an object's name gives it, well apart from the table's."""
     hue = (object_key(name) % 997) / 997.0
     return colorsys.hsv_to_rgb(hue, 0.65, 0.85)
-
-

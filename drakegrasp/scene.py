@@ -192,9 +192,7 @@ def reset_attempt(scene: Scene, X_WO: npt.ArrayLike, X_WG: npt.ArrayLike, spread
     X = np.asarray(X_WG, dtype=float)
     R_WG = RotationMatrix(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]))
     handles.wrist_frame.SetPoseInParentFrame(context, RigidTransform(R_WG, np.zeros(3)))
-    plant.SetPositions(
-        context, handles.instance, np.zeros(plant.num_positions(handles.instance))
-    )
+    plant.SetPositions(context, handles.instance, np.zeros(plant.num_positions(handles.instance)))
     for name in handles.hand.spread.joints:
         plant.GetJointByName(name, handles.instance).set_angle(context, spread)
     for joint, p in zip(handles.wrist_joints, X[:3, 3], strict=True):
@@ -302,9 +300,7 @@ def _add_object(plant: MultibodyPlant, model: ObjectModel, physics: PhysicsConfi
     return body
 
 
-def _add_table(
-    plant: MultibodyPlant, scene_graph: SceneGraph, physics: PhysicsConfig
-) -> RigidBody:
+def _add_table(plant: MultibodyPlant, scene_graph: SceneGraph, physics: PhysicsConfig) -> RigidBody:
     (instance,) = make_parser(plant).AddModels(MODELS / "table.sdf")
     body = plant.GetBodyByName("table", instance)
     plant.WeldFrames(plant.world_frame(), body.body_frame(), RigidTransform(X_WT))
@@ -373,9 +369,7 @@ def _add_hand(plant: MultibodyPlant, hand: Hand, trajectory: TrajectorySource) -
     )
 
 
-def _add_wrist(
-    plant: MultibodyPlant, instance: ModelInstanceIndex
-) -> tuple[PrismaticJoint, ...]:
+def _add_wrist(plant: MultibodyPlant, instance: ModelInstanceIndex) -> tuple[PrismaticJoint, ...]:
     parent = plant.world_body()
     joints = []
     for name, axis in zip("xyz", np.eye(3), strict=True):
@@ -406,7 +400,9 @@ def _add_actuation(plant: MultibodyPlant, hand: Hand, instance: ModelInstanceInd
 
 def _closing_command(hand: Hand) -> Array:
     """Return the constant [q_d; v_d] that closes all fingers at the hand's speed."""
-    return np.concatenate([np.zeros(hand.num_fingers), np.full(hand.num_fingers, hand.closing_speed)])
+    return np.concatenate(
+        [np.zeros(hand.num_fingers), np.full(hand.num_fingers, hand.closing_speed)]
+    )
 
 
 def _make_compliant_hand(
@@ -430,6 +426,7 @@ def _filter_within_hand(
     The other links' shapes overlap at their joints by design, and they cannot reach each
     other before the fingertips do.
     """
+
     def geometries(body: RigidBody) -> list[GeometryId]:
         return list(plant.GetCollisionGeometriesForBody(body))
 

@@ -185,7 +185,12 @@ DATA_FIELDS: tuple[Field, ...] = (
 
 def _contact_fields(prefix: str, when: str, stage: Stage) -> tuple[Field, ...]:
     def field(
-        name: str, shape: tuple[int | str, ...], dtype: str, unit: str, frame: str, meaning: str,
+        name: str,
+        shape: tuple[int | str, ...],
+        dtype: str,
+        unit: str,
+        frame: str,
+        meaning: str,
         per_finger: bool = False,
     ) -> Field:
         return Field(
@@ -404,9 +409,7 @@ LOOK_FIELDS: tuple[Field, ...] = (
 
 #: A row per success, in `/successes` of trials.hdf5.
 SUCCESS_FIELDS: tuple[Field, ...] = (
-    Field(
-        name="trial_id", shape=(), dtype="int64", unit="-", frame="-", meaning="row of /trials"
-    ),
+    Field(name="trial_id", shape=(), dtype="int64", unit="-", frame="-", meaning="row of /trials"),
     Field(
         name="removal",
         shape=(),

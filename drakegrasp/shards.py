@@ -26,6 +26,8 @@ AnyArray = npt.NDArray[Any]
 
 #: Fields of `/trials` that only the whole dataset can fill, so no shard has them.
 ASSEMBLED_FIELDS = ("trial_id", "object")
+#: Deflate compresses by 1,032 at most; more means that a size in the file is wrong.
+MAX_COMPRESSION = 1032
 #: Rows in a chunk of a column of small values.
 COLUMN_CHUNK = 2048
 #: Suffix of a file that is being written; what is left of one after a crash may be deleted.
@@ -163,18 +165,20 @@ def read_shard(path: Path, header: ShardHeader | None = None) -> Shard:
             if version != SCHEMA_VERSION:
                 raise DataError(f"{path}: schema must be {SCHEMA_VERSION}, got {version}")
             found = ShardHeader(
-                **{
-                    name: int(file.attrs[name]) if kind == "int" else str(file.attrs[name])
-                    for name, kind in ShardHeader.__annotations__.items()
-                }
+                config_hash=str(file.attrs["config_hash"]),
+                mesh_sha256=str(file.attrs["mesh_sha256"]),
+                object_name=str(file.attrs["object_name"]),
+                start=int(file.attrs["start"]),
+                stop=int(file.attrs["stop"]),
             )
+            _refuse_impossible_sizes(file, path.stat().st_size)
             shard = Shard(
                 header=found,
                 trials={f.name: file["trials"][f.name][:] for f in trial_columns()},
                 looks={f.name: file["looks"][f.name][:] for f in LOOK_FIELDS},
             )
             checksum = str(file.attrs["checksum"])
-    except (OSError, KeyError, RuntimeError, ValueError) as error:
+    except (OSError, KeyError, RuntimeError, ValueError, TypeError, MemoryError) as error:
         if isinstance(error, DataError):
             raise
         raise DataError(f"{path}: must be a complete shard, got a damaged file ({error})") from None
@@ -183,6 +187,16 @@ def read_shard(path: Path, header: ShardHeader | None = None) -> Shard:
     if _checksum(shard) != checksum:
         raise DataError(f"{path}: checksum must be {checksum[:12]}…, got other content")
     return shard
+
+
+def _refuse_impossible_sizes(file: h5py.File, file_size: int) -> None:
+    """Refuse columns that cannot have come from a file of this size before memory is taken."""
+    for group in ("trials", "looks"):
+        datasets = list(file[group].values())
+        if len({len(dataset) for dataset in datasets}) != 1:
+            raise ValueError(f"columns of {group} differ in length")
+        if any(dataset.nbytes > MAX_COMPRESSION * file_size for dataset in datasets):
+            raise ValueError(f"a column of {group} is larger than the file can hold")
 
 
 def _tables(shard: Shard) -> tuple[tuple[str, tuple[Field, ...], Mapping[str, AnyArray]], ...]:

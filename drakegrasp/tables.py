@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from rich.box import SIMPLE
 from rich.table import Table
 
 from drakegrasp.filters import Removal
@@ -13,16 +14,16 @@ from drakegrasp.stats import Funnel, SplitCount
 
 #: Short heads of the outcomes, in the order of the funnel.
 _OUTCOME_HEADS = {
-    Outcome.RAY_MISS: "ray miss",
-    Outcome.BELOW_TABLE: "below table",
-    Outcome.START_COLLISION: "start coll.",
+    Outcome.RAY_MISS: "ray\nmiss",
+    Outcome.BELOW_TABLE: "below\ntable",
+    Outcome.START_COLLISION: "start\ncollis.",
     Outcome.SCREENED: "screened",
-    Outcome.MISSING_FINGERTIP: "missing tip",
-    Outcome.HAND_CONTACT: "hand cont.",
-    Outcome.TABLE_CONTACT: "table cont.",
+    Outcome.MISSING_FINGERTIP: "missing\ntip",
+    Outcome.HAND_CONTACT: "hand\ncontact",
+    Outcome.TABLE_CONTACT: "table\ncontact",
     Outcome.DROPPED: "dropped",
     Outcome.SLIPPED: "slipped",
-    Outcome.SOLVER_ERROR: "solver err.",
+    Outcome.SOLVER_ERROR: "solver\nerror",
     Outcome.TIMEOUT: "timeout",
     Outcome.CRASHED: "crashed",
     Outcome.SUCCESS: "success",
@@ -30,15 +31,22 @@ _OUTCOME_HEADS = {
 
 
 def funnel_table(funnel: Funnel) -> Table:
-    """Return the funnel: a row per object and one of all; columns that are all zero are left out."""
-    table = Table(title="From palm poses to samples", title_justify="left")
+    """Return the funnel, a row per object and one of all, without columns that are all zero."""
+    table = Table(
+        title="From palm poses to samples",
+        title_justify="left",
+        box=SIMPLE,
+        pad_edge=False,
+        collapse_padding=True,
+        padding=(0, 1, 0, 0),
+    )
     table.add_column("object", no_wrap=True, overflow="ellipsis", max_width=24)
     shown = [o for o in _OUTCOME_HEADS if funnel.outcomes[:, o].any() or o is Outcome.SUCCESS]
     removed = [r for r in Removal if r is not Removal.KEPT and funnel.removals[:, r].any()]
     heads = ["poses", "attempts", *(_OUTCOME_HEADS[o] for o in shown)]
-    heads += [f"-{r.label.replace('_', ' ')}" for r in removed] + ["samples"]
+    heads += [f"- {r.label}".replace("_", "\n") for r in removed] + ["samples"]
     for head in heads:
-        table.add_column(head, justify="right")
+        table.add_column(head, justify="right", no_wrap=True)
 
     def row(outcomes: Sequence[int], removals: Sequence[int], poses: int) -> list[str]:
         cells = [poses, sum(outcomes), *(outcomes[o] for o in shown)]
@@ -46,9 +54,7 @@ def funnel_table(funnel: Funnel) -> Table:
         return [f"{int(cell):,}" for cell in cells]
 
     for i, name in enumerate(funnel.names):
-        table.add_row(
-            name, *row(funnel.outcomes[i], funnel.removals[i], int(funnel.candidates[i]))
-        )
+        table.add_row(name, *row(funnel.outcomes[i], funnel.removals[i], int(funnel.candidates[i])))
     table.add_section()
     totals = (funnel.outcomes.sum(0), funnel.removals.sum(0), int(funnel.candidates.sum()))
     table.add_row("all", *row(*totals))
@@ -57,20 +63,32 @@ def funnel_table(funnel: Funnel) -> Table:
 
 def split_table(counts: Sequence[SplitCount]) -> Table:
     """Return the paper's Table III with a column of objects."""
-    table = Table(title="Samples by split", title_justify="left")
+    table = Table(
+        title="Samples by split",
+        title_justify="left",
+        box=SIMPLE,
+        pad_edge=False,
+        collapse_padding=True,
+        padding=(0, 1, 0, 0),
+    )
     table.add_column("split")
     for head in ("samples", "objects", "classes"):
         table.add_column(head, justify="right")
     for count in counts:
-        table.add_row(
-            count.split, f"{count.samples:,}", f"{count.objects:,}", f"{count.classes:,}"
-        )
+        table.add_row(count.split, f"{count.samples:,}", f"{count.objects:,}", f"{count.classes:,}")
     return table
 
 
 def audit_table(rows: Sequence[AuditRow]) -> Table:
     """Return what would become of each mesh."""
-    table = Table(title="Meshes", title_justify="left")
+    table = Table(
+        title="Meshes",
+        title_justify="left",
+        box=SIMPLE,
+        pad_edge=False,
+        collapse_padding=True,
+        padding=(0, 1, 0, 0),
+    )
     table.add_column("object", no_wrap=True)
     table.add_column("class", no_wrap=True)
     table.add_column("status", no_wrap=True)

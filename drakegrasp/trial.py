@@ -1,7 +1,6 @@
-"""One attempt, from its start pose to its verdict: the function that build, verify and
-replay all call.
+"""One attempt, from its start pose to its verdict.
 
-In: a scene, the object, its resting pose and an attempt. Out: a `TrialRecord` with the
+This is the one function that build, verify and replay all call. In: a scene, the object, its resting pose and an attempt. Out: a `TrialRecord` with the
 outcome and everything that was measured on the way. Failures of the physics are values;
 the one place where an error of Drake becomes an outcome is `run_attempt`.
 """
@@ -66,7 +65,7 @@ class TrialRecord:
     message: str = field(default="")
 
 
-class _StateExploded(Exception):
+class _StateError(Exception):
     """The state left the range in which it means anything."""
 
 
@@ -92,7 +91,7 @@ def run_attempt(scene: Scene, X_TO: npt.ArrayLike, attempt: Attempt, config: Con
     try:
         return _simulate(scene, record, attempt, config)
     # A failed assertion within Drake arrives as SystemExit, everything else as RuntimeError.
-    except (RuntimeError, SystemExit, _StateExploded) as error:
+    except (RuntimeError, SystemExit, _StateError) as error:
         lines = str(error).strip().splitlines() or [type(error).__name__]
         failed = TrialRecord(outcome=Outcome.SOLVER_ERROR, X_TO=X_TO, X_OG=attempt.X_OG)
         return replace(failed, message=lines[0])
@@ -191,7 +190,6 @@ def _refuse_explosion(scene: Scene, config: Config) -> None:
     velocity = scene.plant.EvalBodySpatialVelocityInWorld(scene.context, scene.object)
     speed = float(np.linalg.norm(velocity.translational()))
     if not speed <= config.physics.max_speed:
-        raise _StateExploded(
+        raise _StateError(
             f"the object's speed must stay below {config.physics.max_speed:g} m/s, got {speed:.3g}"
         )
-

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from drakegrasp.camera import camera_pose_oto, camera_pose_otm, image_frame, intrinsics
+from drakegrasp.camera import camera_pose_otm, camera_pose_oto, image_frame, intrinsics
 from drakegrasp.candidates import Attempt, make_attempts
 from drakegrasp.config import Config, parse_config
 from drakegrasp.contacts import Contacts
@@ -245,5 +245,3 @@ def _timed(seconds: dict[str, float], stage: str, step: Callable[[], Any]) -> An
     result = step()
     seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start
     return result
-
-

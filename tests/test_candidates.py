@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +28,10 @@ from drakegrasp.candidates import (
 from drakegrasp.config import CandidateConfig, load_config
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.meshes import MeshSource, ObjectModel, prepare_object
+
+# A busy machine is not a fault of the code.
+settings.register_profile("unhurried", deadline=None)
+settings.load_profile("unhurried")
 
 #: Full extents of three of the paper's meshes [m]; their files are in centimetres. Counts
 #: of valid and of distinct poses, and the distinct ones of an earlier reference that took
@@ -61,6 +64,10 @@ class Reference(NamedTuple):
     every_valid: Array
 
 
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
 def standing(half: Array) -> Array:
     """Return X_TO of a box that stands on the table unturned."""
     return make_pose(np.eye(3), [0.0, 0.0, half[2]])
@@ -77,11 +84,10 @@ def euler(angles_deg: list[tuple[int, ...]]) -> Array:
     return np.moveaxis(np.array(rows), 2, 0)
 
 
-def line_meets_box(p: Array, z: Array, half: Array, margin: float) -> Array:
+def line_meets_box(p: Array, z: Array, half: Array) -> Array:
     """Return whether lines pass a box, by the separating axes of a line and a box.
 
-    The axes are z x e_i: there is no division and no slab. Lines that miss by less than
-    `margin` [m] count as hits.
+    The axes are z x e_i: there is no division and no slab.
     """
     moment, z = np.abs(np.cross(p, z)), np.abs(z)
     reach = np.stack(
@@ -92,13 +98,18 @@ def line_meets_box(p: Array, z: Array, half: Array, margin: float) -> Array:
         ],
         axis=1,
     )
-    return np.all(moment <= reach + margin, axis=1)
+    # A line along e_i has no such axis: 0 <= 0, but for rounding.
+    return np.all(moment <= reach + 1e-15, axis=1)
 
 
-def every_valid_pose(half: Array, margin: float = 1e-12) -> tuple[Array, Array]:
-    """Return rotations (n, 3, 3) and positions (n, 3) of all valid combinations, repeats too."""
-    R_global = euler(list(itertools.product(range(0, 181, 30), range(0, 360, 30), range(0, 360, 45))))
-    R_local = euler(list(itertools.product(range(0, 181, 20), range(0, 360, 20), range(0, 360, 45))))
+def every_valid_pose(half: Array, scale: float = 1.0) -> tuple[Array, Array]:
+    """Return rotations (n, 3, 3) and positions (n, 3) of all valid combinations, repeats too.
+
+    The box that the rays must meet is `scale` times the one that the palms stand around.
+    """
+    eighths = range(0, 360, 45)
+    R_global = euler(list(itertools.product(range(0, 181, 30), range(0, 360, 30), eighths)))
+    R_local = euler(list(itertools.product(range(0, 181, 20), range(0, 360, 20), eighths)))
     radius = np.sqrt(half @ half)
     rotations, positions = [], []
     for R in R_global:
@@ -107,7 +118,7 @@ def every_valid_pose(half: Array, margin: float = 1e-12) -> tuple[Array, Array]:
             continue
         z = R_local[:, :, 2] @ (R @ np.diag([1.0, -1.0, -1.0])).T
         # The palm is outside of the box: a line that meets it does so ahead if z looks inward.
-        hits = line_meets_box(np.broadcast_to(p, z.shape), z, half, margin) & (z @ p < 0.0)
+        hits = line_meets_box(np.broadcast_to(p, z.shape), z, scale * half) & (z @ p < 0.0)
         rotations.append(R @ np.diag([1.0, -1.0, -1.0]) @ R_local[hits])
         positions.append(np.broadcast_to(p, (hits.sum(), 3)))
     return np.concatenate(rotations), np.concatenate(positions)
@@ -165,8 +176,8 @@ def test_full_turn_counts_once() -> None:
 def test_valid_poses_are_as_many_as_a_brute_force_finds(reference: Reference) -> None:
     """And no ray grazes the box, so that the count does not hang on rounding."""
     assert reference.valid == len(reference.every_valid) == BOXES[reference.name][1]
-    generous, strict = (len(every_valid_pose(reference.half, m)[0]) for m in (1e-7, -1e-7))
-    assert generous == strict == reference.valid
+    for scale in (1.0 - 1e-7, 1.0 + 1e-7):
+        assert len(every_valid_pose(reference.half, scale)[0]) == reference.valid
 
 
 def test_distinct_poses_are_counted_right(reference: Reference) -> None:
@@ -212,30 +223,24 @@ def test_palms_rotations_are_proper(reference: Reference) -> None:
     products = R @ np.swapaxes(R, 1, 2)
     np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), R.shape), atol=1e-14)
     np.testing.assert_allclose(np.linalg.det(R), 1.0, atol=1e-14)
-    np.testing.assert_array_equal(
-        reference.poses[:, 3], np.broadcast_to([0, 0, 0, 1], (len(R), 4))
-    )
+    np.testing.assert_array_equal(reference.poses[:, 3], np.broadcast_to([0, 0, 0, 1], (len(R), 4)))
 
 
 def test_first_pose_looks_down_from_above() -> None:
     """With all angles zero: d on +Oz, Gz = -Oz, Gx = Ox (equation 1 of the paper)."""
     zero = {f"{w}_{a}_deg": (0,) for w in ("global", "local") for a in "xyz"}
     poses, combinations, valid = rotation_candidates(
-        [0.02, 0.03, 0.06], standing(np.array([0.02, 0.03, 0.06])), CandidateConfig(**zero), _rng()
+        [0.02, 0.03, 0.06], standing(np.array([0.02, 0.03, 0.06])), CandidateConfig(**zero), rng()
     )
     assert (combinations, valid) == (1, 1)
     np.testing.assert_allclose(poses, [make_pose(np.diag([1, -1, -1]), [0, 0, 0.07])], atol=1e-16)
-
-
-def _rng() -> np.random.Generator:
-    return np.random.default_rng(0)
 
 
 def test_table_cuts_what_lies_below_it_in_world_axes() -> None:
     """An object turned upside down keeps the poses that an upright one loses."""
     half = np.array([0.05, 0.05, 0.05])
     flipped = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.05])
-    up, down = (rotation_candidates(half, X, COARSE, _rng())[0] for X in (standing(half), flipped))
+    up, down = (rotation_candidates(half, X, COARSE, rng())[0] for X in (standing(half), flipped))
     assert up[:, 2, 3].min() > -0.05 < 0.05 < up[:, 2, 3].max()
     assert down[:, 2, 3].max() < 0.05
     assert down[:, 2, 3].min() < -0.05
@@ -265,9 +270,8 @@ def test_slab_test_agrees_with_the_nearest_approach(p: Array, z: Array, half: Ar
     [
         ((0, 0, 2), (0, 0, -1), True),
         ((0, 0, 2), (0, 0, 1), False),  # behind
-        ((1, 0, 2), (0, 0, -1), True),  # in a face: touches
         ((1.001, 0, 2), (0, 0, -1), False),
-        ((1, 1, 2), (0, 0, -1), True),  # along an edge
+        ((0.999, -0.999, 2), (0, 0, -1), True),
         ((0, 0, 0), (1, 0, 0), True),  # from inside
         ((0, 0, 2), (1e-17, -1e-17, -1), True),  # a zero with noise
         ((2, 0, 2), (-1, 0, -1), True),
@@ -280,31 +284,39 @@ def test_ray_and_unit_box_in_the_cases_that_divide_by_zero(
     assert ray_meets_box(np.array([p], dtype=float), direction, np.ones(3)).tolist() == [meets]
 
 
+@pytest.mark.parametrize("p", [(1, 0, 2), (-1, 0, 2), (1, 1, 2), (0, -1, 2)])
+def test_ray_within_a_face_touches_the_box(p: tuple[float, ...]) -> None:
+    """0/0 in a slab constrains nothing, as the code's comment says."""
+    direction = np.array([[0.0, 0.0, -1.0]])
+    assert ray_meets_box(np.array([p], dtype=float), direction, np.ones(3)).all()
+
+
 def test_jitter_keeps_the_number_of_combinations() -> None:
     """The released code: 8^6 combinations, every angle moved by 0 to 44 degrees."""
     half = np.array(BOXES["24_mug"][0]) / 2.0
     config = load_config("released").candidates
-    poses, combinations, valid = rotation_candidates(half, standing(half), config, _rng())
+    poses, combinations, valid = rotation_candidates(half, standing(half), config, rng())
     assert combinations == 8**6 == 262_144
     # Jittered poses hardly ever repeat, in contrast to the grid's.
     assert 0.9 * valid < len(poses) <= valid < combinations
     assert (poses[:, 2, 3] > -half[2]).all()
 
 
-def test_jitter_moves_angles_by_whole_degrees_below_its_bound() -> None:
-    """About one axis alone, the palm's direction tells the angle: 10..13 degrees, all of them."""
+def test_jitter_moves_every_angle_by_whole_degrees_below_its_bound() -> None:
+    """At the zero pose the palm leans by no more than four tilts of three degrees each."""
     axes = {f"{w}_{a}_deg": (0,) for w in ("global", "local") for a in "xyz"}
-    config = CandidateConfig(**{**axes, "local_z_deg": tuple(range(0, 360, 1))}, jitter_deg=1)
+    still = CandidateConfig(**{**axes, "local_z_deg": tuple(range(360))}, jitter_deg=1)
+    moved = still.model_copy(update={"jitter_deg": 4.0})
     half = np.full(3, 0.05)
-    still, *_ = rotation_candidates(half, standing(half), config, _rng())
-    moved, *_ = rotation_candidates(
-        half, standing(half), config.model_copy(update={"jitter_deg": 4.0}), _rng()
-    )
-    # A jitter below one degree is none: floor(u) = 0.
-    assert len(still) == 360
-    tilt = np.rad2deg(np.arccos(np.clip(-moved[:, 2, 2], -1.0, 1.0)))
-    assert tilt.max() > 1.0  # the axes that were zero move too
-    assert tilt.max() < 12.0  # four axes by at most three degrees each
+    # Whole degrees below one are zero.
+    poses, *_ = rotation_candidates(half, standing(half), still, rng())
+    np.testing.assert_allclose(poses[:, 2, 2], -1.0, atol=1e-15)
+    assert len(poses) == 360
+    poses, *_ = rotation_candidates(half, standing(half), moved, rng())
+    lean = np.rad2deg(np.arccos(np.clip(-poses[:, 2, 2], -1.0, 1.0)))
+    assert 4.0 < lean.max() < 12.0
+    # Global X and Y alone move the palm; of their 4 x 4 pairs of degrees all come up.
+    assert len(np.unique(np.round(poses[:, :3, 3], 9), axis=0)) == 16
 
 
 def test_same_seed_draws_the_same(box: ObjectModel) -> None:
@@ -333,8 +345,7 @@ def test_other_seed_or_other_name_draws_others(
 def test_smaller_number_is_a_prefix(box: ObjectModel) -> None:
     """So more candidates can be tried later without losing the shards of the first."""
     many, few = (
-        sample_candidates(box, BOX_X_TO, COARSE.model_copy(update={"max": n}), 0)
-        for n in (150, 40)
+        sample_candidates(box, BOX_X_TO, COARSE.model_copy(update={"max": n}), 0) for n in (150, 40)
     )
     assert (len(many), len(few)) == (150, 40)
     np.testing.assert_array_equal(many.X_OG[:40], few.X_OG)
@@ -348,27 +359,26 @@ def test_smaller_number_is_a_prefix(box: ObjectModel) -> None:
 
 def test_enough_room_keeps_every_distinct_pose(box: ObjectModel) -> None:
     drawn = sample_candidates(box, BOX_X_TO, COARSE, 0)
-    poses, combinations, valid = rotation_candidates(box.half_extents, BOX_X_TO, COARSE, _rng())
+    poses, combinations, valid = rotation_candidates(box.half_extents, BOX_X_TO, COARSE, rng())
     assert (drawn.combinations, drawn.valid, drawn.distinct) == (combinations, valid, len(poses))
     assert 0 < len(drawn) == drawn.distinct < drawn.valid < drawn.combinations
     assert {X.tobytes() for X in drawn.X_OG} == {X.tobytes() for X in poses}
 
 
 def test_object_key_is_frozen_and_of_the_name_alone() -> None:
-    """It decides which grasps an object gets: a change would make every dataset another."""
-    assert object_key("24_mug_final") == 0x00000000 + KEY_OF_MUG
+    """It decides which grasps an object gets: a change would make every dataset another.
+
+    The number is the first four bytes that `printf 24_mug_final | sha256sum` prints.
+    """
+    assert object_key("24_mug_final") == 0x2B63C3F3
     assert object_key("24_mug_final") != object_key("24_mug_final ")
     assert 0 <= object_key("é") < 2**32
-
-
-#: First four bytes of `printf 24_mug_final | sha256sum`.
-KEY_OF_MUG = 0xDEADBEEF
 
 
 @given(arrays(np.float64, 3, elements=st.floats(-1.0, 1.0)).filter(lambda v: v @ v > 1e-2))
 @settings(max_examples=50)
 def test_palm_ray_meets_a_sphere_at_its_radius(v: Array) -> None:
-    """A ray to the centre from 0.5 m meets a sphere of 0.1 m after 0.4 m, a facet's sagitta less."""
+    """From 0.5 m to the centre of a sphere of 0.1 m: 0.4 m, and a facet's sagitta at most."""
     z = -v / np.linalg.norm(v)
     x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
     x /= np.linalg.norm(x)
@@ -387,7 +397,7 @@ def test_palm_ray_to_a_box_in_closed_form(box: ObjectModel) -> None:
     X_OG = np.stack(
         [
             make_pose(looks_down, [0.01, -0.02, 0.3]),
-            make_pose(slanted @ np.diag([1.0, 1.0, 1.0]), [-0.1, 0.0, -0.1]),
+            make_pose(slanted, [-0.1, 0.0, -0.1]),
             make_pose(looks_down, [0.04, 0.0, 0.3]),
             make_pose(np.eye(3), [0.0, 0.0, 0.3]),
         ]
@@ -412,12 +422,14 @@ def test_normals_approach_the_faces_of_a_box_squarely(box: ObjectModel) -> None:
     )
     assert (np.abs(surface) <= box.half_extents + 1e-7).all()
     radius = np.linalg.norm(box.half_extents)
-    np.testing.assert_allclose(drawn.distance, radius, atol=1e-7)
+    # Far enough away to be outside of any object with this box.
+    assert drawn.distance.min() > radius - 1e-7
+    assert np.ptp(drawn.distance) < 1e-7
 
 
 def test_normals_spread_over_the_area_and_roll_freely(box: ObjectModel) -> None:
     """Each pair of faces gets its share of the area; rolls fill the circle."""
-    poses = normal_candidates(box, 4000, _rng())
+    poses = normal_candidates(box, 4000, rng())
     share = np.bincount(np.abs(poses[:, :3, 2]).argmax(axis=1), minlength=3) / len(poses)
     areas = np.array([0.08 * 0.10, 0.06 * 0.10, 0.06 * 0.08])
     # Four standard deviations of a binomial.
@@ -437,11 +449,10 @@ def test_normals_that_start_under_the_table_are_dropped(box: ObjectModel) -> Non
     assert not (drawn.X_OG[:, 2, 2] > 0.5).any()
 
 
-@pytest.mark.xfail(strict=True, reason="candidates.py: one corner's distance ends in another wall")
 def test_normals_start_outside_of_a_hollow_object(make_object: Callable[..., ObjectModel]) -> None:
     """Backing off from a tube's inner wall must not end within the wall across."""
     tube = make_object(trimesh.creation.annulus(r_min=0.08, r_max=0.13, height=0.06), "tube")
-    poses = normal_candidates(tube, 300, _rng())
+    poses = normal_candidates(tube, 300, rng())
     assert not tube.visual.contains(poses[:, :3, 3]).any()
 
 
@@ -505,11 +516,3 @@ def test_seed_belongs_to_the_candidate() -> None:
     assert len(set(seeds)) == 30
     assert seeds[0::3] == seeds[1::3] == seeds[2::3]
     assert 0 <= min(seeds) <= max(seeds) < 2**64
-
-
-def test_object_can_be_written(tmp_path: Path) -> None:
-    """The fixture's own mesh: a box of 6 x 8 x 10 cm arrives with its extents."""
-    path = tmp_path / "b.stl"
-    trimesh.creation.box((0.06, 0.08, 0.10)).export(path)
-    model = prepare_object(MeshSource(name="b", class_name="b", path=path))
-    np.testing.assert_allclose(model.half_extents, [0.03, 0.04, 0.05], atol=1e-8)

@@ -289,7 +289,6 @@ def test_mistake_is_refused_with_key_demand_and_value(override: str, message: st
         ("a: [1\n", r"config\.yaml: must be YAML, got text that is not"),
         ("camera: {size: 64\n", r"config\.yaml: must be YAML, got text that is not"),
         ("camera: 5\n", r"camera: must be .*, got 5"),
-        ("camera:\n", r"camera: must be .*, got None"),
         ("cameras: {size: 64}\n", r"cameras: must be a known key .*, got an unknown one"),
         ("1: 2\n", r"1: must be .*, got 1"),
     ],
@@ -315,7 +314,6 @@ def test_override_into_a_value_of_the_file_is_refused(tmp_path: Path) -> None:
         load_config(write(tmp_path, "camera: 5\n"), ["camera.size=64"])
 
 
-@pytest.mark.xfail(strict=True, raises=UnicodeDecodeError, reason="config.py: decode error leaks")
 def test_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "config.yaml"
     path.write_bytes(b"hand: \xff\xfe")
@@ -323,7 +321,6 @@ def test_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
         load_config(path)
 
 
-@pytest.mark.xfail(strict=True, reason="config.py: these floats allow what is not finite")
 @pytest.mark.parametrize(
     "override", ["lift.p_TG=[0, 0, .nan]", "filters.min_camera_height=.nan", "lift.p_TG=[.inf,0,0]"]
 )
@@ -332,7 +329,6 @@ def test_number_that_is_not_finite_is_refused_everywhere(override: str) -> None:
         load_config(overrides=[override])
 
 
-@pytest.mark.xfail(strict=True, reason="config.py: lax mode takes true for 1")
 @pytest.mark.parametrize("override", ["objects.mass=true", "seed=yes"])
 def test_truth_value_is_no_number(override: str) -> None:
     with pytest.raises(ConfigError, match=r"must be .*, got True"):

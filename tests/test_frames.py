@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
@@ -21,6 +21,10 @@ from drakegrasp.frames import (
     transform_points,
     unpack_pose,
 )
+
+# A busy machine is not a fault of the code.
+settings.register_profile("unhurried", deadline=None)
+settings.load_profile("unhurried")
 
 vectors = arrays(np.float64, 3, elements=st.floats(-3.0, 3.0))
 poses = st.builds(lambda r, p: make_pose(Rotation.from_rotvec(r).as_matrix(), p), vectors, vectors)
@@ -85,9 +89,7 @@ def test_vectors_turn_but_do_not_move(X_AB: Array, v_B: Array) -> None:
     v_A = rotate_vectors(X_AB, v_B)
     origin = transform_points(X_AB, np.zeros((1, 3)))
     np.testing.assert_allclose(v_A, transform_points(X_AB, v_B) - origin, atol=1e-13)
-    np.testing.assert_allclose(
-        np.linalg.norm(v_A, axis=1), np.linalg.norm(v_B, axis=1), atol=1e-13
-    )
+    np.testing.assert_allclose(np.linalg.norm(v_A, axis=1), np.linalg.norm(v_B, axis=1), atol=1e-13)
 
 
 def test_points_and_vectors_in_closed_form() -> None:
@@ -98,7 +100,7 @@ def test_points_and_vectors_in_closed_form() -> None:
 
 @given(vectors, st.floats(0.0, np.pi))
 def test_rotation_angle_is_the_angle_about_any_axis(axis: Array, angle: float) -> None:
-    axis = axis + [0.0, 0.0, 4.0]  # never zero
+    axis = axis + np.array([0.0, 0.0, 4.0])  # never zero
     R_AB = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix()
     # The arc cosine is worth half the digits at its ends.
     assert rotation_angle(R_AB) == pytest.approx(angle, abs=1e-7)

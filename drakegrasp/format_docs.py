@@ -1,0 +1,133 @@
+"""Write docs/dataset-format.md from the schema table, or check that it is up to date.
+
+Usage: python -m drakegrasp.format_docs [--check] FILE
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from drakegrasp.schema import (
+    CONVENTIONS,
+    DATA_FIELDS,
+    LOOK_FIELDS,
+    OBJECT_FIELDS,
+    SCHEMA_VERSION,
+    SUCCESS_FIELDS,
+    TRIAL_FIELDS,
+    Field,
+)
+
+_HEAD = f"""<!-- Made by `make docs` from drakegrasp/schema.py: change that, not this. -->
+
+# The dataset's format
+
+Schema version {SCHEMA_VERSION}. In the shapes `N` is the number of rows, `k` of fingers, `j` of
+the hand's joints, `6k` the length of a grasp (18 for three fingers) and `S` the size of the images.
+Frames are explained in [frames-and-units.md](frames-and-units.md). Every dataset of a file carries
+its `unit`, `frame` and `meaning` as attributes.
+
+```
+OUT/
+  manifest.json            configuration, its hash, seed, versions, objects, refused meshes
+  objects/NAME.npz         an object: meshes, mass, centre of mass, inertia
+  objects/NAME.plan.h5     its resting pose and palm poses
+  shards/NAME/RANGE.h5     what one work unit found; immutable
+  trials.hdf5              a row per attempt, whatever its outcome
+  grasping_oto.hdf5        samples, camera rolled with the palm
+  grasping_otm.hdf5        the same samples, image up is world up
+```
+
+Only the last three are needed to train. With `objects/` and `manifest.json`, every trial can be
+replayed.
+"""
+
+_CONTRACT = """## What makes two files equal
+
+The same command gives the same arrays, whatever the number of workers, in which order they work
+and how often the build was interrupted: nothing in these files depends on the clock or the
+machine's name. `time_close` and `time_lift` are simulated seconds. This holds on one machine with
+one set of library versions (`manifest.json` names them); another CPU or another version of Drake
+may round differently.
+
+## Missing values
+
+The two data files hold no NaN. In `trials.hdf5` a value that does not exist for a row is NaN
+(floats), 0 or false: the column "from" below says with which stage a value begins. Contact points
+and normals are also NaN for a finger that does not touch. The stage of a row follows from its
+outcome: `success`, `slipped` and `dropped` were lifted; `missing_fingertip` and `hand_contact` were
+closed; `table_contact` was closed, and lifted if `time_lift` is a number (then it is the object that
+still touches the table); all others were only placed. `solver_error`, `timeout` and `crashed`
+say that the simulator failed: never count them as failed grasps.
+"""
+
+
+def format_page() -> str:
+    """Return the page."""
+    return "\n".join(
+        [
+            _HEAD,
+            "## Conventions\n\nThey are in every file as attributes `convention_*`.\n",
+            _table(("attribute", "text"), CONVENTIONS.items()),
+            "\nFurther attributes: `schema_version`, `camera`, camera matrix `K` [px], `near` and `far` "
+            "[m], `config` and\n`versions` (JSON), `config_hash`, `seed`, `signature` "
+            "(of what the file was assembled from).\n",
+            "## grasping_oto.hdf5 and grasping_otm.hdf5\n\nGroups `/train`, `/valid` and `/test` have "
+            "the same fields; images and masks are stored in one chunk per\nsample, gzip 1 with "
+            "shuffle. Successes only, after the filters.\n",
+            _fields(DATA_FIELDS),
+            "\n## trials.hdf5\n\n### /trials\n",
+            _fields(TRIAL_FIELDS, stages=True),
+            "\n### /objects\n",
+            _fields(OBJECT_FIELDS),
+            "\n### /successes\n",
+            _fields(SUCCESS_FIELDS),
+            "\n## Shards\n\n`/trials` as above without `trial_id` and `object`, and `/looks` with a row "
+            "per success:\n",
+            _fields(LOOK_FIELDS),
+            "\n" + _CONTRACT,
+        ]
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Write the page, or with --check return 1 if it is out of date."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    check = "--check" in arguments
+    (target,) = (Path(a) for a in arguments if a != "--check")
+    page = format_page()
+    if not check:
+        target.write_text(page, encoding="utf-8")
+        return 0
+    if target.exists() and target.read_text(encoding="utf-8") == page:
+        return 0
+    sys.stderr.write(f"{target}: must be what `make docs` writes, got another text\n")
+    return 1
+
+
+def _fields(fields: Sequence[Field], *, stages: bool = False) -> str:
+    heads: tuple[str, ...] = ("field", "shape", "type", "unit", "frame", "meaning")
+    rows = []
+    for field in fields:
+        shape = (
+            "(" + ", ".join(["N", *map(str, field.shape)]) + ("," if not field.shape else "") + ")"
+        )
+        cells = [f"`{field.name}`", shape, field.dtype, field.unit, field.frame, field.meaning]
+        if stages:
+            cells.insert(5, field.stage.name.lower())
+        rows.append(cells)
+    if stages:
+        heads = (*heads[:5], "from", heads[5])
+    return _table(heads, rows)
+
+
+def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
+    lines += ["| " + " | ".join(row) + " |" for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
