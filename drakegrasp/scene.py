@@ -289,7 +289,7 @@ def _add_object(plant: MultibodyPlant, model: ObjectModel, physics: PhysicsConfi
     text = obj_text(model.collision_vertices, model.collision_faces, normals=False)
     properties = ProximityProperties()
     AddRigidHydroelasticProperties(properties)
-    _add_material(properties, _object_friction(physics), physics)
+    _add_material(properties, object_friction(physics), physics)
     plant.RegisterCollisionGeometry(
         body,
         RigidTransform(),
@@ -306,20 +306,23 @@ def _add_table(plant: MultibodyPlant, scene_graph: SceneGraph, physics: PhysicsC
     plant.WeldFrames(plant.world_frame(), body.body_frame(), RigidTransform(X_WT))
     properties = ProximityProperties()
     AddCompliantHydroelasticProperties(RESOLUTION_HINT, physics.table_modulus, properties)
-    _add_material(properties, _partner_friction(physics.friction_table, physics), physics)
+    _add_material(properties, partner_friction(physics.friction_table, physics), physics)
     _assign_proximity(plant, scene_graph, body, properties)
     return body
 
 
-def _object_friction(physics: PhysicsConfig) -> float:
-    # Drake combines two coefficients to 2 a b / (a + b). With the object at the larger of
-    # the two effective values, both can be met by a positive coefficient of the partner.
+def object_friction(physics: PhysicsConfig) -> float:
+    """Return the object's own friction coefficient.
+
+    Drake combines two coefficients to 2 a b / (a + b). With the object at the larger of the
+    two effective values, both can be met by a positive coefficient of the partner.
+    """
     return max(physics.friction_hand, physics.friction_table)
 
 
-def _partner_friction(effective: float, physics: PhysicsConfig) -> float:
-    """Return the coefficient that gives the effective one against the object."""
-    mu = _object_friction(physics)
+def partner_friction(effective: float, physics: PhysicsConfig) -> float:
+    """Return the coefficient of hand or table that gives the effective one with the object."""
+    mu = object_friction(physics)
     return effective * mu / (2.0 * mu - effective)
 
 
@@ -409,7 +412,7 @@ def _make_compliant_hand(
     plant: MultibodyPlant, scene_graph: SceneGraph, handles: HandHandles, physics: PhysicsConfig
 ) -> None:
     tips = {body.index() for body in handles.fingertips}
-    mu = _partner_friction(physics.friction_hand, physics)
+    mu = partner_friction(physics.friction_hand, physics)
     for index in plant.GetBodyIndices(handles.instance):
         modulus = physics.fingertip_modulus if index in tips else physics.link_modulus
         properties = ProximityProperties()

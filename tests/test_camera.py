@@ -21,9 +21,6 @@ from drakegrasp.camera import (
 from drakegrasp.config import CameraConfig
 from drakegrasp.frames import Array, invert_pose, make_pose, transform_points
 
-# A busy machine is not a fault of the code.
-settings.register_profile("unhurried", deadline=None)
-settings.load_profile("unhurried")
 
 CONFIG = CameraConfig()
 K = intrinsics(CONFIG)

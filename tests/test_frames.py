@@ -22,9 +22,6 @@ from drakegrasp.frames import (
     unpack_pose,
 )
 
-# A busy machine is not a fault of the code.
-settings.register_profile("unhurried", deadline=None)
-settings.load_profile("unhurried")
 
 vectors = arrays(np.float64, 3, elements=st.floats(-3.0, 3.0))
 poses = st.builds(lambda r, p: make_pose(Rotation.from_rotvec(r).as_matrix(), p), vectors, vectors)
