@@ -17,12 +17,12 @@ from drakegrasp.assemble import Assembly, assemble, is_assembled, summarise
 from drakegrasp.config import Config, parse_config
 from drakegrasp.errors import DataError, DrakegraspError, MeshError
 from drakegrasp.hand import load_hand
-from drakegrasp.manifest import Manifest, claim_directory, write_manifest
+from drakegrasp.manifest import Manifest, claim_directory, release_directory, write_manifest
 from drakegrasp.meshes import MeshSource, source_sha256
 from drakegrasp.outcomes import Outcome
 from drakegrasp.prepared import load_prepared, prepare, save_prepared
 from drakegrasp.progress import Report, progress_bar
-from drakegrasp.shards import ShardHeader, read_shard
+from drakegrasp.shards import ShardHeader, read_outcomes
 from drakegrasp.units import WorkUnit, count_outcomes, run_unit
 
 T = TypeVar("T")
@@ -94,15 +94,17 @@ def build(
         HandError: If the hand cannot be used.
     """
     load_hand(config.hand)
-    known = claim_directory(out, config) or Manifest(config=config)
-    manifest = replace(known, config=config)
+    known = claim_directory(out, config)
+    manifest = replace(known or Manifest(config=config), config=config)
     write_manifest(manifest, out)
     with progress_bar("prepare", "objects", show=show) as report:
         manifest = _prepare_all(sources, out, manifest, execute, report)
-    write_manifest(manifest, out)
     if not manifest.objects:
+        if known is None:
+            release_directory(out)
         reasons = "; ".join(f"{entry['name']}: {entry['reason']}" for entry in manifest.refused)
         raise DataError(f"at least one mesh must be fit to simulate, got none: {reasons}")
+    write_manifest(manifest, out)
     with progress_bar("simulate", "attempts", show=show) as report:
         simulated, reused = _run_all(manifest, out, execute, report)
     if simulated or not is_assembled(out):
@@ -198,7 +200,7 @@ def _outcomes_on_disk(header: ShardHeader, out: Path) -> dict[Outcome, int] | No
     if not path.exists():
         return None
     try:
-        return count_outcomes(read_shard(path, header))
+        return count_outcomes(read_outcomes(path, header))
     except DataError:
         return None
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import groupby
+from itertools import cycle, groupby, islice
 from pathlib import Path
 
 import h5py
@@ -17,13 +17,12 @@ import matplotlib as mpl
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
-from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
-from drakegrasp.assemble import DATA_FILES
 from drakegrasp.camera import project
 from drakegrasp.dataset import GraspDataset, Sample
 from drakegrasp.errors import DataError
@@ -36,10 +35,12 @@ FINGER_COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00")
 #: Colours of the x, y and z axes of a frame.
 AXIS_COLOURS = ("#D62728", "#2CA02C", "#1F4FD8")
 #: Length of the arrows along the normals [m].
-ARROW = 0.028
+ARROW = 0.03
 #: A contact this much behind what the depth image shows is hidden [m]; fingertips give way
 #: by less.
 HIDDEN = 0.006
+#: Distance of a label from its point [points].
+LABEL_REACH = 13.0
 #: Samples side by side in a contact sheet, and an image's edge in it [inch].
 ACROSS, EDGE = 3, 1.12
 _INK = "#333333"
@@ -153,7 +154,9 @@ def draw_sheet(samples: Sequence[Sample], K: Array, *, far: float) -> Figure:
     """
     across = min(ACROSS, len(samples))
     lines = -(-len(samples) // across)
-    gap, between, caption, margin, head = 0.035, 0.22, 0.21, 0.16, 0.42
+    gap, between, caption, margin = 0.035, 0.22, 0.21, 0.16
+    # One sample alone is too narrow for the legend and the colour bar side by side.
+    head = 0.42 if across > 1 else 0.62
     block = 3 * EDGE + 2 * gap
     width = across * block + (across - 1) * between + 2 * margin
     height = lines * (EDGE + caption) + head + margin
@@ -173,7 +176,7 @@ def draw_sheet(samples: Sequence[Sample], K: Array, *, far: float) -> Figure:
             fontsize=6.0, color="#888888", ha="right",
         )  # fmt: skip
     bar_width = min(1.6, block / 2.2)
-    bar = _add(figure, width - margin - bar_width, 0.13, bar_width, 0.09)
+    bar = _add(figure, width - margin - bar_width, head - 0.29, bar_width, 0.09)
     _colour_bar(figure, bar, nearest, far, size=6.5)
     _finger_legend(figure, len(samples[0].grasp) // 6, (margin / width, 1.0 - 0.10 / height), 7.0)
     return figure
@@ -219,11 +222,14 @@ def draw_contacts(axes: Axes, sample: Sample, K: Array, *, scale: float = 1.0) -
     axes.set_ylim(size[1] - 0.5, -0.5)
 
 
-def hero_figure(out: Path, trial_id: int, pictures: Sequence[Picture], png: Path) -> None:
+def hero_figure(
+    oto: Path, otm: Path, trial_id: int, pictures: Sequence[Picture], png: Path
+) -> None:
     """Draw one trial: its pictures in a row, and below what both cameras saw.
 
     Args:
-        out: Directory of the dataset.
+        oto: `grasping_oto.hdf5`.
+        otm: `grasping_otm.hdf5` of the same dataset.
         trial_id: A trial that became a sample.
         pictures: Of the trial placed, closed and lifted, from `snapshots.trial_snapshots`.
         png: The file to write.
@@ -231,10 +237,10 @@ def hero_figure(out: Path, trial_id: int, pictures: Sequence[Picture], png: Path
     Raises:
         DataError: If the trial is no sample.
     """
-    top, edge, gap, between, margin = 3.0, 1.44, 0.04, 0.12, 0.1
+    top, gap, between, margin = 3.0, 0.04, 0.12, 0.1
     width = 3 * top + 2 * gap + 2 * margin
     edge = (width - 2 * margin - 4 * gap - between) / 6
-    height = margin + top + 0.3 + edge + 0.36
+    height = margin + top + 0.3 + edge + 0.38
     figure = Figure(figsize=(width, height), facecolor="white")
     words = ("place", "close", "lift")
     for k, (picture, word) in enumerate(zip(pictures, words, strict=True)):
@@ -242,14 +248,14 @@ def hero_figure(out: Path, trial_id: int, pictures: Sequence[Picture], png: Path
         _show_image(axes, picture.image)
         axes.text(0.035, 0.93, f"{k + 1}  {word}", transform=axes.transAxes, fontsize=13,
                   color=_INK, weight="bold", va="center")  # fmt: skip
-    titles = {"oto": "oto: the camera rolls with the palm", "otm": "otm: world up is up"}
     line = margin + top + 0.3
-    for k, (camera, title) in enumerate(titles.items()):
-        path = out / DATA_FILES[camera]
-        sample, K = find_sample(path, trial_id)
+    files = {"oto: the camera rolls with the palm": oto, "otm: world up is up": otm}
+    found = {title: find_sample(path, trial_id) for title, path in files.items()}
+    near = min(float(sample.image[3].min()) for sample, _ in found.values())
+    far = _far(oto)
+    for k, (title, (sample, K)) in enumerate(found.items()):
         left = margin + k * (3 * edge + 2 * gap + between)
         axes_of_sample = [_add(figure, left + i * (edge + gap), line, edge, edge) for i in range(3)]
-        near, far = float(sample.image[3].min()), _far(path)
         draw_sample(axes_of_sample, sample, K, near=near, far=far)
         axes_of_sample[0].text(0.0, 1.045, title, transform=axes_of_sample[0].transAxes,
                                fontsize=9, color=_INK)  # fmt: skip
@@ -274,8 +280,8 @@ def find_sample(path: Path, trial_id: int) -> tuple[Sample, Array]:
     raise DataError(f"{path}: must have a sample of trial {trial_id}, got none")
 
 
-def frames_figure(panels: Sequence[Panel], sample: Sample, png: Path) -> None:
-    """Draw panels side by side; the last is the image of a sample, with pixel axes and contacts."""
+def frames_figure(panels: Sequence[Panel], png: Path) -> None:
+    """Draw panels side by side; the last is a camera's image, with its pixel axes."""
     high, gap, margin, head = 5.0, 0.15, 0.1, 0.3
     aspects = [p.picture.image.shape[1] / p.picture.image.shape[0] for p in panels]
     heights = [high] * (len(panels) - 1) + [0.62 * high]
@@ -288,15 +294,14 @@ def frames_figure(panels: Sequence[Panel], sample: Sample, png: Path) -> None:
         left += aspect * tall + gap
         _show_image(axes, panel.picture.image)
         axes.set_title(panel.title, fontsize=9.5, color=_INK, loc="left", pad=5)
-        if panel is panels[-1]:
-            draw_contacts(axes, sample, panel.picture.K, scale=1.3)
-            _draw_pixel_axes(axes)
         draw_panel(axes, panel)
+    _draw_pixel_axes(axes)
     text = (
         "axes: x red, y green, z blue\n"
-        "arrows: contacts Q1 .. Q3 with their\nnormals, out of the object\n"
+        "arrows: contacts Q1 .. Q3 and their unit\nnormals, out of the object\n"
         "Ocm: centre of mass\n"
-        "dashed: the camera's field of view,\nand p_WT = (0, 0, 0.65 m)"
+        "dashed: p_WT = (0, 0, 0.65) m, the line from\n"
+        "G to C, 0.25 m, and the camera's field of view"
     )
     axes.text(0.0, -0.06, text, transform=axes.transAxes, fontsize=9.5, color=_INK, va="top",
               linespacing=1.5)  # fmt: skip
@@ -328,7 +333,12 @@ def draw_panel(axes: Axes, panel: Panel) -> None:
                   markeredgecolor="white", zorder=7)  # fmt: skip
     labels = {triad.label: triad.X_WA[:3, 3] for triad in panel.triads}
     labels |= dict(panel.points) | {name: start for name, (start, _) in panel.arrows.items()}
-    _draw_labels(axes, {name: picture.pixels(p[None])[0] for name, p in labels.items()})
+    drawn = [
+        t.X_WA[:3, 3] + f * t.length * t.X_WA[:3, :3].T for t in panel.triads for f in (0.5, 1)
+    ]
+    drawn += [np.linspace(start, end, 4) for start, end in panel.arrows.values()]
+    anchors = {name: picture.pixels(p[None])[0] for name, p in labels.items()}
+    _draw_labels(axes, anchors, picture.pixels(np.vstack(drawn)))
 
 
 def candidates_figure(
@@ -339,26 +349,44 @@ def candidates_figure(
     Args:
         vertices: Of the mesh, (n, 3) [m].
         faces: Of the mesh, (m, 3).
-        rays: By title, (r, 2, 3): from the palm's origin to the surface.
+        rays: By title, (r, 2, 3): from the palm's origin to the surface, in {O}.
         png: The file to write.
     """
-    figure = Figure(figsize=(3.6 * len(rays), 3.75), facecolor="white")
-    triangles = vertices[faces]
+    azimuth, elevation = np.deg2rad(-55.0), np.deg2rad(20.0)
+    out = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    right, towards = np.cross([0.0, 0.0, 1.0], out), np.cos(elevation) * out
+    towards[2] = np.sin(elevation)
+    # Orthographic view: rows are the axes to the right, up and towards the reader.
+    R_VO = np.vstack([right, np.cross(towards, right), towards])
+    triangles = vertices[faces] @ R_VO.T
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    light = np.array([0.35, -0.6, 0.72])
-    shade = 0.55 + 0.45 * np.clip(normals @ light, 0.0, 1.0)
-    colours = np.column_stack([np.outer(shade, [0.66, 0.72, 0.80]), np.full(len(faces), 0.55)])
-    reach = max(float(np.abs(ends).max()) for ends in rays.values())
-    for k, (title, ends) in enumerate(rays.items()):
-        axes = figure.add_axes((k / len(rays), 0.0, 1.0 / len(rays), 0.93), projection="3d")
-        axes.add_collection3d(Poly3DCollection(triangles, facecolors=colours, edgecolors="none"))
-        axes.add_collection3d(Line3DCollection(ends, colors="#7B2FA8", linewidths=0.5, alpha=0.55))
-        axes.set(xlim=(-reach, reach), ylim=(-reach, reach), zlim=(-reach, reach))
-        axes.set_box_aspect((1, 1, 1), zoom=1.55)
-        axes.view_init(elev=18.0, azim=-55.0)
-        axes.set_axis_off()
-        figure.text((k + 0.5) / len(rays), 0.945, title, fontsize=10.5, color=_INK, ha="center")
+    front = np.flatnonzero(normals[:, 2] > 0.0)
+    front = front[np.argsort(triangles[front, :, 2].mean(axis=1))]
+    shade = 0.55 + 0.45 * np.clip(normals[front] @ [-0.48, 0.6, 0.64], 0.0, 1.0)
+    colours = np.column_stack([np.outer(shade, [0.70, 0.77, 0.86]), np.full(len(front), 0.8)])
+    seen = {title: ends @ R_VO.T for title, ends in rays.items()}
+    every = np.concatenate([triangles, *(ends[:, [0, 1, 1]] for ends in seen.values())])[..., :2]
+    low, high = every.min(axis=(0, 1)), every.max(axis=(0, 1))
+    wide, margin, head = 3.6, 0.1, 0.3
+    tall = float(wide * (high[1] - low[1]) / (high[0] - low[0]))
+    figure = Figure(
+        figsize=(len(rays) * (wide + margin) + margin, tall + head + margin), facecolor="white"
+    )
+    for k, (title, ends) in enumerate(seen.items()):
+        axes = _add(figure, margin + k * (wide + margin), head, wide, tall)
+        # The mesh lets what is behind it shine through.
+        behind = ends[:, :, 2].mean(axis=1) < 0.0
+        for part, order in ((ends[behind], 1), (ends[~behind], 3)):
+            axes.add_collection(LineCollection(part[..., :2], colors="#7B2FA8", linewidths=0.6,
+                                               alpha=0.6, zorder=order))  # fmt: skip
+        axes.add_collection(
+            PolyCollection(triangles[front, :, :2], facecolors=colours, antialiaseds=False,
+                           edgecolors="none", zorder=2)
+        )  # fmt: skip
+        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        axes.set_title(title, fontsize=10.5, color=_INK, pad=5)
+        _bare(axes)
     _save(figure, png, dpi=130)
 
 
@@ -373,10 +401,8 @@ def _far(path: Path) -> float:
 
 
 def _depth_colours() -> Colormap:
-    colours = mpl.colormaps["viridis_r"].copy()
     # What is beyond the far plane has no depth.
-    colours.set_bad("#E3E6EA")
-    return colours
+    return mpl.colormaps["viridis_r"].with_extremes(bad="#E3E6EA")
 
 
 def _colour_bar(figure: Figure, axes: Axes, near: float, far: float, *, size: float) -> None:
@@ -388,13 +414,15 @@ def _colour_bar(figure: Figure, axes: Axes, near: float, far: float, *, size: fl
 
 
 def _finger_legend(figure: Figure, fingers: int, corner: tuple[float, float], size: float) -> None:
+    def mark(colour: str, inside: str, edge: str, label: str) -> Line2D:
+        return Line2D([], [], marker="o", linestyle="none", markersize=0.75 * size, color=colour,
+                      markerfacecolor=inside, markeredgecolor=edge, label=label)  # fmt: skip
+
     marks = [
-        Line2D([], [], marker="o", linestyle="none", markersize=size * 0.75, markeredgecolor="white",
-               color=FINGER_COLOURS[i % len(FINGER_COLOURS)], label=f"finger {i + 1}")
-        for i in range(fingers)
-    ]  # fmt: skip
-    marks.append(Line2D([], [], marker="o", linestyle="none", markersize=size * 0.7,
-                        markerfacecolor="white", color=_INK, label="hidden by the object"))  # fmt: skip
+        mark(c, c, "white", f"finger {i + 1}")
+        for i, c in enumerate(islice(cycle(FINGER_COLOURS), fingers))
+    ]
+    marks.append(mark(_INK, "white", _INK, "hidden by the object"))
     figure.legend(
         handles=marks, loc="upper left", bbox_to_anchor=corner, ncols=len(marks), fontsize=size,
         frameon=False, handletextpad=0.1, columnspacing=1.2, borderaxespad=0.0, borderpad=0.0,
@@ -402,27 +430,35 @@ def _finger_legend(figure: Figure, fingers: int, corner: tuple[float, float], si
     )  # fmt: skip
 
 
-def _draw_labels(axes: Axes, pixels: Mapping[str, Array]) -> None:
-    """Write names beside points, pushed away from the middle of all."""
-    middle = np.mean(list(pixels.values()), axis=0)
+def _draw_labels(axes: Axes, pixels: Mapping[str, Array], obstacles: Array) -> None:
+    """Write names beside points, each on the side where there is most room."""
+    # Points of the paper per pixel of the image, and pixels per label's distance.
+    window = axes.get_window_extent()
+    reach = LABEL_REACH * axes.figure.dpi / 72.0 * abs(np.ptp(axes.get_xlim())) / window.width
+    angles = np.deg2rad(np.arange(0.0, 360.0, 30.0))
+    directions = np.column_stack([np.cos(angles), np.sin(angles)])
+    taken = np.vstack([obstacles, *pixels.values()])
     for name, pixel in pixels.items():
-        away = pixel - middle
-        away = 13.0 * away / max(float(np.linalg.norm(away)), 1e-9) * np.array([1.0, -1.0])
-        axes.annotate(
-            name, pixel, xytext=away, textcoords="offset points", ha="center", va="center",
-            fontsize=10.5, weight="bold", color="black", zorder=9, annotation_clip=False,
-            path_effects=[withStroke(linewidth=3.0, foreground="white")],
+        places = pixel + reach * directions * [1.0 + 0.25 * len(name), 1.0]
+        distances = np.linalg.norm(places[:, None] - taken[None], axis=2)
+        place = places[np.argmax(np.sort(distances, axis=1)[:, :3] @ [4.0, 2.0, 1.0])]
+        taken = np.vstack([taken, place])
+        axes.text(
+            place[0], place[1], name, ha="center", va="center", fontsize=10.5, weight="bold",
+            color="black", zorder=9, path_effects=[withStroke(linewidth=3.0, foreground="white")],
         )  # fmt: skip
 
 
 def _draw_pixel_axes(axes: Axes) -> None:
     """Draw where pixel coordinates start, and which way u and v go."""
-    for name, tip in (("u", (34.0, 0.0)), ("v", (0.0, 34.0))):
-        axes.annotate(name, (0.0, 0.0), tip, color=_INK, fontsize=11, ha="center", va="center",
-                      arrowprops={"arrowstyle": "<|-", "color": _INK, "shrinkA": 4, "shrinkB": 0},
-                      path_effects=[withStroke(linewidth=3.0, foreground="white")])  # fmt: skip
-    axes.text(4.0, 7.0, "(0, 0)", color=_INK, fontsize=9, va="center",
-              path_effects=[withStroke(linewidth=3.0, foreground="white")])  # fmt: skip
+    halo = [withStroke(linewidth=3.0, foreground="white")]
+    for tip in ((30.0, 0.0), (0.0, 30.0)):
+        arrow = {"arrowstyle": "-|>", "color": _INK, "shrinkA": 0.0, "shrinkB": 0.0,
+                 "path_effects": halo, "linewidth": 1.6}  # fmt: skip
+        axes.annotate("", tip, (0.0, 0.0), arrowprops=arrow)
+    for x, y, text in ((34.0, 3.0, "u"), (3.5, 34.0, "v"), (10.0, 5.0, "(0, 0)")):
+        axes.text(x, y, text, color=_INK, fontsize=10, ha="center", va="center",
+                  path_effects=halo)  # fmt: skip
 
 
 def _add(figure: Figure, left: float, top: float, wide: float, high: float) -> Axes:

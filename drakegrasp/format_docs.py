@@ -55,12 +55,31 @@ may round differently.
 ## Missing values
 
 The two data files hold no NaN. In `trials.hdf5` a value that does not exist for a row is NaN
-(floats), 0 or false: the column "from" below says with which stage a value begins. Contact points
+(floats), 0 or false: the column "from" above says with which stage a value begins. Contact points
 and normals are also NaN for a finger that does not touch. The stage of a row follows from its
 outcome: `success`, `slipped` and `dropped` were lifted; `missing_fingertip` and `hand_contact` were
-closed; `table_contact` was closed, and lifted if `time_lift` is a number (then it is the object that
-still touches the table); all others were only placed. `solver_error`, `timeout` and `crashed`
+closed; `table_contact` was closed, and lifted if `time_lift` is a number (then it is the object
+that still touches the table); all others were only placed. `solver_error`, `timeout` and `crashed`
 say that the simulator failed: never count them as failed grasps.
+"""
+
+
+_ATTRIBUTES = """
+Further attributes: `schema_version`, `camera`, camera matrix `K` [px], `near` and `far` [m],
+`config` and `versions` (JSON), `config_hash`, `seed`, `signature` (of what the file was assembled
+from).
+"""
+
+_DATA = """## grasping_oto.hdf5 and grasping_otm.hdf5
+
+Groups `/train`, `/valid` and `/test` have the same fields; images and masks are stored in one
+chunk per sample, gzip 1 with shuffle. Successes only, after the filters.
+"""
+
+_SHARDS = """
+## Shards
+
+`/trials` as above without `trial_id` and `object`, and `/looks` with a row per success:
 """
 
 
@@ -71,12 +90,8 @@ def format_page() -> str:
             _HEAD,
             "## Conventions\n\nThey are in every file as attributes `convention_*`.\n",
             _table(("attribute", "text"), CONVENTIONS.items()),
-            "\nFurther attributes: `schema_version`, `camera`, camera matrix `K` [px], `near` and `far` "
-            "[m], `config` and\n`versions` (JSON), `config_hash`, `seed`, `signature` "
-            "(of what the file was assembled from).\n",
-            "## grasping_oto.hdf5 and grasping_otm.hdf5\n\nGroups `/train`, `/valid` and `/test` have "
-            "the same fields; images and masks are stored in one chunk per\nsample, gzip 1 with "
-            "shuffle. Successes only, after the filters.\n",
+            _ATTRIBUTES,
+            _DATA,
             _fields(DATA_FIELDS),
             "\n## trials.hdf5\n\n### /trials\n",
             _fields(TRIAL_FIELDS, stages=True),
@@ -84,8 +99,7 @@ def format_page() -> str:
             _fields(OBJECT_FIELDS),
             "\n### /successes\n",
             _fields(SUCCESS_FIELDS),
-            "\n## Shards\n\n`/trials` as above without `trial_id` and `object`, and `/looks` with a row "
-            "per success:\n",
+            _SHARDS,
             _fields(LOOK_FIELDS),
             "\n" + _CONTRACT,
         ]

@@ -86,12 +86,9 @@ class Finger:
 @with_config(_STRICT)
 @dataclass(frozen=True, kw_only=True)
 class Spread:
-    """The joints that all turn by the spread angle; a hand may have none."""
+    """The joints that all stand at the spread angle during an attempt; a hand may have none."""
 
     joints: tuple[Name, ...] = ()
-    torque_limit: NonNegative = 0.0  # at each joint [N m]
-    rotor_inertia: NonNegative = 0.0  # of the motor [kg m^2]
-    gear_ratio: Positive = 1.0  # motor angle / spread angle
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
@@ -164,6 +165,14 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
                 "choose another --out"
             )
     return manifest
+
+
+def release_directory(out: Path) -> None:
+    """Take back a claim on a directory in which nothing was made."""
+    (out / FILE_NAME).unlink(missing_ok=True)
+    # A directory that holds anything else was there before.
+    with suppress(OSError):
+        out.rmdir()
 
 
 def change_postprocessing(out: Path, overrides: Sequence[str]) -> None:

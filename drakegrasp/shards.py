@@ -2,7 +2,8 @@
 
 A file is written under a temporary name in its own folder, closed, synced and renamed, so
 a reader never sees half of one and a crash leaves nothing but a temporary file. A shard's
-header says what it is of; its checksum covers every array.
+header says what it is of. Its seal, the SHA-256 of all other bytes in the user block that
+HDF5 leaves free at a file's start, shows any change of a single bit.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import h5py
 import numpy as np
@@ -26,8 +27,8 @@ AnyArray = npt.NDArray[Any]
 
 #: Fields of `/trials` that only the whole dataset can fill, so no shard has them.
 ASSEMBLED_FIELDS = ("trial_id", "object")
-#: Deflate compresses by 1,032 at most; more means that a size in the file is wrong.
-MAX_COMPRESSION = 1032
+#: Bytes of the user block at a shard's start that holds the seal; HDF5 wants a power of two.
+SEAL_SIZE = 512
 #: Rows in a chunk of a column of small values.
 COLUMN_CHUNK = 2048
 #: Suffix of a file that is being written; what is left of one after a crash may be deleted.
@@ -76,8 +77,12 @@ def trial_columns() -> tuple[Field, ...]:
 
 
 @contextmanager
-def atomic_hdf5(path: Path) -> Iterator[h5py.File]:
+def atomic_hdf5(path: Path, *, sealed: bool = False) -> Iterator[h5py.File]:
     """Open a new HDF5 file that appears at `path` only when the block ends well.
+
+    Args:
+        path: Of the file.
+        sealed: Whether to leave room for a seal and set it, see `seal`.
 
     Raises:
         OSError: If the disk is full or the folder cannot be written; nothing is left behind.
@@ -85,11 +90,43 @@ def atomic_hdf5(path: Path) -> Iterator[h5py.File]:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY_SUFFIX}")
     try:
-        with h5py.File(temporary, "w") as file:
+        with h5py.File(temporary, "w", userblock_size=SEAL_SIZE if sealed else 0) as file:
             yield file
+        if sealed:
+            seal(temporary)
         sync_and_rename(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def seal(path: Path) -> None:
+    """Write the hash of a file's bytes behind the seal into the seal."""
+    with path.open("r+b") as file:
+        text = _seal_of(file)
+        file.seek(0)
+        file.write(text)
+
+
+def refuse_broken_seal(path: Path) -> None:
+    """Refuse a sealed file of which any bit has changed.
+
+    Raises:
+        DataError: If it has, or the file is missing.
+    """
+    try:
+        with path.open("rb") as file:
+            found = file.read(SEAL_SIZE)
+            intact = found == _seal_of(file)
+    except OSError as error:
+        raise DataError(f"{path}: must be a complete shard, got none ({error.strerror})") from None
+    if not intact:
+        raise DataError(f"{path}: must be a complete shard, got one that is damaged or cut off")
+
+
+def _seal_of(file: BinaryIO) -> bytes:
+    file.seek(SEAL_SIZE)
+    digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return f"drakegrasp shard, sha256 of the rest: {digest}\n".encode().ljust(SEAL_SIZE, b"\0")
 
 
 def sync_and_rename(temporary: Path, path: Path) -> None:
@@ -137,11 +174,11 @@ def write_field(group: h5py.Group, field: Field, values: AnyArray) -> h5py.Datas
 def write_shard(out: Path, shard: Shard) -> Path:
     """Write a shard into a dataset's directory and return its path."""
     path = shard.header.path(out)
-    with atomic_hdf5(path) as file:
+    tables = (("trials", trial_columns(), shard.trials), ("looks", LOOK_FIELDS, shard.looks))
+    with atomic_hdf5(path, sealed=True) as file:
         file.attrs.update(asdict(shard.header))
         file.attrs["schema_version"] = SCHEMA_VERSION
-        file.attrs["checksum"] = _checksum(shard)
-        for name, fields, columns in _tables(shard):
+        for name, fields, columns in tables:
             group = file.create_group(name)
             for field in fields:
                 write_field(group, field, np.asarray(columns[field.name]))
@@ -156,9 +193,30 @@ def read_shard(path: Path, header: ShardHeader | None = None) -> Shard:
         header: What it must be of, if that matters.
 
     Raises:
-        DataError: If it is truncated, of another schema, configuration, mesh or range, or
-            its checksum disagrees; the message names the file and the reason.
+        DataError: If it is missing, truncated or changed by a single bit, or of another schema,
+            configuration, mesh or range; the message names the file and the reason.
     """
+    with _open_shard(path, header) as (file, found):
+        return Shard(
+            header=found,
+            trials={f.name: file["trials"][f.name][:] for f in trial_columns()},
+            looks={f.name: file["looks"][f.name][:] for f in LOOK_FIELDS},
+        )
+
+
+def read_outcomes(path: Path, header: ShardHeader) -> npt.NDArray[np.uint8]:
+    """Return the outcomes of a shard's attempts, without its other columns.
+
+    Raises:
+        DataError: See `read_shard`.
+    """
+    with _open_shard(path, header) as (file, _):
+        return np.asarray(file["trials/outcome"][:])
+
+
+@contextmanager
+def _open_shard(path: Path, header: ShardHeader | None) -> Iterator[tuple[h5py.File, ShardHeader]]:
+    refuse_broken_seal(path)
     try:
         with h5py.File(path, "r") as file:
             version = int(file.attrs["schema_version"])
@@ -171,43 +229,8 @@ def read_shard(path: Path, header: ShardHeader | None = None) -> Shard:
                 start=int(file.attrs["start"]),
                 stop=int(file.attrs["stop"]),
             )
-            _refuse_impossible_sizes(file, path.stat().st_size)
-            shard = Shard(
-                header=found,
-                trials={f.name: file["trials"][f.name][:] for f in trial_columns()},
-                looks={f.name: file["looks"][f.name][:] for f in LOOK_FIELDS},
-            )
-            checksum = str(file.attrs["checksum"])
-    except (OSError, KeyError, RuntimeError, ValueError, TypeError, MemoryError) as error:
-        if isinstance(error, DataError):
-            raise
-        raise DataError(f"{path}: must be a complete shard, got a damaged file ({error})") from None
-    if header is not None and found != header:
-        raise DataError(f"{path}: must be a shard of {header}, got one of {found}")
-    if _checksum(shard) != checksum:
-        raise DataError(f"{path}: checksum must be {checksum[:12]}…, got other content")
-    return shard
-
-
-def _refuse_impossible_sizes(file: h5py.File, file_size: int) -> None:
-    """Refuse columns that cannot have come from a file of this size before memory is taken."""
-    for group in ("trials", "looks"):
-        datasets = list(file[group].values())
-        if len({len(dataset) for dataset in datasets}) != 1:
-            raise ValueError(f"columns of {group} differ in length")
-        if any(dataset.nbytes > MAX_COMPRESSION * file_size for dataset in datasets):
-            raise ValueError(f"a column of {group} is larger than the file can hold")
-
-
-def _tables(shard: Shard) -> tuple[tuple[str, tuple[Field, ...], Mapping[str, AnyArray]], ...]:
-    return (("trials", trial_columns(), shard.trials), ("looks", LOOK_FIELDS, shard.looks))
-
-
-def _checksum(shard: Shard) -> str:
-    digest = hashlib.sha256(repr(shard.header).encode())
-    for name, fields, columns in _tables(shard):
-        for field in fields:
-            values = np.ascontiguousarray(columns[field.name], dtype=np.dtype(field.dtype))
-            digest.update(f"{name}/{field.name}{values.shape}".encode())
-            digest.update(values.tobytes())
-    return digest.hexdigest()
+            if header is not None and found != header:
+                raise DataError(f"{path}: must be a shard of {header}, got one of {found}")
+            yield file, found
+    except (OSError, KeyError) as error:
+        raise DataError(f"{path}: must be a complete shard, got another file ({error})") from None

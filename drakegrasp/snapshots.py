@@ -40,9 +40,15 @@ from drakegrasp.assemble import DATA_FILES, TRIALS_FILE
 from drakegrasp.camera import unproject
 from drakegrasp.config import Config
 from drakegrasp.errors import DataError
-from drakegrasp.dataset import Sample
-from drakegrasp.figures import Panel, Picture, Triad, find_sample
-from drakegrasp.frames import X_WT, Array, invert_pose, make_pose, rotate_vectors, transform_points, unpack_pose
+from drakegrasp.figures import ARROW, Panel, Picture, Triad, find_sample
+from drakegrasp.frames import (
+    X_WT,
+    Array,
+    make_pose,
+    rotate_vectors,
+    transform_points,
+    unpack_pose,
+)
 from drakegrasp.hand import Hand, load_hand, make_parser
 from drakegrasp.manifest import read_manifest
 from drakegrasp.meshes import ObjectModel, obj_text
@@ -64,9 +70,13 @@ BACKGROUND = np.array([0.95, 0.96, 0.97])
 TABLE_COLOUR = np.array([0.74, 0.70, 0.64, 1.0])
 TABLE_SIZE, TABLE_THICKNESS = 1.6, 0.1
 #: Edge of the table where the world's origin below it must be seen [m].
-SMALL_TABLE = 0.5
+SMALL_TABLE = 0.36
+#: From where a camera's line of sight is looked at, about the vertical [rad].
+SIDE_VIEW = np.deg2rad(62.0)
+#: The camera follows the lift by this part of the way, and from this much further off.
+FOLLOW, BACK = 0.85, 0.3
 #: Edge of the map that the shadows are looked up in [px].
-SHADOW_MAP = 2048
+SHADOW_MAP = 4096
 _ENGINE = "vtk"
 
 
@@ -280,7 +290,10 @@ def outline(theatre: Theatre, moment: Moment, half_extents: Array) -> Array:
     links = [plant.get_body(i).name() for i in plant.GetBodyIndices(theatre.hand_instance)]
     corners = half_extents * np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T
     return np.vstack(
-        [transform_points(moment.X_WO, corners), *(theatre.pose(link)[None, :3, 3] for link in links)]
+        [
+            transform_points(moment.X_WO, corners),
+            *(theatre.pose(link)[None, :3, 3] for link in links),
+        ]
     )
 
 
@@ -300,67 +313,72 @@ def trial_snapshots(
     for moment in (trial.place, trial.close):
         show(theatre, moment)
         pictures.append(take(theatre, X_WC, size))
-    # The camera follows the lift, not all the way and from further off: the table stays in view.
+    # So the table stays in view, and one sees that there is air below the object.
     rise = trial.lift.X_WG[:3, 3] - trial.close.X_WG[:3, 3]
-    distance = np.linalg.norm(X_WC[:3, 3] - trial.close.X_WO[:3, 3])
-    back = make_pose(np.eye(3), [0.0, 0.0, -0.3 * distance])
+    distance = float(np.linalg.norm(X_WC[:3, 3] - trial.close.X_WO[:3, 3]))
+    back = make_pose(np.eye(3), [0.0, 0.0, -BACK * distance])
     show(theatre, trial.lift)
-    pictures.append(take(theatre, make_pose(np.eye(3), 0.85 * rise) @ X_WC @ back, size))
+    pictures.append(take(theatre, make_pose(np.eye(3), FOLLOW * rise) @ X_WC @ back, size))
     return pictures
 
 
-def frames_panels(out: Path, trial_id: int) -> tuple[list[Panel], Sample]:
-    """Return the panels of the figure of all frames, and the `otm` sample of their trial.
+def frames_panels(out: Path, trial_id: int) -> list[Panel]:
+    """Return the panels of the figure of all frames: from afar, from near, through the camera.
 
     Raises:
         DataError: If the trial is no sample.
     """
     sample, K = find_sample(out / DATA_FILES["otm"], trial_id)
-    trial = stage_trial(out, trial_id, table_size=SMALL_TABLE)
-    theatre, moment, model = trial.theatre, trial.close, trial.model
-    show(theatre, moment)
     X_WC = X_WT @ unpack_pose(sample.props["frame_work2cam_otm"])
     X_WI = X_WC @ unpack_pose(sample.props["frame_cam2img_otm"])
-    p_WQ = transform_points(moment.X_WO, trial.p_OQ)
-    normals = rotate_vectors(moment.X_WO, trial.nhat_Q_O)
-    p_WOcm = transform_points(moment.X_WO, model.p_OOcm[None])[0]
-    body = outline(theatre, moment, model.half_extents)
+    trial = stage_trial(out, trial_id)
+    X_WO, X_WG = trial.close.X_WO, trial.close.X_WG
+    p_WQ = transform_points(X_WO, trial.p_OQ)
+    normals = rotate_vectors(X_WO, trial.nhat_Q_O)
+    tips = zip(p_WQ, p_WQ + ARROW * normals, strict=True)
+    contacts = {f"Q{i + 1}": ends for i, ends in enumerate(tips)}
+    half = trial.model.half_extents
 
-    frustum = _frustum(X_WC, K, sample.mask.shape[0], 0.12)
-    around = np.vstack([np.zeros((1, 3)), body, X_WC[None, :3, 3]])
-    far_off = [Triad(label="W", X_WA=np.eye(4), length=0.15)]
-    far_off += [Triad(label="T", X_WA=X_WT, length=0.1), Triad(label="C", X_WA=X_WC, length=0.09)]
-    # From the side of the camera's line of sight, so that the line of sight is seen.
-    X_WE = view(around, float(np.arctan2(X_WC[1, 2], X_WC[0, 2])) + np.pi / 2.0, np.deg2rad(12.0))
-    overview = Panel(
+    small = build_theatre(trial.model, trial.theatre.hand, table_size=SMALL_TABLE)
+    around = np.vstack([np.zeros((1, 3)), outline(small, trial.close, half), X_WC[None, :3, 3]])
+    # Almost from the side of the camera's line of sight, so that its length is seen.
+    azimuth = float(np.arctan2(X_WC[1, 2], X_WC[0, 2])) + SIDE_VIEW
+    lines = [np.vstack([np.zeros(3), X_WT[:3, 3]]), np.vstack([X_WG[:3, 3], X_WC[:3, 3]])]
+    afar = Panel(
         title="world, table, palm, camera",
-        picture=take(theatre, X_WE, (520, 900)),
-        triads=[*far_off, Triad(label="G", X_WA=moment.X_WG, length=0.09)],
-        lines=[np.vstack([np.zeros(3), X_WT[:3, 3]]), *frustum],
-    )
-    tips = [
-        Triad(label=f"F{i + 1}", X_WA=theatre.pose(link), length=0.022)
-        for i, link in enumerate(theatre.hand.fingertip_links)
-    ]
-    close_up = Panel(
-        title="object, hand, contacts",
-        picture=take(theatre, choose_view(theatre, body), (900, 900)),
+        picture=take(small, view(around, azimuth, np.deg2rad(12.0)), (520, 900)),
         triads=[
-            Triad(label="O", X_WA=moment.X_WO, length=0.04),
-            Triad(label="T", X_WA=X_WT, length=0.04),
-            Triad(label="G", X_WA=moment.X_WG, length=0.04),
-            *tips,
+            Triad(label="W", X_WA=np.eye(4), length=0.15),
+            Triad(label="T", X_WA=X_WT, length=0.1),
+            Triad(label="C", X_WA=X_WC, length=0.09),
+            Triad(label="G", X_WA=X_WG, length=0.09),
         ],
-        points={"Ocm": p_WOcm},
-        arrows={f"Q{i + 1}": (p, p + 0.035 * n) for i, (p, n) in enumerate(zip(p_WQ, normals))},
+        lines=[*lines, *_frustum(X_WC, K, sample.mask.shape[0], depth=0.12)],
+    )
+    body = outline(trial.theatre, trial.close, half)
+    near = Panel(
+        title="object, hand, contacts",
+        picture=take(trial.theatre, choose_view(trial.theatre, body), (900, 900)),
+        triads=[
+            Triad(label="O", X_WA=X_WO, length=0.04),
+            Triad(label="T", X_WA=X_WT, length=0.04),
+            Triad(label="G", X_WA=X_WG, length=0.04),
+            *(
+                Triad(label=f"F{i + 1}", X_WA=trial.theatre.pose(link), length=0.022)
+                for i, link in enumerate(trial.theatre.hand.fingertip_links)
+            ),
+        ],
+        points={"Ocm": transform_points(X_WO, trial.model.p_OOcm[None])[0]},
+        arrows=contacts,
     )
     rgb = np.rint(255.0 * np.moveaxis(sample.image[:3], 0, 2)).astype(np.uint8)
     seen = Panel(
         title="image (otm): pixels, image frame",
         picture=Picture(image=rgb, K=K, X_WC=X_WC),
         triads=[Triad(label="I", X_WA=X_WI, length=0.04)],
+        arrows=contacts,
     )
-    return [overview, close_up, seen], sample
+    return [afar, near, seen]
 
 
 def _frustum(X_WC: Array, K: Array, size: int, depth: float) -> list[Array]:
@@ -375,15 +393,15 @@ def _frustum(X_WC: Array, K: Array, size: int, depth: float) -> list[Array]:
 def _parameters() -> RenderEngineVtkParams:
     # Camera axes: +X right, +Y down. Point lights cast no shadow in VTK; the spot does.
     lights = [
-        LightParameter(type="point", frame="camera", position=[0.3, -0.3, -0.5], intensity=0.6),
-        LightParameter(type="point", frame="world", position=[0.0, 0.0, 4.0], intensity=0.3),
+        LightParameter(type="point", frame="camera", position=[0.3, -0.3, -0.5], intensity=0.5),
+        LightParameter(type="point", frame="world", position=[0.0, 0.0, 4.0], intensity=0.25),
         LightParameter(
             type="spot",
             frame="camera",
             position=[-1.0, -1.3, 0.2],
             direction=[1.0, 1.3, 1.0],
-            intensity=0.75,
-            cone_angle=40.0,
+            intensity=0.7,
+            cone_angle=26.0,
         ),
     ]
     return RenderEngineVtkParams(

@@ -1,8 +1,9 @@
 """One attempt, from its start pose to its verdict.
 
-This is the one function that build, verify and replay all call. In: a scene, the object, its resting pose and an attempt. Out: a `TrialRecord` with the
-outcome and everything that was measured on the way. Failures of the physics are values;
-the one place where an error of Drake becomes an outcome is `run_attempt`.
+This is the one function that build, verify and replay all call. In: a scene, the object's
+resting pose and an attempt. Out: a `TrialRecord` with the outcome and everything that was
+measured on the way. Failures of the physics are values; the one place where an error of
+Drake becomes an outcome is `run_attempt`.
 """
 
 from __future__ import annotations

@@ -124,7 +124,9 @@ def run_unit(unit: WorkUnit) -> UnitSummary:
     looks = _timed(seconds, "look", lambda: look_at_successes(bench, records))
     shard = Shard(header=header, trials=trial_rows(bench, attempts, records), looks=looks)
     _timed(seconds, "write", lambda: write_shard(out, shard))
-    return UnitSummary(header=header, outcomes=count_outcomes(shard), seconds=seconds)
+    return UnitSummary(
+        header=header, outcomes=count_outcomes(shard.trials["outcome"]), seconds=seconds
+    )
 
 
 def unit_attempts(
@@ -151,9 +153,9 @@ def try_on(bench: Workbench, attempt: Attempt) -> TrialRecord:
     return record
 
 
-def count_outcomes(shard: Shard) -> dict[Outcome, int]:
-    """Return the number of a shard's attempts by outcome."""
-    values, counts = np.unique(shard.trials["outcome"], return_counts=True)
+def count_outcomes(outcomes: AnyArray) -> dict[Outcome, int]:
+    """Return the number of attempts by outcome, of a column of outcomes."""
+    values, counts = np.unique(outcomes, return_counts=True)
     return {Outcome(int(v)): int(n) for v, n in zip(values, counts, strict=True)}
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from drakegrasp.assemble import DATA_FILES
 from drakegrasp.builtin import export_builtin
 from drakegrasp.candidates import sample_candidates
 from drakegrasp.config import load_config
@@ -35,32 +36,31 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("dataset", type=Path, help="directory of a finished dataset")
     parser.add_argument("--trial", type=int, required=True, help="a success that is a sample")
     parser.add_argument("--images", type=Path, default=Path("docs/images"), help="where to write")
-    parser.add_argument("--rays", type=int, default=300, help="palm poses drawn per method")
+    parser.add_argument("--rays", type=int, default=220, help="palm poses drawn per method")
     arguments = parser.parse_args(argv)
     out, images = arguments.dataset, arguments.images
     images.mkdir(parents=True, exist_ok=True)
     pictures = trial_snapshots(out, arguments.trial)
-    hero_figure(out, arguments.trial, pictures, images / "trial.png")
-    panels, sample = frames_panels(out, arguments.trial)
-    frames_figure(panels, sample, images / "frames.png")
+    oto, otm = out / DATA_FILES["oto"], out / DATA_FILES["otm"]
+    hero_figure(oto, otm, arguments.trial, pictures, images / "trial.png")
+    frames_figure(frames_panels(out, arguments.trial), images / "frames.png")
     with tempfile.TemporaryDirectory() as folder:
         export_builtin(folder, [MUG])
         mug = prepare(find_meshes(Path(folder))[0], load_config(None, ["candidates.max=1"]))
     rays = {title: palm_rays(mug, method, arguments.rays) for method, title in METHODS.items()}
     model = mug.model
-    candidates_figure(
-        model.visual_vertices, model.visual_faces, rays, images / "candidates.png"
-    )
+    candidates_figure(model.visual_vertices, model.visual_faces, rays, images / "candidates.png")
     return 0
 
 
 def palm_rays(prepared: PreparedObject, method: str, count: int) -> Array:
-    """Return (n, 2, 3), from the palm to the surface, of the candidates whose ray meets it."""
-    config = load_config(None, [f"candidates.method={method}", f"candidates.max={count}"])
+    """Return (count, 2, 3), from the palm at its largest stand-off to the surface, in {O}."""
+    config = load_config(None, [f"candidates.method={method}", f"candidates.max={10 * count}"])
     found = sample_candidates(prepared.model, prepared.X_TO, config.candidates, config.seed)
-    p, z = found.X_OG[:, :3, 3], found.X_OG[:, :3, 2]
-    ends = np.stack([p, p + found.distance[:, None] * z], axis=1)
-    return ends[np.isfinite(found.distance)]
+    hits = np.flatnonzero(np.isfinite(found.distance))[:count]
+    z_O = found.X_OG[hits, :3, 2]
+    p_OS = found.X_OG[hits, :3, 3] + found.distance[hits, None] * z_O
+    return np.stack([p_OS - max(config.candidates.standoffs) * z_O, p_OS], axis=1)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from pydrake.systems.sensors import CameraInfo
@@ -20,7 +20,6 @@ from drakegrasp.camera import (
 )
 from drakegrasp.config import CameraConfig
 from drakegrasp.frames import Array, invert_pose, make_pose, transform_points
-
 
 CONFIG = CameraConfig()
 K = intrinsics(CONFIG)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
@@ -21,7 +21,6 @@ from drakegrasp.frames import (
     transform_points,
     unpack_pose,
 )
-
 
 vectors = arrays(np.float64, 3, elements=st.floats(-3.0, 3.0))
 poses = st.builds(lambda r, p: make_pose(Rotation.from_rotvec(r).as_matrix(), p), vectors, vectors)

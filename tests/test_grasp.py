@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from drakegrasp.frames import Array, invert_pose, make_pose
 from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp
-
 
 vectors = arrays(np.float64, 3, elements=st.floats(-3.0, 3.0))
 poses = st.builds(lambda r, p: make_pose(Rotation.from_rotvec(r).as_matrix(), p), vectors, vectors)

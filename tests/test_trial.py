@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from models import CUBE, box_model, from_above, model_of, standing
 
 from drakegrasp import trial as trial_module
 from drakegrasp.camera import camera_pose_oto
@@ -30,7 +31,6 @@ from drakegrasp.scene import (
     reset_object,
 )
 from drakegrasp.trial import TrialRecord, judge_closed, judge_lifted, lift_duration, run_attempt
-from models import CUBE, box_model, from_above, model_of, standing
 
 pytestmark = pytest.mark.sim
 

@@ -1,0 +1,107 @@
+"""The walls: imports point one way, reading needs no simulator, Dask stays in its place."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import drakegrasp
+
+PACKAGE = Path(drakegrasp.__file__).parent
+
+#: Each line may import only from lines above it (docs/architecture.md).
+LAYERS: tuple[frozenset[str], ...] = tuple(
+    frozenset(line.split())
+    for line in (
+        "errors frames progress",
+        "grasp outcomes config",
+        "schema hand mend shapes",
+        "meshes shards camera filters",
+        "builtin manifest candidates",
+        "scene render dataset assemble",
+        "contacts stats invariants",
+        "resting trial tables check figures",
+        "prepared",
+        "units",
+        "build replay snapshots",
+        "cluster doctor format_docs",
+        "cli",
+    )
+)
+READERS = ("grasp", "schema", "shards", "dataset")
+#: Modules that may know Dask.
+KNOWS_DASK = {"cluster"}
+
+
+def imports_of(module: str) -> set[str]:
+    """Return what a module imports at any depth of its code, as dotted names."""
+    tree = ast.parse((PACKAGE / f"{module}.py").read_text(encoding="utf-8"))
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found.add(node.module or "")
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def modules() -> list[str]:
+    return sorted(p.stem for p in PACKAGE.glob("*.py") if p.stem != "__init__")
+
+
+def test_every_module_has_its_layer() -> None:
+    assert sorted(name for layer in LAYERS for name in layer) == modules()
+
+
+@pytest.mark.parametrize("module", modules())
+def test_imports_point_to_layers_above(module: str) -> None:
+    (own,) = (i for i, layer in enumerate(LAYERS) if module in layer)
+    allowed = {name for layer in LAYERS[:own] for name in layer}
+    ours = {
+        name.split(".")[1]
+        for name in imports_of(module)
+        if name.startswith("drakegrasp.") and name.split(".")[1] in modules()
+    }
+    assert ours <= allowed, f"{module} imports {sorted(ours - allowed)}"
+
+
+@pytest.mark.parametrize("module", modules())
+def test_only_the_cluster_module_knows_dask(module: str) -> None:
+    knows = any(name.split(".")[0] in ("dask", "distributed") for name in imports_of(module))
+    assert not knows or module in KNOWS_DASK
+
+
+@pytest.mark.parametrize("module", [*READERS, "check"])
+def test_reading_data_loads_no_drake_and_no_dask(module: str) -> None:
+    forbidden = ["pydrake", "dask", "distributed"]
+    if module in READERS:
+        forbidden += ["trimesh", "matplotlib", "rich", "scipy"]
+    code = (
+        f"import sys, drakegrasp.{module}; "
+        f"print([name for name in {forbidden} if name in sys.modules])"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == "[]"
+
+
+def test_public_names_are_sorted_and_exist() -> None:
+    assert drakegrasp.__all__ == sorted(drakegrasp.__all__)
+    for name in drakegrasp.__all__:
+        assert getattr(drakegrasp, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'magic'"):
+        _ = drakegrasp.magic
+
+
+@pytest.mark.parametrize("module", modules())
+def test_code_names_a_hand_only_as_a_default(module: str) -> None:
+    tree = ast.parse((PACKAGE / f"{module}.py").read_text(encoding="utf-8"))
+    texts = [n.value for n in ast.walk(tree) if isinstance(n, ast.Constant)]
+    named = [t for t in texts if isinstance(t, str) and t.lower().startswith("barrett")]
+    assert named == (["barrett"] if module in ("config", "hand") else [])
