@@ -51,6 +51,7 @@ class BuildReport:
         reused: Work units that had been done before.
         objects: Number of objects.
         refused: Name and reason of each mesh that was refused.
+        errors: Number of solver errors by message, of the units that were run now.
         assembly: What the files hold.
     """
 
@@ -59,6 +60,7 @@ class BuildReport:
     reused: int
     objects: int
     refused: tuple[dict[str, str], ...]
+    errors: dict[str, int]
     assembly: Assembly
 
 
@@ -106,7 +108,7 @@ def build(
         raise DataError(f"at least one mesh must be fit to simulate, got none: {reasons}")
     write_manifest(manifest, out)
     with progress_bar("simulate", "attempts", show=show) as report:
-        simulated, reused = _run_all(manifest, out, execute, report)
+        simulated, reused, errors = _run_all(manifest, out, execute, report)
     if simulated or not is_assembled(out):
         with progress_bar("assemble", "shards", show=show) as report:
             assemble(out, progress=report)
@@ -116,6 +118,7 @@ def build(
         reused=reused,
         objects=len(manifest.objects),
         refused=manifest.refused,
+        errors=errors,
         assembly=summarise(out),
     )
 
@@ -172,8 +175,10 @@ def _prepare_one(task: _PrepareTask) -> tuple[str, dict[str, Any]]:
     return source.name, prepared.summary()
 
 
-def _run_all(manifest: Manifest, out: Path, execute: Executor, report: Report) -> tuple[int, int]:
-    """Run the work units that are not done; return how many were run and how many reused."""
+def _run_all(
+    manifest: Manifest, out: Path, execute: Executor, report: Report
+) -> tuple[int, int, dict[str, int]]:
+    """Run the work units that are not done; return how many were run, how many reused, errors."""
     progress = _Progress(manifest, report)
     pending = []
     for header in manifest.headers():
@@ -189,9 +194,11 @@ def _run_all(manifest: Manifest, out: Path, execute: Executor, report: Report) -
         for header in pending
         if progress.wants(header)
     )
+    errors: Counter[str] = Counter()
     for summary in execute(run_unit, units):
         progress.add(summary.header, summary.outcomes)
-    return len(progress.done) - reused, reused
+        errors.update(summary.errors)
+    return len(progress.done) - reused, reused, dict(errors)
 
 
 def _outcomes_on_disk(header: ShardHeader, out: Path) -> dict[Outcome, int] | None:

@@ -283,6 +283,8 @@ def _print_report(report: BuildReport) -> None:
         click.echo(f"{report.simulated} work units simulated{reused}")
     else:
         click.echo(f"all {report.reused} work units had been done before: nothing was simulated")
+    for message, count in report.errors.items():
+        click.echo(f"solver error in {count} attempts: {message}")
     for entry in report.refused:
         click.echo(f"refused: {entry['name']}: {entry['reason']}")
     for name in ("grasping_oto.hdf5", "grasping_otm.hdf5", "trials.hdf5"):

@@ -17,6 +17,7 @@ from pydrake.multibody.plant import HydroelasticContactInfo
 from pydrake.multibody.tree import BodyIndex
 
 from drakegrasp.frames import Array, invert_pose, rotate_vectors, transform_points
+from drakegrasp.mend import winding_numbers
 from drakegrasp.scene import HandHandles, Scene
 
 
@@ -81,15 +82,28 @@ def open_hand_collides(scene: Scene) -> bool:
     meetings += [{_body_of(scene, p.id_A), _body_of(scene, p.id_B)} for p in pairs]
     if any(bodies & hand and not bodies <= hand for bodies in meetings):
         return True
-    (object_geometry,) = scene.plant.GetCollisionGeometriesForBody(scene.object)
-    return any(
-        distance.id_G == object_geometry
+    centres = [
+        query.GetPoseInWorld(geometry).translation()
         for index in sorted(hand)
         for geometry in scene.plant.GetCollisionGeometriesForBody(scene.plant.get_body(index))
-        for distance in query.ComputeSignedDistanceToPoint(
-            query.GetPoseInWorld(geometry).translation(), threshold=0.0
-        )
+    ]
+    return is_inside(scene, np.array(centres))
+
+
+def is_inside(scene: Scene, p_WP: Array) -> bool:
+    """Return whether any of the points (n, 3) [m] is inside the object's volume.
+
+    Drake's own point distance refuses meshes with very sharp edges; a winding number does not.
+    """
+    model = scene.model
+    p_OP = transform_points(invert_pose(scene.pose(scene.object)), p_WP)
+    near = p_OP[np.all(np.abs(p_OP) <= model.half_extents, axis=1)]
+    if not len(near):
+        return False
+    winding = winding_numbers(
+        near, model.collision_vertices, model.collision_faces.astype(np.int64)
     )
+    return bool(np.any(winding > 0.5))
 
 
 class _Reader:

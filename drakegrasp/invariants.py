@@ -69,6 +69,9 @@ P_TTABLE = np.array([0.0, 0.0, -0.05])
 FRAMES = tuple(f.name for f in DATA_FIELDS if f.name.startswith("object_props/frame_"))
 #: K, near and far are float64 copies of what the configuration gives.
 CAMERA_TOLERANCE = 1e-9
+#: A patch's mean normal and its force are two averages: where a fingertip is just losing the
+#: object they may disagree by as much as the force from which on a contact counts [N].
+PULL = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -833,7 +836,7 @@ def trial_contacts(batch: Batch) -> Iterator[Violation]:
             touches = touching[:, k]
             yield from batch.broken(
                 f"{stage}_f_Q_O of finger {k + 1} must push into the object [N]",
-                touches & ~(push[:, k] < 0.0),
+                touches & ~(push[:, k] < PULL),
                 push[:, k],
             )
             yield from batch.broken(

@@ -22,6 +22,7 @@ from pydrake.geometry import (
     DepthRange,
     DepthRenderCamera,
     InMemoryMesh,
+    LightParameter,
     MakeRenderEngineVtk,
     Mesh,
     RenderCameraCore,
@@ -43,6 +44,12 @@ from drakegrasp.meshes import ObjectModel, obj_text
 
 #: Colour of what lies beyond the table.
 BACKGROUND = np.array([0.86, 0.90, 0.94])
+#: A lamp at the camera, and daylight from above at a slant: with the lamp alone the table is
+#: black where the camera looks along it.
+LIGHTS = (
+    LightParameter(type="directional", frame="camera", direction=[0.0, 0.0, 1.0], intensity=0.6),
+    LightParameter(type="directional", frame="world", direction=[0.3, 0.4, -1.0], intensity=0.7),
+)
 _ENGINE = "vtk"
 
 
@@ -74,7 +81,7 @@ def build_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
     """Return a renderer of an object's full mesh on the table."""
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.0), builder)
-    parameters = RenderEngineVtkParams(default_clear_color=BACKGROUND)
+    parameters = RenderEngineVtkParams(default_clear_color=BACKGROUND, lights=list(LIGHTS))
     scene_graph.AddRenderer(_ENGINE, MakeRenderEngineVtk(parameters))
     body = plant.AddRigidBody("object", SpatialInertia.SolidSphereWithMass(1.0, 1.0))
     text = obj_text(model.visual_vertices, model.visual_faces, normals=True)

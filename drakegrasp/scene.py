@@ -90,6 +90,7 @@ class Scene:
     """A built diagram with its one context.
 
     Attributes:
+        model: The object.
         simulator: Owns the diagram's context.
         plant, scene_graph: The two systems of the diagram.
         object, table: The bodies.
@@ -97,6 +98,7 @@ class Scene:
         physics: The configuration that it was built with.
     """
 
+    model: ObjectModel
     simulator: Simulator
     plant: MultibodyPlant
     scene_graph: SceneGraph
@@ -152,6 +154,7 @@ def build_scene(model: ObjectModel, physics: PhysicsConfig, hand: Hand | None = 
         )
     simulator = Simulator(builder.Build())
     scene = Scene(
+        model=model,
         simulator=simulator,
         plant=plant,
         scene_graph=scene_graph,

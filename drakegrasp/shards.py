@@ -13,8 +13,9 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from io import BufferedRandom, BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import h5py
 import numpy as np
@@ -123,7 +124,7 @@ def refuse_broken_seal(path: Path) -> None:
         raise DataError(f"{path}: must be a complete shard, got one that is damaged or cut off")
 
 
-def _seal_of(file: BinaryIO) -> bytes:
+def _seal_of(file: BufferedReader | BufferedRandom) -> bytes:
     file.seek(SEAL_SIZE)
     digest = hashlib.file_digest(file, "sha256").hexdigest()
     return f"drakegrasp shard, sha256 of the rest: {digest}\n".encode().ljust(SEAL_SIZE, b"\0")

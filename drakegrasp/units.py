@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gc
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,11 +58,13 @@ class UnitSummary:
         header: Of the unit.
         outcomes: Number of attempts by outcome.
         seconds: Wall clock by stage (`build`, `try`, `look`, `write`) [s]; for logs only.
+        errors: Number of solver errors by their message.
     """
 
     header: ShardHeader
     outcomes: dict[Outcome, int]
     seconds: dict[str, float]
+    errors: dict[str, int]
 
     @property
     def attempts(self) -> int:
@@ -125,7 +128,10 @@ def run_unit(unit: WorkUnit) -> UnitSummary:
     shard = Shard(header=header, trials=trial_rows(bench, attempts, records), looks=looks)
     _timed(seconds, "write", lambda: write_shard(out, shard))
     return UnitSummary(
-        header=header, outcomes=count_outcomes(shard.trials["outcome"]), seconds=seconds
+        header=header,
+        outcomes=count_outcomes(shard.trials["outcome"]),
+        seconds=seconds,
+        errors=dict(Counter(record.message for record in records if record.message)),
     )
 
 

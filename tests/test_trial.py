@@ -15,7 +15,7 @@ from drakegrasp.candidates import Attempt
 from drakegrasp.config import Config, load_config
 from drakegrasp.frames import X_WT, invert_pose, make_pose
 from drakegrasp.hand import Hand, load_hand
-from drakegrasp.meshes import ObjectModel
+from drakegrasp.meshes import MeshSource, ObjectModel, prepare_object
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.resting import settle
 from drakegrasp.scene import (
@@ -156,6 +156,17 @@ def test_hand_wholly_inside_of_an_object_collides(tmp_path, config, hand):
     attempt = replace(from_above(block, 0.0), X_OG=make_pose(np.eye(3), [0.0, 0.0, 0.0]))
     scene = build_scene(block, config.physics, hand)
     assert run_attempt(scene, standing(block), attempt, config).outcome is Outcome.START_COLLISION
+
+
+@pytest.mark.parametrize("name", ["54_candlestick_final", "60_comb_final", "65_coffeemaker_final"])
+def test_real_mesh_with_needles_is_tried_like_any_other(name, g3db, config, hand):
+    """Drake's point distance gives up on such meshes; the inside test must not."""
+    path = g3db / f"{name}.obj"
+    source = MeshSource(name=name, class_name="thing", path=path, scale=0.01)
+    model = prepare_object(source)
+    scene = build_scene(model, config.physics, hand)
+    record = run_attempt(scene, standing(model), from_above(model, 0.25), config)
+    assert record.outcome is Outcome.MISSING_FINGERTIP
 
 
 def test_hand_inside_of_a_ring_does_not_collide(tmp_path, config, hand):
