@@ -12,9 +12,6 @@ import numpy.typing as npt
 
 from drakegrasp.frames import Array, rotate_vectors, transform_points
 
-#: A normal whose length is off by more than this is refused instead of mended.
-NORMAL_LENGTH_TOLERANCE = 0.05
-
 
 def pack_grasp(p_AQ: npt.ArrayLike, nhat_Q_A: npt.ArrayLike) -> Array:
     """Return the grasp vector (6k,) of points (k, 3) [m] and unit normals (k, 3) in one frame A.

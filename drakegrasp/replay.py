@@ -9,12 +9,12 @@ import h5py
 import numpy as np
 
 from drakegrasp.assemble import TRIALS_FILE
+from drakegrasp.construction import build_scene
 from drakegrasp.errors import DataError
 from drakegrasp.hand import load_hand
 from drakegrasp.manifest import installed_versions, read_manifest
 from drakegrasp.outcomes import Outcome
 from drakegrasp.prepared import load_prepared
-from drakegrasp.scene import build_scene
 from drakegrasp.shards import ShardHeader, trial_columns
 from drakegrasp.units import Workbench, trial_rows, try_on, unit_attempts
 

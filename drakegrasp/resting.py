@@ -11,11 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from drakegrasp.config import Config
+from drakegrasp.construction import build_scene
 from drakegrasp.contacts import read_contacts
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import X_WT, Array, invert_pose, make_pose
 from drakegrasp.meshes import ObjectModel
-from drakegrasp.scene import Scene, advance, build_scene, reset_object
+from drakegrasp.scene import Scene, advance, reset_object
 
 #: Simulated time between two looks at the object's speed [s].
 LOOK_PERIOD = 0.05

@@ -83,9 +83,6 @@ def sizes(*, fingers: int, joints: int, image: int) -> dict[str, int]:
     return {"k": fingers, "6k": 6 * fingers, "j": joints, "S": image}
 
 
-_POSE_DTYPE = "float64"
-
-
 def _frame(name: str, meaning: str, frame: str) -> Field:
     return Field(
         name=f"object_props/{name}",

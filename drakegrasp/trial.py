@@ -8,6 +8,7 @@ Drake becomes an outcome is `run_attempt`.
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -70,6 +71,23 @@ class _StateError(Exception):
     """The state left the range in which it means anything."""
 
 
+class _TimeoutError(Exception):
+    """The attempt's wall-clock limit passed."""
+
+
+@dataclass(frozen=True)
+class _Clock:
+    """Simulates in pieces, within the attempt's wall-clock limit."""
+
+    scene: Scene
+    end: float  # of the wall clock [s]
+
+    def advance(self, duration: float) -> None:
+        advance(self.scene, duration)
+        if time.monotonic() > self.end:
+            raise _TimeoutError
+
+
 def run_attempt(scene: Scene, X_TO: npt.ArrayLike, attempt: Attempt, config: Config) -> TrialRecord:
     """Return what happens when the hand tries one attempt.
 
@@ -91,6 +109,8 @@ def run_attempt(scene: Scene, X_TO: npt.ArrayLike, attempt: Attempt, config: Con
         return replace(record, outcome=Outcome.BELOW_TABLE)
     try:
         return _simulate(scene, record, attempt, config)
+    except _TimeoutError:
+        return TrialRecord(outcome=Outcome.TIMEOUT, X_TO=X_TO, X_OG=attempt.X_OG)
     # A failed assertion within Drake arrives as SystemExit, everything else as RuntimeError.
     except (RuntimeError, SystemExit, _StateError) as error:
         lines = str(error).strip().splitlines() or [type(error).__name__]
@@ -100,15 +120,16 @@ def run_attempt(scene: Scene, X_TO: npt.ArrayLike, attempt: Attempt, config: Con
 
 def _simulate(scene: Scene, record: TrialRecord, attempt: Attempt, config: Config) -> TrialRecord:
     X_WO = X_WT @ record.X_TO
+    clock = _Clock(scene, time.monotonic() + config.attempt_seconds)
     reset_attempt(scene, X_WO, X_WO @ attempt.X_OG, attempt.spread)
     if open_hand_collides(scene):
         return replace(record, outcome=Outcome.START_COLLISION)
-    record = _close(scene, record, config)
+    record = _close(clock, record, config)
     assert record.closed is not None
     verdict = judge_closed(record.closed)
     if verdict is not None:
         return replace(record, outcome=verdict)
-    return _lift(scene, record, config)
+    return _lift(clock, record, config)
 
 
 def judge_closed(contacts: Contacts) -> Outcome | None:
@@ -140,10 +161,10 @@ def lift_duration(distance: float, config: Config) -> float:
     return float(max(at_speed_limit, at_acceleration_limit))
 
 
-def _close(scene: Scene, record: TrialRecord, config: Config) -> TrialRecord:
-    rules = config.close
+def _close(clock: _Clock, record: TrialRecord, config: Config) -> TrialRecord:
+    scene, rules = clock.scene, config.close
     while scene.time < rules.max_time:
-        advance(scene, rules.check_period)
+        clock.advance(rules.check_period)
         if finger_speed(scene) < rules.stop_speed:
             break
     return replace(
@@ -154,7 +175,8 @@ def _close(scene: Scene, record: TrialRecord, config: Config) -> TrialRecord:
     )
 
 
-def _lift(scene: Scene, record: TrialRecord, config: Config) -> TrialRecord:
+def _lift(clock: _Clock, record: TrialRecord, config: Config) -> TrialRecord:
+    scene = clock.scene
     X_GO_before = invert_pose(palm_pose(scene)) @ scene.pose(scene.object)
     start = scene.time
     target = X_WT[:3, 3] + config.lift.p_TG
@@ -165,7 +187,7 @@ def _lift(scene: Scene, record: TrialRecord, config: Config) -> TrialRecord:
     contacts = None
     while contacts is None:
         remaining = end - scene.time
-        advance(scene, min(config.lift.check_period, remaining))
+        clock.advance(min(config.lift.check_period, remaining))
         _refuse_explosion(scene, config)
         now = read_contacts(scene)
         lost = not now.touching.any() and not now.other_links

@@ -20,13 +20,14 @@ import numpy as np
 from drakegrasp.camera import camera_pose_otm, camera_pose_oto, image_frame, intrinsics
 from drakegrasp.candidates import Attempt, make_attempts
 from drakegrasp.config import Config, parse_config
+from drakegrasp.construction import build_scene
 from drakegrasp.contacts import Contacts
 from drakegrasp.frames import pack_pose
 from drakegrasp.hand import load_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.prepared import PreparedObject, load_prepared
 from drakegrasp.render import Renderer, build_renderer, look
-from drakegrasp.scene import Scene, build_scene, hand_joint_names
+from drakegrasp.scene import Scene, hand_joint_names
 from drakegrasp.schema import CAMERAS, LOOK_FIELDS, sizes
 from drakegrasp.shards import AnyArray, Shard, ShardHeader, trial_columns, write_shard
 from drakegrasp.trial import TrialRecord, run_attempt

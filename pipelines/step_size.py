@@ -15,11 +15,11 @@ from pathlib import Path
 
 from drakegrasp.candidates import Attempt, make_attempts
 from drakegrasp.config import Config, override_config
+from drakegrasp.construction import build_scene
 from drakegrasp.hand import load_hand
 from drakegrasp.manifest import read_manifest
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.prepared import PreparedObject, load_prepared
-from drakegrasp.scene import build_scene
 from drakegrasp.trial import run_attempt
 
 

@@ -23,7 +23,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
         "meshes shards camera filters",
         "builtin manifest candidates",
         "scene render dataset assemble",
-        "contacts stats invariants",
+        "construction contacts stats invariants",
         "resting trial tables check figures",
         "prepared",
         "units",

@@ -271,9 +271,10 @@ def test_figure_of_the_frames_has_them_all(dataset: Path, tmp_path: Path) -> Non
 @pytest.mark.sim
 @needs_egl
 def test_chosen_view_sees_every_fingertip(dataset: Path) -> None:
+    from drakegrasp.construction import build_scene
     from drakegrasp.frames import X_WT
     from drakegrasp.hand import load_hand
-    from drakegrasp.scene import build_scene, hand_joint_names
+    from drakegrasp.scene import hand_joint_names
     from drakegrasp.snapshots import choose_view, labels, outline, show, stage_trial, take
 
     trial = stage_trial(dataset, 0)

@@ -13,6 +13,8 @@ from drakegrasp import trial as trial_module
 from drakegrasp.camera import camera_pose_oto
 from drakegrasp.candidates import Attempt
 from drakegrasp.config import Config, load_config
+from drakegrasp.construction import build_scene, object_friction, partner_friction
+from drakegrasp.contacts import is_inside
 from drakegrasp.frames import X_WT, invert_pose, make_pose
 from drakegrasp.hand import Hand, load_hand
 from drakegrasp.meshes import MeshSource, ObjectModel, prepare_object
@@ -21,11 +23,8 @@ from drakegrasp.resting import settle
 from drakegrasp.scene import (
     Scene,
     advance,
-    build_scene,
     move_wrist,
-    object_friction,
     palm_pose,
-    partner_friction,
     release,
     reset_attempt,
     reset_object,
@@ -159,14 +158,19 @@ def test_hand_wholly_inside_of_an_object_collides(tmp_path, config, hand):
 
 
 @pytest.mark.parametrize("name", ["54_candlestick_final", "60_comb_final", "65_coffeemaker_final"])
-def test_real_mesh_with_needles_is_tried_like_any_other(name, g3db, config, hand):
-    """Drake's point distance gives up on such meshes; the inside test must not."""
-    path = g3db / f"{name}.obj"
-    source = MeshSource(name=name, class_name="thing", path=path, scale=0.01)
+def test_points_inside_of_a_real_mesh_with_needles_are_found(name, g3db, config):
+    """Drake's point distance gives up on such meshes; the inside test agrees with rays."""
+    source = MeshSource(name=name, class_name="thing", path=g3db / f"{name}.obj", scale=0.01)
     model = prepare_object(source)
-    scene = build_scene(model, config.physics, hand)
-    record = run_attempt(scene, standing(model), from_above(model, 0.25), config)
-    assert record.outcome is Outcome.MISSING_FINGERTIP
+    scene = build_scene(model, config.physics)
+    reset_object(scene, X_WT @ standing(model))
+    rng = np.random.default_rng(0)
+    p_OP = rng.uniform(-1.0, 1.0, (400, 3)) * model.half_extents
+    p_WP = p_OP + (X_WT @ standing(model))[:3, 3]
+    found = np.array([is_inside(scene, p[None]) for p in p_WP])
+    by_rays = model.collision.contains(p_OP)
+    assert 0 < found.sum() < len(found)
+    assert np.mean(found == by_rays) > 0.99
 
 
 def test_hand_inside_of_a_ring_does_not_collide(tmp_path, config, hand):
@@ -206,6 +210,13 @@ def test_error_within_drake_is_an_outcome(scene, cube, config, monkeypatch, erro
     assert record.outcome is Outcome.SOLVER_ERROR
     assert record.message == str(error).splitlines()[0]
     assert record.outcome.stage is Stage.PLACED
+
+
+def test_attempt_that_takes_too_long_is_a_timeout(scene, cube):
+    hurried = load_config(overrides=["attempt_seconds=1e-6"])
+    record = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), hurried)
+    assert record.outcome is Outcome.TIMEOUT
+    assert record.closed is None
 
 
 def test_exploded_state_is_no_verdict_on_the_grasp(scene, cube, hand):
