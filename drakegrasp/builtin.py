@@ -1,9 +1,10 @@
 """The built-in objects: a table of everyday things, so that a dataset needs no meshes.
 
 Each row of `BUILTIN_OBJECTS` is one object: a class, a variant and a function of
-`drakegrasp.shapes` with its sizes. Nothing is built before `build()` is called. Every
-class has at least two variants, so that a split by class has something on both sides.
-`export_builtin` writes the meshes as Wavefront files, the same bytes every time.
+`drakegrasp.shapes`, `vessels` or `fruit` with its sizes. Nothing is built before `build()`
+is called. Every class has at least two variants, so that a split by class has something on
+both sides. `export_builtin` writes the meshes as Wavefront files, the same bytes every
+time.
 
 Sizes are our own, chosen for a hand of the Barrett's size: it spans 0.24 m and its pads
 reach about 0.11 m ahead of the palm.
@@ -20,8 +21,9 @@ from typing import Any
 
 import trimesh
 
-from drakegrasp import shapes
+from drakegrasp import fruit, shapes, vessels
 from drakegrasp.errors import MeshError
+from drakegrasp.solids import DECIMALS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +44,7 @@ class BuiltinObject:
 #: The classes in order: the function and, for each variant, its sizes [m] (angles [rad]).
 _CLASSES: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, dict[str, Any]]], ...] = (
     (
-        shapes.mug,
+        vessels.mug,
         {
             "small": dict(radius=0.036, height=0.085, handle_reach=0.028, handle_radius=0.005),
             "large": dict(radius=0.044, height=0.100, handle_reach=0.034, handle_radius=0.006),
@@ -56,14 +58,14 @@ _CLASSES: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, dict[str, Any]]]
         },
     ),
     (
-        shapes.bowl,
+        vessels.bowl,
         {
             "small": dict(radius=0.055, height=0.055, foot_radius=0.026),
             "large": dict(radius=0.070, height=0.065, foot_radius=0.034),
         },
     ),
     (
-        shapes.wineglass,
+        vessels.wineglass,
         {
             "round": dict(
                 foot_radius=0.036,
@@ -112,7 +114,7 @@ _CLASSES: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, dict[str, Any]]]
         },
     ),
     (
-        shapes.vase,
+        vessels.vase,
         {
             "round": dict(
                 foot_radius=0.032,
@@ -139,7 +141,7 @@ _CLASSES: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, dict[str, Any]]]
         },
     ),
     (
-        shapes.cup,
+        vessels.cup,
         {
             "small": dict(top_radius=0.036, bottom_radius=0.027, height=0.085),
             "large": dict(top_radius=0.042, bottom_radius=0.030, height=0.120),
@@ -153,7 +155,7 @@ _CLASSES: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, dict[str, Any]]]
         },
     ),
     (
-        shapes.pitcher,
+        vessels.pitcher,
         {
             "small": dict(
                 foot_radius=0.036,
@@ -179,7 +181,7 @@ _CLASSES: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, dict[str, Any]]]
         },
     ),
     (
-        shapes.funnel,
+        vessels.funnel,
         {
             "small": dict(radius=0.042, spout_radius=0.011, cone_height=0.050, height=0.095),
             "large": dict(radius=0.055, spout_radius=0.013, cone_height=0.070, height=0.130),
@@ -207,28 +209,28 @@ _CLASSES: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, dict[str, Any]]]
         },
     ),
     (
-        shapes.banana,
+        fruit.banana,
         {
             "short": dict(bend_radius=0.090, angle=1.75, thickness=0.034),
             "long": dict(bend_radius=0.130, angle=1.55, thickness=0.040),
         },
     ),
     (
-        shapes.saucepan,
+        vessels.saucepan,
         {
             "small": dict(radius=0.050, height=0.055, handle_length=0.090),
             "deep": dict(radius=0.058, height=0.085, handle_length=0.100),
         },
     ),
     (
-        shapes.apple,
+        fruit.apple,
         {
             "small": dict(radius=0.034, height=0.060),
             "large": dict(radius=0.042, height=0.070),
         },
     ),
     (
-        shapes.pear,
+        fruit.pear,
         {
             "round": dict(radius=0.037, neck_radius=0.020, height=0.085),
             "long": dict(radius=0.036, neck_radius=0.017, height=0.105),
@@ -303,7 +305,7 @@ def export_builtin(
 
 def _wavefront(mesh: trimesh.Trimesh) -> bytes:
     """Return a mesh as Wavefront text; we write it ourselves, so that a release changes nothing."""
-    d = shapes.DECIMALS
+    d = DECIMALS
     lines = [f"v {x:.{d}f} {y:.{d}f} {z:.{d}f}" for x, y, z in mesh.vertices.tolist()]
     lines += [f"f {a} {b} {c}" for a, b, c in (mesh.faces + 1).tolist()]
     return ("\n".join(lines) + "\n").encode("ascii")

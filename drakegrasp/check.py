@@ -9,36 +9,27 @@ it. Needs no Drake.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 
-from drakegrasp import invariants
+from drakegrasp import dataset_rules, image_rules, sample_rules, trial_rules
 from drakegrasp.assemble import DATA_FILES, TRIALS_FILE
-from drakegrasp.config import Config
 from drakegrasp.errors import DataError, MeshError
-from drakegrasp.filters import Removal
-from drakegrasp.invariants import AnyArray, Batch, Findings, Lens, Violation
+from drakegrasp.image_rules import Lens
 from drakegrasp.manifest import FILE_NAME, Manifest, model_path, read_manifest
 from drakegrasp.meshes import ObjectModel, load_object
+from drakegrasp.open_file import OpenFile, Rule, first_line, open_file
 from drakegrasp.outcomes import Outcome
 from drakegrasp.progress import Report, silent
-from drakegrasp.schema import (
-    CAMERAS,
-    DATA_FIELDS,
-    OBJECT_FIELDS,
-    SPLITS,
-    SUCCESS_FIELDS,
-    TRIAL_FIELDS,
-    Field,
-)
+from drakegrasp.schema import CAMERAS, DATA_FIELDS, SPLITS
 from drakegrasp.shards import read_shard
+from drakegrasp.violations import Batch, Findings, Violation, of_file
 
 __all__ = ["Violation", "check_dataset"]
 
@@ -50,60 +41,6 @@ KEPT_OBJECTS = 4
 #: The fields of a trial that a sample is compared with.
 COMPARED = ("object", "outcome", "X_TO", "X_OG", "closed_p_OQ", "closed_nhat_Q_O")
 
-Invariant = Callable[[Batch], Iterator[Violation]]
-
-
-@dataclass(eq=False)
-class _File:
-    """An open file: its groups by name, none of those whose structure is broken."""
-
-    name: str
-    file: h5py.File
-    config: Config | None
-    fields: Mapping[str, tuple[Field, ...]]
-    groups: dict[str, h5py.Group] = field(default_factory=dict)
-    bad_rows: dict[str, set[int]] = field(default_factory=dict)
-
-    def count(self, group: str) -> int:
-        """Return the number of rows of a group."""
-        return len(self.groups[group][self.fields[group][0].name]) if group in self.groups else 0
-
-    def bad(self, group: str) -> list[int]:
-        """Return the rows of a group that broke an invariant or cannot be read."""
-        return sorted(self.bad_rows.get(group, ()))
-
-    def read(self, group: str, rows: AnyArray, names: Sequence[str] | None = None) -> Batch:
-        """Return some rows, in rising order, of a group; of all fields unless some are named."""
-        fields = [f for f in self.fields[group] if names is None or f.name in names]
-        # A slice is read far faster than the same rows as a list.
-        dense = len(rows) > 0 and rows[-1] - rows[0] + 1 == len(rows)
-        choice = slice(int(rows[0]), int(rows[-1]) + 1) if dense else rows
-        columns = {f.name: _decoded(self.groups[group][f.name], f)[choice] for f in fields}
-        return Batch(file=self.name, group=f"/{group}", rows=rows, columns=columns)
-
-    def batches(
-        self, group: str, size: int, findings: Findings, names: Sequence[str] | None = None
-    ) -> Iterator[Batch]:
-        """Yield all rows of a group; rows that cannot be read are a finding."""
-        for start in range(0, self.count(group), size):
-            rows = np.arange(start, min(start + size, self.count(group)))
-            try:
-                yield self.read(group, rows, names)
-            except (OSError, UnicodeDecodeError) as error:
-                what = f"rows {start} to {rows[-1]} must be readable"
-                findings.add([_whole(self.name, what, _first_line(error), f"/{group}")])
-                self.bad_rows.setdefault(group, set()).update(rows.tolist())
-
-    def judge(self, batch: Batch, findings: Findings, *tests: Invariant) -> Batch:
-        """Apply invariants that do not build on each other; return the rows that hold."""
-        if not len(batch):
-            return batch
-        rows: set[int] = set()
-        for test in tests:
-            rows |= findings.add(test(batch))
-        self.bad_rows.setdefault(batch.group[1:], set()).update(rows)
-        return batch.without(rows)
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Dataset:
@@ -111,7 +48,7 @@ class _Dataset:
 
     out: Path
     manifest: Manifest
-    trials: _File | None
+    trials: OpenFile | None
     model: Callable[[str], ObjectModel | None]
 
     @property
@@ -147,14 +84,14 @@ def _check_file(path: Path, stack: ExitStack, findings: Findings, report: Report
     except OSError as error:
         raise DataError(
             f"{path}: must be the directory of a dataset or one of its HDF5 files, "
-            f"got one that cannot be read ({_first_line(error)})"
+            f"got one that cannot be read ({first_line(error)})"
         ) from None
     camera = str(file.attrs.get("camera", ""))
     if camera in CAMERAS:
-        opened = _open(path.name, file, camera, findings)
+        opened = open_file(path.name, file, camera, findings)
         _check_data(opened, camera, None, findings, _Steps(report, _rows(opened)))
     elif "trials" in file:
-        opened = _open(path.name, file, "", findings)
+        opened = open_file(path.name, file, "", findings)
         _check_trials(opened, None, findings, _Steps(report, _rows(opened)))
     else:
         raise DataError(
@@ -169,83 +106,66 @@ def _check_directory(out: Path, stack: ExitStack, findings: Findings, report: Re
         try:
             file = stack.enter_context(h5py.File(out / name, "r"))
         except OSError as error:
-            got = _first_line(error) if (out / name).exists() else "none; `drakegrasp assemble`"
-            findings.add([_whole(name, "the file must be there and readable", got)])
+            got = first_line(error) if (out / name).exists() else "none; `drakegrasp assemble`"
+            findings.add([of_file(name, "the file must be there and readable", got)])
             continue
-        files[camera] = _open(name, file, camera, findings)
+        files[camera] = open_file(name, file, camera, findings)
     headers = manifest.headers()
     steps = _Steps(report, sum(map(_rows, files.values())) + len(headers))
     trials = files.pop("", None)
     models = lru_cache(KEPT_OBJECTS)(partial(_load_model, out, manifest, findings))
     dataset = _Dataset(out=out, manifest=manifest, trials=trials, model=models)
-    findings.add(_same_configuration([*files.values(), *([trials] if trials else [])], manifest))
+    findings.add(
+        dataset_rules.same_configuration([*files.values(), *([trials] if trials else [])], manifest)
+    )
     _check_shards(dataset, findings, steps)
     if trials is not None:
         _check_trials(trials, dataset, findings, steps)
     for camera, data in files.items():
         _check_data(data, camera, dataset, findings, steps)
         if trials is not None:
-            _add(findings, data, _kept_are_samples(data, trials))
-    if len(files) == len(CAMERAS):
+            _add(findings, data, dataset_rules.kept_are_samples(data, trials))
+    if len(files) == len(CAMERAS) and all(data.config for data in files.values()):
         _check_pair(files[CAMERAS[0]], files[CAMERAS[1]], findings)
-
-
-def _open(name: str, file: h5py.File, camera: str, findings: Findings) -> _File:
-    """Check what a file says of itself and how it is laid out."""
-    config, broken = invariants.read_config(name, file)
-    findings.add([*broken, *invariants.attributes(name, file, config, camera)])
-    fields = (
-        {split: DATA_FIELDS for split in SPLITS}
-        if camera
-        else {"objects": OBJECT_FIELDS, "trials": TRIAL_FIELDS, "successes": SUCCESS_FIELDS}
-    )
-    opened = _File(name, file, config, fields)
-    broken_groups = set()
-    for violation in invariants.structure(name, file, fields, config):
-        findings.add([violation])
-        if not violation.what.startswith("attribute"):
-            broken_groups.add(violation.group[1:].split("/")[0])
-    opened.groups = {g: file[g] for g in fields if g in file and g not in broken_groups}
-    return opened
 
 
 # Data files
 
 
 def _check_data(
-    data: _File, camera: str, dataset: _Dataset | None, findings: Findings, steps: _Steps
+    data: OpenFile, camera: str, dataset: _Dataset | None, findings: Findings, steps: _Steps
 ) -> None:
     if data.config is None:
         return  # already found; without a lens no image can be judged
     lens = Lens.of(camera, data.config.camera)
-    _add(findings, data, _splits(data))
+    _add(findings, data, dataset_rules.splits(data))
     for split in data.groups:
         for whole in data.batches(split, SAMPLE_ROWS, findings):
-            batch = data.judge(whole, findings, invariants.finite)
+            batch = data.judge(whole, findings, sample_rules.finite)
             batch = data.judge(
                 batch,
                 findings,
-                invariants.normals,
-                partial(invariants.image_values, lens=lens),
-                invariants.mask_values,
-                invariants.frames,
-                invariants.work_frame,
-                invariants.mass_properties,
+                sample_rules.normals,
+                partial(image_rules.image_values, lens=lens),
+                image_rules.mask_values,
+                sample_rules.frames,
+                sample_rules.work_frame,
+                sample_rules.mass_properties,
             )
-            batch = data.judge(batch, findings, invariants.inverse_frames)
+            batch = data.judge(batch, findings, sample_rules.inverse_frames)
             batch = data.judge(
                 batch,
                 findings,
-                invariants.camera_pair,
-                partial(invariants.image_frames, lens=lens),
+                sample_rules.camera_pair,
+                partial(image_rules.image_frames, lens=lens),
             )
             if dataset is not None:
-                batch = _judge_by_trial(data, batch, lens, dataset, findings)
+                batch = _judge_by_trial(data, batch, camera, dataset, findings)
             batch = data.judge(
                 batch,
                 findings,
-                partial(invariants.contacts_in_image, lens=lens),
-                partial(invariants.table_pixels, lens=lens),
+                partial(image_rules.contacts_in_image, lens=lens),
+                partial(image_rules.table_pixels, lens=lens),
             )
             if dataset is not None:
                 _judge_by_mesh(data, batch, lens, dataset, findings)
@@ -253,7 +173,7 @@ def _check_data(
 
 
 def _judge_by_trial(
-    data: _File, batch: Batch, lens: Lens, dataset: _Dataset, findings: Findings
+    data: OpenFile, batch: Batch, camera: str, dataset: _Dataset, findings: Findings
 ) -> Batch:
     """Compare samples with their trials; return those that have one and are like it."""
     trials = dataset.trials
@@ -293,9 +213,9 @@ def _judge_by_trial(
     like = data.judge(fit, findings, of_trial)
     still = np.isin(fit.rows, like.rows)
     compare = partial(
-        invariants.same_as_trial,
+        sample_rules.same_as_trial,
         trials={name: values[still] for name, values in rows.items()},
-        lens=lens,
+        camera=camera,
         config=data.config.camera,
     )
     like = data.judge(like, findings, compare)
@@ -303,11 +223,11 @@ def _judge_by_trial(
 
 
 def _judge_by_mesh(
-    data: _File, batch: Batch, lens: Lens, dataset: _Dataset, findings: Findings
+    data: OpenFile, batch: Batch, lens: Lens, dataset: _Dataset, findings: Findings
 ) -> None:
     """Compare samples with the meshes of their objects."""
     assert data.config is not None
-    limit = data.config.filters.max_surface_distance
+    camera, limit = lens.camera, data.config.filters.max_surface_distance
     names = batch["object_props/object_name"]
     for name in dict.fromkeys(names.tolist()):
         model = dataset.model(name)
@@ -315,9 +235,11 @@ def _judge_by_mesh(
             data.judge(
                 batch.without(set(batch.rows[names != name].tolist())),
                 findings,
-                partial(invariants.object_values, model=model),
-                partial(invariants.object_pixels, lens=lens, model=model),
-                partial(invariants.contacts_on_mesh, lens=lens, model=model, max_distance=limit),
+                partial(sample_rules.object_values, model=model),
+                partial(image_rules.object_pixels, lens=lens, model=model),
+                partial(
+                    sample_rules.contacts_on_mesh, camera=camera, model=model, max_distance=limit
+                ),
             )
 
 
@@ -327,78 +249,39 @@ def _load_model(out: Path, manifest: Manifest, findings: Findings, name: str) ->
     try:
         model = load_object(path)
     except MeshError as error:
-        findings.add([_whole(file, "the object must be readable", str(error))])
+        findings.add([of_file(file, "the object must be readable", str(error))])
         return None
     hashes = {entry["name"]: entry["mesh_sha256"] for entry in manifest.objects}
     if hashes.get(name) != model.mesh_sha256:
         what = f"mesh_sha256 must be that of {FILE_NAME}"
-        findings.add([_whole(file, what, model.mesh_sha256)])
+        findings.add([of_file(file, what, model.mesh_sha256)])
     return model
 
 
-def _splits(data: _File) -> Iterator[Violation]:
-    """A trial is one sample, and a tested object or a class left out is nowhere else."""
-    seen: dict[int, str] = {}
-    objects: dict[str, dict[str, str]] = {}
-    for split, group in data.groups.items():
-        for row, number in enumerate(group["trial_id"][:].tolist()):
-            if number in seen:
-                what = "trial_id must be unique in all splits"
-                got = f"{number}, which is in /{seen[number]} too"
-                yield Violation(file=data.name, group=f"/{split}", row=row, what=what, got=got)
-            seen.setdefault(number, split)
-        names, classes = (
-            _decoded(group[f"object_props/{key}"], _STR)[:] for key in ("object_name", "class_name")
-        )
-        objects[split] = dict(zip(names.tolist(), classes.tolist(), strict=True))
-    tested = objects.pop("test", {})
-    allowed = data.config.split.train_classes if data.config else None
-    for split, members in objects.items():
-        for name, class_name in sorted(members.items()):
-            if name in tested:
-                what = "an object of /test must be in no other split"
-                yield _whole(data.name, what, f"{name} in both", f"/{split}")
-            if allowed is not None and class_name not in allowed:
-                what = "a class must be one of split.train_classes"
-                yield _whole(data.name, what, class_name, f"/{split}")
-    trained = {c for members in objects.values() for c in members.values()}
-    if len(data.groups) == len(SPLITS):
-        for class_name in sorted(trained):
-            count = sum(c == class_name for c in tested.values())
-            if count != 1:
-                what = f"class {class_name} must have one object in /test, as it has others outside"
-                yield _whole(data.name, what, str(count))
-
-
-def _check_pair(oto: _File, otm: _File, findings: Findings) -> None:
-    """The two data files hold the same samples."""
+def _check_pair(oto: OpenFile, otm: OpenFile, findings: Findings) -> None:
+    """The two data files hold the same samples; what is wrong in one is found already."""
     names = [f.name for f in DATA_FIELDS if not f.sample]
     for split in [s for s in SPLITS if s in oto.groups and s in otm.groups]:
-        if oto.count(split) != otm.count(split):
-            what = f"number of rows must be that of {oto.name}, {oto.count(split)}"
-            findings.add([_whole(otm.name, what, str(otm.count(split)), f"/{split}")])
+        count = oto.count(split)
+        if otm.count(split) != count:
+            what = f"number of rows must be that of {oto.name}, {count}"
+            findings.add([of_file(otm.name, what, str(otm.count(split)), f"/{split}")])
             continue
-        bad = oto.bad_rows.get(split, set()) | otm.bad_rows.get(split, set())
-        pairs = (f.batches(split, TRIAL_ROWS, findings, names) for f in (oto, otm))
-        for one, other in zip(*pairs, strict=False):
-            one, other = one.without(bad), other.without(bad)
-            if not len(one):
-                continue
-            ids = other["trial_id"]
-            differs = one["trial_id"] != ids if len(one) == len(other) else np.zeros(0, dtype=bool)
-            what = f"trial_id must be that of {oto.name}"
-            rows = findings.add(other.broken(what, differs, ids))
-            findings.add(invariants.same_grasp(one.without(rows), other.without(rows)))
+        good = np.setdiff1d(np.arange(count), oto.bad(split) + otm.bad(split))
+        for start in range(0, len(good), TRIAL_ROWS):
+            rows = good[start : start + TRIAL_ROWS]
+            one, other = (file.read(split, rows, names) for file in (oto, otm))
+            findings.add(sample_rules.same_properties(one, other))
 
 
 # Trials
 
 
 def _check_trials(
-    trials: _File, dataset: _Dataset | None, findings: Findings, steps: _Steps
+    trials: OpenFile, dataset: _Dataset | None, findings: Findings, steps: _Steps
 ) -> None:
     if dataset is not None:
-        _add(findings, trials, _same_objects(trials, dataset.manifest))
+        _add(findings, trials, dataset_rules.same_objects(trials, dataset.manifest))
     if not {"objects", "trials"} <= set(trials.groups):
         return  # found as a broken layout; trials mean nothing without their objects
     candidates = [entry["candidates"] for entry in dataset.manifest.objects] if dataset else None
@@ -407,96 +290,29 @@ def _check_trials(
     for whole in trials.batches("trials", TRIAL_ROWS, findings):
         successes.append(whole["trial_id"][whole["outcome"] == Outcome.SUCCESS])
         numbers = partial(
-            invariants.trial_numbers,
+            trial_rules.numbers,
             objects=trials.count("objects"),
             candidates=candidates,
             standoffs=standoffs,
         )
         batch = trials.judge(whole, findings, numbers)
-        batch = trials.judge(batch, findings, invariants.trial_stages)
-        checks: list[Invariant] = [
-            invariants.trial_verdicts,
-            invariants.trial_contacts,
-            invariants.trial_poses,
+        batch = trials.judge(batch, findings, trial_rules.stages)
+        checks: list[Rule] = [
+            trial_rules.verdicts,
+            trial_rules.contacts,
+            trial_rules.poses,
         ]
         if dataset is not None and trials.count("objects") == len(dataset.manifest.objects):
             poses = [entry["X_TO"] for entry in dataset.manifest.objects]
-            checks.append(partial(invariants.resting_poses, X_TO=poses))
+            checks.append(partial(trial_rules.resting_poses, X_TO=poses))
         trials.judge(batch, findings, *checks)
         steps.add(len(whole))
     if "successes" in trials.groups:
         expected = np.concatenate([np.zeros(0, dtype=np.int64), *successes])
-        _add(findings, trials, _successes(trials, expected))
-
-
-def _successes(trials: _File, expected: AnyArray) -> Iterator[Violation]:
-    """Every success is in /successes, in order, with a legal reason of removal."""
-    group = trials.groups["successes"]
-    ids, removal = group["trial_id"][:], group["removal"][:]
-    if not np.array_equal(ids, expected):
-        odd = sorted(set(ids.tolist()) ^ set(expected.tolist()))
-        got = f"differences at trials {odd[:5]}" if odd else "another order"
-        yield _whole(trials.name, "trial_id must list the successes of /trials", got, "/successes")
-    for row in np.flatnonzero(~np.isin(removal, [r.value for r in Removal])).tolist():
-        yield Violation(
-            file=trials.name,
-            group="/successes",
-            row=row,
-            what=f"removal must be 0..{max(Removal)}",
-            got=str(removal[row]),
-        )
-
-
-def _kept_are_samples(data: _File, trials: _File) -> Iterator[Violation]:
-    """The samples are exactly the successes that no filter removed."""
-    if len(data.groups) < len(SPLITS) or "successes" not in trials.groups:
-        return
-    group = trials.groups["successes"]
-    kept = set(group["trial_id"][:][group["removal"][:] == Removal.KEPT].tolist())
-    ids = {i for split in data.groups.values() for i in split["trial_id"][:].tolist()}
-    for what, odd in (
-        (f"every success that /successes of {trials.name} keeps must be a sample", kept - ids),
-        (f"every sample must be a success that /successes of {trials.name} keeps", ids - kept),
-    ):
-        if odd:
-            yield _whole(data.name, what, f"{len(odd)} otherwise: trials {sorted(odd)[:5]}")
-
-
-def _same_objects(trials: _File, manifest: Manifest) -> Iterator[Violation]:
-    """/objects says the same as the manifest."""
-    if "objects" not in trials.groups:
-        return
-    if trials.count("objects") != len(manifest.objects):
-        what = f"number of objects must be that of {FILE_NAME}, {len(manifest.objects)}"
-        yield _whole(trials.name, what, str(trials.count("objects")), "/objects")
-        return
-    for f in OBJECT_FIELDS:
-        values = _decoded(trials.groups["objects"][f.name], f)[:].tolist()
-        key = {"class_name": "class"}.get(f.name, f.name)
-        for row, (value, entry) in enumerate(zip(values, manifest.objects, strict=True)):
-            if value != entry[key]:
-                what = f"{f.name} must be that of {FILE_NAME}, {entry[key]!r}"
-                yield Violation(
-                    file=trials.name, group="/objects", row=row, what=what, got=repr(value)
-                )
+        _add(findings, trials, dataset_rules.successes(trials, expected))
 
 
 # The directory
-
-
-def _same_configuration(files: Sequence[_File], manifest: Manifest) -> Iterator[Violation]:
-    """All files are of the manifest's configuration."""
-    expected = manifest.config.simulation_hash()
-    for file in files:
-        if file.config is None:
-            continue
-        found = file.config.simulation_hash()
-        if found != expected:
-            what = f"configuration must be that of {FILE_NAME}, {expected}"
-            yield _whole(file.name, what, found)
-        elif file.config != manifest.config:
-            what = f"filters, split and limits must be those of {FILE_NAME}"
-            yield _whole(file.name, what, "others; run `drakegrasp assemble` again")
 
 
 def _check_shards(dataset: _Dataset, findings: Findings, steps: _Steps) -> None:
@@ -513,7 +329,7 @@ def _check_shards(dataset: _Dataset, findings: Findings, steps: _Steps) -> None:
         except DataError as error:
             what = "the shard must be there, whole and of its work unit"
             got = str(error).removeprefix(f"{path}: ") if path.exists() else "none"
-            findings.add([_whole(str(path.relative_to(dataset.out)), what, got)])
+            findings.add([of_file(str(path.relative_to(dataset.out)), what, got)])
             continue
         if left is not None:
             wanted[header.object_name] = left - int((outcome == Outcome.SUCCESS).sum())
@@ -533,28 +349,13 @@ class _Steps:
         self.report(self.done, self.total)
 
 
-_STR = next(f for f in DATA_FIELDS if f.dtype == "str")
-
-
-def _rows(opened: _File) -> int:
+def _rows(opened: OpenFile) -> int:
     return sum(opened.count(g) for g in opened.groups if g not in ("objects", "successes"))
 
 
-def _decoded(dataset: h5py.Dataset, field: Field) -> Any:
-    return dataset.asstr() if field.dtype == "str" else dataset
-
-
-def _add(findings: Findings, file: _File, violations: Iterator[Violation]) -> None:
+def _add(findings: Findings, file: OpenFile, violations: Iterator[Violation]) -> None:
     """Take violations of a file as a whole, whose columns may turn out to be unreadable."""
     try:
         findings.add(violations)
     except (OSError, UnicodeDecodeError) as error:
-        findings.add([_whole(file.name, "all columns must be readable", _first_line(error))])
-
-
-def _whole(file: str, what: str, got: str, group: str = "") -> Violation:
-    return Violation(file=file, group=group, what=what, got=got)
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+        findings.add([of_file(file.name, "all columns must be readable", first_line(error))])

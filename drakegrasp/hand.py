@@ -1,8 +1,9 @@
-"""The hand: what an SDFormat file and a YAML file say of it, and its forward kinematics.
+"""The hand: what an SDFormat file and a YAML file say of it.
 
-Nothing here knows a particular hand or a number of fingers. `load_hand` reads the YAML,
-has Drake parse the SDFormat file once, checks one against the other, and keeps each
-finger's joints as constants. After that the kinematics is NumPy and knows no Drake.
+In: a YAML file and the SDFormat file that it names. Out: a `Hand`. Nothing here knows a
+particular hand or a number of fingers. `load_hand` reads the YAML, has Drake parse the
+SDFormat file once, checks one against the other, and keeps each finger's joints as
+constants; `kinematics` needs no more than those.
 
 The coordinates of a hand with k fingers are c = (spread, closing of finger 1..k) [rad];
 each joint is driven by exactly one of them: its angle is `gain @ c`. Frames: B palm link,
@@ -17,7 +18,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import numpy.typing as npt
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, with_config
 from pydrake.math import RollPitchYaw
@@ -198,82 +198,6 @@ def load_hand(name_or_yaml: str | Path = "barrett") -> Hand:
         return _build_hand(path.stem.removesuffix("_hand"), description, sdf_path)
     except HandError as error:
         raise HandError(f"{path}: {error}") from None
-
-
-def coordinate_limits(hand: Hand) -> Array:
-    """Return the least and greatest value of each coordinate, (1 + k, 2) [rad].
-
-    Row 0 is the spread, row 1 + i the closing of finger i. A coordinate's limits are those
-    of all joints that it drives, couplings included. A hand without spread has 0, 0 there.
-    """
-    limits = np.tile([-np.inf, np.inf], (1 + hand.num_fingers, 1))
-    for gain, joint_limits in zip(hand.joint_gain, hand.joint_limits, strict=True):
-        (column,) = np.flatnonzero(gain)
-        lower, upper = np.sort(joint_limits / gain[column])
-        limits[column] = max(limits[column, 0], lower), min(limits[column, 1], upper)
-    if not hand.spread.joints:
-        limits[0] = 0.0
-    return limits
-
-
-def joint_positions(hand: Hand, spread: float, closing: npt.ArrayLike) -> dict[str, float]:
-    """Return each revolute joint's angle [rad] at a spread and closing angles (k,) [rad].
-
-    Raises:
-        ValueError: If `closing` is not one angle per finger.
-    """
-    q = hand.joint_gain @ _coordinates(hand, spread, closing)
-    return dict(zip(hand.joint_names, q.tolist(), strict=True))
-
-
-def fingertip_poses(hand: Hand, *, spread: npt.ArrayLike, closing: npt.ArrayLike) -> Array:
-    """Return the poses X_GFi (k, 4, 4) of the fingertip links in the palm frame.
-
-    Limits are not looked at.
-
-    Args:
-        hand: The hand.
-        spread: Angle of the spread joints [rad]; any shape (...,).
-        closing: Angle of each finger's closing joint (k,) [rad]; for many postures
-            (..., k), and the result is (..., k, 4, 4).
-
-    Raises:
-        ValueError: If `closing` is not one angle per finger.
-    """
-    c = _coordinates(hand, spread, closing)
-    return np.stack([_chain_pose(chain, c) for chain in hand.chains], axis=-3)
-
-
-def _coordinates(hand: Hand, spread: npt.ArrayLike, closing: npt.ArrayLike) -> Array:
-    """Return (..., 1 + k) of a spread (...,) and closing angles (..., k)."""
-    angles = np.asarray(closing, dtype=float)
-    k = hand.num_fingers
-    if angles.shape[-1:] != (k,):
-        raise ValueError(f"closing must have shape (..., {k}), got {angles.shape}")
-    first = np.asarray(spread, dtype=float)
-    shape = np.broadcast_shapes(first.shape, angles.shape[:-1])
-    return np.concatenate(
-        [np.broadcast_to(first, shape)[..., None], np.broadcast_to(angles, (*shape, k))], axis=-1
-    )
-
-
-def _chain_pose(chain: Chain, c: Array) -> Array:
-    q = c @ chain.gain.T
-    X = np.eye(4)
-    for j, (X_PJ, axis) in enumerate(zip(chain.X_PJ, chain.axis, strict=True)):
-        X = X @ X_PJ @ _turn(axis, q[..., j])
-    return X @ chain.X_JFi
-
-
-def _turn(axis: Array, angle: Array) -> Array:
-    """Return the poses (..., 4, 4) that turn by angles (...,) about an axis (Rodrigues)."""
-    x, y, z = axis
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    s, c = np.sin(angle)[..., None, None], np.cos(angle)[..., None, None]
-    X = np.zeros((*np.shape(angle), 4, 4))
-    X[..., :3, :3] = np.eye(3) + s * K + (1.0 - c) * (K @ K)
-    X[..., 3, 3] = 1.0
-    return X
 
 
 def _read_description(path: Path) -> _Description:

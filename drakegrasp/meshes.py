@@ -1,11 +1,7 @@
-"""From a directory of mesh files to objects that Drake can simulate.
+"""Mesh files: a directory comes in, their names, classes, units and triangles go out.
 
-`find_meshes` lists the files with their classes and units, `prepare_object` turns one
-of them into an `ObjectModel`: a watertight solid in metres with its origin {O} at the
-centre of the bounding box, mass properties of uniform density, and a collision mesh
-that is not too fine for hydroelastic contact. Drake itself accepts open, inverted and
-flat meshes without a word and simulates nonsense, so everything it needs is checked
-here; what is wrong is mended (`drakegrasp.mend`) and noted, or refused as `MeshError`.
+`find_meshes` lists the files of a directory, `load_mesh` reads one; the object that Drake
+simulates is made of it in `drakegrasp.object_model`.
 
 File names and `objects.yaml`: a mesh called `<number>_<class>_<rest>.ext` belongs to
 `<class>`, which may itself contain underscores: the number goes, and so does the last
@@ -22,47 +18,27 @@ from __future__ import annotations
 
 import hashlib
 import io
-import os
-import tempfile
 import unicodedata
 from collections import Counter
-from dataclasses import dataclass, fields
-from functools import cached_property
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 import pydantic
 import trimesh
 import yaml
-from scipy.sparse import coo_matrix
 
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
-from drakegrasp.mend import (
-    Faces,
-    Solid,
-    count_parts,
-    decimate,
-    diagonal,
-    mend_solid,
-    signed_volume,
-    weld,
-)
-
-Status = Literal["fit", "mended", "refused"]
+from drakegrasp.mend import weld
+from drakegrasp.surfaces import Faces
 
 #: Mesh files that are read; everything else in the directory is ignored.
 SUFFIXES = (".obj", ".stl", ".ply", ".glb")
 #: Metres per unit of length of a file.
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 MANIFEST_NAME = "objects.yaml"
-#: Below these an object is a sheet or a speck, which no hydroelastic contact resolves.
-MIN_EXTENT = 0.5e-3  # [m]
-MIN_VOLUME = 1e-9  # [m^3]
-#: Faces that meet at less than this angle are shaded as one smooth surface.
-CREASE_DEG = 30.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,98 +69,6 @@ class MeshSource:
             raise MeshError(f"{self.path.name}: scale must be positive, got {self.scale}")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ObjectModel:
-    """A rigid object, ready to be simulated. Lengths in [m], all arrays read-only.
-
-    Attributes:
-        name: Unique name.
-        class_name: Class.
-        mesh_sha256: Digest of the source file's bytes and its scale, hexadecimal.
-        visual_vertices: (n, 3) float64, in {O}, full resolution.
-        visual_faces: (m, 3) int32, counter-clockwise seen from outside.
-        collision_vertices: (k, 3) float64, in {O}.
-        collision_faces: (l, 3) int32.
-        mass: [kg]
-        p_OOcm: (3,) centre of mass.
-        I_OOcm_O: (3, 3) rotational inertia about the centre of mass, in axes of {O} [kg m^2].
-        collision_error: Largest distance between visual and collision surface.
-        notes: What was mended, in sentences.
-    """
-
-    name: str
-    class_name: str
-    mesh_sha256: str
-    visual_vertices: Array
-    visual_faces: npt.NDArray[np.int32]
-    collision_vertices: Array
-    collision_faces: npt.NDArray[np.int32]
-    mass: float
-    p_OOcm: Array
-    I_OOcm_O: Array
-    collision_error: float
-    notes: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        shapes = {
-            "visual_vertices": (np.float64, (None, 3)),
-            "visual_faces": (np.int32, (None, 3)),
-            "collision_vertices": (np.float64, (None, 3)),
-            "collision_faces": (np.int32, (None, 3)),
-            "p_OOcm": (np.float64, (3,)),
-            "I_OOcm_O": (np.float64, (3, 3)),
-        }
-        for key, (dtype, shape) in shapes.items():
-            array = np.array(getattr(self, key), dtype=dtype, order="C")
-            if len(array.shape) != len(shape) or array.shape[-1] != 3 or not array.size:
-                raise MeshError(f"{self.name}: {key} must have shape {shape}, got {array.shape}")
-            array.setflags(write=False)
-            object.__setattr__(self, key, array)
-
-    @property
-    def half_extents(self) -> Array:
-        """Half of the bounding box's edges (3,) [m]; its centre is the origin of {O}."""
-        return np.asarray(np.ptp(self.visual_vertices, axis=0) / 2.0)
-
-    @property
-    def volume(self) -> float:
-        """Volume of the solid [m^3]."""
-        return signed_volume(self.visual_vertices, self.visual_faces.astype(np.int64))
-
-    @cached_property
-    def visual(self) -> trimesh.Trimesh:
-        """The visual surface in {O}."""
-        return trimesh.Trimesh(self.visual_vertices, self.visual_faces, process=False)
-
-    @cached_property
-    def collision(self) -> trimesh.Trimesh:
-        """The collision surface in {O}."""
-        return trimesh.Trimesh(self.collision_vertices, self.collision_faces, process=False)
-
-
-@dataclass(frozen=True, kw_only=True)
-class AuditRow:
-    """What would happen to one mesh; sizes are None where the file gave none.
-
-    Attributes:
-        name: Name of the object.
-        class_name: Its class.
-        status: "fit" as it is, "mended", or "refused".
-        notes: What was mended, or the one reason of the refusal.
-        faces: Number of faces, of the solid or, if refused, of the file.
-        extents: Edges of the bounding box [m], likewise.
-        volume: Volume of the solid [m^3].
-    """
-
-    name: str
-    class_name: str
-    status: Status
-    notes: tuple[str, ...]
-    faces: int | None
-    extents: tuple[float, float, float] | None
-    volume: float | None
-
-
 # Finding meshes
 
 
@@ -207,7 +91,7 @@ def _read_manifest(path: Path) -> _Manifest:
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise MeshError(f"{path}: must be a readable YAML file, got: {_one_line(error)}") from error
+        raise MeshError(f"{path}: must be a readable YAML file, got: {one_line(error)}") from error
     try:
         return _Manifest.model_validate({} if content is None else content)
     except pydantic.ValidationError as error:
@@ -297,7 +181,7 @@ def _refuse_twins(directory: Path, names: dict[Path, str]) -> None:
             raise MeshError(f"{directory}: names must be unique, got {name!r} for {twins}")
 
 
-# Loading
+# Reading one
 
 
 def load_mesh(path: str | Path) -> trimesh.Trimesh:
@@ -311,6 +195,15 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
     """
     path = Path(path)
     return _parse(path, _read(path))
+
+
+def source_sha256(source: MeshSource) -> str:
+    """Return the hash of a mesh file's bytes and its scale, hexadecimal.
+
+    Raises:
+        MeshError: If the file cannot be read.
+    """
+    return hashlib.sha256(_read(source.path) + f"\nscale {source.scale!r}".encode()).hexdigest()
 
 
 def _read(path: Path) -> bytes:
@@ -344,7 +237,7 @@ def _parse(path: Path, data: bytes) -> trimesh.Trimesh:
             vertices, faces = _concatenate(parts)
     except Exception as error:
         raise MeshError(
-            f"{path.name}: must be a valid {suffix} mesh, got: {_one_line(error)}"
+            f"{path.name}: must be a valid {suffix} mesh, got: {one_line(error)}"
         ) from error
     if not len(faces):
         raise MeshError(f"{path.name}: must hold triangles, got no faces")
@@ -372,242 +265,6 @@ def _concatenate(parts: list[trimesh.Trimesh]) -> tuple[Array, Faces]:
     return np.array(vertices, dtype=np.float64), np.vstack(faces).astype(np.int64)
 
 
-def _one_line(error: Exception) -> str:
+def one_line(error: Exception) -> str:
+    """Return what another library says is wrong, fit to stand in a message of ours."""
     return " ".join(str(error).split())[:200] or type(error).__name__
-
-
-# Preparing
-
-
-def source_sha256(source: MeshSource) -> str:
-    """Return the hash of a mesh file's bytes and its scale, hexadecimal.
-
-    Raises:
-        MeshError: If the file cannot be read.
-    """
-    return hashlib.sha256(_read(source.path) + f"\nscale {source.scale!r}".encode()).hexdigest()
-
-
-def prepare_object(
-    source: MeshSource,
-    *,
-    mass: float = 1.0,
-    max_collision_faces: int = 3000,
-    min_diagonal: float = 0.01,
-    max_diagonal: float = 2.0,
-) -> ObjectModel:
-    """Return the simulated object of a mesh file, mended where that is honest.
-
-    Args:
-        source: Where the mesh is and what unit it is in.
-        mass: [kg]
-        max_collision_faces: The collision mesh is decimated if it has more faces than
-            this; it is never refined.
-        min_diagonal: Shortest diagonal of the bounding box [m] that is no mistake of unit.
-        max_diagonal: Longest diagonal [m].
-
-    Raises:
-        MeshError: If the file is no mesh, has an implausible size, or no solid can be
-            made of it; the message gives the reason.
-    """
-    if not (np.isfinite(mass) and mass > 0.0):
-        raise MeshError(f"mass must be positive [kg], got {mass}")
-    if max_collision_faces < 4:
-        raise MeshError(f"max_collision_faces must be at least 4, got {max_collision_faces}")
-    file = source.path.name
-    data = _read(source.path)
-    mesh = _parse(source.path, data)
-    vertices, faces = np.asarray(mesh.vertices) * source.scale, np.asarray(mesh.faces)
-    size = diagonal(vertices)
-    if not min_diagonal <= size <= max_diagonal:
-        raise MeshError(
-            f"{file}: the diagonal of the bounding box must be {min_diagonal:g} m to "
-            f"{max_diagonal:g} m, got {size:.4g} m with 1 unit = {source.scale:g} m: give the "
-            f"file's unit with --units ({', '.join(UNITS)}) or for this mesh in {MANIFEST_NAME}"
-        )
-    try:
-        solid = mend_solid(vertices, faces)
-        _refuse_slight(solid)
-        centre = (solid.vertices.min(axis=0) + solid.vertices.max(axis=0)) / 2.0
-        visual = Solid(vertices=solid.vertices - centre, faces=solid.faces)
-        p_OOcm, I_OOcm_O = _mass_properties(visual, mass)
-        collision, error = decimate(visual, max_collision_faces)
-    except MeshError as reason:
-        raise MeshError(f"{file}: {reason}") from reason
-    notes = solid.notes
-    parts = count_parts(solid.vertices, solid.faces)
-    if parts > 1:
-        notes = (*notes, f"{parts} parts do not touch and will move as one")
-    return ObjectModel(
-        name=source.name,
-        class_name=source.class_name,
-        mesh_sha256=source_sha256(source),
-        visual_vertices=visual.vertices,
-        visual_faces=visual.faces.astype(np.int32),
-        collision_vertices=collision.vertices,
-        collision_faces=collision.faces.astype(np.int32),
-        mass=float(mass),
-        p_OOcm=p_OOcm,
-        I_OOcm_O=I_OOcm_O,
-        collision_error=error,
-        notes=notes,
-    )
-
-
-def _refuse_slight(solid: Solid) -> None:
-    """Refuse sheets, specks, and a volume that the convex hull contradicts."""
-    extents = np.ptp(solid.vertices, axis=0)
-    if extents.min() < MIN_EXTENT:
-        raise MeshError(
-            f"the object must be at least {MIN_EXTENT * 1e3:g} mm thick, "
-            f"got {extents.min() * 1e3:.3g} mm"
-        )
-    volume = signed_volume(solid.vertices, solid.faces)
-    if volume < MIN_VOLUME:
-        raise MeshError(f"the volume must be at least {MIN_VOLUME:g} m^3, got {volume:.3g} m^3")
-    hull = trimesh.Trimesh(solid.vertices, solid.faces, process=False).convex_hull.volume
-    if volume > hull * (1.0 + 1e-6):
-        raise MeshError(
-            f"the volume must be within the convex hull's, {hull:.4g} m^3, got {volume:.4g} m^3"
-        )
-
-
-def _mass_properties(solid: Solid, mass: float) -> tuple[Array, Array]:
-    """Return p_OOcm (3,) and I_OOcm_O (3, 3) of a solid of uniform density."""
-    triangles = solid.vertices[solid.faces]
-    volume = signed_volume(solid.vertices, solid.faces)
-    properties = trimesh.triangles.mass_properties(triangles, density=mass / volume)
-    p_OOcm = np.asarray(properties["center_mass"])
-    inertia = np.asarray(properties["inertia"])
-    I_OOcm_O = (inertia + inertia.T) / 2.0
-    moments = np.linalg.eigvalsh(I_OOcm_O)
-    if not (moments[0] > 0.0 and moments[0] + moments[1] >= moments[2] * (1.0 - 1e-9)):
-        raise MeshError(f"the moments of inertia must obey the triangle inequality, got {moments}")
-    # A centre of mass outside the hull is impossible for a solid, and trimesh's search
-    # for resting poses never returns from it.
-    hull = trimesh.Trimesh(solid.vertices, solid.faces, process=False).convex_hull
-    outside = np.einsum("ij,ij->i", p_OOcm - hull.triangles[:, 0], hull.face_normals).max()
-    if outside > 1e-9:
-        raise MeshError(f"the centre of mass must be inside the convex hull, got {p_OOcm}")
-    return p_OOcm, I_OOcm_O
-
-
-# Keeping and handing on
-
-
-def save_object(model: ObjectModel, path: str | Path) -> None:
-    """Write an object to a .npz file, atomically; equal objects give equal bytes."""
-    path = Path(path)
-    content: dict[str, Any] = {f.name: np.asarray(getattr(model, f.name)) for f in fields(model)}
-    content["notes"] = np.array(model.notes, dtype=np.str_)
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **content)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(buffer.getvalue())
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-
-
-def load_object(path: str | Path) -> ObjectModel:
-    """Return an object that `save_object` wrote.
-
-    Raises:
-        MeshError: If the file is missing, damaged or something else.
-    """
-    path = Path(path)
-    try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as content:
-            values: dict[str, Any] = {f.name: content[f.name] for f in fields(ObjectModel)}
-    except Exception as error:
-        raise MeshError(
-            f"{path.name}: must be an object file of drakegrasp, got: {_one_line(error)}"
-        ) from error
-    for key in ("name", "class_name", "mesh_sha256", "mass", "collision_error"):
-        values[key] = values[key].item()
-    values["notes"] = tuple(values["notes"].tolist())
-    return ObjectModel(**values)
-
-
-def obj_text(vertices: npt.ArrayLike, faces: npt.ArrayLike, *, normals: bool) -> str:
-    """Return a triangle mesh as Wavefront text, for Drake's in-memory meshes.
-
-    Coordinates are written so that they read back exactly. With `normals`, every corner
-    gets the area-weighted mean normal of those faces at its vertex that are within 30
-    degrees of its own face: curved surfaces look smooth, edges of boxes stay crisp.
-    """
-    v = np.asarray(vertices, dtype=np.float64)
-    f = np.asarray(faces, dtype=np.int64)
-    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in v.tolist()]
-    if not normals:
-        lines += [f"f {a} {b} {c}" for a, b, c in (f + 1).tolist()]
-        return "\n".join(lines) + "\n"
-    vn, index = np.unique(np.round(_corner_normals(v, f), 6), axis=0, return_inverse=True)
-    lines += [f"vn {x:.6f} {y:.6f} {z:.6f}" for x, y, z in (vn + 0.0).tolist()]
-    corners = np.stack((f, index.reshape(f.shape)), axis=2).reshape(-1, 6) + 1
-    lines += ["f {}//{} {}//{} {}//{}".format(*row) for row in corners.tolist()]
-    return "\n".join(lines) + "\n"
-
-
-def _corner_normals(vertices: Array, faces: Faces) -> Array:
-    """Return the shading normal of every corner (3m, 3)."""
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    weighted = np.cross(b - a, c - a)
-    unit = weighted / np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-300)
-    corner = np.arange(faces.size)
-    at_vertex = coo_matrix(
-        (np.ones(faces.size), (faces.ravel(), corner // 3)), shape=(len(vertices), len(faces))
-    ).tocsr()
-    pairs = at_vertex[faces.ravel()].tocoo()
-    smooth = (unit[pairs.row // 3] * unit[pairs.col]).sum(axis=1) >= np.cos(np.radians(CREASE_DEG))
-    smooth |= pairs.row // 3 == pairs.col
-    rows, columns = pairs.row[smooth], pairs.col[smooth]
-    mean = (
-        coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(faces.size, len(faces))).tocsr()
-        @ weighted
-    )
-    return np.asarray(mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-300))
-
-
-def audit(
-    directory: str | Path, *, units: str = "m", manifest: str | Path | None = None
-) -> list[AuditRow]:
-    """Return, mesh by mesh, whether it is fit to be simulated, was mended, or is refused.
-
-    Raises:
-        MeshError: As `find_meshes`; a bad mesh is a row, not an error.
-    """
-    return [_audit_one(source) for source in find_meshes(directory, units=units, manifest=manifest)]
-
-
-def _audit_one(source: MeshSource) -> AuditRow:
-    status: Status
-    try:
-        model = prepare_object(source)
-        vertices, faces, volume = model.visual_vertices, len(model.visual_faces), model.volume
-        notes, status = model.notes, "mended" if model.notes else "fit"
-    except MeshError as error:
-        notes, status, volume = (str(error),), "refused", None
-        try:
-            mesh = load_mesh(source.path)
-            vertices, faces = np.asarray(mesh.vertices) * source.scale, len(mesh.faces)
-        except MeshError:
-            vertices, faces = None, None
-    extents: tuple[float, float, float] | None = None
-    if vertices is not None:
-        x, y, z = np.ptp(vertices, axis=0).tolist()
-        extents = (x, y, z)
-    return AuditRow(
-        name=source.name,
-        class_name=source.class_name,
-        status=status,
-        notes=notes,
-        faces=faces,
-        extents=extents,
-        volume=volume,
-    )

@@ -17,7 +17,7 @@ from drakegrasp.assemble import DATA_FILES
 from drakegrasp.builtin import export_builtin
 from drakegrasp.candidates import sample_candidates
 from drakegrasp.config import load_config
-from drakegrasp.figures import candidates_figure, frames_figure, hero_figure
+from drakegrasp.doc_figures import candidates_figure, frames_figure, hero_figure
 from drakegrasp.frames import Array
 from drakegrasp.meshes import find_meshes
 from drakegrasp.prepared import PreparedObject, prepare

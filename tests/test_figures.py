@@ -16,16 +16,9 @@ from drakegrasp.builtin import builtin_object, export_builtin
 from drakegrasp.camera import intrinsics, project
 from drakegrasp.config import CameraConfig, load_config
 from drakegrasp.dataset import GraspDataset
+from drakegrasp.doc_figures import candidates_figure, find_sample, frames_figure, hero_figure
 from drakegrasp.errors import DataError
-from drakegrasp.figures import (
-    candidates_figure,
-    contact_sheet,
-    draw_sheet,
-    find_sample,
-    frames_figure,
-    hero_figure,
-    spread_over_objects,
-)
+from drakegrasp.figures import contact_sheet, draw_sheet, spread_over_objects
 from drakegrasp.frames import Array, make_pose, pack_pose
 from drakegrasp.grasp import pack_grasp
 from drakegrasp.schema import (
@@ -275,7 +268,8 @@ def test_chosen_view_sees_every_fingertip(dataset: Path) -> None:
     from drakegrasp.frames import X_WT
     from drakegrasp.hand import load_hand
     from drakegrasp.scene import hand_joint_names
-    from drakegrasp.snapshots import choose_view, labels, outline, show, stage_trial, take
+    from drakegrasp.snapshots import stage_trial
+    from drakegrasp.theatre import choose_view, labels, outline, show, take
 
     trial = stage_trial(dataset, 0)
     theatre, plant = trial.theatre, trial.theatre.plant
@@ -313,8 +307,6 @@ def test_only_lifted_trials_can_be_shown(dataset: Path) -> None:
 def test_figures_import_no_drake() -> None:
     import subprocess
 
-    code = (
-        "import sys, drakegrasp.figures; print({'pydrake', 'dask', 'trimesh'} & set(sys.modules))"
-    )
+    code = "import sys, drakegrasp.doc_figures; print({'pydrake', 'dask', 'trimesh'} & set(sys.modules))"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "set()"

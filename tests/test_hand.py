@@ -20,12 +20,10 @@ from drakegrasp.hand import (
     MODELS,
     Coupling,
     Hand,
-    coordinate_limits,
-    fingertip_poses,
     hand_names,
-    joint_positions,
     load_hand,
 )
+from drakegrasp.kinematics import coordinate_limits, fingertip_poses, joint_positions
 
 #: The palm's surface above the base [m]; the table below is given from there.
 PALM_SURFACE = 0.0793

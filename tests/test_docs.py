@@ -1,0 +1,69 @@
+"""What the docs say is what the code does."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from drakegrasp import format_docs
+from drakegrasp.cli import main
+from drakegrasp.outcomes import Outcome
+from drakegrasp.schema import DATA_FIELDS, LOOK_FIELDS, OBJECT_FIELDS, SUCCESS_FIELDS, TRIAL_FIELDS
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+
+
+def test_format_page_is_what_the_schema_says(tmp_path: Path) -> None:
+    page = ROOT / "docs" / "dataset-format.md"
+    assert format_docs.main(["--check", str(page)]) == 0
+    stale = tmp_path / "page.md"
+    stale.write_text(page.read_text(encoding="utf-8").replace("float64", "float16"))
+    assert format_docs.main(["--check", str(stale)]) == 1
+    assert format_docs.main([str(stale)]) == 0
+    assert stale.read_bytes() == page.read_bytes()
+
+
+def test_every_field_is_on_the_format_page() -> None:
+    text = (ROOT / "docs" / "dataset-format.md").read_text(encoding="utf-8")
+    for field in (*DATA_FIELDS, *TRIAL_FIELDS, *LOOK_FIELDS, *OBJECT_FIELDS, *SUCCESS_FIELDS):
+        assert f"`{field.name}`" in text
+    for outcome in Outcome:
+        assert f"{outcome.value} {outcome.label}" in text
+
+
+def test_field_names_are_unique_in_their_table() -> None:
+    for table in (DATA_FIELDS, TRIAL_FIELDS, LOOK_FIELDS, OBJECT_FIELDS, SUCCESS_FIELDS):
+        names = [field.name for field in table]
+        assert len(names) == len(set(names))
+
+
+@pytest.mark.parametrize("page", DOCS, ids=lambda p: p.name)
+def test_links_lead_somewhere(page: Path) -> None:
+    targets = re.findall(r"\]\((?!https?://)([^)#]+)", page.read_text(encoding="utf-8"))
+    missing = [t for t in targets if not (page.parent / t).exists()]
+    assert not missing
+
+
+@pytest.mark.parametrize("page", DOCS, ids=lambda p: p.name)
+def test_commands_in_the_docs_exist(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    for command in re.findall(r"^drakegrasp ([a-z]+)", text, flags=re.MULTILINE):
+        assert command in main.commands
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_session_of_the_readme_runs(
+    small_dataset: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """All but the build itself, on the small dataset."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    lines = [line for line in code.splitlines() if not line.startswith("dg.build_dataset")]
+    assert len(code.splitlines()) == len(lines) + 1
+    monkeypatch.chdir(small_dataset.parent)
+    exec(compile("\n".join(lines).replace('"OUT', '"out'), "README.md", "exec"), {})
+    assert capsys.readouterr().out.rstrip().endswith("True")
