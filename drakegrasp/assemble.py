@@ -26,7 +26,7 @@ from drakegrasp.filters import Removal, Successes, judge_successes, split_sample
 from drakegrasp.frames import X_WT, Array, invert_pose, pack_pose, transform_points, unpack_pose
 from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp
 from drakegrasp.manifest import Manifest, model_path, read_manifest
-from drakegrasp.meshes import ObjectModel, load_object
+from drakegrasp.object_model import ObjectModel, load_object
 from drakegrasp.outcomes import Outcome
 from drakegrasp.progress import Report, silent
 from drakegrasp.schema import (
@@ -107,6 +107,8 @@ def assemble(out: Path, *, rejected: Sequence[int] = (), progress: Report = sile
             parts.append(part)
             found.append(_successes(part, shard, K))
             progress(len(parts), 2 * total)
+        if not parts:
+            raise DataError(f"{out}: at least one object must have a palm pose to try, got none")
         successes = _concatenate(found)
         removal = judge_successes(successes, manifest.config.filters, rejected)
         _write_removal(trials, successes, removal)

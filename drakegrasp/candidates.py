@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from drakegrasp.config import CandidateConfig
 from drakegrasp.frames import Array, make_pose
-from drakegrasp.meshes import ObjectModel
+from drakegrasp.object_model import ObjectModel
 
 #: The first palm's axes in {O}: +Gz looks down onto the object, Gx = Ox.
 R_OG0 = np.diag([1.0, -1.0, -1.0])

@@ -1,10 +1,10 @@
-"""`drakegrasp check`: every invariant of a dataset, or of one of its files.
+"""`drakegrasp check`: every rule on every row of a dataset, or of one of its files.
 
 In: a dataset's directory, or grasping_oto.hdf5, grasping_otm.hdf5 or trials.hdf5 alone. Out:
 a list of violations, empty for a sound dataset. Rows are read in batches, so memory is
-bounded whatever the size of the dataset. A row that breaks an invariant is not shown to
-the invariants that build on it: what is reported is the cause, not all that follows from
-it. Needs no Drake.
+bounded whatever the size of the dataset. Here is only which rule sees which rows, and in
+which order: a row that breaks a rule is not shown to the rules that build on it, so what is
+reported is the cause, not all that follows from it. Needs no Drake.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from drakegrasp.assemble import DATA_FILES, TRIALS_FILE
 from drakegrasp.errors import DataError, MeshError
 from drakegrasp.image_rules import Lens
 from drakegrasp.manifest import FILE_NAME, Manifest, model_path, read_manifest
-from drakegrasp.meshes import ObjectModel, load_object
+from drakegrasp.object_model import ObjectModel, load_object
 from drakegrasp.open_file import OpenFile, Rule, first_line, open_file
 from drakegrasp.outcomes import Outcome
 from drakegrasp.progress import Report, silent
@@ -112,12 +112,10 @@ def _check_directory(out: Path, stack: ExitStack, findings: Findings, report: Re
         files[camera] = open_file(name, file, camera, findings)
     headers = manifest.headers()
     steps = _Steps(report, sum(map(_rows, files.values())) + len(headers))
+    findings.add(dataset_rules.same_configuration(files.values(), manifest))
     trials = files.pop("", None)
     models = lru_cache(KEPT_OBJECTS)(partial(_load_model, out, manifest, findings))
     dataset = _Dataset(out=out, manifest=manifest, trials=trials, model=models)
-    findings.add(
-        dataset_rules.same_configuration([*files.values(), *([trials] if trials else [])], manifest)
-    )
     _check_shards(dataset, findings, steps)
     if trials is not None:
         _check_trials(trials, dataset, findings, steps)
@@ -189,8 +187,6 @@ def _judge_by_trial(
             b["trial_id"],
         ),
     )
-    if not len(batch):
-        return batch
     # A trial that is wrong in itself is found already and says nothing about its sample.
     fit = batch.without(set(batch.rows[np.isin(batch["trial_id"], trials.bad("trials"))].tolist()))
     if not len(fit):
@@ -297,11 +293,7 @@ def _check_trials(
         )
         batch = trials.judge(whole, findings, numbers)
         batch = trials.judge(batch, findings, trial_rules.stages)
-        checks: list[Rule] = [
-            trial_rules.verdicts,
-            trial_rules.contacts,
-            trial_rules.poses,
-        ]
+        checks: list[Rule] = [trial_rules.verdicts, trial_rules.contacts, trial_rules.poses]
         if dataset is not None and trials.count("objects") == len(dataset.manifest.objects):
             poses = [entry["X_TO"] for entry in dataset.manifest.objects]
             checks.append(partial(trial_rules.resting_poses, X_TO=poses))

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 #: Errors of what was asked for, as against errors of what was done.
 WRONG_USAGE = (ConfigError, HandError, MeshError)
 #: Width of tables where standard output is not a terminal [characters].
-WIDTH = 160
+WIDTH = 180
 
 
 class _Commands(click.Group):
@@ -110,7 +110,7 @@ def export_objects(directory: Path) -> None:
 @manifest_option
 def audit(mesh_dir: Path, units: str, manifest: Path | None) -> None:
     """Say mesh by mesh: fit to simulate, mended, or refused, and why."""
-    from drakegrasp.meshes import audit as audit_meshes
+    from drakegrasp.audit import audit as audit_meshes
     from drakegrasp.tables import audit_table
 
     rows = audit_meshes(mesh_dir, units=units, manifest=manifest)

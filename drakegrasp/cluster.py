@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
@@ -148,11 +148,12 @@ def connect(
 
 def _close_workbenches(client: Client) -> None:
     """End the renderers in the thread that made them: the one that runs tasks."""
-    workers = list(client.scheduler_info(n_workers=-1)["workers"])
-    wait(
-        [client.submit(close_workbenches, workers=[w], pure=False) for w in workers],
-        timeout=CONNECT_SECONDS,
-    )
+    # A worker that is still busy keeps its own: VTK then grumbles when its process ends.
+    with suppress(TimeoutError):
+        wait(
+            [client.submit(close_workbenches, workers=[w], pure=False) for w in client.ncores()],
+            timeout=CONNECT_SECONDS,
+        )
 
 
 class DaskExecutor:
@@ -181,7 +182,7 @@ class DaskExecutor:
                 running.add(self._submit(function, item))
 
     def _room(self) -> int:
-        return IN_FLIGHT * max(1, len(self._client.scheduler_info(n_workers=-1)["workers"]))
+        return IN_FLIGHT * max(1, len(self._client.ncores()))
 
     def _submit(self, function: Callable[[T], R], item: T) -> Future:
         # A task writes files, so it is never the same as one that was done before.

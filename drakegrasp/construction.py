@@ -52,8 +52,9 @@ from pydrake.trajectories import PiecewisePolynomial
 from drakegrasp.config import PhysicsConfig
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand import MODELS, Hand, make_parser
-from drakegrasp.meshes import ObjectModel, obj_text
+from drakegrasp.object_model import ObjectModel
 from drakegrasp.scene import HandHandles, Scene
+from drakegrasp.wavefront import obj_text
 
 #: Mass of each of the three bodies that carry the wrist [kg]; light beside the hand.
 WRIST_BODY_MASS = 0.02

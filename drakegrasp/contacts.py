@@ -17,8 +17,8 @@ from pydrake.multibody.plant import HydroelasticContactInfo
 from pydrake.multibody.tree import BodyIndex
 
 from drakegrasp.frames import Array, invert_pose, rotate_vectors, transform_points
-from drakegrasp.mend import winding_numbers
 from drakegrasp.scene import HandHandles, Scene
+from drakegrasp.surfaces import winding_numbers
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -7,7 +7,7 @@ read here, whole.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -104,7 +104,7 @@ def same_objects(trials: OpenFile, manifest: Manifest) -> Iterator[Violation]:
                 )
 
 
-def same_configuration(files: Sequence[OpenFile], manifest: Manifest) -> Iterator[Violation]:
+def same_configuration(files: Iterable[OpenFile], manifest: Manifest) -> Iterator[Violation]:
     """All files are of the manifest's configuration."""
     expected = manifest.config.simulation_hash()
     for file in files:

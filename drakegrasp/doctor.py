@@ -238,7 +238,7 @@ def render_test_image() -> tuple[int, int]:
     from drakegrasp.camera import intrinsics
     from drakegrasp.config import CameraConfig
     from drakegrasp.frames import make_pose
-    from drakegrasp.meshes import ObjectModel
+    from drakegrasp.object_model import ObjectModel
     from drakegrasp.render import build_renderer, look
 
     config = CameraConfig()

@@ -15,7 +15,7 @@ import numpy as np
 from drakegrasp.camera import intrinsics, project, unproject
 from drakegrasp.config import CameraConfig
 from drakegrasp.frames import Array, invert_pose, transform_points
-from drakegrasp.meshes import ObjectModel
+from drakegrasp.object_model import ObjectModel
 from drakegrasp.violations import UNIT_TOLERANCE, AnyArray, Batch, Violation
 
 #: Depth images reproduce the table and the mesh to 1e-6 m when the lens is right. Half a pixel

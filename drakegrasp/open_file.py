@@ -31,7 +31,16 @@ Rule = Callable[[Batch], Iterator[Violation]]
 
 @dataclass(eq=False)
 class OpenFile:
-    """An open file: its groups by name, none of those whose structure is broken."""
+    """An open file.
+
+    Attributes:
+        name: Of the file, for the violations.
+        file: The file.
+        config: That it holds, if it is sound.
+        fields: Of each group, by its name.
+        groups: By name, without those whose layout is broken.
+        bad_rows: Of each group, those that broke a rule or cannot be read.
+    """
 
     name: str
     file: h5py.File
@@ -57,14 +66,12 @@ class OpenFile:
         columns = {f.name: column(self.groups[group][f.name], f)[choice] for f in fields}
         return Batch(file=self.name, group=f"/{group}", rows=rows, columns=columns)
 
-    def batches(
-        self, group: str, size: int, findings: Findings, names: Sequence[str] | None = None
-    ) -> Iterator[Batch]:
+    def batches(self, group: str, size: int, findings: Findings) -> Iterator[Batch]:
         """Yield all rows of a group; rows that cannot be read are a finding."""
         for start in range(0, self.count(group), size):
             rows = np.arange(start, min(start + size, self.count(group)))
             try:
-                yield self.read(group, rows, names)
+                yield self.read(group, rows)
             except (OSError, UnicodeDecodeError) as error:
                 what = f"rows {start} to {rows[-1]} must be readable"
                 findings.add([of_file(self.name, what, first_line(error), f"/{group}")])
@@ -82,7 +89,14 @@ class OpenFile:
 
 
 def open_file(name: str, file: h5py.File, camera: str, findings: Findings) -> OpenFile:
-    """Check what a file says of itself and how it is laid out."""
+    """Return a file, once it is checked what it says of itself and how it is laid out.
+
+    Args:
+        name: Of the file, for the violations.
+        file: The file.
+        camera: `oto` or `otm`; empty for the trials.
+        findings: Where violations go.
+    """
     config, broken = layout_rules.read_config(name, file)
     findings.add([*broken, *layout_rules.attributes(name, file, config, camera)])
     fields = (

@@ -19,7 +19,8 @@ from drakegrasp.config import Config
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array
 from drakegrasp.manifest import model_path, plan_path
-from drakegrasp.meshes import MeshSource, ObjectModel, load_object, prepare_object, save_object
+from drakegrasp.meshes import MeshSource
+from drakegrasp.object_model import ObjectModel, load_object, prepare_object, save_object
 from drakegrasp.resting import settle
 from drakegrasp.shards import atomic_hdf5
 

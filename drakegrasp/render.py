@@ -40,7 +40,8 @@ from drakegrasp.config import CameraConfig
 from drakegrasp.errors import MachineError
 from drakegrasp.frames import X_WT
 from drakegrasp.hand import MODELS, make_parser
-from drakegrasp.meshes import ObjectModel, obj_text
+from drakegrasp.object_model import ObjectModel
+from drakegrasp.wavefront import obj_text
 
 #: Colour of what lies beyond the table.
 BACKGROUND = np.array([0.86, 0.90, 0.94])

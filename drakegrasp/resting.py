@@ -15,7 +15,7 @@ from drakegrasp.construction import build_scene
 from drakegrasp.contacts import read_contacts
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import X_WT, Array, invert_pose, make_pose
-from drakegrasp.meshes import ObjectModel
+from drakegrasp.object_model import ObjectModel
 from drakegrasp.scene import Scene, advance, reset_object
 
 #: Simulated time between two looks at the object's speed [s].

@@ -15,7 +15,7 @@ import numpy as np
 from drakegrasp.camera import LOOKS_VERTICALLY, camera_pose_otm, camera_pose_oto
 from drakegrasp.config import CameraConfig
 from drakegrasp.frames import P_WT, X_WT, Array, invert_pose, unpack_pose
-from drakegrasp.meshes import ObjectModel
+from drakegrasp.object_model import ObjectModel
 from drakegrasp.schema import CAMERAS, DATA_FIELDS
 from drakegrasp.violations import (
     POSITION_TOLERANCE,

@@ -23,7 +23,7 @@ from pydrake.trajectories import BezierCurve, PiecewisePolynomial
 from drakegrasp.config import PhysicsConfig
 from drakegrasp.frames import Array
 from drakegrasp.hand import Hand
-from drakegrasp.meshes import ObjectModel
+from drakegrasp.object_model import ObjectModel
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

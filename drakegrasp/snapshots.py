@@ -29,7 +29,7 @@ from drakegrasp.frames import (
 )
 from drakegrasp.hand import load_hand
 from drakegrasp.manifest import read_manifest
-from drakegrasp.meshes import ObjectModel
+from drakegrasp.object_model import ObjectModel
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.prepared import load_prepared
 from drakegrasp.theatre import (

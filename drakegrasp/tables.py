@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from rich.box import SIMPLE
 from rich.table import Table
 
+from drakegrasp.audit import AuditRow
 from drakegrasp.filters import Removal
-from drakegrasp.meshes import AuditRow
 from drakegrasp.outcomes import Outcome
 from drakegrasp.stats import Funnel, SplitCount
 

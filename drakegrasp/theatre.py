@@ -36,8 +36,9 @@ from pydrake.systems.sensors import CameraInfo
 from drakegrasp.doc_figures import Picture
 from drakegrasp.frames import X_WT, Array, make_pose, transform_points
 from drakegrasp.hand import Hand, make_parser
-from drakegrasp.meshes import ObjectModel, obj_text
+from drakegrasp.object_model import ObjectModel
 from drakegrasp.render import object_colour
+from drakegrasp.wavefront import obj_text
 
 #: Vertical field of view [deg]: narrow, so that nothing is distorted.
 FOV_Y_DEG = 26.0

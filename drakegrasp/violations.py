@@ -165,7 +165,7 @@ def unit_length(batch: Batch, lengths: Array, what: str) -> Iterator[Violation]:
 def rotation(batch: Batch, name: str) -> Iterator[Violation]:
     """The pose of that name has an orthonormal rotation with determinant +1."""
     R = batch.pose(name)[:, :3, :3]
-    # A pose that is due to be NaN is not a pose: `trial_stages` looks after those.
+    # A pose that is due to be NaN is not a pose: `trial_rules.stages` looks after those.
     R = np.where(np.isfinite(R).all(axis=(1, 2), keepdims=True), R, np.eye(3))
     skew = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
     determinant = np.linalg.det(R)

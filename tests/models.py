@@ -10,7 +10,8 @@ import trimesh
 
 from drakegrasp.candidates import R_OG0, Attempt
 from drakegrasp.frames import make_pose
-from drakegrasp.meshes import MeshSource, ObjectModel, prepare_object
+from drakegrasp.meshes import MeshSource
+from drakegrasp.object_model import ObjectModel, prepare_object
 
 #: Edge of the cube that the hand can grasp from above [m].
 CUBE = 0.07

@@ -18,10 +18,13 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
     frozenset(line.split())
     for line in (
         "errors frames progress",
-        "grasp outcomes config",
-        "schema hand mend shapes",
-        "meshes shards camera filters",
-        "builtin manifest candidates kinematics violations",
+        "grasp outcomes config curves surfaces",
+        "schema hand solids bodies wavefront",
+        "shards camera filters shapes vessels fruit holes union decimation",
+        "builtin manifest mend",
+        "meshes",
+        "object_model",
+        "audit candidates kinematics violations",
         "scene render dataset assemble",
         "construction contacts stats figures",
         "layout_rules sample_rules image_rules trial_rules",

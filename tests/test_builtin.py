@@ -13,7 +13,7 @@ import pytest
 import trimesh
 from scipy.spatial import ConvexHull
 
-from drakegrasp import shapes
+from drakegrasp import shapes, vessels
 from drakegrasp.builtin import BUILTIN_OBJECTS, BuiltinObject, builtin_object, export_builtin
 from drakegrasp.errors import MeshError
 
@@ -100,7 +100,7 @@ def test_can_volume_is_that_of_a_cylinder() -> None:
 
 def test_mug_is_a_shell_with_a_handle() -> None:
     radius, height, wall, floor = 0.044, 0.1, 0.005, 0.007
-    mesh = shapes.mug(
+    mesh = vessels.mug(
         radius=radius, height=height, handle_reach=0.034, handle_radius=0.006, wall=wall
     )
     shell = np.pi * (radius**2 * height - (radius - wall) ** 2 * (height - floor))

@@ -27,7 +27,8 @@ from drakegrasp.candidates import (
 )
 from drakegrasp.config import CandidateConfig, load_config
 from drakegrasp.frames import Array, make_pose
-from drakegrasp.meshes import MeshSource, ObjectModel, prepare_object
+from drakegrasp.meshes import MeshSource
+from drakegrasp.object_model import ObjectModel, prepare_object
 
 #: Full extents of three of the paper's meshes [m]; their files are in centimetres. Counts
 #: of valid and of distinct poses, and the distinct ones of an earlier reference that took

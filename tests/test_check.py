@@ -28,7 +28,8 @@ from drakegrasp.config import CameraConfig, load_config
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, invert_pose, make_pose, pack_pose, unpack_pose
 from drakegrasp.manifest import Manifest, model_path, read_manifest, write_manifest
-from drakegrasp.meshes import MeshSource, ObjectModel, load_object, prepare_object, save_object
+from drakegrasp.meshes import MeshSource
+from drakegrasp.object_model import ObjectModel, load_object, prepare_object, save_object
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.schema import CAMERAS, LOOK_FIELDS, sizes
 from drakegrasp.shards import Shard, ShardHeader, read_shard, trial_columns, write_shard

@@ -307,6 +307,9 @@ def test_only_lifted_trials_can_be_shown(dataset: Path) -> None:
 def test_figures_import_no_drake() -> None:
     import subprocess
 
-    code = "import sys, drakegrasp.doc_figures; print({'pydrake', 'dask', 'trimesh'} & set(sys.modules))"
+    code = (
+        "import sys, drakegrasp.doc_figures; "
+        "print({'pydrake', 'dask', 'trimesh'} & set(sys.modules))"
+    )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "set()"

@@ -10,7 +10,6 @@ import trimesh
 import yaml
 from pydrake.geometry import Box, Convex, Cylinder, Role, SceneGraph
 from pydrake.math import RigidTransform
-from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.framework import DiagramBuilder
 
@@ -22,6 +21,7 @@ from drakegrasp.hand import (
     Hand,
     hand_names,
     load_hand,
+    make_parser,
 )
 from drakegrasp.kinematics import coordinate_limits, fingertip_poses, joint_positions
 
@@ -99,7 +99,7 @@ def link_kind(name: str) -> str:
 
 def parsed_plant(hand: Hand) -> MultibodyPlant:
     plant = MultibodyPlant(0.0)
-    Parser(plant).AddModels(str(hand.sdf_path))
+    make_parser(plant).AddModels(str(hand.sdf_path))
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(hand.palm_link))
     plant.Finalize()
     return plant
@@ -266,7 +266,7 @@ def built_scene(hand: Hand) -> tuple[MultibodyPlant, SceneGraph, object]:
     builder = DiagramBuilder()
     config = MultibodyPlantConfig(time_step=0.01)
     plant, scene_graph = AddMultibodyPlant(config, builder)
-    Parser(plant).AddModels(str(hand.sdf_path))
+    make_parser(plant).AddModels(str(hand.sdf_path))
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(hand.palm_link))
     plant.Finalize()
     return plant, scene_graph, builder.Build()

@@ -14,7 +14,8 @@ import trimesh
 from drakegrasp.camera import intrinsics, project, unproject
 from drakegrasp.config import CameraConfig
 from drakegrasp.frames import Array, invert_pose, make_pose, transform_points
-from drakegrasp.meshes import MeshSource, ObjectModel, prepare_object
+from drakegrasp.meshes import MeshSource
+from drakegrasp.object_model import ObjectModel, prepare_object
 from drakegrasp.render import Look, Renderer, build_renderer, look, object_colour
 
 

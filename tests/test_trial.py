@@ -17,7 +17,8 @@ from drakegrasp.construction import build_scene, object_friction, partner_fricti
 from drakegrasp.contacts import is_inside
 from drakegrasp.frames import X_WT, invert_pose, make_pose
 from drakegrasp.hand import Hand, load_hand
-from drakegrasp.meshes import MeshSource, ObjectModel, prepare_object
+from drakegrasp.meshes import MeshSource
+from drakegrasp.object_model import ObjectModel, prepare_object
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.resting import settle
 from drakegrasp.scene import (
