@@ -11,7 +11,7 @@ from models import CUBE, box_model, from_above, model_of, standing
 
 from drakegrasp import trial as trial_module
 from drakegrasp.camera import camera_pose_oto
-from drakegrasp.candidates import Attempt
+from drakegrasp.candidates import Attempt, make_attempts, sample_candidates
 from drakegrasp.config import Config, load_config
 from drakegrasp.construction import build_scene, object_friction, partner_friction
 from drakegrasp.contacts import is_inside
@@ -321,3 +321,23 @@ def test_camera_stands_behind_the_palm(cube, config):
     X_TG = standing(cube) @ from_above(cube, STANDOFF).X_OG
     X_GC = invert_pose(X_TG) @ camera_pose_oto(X_TG, config.camera)
     assert np.allclose(X_GC, make_pose(np.eye(3), [0.0, 0.0, -0.25]))
+
+
+@pytest.mark.slow
+def test_quarter_of_the_step_gives_the_same_verdicts(tmp_path, config, hand):
+    """At 4 ms and at 1 ms at least 95 % of the attempts that are simulated end alike."""
+    model = box_model(tmp_path, [0.05, 0.07, 0.15], name="1_box_tall")
+    X_TO = standing(model)
+    candidates = sample_candidates(model, X_TO, config.candidates, 0)
+    made = make_attempts(candidates, range(40), config.candidates, name=model.name, seed=0)
+    attempts = [attempt for attempt in made if attempt.ray_hits]
+    fine = load_config(overrides=["physics.time_step=0.001"])
+    coarse_scene = build_scene(model, config.physics, hand)
+    fine_scene = build_scene(model, fine.physics, hand)
+    coarse = [run_attempt(coarse_scene, X_TO, a, config) for a in attempts]
+    simulated = [i for i, record in enumerate(coarse) if record.closed is not None]
+    again = [run_attempt(fine_scene, X_TO, attempts[i], fine) for i in simulated]
+    alike = [coarse[i].outcome is b.outcome for i, b in zip(simulated, again, strict=True)]
+    assert len(alike) >= 20
+    assert sum(coarse[i].outcome is Outcome.SUCCESS for i in simulated) >= 3
+    assert np.mean(alike) >= 0.95
