@@ -17,7 +17,13 @@ from drakegrasp.assemble import Assembly, assemble, is_assembled, summarise
 from drakegrasp.config import Config, parse_config
 from drakegrasp.errors import DataError, DrakegraspError, MeshError
 from drakegrasp.hand import load_hand
-from drakegrasp.manifest import Manifest, claim_directory, release_directory, write_manifest
+from drakegrasp.manifest import (
+    Manifest,
+    claim_directory,
+    installed_versions,
+    release_directory,
+    write_manifest,
+)
 from drakegrasp.meshes import MeshSource, source_sha256
 from drakegrasp.outcomes import Outcome
 from drakegrasp.prepared import load_prepared, prepare, save_prepared
@@ -97,7 +103,8 @@ def build(
     """
     load_hand(config.hand)
     known = claim_directory(out, config)
-    manifest = replace(known or Manifest(config=config), config=config)
+    new = Manifest(config=config, versions=installed_versions(config))
+    manifest = replace(known or new, config=config)
     write_manifest(manifest, out)
     with progress_bar("prepare", "objects", show=show) as report:
         manifest = _prepare_all(sources, out, manifest, execute, report)

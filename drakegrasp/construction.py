@@ -51,7 +51,8 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drakegrasp.config import PhysicsConfig
 from drakegrasp.frames import X_WT, Array
-from drakegrasp.hand import MODELS, Hand, make_parser
+from drakegrasp.hand import Hand, make_parser
+from drakegrasp.hand_files import MODELS
 from drakegrasp.object_model import ObjectModel
 from drakegrasp.scene import HandHandles, Scene
 from drakegrasp.wavefront import obj_text

@@ -27,9 +27,7 @@ from pydrake.multibody.tree import ModelInstanceIndex, RevoluteJoint, RigidBody,
 
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, invert_pose, make_pose
-
-#: Where the hands that come with the package are, as `<name>_hand.yaml`.
-MODELS = Path(__file__).resolve().parent / "models"
+from drakegrasp.hand_files import hand_file
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -171,27 +169,18 @@ def make_parser(plant: MultibodyPlant) -> Parser:
             os.environ[name] = allowed
 
 
-def hand_names() -> list[str]:
-    """Return the names of the hands that come with the package."""
-    return sorted(path.name.removesuffix("_hand.yaml") for path in MODELS.glob("*_hand.yaml"))
-
-
 def load_hand(name_or_yaml: str | Path = "barrett") -> Hand:
     """Return a hand that comes with the package, or the one of a YAML file.
 
     Args:
-        name_or_yaml: One of `hand_names()`, or the path of a YAML file with the keys of
+        name_or_yaml: One of `hand_files.hand_names()`, or the path of a YAML file with the keys of
             `models/barrett_hand.yaml`, whose `model` is found relative to it.
 
     Raises:
         HandError: If there is no such hand, a key or value of the YAML cannot be used, or
             the SDFormat model lacks a link or joint that the YAML names.
     """
-    path = MODELS / f"{name_or_yaml}_hand.yaml" if name_or_yaml in hand_names() else None
-    path = path or Path(name_or_yaml)
-    if not path.is_file():
-        names = ", ".join(hand_names())
-        raise HandError(f"hand must be one of {names} or a YAML file, got {str(name_or_yaml)!r}")
+    path = hand_file(name_or_yaml)
     description = _read_description(path)
     sdf_path = path.parent.resolve() / description.model
     try:

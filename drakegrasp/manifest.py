@@ -11,13 +11,14 @@ import json
 import os
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from drakegrasp.config import Config, override_config, parse_config
 from drakegrasp.errors import ConfigError, DataError
+from drakegrasp.hand_files import hand_digest
 from drakegrasp.schema import SCHEMA_VERSION
 from drakegrasp.shards import ShardHeader, sync_and_rename
 
@@ -28,8 +29,8 @@ BUILTIN_FOLDER = "builtin"
 OWN_FOLDERS = (BUILTIN_FOLDER, "objects", "shards")
 #: Packages whose versions may change a result.
 VERSIONED = ("drakegrasp", "drake", "numpy", "scipy", "trimesh", "manifold3d", "embreex", "h5py")
-#: Those of them that a dataset is never continued with another version of.
-DECISIVE = ("drakegrasp", "drake")
+#: Those that a dataset is never continued with another version of.
+DECISIVE = ("drakegrasp", "drake", "hand")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,13 +41,13 @@ class Manifest:
         config: Resolved configuration, with the seed.
         objects: `PreparedObject.summary` of each object, by name.
         refused: Name and reason of each mesh that was refused.
-        versions: Of the packages that made it.
+        versions: Of the packages that made it, and a hash of the hand's files.
     """
 
     config: Config
     objects: tuple[dict[str, Any], ...] = ()
     refused: tuple[dict[str, str], ...] = ()
-    versions: dict[str, str] = field(default_factory=lambda: installed_versions())
+    versions: dict[str, str]
 
     def headers(self) -> list[ShardHeader]:
         """Return the work units of the dataset in the order of its rows."""
@@ -64,9 +65,10 @@ class Manifest:
         ]
 
 
-def installed_versions() -> dict[str, str]:
-    """Return the versions of the packages that may change a result."""
-    return {name: metadata.version(name) for name in VERSIONED}
+def installed_versions(config: Config) -> dict[str, str]:
+    """Return the versions of what may change a result: packages, and the hand's files."""
+    packages = {name: metadata.version(name) for name in VERSIONED}
+    return {**packages, "hand": hand_digest(config.hand)}
 
 
 def write_manifest(manifest: Manifest, out: Path) -> None:
@@ -158,7 +160,7 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
             f"{_differences(manifest.config, config)}; choose another --out"
         )
     for name in DECISIVE:
-        then, now = manifest.versions.get(name), installed_versions()[name]
+        then, now = manifest.versions.get(name), installed_versions(config)[name]
         if then != now:
             raise DataError(
                 f"{out}: must be continued with {name} {then}, which made it, got {now}; "

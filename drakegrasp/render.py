@@ -39,7 +39,8 @@ from drakegrasp.candidates import object_key
 from drakegrasp.config import CameraConfig
 from drakegrasp.errors import MachineError
 from drakegrasp.frames import X_WT
-from drakegrasp.hand import MODELS, make_parser
+from drakegrasp.hand import make_parser
+from drakegrasp.hand_files import MODELS
 from drakegrasp.object_model import ObjectModel
 from drakegrasp.wavefront import obj_text
 

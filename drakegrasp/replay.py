@@ -70,7 +70,7 @@ def replay_trial(out: str | Path, trial_id: int) -> Replay:
     )
     attempt = unit_attempts(prepared, header, config)[int(stored["standoff_index"])]
     again = trial_rows(bench, [attempt], [try_on(bench, attempt)])
-    now = installed_versions()
+    now = installed_versions(config)
     return Replay(
         trial_id=trial_id,
         object_name=name,

@@ -18,7 +18,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
     frozenset(line.split())
     for line in (
         "errors frames progress",
-        "grasp outcomes config curves surfaces",
+        "grasp outcomes hand_files config curves surfaces",
         "schema hand solids bodies wavefront",
         "shards camera filters shapes vessels fruit holes union decimation",
         "builtin manifest mend",

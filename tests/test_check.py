@@ -27,7 +27,13 @@ from drakegrasp.check import check_dataset
 from drakegrasp.config import CameraConfig, load_config
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, invert_pose, make_pose, pack_pose, unpack_pose
-from drakegrasp.manifest import Manifest, model_path, read_manifest, write_manifest
+from drakegrasp.manifest import (
+    Manifest,
+    installed_versions,
+    model_path,
+    read_manifest,
+    write_manifest,
+)
 from drakegrasp.meshes import MeshSource
 from drakegrasp.object_model import ObjectModel, load_object, prepare_object, save_object
 from drakegrasp.outcomes import Outcome, Stage
@@ -178,7 +184,7 @@ def make_dataset(out: Path, meshes: Path, *overrides: str) -> Path:
         entry = {"name": name, "class": class_name, "mesh_sha256": model.mesh_sha256}
         entries.append({**entry, **numbers, "X_TO": pack_pose(X_TO).tolist()})
         models.append((model, X_TO))
-    manifest = Manifest(config=config, objects=tuple(entries))
+    manifest = Manifest(config=config, objects=tuple(entries), versions=installed_versions(config))
     write_manifest(manifest, out)
     by_name = {model.name: (model, X_TO) for model, X_TO in models}
     for header in manifest.headers():

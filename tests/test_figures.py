@@ -182,7 +182,7 @@ needs_egl = pytest.mark.skipif(
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a directory with one object and one trial, made up: a top grasp that is lifted."""
-    from drakegrasp.manifest import Manifest, write_manifest
+    from drakegrasp.manifest import Manifest, installed_versions, write_manifest
     from drakegrasp.meshes import find_meshes
     from drakegrasp.outcomes import Outcome
     from drakegrasp.prepared import prepare, save_prepared
@@ -192,7 +192,10 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config, out = load_config(None, ["candidates.max=1"]), folder / "out"
     prepared = prepare(find_meshes(folder / "meshes")[0], config)
     save_prepared(prepared, out, config)
-    write_manifest(Manifest(config=config, objects=(prepared.summary(),)), out)
+    write_manifest(
+        Manifest(config=config, objects=(prepared.summary(),), versions=installed_versions(config)),
+        out,
+    )
     palm = prepared.model.half_extents[2] + 0.08
     X_TO_lifted = prepared.X_TO.copy()
     X_TO_lifted[2, 3] += 0.4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +17,12 @@ from pydrake.systems.framework import DiagramBuilder
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array
 from drakegrasp.hand import (
-    MODELS,
     Coupling,
     Hand,
-    hand_names,
     load_hand,
     make_parser,
 )
+from drakegrasp.hand_files import MODELS, hand_digest, hand_names
 from drakegrasp.kinematics import coordinate_limits, fingertip_poses, joint_positions
 
 #: The palm's surface above the base [m]; the table below is given from there.
@@ -404,3 +404,19 @@ def test_a_sliding_joint_is_refused(tmp_path: Path) -> None:
     (tmp_path / "pincer.sdf").write_text(PINCER_SDF.replace("revolute", "prismatic"))
     with pytest.raises(HandError, match=r"'left_hinge' must be revolute or fixed, got Prismatic"):
         load_hand(path)
+
+
+def test_digest_tells_changed_files_of_one_hand_apart(tmp_path: Path) -> None:
+    """YAML, SDFormat and every mesh in it count; a copy elsewhere is the same hand."""
+    for source in MODELS.glob("barrett_*"):
+        shutil.copy(source, tmp_path)
+    copy = tmp_path / "barrett_hand.yaml"
+    assert hand_digest(copy) == hand_digest("barrett")
+    digests = {hand_digest("barrett")}
+    for name in ("barrett_hand.yaml", "barrett_hand.sdf", "barrett_distal.obj"):
+        path = tmp_path / name
+        path.write_text(path.read_text() + ("\n" if name.endswith(".sdf") else "\n# changed\n"))
+        digests.add(hand_digest(copy))
+    assert len(digests) == 4
+    with pytest.raises(HandError, match="hand must be one of barrett"):
+        hand_digest("octopus")
