@@ -10,11 +10,10 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -23,30 +22,26 @@ import numpy.typing as npt
 from drakegrasp.camera import intrinsics, project
 from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal, Successes, judge_successes, split_samples
-from drakegrasp.frames import X_WT, Array, invert_pose, pack_pose, transform_points, unpack_pose
+from drakegrasp.frames import Array, invert_pose, transform_points, unpack_pose
 from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp
-from drakegrasp.manifest import Manifest, model_path, read_manifest
-from drakegrasp.object_model import ObjectModel, load_object
-from drakegrasp.outcomes import Outcome
+from drakegrasp.manifest import Manifest, read_manifest
+from drakegrasp.parts import Part, walk_parts
 from drakegrasp.progress import Report, silent
+from drakegrasp.samples import create_splits, write_samples
 from drakegrasp.schema import (
     CAMERAS,
     CONVENTIONS,
-    DATA_FIELDS,
     OBJECT_FIELDS,
     SCHEMA_VERSION,
     SPLITS,
     SUCCESS_FIELDS,
     TRIAL_FIELDS,
-    sizes,
 )
 from drakegrasp.shards import (
     AnyArray,
     Shard,
-    ShardHeader,
     atomic_hdf5,
     create_field,
-    read_shard,
     trial_columns,
     write_field,
 )
@@ -72,17 +67,6 @@ class Assembly:
     samples: dict[str, int]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Part:
-    """A shard's place in the dataset: its first row, how many rows are taken, their shapes."""
-
-    header: ShardHeader
-    object: int
-    first: int
-    rows: int
-    shapes: Mapping[str, tuple[int, ...]]
-
-
 def assemble(out: Path, *, rejected: Sequence[int] = (), progress: Report = silent) -> Assembly:
     """Write the three files of a dataset whose work units are all done.
 
@@ -102,7 +86,7 @@ def assemble(out: Path, *, rejected: Sequence[int] = (), progress: Report = sile
         trials = stack.enter_context(atomic_hdf5(out / TRIALS_FILE))
         _write_attributes(trials, manifest)
         _write_objects(trials, manifest)
-        for part, shard in _walk(out, manifest):
+        for part, shard in walk_parts(out, manifest):
             _append_trials(trials, part, shard)
             parts.append(part)
             found.append(_successes(part, shard, K))
@@ -117,9 +101,9 @@ def assemble(out: Path, *, rejected: Sequence[int] = (), progress: Report = sile
         for camera, file in files.items():
             _write_attributes(file, manifest)
             file.attrs["camera"] = camera
-            _create_splits(file, ids, parts[0].shapes)
+            create_splits(file, ids, parts[0].shapes)
         for number, part in enumerate(parts):
-            _write_samples(files, out, manifest, part, ids)
+            write_samples(files, out, part, ids)
             progress(len(parts) + number + 1, 2 * len(parts))
     return summarise(out)
 
@@ -176,38 +160,6 @@ def is_assembled(out: Path) -> bool:
     return True
 
 
-def _walk(out: Path, manifest: Manifest) -> Iterator[tuple[_Part, Shard]]:
-    """Yield the shards in the order of their rows, each object's up to its last wanted grasp."""
-    index = {entry["name"]: i for i, entry in enumerate(manifest.objects)}
-    wanted: dict[str, int | None] = dict.fromkeys(index, manifest.config.max_grasps)
-    first = 0
-    for header in manifest.headers():
-        name = header.object_name
-        if wanted[name] == 0:
-            continue
-        shard = read_shard(header.path(out), header)
-        rows, wanted[name] = rows_within(shard, wanted[name])
-        shapes = {f.name: shard.trials[f.name].shape[1:] for f in trial_columns()}
-        shapes["image"] = shard.looks["mask_oto"].shape[1:]
-        yield (
-            _Part(header=header, object=index[name], first=first, rows=rows, shapes=shapes),
-            shard,
-        )
-        first += rows
-
-
-def rows_within(shard: Shard, wanted: int | None) -> tuple[int, int | None]:
-    """Return how many rows of a shard an object needs, and how many grasps it then wants.
-
-    The rows end with the last wanted grasp, so what is in a dataset does not depend on how
-    far work had gone when enough was found.
-    """
-    hits = np.flatnonzero(shard.trials["outcome"] == Outcome.SUCCESS)
-    if wanted is None or len(hits) < wanted:
-        return len(shard.trials["outcome"]), None if wanted is None else wanted - len(hits)
-    return int(hits[wanted - 1]) + 1, 0
-
-
 def _signature(manifest: Manifest) -> str:
     """Return a hash of all that decides what the files hold, but for a reject list."""
     content = [manifest.config.to_dict(), [repr(h) for h in manifest.headers()]]
@@ -236,7 +188,7 @@ def _write_objects(file: h5py.File, manifest: Manifest) -> None:
         write_field(group, field, np.array(values, dtype=dtype))
 
 
-def _append_trials(file: h5py.File, part: _Part, shard: Shard) -> None:
+def _append_trials(file: h5py.File, part: Part, shard: Shard) -> None:
     group = file.require_group("trials")
     columns = {f.name: shard.trials[f.name][: part.rows] for f in trial_columns()}
     columns["trial_id"] = np.arange(part.first, part.first + part.rows, dtype=np.int64)
@@ -250,7 +202,7 @@ def _append_trials(file: h5py.File, part: _Part, shard: Shard) -> None:
         dataset[part.first :] = values
 
 
-def _successes(part: _Part, shard: Shard, K: Array) -> Successes:
+def _successes(part: Part, shard: Shard, K: Array) -> Successes:
     """Return what the filters must know of a shard's successes."""
     taken = shard.looks["row"] < part.rows
     rows = shard.looks["row"][taken]
@@ -310,74 +262,3 @@ def _split_ids(
         manifest.config.seed,
     )
     return {name: successes.trial_id[kept[rows]] for name, rows in split.items()}
-
-
-def _create_splits(
-    file: h5py.File,
-    ids: Mapping[str, npt.NDArray[np.int64]],
-    shapes: Mapping[str, tuple[int, ...]],
-) -> None:
-    letters = sizes(
-        fingers=shapes["closed_touching"][0],
-        joints=shapes["closed_q"][0],
-        image=shapes["image"][0],
-    )
-    for split, rows in ids.items():
-        group = file.create_group(split)
-        for field in DATA_FIELDS:
-            dataset = create_field(group, field, field.row_shape(letters))
-            dataset.resize(len(rows), axis=0)
-
-
-def _write_samples(
-    files: Mapping[str, h5py.File],
-    out: Path,
-    manifest: Manifest,
-    part: _Part,
-    ids: Mapping[str, npt.NDArray[np.int64]],
-) -> None:
-    """Write the samples that come from one shard into their places in both files."""
-    bounds = {s: np.searchsorted(ids[s], [part.first, part.first + part.rows]) for s in SPLITS}
-    if all(start == stop for start, stop in bounds.values()):
-        return
-    shard = read_shard(part.header.path(out), part.header)
-    model = load_object(model_path(out, part.header.object_name))
-    look_of = {int(row): k for k, row in enumerate(shard.looks["row"])}
-    for split, (start, stop) in bounds.items():
-        for place in range(start, stop):
-            trial_id = int(ids[split][place])
-            row = trial_id - part.first
-            for camera, file in files.items():
-                sample = _sample(model, shard, row, look_of[row], camera)
-                sample["trial_id"] = trial_id
-                for field in DATA_FIELDS:
-                    file[split][field.name][place] = sample[field.name]
-
-
-def _sample(model: ObjectModel, shard: Shard, row: int, k: int, camera: str) -> dict[str, Any]:
-    """Return a sample by the names of DATA_FIELDS, without its trial's id."""
-    trials, looks = shard.trials, shard.looks
-    X_TO = unpack_pose(trials["X_TO"][row])
-    X_TC = {c: unpack_pose(looks[f"X_TC_{c}"][k]) for c in CAMERAS}
-    grasp_O = pack_grasp(trials["closed_p_OQ"][row], trials["closed_nhat_Q_O"][row])
-    R_TO = X_TO[:3, :3]
-    properties = {
-        "object_name": model.name,
-        "class_name": model.class_name,
-        "work2com": transform_points(X_TO, model.p_OOcm[None])[0],
-        "work2inertia": (R_TO @ model.I_OOcm_O @ R_TO.T).ravel(),
-        "work2mass": [model.mass],
-        "frame_cam2img_otm": looks["X_CI_otm"][k],
-        "frame_cam2work_otm": pack_pose(invert_pose(X_TC["otm"])),
-        "frame_cam2work_oto": pack_pose(invert_pose(X_TC["oto"])),
-        "frame_work2cam_otm": pack_pose(X_TC["otm"]),
-        "frame_work2cam_oto": pack_pose(X_TC["oto"]),
-        "frame_world2obj": pack_pose(X_WT @ X_TO),
-        "frame_world2work": pack_pose(X_WT),
-    }
-    return {
-        "images": looks[f"image_{camera}"][k],
-        "masks": looks[f"mask_{camera}"][k],
-        "grasps": transform_grasp(invert_pose(X_TC[camera]) @ X_TO, grasp_O),
-        **{f"object_props/{name}": value for name, value in properties.items()},
-    }
