@@ -94,6 +94,11 @@ def assemble(out: Path, *, rejected: Sequence[int] = (), progress: Report = sile
         if not parts:
             raise DataError(f"{out}: at least one object must have a palm pose to try, got none")
         successes = _concatenate(found)
+        unknown = sorted(set(rejected) - set(successes.trial_id.tolist()))
+        if unknown:
+            raise DataError(
+                f"{out}: rejected trials must be successes, got {unknown[0]}, which is none"
+            )
         removal = judge_successes(successes, manifest.config.filters, rejected)
         _write_removal(trials, successes, removal)
         ids = _split_ids(manifest, successes, removal)
@@ -137,8 +142,12 @@ def read_reject_list(path: Path) -> list[int]:
     Raises:
         DataError: If a line is no id.
     """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError:
+        raise DataError(f"{path}: must be a text file of trial ids, got other bytes") from None
     ids = []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+    for number, line in enumerate(lines, start=1):
         text = line.partition("#")[0].strip()
         if text and not text.isdecimal():
             raise DataError(f"{path}, line {number}: must be the id of a trial, got {text!r}")

@@ -103,6 +103,8 @@ def build(
     """
     load_hand(config.hand)
     known = claim_directory(out, config)
+    if known is not None:
+        _refuse_missing(known, sources, out)
     new = Manifest(config=config, versions=installed_versions(config))
     manifest = replace(known or new, config=config)
     write_manifest(manifest, out)
@@ -128,6 +130,17 @@ def build(
         errors=errors,
         assembly=summarise(out),
     )
+
+
+def _refuse_missing(known: Manifest, sources: Sequence[MeshSource], out: Path) -> None:
+    """Refuse to go on with a dataset without a mesh that it was built from."""
+    names = {source.name for source in sources}
+    missing = [e["name"] for e in (*known.objects, *known.refused) if e["name"] not in names]
+    if missing:
+        raise DataError(
+            f"{out}: must be given every mesh that it was built from, got none named "
+            f"{missing[0]}; choose another --out"
+        )
 
 
 def _prepare_all(
@@ -161,7 +174,8 @@ def _known_entry(source: MeshSource, out: Path, manifest: Manifest) -> dict[str,
         if (entry["name"], entry["mesh_sha256"]) == (source.name, digest):
             return dict(entry)
     for entry in manifest.objects:
-        if (entry["name"], entry["mesh_sha256"]) == (source.name, digest):
+        known = (entry["name"], entry["class"], entry["mesh_sha256"])
+        if known == (source.name, source.class_name, digest):
             try:
                 load_prepared(out, source.name, manifest.config)
             except DrakegraspError:

@@ -22,7 +22,13 @@ from drakegrasp import dataset_rules, image_rules, sample_rules, trial_rules
 from drakegrasp.assemble import DATA_FILES, TRIALS_FILE
 from drakegrasp.errors import DataError, MeshError
 from drakegrasp.image_rules import Lens
-from drakegrasp.manifest import FILE_NAME, Manifest, model_path, read_manifest
+from drakegrasp.manifest import (
+    FILE_NAME,
+    Manifest,
+    model_path,
+    read_manifest,
+    refuse_changed_object,
+)
 from drakegrasp.object_model import ObjectModel, load_object
 from drakegrasp.open_file import OpenFile, Rule, first_line, open_file
 from drakegrasp.outcomes import Outcome
@@ -116,6 +122,7 @@ def _check_directory(out: Path, stack: ExitStack, findings: Findings, report: Re
     trials = files.pop("", None)
     models = lru_cache(KEPT_OBJECTS)(partial(_load_model, out, manifest, findings))
     dataset = _Dataset(out=out, manifest=manifest, trials=trials, model=models)
+    _check_objects(dataset, findings)
     _check_shards(dataset, findings, steps)
     if trials is not None:
         _check_trials(trials, dataset, findings, steps)
@@ -305,6 +312,17 @@ def _check_trials(
 
 
 # The directory
+
+
+def _check_objects(dataset: _Dataset, findings: Findings) -> None:
+    """Every object's files are as they were written: the plan is sealed and vouches for both."""
+    for name in dataset.names:
+        try:
+            refuse_changed_object(dataset.out, name)
+        except DataError as error:
+            path, _, got = str(error).partition(": ")
+            where = str(Path(path).relative_to(dataset.out))
+            findings.add([of_file(where, "an object's file must be as it was written", got)])
 
 
 def _check_shards(dataset: _Dataset, findings: Findings, steps: _Steps) -> None:

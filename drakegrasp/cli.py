@@ -7,12 +7,15 @@ answers at once.
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 from rich.console import Console
+from rich.measure import Measurement
+from rich.table import Table
 
 from drakegrasp import __version__
 from drakegrasp.errors import ConfigError, DrakegraspError, HandError, MeshError
@@ -22,8 +25,8 @@ if TYPE_CHECKING:
 
 #: Errors of what was asked for, as against errors of what was done.
 WRONG_USAGE = (ConfigError, HandError, MeshError)
-#: Width of tables where standard output is not a terminal [characters].
-WIDTH = 180
+#: Width of tables where standard output is not a terminal [characters]: as wide as they are.
+WIDTH = 1000
 
 
 class _Commands(click.Group):
@@ -36,11 +39,16 @@ class _Commands(click.Group):
         try:
             return super().invoke(ctx)
         except DrakegraspError as error:
-            click.echo(f"error: {error}", err=True)
+            click.echo(f"error: {' '.join(str(error).split())}", err=True)
             ctx.exit(2 if isinstance(error, WRONG_USAGE) else 1)
-        except OSError as error:
-            click.echo(f"error: {error}", err=True)
+        except (OSError, RuntimeError) as error:
+            if isinstance(error, click.exceptions.Exit | click.Abort):
+                raise
+            click.echo(f"error: {str(error).strip().splitlines()[0]}", err=True)
             ctx.exit(1)
+        except KeyboardInterrupt:
+            click.echo("stopped; the same command goes on from here", err=True)
+            ctx.exit(130)
 
 
 out_argument = click.argument("out", type=click.Path(path_type=Path), metavar="OUT")
@@ -109,7 +117,10 @@ def export_objects(directory: Path) -> None:
 @units_option
 @manifest_option
 def audit(mesh_dir: Path, units: str, manifest: Path | None) -> None:
-    """Say mesh by mesh: fit to simulate, mended, or refused, and why."""
+    """Say mesh by mesh: fit to simulate, mended, or refused, and why.
+
+    A build also drops each object on the table, and refuses one that does not come to rest.
+    """
     from drakegrasp.audit import audit as audit_meshes
     from drakegrasp.tables import audit_table
 
@@ -256,24 +267,35 @@ def replay(out: Path, trial: int) -> None:
         f"trial {trial} of {again.object_name}: was {again.recorded.label}, is {again.found.label}"
     )
     for name, difference in again.differences.items():
-        click.echo(f"  {name} differs by up to {difference:.3g}")
+        how = "is missing in one" if math.isnan(difference) else f"by up to {difference:.3g}"
+        click.echo(f"  {name} differs: {how}")
     for package, change in again.versions.items():
         click.echo(f"  {package}: {change}")
     if not again.same:
         sys.exit(1)
 
 
-def _print(table: Any) -> None:
+def _console() -> Console:
     console = Console()
-    Console(width=None if console.is_terminal else WIDTH).print(table)
+    return console if console.is_terminal else Console(width=WIDTH)
+
+
+def _print(table: Table) -> None:
+    _console().print(table)
 
 
 def _print_stats(out: Path) -> None:
     from drakegrasp.stats import count_funnel, count_splits
     from drakegrasp.tables import funnel_table, split_table
 
-    _print(funnel_table(count_funnel(out)))
-    _print(split_table(count_splits(out)))
+    console, funnel = _console(), count_funnel(out)
+    table = funnel_table(funnel)
+    # Numbers are never cut: where the columns do not fit, fewer say the same.
+    natural = Measurement.get(console, console.options.update(max_width=WIDTH), table).maximum
+    if natural > console.width:
+        table = funnel_table(funnel, compact=True)
+    console.print(table)
+    console.print(split_table(count_splits(out)))
 
 
 def _print_report(report: BuildReport) -> None:

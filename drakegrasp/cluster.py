@@ -21,7 +21,8 @@ from drakegrasp.build import BuildReport, build
 from drakegrasp.builtin import export_builtin
 from drakegrasp.config import Config, load_config
 from drakegrasp.errors import ConfigError, MachineError
-from drakegrasp.manifest import BUILTIN_FOLDER, claim_directory
+from drakegrasp.hand import load_hand
+from drakegrasp.manifest import BUILTIN_FOLDER, DECISIVE, claim_directory, installed_versions
 from drakegrasp.meshes import find_meshes
 from drakegrasp.units import close_workbenches
 
@@ -47,6 +48,8 @@ WORKER_ENVIRONMENT = {
 #: image hangs; its profiler costs time; a worker takes no task before it can start it.
 DASK_SETTINGS: dict[str, Any] = {
     "distributed.worker.multiprocessing-method": "spawn",
+    # Ctrl-C reaches every process of a terminal: the client stops, and then its workers.
+    "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],
     "distributed.worker.profile.enabled": False,
     "distributed.scheduler.worker-saturation": 1.0,
     "distributed.nanny.pre-spawn-environ": WORKER_ENVIRONMENT,
@@ -92,17 +95,18 @@ def build_dataset(
     if workers is not None and workers < 1:
         raise ConfigError(f"workers must be at least 1, got {workers}")
     out, config = Path(out).absolute(), config or load_config()
-    directory = Path(objects)
-    if str(objects) == BUILTIN:
-        claim_directory(out, config)
-        directory = out / BUILTIN_FOLDER
-        export_builtin(directory)
-    sources = find_meshes(directory, units=units, manifest=manifest)
+    load_hand(config.hand)
+    builtin = str(objects) == BUILTIN
+    sources = [] if builtin else find_meshes(objects, units=units, manifest=manifest)
     with connect(workers, scheduler, scheduler_file) as client:
-        try:
-            return build(sources, out, config, DaskExecutor(client), show=show)
-        finally:
-            _close_workbenches(client)
+        _refuse_unfit_workers(client, config)
+        if builtin:
+            claim_directory(out, config)
+            export_builtin(out / BUILTIN_FOLDER)
+            sources = find_meshes(out / BUILTIN_FOLDER)
+        report = build(sources, out, config, DaskExecutor(client), show=show)
+        _close_workbenches(client)
+        return report
 
 
 @contextmanager
@@ -144,6 +148,28 @@ def connect(
                 Client(cluster) as client,
             ):
                 yield client
+
+
+def _refuse_unfit_workers(client: Client, config: Config) -> None:
+    """Refuse workers that would give other results than this machine, or give them badly.
+
+    Raises:
+        MachineError: If a worker has several threads, or other versions of what decides.
+    """
+    for address, threads in client.nthreads().items():
+        if threads != 1:
+            raise MachineError(
+                f"worker {address}: must have one thread (dask worker --nthreads 1), because the "
+                f"first that renders owns the images, got {threads}"
+            )
+    ours = installed_versions(config)
+    for address, theirs in client.run(installed_versions, config).items():
+        for name in DECISIVE:
+            if theirs[name] != ours[name]:
+                raise MachineError(
+                    f"worker {address}: must have {name} {ours[name]} like the client, "
+                    f"got {theirs[name]}"
+                )
 
 
 def _close_workbenches(client: Client) -> None:

@@ -310,6 +310,10 @@ def _describe(error: Any) -> str:
     if error["type"] == "value_error":
         return f"{path}: {message}"
     must = message.removeprefix("Input should be ").removeprefix("Input should ")
+    if error["type"] in ("model_type", "dict_type"):
+        must = "a section, a mapping of keys to values"
+    if error["type"] == "tuple_type":
+        must = "a list"
     if error["type"] == "too_short":
         must = f"a list of at least {error['ctx']['min_length']}"
     if error["type"] == "too_long":

@@ -86,7 +86,7 @@ def build_scene(model: ObjectModel, physics: PhysicsConfig, hand: Hand | None = 
         trajectory = builder.AddSystem(
             TrajectorySource(PiecewisePolynomial(np.zeros((3, 1))), output_derivative_order=1)
         )
-        handles = _add_hand(plant, hand, trajectory)
+        handles = _add_hand(plant, scene_graph, hand, trajectory)
         _make_compliant_hand(plant, scene_graph, handles, physics)
     plant.Finalize()
     if handles is not None:
@@ -192,7 +192,9 @@ def _assign_proximity(
         scene_graph.AssignRole(plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
 
 
-def _add_hand(plant: MultibodyPlant, hand: Hand, trajectory: TrajectorySource) -> HandHandles:
+def _add_hand(
+    plant: MultibodyPlant, scene_graph: SceneGraph, hand: Hand, trajectory: TrajectorySource
+) -> HandHandles:
     wrist_instance = plant.AddModelInstance("wrist")
     joints = _add_wrist(plant, wrist_instance)
     (instance,) = make_parser(plant).AddModels(hand.sdf_path)
@@ -216,7 +218,24 @@ def _add_hand(plant: MultibodyPlant, hand: Hand, trajectory: TrajectorySource) -
         wrist_frame=wrist,
         wrist_trajectory=trajectory,
         fingertips=tuple(plant.GetBodyByName(f.fingertip, instance) for f in hand.fingers),
+        parts=_points_inside(plant, scene_graph, instance),
     )
+
+
+def _points_inside(
+    plant: MultibodyPlant, scene_graph: SceneGraph, instance: ModelInstanceIndex
+) -> tuple[tuple[GeometryId, Array], ...]:
+    """Return each collision shape of a model with a point inside it, (3,) in its own frame [m]."""
+    inspector, found = scene_graph.model_inspector(), []
+    for index in plant.GetBodyIndices(instance):
+        for geometry in plant.GetCollisionGeometriesForBody(plant.get_body(index)):
+            hull = inspector.GetConvexHull(geometry)
+            # A primitive has no hull, and its frame's origin is its centre.
+            vertices = (
+                [np.zeros(3)] if hull is None else map(hull.vertex, range(hull.num_vertices()))
+            )
+            found.append((geometry, np.mean(list(vertices), axis=0)))
+    return tuple(found)
 
 
 def _add_wrist(plant: MultibodyPlant, instance: ModelInstanceIndex) -> tuple[PrismaticJoint, ...]:

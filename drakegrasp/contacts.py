@@ -67,7 +67,7 @@ def open_hand_collides(scene: Scene) -> bool:
     """Return whether any part of the hand meets or is inside the object, or meets the table.
 
     This is geometry only, nothing is solved. Surfaces that cross give contact surfaces; a
-    part that is wholly inside the object gives none, so the centre of each part is tested
+    part that is wholly inside the object gives none, so a point inside each part is tested
     against the object's volume as well.
     """
     handles = scene.handles
@@ -82,12 +82,8 @@ def open_hand_collides(scene: Scene) -> bool:
     meetings += [{_body_of(scene, p.id_A), _body_of(scene, p.id_B)} for p in pairs]
     if any(bodies & hand and not bodies <= hand for bodies in meetings):
         return True
-    centres = [
-        query.GetPoseInWorld(geometry).translation()
-        for index in sorted(hand)
-        for geometry in scene.plant.GetCollisionGeometriesForBody(scene.plant.get_body(index))
-    ]
-    return is_inside(scene, np.array(centres))
+    points = [query.GetPoseInWorld(geometry) @ p for geometry, p in handles.parts]
+    return is_inside(scene, np.array(points))
 
 
 def is_inside(scene: Scene, p_WP: Array) -> bool:

@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+import operator
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -76,10 +77,11 @@ class GraspDataset:
         return self._length
 
     def __getitem__(self, index: int) -> Sample:
+        index = operator.index(index)
         if not -self._length <= index < self._length:
             raise IndexError(f"index must be below {self._length}, got {index}")
         group = self._open()[self.split]
-        row = int(index) % self._length
+        row = index % self._length
         values = {f.name: _value(group[f.name], row, f.dtype) for f in DATA_FIELDS}
         prefix = "object_props/"
         return Sample(

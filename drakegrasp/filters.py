@@ -72,6 +72,8 @@ def judge_successes(
         (Removal.OUT_OF_VIEW, ~successes.in_view),
         (Removal.BISECTS_TABLE, successes.camera_height < config.min_camera_height),
         (Removal.FLAT_DEPTH, successes.depth_variance < config.min_depth_variance),
+        # A mean normal of zero length, from patches that oppose each other, is not finite.
+        (Removal.OFF_SURFACE, ~np.isfinite(successes.grasp_T).all(axis=1)),
         (Removal.OFF_SURFACE, successes.surface_distance > config.max_surface_distance),
     ):
         removal[bad & (removal == Removal.KEPT)] = reason
@@ -106,7 +108,7 @@ def split_samples(
     """Return the indices of the samples of each split, in their order.
 
     Per class one object, drawn with the seed, is tested whole; of the grasps of the others
-    a share validates and the rest trains. A class with one object, or one that
+    a share validates and the rest trains. A class with one object that has samples, or one that
     `train_classes` leaves out, is tested only. The draw of a class depends on its own
     objects alone.
 
@@ -123,8 +125,9 @@ def split_samples(
     parts: Mapping[str, list[npt.NDArray[np.int64]]] = {"train": [], "valid": [], "test": []}
     for class_name in sorted(members):
         indices = sorted(members[class_name], key=lambda i: names[i])
+        # Three numbers, so it is never the stream of a candidate of an object of this name.
         key = int.from_bytes(hashlib.sha256(class_name.encode()).digest()[:4], "big")
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(key, 0)))
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(key, 0, 1)))
         trains = config.train_classes is None or class_name in config.train_classes
         if len(indices) < 2 or not trains:
             tested, others = indices, []

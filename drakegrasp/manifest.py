@@ -7,8 +7,8 @@ the machine or the number of workers: the same command gives the same bytes.
 
 from __future__ import annotations
 
+import hashlib
 import json
-import os
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -16,11 +16,18 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import h5py
+
 from drakegrasp.config import Config, override_config, parse_config
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.hand_files import hand_digest
 from drakegrasp.schema import SCHEMA_VERSION
-from drakegrasp.shards import ShardHeader, sync_and_rename
+from drakegrasp.shards import (
+    ShardHeader,
+    refuse_broken_seal,
+    sync_and_rename,
+    temporary_name,
+)
 
 FILE_NAME = "manifest.json"
 #: Where the built-in objects' meshes are put when they are asked for.
@@ -83,7 +90,7 @@ def write_manifest(manifest: Manifest, out: Path) -> None:
         "refused": list(manifest.refused),
     }
     path = out / FILE_NAME
-    temporary = path.with_name(f".{FILE_NAME}.{os.getpid()}.tmp")
+    temporary = temporary_name(path)
     try:
         temporary.write_text(
             json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
@@ -134,7 +141,7 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
-        probe = out / f".probe.{os.getpid()}.tmp"
+        probe = temporary_name(out / "probe")
         probe.touch()
         probe.unlink()
     except OSError as error:
@@ -217,3 +224,23 @@ def model_path(out: Path, name: str) -> Path:
 def plan_path(out: Path, name: str) -> Path:
     """Return where a dataset keeps an object's resting pose and palm poses."""
     return out / "objects" / f"{name}.plan.h5"
+
+
+def model_file_sha256(out: Path, name: str) -> str:
+    """Return the hash of the file that keeps an object's meshes, hexadecimal."""
+    return hashlib.sha256(model_path(out, name).read_bytes()).hexdigest()
+
+
+def refuse_changed_object(out: Path, name: str) -> None:
+    """Refuse an object of which either file is missing or not as it was written.
+
+    Raises:
+        DataError: If so. The plan is sealed, and vouches for the other file.
+    """
+    path, model = plan_path(out, name), model_path(out, name)
+    refuse_broken_seal(path, "plan of an object")
+    with h5py.File(path, "r") as file:
+        expected = str(file.attrs["model_sha256"])
+    if not model.is_file() or model_file_sha256(out, name) != expected:
+        got = "other content" if model.is_file() else "none"
+        raise DataError(f"{model}: must be the file that was written with its plan, got {got}")

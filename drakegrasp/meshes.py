@@ -39,6 +39,8 @@ SUFFIXES = (".obj", ".stl", ".ply", ".glb")
 #: Metres per unit of length of a file.
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 MANIFEST_NAME = "objects.yaml"
+#: Longest name of an object [bytes]; file systems allow 255 with what is added to it.
+MAX_NAME = 200
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,11 +61,12 @@ class MeshSource:
 
     def __post_init__(self) -> None:
         for what, text in (("name", self.name), ("class", self.class_name)):
-            # Names become keys of HDF5 groups and parts of file names.
-            if not text.strip() or any(c in "/\\" or not c.isprintable() for c in text):
+            # Names become names of folders and files.
+            bad = any(c in "/\\" or not c.isprintable() for c in text) or text.startswith(".")
+            if not text.strip() or bad or len(text.encode()) > MAX_NAME:
                 raise MeshError(
-                    f"{self.path.name}: the {what} must be printable, not empty and without "
-                    f"slashes, got {text!r}"
+                    f"{self.path.name}: the {what} must be printable, not empty, without slashes, "
+                    f"not begin with a dot, and have at most {MAX_NAME} bytes, got {text!r}"
                 )
         if not (np.isfinite(self.scale) and self.scale > 0.0):
             raise MeshError(f"{self.path.name}: scale must be positive, got {self.scale}")
@@ -86,6 +89,12 @@ class _Manifest(pydantic.BaseModel):
     units: Literal["m", "cm", "mm"] | None = None
     objects: dict[str, _Entry] = pydantic.Field(default_factory=dict)
 
+    @pydantic.field_validator("objects", mode="before")
+    @classmethod
+    def _empty_section(cls, value: object) -> object:
+        # A section whose keys are all commented out is read as None.
+        return {} if value is None else value
+
 
 def _read_manifest(path: Path) -> _Manifest:
     try:
@@ -100,8 +109,13 @@ def _read_manifest(path: Path) -> _Manifest:
         legal = "; legal keys: " + (
             "units, class, name" if first["loc"][:1] == ("objects",) else "units, objects"
         )
+        must = {
+            "extra_forbidden": "a known key",
+            "model_type": "a mapping of keys to values",
+            "dict_type": "a mapping of names to their values",
+        }.get(first["type"], first["msg"].removeprefix("Input should be "))
         raise MeshError(
-            f"{path}: {place}: {first['msg']}, got {first['input']!r}"
+            f"{path}: {place}: must be {must}, got {first['input']!r}"
             + (legal if first["type"] == "extra_forbidden" else "")
         ) from error
 

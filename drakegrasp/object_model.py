@@ -10,8 +10,6 @@ simulates nonsense, so everything it needs is checked here; what is wrong is men
 from __future__ import annotations
 
 import io
-import os
-import tempfile
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -27,6 +25,7 @@ from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
 from drakegrasp.mend import mend_solid
 from drakegrasp.meshes import MANIFEST_NAME, UNITS, MeshSource, load_mesh, one_line, source_sha256
+from drakegrasp.shards import sync_and_rename, temporary_name
 from drakegrasp.surfaces import Solid, diagonal, signed_volume
 
 #: Below these an object is a sheet or a speck, which no hydroelastic contact resolves.
@@ -219,16 +218,12 @@ def save_object(model: ObjectModel, path: str | Path) -> None:
     content["notes"] = np.array(model.notes, dtype=np.str_)
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **content)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    temporary = temporary_name(path)
     try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(buffer.getvalue())
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+        temporary.write_bytes(buffer.getvalue())
+        sync_and_rename(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def load_object(path: str | Path) -> ObjectModel:

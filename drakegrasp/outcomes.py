@@ -23,7 +23,7 @@ class Outcome(IntEnum):
     SCREENED = 4  # geometry shows that not every fingertip can meet the object
     MISSING_FINGERTIP = 5  # after closing, a fingertip does not touch the object
     HAND_CONTACT = 6  # after closing, a hand part that is no fingertip touches the object
-    TABLE_CONTACT = 7  # the hand touches the table, or the object still does after the lift
+    TABLE_CONTACT = 7  # after closing the hand touches the table, or after the lift the object does
     SLIPPED = 8  # lost a fingertip's contact during the lift, but not the object
     DROPPED = 9  # lost the object during the lift
     SOLVER_ERROR = 10  # Drake failed or the state exploded; says nothing about the grasp

@@ -18,7 +18,12 @@ from drakegrasp.candidates import Candidates, sample_candidates
 from drakegrasp.config import Config
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array
-from drakegrasp.manifest import model_path, plan_path
+from drakegrasp.manifest import (
+    model_file_sha256,
+    model_path,
+    plan_path,
+    refuse_changed_object,
+)
 from drakegrasp.meshes import MeshSource
 from drakegrasp.object_model import ObjectModel, load_object, prepare_object, save_object
 from drakegrasp.resting import settle
@@ -90,7 +95,8 @@ def save_prepared(prepared: PreparedObject, out: Path, config: Config) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     model, candidates = prepared.model, prepared.candidates
     save_object(model, model_path(out, model.name))
-    with atomic_hdf5(plan_path(out, model.name)) as file:
+    with atomic_hdf5(plan_path(out, model.name), sealed=True) as file:
+        file.attrs["model_sha256"] = model_file_sha256(out, model.name)
         file.attrs["config_hash"] = config.simulation_hash()
         file.attrs["mesh_sha256"] = model.mesh_sha256
         file.attrs["table_force"] = prepared.table_force
@@ -113,6 +119,7 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
         MeshError: If the object's file is damaged.
     """
     path = plan_path(out, name)
+    refuse_changed_object(out, name)
     try:
         with h5py.File(path, "r") as file:
             attributes = dict(file.attrs)

@@ -64,11 +64,15 @@ def progress_bar(title: str, unit: str, *, show: bool = True) -> Iterator[Report
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task(f"{title:<10}", total=None, figures="")
+    bar = Progress(*columns, console=Console(stderr=True))
+    task = bar.add_task(f"{title:<10}", total=None, figures="")
 
-        def report(done: int, total: int, **figures: int) -> None:
-            text = " ".join(f"{value} {name}" for name, value in figures.items())
-            bar.update(task, completed=done, total=total, figures=text)
+    def report(done: int, total: int, **figures: int) -> None:
+        bar.start()  # only now, so that an error before the first report stands alone
+        text = " ".join(f"{value} {name}" for name, value in figures.items())
+        bar.update(task, completed=done, total=total, figures=text)
 
+    try:
         yield report
+    finally:
+        bar.stop()

@@ -11,6 +11,7 @@ error here, never data.
 from __future__ import annotations
 
 import colorsys
+import os
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,6 +82,8 @@ class Renderer:
 
 def build_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
     """Return a renderer of an object's full mesh on the table."""
+    # Software OpenGL would start threads of its own beside the one process per core.
+    os.environ.setdefault("LP_NUM_THREADS", "0")
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.0), builder)
     parameters = RenderEngineVtkParams(default_clear_color=BACKGROUND, lights=list(LIGHTS))

@@ -20,6 +20,8 @@ from drakegrasp.scene import Scene, advance, reset_object
 
 #: Simulated time between two looks at the object's speed [s].
 LOOK_PERIOD = 0.05
+#: Drake's gravity [m/s^2], and by how much the table's force at rest may miss the weight.
+GRAVITY, MAX_FORCE_ERROR = 9.81, 0.01
 #: When a rolling object is stopped by hand, as a share of the longest time; see `settle`.
 STOP_FRACTION = 0.6
 
@@ -49,8 +51,18 @@ def settle(model: ObjectModel, config: Config) -> Resting:
     once at every look, as the released code froze whatever still moved.
 
     Raises:
-        MeshError: If the object leaves the table or never comes to rest.
+        MeshError: If the object leaves the table, never comes to rest, or Drake cannot
+            simulate it.
     """
+    try:
+        return _settle(model, config)
+    # A failed assertion within Drake arrives as SystemExit.
+    except (RuntimeError, SystemExit) as error:
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        raise MeshError(f"{model.name}: Drake must be able to drop it, got: {lines[0]}") from None
+
+
+def _settle(model: ObjectModel, config: Config) -> Resting:
     scene = build_scene(model, config.physics)
     rules = config.settle
     lowest = float(model.collision_vertices[:, 2].min())
@@ -78,6 +90,11 @@ def settle(model: ObjectModel, config: Config) -> Resting:
         raise MeshError(f"{model.name}: must come to rest on the table, got an object that left it")
     X_TO[:2, 3] = 0.0
     force = float(read_contacts(scene).table_force[2])
+    weight = model.mass * GRAVITY
+    if abs(force - weight) > MAX_FORCE_ERROR * weight:
+        raise MeshError(
+            f"{model.name}: the table must carry its {weight:.3g} N at rest, got {force:.3g} N"
+        )
     return Resting(X_TO=X_TO, seconds=scene.time, table_force=force, stopped=stopped)
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from pydrake.geometry import SceneGraph
+from pydrake.geometry import GeometryId, SceneGraph
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, ModelInstanceIndex, PrismaticJoint, RigidBody
@@ -37,6 +37,7 @@ class HandHandles:
     wrist_frame: FixedOffsetFrame
     wrist_trajectory: TrajectorySource
     fingertips: tuple[RigidBody, ...]
+    parts: tuple[tuple[GeometryId, Array], ...]  # each shape of the hand with a point inside it
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

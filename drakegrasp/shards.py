@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import secrets
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -89,7 +90,7 @@ def atomic_hdf5(path: Path, *, sealed: bool = False) -> Iterator[h5py.File]:
         OSError: If the disk is full or the folder cannot be written; nothing is left behind.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY_SUFFIX}")
+    temporary = temporary_name(path)
     try:
         with h5py.File(temporary, "w", userblock_size=SEAL_SIZE if sealed else 0) as file:
             yield file
@@ -108,7 +109,7 @@ def seal(path: Path) -> None:
         file.write(text)
 
 
-def refuse_broken_seal(path: Path) -> None:
+def refuse_broken_seal(path: Path, what: str = "shard") -> None:
     """Refuse a sealed file of which any bit has changed.
 
     Raises:
@@ -119,27 +120,35 @@ def refuse_broken_seal(path: Path) -> None:
             found = file.read(SEAL_SIZE)
             intact = found == _seal_of(file)
     except OSError as error:
-        raise DataError(f"{path}: must be a complete shard, got none ({error.strerror})") from None
+        raise DataError(f"{path}: must be a complete {what}, got none ({error.strerror})") from None
     if not intact:
-        raise DataError(f"{path}: must be a complete shard, got one that is damaged or cut off")
+        raise DataError(f"{path}: must be a complete {what}, got one that is damaged or cut off")
 
 
 def _seal_of(file: BufferedReader | BufferedRandom) -> bytes:
     file.seek(SEAL_SIZE)
     digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return f"drakegrasp shard, sha256 of the rest: {digest}\n".encode().ljust(SEAL_SIZE, b"\0")
+    return f"drakegrasp, sha256 of the rest: {digest}\n".encode().ljust(SEAL_SIZE, b"\0")
 
 
 def sync_and_rename(temporary: Path, path: Path) -> None:
     """Make a finished temporary file durable and give it its name, in one step for readers."""
-    for name, flags in ((temporary, os.O_RDONLY), (path.parent, os.O_RDONLY | os.O_DIRECTORY)):
-        if name == path.parent:
-            temporary.replace(path)
-        descriptor = os.open(name, flags)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+    _sync(temporary)
+    temporary.replace(path)
+    _sync(path.parent)
+
+
+def temporary_name(path: Path) -> Path:
+    """Return a name beside a file under which it may be written, unlike any other process's."""
+    return path.with_name(f".{path.name}.{secrets.token_hex(6)}{TEMPORARY_SUFFIX}")
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def create_field(group: h5py.Group, field: Field, shape: tuple[int, ...]) -> h5py.Dataset:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rich.box import SIMPLE
+from rich.markup import escape
 from rich.table import Table
 
 from drakegrasp.audit import AuditRow
@@ -30,31 +31,42 @@ _OUTCOME_HEADS = {
 }
 
 
-def funnel_table(funnel: Funnel) -> Table:
-    """Return the funnel, a row per object and one of all, without columns that are all zero."""
-    table = Table(
-        title="From palm poses to samples",
-        title_justify="left",
-        box=SIMPLE,
-        pad_edge=False,
-        collapse_padding=True,
-        padding=(0, 1, 0, 0),
-    )
-    table.add_column("object", no_wrap=True, overflow="ellipsis", max_width=24)
+#: What the outcomes amount to, for terminals that are too narrow for all of them.
+_COMPACT_HEADS = {
+    "no ray": (Outcome.RAY_MISS, Outcome.BELOW_TABLE),
+    "collis.": (Outcome.START_COLLISION, Outcome.SCREENED),
+    "no grip": (Outcome.MISSING_FINGERTIP, Outcome.HAND_CONTACT, Outcome.TABLE_CONTACT),
+    "lost": (Outcome.DROPPED, Outcome.SLIPPED),
+    "errors": (Outcome.SOLVER_ERROR, Outcome.TIMEOUT, Outcome.CRASHED),
+    "success": (Outcome.SUCCESS,),
+}
+
+
+def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
+    """Return the funnel, a row per object and one of all.
+
+    Args:
+        funnel: The counts.
+        compact: Whether to put outcomes together; else columns that are all zero are left out.
+    """
     shown = [o for o in _OUTCOME_HEADS if funnel.outcomes[:, o].any() or o is Outcome.SUCCESS]
+    groups = _COMPACT_HEADS if compact else {_OUTCOME_HEADS[o]: (o,) for o in shown}
     removed = [r for r in Removal if r is not Removal.KEPT and funnel.removals[:, r].any()]
-    heads = ["poses", "attempts", *(_OUTCOME_HEADS[o] for o in shown)]
-    heads += [f"- {r.label}".replace("_", "\n") for r in removed] + ["samples"]
-    for head in heads:
+    heads = ["poses", "attempts", *groups]
+    heads += [] if compact else [f"- {r.label}".replace("_", "\n") for r in removed]
+    table = _table("From palm poses to samples")
+    table.add_column("object", no_wrap=True, overflow="ellipsis", max_width=24)
+    for head in [*heads, "samples"]:
         table.add_column(head, justify="right", no_wrap=True)
 
     def row(outcomes: Sequence[int], removals: Sequence[int], poses: int) -> list[str]:
-        cells = [poses, sum(outcomes), *(outcomes[o] for o in shown)]
-        cells += [*(removals[r] for r in removed), removals[Removal.KEPT]]
-        return [f"{int(cell):,}" for cell in cells]
+        cells = [poses, sum(outcomes), *(sum(outcomes[o] for o in g) for g in groups.values())]
+        cells += [] if compact else [removals[r] for r in removed]
+        return [f"{int(cell):,}" for cell in (*cells, removals[Removal.KEPT])]
 
     for i, name in enumerate(funnel.names):
-        table.add_row(name, *row(funnel.outcomes[i], funnel.removals[i], int(funnel.candidates[i])))
+        counts = (funnel.outcomes[i], funnel.removals[i], int(funnel.candidates[i]))
+        table.add_row(escape(name), *row(*counts))
     table.add_section()
     totals = (funnel.outcomes.sum(0), funnel.removals.sum(0), int(funnel.candidates.sum()))
     table.add_row("all", *row(*totals))
@@ -63,14 +75,7 @@ def funnel_table(funnel: Funnel) -> Table:
 
 def split_table(counts: Sequence[SplitCount]) -> Table:
     """Return the paper's Table III with a column of objects."""
-    table = Table(
-        title="Samples by split",
-        title_justify="left",
-        box=SIMPLE,
-        pad_edge=False,
-        collapse_padding=True,
-        padding=(0, 1, 0, 0),
-    )
+    table = _table("Samples by split")
     table.add_column("split")
     for head in ("samples", "objects", "classes"):
         table.add_column(head, justify="right")
@@ -81,29 +86,33 @@ def split_table(counts: Sequence[SplitCount]) -> Table:
 
 def audit_table(rows: Sequence[AuditRow]) -> Table:
     """Return what would become of each mesh."""
-    table = Table(
-        title="Meshes",
+    table = _table("Meshes")
+    table.add_column("object", no_wrap=True)
+    table.add_column("class", no_wrap=True)
+    table.add_column("status", no_wrap=True)
+    table.add_column("faces", justify="right")
+    table.add_column(escape("size [mm]"), justify="right", no_wrap=True)
+    table.add_column("notes", overflow="fold")
+    colours = {"fit": "green", "mended": "yellow", "refused": "red"}
+    for row in rows:
+        size = "-" if row.extents is None else "x".join(f"{1e3 * e:.0f}" for e in row.extents)
+        table.add_row(
+            escape(row.name),
+            escape(row.class_name),
+            f"[{colours[row.status]}]{row.status}[/]",
+            "-" if row.faces is None else f"{row.faces:,}",
+            size,
+            escape("; ".join(row.notes)),
+        )
+    return table
+
+
+def _table(title: str) -> Table:
+    return Table(
+        title=title,
         title_justify="left",
         box=SIMPLE,
         pad_edge=False,
         collapse_padding=True,
         padding=(0, 1, 0, 0),
     )
-    table.add_column("object", no_wrap=True)
-    table.add_column("class", no_wrap=True)
-    table.add_column("status", no_wrap=True)
-    table.add_column("faces", justify="right")
-    table.add_column("size [mm]", justify="right", no_wrap=True)
-    table.add_column("notes", overflow="fold")
-    colours = {"fit": "green", "mended": "yellow", "refused": "red"}
-    for row in rows:
-        size = "-" if row.extents is None else "x".join(f"{1e3 * e:.0f}" for e in row.extents)
-        table.add_row(
-            row.name,
-            row.class_name,
-            f"[{colours[row.status]}]{row.status}[/]",
-            "-" if row.faces is None else f"{row.faces:,}",
-            size,
-            "; ".join(row.notes),
-        )
-    return table

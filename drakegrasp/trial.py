@@ -34,6 +34,8 @@ from drakegrasp.scene import (
 PEAK_SPEED = 15.0 / 8.0
 #: Peak acceleration of a minimum-jerk motion times duration squared over distance.
 PEAK_ACCELERATION = 10.0 / np.sqrt(3.0)
+#: Far below a time step, far above the rounding of a sum of them [s].
+ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -163,8 +165,10 @@ def lift_duration(distance: float, config: Config) -> float:
 
 def _close(clock: _Clock, record: TrialRecord, config: Config) -> TrialRecord:
     scene, rules = clock.scene, config.close
-    while scene.time < rules.max_time:
-        clock.advance(rules.check_period)
+    # The last look may fall short of the end by rounding, never by a step.
+    while rules.max_time - scene.time > ROUNDING:
+        clock.advance(min(rules.check_period, rules.max_time - scene.time))
+        _refuse_explosion(scene, config)
         if finger_speed(scene) < rules.stop_speed:
             break
     return replace(
@@ -181,6 +185,7 @@ def _lift(clock: _Clock, record: TrialRecord, config: Config) -> TrialRecord:
     start = scene.time
     target = X_WT[:3, 3] + config.lift.p_TG
     duration = lift_duration(float(np.linalg.norm(target - palm_pose(scene)[:3, 3])), config)
+    duration = max(duration, config.physics.time_step)  # the palm may start at its target
     release(scene)
     move_wrist(scene, target, duration)
     end = start + duration + config.lift.hold_time
@@ -191,8 +196,7 @@ def _lift(clock: _Clock, record: TrialRecord, config: Config) -> TrialRecord:
         _refuse_explosion(scene, config)
         now = read_contacts(scene)
         lost = not now.touching.any() and not now.other_links
-        # The last look may fall short of the end by rounding, never by a step.
-        if lost or end - scene.time < 1e-9:
+        if lost or end - scene.time < ROUNDING:
             contacts = now
     X_WO = scene.pose(scene.object)
     X_GO = invert_pose(palm_pose(scene)) @ X_WO
@@ -210,6 +214,8 @@ def _lift(clock: _Clock, record: TrialRecord, config: Config) -> TrialRecord:
 
 
 def _refuse_explosion(scene: Scene, config: Config) -> None:
+    if not np.isfinite(hand_positions(scene)).all():
+        raise _StateError("the hand's joints must have finite positions, got others")
     velocity = scene.plant.EvalBodySpatialVelocityInWorld(scene.context, scene.object)
     speed = float(np.linalg.norm(velocity.translational()))
     if not speed <= config.physics.max_speed:

@@ -8,6 +8,7 @@ header and the configuration alone: not on who runs it, nor on what ran before.
 from __future__ import annotations
 
 import gc
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -22,6 +23,7 @@ from drakegrasp.candidates import Attempt, make_attempts
 from drakegrasp.config import Config, parse_config
 from drakegrasp.construction import build_scene
 from drakegrasp.contacts import Contacts
+from drakegrasp.errors import DataError
 from drakegrasp.frames import pack_pose
 from drakegrasp.hand import load_hand
 from drakegrasp.outcomes import Outcome
@@ -95,14 +97,22 @@ class Workbench:
         return self._renderer
 
 
-_workbenches: dict[tuple[str, str, str], Workbench] = {}
+_workbenches: dict[tuple[Path, str, str, str], Workbench] = {}
+#: Two threads in one scene would give each other's results: only one unit runs at a time.
+_one_unit = threading.Lock()
 
 
-def workbench(out: Path, name: str, config: Config) -> Workbench:
-    """Return the diagrams of an object, built now or kept from an earlier unit."""
-    prepared = load_prepared(out, name, config)
-    key = (config.simulation_hash(), name, prepared.model.mesh_sha256)
+def workbench(out: Path, header: ShardHeader, config: Config) -> Workbench:
+    """Return the diagrams of a unit's object, built now or kept from an earlier unit.
+
+    Raises:
+        DataError: If the object's files are damaged, or of another configuration or mesh.
+    """
+    key = (out, header.config_hash, header.object_name, header.mesh_sha256)
     if key not in _workbenches:
+        prepared = load_prepared(out, header.object_name, config)
+        if prepared.model.mesh_sha256 != header.mesh_sha256:
+            raise DataError(f"{out}: {header.object_name} must be of the unit's mesh, got another")
         while len(_workbenches) >= KEPT_OBJECTS:
             del _workbenches[next(iter(_workbenches))]
             # Diagrams sit in reference cycles and own memory that Python does not count.
@@ -120,9 +130,14 @@ def close_workbenches() -> None:
 
 def run_unit(unit: WorkUnit) -> UnitSummary:
     """Try all attempts of a unit, look at the successes, and write the shard."""
+    with _one_unit:
+        return _run_unit(unit)
+
+
+def _run_unit(unit: WorkUnit) -> UnitSummary:
     config, out, header = parse_config(unit.config), Path(unit.out), unit.header
     seconds: dict[str, float] = {}
-    bench = _timed(seconds, "build", lambda: workbench(out, header.object_name, config))
+    bench = _timed(seconds, "build", lambda: workbench(out, header, config))
     attempts = list(unit_attempts(bench.prepared, header, config))
     records = _timed(seconds, "try", lambda: [try_on(bench, attempt) for attempt in attempts])
     looks = _timed(seconds, "look", lambda: look_at_successes(bench, records))

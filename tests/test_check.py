@@ -23,6 +23,7 @@ from drakegrasp.camera import (
     image_frame,
     intrinsics,
 )
+from drakegrasp.candidates import Candidates
 from drakegrasp.check import check_dataset
 from drakegrasp.config import CameraConfig, load_config
 from drakegrasp.errors import DataError
@@ -31,12 +32,14 @@ from drakegrasp.manifest import (
     Manifest,
     installed_versions,
     model_path,
+    plan_path,
     read_manifest,
     write_manifest,
 )
 from drakegrasp.meshes import MeshSource
 from drakegrasp.object_model import ObjectModel, load_object, prepare_object, save_object
 from drakegrasp.outcomes import Outcome, Stage
+from drakegrasp.prepared import PreparedObject, save_prepared
 from drakegrasp.schema import CAMERAS, LOOK_FIELDS, sizes
 from drakegrasp.shards import Shard, ShardHeader, read_shard, trial_columns, write_shard
 
@@ -162,6 +165,20 @@ def make_shard(model: ObjectModel, header: ShardHeader, X_TO: Array, camera: Cam
     return Shard(header=header, trials=trials, looks=looks)
 
 
+def resting(model: ObjectModel, X_TO: Array) -> PreparedObject:
+    """An object on the table, with four palm poses that nobody looks at."""
+    candidates = Candidates(
+        X_OG=np.tile(np.eye(4), (4, 1, 1)),
+        distance=np.full(4, np.nan),
+        combinations=4,
+        valid=4,
+        distinct=4,
+    )
+    return PreparedObject(
+        model=model, X_TO=X_TO, candidates=candidates, table_force=9.81, stopped=False
+    )
+
+
 def make_dataset(out: Path, meshes: Path, *overrides: str) -> Path:
     config = load_config(
         overrides=[
@@ -178,8 +195,8 @@ def make_dataset(out: Path, meshes: Path, *overrides: str) -> Path:
         path = meshes / f"{name}.stl"
         trimesh.creation.box(extents).export(path)
         model = prepare_object(MeshSource(name=name, class_name=class_name, path=path))
-        save_object(model, model_path(out, name))
         X_TO = make_pose(np.eye(3), [0.0, 0.0, model.half_extents[2]])
+        save_prepared(resting(model, X_TO), out, config)
         numbers = {"candidates": 4, "combinations": 4, "valid": 4, "distinct": 4}
         entry = {"name": name, "class": class_name, "mesh_sha256": model.mesh_sha256}
         entries.append({**entry, **numbers, "X_TO": pack_pose(X_TO).tolist()})
@@ -692,6 +709,15 @@ def test_a_shard_of_another_unit_is_found(out: Path) -> None:
     must_find(out, ("shards/2_box_b/0000000-0000002.h5", "", None, "the shard must be there"))
 
 
+def test_a_flipped_bit_in_a_plan_is_found(out: Path) -> None:
+    path = plan_path(out, "2_box_b")
+    content = bytearray(path.read_bytes())
+    content[-100] ^= 1
+    path.write_bytes(content)
+    what = "an object's file must be as it was written"
+    must_find(out, ("objects/2_box_b.plan.h5", "", None, what))
+
+
 def test_objects_files_are_checked(out: Path) -> None:
     model_path(out, "3_brick").unlink()
     other = load_object(model_path(out, "1_box_a"))
@@ -699,6 +725,8 @@ def test_objects_files_are_checked(out: Path) -> None:
     must_find(
         out,
         ("objects/3_brick.npz", "", None, "the object must be readable"),
+        ("objects/3_brick.npz", "", None, "an object's file must be as it was written"),
+        ("objects/1_box_a.npz", "", None, "an object's file must be as it was written"),
         ("objects/1_box_a.npz", "", None, "mesh_sha256 must be that of manifest.json"),
     )
 
