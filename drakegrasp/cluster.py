@@ -9,13 +9,13 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
 import dask
-from distributed import Client, Future, KilledWorker, LocalCluster, as_completed, wait
+from distributed import Client, Future, KilledWorker, LocalCluster, as_completed
 
 from drakegrasp.build import BuildReport, build
 from drakegrasp.builtin import export_builtin
@@ -24,7 +24,6 @@ from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.hand import load_hand
 from drakegrasp.manifest import BUILTIN_FOLDER, DECISIVE, claim_directory, installed_versions
 from drakegrasp.meshes import find_meshes
-from drakegrasp.units import close_workbenches
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -104,9 +103,7 @@ def build_dataset(
             claim_directory(out, config)
             export_builtin(out / BUILTIN_FOLDER)
             sources = find_meshes(out / BUILTIN_FOLDER)
-        report = build(sources, out, config, DaskExecutor(client), show=show)
-        _close_workbenches(client)
-        return report
+        return build(sources, out, config, DaskExecutor(client), show=show)
 
 
 @contextmanager
@@ -170,16 +167,6 @@ def _refuse_unfit_workers(client: Client, config: Config) -> None:
                     f"worker {address}: must have {name} {ours[name]} like the client, "
                     f"got {theirs[name]}"
                 )
-
-
-def _close_workbenches(client: Client) -> None:
-    """End the renderers in the thread that made them: the one that runs tasks."""
-    # A worker that is still busy keeps its own: VTK then grumbles when its process ends.
-    with suppress(TimeoutError):
-        wait(
-            [client.submit(close_workbenches, workers=[w], pure=False) for w in client.ncores()],
-            timeout=CONNECT_SECONDS,
-        )
 
 
 class DaskExecutor:

@@ -50,7 +50,15 @@ The same command gives the same arrays, whatever the number of workers, in which
 and how often the build was interrupted: nothing in these files depends on the clock or the
 machine's name. `time_close` and `time_lift` are simulated seconds. This holds on one machine with
 one set of library versions (`manifest.json` names them); another CPU or another version of Drake
-may round differently.
+may round differently. The one exception is the outcome `timeout`: an attempt that takes longer
+than `attempt_seconds` (60 s, where a usual one takes about one) says more about the machine than
+about the grasp, and may end otherwise elsewhere. `screened` and `crashed` are reserved: nothing
+makes them yet.
+
+Shards and the files in `objects/` are sealed: a changed bit in one of them is found when it is
+used, and by `drakegrasp check`. The three main files have no seal: `check` finds what breaks an
+invariant, not every changed bit of an image. `drakegrasp assemble` makes them again from the
+shards; a list of rejected trials (`--reject`) holds until then.
 
 ## Missing values
 

@@ -7,6 +7,8 @@ header and the configuration alone: not on who runs it, nor on what ran before.
 
 from __future__ import annotations
 
+import atexit
+import ctypes
 import gc
 import threading
 import time
@@ -122,10 +124,15 @@ def workbench(out: Path, header: ShardHeader, config: Config) -> Workbench:
     return _workbenches[key]
 
 
-def close_workbenches() -> None:
-    """Let go of all diagrams; a renderer must end in the thread that made it."""
-    _workbenches.clear()
-    gc.collect()
+@atexit.register
+def _leave_renderers_to_the_system() -> None:
+    """Keep the renderers from being destroyed when the process ends.
+
+    That would happen in another thread than the one that made them, which VTK answers with a
+    page of warnings. A reference that nobody gives back keeps them until the process is gone.
+    """
+    for bench in _workbenches.values():
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(bench))
 
 
 def run_unit(unit: WorkUnit) -> UnitSummary:

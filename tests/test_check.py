@@ -536,7 +536,7 @@ def test_classes_are_checked(out: Path) -> None:
 
 def test_both_data_files_must_agree(out: Path) -> None:
     (out / TRIALS).unlink()
-    change(out, OTM, "train/trial_id", 1, lambda i: i + 1)
+    change(out, OTM, "train/trial_id", 1, lambda i: i + 1000)
     change(out, OTM, "test/object_props/class_name", 0, lambda _: "box")
     change(out, OTM, "test/object_props/frame_cam2img_otm", 1, moved(0, 0, 1e-4))
     must_find(
