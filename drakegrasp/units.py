@@ -71,16 +71,6 @@ class UnitSummary:
     seconds: dict[str, float]
     errors: dict[str, int]
 
-    @property
-    def attempts(self) -> int:
-        """Number of attempts that were resolved."""
-        return sum(self.outcomes.values())
-
-    @property
-    def grasps(self) -> int:
-        """Number of successes."""
-        return self.outcomes.get(Outcome.SUCCESS, 0)
-
 
 @dataclass(eq=False)
 class Workbench:
