@@ -67,6 +67,8 @@ class Attempt:
         X_OG: Pose of the palm (4, 4); the candidate's own where its ray misses.
         ray_hits: Whether the palm ray meets the object.
         seed: What `spread` was drawn from.
+        closing: Angles of the closing joints (k,) [rad] from which the fingers close; None is
+            the open hand.
     """
 
     candidate: int
@@ -76,6 +78,7 @@ class Attempt:
     X_OG: Array
     ray_hits: bool
     seed: int
+    closing: Array | None = None
 
 
 def object_key(name: str) -> int:

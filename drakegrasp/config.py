@@ -155,6 +155,19 @@ class SplitConfig(_Section):
     train_classes: tuple[str, ...] | None = None  # None: every class with two objects or more
 
 
+class VerifyConfig(_Section):
+    """What a predicted grasp is held to; see docs/verification.md."""
+
+    max_surface_distance: Positive = 0.01  # [m], of a predicted point from the object's surface
+    max_residual: Positive = 0.008  # [m], of a fingertip from its point before closing
+    max_normal_error_deg: Positive = 45.0  # between a pad's normal and the predicted one
+    max_contact_error: Positive = 0.01  # [m], of a contact after closing from its point
+    open_margin_deg: Positive = 20.0  # by which fingers are opened before they close
+    max_tries: Count = 5  # wrist poses that are simulated before the grasp has failed
+    max_position_error: Positive = 0.01  # [m], of an object lifted by forces alone
+    max_angle_error_deg: Positive = 5.0  # of an object lifted by forces alone
+
+
 class Config(_Section):
     """Everything that decides what is in a dataset, but for the meshes themselves."""
 
@@ -172,6 +185,7 @@ class Config(_Section):
     max_grasps: Count | None = None  # successes per object after which no more are tried
     filters: FilterConfig = FilterConfig()
     split: SplitConfig = SplitConfig()
+    verify: VerifyConfig = VerifyConfig()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the resolved values as plain JSON types."""
@@ -180,11 +194,11 @@ class Config(_Section):
     def simulation_hash(self) -> str:
         """Return the hash of all that decides what a shard holds (16 hex digits).
 
-        Filters and split act later, on assembled shards, and are left out; so is
-        `max_grasps`, which only says where to stop, and the wall-clock limit.
+        Filters and split act later, on assembled shards, and are left out; so are
+        `max_grasps`, which only says where to stop, the wall-clock limit, and `verify`.
         """
         values = self.to_dict()
-        for key in ("filters", "split", "max_grasps", "attempt_seconds"):
+        for key in ("filters", "split", "max_grasps", "attempt_seconds", "verify"):
             del values[key]
         canonical = json.dumps(values, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]

@@ -5,6 +5,8 @@
   * MeshError            a mesh that cannot become a simulated object
   * HandError            a hand description (SDFormat and YAML) that cannot be used
   * DataError            a dataset, shard or manifest that is missing, foreign or broken
+  * GraspError           a grasp vector, or its frame, that cannot be verified
+    * OffSurfaceError    a grasp whose contacts are not on the object
   * MachineError         something that the machine lacks (EGL, a usable Drake, disk)
 
 Failures of the physics are not here: they are values, see `drakegrasp.outcomes`.
@@ -30,6 +32,14 @@ class HandError(DrakegraspError, ValueError):
 
 class DataError(DrakegraspError, ValueError):
     """A dataset, shard or manifest that is missing, foreign or broken."""
+
+
+class GraspError(DrakegraspError, ValueError):
+    """A grasp vector, or its frame, that cannot be verified."""
+
+
+class OffSurfaceError(GraspError):
+    """A grasp whose contacts are not on the object's surface."""
 
 
 class MachineError(DrakegraspError, RuntimeError):

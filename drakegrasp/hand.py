@@ -7,7 +7,7 @@ constants; `kinematics` needs no more than those.
 
 The coordinates of a hand with k fingers are c = (spread, closing of finger 1..k) [rad];
 each joint is driven by exactly one of them: its angle is `gain @ c`. Frames: B palm link,
-G palm, Fi distal (fingertip) link of finger i, P a point on its pad.
+G palm, Fi distal (fingertip) link of finger i, P a point on it.
 """
 
 from __future__ import annotations
@@ -62,23 +62,12 @@ class Finger:
     rotor_inertia: NonNegative = 0.0  # of the motor [kg m^2]
     gear_ratio: Positive = 1.0  # motor angle / closing angle
     coupled: tuple[Coupling, ...] = ()
-    pad_point: Vector  # nominal contact point on the pad, in Fi [m]
-    pad_normal: Vector  # outward normal of the pad there, in Fi; of any length
-
-    def __post_init__(self) -> None:
-        if not any(self.pad_normal):
-            raise ValueError(f"pad_normal must not be zero, got {self.pad_normal}")
+    pad_point: Vector  # where contacts usually are, in Fi [m]
 
     @property
     def p_FiP(self) -> Array:
-        """Nominal contact point on the pad (3,) in the fingertip link's frame [m]."""
+        """Usual contact point (3,) in the fingertip link's frame [m]."""
         return np.array(self.pad_point)
-
-    @property
-    def n_Fi(self) -> Array:
-        """Unit outward normal of the pad (3,) in the fingertip link's frame."""
-        n: Array = np.array(self.pad_normal)
-        return n / float(np.linalg.norm(n))
 
 
 @with_config(_STRICT)

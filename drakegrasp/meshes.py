@@ -253,20 +253,34 @@ def _parse(path: Path, data: bytes) -> trimesh.Trimesh:
         raise MeshError(
             f"{path.name}: must be a valid {suffix} mesh, got: {one_line(error)}"
         ) from error
+    return clean_triangles(vertices, faces, path.name)
+
+
+def clean_triangles(vertices: Array, faces: Faces, name: str) -> trimesh.Trimesh:
+    """Return triangles with equal vertices merged and degenerate faces dropped.
+
+    Args:
+        vertices: (n, 3).
+        faces: (m, 3).
+        name: What to call them in an error.
+
+    Raises:
+        MeshError: If they are no finite triangles.
+    """
     if not len(faces):
-        raise MeshError(f"{path.name}: must hold triangles, got no faces")
+        raise MeshError(f"{name}: must hold triangles, got no faces")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise MeshError(
-            f"{path.name}: faces must use vertices 0..{len(vertices) - 1}, "
+            f"{name}: faces must use vertices 0..{len(vertices) - 1}, "
             f"got {faces.min()}..{faces.max()}"
         )
     used = vertices[faces.ravel()]
     if not np.isfinite(used).all():
         bad = int((~np.isfinite(used)).any(axis=1).sum())
-        raise MeshError(f"{path.name}: vertices must be finite, got NaN or inf at {bad} corners")
+        raise MeshError(f"{name}: vertices must be finite, got NaN or inf at {bad} corners")
     vertices, faces = weld(vertices, faces)
     if not len(faces):
-        raise MeshError(f"{path.name}: must hold triangles, got only degenerate faces")
+        raise MeshError(f"{name}: must hold triangles, got only degenerate faces")
     return trimesh.Trimesh(vertices, faces, process=False)
 
 

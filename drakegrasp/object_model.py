@@ -20,6 +20,7 @@ import numpy.typing as npt
 import trimesh
 
 from drakegrasp.bodies import count_parts
+from drakegrasp.config import ObjectConfig
 from drakegrasp.decimation import decimate
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
@@ -105,64 +106,82 @@ class ObjectModel:
 # Preparing
 
 
-def prepare_object(
-    source: MeshSource,
-    *,
-    mass: float = 1.0,
-    max_collision_faces: int = 3000,
-    min_diagonal: float = 0.01,
-    max_diagonal: float = 2.0,
-) -> ObjectModel:
+def prepare_object(source: MeshSource, config: ObjectConfig | None = None) -> ObjectModel:
     """Return the simulated object of a mesh file, mended where that is honest.
 
     Args:
         source: Where the mesh is and what unit it is in.
-        mass: [kg]
-        max_collision_faces: The collision mesh is decimated if it has more faces than
-            this; it is never refined.
-        min_diagonal: Shortest diagonal of the bounding box [m] that is no mistake of unit.
-        max_diagonal: Longest diagonal [m].
+        config: Mass, and limits of size and faces; the defaults if None.
 
     Raises:
         MeshError: If the file is no mesh, has an implausible size, or no solid can be
             made of it; the message gives the reason.
     """
-    if not (np.isfinite(mass) and mass > 0.0):
-        raise MeshError(f"mass must be positive [kg], got {mass}")
-    if max_collision_faces < 4:
-        raise MeshError(f"max_collision_faces must be at least 4, got {max_collision_faces}")
-    file = source.path.name
     mesh = load_mesh(source.path)
     vertices, faces = np.asarray(mesh.vertices) * source.scale, np.asarray(mesh.faces)
+    try:
+        return make_object(
+            vertices,
+            faces,
+            config or ObjectConfig(),
+            name=source.name,
+            class_name=source.class_name,
+            mesh_sha256=source_sha256(source),
+            unit=f" with 1 unit = {source.scale:g} m",
+        )
+    except MeshError as reason:
+        raise MeshError(f"{source.path.name}: {reason}") from reason
+
+
+def make_object(
+    vertices: npt.ArrayLike,
+    faces: npt.ArrayLike,
+    config: ObjectConfig,
+    *,
+    name: str,
+    class_name: str,
+    mesh_sha256: str,
+    unit: str = "",
+) -> ObjectModel:
+    """Return the simulated object of a surface, see `prepare_object`.
+
+    Args:
+        vertices: (n, 3) [m].
+        faces: (m, 3).
+        config: Mass, and limits of size and faces.
+        name, class_name, mesh_sha256: Fields of the result.
+        unit: What to say of the unit of length where the size is refused.
+
+    Raises:
+        MeshError: If the size is implausible, or no solid can be made of it.
+    """
+    vertices, faces = np.asarray(vertices, dtype=float), np.asarray(faces)
     size = diagonal(vertices)
-    if not min_diagonal <= size <= max_diagonal:
+    if not config.min_diagonal <= size <= config.max_diagonal:
         raise MeshError(
-            f"{file}: the diagonal of the bounding box must be {min_diagonal:g} m to "
-            f"{max_diagonal:g} m, got {size:.4g} m with 1 unit = {source.scale:g} m: give the "
+            f"the diagonal of the bounding box must be {config.min_diagonal:g} m to "
+            f"{config.max_diagonal:g} m, got {size:.4g} m{unit}: give the "
             f"file's unit with --units ({', '.join(UNITS)}) or for this mesh in {MANIFEST_NAME}"
         )
-    try:
-        solid = mend_solid(vertices, faces)
-        _refuse_slight(solid)
-        centre = (solid.vertices.min(axis=0) + solid.vertices.max(axis=0)) / 2.0
-        visual = Solid(vertices=solid.vertices - centre, faces=solid.faces)
-        p_OOcm, I_OOcm_O = _mass_properties(visual, mass)
-        collision, error = decimate(visual, max_collision_faces)
-    except MeshError as reason:
-        raise MeshError(f"{file}: {reason}") from reason
+    solid = mend_solid(vertices, faces)
+    _refuse_slight(solid)
+    centre = (solid.vertices.min(axis=0) + solid.vertices.max(axis=0)) / 2.0
+    visual = Solid(vertices=solid.vertices - centre, faces=solid.faces)
+    p_OOcm, I_OOcm_O = _mass_properties(visual, config.mass)
+    collision, error = decimate(visual, config.max_collision_faces)
     notes = solid.notes
     parts = count_parts(solid.vertices, solid.faces)
     if parts > 1:
         notes = (*notes, f"{parts} parts do not touch and will move as one")
     return ObjectModel(
-        name=source.name,
-        class_name=source.class_name,
-        mesh_sha256=source_sha256(source),
+        name=name,
+        class_name=class_name,
+        mesh_sha256=mesh_sha256,
         visual_vertices=visual.vertices,
         visual_faces=visual.faces.astype(np.int32),
         collision_vertices=collision.vertices,
         collision_faces=collision.faces.astype(np.int32),
-        mass=float(mass),
+        mass=config.mass,
         p_OOcm=p_OOcm,
         I_OOcm_O=I_OOcm_O,
         collision_error=error,

@@ -29,6 +29,8 @@ class Outcome(IntEnum):
     SOLVER_ERROR = 10  # Drake failed or the state exploded; says nothing about the grasp
     TIMEOUT = 11  # the attempt's wall-clock limit passed; says nothing about the grasp
     CRASHED = 12  # the attempt killed its process; says nothing about the grasp
+    UNREACHABLE = 13  # verification only: no wrist pose brings the fingertips to the contacts
+    OFF_SURFACE = 14  # verification only: a predicted contact is not on the object's surface
 
     @property
     def label(self) -> str:
@@ -39,6 +41,11 @@ class Outcome(IntEnum):
     def says_nothing(self) -> bool:
         """Whether the simulator failed, not the grasp: never count it as a negative."""
         return self in (Outcome.SOLVER_ERROR, Outcome.TIMEOUT, Outcome.CRASHED)
+
+    @property
+    def only_verified(self) -> bool:
+        """Whether only verification has this outcome, so that no file of a dataset holds it."""
+        return self in (Outcome.UNREACHABLE, Outcome.OFF_SURFACE)
 
     @property
     def stage(self) -> Stage:
@@ -60,4 +67,6 @@ _STAGE = {
     Outcome.SOLVER_ERROR: Stage.PLACED,
     Outcome.TIMEOUT: Stage.PLACED,
     Outcome.CRASHED: Stage.PLACED,
+    Outcome.UNREACHABLE: Stage.PLACED,
+    Outcome.OFF_SURFACE: Stage.PLACED,
 }

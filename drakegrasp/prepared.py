@@ -72,13 +72,7 @@ def prepare(source: MeshSource, config: Config) -> PreparedObject:
         MeshError: If the mesh cannot be mended, its size is implausible, or the object does
             not come to rest.
     """
-    model = prepare_object(
-        source,
-        mass=config.objects.mass,
-        max_collision_faces=config.objects.max_collision_faces,
-        min_diagonal=config.objects.min_diagonal,
-        max_diagonal=config.objects.max_diagonal,
-    )
+    model = prepare_object(source, config.objects)
     resting = settle(model, config)
     return PreparedObject(
         model=model,

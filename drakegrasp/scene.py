@@ -23,6 +23,7 @@ from pydrake.trajectories import BezierCurve, PiecewisePolynomial
 from drakegrasp.config import PhysicsConfig
 from drakegrasp.frames import Array
 from drakegrasp.hand import Hand
+from drakegrasp.kinematics import joint_positions
 from drakegrasp.object_model import ObjectModel
 
 
@@ -85,14 +86,22 @@ def reset_object(scene: Scene, X_WO: npt.ArrayLike) -> None:
     scene.plant.SetVelocities(scene.context, np.zeros(scene.plant.num_velocities()))
 
 
-def reset_attempt(scene: Scene, X_WO: npt.ArrayLike, X_WG: npt.ArrayLike, spread: float) -> None:
-    """Put the open hand and the object at the start of an attempt; wrist and object static.
+def reset_attempt(
+    scene: Scene,
+    X_WO: npt.ArrayLike,
+    X_WG: npt.ArrayLike,
+    *,
+    spread: float,
+    closing: npt.ArrayLike | None = None,
+) -> None:
+    """Put hand and object at the start of an attempt; wrist and object static.
 
     Args:
         scene: A scene with a hand.
         X_WO: Pose of the object (4, 4).
         X_WG: Pose of the palm (4, 4).
         spread: Angle of the spread joints [rad].
+        closing: Angle of each finger's closing joint (k,) [rad]; None is the open hand.
     """
     handles = _handles(scene)
     context, plant = scene.context, scene.plant
@@ -102,9 +111,9 @@ def reset_attempt(scene: Scene, X_WO: npt.ArrayLike, X_WG: npt.ArrayLike, spread
     X = np.asarray(X_WG, dtype=float)
     R_WG = RotationMatrix(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]))
     handles.wrist_frame.SetPoseInParentFrame(context, RigidTransform(R_WG, np.zeros(3)))
-    plant.SetPositions(context, handles.instance, np.zeros(plant.num_positions(handles.instance)))
-    for name in handles.hand.spread.joints:
-        plant.GetJointByName(name, handles.instance).set_angle(context, spread)
+    opened = np.zeros(handles.hand.num_fingers) if closing is None else closing
+    for name, angle in joint_positions(handles.hand, spread, opened).items():
+        plant.GetJointByName(name, handles.instance).set_angle(context, angle)
     for joint, p in zip(handles.wrist_joints, X[:3, 3], strict=True):
         joint.set_translation(context, float(p))
         joint.Lock(context)

@@ -276,7 +276,9 @@ TRIAL_FIELDS: tuple[Field, ...] = (
         dtype="uint8",
         unit="-",
         frame="-",
-        meaning="verdict: " + ", ".join(f"{o.value} {o.label}" for o in Outcome),
+        meaning="verdict: " + ", ".join(
+            f"{o.value} {o.label}" for o in Outcome if not o.only_verified
+        ),
     ),
     Field(
         name="X_TO",

@@ -123,7 +123,8 @@ def run_attempt(scene: Scene, X_TO: npt.ArrayLike, attempt: Attempt, config: Con
 def _simulate(scene: Scene, record: TrialRecord, attempt: Attempt, config: Config) -> TrialRecord:
     X_WO = X_WT @ record.X_TO
     clock = _Clock(scene, time.monotonic() + config.attempt_seconds)
-    reset_attempt(scene, X_WO, X_WO @ attempt.X_OG, attempt.spread)
+    X_WG = X_WO @ attempt.X_OG
+    reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=attempt.closing)
     if open_hand_collides(scene):
         return replace(record, outcome=Outcome.START_COLLISION)
     record = _close(clock, record, config)

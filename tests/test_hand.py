@@ -79,7 +79,6 @@ PINCER = {
             "closing_joint": f"{side}_hinge",
             "torque_limit": 1.0,
             "pad_point": [0.0, 0.0, 0.1],
-            "pad_normal": [0, sign * 2, 0],
         }
         for side, sign in (("left", 1), ("right", -1))
     ],
@@ -341,10 +340,6 @@ REFUSALS = {
     ),
     "not positive": ({"closing_speed_deg": 0}, r"closing_speed_deg: must be greater than 0, got 0"),
     "no fingers": ({"fingers": []}, r"fingers: must .* at least 1 item"),
-    "zero normal": (
-        {"fingers": changed_finger(pad_normal=[0, 0, 0])},
-        r"fingers\.0: pad_normal must not be zero",
-    ),
     "zero ratio": (
         {"fingers": changed_finger(coupled=[{"joint": "right_hinge", "ratio": 0}])},
         r"fingers\.0\.coupled\.0: ratio must not be zero",

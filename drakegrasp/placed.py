@@ -1,0 +1,134 @@
+"""An object where it rests on the table: what a grasp is verified against.
+
+In: a mesh file, a trimesh or an object that was prepared before. Out: the object and its
+resting pose. What stays the same however the object is turned or moved on the table is
+computed at one pose, `rest_pose`, so a verdict cannot depend on it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+
+from drakegrasp.config import Config, load_config
+from drakegrasp.errors import GraspError, MeshError
+from drakegrasp.frames import Array, make_pose, transform_points
+from drakegrasp.meshes import UNITS, clean_triangles, find_meshes
+from drakegrasp.object_model import ObjectModel, make_object, prepare_object
+from drakegrasp.prediction import read_pose
+from drakegrasp.resting import settle
+
+#: A given pose may leave this much between the object's lowest point and the table [m].
+MAX_GAP = 0.005
+
+
+@runtime_checkable
+class Placed(Protocol):
+    """Anything with a model and its pose: a `PlacedObject`, or a dataset's prepared object."""
+
+    @property
+    def model(self) -> ObjectModel:
+        """The object."""
+
+    @property
+    def X_TO(self) -> Array:
+        """Its pose in the table-top frame, (4, 4)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlacedObject:
+    """An object on the table.
+
+    Attributes:
+        model: Meshes and mass properties.
+        X_TO: Pose in the table-top frame, (4, 4).
+    """
+
+    model: ObjectModel
+    X_TO: Array
+
+
+def place_object(
+    mesh: str | Path | trimesh.Trimesh | Placed,
+    *,
+    units: str = "m",
+    X_TO: npt.ArrayLike | None = None,
+    config: Config | None = None,
+) -> PlacedObject:
+    """Return an object on the table, ready for many calls of `verify_grasp`.
+
+    Args:
+        mesh: Path of a mesh file, a mesh, or an object that was placed before. The origin
+            of {O} is the centre of its bounding box, not that of the file.
+        units: Unit of the mesh's lengths: m, cm or mm; an `objects.yaml` beside a file wins.
+        X_TO: Pose of the object on the table; dropped as in a build if None.
+        config: Mass, friction and how it settles; the preset `paper` if None.
+
+    Raises:
+        MeshError: If the mesh cannot be simulated or does not come to rest.
+        GraspError: If X_TO is no pose or does not stand on the table.
+    """
+    config = config or load_config()
+    if isinstance(mesh, Placed):
+        model, known = mesh.model, np.asarray(mesh.X_TO)
+    elif isinstance(mesh, trimesh.Trimesh):
+        model, known = _model_of(mesh, units, config), None
+    else:
+        model, known = _read(Path(mesh), units, config), None
+    if X_TO is not None:
+        known = _standing(model, read_pose(X_TO, "X_TO"))
+    return PlacedObject(model=model, X_TO=settle(model, config).X_TO if known is None else known)
+
+
+def rest_pose(X_TO: Array) -> Array:
+    """Return the pose (4, 4) over the table's centre that lies as X_TO does, without its yaw.
+
+    Of all rotations that agree with X_TO on which way is up in {O} it is the smallest one.
+    """
+    up = X_TO[2, :3]
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    x, y, z = axis
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    # Rodrigues' formula with sin = |axis| and cos = up_z; upside down, half a turn about x.
+    upright = 1.0 + up[2]
+    R = np.eye(3) + K + K @ K / upright if upright > 1e-9 else np.diag([1.0, -1.0, -1.0])
+    return make_pose(R, [0.0, 0.0, X_TO[2, 3]])
+
+
+def _read(path: Path, units: str, config: Config) -> ObjectModel:
+    if not path.is_file():
+        raise MeshError(f"mesh must be a file, a trimesh or a placed object, got {str(path)!r}")
+    sources = [s for s in find_meshes(path.parent, units=units) if s.path.name == path.name]
+    if not sources:
+        raise MeshError(f"{path}: must be a .obj, .stl, .ply or .glb file, got {path.suffix!r}")
+    return prepare_object(sources[0], config.objects)
+
+
+def _model_of(mesh: trimesh.Trimesh, units: str, config: Config) -> ObjectModel:
+    if units not in UNITS:
+        raise MeshError(f"units must be one of {', '.join(UNITS)}, got {units!r}")
+    given = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=np.int64)
+    clean = clean_triangles(*given, "mesh")
+    vertices = clean.vertices * UNITS[units]
+    digest = hashlib.sha256(vertices.tobytes() + clean.faces.tobytes()).hexdigest()
+    return make_object(
+        vertices, clean.faces, config.objects, name="mesh", class_name="mesh", mesh_sha256=digest
+    )
+
+
+def _standing(model: ObjectModel, X_TO: Array) -> Array:
+    if X_TO.shape != (4, 4):
+        raise GraspError(f"X_TO must be one pose, got an array of shape {X_TO.shape}")
+    lowest = float(transform_points(X_TO, model.collision_vertices)[:, 2].min())
+    if abs(lowest) > MAX_GAP:
+        raise GraspError(
+            f"X_TO must put the object on the table, its lowest point within {1e3 * MAX_GAP:g} mm, "
+            f"got one at {1e3 * lowest:.3g} mm"
+        )
+    return X_TO

@@ -1,0 +1,40 @@
+"""The scenes that a process keeps, because building one costs as much as simulating.
+
+A scene that is reset gives the same bits as a new one, so who used it before does not matter.
+"""
+
+from __future__ import annotations
+
+import gc
+
+from drakegrasp.config import PhysicsConfig
+from drakegrasp.construction import build_scene
+from drakegrasp.hand import load_hand
+from drakegrasp.object_model import ObjectModel
+from drakegrasp.scene import Scene
+
+#: How many are kept: the same object with the hand and without, twice.
+KEPT = 4
+
+_scenes: dict[tuple[int, PhysicsConfig, str | None], Scene] = {}
+
+
+def scene_of(model: ObjectModel, physics: PhysicsConfig, hand: str | None) -> Scene:
+    """Return the scene of an object, built now or kept, with a hand by name or without one."""
+    # The kept scene holds its model, so no other object can have that identity.
+    key = (id(model), physics, hand)
+    scene = _scenes.pop(key, None)
+    if scene is None:
+        while len(_scenes) >= KEPT:
+            del _scenes[next(iter(_scenes))]
+            # Diagrams sit in reference cycles and own memory that Python does not count.
+            gc.collect()
+        scene = build_scene(model, physics, None if hand is None else load_hand(hand))
+    _scenes[key] = scene  # the last in order is the last used
+    return scene
+
+
+def forget_scenes() -> None:
+    """Drop every scene: one in which Drake failed must not be used again."""
+    _scenes.clear()
+    gc.collect()
