@@ -11,13 +11,16 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from drakegrasp.check import check_dataset
-    from drakegrasp.cluster import build_dataset
+    from drakegrasp.cluster import build_dataset, verify_grasps
     from drakegrasp.config import Config, load_config
     from drakegrasp.dataset import GraspDataset
     from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp
     from drakegrasp.hand import load_hand
     from drakegrasp.outcomes import Outcome
+    from drakegrasp.placed import place_object
     from drakegrasp.replay import replay_trial
+    from drakegrasp.verification import Verification
+    from drakegrasp.verify_grasps import verify_grasp
 
 __version__ = metadata.version("drakegrasp")
 
@@ -25,28 +28,36 @@ _HOMES = {
     "Config": "config",
     "GraspDataset": "dataset",
     "Outcome": "outcomes",
+    "Verification": "verification",
     "build_dataset": "cluster",
     "check_dataset": "check",
     "load_config": "config",
     "load_hand": "hand",
     "pack_grasp": "grasp",
+    "place_object": "placed",
     "replay_trial": "replay",
     "transform_grasp": "grasp",
     "unpack_grasp": "grasp",
+    "verify_grasp": "verify_grasps",
+    "verify_grasps": "cluster",
 }
 
 __all__ = [
     "Config",
     "GraspDataset",
     "Outcome",
+    "Verification",
     "build_dataset",
     "check_dataset",
     "load_config",
     "load_hand",
     "pack_grasp",
+    "place_object",
     "replay_trial",
     "transform_grasp",
     "unpack_grasp",
+    "verify_grasp",
+    "verify_grasps",
 ]
 
 

@@ -1,21 +1,21 @@
 """The whole path from meshes to files, apart from who does the work.
 
 `build` plans and records; an `Executor` runs the two kinds of tasks: preparing an object
-and running a work unit. `run_here` is the plain loop; `drakegrasp.cluster` has the one on
-Dask. Results come back in any order and the files end up the same.
+and running a work unit. Results come back in any order and the files end up the same.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 from drakegrasp.assemble import Assembly, assemble, is_assembled, summarise
 from drakegrasp.config import Config, parse_config
 from drakegrasp.errors import DataError, DrakegraspError, MeshError
+from drakegrasp.executor import Executor
 from drakegrasp.hand import load_hand
 from drakegrasp.manifest import (
     Manifest,
@@ -30,22 +30,6 @@ from drakegrasp.prepared import load_prepared, prepare, save_prepared
 from drakegrasp.progress import Report, progress_bar
 from drakegrasp.shards import ShardHeader, read_outcomes
 from drakegrasp.units import WorkUnit, count_outcomes, run_unit
-
-T = TypeVar("T")
-R = TypeVar("R")
-
-
-class Executor(Protocol):
-    """Runs a function on items, somewhere, and yields the results in any order."""
-
-    def __call__(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-        """Yield function(item) of every item; items are taken as there is room for them."""
-
-
-def run_here(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """Run in this process, one after the other: for tests and debuggers."""
-    return (function(item) for item in items)
-
 
 @dataclass(frozen=True, kw_only=True)
 class BuildReport:

@@ -258,9 +258,14 @@ def stats(out: Path) -> None:
 @main.command()
 @out_argument
 @click.option("--trial", required=True, type=int, help="Row of trials.hdf5.")
-def replay(out: Path, trial: int) -> None:
+@click.option(
+    "--html",
+    type=click.Path(path_type=Path),
+    help="File to write that plays the trial in a browser.",
+)
+def replay(out: Path, trial: int, html: Path | None) -> None:
     """Run a trial again: the same outcome and contacts, or exit code 1."""
-    from drakegrasp.replay import replay_trial
+    from drakegrasp.replay import record_trial, replay_trial
 
     again = replay_trial(out, trial)
     click.echo(
@@ -271,6 +276,9 @@ def replay(out: Path, trial: int) -> None:
         click.echo(f"  {name} differs: {how}")
     for package, change in again.versions.items():
         click.echo(f"  {package}: {change}")
+    if html is not None:
+        record_trial(out, trial, html)
+        click.echo(str(html))
     if not again.same:
         sys.exit(1)
 

@@ -8,22 +8,29 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
 import dask
+import numpy.typing as npt
 from distributed import Client, Future, KilledWorker, LocalCluster, as_completed
 
 from drakegrasp.build import BuildReport, build
 from drakegrasp.builtin import export_builtin
-from drakegrasp.config import Config, load_config
+from drakegrasp.config import Config, load_config, parse_config
+from drakegrasp.dataset import GraspDataset
 from drakegrasp.errors import ConfigError, MachineError
+from drakegrasp.executor import Executor, run_here
 from drakegrasp.hand import load_hand
 from drakegrasp.manifest import BUILTIN_FOLDER, DECISIVE, claim_directory, installed_versions
 from drakegrasp.meshes import find_meshes
+from drakegrasp.progress import progress_bar
+from drakegrasp.verification import Verification
+from drakegrasp.verify_grasps import verify_tasks
+from drakegrasp.verify_plan import Mesh, plan_verification
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -104,6 +111,63 @@ def build_dataset(
             export_builtin(out / BUILTIN_FOLDER)
             sources = find_meshes(out / BUILTIN_FOLDER)
         return build(sources, out, config, DaskExecutor(client), show=show)
+
+
+def verify_grasps(
+    grasps: npt.ArrayLike,
+    mesh: Mesh | None = None,
+    *,
+    frame: str | None = None,
+    X: npt.ArrayLike | None = None,
+    X_TO: npt.ArrayLike | None = None,
+    units: str = "m",
+    hand: str | Path | None = None,
+    method: str = "hand",
+    config: Config | None = None,
+    dataset: GraspDataset | None = None,
+    rows: Sequence[int] | None = None,
+    client: Client | None = None,
+    show: bool = False,
+) -> list[Verification]:
+    """Return the verdicts on many predicted grasps, in their order; see `verify_grasp`.
+
+    Other than there a grasp whose contacts are not on the surface is no mistake of the
+    caller's: its outcome is `off_surface`.
+
+    Args:
+        grasps: (n, 6k).
+        mesh, frame, X_TO, units, hand, method, config: As for `verify_grasp`.
+        X: With frame "camera": X_TC (4, 4), or one per grasp (n, 4, 4).
+        dataset: In place of a mesh: a data file of a dataset.
+        rows: The rows of its split that the grasps are for; all of them, in order, if None.
+        client: A Dask client whose workers share the work; a plain loop here if None.
+        show: Whether to show progress on standard error.
+
+    Raises:
+        GraspError, MeshError, ConfigError, HandError, DataError: As `verify_grasp`, before
+            anything is simulated.
+        MachineError: If a worker would give other results than this machine.
+    """
+    tasks = plan_verification(
+        grasps,
+        mesh,
+        frame=frame,
+        X=X,
+        X_TO=X_TO,
+        units=units,
+        hand=hand,
+        method=method,
+        config=config,
+        dataset=dataset,
+        rows=rows,
+    )
+    execute: Executor = run_here
+    if client is not None:
+        if tasks:
+            _refuse_unfit_workers(client, parse_config(tasks[0].config))
+        execute = DaskExecutor(client)
+    with progress_bar("verify", "grasps", show=show) as report:
+        return verify_tasks(tasks, execute, report)
 
 
 @contextmanager

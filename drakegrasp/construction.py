@@ -24,6 +24,9 @@ from pydrake.geometry import (
     GeometrySet,
     InMemoryMesh,
     Mesh,
+    Meshcat,
+    MeshcatVisualizer,
+    MeshcatVisualizerParams,
     ProximityProperties,
     RoleAssign,
     SceneGraph,
@@ -54,6 +57,7 @@ from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand import Hand, make_parser
 from drakegrasp.hand_files import MODELS
 from drakegrasp.object_model import ObjectModel
+from drakegrasp.render import object_colour
 from drakegrasp.scene import HandHandles, Scene
 from drakegrasp.wavefront import obj_text
 
@@ -68,19 +72,38 @@ FINGER_DAMPING = 20.0
 FINGER_STIFFNESS = 1e-6
 #: Resolution of the few hand parts that are cylinders [m]; boxes and meshes have none.
 RESOLUTION_HINT = 0.005
+#: Pictures per simulated second where a scene is shown in Meshcat. Times of a power of two are
+#: exact, so none of them is rounded into the place of another.
+MESHCAT_RATE = 32.0
 
 
-def build_scene(model: ObjectModel, physics: PhysicsConfig, hand: Hand | None = None) -> Scene:
+def build_scene(
+    model: ObjectModel,
+    physics: PhysicsConfig,
+    hand: Hand | None = None,
+    *,
+    meshcat: Meshcat | None = None,
+) -> Scene:
     """Return the scene of an object and the table, with the hand if one is given.
 
     The object is a rigid hydroelastic surface of its exact collision mesh; the table and
     every part of the hand are compliant, so that each contact with the object is a
     hydroelastic one.
+
+    Args:
+        model: The object.
+        physics: Materials, solver and time step.
+        hand: The hand.
+        meshcat: Where to show the scene while it is simulated; that changes no bit of it.
     """
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(_plant_config(physics), builder)
     object_body = _add_object(plant, model, physics)
     table = _add_table(plant, scene_graph, physics)
+    if meshcat is not None:
+        _add_visual(plant, object_body, model)
+        rate = MeshcatVisualizerParams(publish_period=1.0 / MESHCAT_RATE)
+        MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, rate)
     handles = None
     if hand is not None:
         trajectory = builder.AddSystem(
@@ -145,6 +168,14 @@ def _add_object(plant: MultibodyPlant, model: ObjectModel, physics: PhysicsConfi
         properties,
     )
     return body
+
+
+def _add_visual(plant: MultibodyPlant, body: RigidBody, model: ObjectModel) -> None:
+    # The surface that is simulated: its number of faces is bounded, that of the file is not.
+    text = obj_text(model.collision_vertices, model.collision_faces, normals=True)
+    mesh = Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", model.name)))
+    colour = np.array([*object_colour(model.name), 1.0])
+    plant.RegisterVisualGeometry(body, RigidTransform(), mesh, "visual", colour)
 
 
 def _add_table(plant: MultibodyPlant, scene_graph: SceneGraph, physics: PhysicsConfig) -> RigidBody:

@@ -51,6 +51,10 @@ class GraspDataset:
         path: `grasping_oto.hdf5` or `grasping_otm.hdf5`.
         split: `train`, `valid` or `test`.
 
+    Attributes:
+        camera: Whose images and frame the file has, `oto` or `otm`.
+        K: (3, 3), camera matrix [px].
+
     Raises:
         DataError: If the file is missing, of another kind or schema, or the split unknown.
     """
@@ -66,6 +70,7 @@ class GraspDataset:
                 version = int(file.attrs["schema_version"])
                 self._length = len(file[split]["grasps"])
                 self.K = np.array(file.attrs["K"])
+                self.camera = str(file.attrs["camera"])
         except (OSError, KeyError) as error:
             raise DataError(
                 f"{self.path}: must be a data file of drakegrasp, got none ({error})"

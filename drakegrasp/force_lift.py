@@ -11,7 +11,7 @@ cannot give the object does not get, and it strays.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
@@ -21,14 +21,15 @@ from pydrake.multibody.plant import ExternallyAppliedSpatialForce
 from scipy.spatial.transform import Rotation
 
 from drakegrasp.config import Config
-from drakegrasp.contact_forces import ForceProgram, largest_normal_force, smallest_friction
-from drakegrasp.frames import X_WT, Array, invert_pose, rotate_vectors, rotation_angle
+from drakegrasp.contact_forces import ForceProgram, largest_normal_force
+from drakegrasp.frames import X_WT, Array, invert_pose, rotation_angle
+from drakegrasp.lift_path import LiftPath, carrying_force, lift_path
 from drakegrasp.scene import Scene, advance, reset_object
-from drakegrasp.trial import PEAK_ACCELERATION, lift_duration
-from drakegrasp.wrenches import characteristic_length, ferrari_canny
 
-#: Time steps of the simulation between two solutions of the contact forces.
-STEPS_PER_CONTROL = 5
+#: Time steps of the simulation between two solutions of the contact forces. In between, the
+#: forces keep their direction while the object turns, which drives it on as a squeezed column
+#: buckles: at 5 steps this overcame the damping of slim objects (4 of 120 lifts).
+STEPS_PER_CONTROL = 1
 #: Natural frequency omega of the object about its path, times the control period h. A mass
 #: under critically damped feedback that is held over h is stable up to omega h = 1; at a fifth
 #: of that an error dies without overshoot, as under feedback that is not sampled.
@@ -37,7 +38,7 @@ FREQUENCY_TIMES_PERIOD = 0.2
 LOST = 10.0
 
 
-class ForceOutcome(StrEnum):
+class LiftEnd(StrEnum):
     """How a lift by forces ended."""
 
     HELD = "held"  # the object arrived, in position and orientation
@@ -52,13 +53,9 @@ class ForceLift:
     """The result of one lift by forces. What was not reached is NaN or None.
 
     Attributes:
-        outcome: The verdict.
+        end: How it ended.
         planned_force: Largest normal force that the lift takes at least [N]; inf if no
             forces carry the object.
-        smallest_friction: Coefficient at which the lift would just be within the force
-            limit; inf if none is.
-        epsilon: Of Ferrari and Canny, torques divided by the largest distance of the
-            object's surface from its centre of mass.
         applied_force: Largest normal force that was applied [N].
         position_error: Distance of the object's origin from its path at the end, or when it
             was lost [m].
@@ -68,10 +65,8 @@ class ForceLift:
         message: Text of the error for `error`, else empty.
     """
 
-    outcome: ForceOutcome
+    end: LiftEnd
     planned_force: float
-    smallest_friction: float
-    epsilon: float
     applied_force: float = np.nan
     position_error: float = np.nan
     angle_error: float = np.nan
@@ -82,35 +77,11 @@ class ForceLift:
     @property
     def held(self) -> bool:
         """Whether the forces lifted the object to the target."""
-        return self.outcome is ForceOutcome.HELD
+        return self.end is LiftEnd.HELD
 
 
 class _StateError(Exception):
     """The state or the solution left the range in which it means anything."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Path:
-    """A straight minimum-jerk motion of the object's origin (Flash and Hogan, 1985)."""
-
-    start: Array  # (3,) [m]
-    target: Array  # (3,) [m]
-    duration: float  # [s]
-
-    @property
-    def peak_acceleration(self) -> Array:
-        """Largest acceleration (3,) [m/s^2]; it comes once forwards and once backwards."""
-        return PEAK_ACCELERATION * (self.target - self.start) / self.duration**2
-
-    def at(self, time: float) -> tuple[Array, Array, Array]:
-        """Return position [m], velocity [m/s] and acceleration [m/s^2] at a time [s]."""
-        s = min(time / self.duration, 1.0)
-        way = self.target - self.start
-        return (
-            self.start + way * s**3 * (10.0 - 15.0 * s + 6.0 * s**2),
-            way * 30.0 * s**2 * (1.0 - s) ** 2 / self.duration,
-            way * 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s) / self.duration**2,
-        )
 
 
 def lift_by_forces(
@@ -124,10 +95,8 @@ def lift_by_forces(
 ) -> ForceLift:
     """Return what happens when forces at contact points lift the object.
 
-    The object's origin moves on a straight minimum-jerk path, orientation kept, within the
-    limits of the palm's lift, and then stays for `lift.hold_time`. Its target is p_TO =
-    `lift.p_TG`: there is no palm that could be brought there. Friction is
-    `physics.friction_hand`. The same arguments give the same bits, whatever ran before.
+    The object moves along `lift_path.lift_path`, and then stays for `lift.hold_time`. Friction
+    is `physics.friction_hand`. The same arguments give the same bits, whatever ran before.
 
     Args:
         scene: Of the object, without a hand.
@@ -142,58 +111,22 @@ def lift_by_forces(
     """
     if scene.handles is not None:
         raise ValueError("the scene must have no hand, got one with a hand")
-    X_WO = X_WT @ np.asarray(X_TO, dtype=float)
-    path = _path_from(X_WO[:3, 3], config)
-    loads = _loads(scene, X_WO, path)
-    model, friction = scene.model, config.physics.friction_hand
-    program = ForceProgram(p_OQ, nhat_Q_O, model.p_OOcm, friction)
-    planned = ForceLift(
-        outcome=ForceOutcome.INFEASIBLE,
-        planned_force=largest_normal_force(program, loads),
-        smallest_friction=smallest_friction(p_OQ, nhat_Q_O, model.p_OOcm, loads, force_limit),
-        epsilon=ferrari_canny(
-            p_OQ,
-            nhat_Q_O,
-            model.p_OOcm,
-            friction=friction,
-            length=characteristic_length(model.visual_vertices, model.p_OOcm),
-        ),
-    )
-    if not np.isfinite(planned.planned_force):
-        return planned
-    if planned.planned_force > force_limit:
-        return replace(planned, outcome=ForceOutcome.OVER_LIMIT)
-    hand = _Fingers(scene, np.asarray(p_OQ, dtype=float), program, force_limit)
+    path = lift_path(X_TO, config)
+    program = ForceProgram(p_OQ, nhat_Q_O, scene.model.p_OOcm, config.physics.friction_hand)
+    force = largest_normal_force(program, path.wrenches(scene.model))
+    if not np.isfinite(force):
+        return ForceLift(end=LiftEnd.INFEASIBLE, planned_force=force)
+    if force > force_limit:
+        return ForceLift(end=LiftEnd.OVER_LIMIT, planned_force=force)
+    fingers = _Fingers(scene, np.asarray(p_OQ, dtype=float), program, force_limit)
     try:
-        return _simulate(hand, planned, X_WO, path, config)
+        return _simulate(fingers, force, path, config)
     # A failed assertion within Drake arrives as SystemExit, everything else as RuntimeError.
     except (RuntimeError, SystemExit, _StateError) as error:
         lines = str(error).strip().splitlines() or [type(error).__name__]
-        return replace(planned, outcome=ForceOutcome.ERROR, message=lines[0])
+        return ForceLift(end=LiftEnd.ERROR, planned_force=force, message=lines[0])
     finally:
-        hand.let_go()
-
-
-def _path_from(p_WO: Array, config: Config) -> _Path:
-    target = X_WT[:3, 3] + config.lift.p_TG
-    duration = lift_duration(float(np.linalg.norm(target - p_WO)), config)
-    # The object may start at its target.
-    return _Path(start=p_WO, target=target, duration=max(duration, config.physics.time_step))
-
-
-def _loads(scene: Scene, X_WO: Array, path: _Path) -> Array:
-    """Return the wrenches (2, 6) of the path's largest accelerations, about Ocm in {O}.
-
-    The orientation is kept, so no wrench of the lift has a torque, and all lie between these.
-    """
-    peaks = np.array([path.peak_acceleration, -path.peak_acceleration])
-    forces_W = scene.model.mass * (peaks - _gravity(scene))
-    return np.hstack([np.zeros((2, 3)), rotate_vectors(invert_pose(X_WO), forces_W)])
-
-
-def _gravity(scene: Scene) -> Array:
-    """Return the acceleration of gravity (3,) in {W} [m/s^2]."""
-    return np.array(scene.plant.gravity_field().gravity_vector())
+        fingers.let_go()
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,27 +165,27 @@ class _Fingers:
         port.FixValue(self.scene.context, applied)
 
 
-def _simulate(
-    fingers: _Fingers, planned: ForceLift, X_WO: Array, path: _Path, config: Config
-) -> ForceLift:
+def _simulate(fingers: _Fingers, planned: float, path: LiftPath, config: Config) -> ForceLift:
     scene = fingers.scene
     period = STEPS_PER_CONTROL * config.physics.time_step
     steps = int(np.ceil((path.duration + config.lift.hold_time) / period))
     fingers.let_go()
-    reset_object(scene, X_WO)
+    reset_object(scene, path.X_WO)
     scene.simulator.Initialize()
     largest, done = 0.0, 0
     deviation = (0.0, 0.0)
     while done < steps and _within(deviation, config, LOST):
-        wrench_O = _wanted_wrench(scene, X_WO[:3, :3], path, FREQUENCY_TIMES_PERIOD / period)
+        wrench_O = _wanted_wrench(scene, path, FREQUENCY_TIMES_PERIOD / period)
         largest = max(largest, fingers.push(wrench_O))
         advance(scene, period)
-        deviation = _deviation(scene, X_WO[:3, :3], path)
+        deviation = _deviation(scene, path)
         done += 1
+    if not np.isfinite(deviation).all():
+        raise _StateError("the object's pose must stay finite, got one that is not")
     arrived = done == steps and _within(deviation, config, 1.0)
-    return replace(
-        planned,
-        outcome=ForceOutcome.HELD if arrived else ForceOutcome.STRAYED,
+    return ForceLift(
+        planned_force=planned,
+        end=LiftEnd.HELD if arrived else LiftEnd.STRAYED,
         applied_force=largest,
         position_error=deviation[0],
         angle_error=deviation[1],
@@ -261,11 +194,11 @@ def _simulate(
     )
 
 
-def _deviation(scene: Scene, R_WO_path: Array, path: _Path) -> tuple[float, float]:
+def _deviation(scene: Scene, path: LiftPath) -> tuple[float, float]:
     """Return how far the object is from its path now [m], and by how much it is turned [rad]."""
     X_WO = scene.pose(scene.object)
     p, _, _ = path.at(scene.time)
-    return float(np.linalg.norm(X_WO[:3, 3] - p)), rotation_angle(X_WO[:3, :3] @ R_WO_path.T)
+    return float(np.linalg.norm(X_WO[:3, 3] - p)), rotation_angle(X_WO[:3, :3] @ path.R_WO.T)
 
 
 def _within(deviation: tuple[float, float], config: Config, times: float) -> bool:
@@ -275,7 +208,7 @@ def _within(deviation: tuple[float, float], config: Config, times: float) -> boo
     return all(d <= times * limit for d, limit in zip(deviation, allowed, strict=True))
 
 
-def _wanted_wrench(scene: Scene, R_WO_path: Array, path: _Path, frequency: float) -> Array:
+def _wanted_wrench(scene: Scene, path: LiftPath, frequency: float) -> Array:
     """Return the wrench (6,) about Ocm in {O} that carries the object along its path.
 
     Against gravity and inertia, plus critically damped feedback of both errors: with a
@@ -290,12 +223,12 @@ def _wanted_wrench(scene: Scene, R_WO_path: Array, path: _Path, frequency: float
 
     # The path is that of the origin; forces act on the centre of mass.
     arm = R_WO @ model.p_OOcm
-    position_error = p + R_WO_path @ model.p_OOcm - (X_WO[:3, 3] + arm)
+    position_error = p + path.R_WO @ model.p_OOcm - (X_WO[:3, 3] + arm)
     velocity_error = v - (velocity.translational() + np.cross(turning, arm))
     acceleration = a + frequency**2 * position_error + 2.0 * frequency * velocity_error
-    force_W = model.mass * (acceleration - _gravity(scene))
+    force_W = carrying_force(model, acceleration)
 
-    angle_error = Rotation.from_matrix(R_WO_path @ R_WO.T).as_rotvec()
+    angle_error = Rotation.from_matrix(path.R_WO @ R_WO.T).as_rotvec()
     I_W = R_WO @ model.I_OOcm_O @ R_WO.T
     spin = I_W @ (frequency**2 * angle_error - 2.0 * frequency * turning)
     torque_W = spin + np.cross(turning, I_W @ turning)  # Euler's equation

@@ -9,12 +9,14 @@ import h5py
 import numpy as np
 
 from drakegrasp.assemble import TRIALS_FILE
+from drakegrasp.candidates import Attempt
 from drakegrasp.construction import build_scene
 from drakegrasp.errors import DataError
 from drakegrasp.hand import load_hand
-from drakegrasp.manifest import installed_versions, read_manifest
+from drakegrasp.manifest import Manifest, installed_versions, read_manifest
 from drakegrasp.outcomes import Outcome
-from drakegrasp.prepared import load_prepared
+from drakegrasp.prepared import PreparedObject, load_prepared
+from drakegrasp.recording import record_attempt
 from drakegrasp.shards import ShardHeader, trial_columns
 from drakegrasp.units import Workbench, trial_rows, try_on, unit_attempts
 
@@ -53,14 +55,62 @@ def replay_trial(out: str | Path, trial_id: int) -> Replay:
     Raises:
         DataError: If the dataset or the trial is not there.
     """
-    out = Path(out)
-    manifest = read_manifest(out)
-    config = manifest.config
-    stored, name = _stored_row(out, trial_id)
-    prepared = load_prepared(out, name, config)
+    stored = _stored_trial(Path(out), trial_id)
+    prepared, config = stored.prepared, stored.manifest.config
     scene = build_scene(prepared.model, config.physics, load_hand(config.hand))
     bench = Workbench(prepared=prepared, config=config, scene=scene)
-    candidate = int(stored["candidate"])
+    again = trial_rows(bench, [stored.attempt], [try_on(bench, stored.attempt)])
+    now = installed_versions(config)
+    return Replay(
+        trial_id=trial_id,
+        object_name=prepared.model.name,
+        recorded=Outcome(int(stored.row["outcome"])),
+        found=Outcome(int(again["outcome"][0])),
+        differences={
+            field.name: _difference(stored.row[field.name], again[field.name][0])
+            for field in trial_columns()
+            if not np.array_equal(stored.row[field.name], again[field.name][0], equal_nan=True)
+        },
+        versions={
+            key: f"{then} -> {now.get(key)}"
+            for key, then in stored.manifest.versions.items()
+            if now.get(key) != then
+        },
+    )
+
+
+def record_trial(out: str | Path, trial_id: int, path: str | Path) -> Outcome:
+    """Run one trial of a dataset again and write an HTML file that plays it, see `recording`.
+
+    Returns:
+        The outcome now.
+
+    Raises:
+        DataError: If the dataset or the trial is not there.
+        OSError: If the file cannot be written.
+    """
+    stored = _stored_trial(Path(out), trial_id)
+    model, X_TO = stored.prepared.model, stored.prepared.X_TO
+    config = stored.manifest.config
+    return record_attempt(model, X_TO, stored.attempt, config, Path(path)).outcome
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _StoredTrial:
+    """A row of trials.hdf5 and what it was tried with."""
+
+    row: dict[str, np.ndarray]
+    prepared: PreparedObject
+    attempt: Attempt
+    manifest: Manifest
+
+
+def _stored_trial(out: Path, trial_id: int) -> _StoredTrial:
+    manifest = read_manifest(out)
+    config = manifest.config
+    row, name = _stored_row(out, trial_id)
+    prepared = load_prepared(out, name, config)
+    candidate = int(row["candidate"])
     header = ShardHeader(
         config_hash=config.simulation_hash(),
         mesh_sha256=prepared.model.mesh_sha256,
@@ -68,25 +118,8 @@ def replay_trial(out: str | Path, trial_id: int) -> Replay:
         start=candidate,
         stop=candidate + 1,
     )
-    attempt = unit_attempts(prepared, header, config)[int(stored["standoff_index"])]
-    again = trial_rows(bench, [attempt], [try_on(bench, attempt)])
-    now = installed_versions(config)
-    return Replay(
-        trial_id=trial_id,
-        object_name=name,
-        recorded=Outcome(int(stored["outcome"])),
-        found=Outcome(int(again["outcome"][0])),
-        differences={
-            field.name: _difference(stored[field.name], again[field.name][0])
-            for field in trial_columns()
-            if not np.array_equal(stored[field.name], again[field.name][0], equal_nan=True)
-        },
-        versions={
-            key: f"{then} -> {now.get(key)}"
-            for key, then in manifest.versions.items()
-            if now.get(key) != then
-        },
-    )
+    attempt = unit_attempts(prepared, header, config)[int(row["standoff_index"])]
+    return _StoredTrial(row=row, prepared=prepared, attempt=attempt, manifest=manifest)
 
 
 def _stored_row(out: Path, trial_id: int) -> tuple[dict[str, np.ndarray], str]:

@@ -49,6 +49,14 @@ _REASONS = {
     Outcome.SOLVER_ERROR: "the simulator failed, which says nothing about the grasp",
     Outcome.TIMEOUT: "the wall-clock limit passed, which says nothing about the grasp",
 }
+#: The verdict on a lift by forces.
+_ENDS = {
+    LiftEnd.HELD: Outcome.SUCCESS,
+    LiftEnd.INFEASIBLE: Outcome.DROPPED,
+    LiftEnd.OVER_LIMIT: Outcome.DROPPED,
+    LiftEnd.STRAYED: Outcome.SLIPPED,
+    LiftEnd.ERROR: Outcome.SOLVER_ERROR,
+}
 #: What a failed grasp is called when several wrist poses failed differently: the last that
 #: applies, as that one came farthest.
 _RANK = (
@@ -129,6 +137,33 @@ def _by_hand(base: Verification, config: Config) -> Verification:
             return replace(results[-1], tries=tries)
     farthest = max(results, key=lambda result: _RANK.index(result.outcome))
     return replace(farthest, tries=len(near))
+
+
+def _by_forces(base: Verification, config: Config) -> Verification:
+    limit = load_hand(config.hand).fingertip_force_limit
+    with _timed(base.seconds, "simulate"):
+        scene = scene_of(base.placed.model, config.physics, None)
+        lift = lift_by_forces(
+            scene,
+            rest_pose(base.placed.X_TO),
+            base.p_OQ,
+            base.nhat_Q_O,
+            force_limit=limit,
+            config=config,
+        )
+    if lift.end is LiftEnd.ERROR:
+        forget_scenes()
+    moved = f"{_mm(lift.position_error)} and {np.rad2deg(lift.angle_error):.1f}°"
+    reasons = {
+        LiftEnd.HELD: f"forces of at most {lift.applied_force:.1f} N carry it, and it arrives "
+        f"within {moved}",
+        LiftEnd.INFEASIBLE: "no forces within the friction cones carry it",
+        LiftEnd.OVER_LIMIT: f"it takes a normal force of {lift.planned_force:.1f} N, more than a "
+        f"fingertip's {limit:g} N",
+        LiftEnd.STRAYED: f"under the forces it strays from its path, by {moved}",
+        LiftEnd.ERROR: f"the simulator failed, which says nothing about the grasp: {lift.message}",
+    }
+    return replace(base, outcome=_ENDS[lift.end], reason=reasons[lift.end], lift=lift)
 
 
 def _misfit(fit: WristFit, config: Config) -> str:

@@ -48,7 +48,8 @@ def grasp_map(p_OQ: npt.ArrayLike, p_OOcm: npt.ArrayLike) -> Array:
     """
     arms = np.asarray(p_OQ, dtype=float) - np.asarray(p_OOcm, dtype=float)
     # Column j of a block is the moment of the unit force along axis j.
-    moments = np.cross(arms[:, None, :], np.eye(3)).transpose(2, 0, 1).reshape(3, -1)
+    with np.errstate(invalid="ignore"):
+        moments = np.cross(arms[:, None, :], np.eye(3)).transpose(2, 0, 1).reshape(3, -1)
     return np.vstack([moments, np.tile(np.eye(3), len(arms))])
 
 

@@ -24,9 +24,9 @@ UNIT = 0.005**2
 #: Unit of the clearance over the table [m].
 CLEARANCE_UNIT = 0.01
 #: Share of the identity in the scaling matrix; it keeps steps short where contacts say little.
-DAMPING = 1e-3
+DAMPING = 3e-4
 #: SLSQP stops after so many iterations, or when the objective changes by less than this.
-MAX_ITERATIONS, TOLERANCE = 50, 1e-4
+MAX_ITERATIONS, TOLERANCE = 50, 1e-3
 #: Steps of Newton's method that bring each pad onto its point.
 REFINEMENTS = 3
 

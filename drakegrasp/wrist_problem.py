@@ -113,8 +113,11 @@ class Evaluation:
         p_FiQ: (k, 3), the predicted points in the fingertips' frames [m].
         contact: Where they stand to the pads.
         pad_normals_O: (k, 3), outward normals of the pads there, in {O}.
-        residuals: (r,), weighted misfits [m]; the objective is their sum of squares.
-        jacobian: (r, n), their derivatives.
+        residuals: (r,), weighted misfits [m]; the objective is their sum of squares. Those of
+            normals and closing directions are vectors expressed in {G}.
+        jacobian: (r, n), their derivatives. Where the residual is a vector in {G} it is the
+            derivative seen from {O}: not that of its three numbers, as {G} turns with x.
+            The slope of the objective is exactly 2 residuals @ jacobian.
         clearance: (1 + k,), heights of palm and fingertips above the table [m].
         clearance_jacobian: (1 + k, n).
     """

@@ -9,7 +9,8 @@ import pytest
 import trimesh
 from hypothesis import settings
 
-from drakegrasp.build import build, run_here
+from drakegrasp.build import build
+from drakegrasp.executor import run_here
 from drakegrasp.builtin import export_builtin
 from drakegrasp.config import Config, load_config
 from drakegrasp.meshes import find_meshes

@@ -13,7 +13,8 @@ import trimesh
 from assertions import assert_same_dataset
 
 from drakegrasp.assemble import assemble
-from drakegrasp.build import build, run_here
+from drakegrasp.build import build
+from drakegrasp.executor import run_here
 from drakegrasp.check import check_dataset
 from drakegrasp.cluster import build_dataset
 from drakegrasp.config import Config, load_config

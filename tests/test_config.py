@@ -84,6 +84,15 @@ filters:
 split:
   valid_fraction: 0.2
   train_classes: [mug, bottle]
+verify:
+  max_surface_distance: 0.02
+  max_residual: 0.005
+  max_normal_error_deg: 30.0
+  max_contact_error: 0.015
+  open_margin_deg: 10.0
+  max_tries: 3
+  max_position_error: 0.02
+  max_angle_error_deg: 10.0
 """
 
 #: Where the released code differs from the paper (original_system.md, 2.1); its hand's
@@ -135,8 +144,8 @@ PAPER = {
     "split.train_classes": None,
 }
 
-#: They act on assembled shards, or say only where to stop.
-NOT_SIMULATED = ("filters", "split", "max_grasps", "attempt_seconds")
+#: They act on assembled shards or on predicted grasps, or say only where to stop.
+NOT_SIMULATED = ("filters", "split", "max_grasps", "attempt_seconds", "verify")
 
 
 def leaves(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-import yaml
+from hands import PINCER, PINCER_SDF, changed_finger, write_pincer
 from pydrake.geometry import Box, Convex, Cylinder, Role, SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
@@ -29,7 +29,9 @@ from drakegrasp.kinematics import coordinate_limits, fingertip_poses, joint_posi
 PALM_SURFACE = 0.0793
 #: Tip of the official Denavit-Hartenberg table in the distal link's frame [m].
 P_FiT = np.array([0.050, 0.0095, 0.0])
-#: Spread, proximal angle [deg], finger; T, pad point [m], pad normal in base axes.
+#: Veres' fingertip sensor in the distal link's frame [m], and the surface's normal there.
+P_FiV, N_FiV = np.array([0.0401, 0.0106, 0.0]), np.array([0.041, 0.999, 0.0])
+#: Spread, proximal angle [deg], finger; T, V [m], normal at V in base axes.
 TABLE = """
 0 0 F1 -0.0250 -0.1521 0.0385 -0.0250 -0.1438 0.0330 0.000 0.611 0.792
 0 0 F2 0.0250 -0.1521 0.0385 0.0250 -0.1438 0.0330 0.000 0.611 0.792
@@ -56,34 +58,6 @@ LINKS = {
     "spread": (0.14109, (-0.0123, -0.0123, -0.0389), (0.0650, 0.0123, 0.0150)),
     "proximal": (0.062139, (-0.0125, -0.0125, -0.0105), (0.0794, 0.0150, 0.0105)),
     "distal": (0.04166, (-0.0095, -0.0095, -0.0115), (0.0590, 0.01105, 0.0115)),
-}
-#: A gripper whose two fingers face each other along y, hinged at y = -+0.04, length 0.1.
-PINCER_SDF = """<sdf version="1.9"><model name="pincer">
-  <link name="palm"/>
-  <link name="mount"><pose>0 -0.04 0.02 0 0 0</pose></link>
-  <link name="left"><pose>0 -0.04 0.02 0 0 0</pose></link>
-  <link name="right"><pose>0 0.04 0.02 0 0 0</pose></link>
-  <joint name="fixed" type="fixed"><parent>palm</parent><child>mount</child></joint>
-  <joint name="left_hinge" type="revolute"><parent>mount</parent><child>left</child>
-    <axis><xyz>-1 0 0</xyz><limit><lower>-0.1</lower><upper>1</upper></limit></axis></joint>
-  <joint name="right_hinge" type="revolute"><parent>palm</parent><child>right</child>
-    <axis><xyz>1 0 0</xyz><limit><lower>0</lower><upper>1</upper></limit></axis></joint>
-</model></sdf>"""
-PINCER = {
-    "model": "pincer.sdf",
-    "palm": {"link": "palm", "p_BG": [0.0, 0.0, 0.01]},
-    "fingers": [
-        {
-            "name": side,
-            "fingertip": side,
-            "closing_joint": f"{side}_hinge",
-            "torque_limit": 1.0,
-            "pad_point": [0.0, 0.0, 0.1],
-        }
-        for side, sign in (("left", 1), ("right", -1))
-    ],
-    "closing_speed_deg": 90.0,
-    "fingertip_force_limit": 10.0,
 }
 
 
@@ -118,17 +92,6 @@ def drake_fingertip_poses(hand: Hand, spread: float, closing: Array) -> Array:
     )
 
 
-def write_pincer(folder: Path, **changes: object) -> Path:
-    (folder / "pincer.sdf").write_text(PINCER_SDF)
-    path = folder / "pincer_hand.yaml"
-    path.write_text(yaml.safe_dump({**PINCER, **changes}))
-    return path
-
-
-def changed_finger(**changes: object) -> list[object]:
-    return [{**PINCER["fingers"][0], **changes}, PINCER["fingers"][1]]
-
-
 def test_barrett_is_the_only_hand_and_has_the_fields_of_its_file(hand: Hand) -> None:
     assert hand_names() == ["barrett"]
     assert hand.name == "barrett"
@@ -143,16 +106,15 @@ def test_barrett_is_the_only_hand_and_has_the_fields_of_its_file(hand: Hand) -> 
 @pytest.mark.parametrize("row", TABLE.strip().splitlines())
 def test_forward_kinematics_agrees_with_the_table(hand: Hand, row: str) -> None:
     spread, proximal, name, *numbers = row.split()
-    T, pad, n = np.array(numbers, dtype=float).reshape(3, 3)
+    T, V, n = np.array(numbers, dtype=float).reshape(3, 3)
     i = [finger.name for finger in hand.fingers].index(name)
     closing = np.full(3, np.deg2rad(float(proximal)))
     X_BFi = hand.X_BG @ fingertip_poses(hand, spread=np.deg2rad(float(spread)), closing=closing)[i]
     # The table is rounded to 0.1 mm; the brief for the model is half a millimetre.
     lift = [0.0, 0.0, PALM_SURFACE]
-    finger = hand.fingers[i]
     assert np.linalg.norm(X_BFi[:3, :3] @ P_FiT + X_BFi[:3, 3] - lift - T) < 5e-4
-    assert np.linalg.norm(X_BFi[:3, :3] @ finger.p_FiP + X_BFi[:3, 3] - lift - pad) < 5e-4
-    np.testing.assert_allclose(X_BFi[:3, :3] @ finger.n_Fi, n, atol=1e-3)
+    assert np.linalg.norm(X_BFi[:3, :3] @ P_FiV + X_BFi[:3, 3] - lift - V) < 5e-4
+    np.testing.assert_allclose(X_BFi[:3, :3] @ N_FiV, n, atol=1e-3)
 
 
 def test_numpy_and_drake_have_the_same_forward_kinematics(hand: Hand) -> None:
@@ -300,12 +262,10 @@ def test_a_hand_of_two_fingers_without_spread_loads(tmp_path: Path) -> None:
     # Each finger leans inwards by its own angle about its hinge, 10 mm above the palm frame.
     X_GF = fingertip_poses(pincer, spread=0.0, closing=[0.2, 0.5])
     for X, finger, y, angle in zip(X_GF, pincer.fingers, (-0.04, 0.04), (0.2, 0.5), strict=True):
-        inward = -np.sign(y)
+        inward, (s, c) = -np.sign(y), (np.sin(angle), np.cos(angle))
         p_GP = X[:3, :3] @ finger.p_FiP + X[:3, 3]
-        expected = [0.0, y + inward * 0.1 * np.sin(angle), 0.01 + 0.1 * np.cos(angle)]
+        expected = [0.0, y + inward * (0.09 * s + 0.01 * c), 0.01 + 0.09 * c - 0.01 * s]
         np.testing.assert_allclose(p_GP, expected, atol=1e-12)
-        n_G = X[:3, :3] @ finger.n_Fi
-        np.testing.assert_allclose(n_G, [0.0, inward * np.cos(angle), -np.sin(angle)], atol=1e-12)
     np.testing.assert_allclose(
         X_GF, drake_fingertip_poses(pincer, 0.0, np.array([0.2, 0.5])), atol=1e-12
     )
@@ -395,8 +355,7 @@ def test_text_that_is_no_mapping_is_refused(tmp_path: Path, text: str) -> None:
 
 
 def test_a_sliding_joint_is_refused(tmp_path: Path) -> None:
-    path = write_pincer(tmp_path)
-    (tmp_path / "pincer.sdf").write_text(PINCER_SDF.replace("revolute", "prismatic"))
+    path = write_pincer(tmp_path, PINCER_SDF.replace("revolute", "prismatic"))
     with pytest.raises(HandError, match=r"'left_hinge' must be revolute or fixed, got Prismatic"):
         load_hand(path)
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 import drakegrasp.union
 from drakegrasp.audit import audit
+from drakegrasp.config import ObjectConfig
 from drakegrasp.decimation import decimate
 from drakegrasp.errors import MeshError
 from drakegrasp.meshes import MeshSource, find_meshes, load_mesh

@@ -23,6 +23,8 @@ TABLE = [
     ("solver_error", 10, PLACED, True),
     ("timeout", 11, PLACED, True),
     ("crashed", 12, PLACED, True),
+    ("unreachable", 13, PLACED, False),
+    ("off_surface", 14, PLACED, False),
 ]
 
 
@@ -54,5 +56,9 @@ def test_stages_are_ordered_and_frozen() -> None:
 
 
 def test_number_of_no_outcome_is_refused() -> None:
-    with pytest.raises(ValueError, match="13"):
-        Outcome(13)
+    with pytest.raises(ValueError, match="15"):
+        Outcome(15)
+
+
+def test_no_file_of_a_dataset_holds_what_only_verification_tells() -> None:
+    assert {o.label for o in Outcome if o.only_verified} == {"unreachable", "off_surface"}

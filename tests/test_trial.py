@@ -255,7 +255,7 @@ def test_lift_keeps_its_speed_and_acceleration_limits(scene, cube, config):
         scene,
         X_WT @ standing(cube),
         X_WT @ standing(cube) @ from_above(cube, 0.25).X_OG,
-        0.0,
+        spread=0.0,
     )
     advance(scene, 4.0)  # fingers that start and stop shake the wrist
     release(scene)

@@ -1,0 +1,24 @@
+"""Who does the work: the plain loop, and what any other way to run tasks looks like.
+
+`run_here` is the plain loop; `drakegrasp.cluster` has the one on Dask.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Protocol, TypeVar
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+class Executor(Protocol):
+    """Runs a function on items, somewhere, and yields the results in any order."""
+
+    def __call__(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+        """Yield function(item) of every item; items are taken as there is room for them."""
+
+
+def run_here(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """Run in this process, one after the other: for tests and debuggers."""
+    return (function(item) for item in items)

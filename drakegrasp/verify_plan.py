@@ -1,0 +1,175 @@
+"""What a caller asks to be verified, as tasks: grasps with their objects, in {O}.
+
+In: grasp vectors in any of three frames, with a mesh, or with the rows of a dataset that
+they were predicted for. Out: `VerifyTask`s, plain data that can cross a process border. All
+of a caller's mistakes are found here, before anything is simulated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+
+from drakegrasp.config import Config, load_config, parse_config
+from drakegrasp.dataset import GraspDataset
+from drakegrasp.errors import GraspError
+from drakegrasp.frames import Array, unpack_pose
+from drakegrasp.hand import load_hand
+from drakegrasp.manifest import read_manifest
+from drakegrasp.placed import Placed, PlacedObject, place_object
+from drakegrasp.prediction import read_grasps, read_pose, refuse_other_units, to_object_frame
+from drakegrasp.prepared import load_prepared
+from drakegrasp.verification import Verification
+from drakegrasp.verify import METHODS, verify_contacts
+
+#: Grasps in a task: some ten seconds of work.
+TASK_GRASPS = 8
+
+Mesh = str | Path | trimesh.Trimesh | Placed
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class VerifyTask:
+    """Some grasps of one object.
+
+    Attributes:
+        indices: Which of the caller's grasps they are.
+        placed: The object on the table.
+        p_OQ, nhat_Q_O: (m, k, 3), contact points [m] and outward unit normals.
+        method: "hand" or "forces".
+        config: `Config.to_dict()`.
+    """
+
+    indices: tuple[int, ...]
+    placed: PlacedObject
+    p_OQ: Array
+    nhat_Q_O: Array
+    method: str
+    config: dict[str, Any]
+
+
+def run_task(task: VerifyTask) -> tuple[tuple[int, ...], list[Verification]]:
+    """Verify the grasps of a task, one after the other."""
+    config = parse_config(task.config)
+    results = [
+        verify_contacts(task.placed, p, n, method=task.method, config=config)
+        for p, n in zip(task.p_OQ, task.nhat_Q_O, strict=True)
+    ]
+    return task.indices, results
+
+
+def plan_verification(
+    grasps: npt.ArrayLike,
+    mesh: Mesh | None,
+    *,
+    frame: str | None,
+    X: npt.ArrayLike | None,
+    X_TO: npt.ArrayLike | None,
+    units: str,
+    hand: str | Path | None,
+    method: str,
+    config: Config | None,
+    dataset: GraspDataset | None,
+    rows: Sequence[int] | None,
+) -> list[VerifyTask]:
+    """Return the tasks of some grasps; the arguments are those of `verify_grasps`.
+
+    Raises:
+        GraspError: If a grasp, frame or pose cannot be used.
+        MeshError: If the mesh cannot be simulated.
+        ConfigError, HandError, DataError: If configuration, hand or dataset cannot be used.
+    """
+    if method not in METHODS:
+        raise GraspError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
+    if (mesh is None) == (dataset is None):
+        raise GraspError("a mesh or a dataset must be given, and not both")
+    if dataset is None:
+        config = _with_hand(config or load_config(), hand)
+        points, normals = read_grasps(grasps, load_hand(config.hand).num_fingers)
+        if rows is not None:
+            raise GraspError("rows must be None without a dataset, got some")
+        assert mesh is not None
+        placed = place_object(mesh, units=units, X_TO=X_TO, config=config)
+        pose = None if X is None else read_pose(X, "X")
+        groups = [(placed, np.arange(len(points)), pose)]
+        frame = frame or "object"
+    else:
+        for name, value in (("X", X), ("X_TO", X_TO)):
+            if value is not None:
+                raise GraspError(f"{name} must be None with a dataset, which has it, got a pose")
+        out = dataset.path.parent
+        known = read_manifest(out).config
+        config = _with_hand(config or known, hand)
+        points, normals = read_grasps(grasps, load_hand(config.hand).num_fingers)
+        chosen = _chosen_rows(dataset, rows, len(points))
+        frame = frame or "camera"
+        groups = _objects_of_rows(dataset, out, known, chosen, with_camera=frame == "camera")
+    tasks = []
+    for placed, indices, pose in groups:
+        p_OQ, nhat_Q_O = to_object_frame(
+            points[indices], normals[indices], frame=frame, X=pose, X_TO=placed.X_TO
+        )
+        refuse_other_units(p_OQ, placed.model.half_extents)
+        for start in range(0, len(indices), TASK_GRASPS):
+            part = slice(start, start + TASK_GRASPS)
+            tasks.append(
+                VerifyTask(
+                    indices=tuple(indices[part].tolist()),
+                    placed=placed,
+                    p_OQ=p_OQ[part],
+                    nhat_Q_O=nhat_Q_O[part],
+                    method=method,
+                    config=config.to_dict(),
+                )
+            )
+    return tasks
+
+
+def _with_hand(config: Config, hand: str | Path | None) -> Config:
+    return config if hand is None else parse_config({**config.to_dict(), "hand": str(hand)})
+
+
+def _chosen_rows(
+    dataset: GraspDataset, rows: Sequence[int] | None, count: int
+) -> npt.NDArray[np.int64]:
+    chosen = np.arange(count) if rows is None else np.asarray(rows, dtype=np.int64).ravel()
+    if len(chosen) != count:
+        raise GraspError(f"rows must be one per grasp ({count}), got {len(chosen)}")
+    if rows is None and count != len(dataset):
+        raise GraspError(
+            f"there must be a grasp for each of the {len(dataset)} rows of {dataset.split} in "
+            f"{dataset.path.name}, or rows, got {count} grasps"
+        )
+    wrong = chosen[(chosen < 0) | (chosen >= len(dataset))]
+    if len(wrong):
+        raise GraspError(
+            f"rows must be 0 to {len(dataset) - 1} of {dataset.split} in {dataset.path.name}, "
+            f"got {wrong[0]}"
+        )
+    return chosen
+
+
+def _objects_of_rows(
+    dataset: GraspDataset,
+    out: Path,
+    config: Config,
+    rows: npt.NDArray[np.int64],
+    *,
+    with_camera: bool,
+) -> list[tuple[PlacedObject, npt.NDArray[np.int64], Array | None]]:
+    """Return each object with the indices of its grasps and their cameras' poses."""
+    names = dataset.column("object_props/object_name")[rows]
+    X_TC = unpack_pose(dataset.column(f"object_props/frame_work2cam_{dataset.camera}")[rows])
+    groups = []
+    for name in dict.fromkeys(names.tolist()):
+        indices = np.flatnonzero(names == name)
+        placed = place_object(load_prepared(out, name, config), config=config)
+        poses = read_pose(X_TC[indices], "the camera's pose") if with_camera else None
+        groups.append((placed, indices, poses))
+    return groups
