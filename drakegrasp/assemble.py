@@ -24,15 +24,13 @@ from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal, Successes, judge_successes, split_samples
 from drakegrasp.frames import Array, invert_pose, transform_points, unpack_pose
 from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp
-from drakegrasp.manifest import Manifest, read_manifest
+from drakegrasp.manifest import Manifest, read_manifest, write_origin
 from drakegrasp.parts import Part, walk_parts
 from drakegrasp.progress import Report, silent
 from drakegrasp.samples import create_splits, write_samples
 from drakegrasp.schema import (
     CAMERAS,
-    CONVENTIONS,
     OBJECT_FIELDS,
-    SCHEMA_VERSION,
     SPLITS,
     SUCCESS_FIELDS,
     TRIAL_FIELDS,
@@ -177,13 +175,8 @@ def _signature(manifest: Manifest) -> str:
 
 def _write_attributes(file: h5py.File, manifest: Manifest) -> None:
     camera = manifest.config.camera
-    file.attrs.update({f"convention_{key}": text for key, text in CONVENTIONS.items()})
-    file.attrs["schema_version"] = SCHEMA_VERSION
+    write_origin(file, manifest.config, manifest.versions)
     file.attrs["signature"] = _signature(manifest)
-    file.attrs["config"] = json.dumps(manifest.config.to_dict(), sort_keys=True)
-    file.attrs["config_hash"] = manifest.config.simulation_hash()
-    file.attrs["seed"] = manifest.config.seed
-    file.attrs["versions"] = json.dumps(manifest.versions, sort_keys=True)
     file.attrs["K"] = intrinsics(camera)
     file.attrs["near"], file.attrs["far"] = camera.near, camera.far
 

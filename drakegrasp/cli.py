@@ -18,13 +18,13 @@ from rich.measure import Measurement
 from rich.table import Table
 
 from drakegrasp import __version__
-from drakegrasp.errors import ConfigError, DrakegraspError, HandError, MeshError
+from drakegrasp.errors import ConfigError, DrakegraspError, GraspError, HandError, MeshError
 
 if TYPE_CHECKING:
     from drakegrasp.build import BuildReport
 
 #: Errors of what was asked for, as against errors of what was done.
-WRONG_USAGE = (ConfigError, HandError, MeshError)
+WRONG_USAGE = (ConfigError, GraspError, HandError, MeshError)
 #: Width of tables where standard output is not a terminal [characters]: as wide as they are.
 WIDTH = 1000
 
@@ -47,7 +47,8 @@ class _Commands(click.Group):
             click.echo(f"error: {str(error).strip().splitlines()[0]}", err=True)
             ctx.exit(1)
         except KeyboardInterrupt:
-            click.echo("stopped; the same command goes on from here", err=True)
+            goes_on = ctx.invoked_subcommand == "build"
+            click.echo(f"stopped{'; the same command goes on from here' * goes_on}", err=True)
             ctx.exit(130)
 
 
@@ -59,6 +60,24 @@ manifest_option = click.option(
     "--manifest",
     type=click.Path(path_type=Path),
     help="YAML file with units and classes by mesh.  [default: objects.yaml beside the meshes]",
+)
+set_option = click.option(
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Set one value, e.g. lift.hold_time=1.",
+)
+workers_option = click.option(
+    "--workers", type=int, help="Processes on this machine.  [one per core]"
+)
+scheduler_option = click.option(
+    "--scheduler", metavar="ADDRESS", help="A running Dask scheduler to use instead."
+)
+scheduler_file_option = click.option(
+    "--scheduler-file",
+    type=click.Path(path_type=Path),
+    help="Its JSON file, instead of the address.",
 )
 
 
@@ -147,25 +166,15 @@ def audit(mesh_dir: Path, units: str, manifest: Path | None) -> None:
 @click.option(
     "--config", metavar="YAML|PRESET", help="Configuration: a file, or paper or released.  [paper]"
 )
-@click.option(
-    "--set",
-    "overrides",
-    multiple=True,
-    metavar="KEY=VALUE",
-    help="Set one value, e.g. lift.hold_time=1.",
-)
+@set_option
 @click.option("--candidates", type=int, help="Palm poses per object.  [10000]")
 @click.option("--max-grasps", type=int, help="Grasps per object after which no more are tried.")
 @click.option("--seed", type=int, help="Of all random draws.  [0]")
 @units_option
 @manifest_option
-@click.option("--workers", type=int, help="Processes on this machine.  [one per core]")
-@click.option("--scheduler", metavar="ADDRESS", help="A running Dask scheduler to use instead.")
-@click.option(
-    "--scheduler-file",
-    type=click.Path(path_type=Path),
-    help="Its JSON file, instead of the address.",
-)
+@workers_option
+@scheduler_option
+@scheduler_file_option
 @click.option("--quiet", is_flag=True, help="Show no progress.")
 def build(
     mesh_dir: str,
@@ -283,9 +292,118 @@ def replay(out: Path, trial: int, html: Path | None) -> None:
         sys.exit(1)
 
 
-def _console() -> Console:
-    console = Console()
-    return console if console.is_terminal else Console(width=WIDTH)
+@main.command()
+@click.argument("grasps", type=click.Path(path_type=Path), metavar="GRASPS")
+@click.option(
+    "--object",
+    "mesh",
+    type=click.Path(path_type=Path),
+    metavar="MESH",
+    help="The object: a .obj, .stl, .ply or .glb file.",
+)
+@units_option
+@click.option(
+    "--dataset",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="In place of --object: a data file, OUT/grasping_oto.hdf5 or _otm; object, its pose and "
+    "the camera's come with the row.",
+)
+@click.option(
+    "--split",
+    type=click.Choice(["train", "valid", "test"]),
+    help="Which rows of the dataset, and which group of an HDF5 file of grasps.  [test]",
+)
+@click.option(
+    "--frame",
+    type=click.Choice(["object", "camera", "workspace"]),
+    help="What the grasps are expressed in.  [object; camera with a dataset]",
+)
+@click.option(
+    "--camera",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="With --object and --frame camera: .npy file with the camera's pose in the table-top "
+    "frame, X_TC (4, 4), or one per grasp (n, 4, 4) or (n, 12).",
+)
+@click.option(
+    "--method",
+    type=click.Choice(["hand", "forces"]),
+    default="hand",
+    show_default=True,
+    help="Close a simulated hand on the contacts and lift, or lift by forces at the contacts "
+    "alone.",
+)
+@click.option("--hand", metavar="NAME|YAML", help="The hand.  [the configuration's: barrett]")
+@click.option(
+    "--config",
+    metavar="YAML|PRESET",
+    help="Configuration: a file, or paper or released.  [the dataset's, else paper]",
+)
+@set_option
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    metavar="NAME",
+    help="Write NAME.jsonl and NAME.h5 instead of JSON lines to standard output.",
+)
+@workers_option
+@scheduler_option
+@scheduler_file_option
+@click.option("--quiet", is_flag=True, help="Show neither progress nor the table.")
+def verify(
+    out: Path | None,
+    workers: int | None,
+    scheduler: str | None,
+    scheduler_file: Path | None,
+    quiet: bool,
+    **options: Any,
+) -> None:
+    """Try predicted grasps in the simulator: does each hold its object, and if not, why?
+
+    GRASPS is a .npy array with a row per grasp, a .csv file with a line per grasp, or an HDF5
+    file with an array `grasps` at its root or in a group, and maybe `rows` beside it: the rows of
+    the dataset that they are for. A grasp is 6 numbers per finger (18 for the Barrett Hand): the
+    contact points in metres, then the unit normals out of the object, in the hand file's order
+    of fingers.
+
+    If GRASPS is a data file of a dataset, and neither --object nor --dataset is given, its own
+    grasps are tried.
+
+    A line of JSON per grasp goes to standard output or NAME.jsonl, a table of the outcomes to
+    standard error. Exit code: 0 when every grasp was tried, whatever came of it; 2 for input
+    that cannot be used, such as a single grasp that is not on the object.
+    """
+    from drakegrasp.cluster import run_verification
+    from drakegrasp.tables import verdict_table
+    from drakegrasp.verification_files import refuse_unwritable, save_results, write_json_lines
+    from drakegrasp.verify_grasps import refuse_off_surface
+    from drakegrasp.verify_request import VerifyRequest, plan_request
+
+    if out is not None:
+        refuse_unwritable(out)
+    tasks, config = plan_request(VerifyRequest(**options))
+    results = run_verification(
+        tasks,
+        workers=workers,
+        scheduler=scheduler,
+        scheduler_file=scheduler_file,
+        show=not quiet,
+    )
+    if len(results) == 1:
+        refuse_off_surface(results[0])
+    if out is None:
+        write_json_lines(results, sys.stdout)
+    else:
+        for path in save_results(results, out, config):
+            click.echo(str(path))
+    if not quiet:
+        _console(stderr=True).print(verdict_table([result.outcome for result in results]))
+
+
+def _console(*, stderr: bool = False) -> Console:
+    console = Console(stderr=stderr)
+    return console if console.is_terminal else Console(width=WIDTH, stderr=stderr)
 
 
 def _print(table: Table) -> None:

@@ -30,7 +30,7 @@ from drakegrasp.meshes import find_meshes
 from drakegrasp.progress import progress_bar
 from drakegrasp.verification import Verification
 from drakegrasp.verify_grasps import verify_tasks
-from drakegrasp.verify_plan import Mesh, plan_verification
+from drakegrasp.verify_plan import TASK_GRASPS, Mesh, VerifyTask, plan_verification, split_task
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -96,10 +96,7 @@ def build_dataset(
         ConfigError: If both workers and a scheduler are given.
         DataError: If `out` cannot be used, or no mesh is fit to be simulated.
     """
-    if workers is not None and (scheduler or scheduler_file):
-        raise ConfigError("workers must not be given with a scheduler, which has its own")
-    if workers is not None and workers < 1:
-        raise ConfigError(f"workers must be at least 1, got {workers}")
+    _refuse_workers(workers, scheduler, scheduler_file)
     out, config = Path(out).absolute(), config or load_config()
     load_hand(config.hand)
     builtin = str(objects) == BUILTIN
@@ -136,8 +133,14 @@ def verify_grasps(
 
     Args:
         grasps: (n, 6k).
-        mesh, frame, X_TO, units, hand, method, config: As for `verify_grasp`.
+        mesh: The object, as for `verify_grasp`.
+        frame: What the grasps are expressed in, as there.
         X: With frame "camera": X_TC (4, 4), or one per grasp (n, 4, 4).
+        X_TO: Pose of the object on the table (4, 4); dropped as in a build if None.
+        units: Unit of the mesh's lengths: m, cm or mm.
+        hand: Name or YAML file of the hand; the configuration's if None.
+        method: "hand" or "forces".
+        config: Physics, lift and limits; the preset `paper`, or the dataset's, if None.
         dataset: In place of a mesh: a data file of a dataset.
         rows: The rows of its split that the grasps are for; all of them, in order, if None.
         client: A Dask client whose workers share the work; a plain loop here if None.
@@ -161,11 +164,50 @@ def verify_grasps(
         dataset=dataset,
         rows=rows,
     )
+    return _verify(tasks, client, show)
+
+
+def run_verification(
+    tasks: Sequence[VerifyTask],
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    scheduler_file: str | Path | None = None,
+    show: bool = True,
+) -> list[Verification]:
+    """Return the verdicts of tasks in the order of their grasps; what `drakegrasp verify` does.
+
+    One worker, or few grasps, are a plain loop in this process: it would take longer to start
+    others.
+
+    Args:
+        tasks: From `verify_plan.plan_verification`.
+        workers: Processes on this machine; one per core if None.
+        scheduler: Address of a running Dask scheduler to use instead.
+        scheduler_file: Its JSON file, instead of the address.
+        show: Whether to show progress on standard error.
+
+    Raises:
+        ConfigError: If both workers and a scheduler are given.
+        MachineError: If a worker would give other results than this machine.
+    """
+    _refuse_workers(workers, scheduler, scheduler_file)
+    few = sum(len(task.indices) for task in tasks) <= TASK_GRASPS
+    if not (scheduler or scheduler_file) and (few or (workers or _cores()) == 1):
+        return _verify(tasks, None, show)
+    with connect(workers, scheduler, scheduler_file) as client:
+        return _verify(tasks, client, show)
+
+
+def _verify(tasks: Sequence[VerifyTask], client: Client | None, show: bool) -> list[Verification]:
     execute: Executor = run_here
     if client is not None:
         if tasks:
             _refuse_unfit_workers(client, parse_config(tasks[0].config))
         execute = DaskExecutor(client)
+    else:
+        # Here it costs nothing to report every grasp.
+        tasks = [part for task in tasks for part in split_task(task, 1)]
     with progress_bar("verify", "grasps", show=show) as report:
         return verify_tasks(tasks, execute, report)
 
@@ -198,7 +240,7 @@ def connect(
             with client:
                 yield client
         else:
-            count = workers or len(os.sched_getaffinity(0))
+            count = workers or _cores()
             with (
                 LocalCluster(
                     n_workers=count,
@@ -209,6 +251,24 @@ def connect(
                 Client(cluster) as client,
             ):
                 yield client
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0))
+
+
+def _refuse_workers(
+    workers: int | None, scheduler: str | None, scheduler_file: str | Path | None
+) -> None:
+    """Refuse a number of workers that cannot be had.
+
+    Raises:
+        ConfigError: If it is below one, or given with a scheduler.
+    """
+    if workers is not None and (scheduler or scheduler_file):
+        raise ConfigError("workers must not be given with a scheduler, which has its own")
+    if workers is not None and workers < 1:
+        raise ConfigError(f"workers must be at least 1, got {workers}")
 
 
 def _refuse_unfit_workers(client: Client, config: Config) -> None:

@@ -17,6 +17,7 @@ from drakegrasp.schema import (
     SCHEMA_VERSION,
     SUCCESS_FIELDS,
     TRIAL_FIELDS,
+    VERIFICATION_FIELDS,
     Field,
 )
 
@@ -84,6 +85,24 @@ Groups `/train`, `/valid` and `/test` have the same fields; images and masks are
 chunk per sample, gzip 1 with shuffle. Successes only, after the filters.
 """
 
+_VERIFICATION = """
+## The results of `drakegrasp verify`
+
+`drakegrasp verify ... --out NAME` writes two files, with a row or a line per grasp in the order of
+the input. `NAME.h5` has the attributes `convention_*`, `schema_version`, `config`, `config_hash`,
+`seed` and `versions`, and a group `/grasps`. What a method or a stage did not reach is NaN, 0,
+false or empty; "from" says with which stage a value begins. Equal input gives equal bytes.
+"""
+
+_LINES = """
+`NAME.jsonl`, or standard output without `--out`, has a JSON object per line; NaN and inf are
+`null`. `index` is the grasp's place in the input, `success` whether it holds, `outcome` the label
+of the verdict, `explain` the verdict in sentences, `X_OG` a 4 x 4 matrix. `solver` (SLSQP's
+`status`, `message`, `iterations`), `closed` and `lifted` (contacts then) and `forces` (method
+`forces`) are objects, or `null` if they were not reached; `seconds` is the wall clock by stage.
+Angles that end in `_deg` are in degrees; all else is as in the table, in its units.
+"""
+
 _SHARDS = """
 ## Shards
 
@@ -109,6 +128,9 @@ def format_page() -> str:
             _fields(SUCCESS_FIELDS),
             _SHARDS,
             _fields(LOOK_FIELDS),
+            _VERIFICATION,
+            _fields(VERIFICATION_FIELDS, stages=True),
+            _LINES,
             "\n" + _CONTRACT,
         ]
     )

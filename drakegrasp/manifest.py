@@ -21,7 +21,7 @@ import h5py
 from drakegrasp.config import Config, override_config, parse_config
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.hand_files import hand_digest
-from drakegrasp.schema import SCHEMA_VERSION
+from drakegrasp.schema import CONVENTIONS, SCHEMA_VERSION
 from drakegrasp.shards import (
     ShardHeader,
     refuse_broken_seal,
@@ -76,6 +76,16 @@ def installed_versions(config: Config) -> dict[str, str]:
     """Return the versions of what may change a result: packages, and the hand's files."""
     packages = {name: metadata.version(name) for name in VERSIONED}
     return {**packages, "hand": hand_digest(config.hand)}
+
+
+def write_origin(file: h5py.File, config: Config, versions: dict[str, str]) -> None:
+    """Write what every file says of itself: conventions, configuration and versions."""
+    file.attrs.update({f"convention_{key}": text for key, text in CONVENTIONS.items()})
+    file.attrs["schema_version"] = SCHEMA_VERSION
+    file.attrs["config"] = json.dumps(config.to_dict(), sort_keys=True)
+    file.attrs["config_hash"] = config.simulation_hash()
+    file.attrs["seed"] = config.seed
+    file.attrs["versions"] = json.dumps(versions, sort_keys=True)
 
 
 def write_manifest(manifest: Manifest, out: Path) -> None:

@@ -143,8 +143,7 @@ def find_meshes(
         MeshError: If there is no mesh, two have the same name, or the manifest is wrong.
     """
     directory = Path(directory)
-    if units not in UNITS:
-        raise MeshError(f"--units must be one of {', '.join(UNITS)}, got {units!r}")
+    _refuse_units(units)
     try:
         paths = [
             path
@@ -166,7 +165,7 @@ def find_meshes(
     if manifest is None and (directory / MANIFEST_NAME).is_file():
         manifest = directory / MANIFEST_NAME
     table = _Manifest() if manifest is None else _read_manifest(Path(manifest))
-    entries = {unicodedata.normalize("NFC", key): entry for key, entry in table.objects.items()}
+    entries = _entries(table)
     unknown = sorted(set(entries) - set(stems.values()))
     if unknown:
         raise MeshError(
@@ -174,18 +173,44 @@ def find_meshes(
             f"{', '.join(sorted(stems.values()))}; got {', '.join(unknown)}"
         )
 
-    sources = []
-    for path, stem in stems.items():
-        entry = entries.get(stem, _Entry())
-        source = MeshSource(
-            name=stem if entry.name is None else entry.name,
-            class_name=_class_of(stem) if entry.class_name is None else entry.class_name,
-            path=path,
-            scale=UNITS[entry.units or table.units or units],
-        )
-        sources.append(source)
+    sources = [_source(path, stem, table, units) for path, stem in stems.items()]
     _refuse_twins(directory, {source.path: source.name for source in sources})
     return sorted(sources, key=lambda source: source.name)
+
+
+def find_mesh(path: str | Path, *, units: str = "m") -> MeshSource:
+    """Return one mesh file as `find_meshes` does, whatever else is in its directory.
+
+    Raises:
+        MeshError: If it is no mesh file, or the manifest beside it is wrong.
+    """
+    path = Path(path)
+    _refuse_units(units)
+    if path.suffix.lower() not in SUFFIXES or not path.is_file():
+        got = repr(path.suffix) if path.is_file() else "none"
+        raise MeshError(f"{path}: must be a mesh file ({', '.join(SUFFIXES)}), got {got}")
+    manifest = path.with_name(MANIFEST_NAME)
+    table = _read_manifest(manifest) if manifest.is_file() else _Manifest()
+    return _source(path, unicodedata.normalize("NFC", path.stem), table, units)
+
+
+def _entries(table: _Manifest) -> dict[str, _Entry]:
+    return {unicodedata.normalize("NFC", key): entry for key, entry in table.objects.items()}
+
+
+def _source(path: Path, stem: str, table: _Manifest, units: str) -> MeshSource:
+    entry = _entries(table).get(stem, _Entry())
+    return MeshSource(
+        name=stem if entry.name is None else entry.name,
+        class_name=_class_of(stem) if entry.class_name is None else entry.class_name,
+        path=path,
+        scale=UNITS[entry.units or table.units or units],
+    )
+
+
+def _refuse_units(units: str) -> None:
+    if units not in UNITS:
+        raise MeshError(f"--units must be one of {', '.join(UNITS)}, got {units!r}")
 
 
 def _refuse_twins(directory: Path, names: dict[Path, str]) -> None:

@@ -19,7 +19,7 @@ import trimesh
 from drakegrasp.config import Config, load_config
 from drakegrasp.errors import GraspError, MeshError
 from drakegrasp.frames import Array, make_pose, transform_points
-from drakegrasp.meshes import UNITS, clean_triangles, find_meshes
+from drakegrasp.meshes import UNITS, clean_triangles, find_mesh
 from drakegrasp.object_model import ObjectModel, make_object, prepare_object
 from drakegrasp.prediction import read_pose
 from drakegrasp.resting import settle
@@ -75,12 +75,19 @@ def place_object(
         GraspError: If X_TO is no pose or does not stand on the table.
     """
     config = config or load_config()
+    if units not in UNITS:
+        raise MeshError(f"units must be one of {', '.join(UNITS)}, got {units!r}")
     if isinstance(mesh, Placed):
         model, known = mesh.model, np.asarray(mesh.X_TO)
     elif isinstance(mesh, trimesh.Trimesh):
         model, known = _model_of(mesh, units, config), None
-    else:
+    elif isinstance(mesh, str | Path):
         model, known = _read(Path(mesh), units, config), None
+    else:
+        raise MeshError(
+            "mesh must be a mesh file, a trimesh.Trimesh or a placed object, "
+            f"got {type(mesh).__name__}"
+        )
     if X_TO is not None:
         known = _standing(model, read_pose(X_TO, "X_TO"))
     return PlacedObject(model=model, X_TO=settle(model, config).X_TO if known is None else known)
@@ -95,31 +102,34 @@ def rest_pose(X_TO: Array) -> Array:
     axis = np.cross(up, [0.0, 0.0, 1.0])
     x, y, z = axis
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    # Rodrigues' formula with sin = |axis| and cos = up_z; upside down, half a turn about x.
-    upright = 1.0 + up[2]
-    R = np.eye(3) + K + K @ K / upright if upright > 1e-9 else np.diag([1.0, -1.0, -1.0])
+    # Rodrigues' formula with sin = |axis|, cos = up_z and K K / (1 + cos), which is here without
+    # cancellation where cos is nearly -1; upside down it is half a turn about x.
+    upright = 1.0 + up[2] if up[2] > 0.0 else axis @ axis / (1.0 - up[2])
+    R = np.eye(3) + K + K @ K / upright if upright > 1e-20 else np.diag([1.0, -1.0, -1.0])
     return make_pose(R, [0.0, 0.0, X_TO[2, 3]])
 
 
 def _read(path: Path, units: str, config: Config) -> ObjectModel:
-    if not path.is_file():
-        raise MeshError(f"mesh must be a file, a trimesh or a placed object, got {str(path)!r}")
-    sources = [s for s in find_meshes(path.parent, units=units) if s.path.name == path.name]
-    if not sources:
-        raise MeshError(f"{path}: must be a .obj, .stl, .ply or .glb file, got {path.suffix!r}")
-    return prepare_object(sources[0], config.objects)
+    return prepare_object(find_mesh(path, units=units), config.objects)
 
 
 def _model_of(mesh: trimesh.Trimesh, units: str, config: Config) -> ObjectModel:
-    if units not in UNITS:
-        raise MeshError(f"units must be one of {', '.join(UNITS)}, got {units!r}")
     given = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=np.int64)
     clean = clean_triangles(*given, "mesh")
     vertices = clean.vertices * UNITS[units]
     digest = hashlib.sha256(vertices.tobytes() + clean.faces.tobytes()).hexdigest()
-    return make_object(
-        vertices, clean.faces, config.objects, name="mesh", class_name="mesh", mesh_sha256=digest
-    )
+    try:
+        return make_object(
+            vertices,
+            clean.faces,
+            config.objects,
+            name="mesh",
+            class_name="mesh",
+            mesh_sha256=digest,
+            unit=f" with 1 unit = {UNITS[units]:g} m",
+        )
+    except MeshError as reason:
+        raise MeshError(f"mesh: {reason}") from reason
 
 
 def _standing(model: ObjectModel, X_TO: Array) -> Array:

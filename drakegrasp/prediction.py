@@ -39,8 +39,10 @@ def read_grasps(grasps: npt.ArrayLike, fingers: int) -> tuple[Array, Array]:
     size = 6 * fingers
     try:
         array = np.asarray(grasps, dtype=float)
-    except (TypeError, ValueError):
-        raise GraspError(f"a grasp must be {size} numbers, got {type(grasps).__name__}") from None
+    except (TypeError, ValueError) as error:
+        raise GraspError(
+            f"a grasp must be {size} numbers, got {_not_numbers(grasps, error)}"
+        ) from None
     if array.ndim not in (1, 2) or array.shape[-1] != size:
         raise GraspError(
             f"a grasp must be {size} numbers ({fingers} points, then {fingers} outward normals), "
@@ -69,6 +71,10 @@ def _of(rows: Array, row: int) -> str:
     return f"grasp {row}: " if len(rows) > 1 else ""
 
 
+def _not_numbers(value: object, error: Exception) -> str:
+    return f"a {type(value).__name__} that is none ({str(error).splitlines()[0]})"
+
+
 def read_pose(X_AB: npt.ArrayLike, name: str) -> Array:
     """Return a pose (4, 4), or poses (n, 4, 4), with exact rotations.
 
@@ -81,9 +87,9 @@ def read_pose(X_AB: npt.ArrayLike, name: str) -> Array:
     """
     try:
         X = np.asarray(X_AB, dtype=float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError) as error:
         raise GraspError(
-            f"{name} must be a pose, 4 x 4 numbers, got {type(X_AB).__name__}"
+            f"{name} must be a pose, 4 x 4 numbers, got {_not_numbers(X_AB, error)}"
         ) from None
     if X.shape[-1:] == (12,):
         X = X.reshape(*X.shape[:-1], 3, 4)
@@ -94,16 +100,20 @@ def read_pose(X_AB: npt.ArrayLike, name: str) -> Array:
         raise GraspError(f"{name} must be a pose, 4 x 4 numbers, got an array of shape {X.shape}")
     if not np.isfinite(X).all():
         raise GraspError(f"{name} must be finite, got numbers that are not")
+    if np.any(np.abs(X[..., 3, :] - [0.0, 0.0, 0.0, 1.0]) > ROTATION_TOLERANCE):
+        raise GraspError(
+            f"{name} must have 0 0 0 1 as its last row, got another: are rows and columns swapped?"
+        )
     R = X[..., :3, :3]
-    error = float(np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max())
-    if error > ROTATION_TOLERANCE or np.any(np.linalg.det(R) < 0.0):
+    off = float(np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(initial=0.0))
+    if off > ROTATION_TOLERANCE or np.any(np.linalg.det(R) < 0.0):
         raise GraspError(
             f"{name} must hold a rotation, an orthogonal matrix with determinant +1, "
-            f"got one that is off by {error:.2g} with determinant {np.linalg.det(R).min():.3g}"
+            f"got one that is off by {off:.2g} with determinant {np.linalg.det(R).min():.3g}"
         )
     U, _, Vt = np.linalg.svd(R)
     exact = X.copy()
-    exact[..., :3, :3] = U @ Vt
+    exact[..., :3, :3], exact[..., 3, :] = U @ Vt, [0.0, 0.0, 0.0, 1.0]
     return exact
 
 
@@ -142,7 +152,13 @@ def to_object_frame(
         raise GraspError(f"X must be one pose, or one per grasp ({len(points)}), got {len(X_OA)}")
     moved = [transform_points(A, p) for A, p in zip(X_OA, points, strict=True)]
     turned = [rotate_vectors(A, n) for A, n in zip(X_OA, normals, strict=True)]
-    return np.array(moved), np.array(turned)
+    # No grasps at all keep their shape, too.
+    return np.reshape(moved, points.shape), np.reshape(turned, normals.shape)
+
+
+def boxes_away(p_OQ: Array, half_extents: Array) -> float:
+    """Return how many times the bounding box the nearest of points (n, k, 3) is out; 1 is on it."""
+    return float(np.abs(p_OQ / half_extents).max(axis=-1).min(initial=np.inf))
 
 
 def refuse_other_units(p_OQ: Array, half_extents: Array) -> None:
@@ -151,11 +167,11 @@ def refuse_other_units(p_OQ: Array, half_extents: Array) -> None:
     Raises:
         GraspError: If every point is beyond three times the bounding box.
     """
-    factor = np.abs(p_OQ / half_extents).max(axis=-1)
-    if p_OQ.size and np.all(factor > UNIT_FACTOR):
+    factor = boxes_away(p_OQ, half_extents)
+    if p_OQ.size and factor > UNIT_FACTOR:
         size = " x ".join(f"{edge:.3g}" for edge in 2.0 * half_extents)
         raise GraspError(
             f"contact points must lie on the object, whose box is {size} m, got points all "
-            f"outside {UNIT_FACTOR:g} times that (the nearest at {factor.min():.3g} times): are grasp "
+            f"outside {UNIT_FACTOR:g} times that (the nearest at {factor:.3g} times): are grasp "
             "and mesh in the same units (metres, see units) and is the frame the right one?"
         )

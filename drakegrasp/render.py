@@ -53,6 +53,11 @@ LIGHTS = (
     LightParameter(type="directional", frame="camera", direction=[0.0, 0.0, 1.0], intensity=0.6),
     LightParameter(type="directional", frame="world", direction=[0.3, 0.4, -1.0], intensity=0.7),
 )
+#: What is said of a blank image.
+BLANK = (
+    "the rendered image must not be blank, got all zeros: OpenGL works in one thread of a "
+    "process only, and needs EGL (run `drakegrasp doctor`)"
+)
 _ENGINE = "vtk"
 
 
@@ -140,10 +145,7 @@ def look(renderer: Renderer, X_TO: npt.ArrayLike, X_TC: npt.ArrayLike) -> Look:
     labels = query.RenderLabelImage(colour_camera, world, X_WC).data[:, :, 0]
     rgb = query.RenderColorImage(colour_camera, world, X_WC).data[:, :, :3]
     if not rgb.any() or not depth.any():
-        raise MachineError(
-            "the rendered image must not be blank, got all zeros: OpenGL works in one thread of a "
-            "process only, and needs EGL (run `drakegrasp doctor`)"
-        )
+        raise MachineError(BLANK)
     image = np.empty_like(rgb, shape=(4, config.size, config.size), dtype=np.float32)
     image[:3] = np.moveaxis(rgb, 2, 0) / np.float32(255.0)
     # Drake gives 0 for too near and infinity for too far.

@@ -9,6 +9,7 @@ As for `render`: a theatre must be made and used in one thread.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,10 +35,11 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
 from drakegrasp.doc_figures import Picture
+from drakegrasp.errors import MachineError
 from drakegrasp.frames import X_WT, Array, make_pose, transform_points
 from drakegrasp.hand import Hand, make_parser
 from drakegrasp.object_model import ObjectModel
-from drakegrasp.render import object_colour
+from drakegrasp.render import BLANK, object_colour
 from drakegrasp.wavefront import obj_text
 
 #: Vertical field of view [deg]: narrow, so that nothing is distorted.
@@ -55,6 +57,20 @@ TABLE_COLOUR = np.array([0.74, 0.70, 0.64, 1.0])
 TABLE_SIZE, TABLE_THICKNESS = 1.6, 0.1
 #: Edge of the map that the shadows are looked up in [px].
 SHADOW_MAP = 4096
+#: For pictures of hand and object together. Camera axes: +X right, +Y down. Point lights cast
+#: no shadow in VTK; the spot does.
+LIGHTS = (
+    LightParameter(type="point", frame="camera", position=[0.3, -0.3, -0.5], intensity=0.5),
+    LightParameter(type="point", frame="world", position=[0.0, 0.0, 4.0], intensity=0.25),
+    LightParameter(
+        type="spot",
+        frame="camera",
+        position=[-1.0, -1.3, 0.2],
+        direction=[1.0, 1.3, 1.0],
+        intensity=0.7,
+        cone_angle=26.0,
+    ),
+)
 _ENGINE = "vtk"
 
 
@@ -94,11 +110,23 @@ class Theatre:
         return self.plant.EvalBodyPoseInWorld(context, body).GetAsMatrix4()
 
 
-def build_theatre(model: ObjectModel, hand: Hand, *, table_size: float = TABLE_SIZE) -> Theatre:
-    """Return a diagram of an object, a hand and a square table of an edge [m]."""
+def build_theatre(
+    model: ObjectModel,
+    hand: Hand,
+    *,
+    table_size: float = TABLE_SIZE,
+    lights: Sequence[LightParameter] = LIGHTS,
+) -> Theatre:
+    """Return a diagram of an object, a hand and a square table of an edge [m], lit by lights."""
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.0), builder)
-    scene_graph.AddRenderer(_ENGINE, MakeRenderEngineVtk(_parameters()))
+    parameters = RenderEngineVtkParams(
+        default_clear_color=BACKGROUND,
+        lights=list(lights),
+        cast_shadows=True,
+        shadow_map_size=SHADOW_MAP,
+    )
+    scene_graph.AddRenderer(_ENGINE, MakeRenderEngineVtk(parameters))
     body = plant.AddRigidBody("object", SpatialInertia.SolidSphereWithMass(1.0, 1.0))
     text = obj_text(model.visual_vertices, model.visual_faces, normals=True)
     mesh = Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", model.name)))
@@ -138,9 +166,15 @@ def show(theatre: Theatre, moment: Moment) -> None:
 
 
 def take(theatre: Theatre, X_WC: Array, size: tuple[int, int]) -> Picture:
-    """Return what a camera at X_WC (4, 4) sees, `size` = (width, height) [px]."""
+    """Return what a camera at X_WC (4, 4) sees, `size` = (width, height) [px].
+
+    Raises:
+        MachineError: If the picture is blank, which means that OpenGL failed.
+    """
     query, camera, world = _camera(theatre, (OVERSAMPLING * size[0], OVERSAMPLING * size[1]))
     large = query.RenderColorImage(camera, world, RigidTransform(X_WC)).data[:, :, :3]
+    if not large.any():
+        raise MachineError(BLANK)
     blocks = large.reshape(size[1], OVERSAMPLING, size[0], OVERSAMPLING, 3)
     image = np.rint(blocks.mean(axis=(1, 3))).astype(np.uint8)
     focal = size[1] / (2.0 * np.tan(np.deg2rad(FOV_Y_DEG) / 2.0))
@@ -206,25 +240,6 @@ def outline(theatre: Theatre, moment: Moment, half_extents: Array) -> Array:
             transform_points(moment.X_WO, corners),
             *(theatre.pose(link)[None, :3, 3] for link in links),
         ]
-    )
-
-
-def _parameters() -> RenderEngineVtkParams:
-    # Camera axes: +X right, +Y down. Point lights cast no shadow in VTK; the spot does.
-    lights = [
-        LightParameter(type="point", frame="camera", position=[0.3, -0.3, -0.5], intensity=0.5),
-        LightParameter(type="point", frame="world", position=[0.0, 0.0, 4.0], intensity=0.25),
-        LightParameter(
-            type="spot",
-            frame="camera",
-            position=[-1.0, -1.3, 0.2],
-            direction=[1.0, 1.3, 1.0],
-            intensity=0.7,
-            cone_angle=26.0,
-        ),
-    ]
-    return RenderEngineVtkParams(
-        default_clear_color=BACKGROUND, lights=lights, cast_shadows=True, shadow_map_size=SHADOW_MAP
     )
 
 

@@ -81,9 +81,18 @@ def verify_grasp(
         rows=None if row is None else [row],
     )
     _, (result,) = run_task(task)
+    refuse_off_surface(result)
+    return result
+
+
+def refuse_off_surface(result: Verification) -> None:
+    """Refuse the result of a single grasp whose contacts are not on the object.
+
+    Raises:
+        OffSurfaceError: If so.
+    """
     if result.outcome is Outcome.OFF_SURFACE:
         raise OffSurfaceError(f"contacts must be on the object's surface, got: {result.reason}")
-    return result
 
 
 def verify_tasks(

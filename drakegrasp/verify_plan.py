@@ -8,9 +8,9 @@ of a caller's mistakes are found here, before anything is simulated.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -18,20 +18,26 @@ import trimesh
 
 from drakegrasp.config import Config, load_config, parse_config
 from drakegrasp.dataset import GraspDataset
-from drakegrasp.errors import GraspError
+from drakegrasp.errors import ConfigError, GraspError
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.hand import load_hand
 from drakegrasp.manifest import read_manifest
 from drakegrasp.placed import Placed, PlacedObject, place_object
-from drakegrasp.prediction import read_grasps, read_pose, refuse_other_units, to_object_frame
+from drakegrasp.prediction import (
+    boxes_away,
+    read_grasps,
+    read_pose,
+    refuse_other_units,
+    to_object_frame,
+)
 from drakegrasp.prepared import load_prepared
 from drakegrasp.verification import Verification
 from drakegrasp.verify import METHODS, verify_contacts
 
-#: Grasps in a task: some ten seconds of work.
-TASK_GRASPS = 8
+#: Grasps in a task: some seconds of work, so that no worker waits long for the last one.
+TASK_GRASPS = 4
 
-Mesh = str | Path | trimesh.Trimesh | Placed
+Mesh: TypeAlias = str | Path | trimesh.Trimesh | Placed
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -93,7 +99,7 @@ def plan_verification(
         config = _with_hand(config or load_config(), hand)
         points, normals = read_grasps(grasps, load_hand(config.hand).num_fingers)
         if rows is not None:
-            raise GraspError("rows must be None without a dataset, got some")
+            raise GraspError("rows must be those of a dataset, got some without a dataset")
         assert mesh is not None
         placed = place_object(mesh, units=units, X_TO=X_TO, config=config)
         pose = None if X is None else read_pose(X, "X")
@@ -106,29 +112,58 @@ def plan_verification(
         out = dataset.path.parent
         known = read_manifest(out).config
         config = _with_hand(config or known, hand)
+        _refuse_other_objects(config, known)
         points, normals = read_grasps(grasps, load_hand(config.hand).num_fingers)
         chosen = _chosen_rows(dataset, rows, len(points))
         frame = frame or "camera"
         groups = _objects_of_rows(dataset, out, known, chosen, with_camera=frame == "camera")
-    tasks = []
+    whole = []
     for placed, indices, pose in groups:
         p_OQ, nhat_Q_O = to_object_frame(
             points[indices], normals[indices], frame=frame, X=pose, X_TO=placed.X_TO
         )
-        refuse_other_units(p_OQ, placed.model.half_extents)
-        for start in range(0, len(indices), TASK_GRASPS):
-            part = slice(start, start + TASK_GRASPS)
-            tasks.append(
-                VerifyTask(
-                    indices=tuple(indices[part].tolist()),
-                    placed=placed,
-                    p_OQ=p_OQ[part],
-                    nhat_Q_O=nhat_Q_O[part],
-                    method=method,
-                    config=config.to_dict(),
-                )
+        task = VerifyTask(
+            indices=tuple(indices.tolist()),
+            placed=placed,
+            p_OQ=p_OQ,
+            nhat_Q_O=nhat_Q_O,
+            method=method,
+            config=config.to_dict(),
+        )
+        whole.append(task)
+    _refuse_other_units(whole)
+    return [part for task in whole for part in split_task(task, TASK_GRASPS)]
+
+
+def split_task(task: VerifyTask, size: int) -> list[VerifyTask]:
+    """Return a task as tasks of at most so many grasps."""
+    parts = [slice(start, start + size) for start in range(0, len(task.indices), size)]
+    return [
+        replace(
+            task,
+            indices=task.indices[part],
+            p_OQ=task.p_OQ[part],
+            nhat_Q_O=task.nhat_Q_O[part],
+        )
+        for part in parts
+    ]
+
+
+def _refuse_other_units(tasks: Sequence[VerifyTask]) -> None:
+    """Refuse grasps that are all far from their objects; a few are the prediction's fault."""
+    if tasks:
+        nearest = min(tasks, key=lambda t: boxes_away(t.p_OQ, t.placed.model.half_extents))
+        refuse_other_units(nearest.p_OQ, nearest.placed.model.half_extents)
+
+
+def _refuse_other_objects(config: Config, known: Config) -> None:
+    """Refuse a configuration that a dataset's objects were not prepared and dropped with."""
+    for name in ("objects", "settle"):
+        if getattr(config, name) != getattr(known, name):
+            raise ConfigError(
+                f"{name} must be as in the dataset, whose objects are prepared already, "
+                "got other values; give the mesh instead"
             )
-    return tasks
 
 
 def _with_hand(config: Config, hand: str | Path | None) -> Config:
@@ -138,7 +173,10 @@ def _with_hand(config: Config, hand: str | Path | None) -> Config:
 def _chosen_rows(
     dataset: GraspDataset, rows: Sequence[int] | None, count: int
 ) -> npt.NDArray[np.int64]:
-    chosen = np.arange(count) if rows is None else np.asarray(rows, dtype=np.int64).ravel()
+    chosen = np.arange(count) if rows is None else np.asarray(rows)
+    if chosen.dtype.kind not in "iu":
+        raise GraspError(f"rows must be whole numbers, got values of type {chosen.dtype}")
+    chosen = chosen.astype(np.int64).ravel()
     if len(chosen) != count:
         raise GraspError(f"rows must be one per grasp ({count}), got {len(chosen)}")
     if rows is None and count != len(dataset):

@@ -25,6 +25,7 @@ def data_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with h5py.File(path, "w") as file:
         file.attrs["schema_version"] = SCHEMA_VERSION
         file.attrs["K"] = np.eye(3)
+        file.attrs["camera"] = "oto"
         for split in SPLITS:
             group = file.create_group(split)
             count = 5 if split == "train" else 0
@@ -64,6 +65,12 @@ def test_columns_come_whole(data_file: Path) -> None:
     assert data.column("object_props/class_name").tolist()[1] == "object 1 ü"
     with pytest.raises(DataError, match=r"field must be one of images, .*, got 'poses'"):
         data.column("poses")
+
+
+def test_file_says_whose_camera_it_is(data_file: Path) -> None:
+    data = GraspDataset(data_file)
+    assert data.camera == "oto"
+    assert np.array_equal(data.K, np.eye(3))
 
 
 def test_empty_split_is_empty(data_file: Path) -> None:

@@ -15,7 +15,7 @@ from drakegrasp.audit import audit
 from drakegrasp.config import ObjectConfig
 from drakegrasp.decimation import decimate
 from drakegrasp.errors import MeshError
-from drakegrasp.meshes import MeshSource, find_meshes, load_mesh
+from drakegrasp.meshes import MeshSource, find_mesh, find_meshes, load_mesh
 from drakegrasp.object_model import ObjectModel, load_object, prepare_object, save_object
 from drakegrasp.surfaces import Solid, is_solid_surface, signed_volume, winding_numbers
 from drakegrasp.wavefront import obj_text
@@ -495,6 +495,21 @@ def test_wrong_directories_are_refused(tmp_path):
         find_meshes(tmp_path)
     with pytest.raises(MeshError, match=r"gone\.yaml: must be a readable YAML"):
         find_meshes(tmp_path, manifest=tmp_path / "gone.yaml")
+
+
+def test_one_mesh_is_found_whatever_lies_beside_it(tmp_path):
+    for name in ("1_mug_a.obj", "1_mug_a.stl", "b.obj"):
+        write(tmp_path / name, box())
+    (tmp_path / "objects.yaml").write_text("objects: {1_mug_a: {units: cm}, gone: {units: m}}")
+    source = find_mesh(tmp_path / "1_mug_a.obj", units="mm")
+    assert (source.name, source.class_name, source.scale) == ("1_mug_a", "mug", 0.01)
+    assert find_mesh(tmp_path / "b.obj", units="mm").scale == 0.001
+    (tmp_path / "a.txt").write_text("")
+    for name, got in (("a.txt", "'.txt'"), ("gone.obj", "none")):
+        with pytest.raises(MeshError, match=rf"{name}: must be a mesh file .*, got {got}"):
+            find_mesh(tmp_path / name)
+    with pytest.raises(MeshError, match="--units must be one of m, cm, mm, got 'inch'"):
+        find_mesh(tmp_path / "b.obj", units="inch")
 
 
 # Collision meshes

@@ -46,7 +46,7 @@ def points_about(hulls: list[trimesh.Trimesh], seed: int) -> Array:
     """Return one point for each hull, within its box made larger by 10 mm."""
     rng = np.random.default_rng(seed)
     low, high = np.swapaxes([hull.bounds for hull in hulls], 0, 1)
-    return rng.uniform(low - 0.01, high + 0.01)
+    return np.asarray(rng.uniform(low - 0.01, high + 0.01))
 
 
 def highest_plane(hull: trimesh.Trimesh, p: Array) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from hands import write_pincer
 from scipy.spatial.transform import Rotation
 
 from drakegrasp.frames import Array, invert_pose, make_pose, rotate_vectors, transform_points
-from drakegrasp.hand import load_hand
+from drakegrasp.hand import Hand, load_hand
 from drakegrasp.hand_shapes import link_shapes
 from drakegrasp.kinematics import coordinate_limits, fingertip_poses
 from drakegrasp.pads import touch
@@ -27,6 +27,11 @@ from drakegrasp.wrist_problem import (
 )
 
 SEEDS = range(12)
+
+
+@cache
+def hand_of(name: str) -> Hand:
+    return load_hand(name)
 
 
 @pytest.fixture(scope="module", params=["barrett", "pincer"])
@@ -48,7 +53,7 @@ def random_pose(rng: np.random.Generator) -> Array:
 def random_problem(name: str, seed: int) -> tuple[WristProblem, Array]:
     """Return contacts some centimetres off a hand's fingertips, and an x away from the start."""
     rng = np.random.default_rng(seed)
-    hand, X_OS = load_hand(name), random_pose(rng)
+    hand, X_OS = hand_of(name), random_pose(rng)
     k, (lower, upper) = hand.num_fingers, coordinate_limits(hand).T
     c = rng.uniform(lower, upper)
     X_GF = fingertip_poses(hand, spread=c[0], closing=c[1:])
@@ -80,7 +85,7 @@ def test_palm_and_fingertips_are_where_kinematics_puts_them(name: str, seed: int
     R_SG = Rotation.from_euler("XYZ", x[:3]).as_matrix()
     X_OG = problem.X_OS @ make_pose(R_SG, x[3:POSE])
     np.testing.assert_allclose(at.X_OG, X_OG, atol=1e-12)
-    X_GF = fingertip_poses(load_hand(name), spread=x[POSE], closing=x[POSE + 1 :])
+    X_GF = fingertip_poses(hand_of(name), spread=x[POSE], closing=x[POSE + 1 :])
     X_FO = invert_pose(X_OG @ X_GF)
     p_FQ = np.array(
         [transform_points(X, p[None])[0] for X, p in zip(X_FO, problem.p_OQ, strict=True)]
@@ -152,7 +157,7 @@ def test_rows_of_scalars_are_plain_derivatives(name: str, seed: int) -> None:
 @pytest.mark.parametrize("seed", SEEDS)
 def test_closing_direction_is_how_the_fingertip_moves_at_the_point(name: str, seed: int) -> None:
     problem, x = random_problem(name, seed)
-    at, hand, h = evaluate(problem, x), load_hand(name), 1e-6
+    at, hand, h = evaluate(problem, x), hand_of(name), 1e-6
     k = hand.num_fingers
     residual = at.residuals[terms(k)["closing"]].reshape(k, 3) / CLOSING_WEIGHT
     direction = residual - problem.nhat_Q_O @ at.X_OG[:3, :3]
@@ -169,7 +174,7 @@ def test_closing_direction_is_how_the_fingertip_moves_at_the_point(name: str, se
 @pytest.mark.parametrize("seed", SEEDS)
 def test_clearance_is_the_lowest_corners_height_within_the_rounding(name: str, seed: int) -> None:
     problem, x = random_problem(name, seed)
-    at, hand = evaluate(problem, x), load_hand(name)
+    at, hand = evaluate(problem, x), hand_of(name)
     shapes = link_shapes(hand)
     X_GF = fingertip_poses(hand, spread=x[POSE], closing=x[POSE + 1 :])
     parts = [(invert_pose(hand.X_BG), hand.palm_link)]
@@ -213,7 +218,7 @@ def test_where_the_object_is_does_not_matter(name: str, seed: int) -> None:
 
 def test_a_finger_closed_against_its_contact_leaves_little(name: str) -> None:
     """Contacts on the nominal points, normals against the pads: only rounding is left."""
-    hand, constants = load_hand(name), hand_constants(name)
+    hand, constants = hand_of(name), hand_constants(name)
     c = coordinate_limits(hand).mean(axis=1) * [0.2, *[0.8] * hand.num_fingers]
     X_GF = fingertip_poses(hand, spread=c[0], closing=c[1:])
     contact = touch(constants.pads, constants.pad_points)
