@@ -31,6 +31,7 @@ from drakegrasp.progress import Report, progress_bar
 from drakegrasp.shards import ShardHeader, read_outcomes
 from drakegrasp.units import WorkUnit, count_outcomes, run_unit
 
+
 @dataclass(frozen=True, kw_only=True)
 class BuildReport:
     """What a build did.

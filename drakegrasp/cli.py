@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,10 +20,19 @@ from rich.measure import Measurement
 from rich.table import Table
 
 from drakegrasp import __version__
+from drakegrasp.build_options import (
+    build_options,
+    manifest_option,
+    parse_request,
+    set_option,
+    times_option,
+    units_option,
+)
 from drakegrasp.errors import ConfigError, DrakegraspError, GraspError, HandError, MeshError
 
 if TYPE_CHECKING:
     from drakegrasp.build import BuildReport
+    from drakegrasp.build_options import BuildRequest
 
 #: Errors of what was asked for, as against errors of what was done.
 WRONG_USAGE = (ConfigError, GraspError, HandError, MeshError)
@@ -36,38 +47,38 @@ class _Commands(click.Group):
         return list(self.commands)
 
     def invoke(self, ctx: click.Context) -> Any:
-        try:
+        with one_line_errors(ctx):
             return super().invoke(ctx)
-        except DrakegraspError as error:
-            click.echo(f"error: {' '.join(str(error).split())}", err=True)
-            ctx.exit(2 if isinstance(error, WRONG_USAGE) else 1)
-        except (OSError, RuntimeError) as error:
-            if isinstance(error, click.exceptions.Exit | click.Abort):
-                raise
-            click.echo(f"error: {str(error).strip().splitlines()[0]}", err=True)
-            ctx.exit(1)
-        except KeyboardInterrupt:
-            goes_on = ctx.invoked_subcommand == "build"
-            click.echo(f"stopped{'; the same command goes on from here' * goes_on}", err=True)
-            ctx.exit(130)
+
+
+class OneCommand(click.Command):
+    """A script's only command: a build, with errors in one line."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        with one_line_errors(ctx, builds=True):
+            return super().invoke(ctx)
+
+
+@contextmanager
+def one_line_errors(ctx: click.Context, *, builds: bool = False) -> Iterator[None]:
+    """Turn errors within the block into one line on standard error and an exit code."""
+    try:
+        yield
+    except DrakegraspError as error:
+        click.echo(f"error: {' '.join(str(error).split())}", err=True)
+        ctx.exit(2 if isinstance(error, WRONG_USAGE) else 1)
+    except (OSError, RuntimeError) as error:
+        if isinstance(error, click.exceptions.Exit | click.Abort):
+            raise
+        click.echo(f"error: {str(error).strip().splitlines()[0]}", err=True)
+        ctx.exit(1)
+    except KeyboardInterrupt:
+        goes_on = builds or ctx.invoked_subcommand == "build"
+        click.echo(f"stopped{'; the same command goes on from here' * goes_on}", err=True)
+        ctx.exit(130)
 
 
 out_argument = click.argument("out", type=click.Path(path_type=Path), metavar="OUT")
-units_option = click.option(
-    "--units", default="m", show_default=True, help="Unit of length of the meshes: m, cm or mm."
-)
-manifest_option = click.option(
-    "--manifest",
-    type=click.Path(path_type=Path),
-    help="YAML file with units and classes by mesh.  [default: objects.yaml beside the meshes]",
-)
-set_option = click.option(
-    "--set",
-    "overrides",
-    multiple=True,
-    metavar="KEY=VALUE",
-    help="Set one value, e.g. lift.hold_time=1.",
-)
 workers_option = click.option(
     "--workers", type=int, help="Processes on this machine.  [one per core]"
 )
@@ -150,66 +161,39 @@ def audit(mesh_dir: Path, units: str, manifest: Path | None) -> None:
 
 
 @main.command()
-@click.option(
-    "--objects",
-    "mesh_dir",
-    required=True,
-    metavar="MESH_DIR|builtin",
-    help="Directory of .obj, .stl, .ply or .glb files, or the built-in objects.",
-)
-@click.option(
-    "--out",
-    required=True,
-    type=click.Path(path_type=Path),
-    help="Directory of the dataset; the same command goes on with what is there.",
-)
-@click.option(
-    "--config", metavar="YAML|PRESET", help="Configuration: a file, or paper or released.  [paper]"
-)
-@set_option
-@click.option("--candidates", type=int, help="Palm poses per object.  [10000]")
-@click.option("--max-grasps", type=int, help="Grasps per object after which no more are tried.")
-@click.option("--seed", type=int, help="Of all random draws.  [0]")
-@units_option
-@manifest_option
+@build_options
 @workers_option
 @scheduler_option
 @scheduler_file_option
-@click.option("--quiet", is_flag=True, help="Show no progress.")
+@click.option("--plan", is_flag=True, help="Only print the hours and bytes that it would take.")
+@times_option
 def build(
-    mesh_dir: str,
-    out: Path,
-    config: str | None,
-    overrides: tuple[str, ...],
-    candidates: int | None,
-    max_grasps: int | None,
-    seed: int | None,
-    units: str,
-    manifest: Path | None,
     workers: int | None,
     scheduler: str | None,
     scheduler_file: Path | None,
-    quiet: bool,
+    plan: bool,
+    times: Path | None,
+    **options: Any,
 ) -> None:
     """Build the dataset of a directory of meshes."""
     from drakegrasp.cluster import build_dataset
-    from drakegrasp.config import load_config
 
-    chosen = list(overrides)
-    if candidates is not None:
-        chosen.append(f"candidates.max={candidates}")
+    request = parse_request(**options)
+    if plan:
+        print_plan(request, workers, times)
+        return
     report = build_dataset(
-        mesh_dir,
-        out,
-        config=load_config(config, chosen, seed=seed, max_grasps=max_grasps),
-        units=units,
-        manifest=manifest,
+        request.objects,
+        request.out,
+        config=request.config,
+        units=request.units,
+        manifest=request.manifest,
         workers=workers,
         scheduler=scheduler,
         scheduler_file=scheduler_file,
-        show=not quiet,
+        show=request.show,
     )
-    _print_report(report)
+    print_report(report)
 
 
 @main.command()
@@ -424,7 +408,16 @@ def _print_stats(out: Path) -> None:
     console.print(split_table(count_splits(out)))
 
 
-def _print_report(report: BuildReport) -> None:
+def print_plan(request: BuildRequest, workers: int | None, times: Path | None) -> None:
+    """Print what a build that was asked for is expected to take."""
+    from drakegrasp.plan import plan_lines, plan_request, read_times
+
+    measured = None if times is None else read_times(times)
+    click.echo("\n".join(plan_lines(plan_request(request, workers, measured))))
+
+
+def print_report(report: BuildReport) -> None:
+    """Print what a build did, and where it put it."""
     _print_stats(report.out)
     if report.simulated:
         reused = f" ({report.reused} had been done before)" if report.reused else ""

@@ -1,4 +1,4 @@
-"""Running the work on Dask: the only module of the package that knows it.
+"""Running the work on Dask.
 
 Tasks are work units of many attempts; their data goes through shards, and only a summary
 comes back. A few tasks per worker are in flight at a time, whatever their number.
@@ -17,20 +17,23 @@ from typing import Any, TypeVar
 import dask
 import numpy.typing as npt
 from distributed import Client, Future, KilledWorker, LocalCluster, as_completed
+from distributed.security import Security
 
 from drakegrasp.build import BuildReport, build
+from drakegrasp.build_options import BUILTIN
 from drakegrasp.builtin import export_builtin
 from drakegrasp.config import Config, load_config, parse_config
 from drakegrasp.dataset import GraspDataset
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.executor import Executor, run_here
 from drakegrasp.hand import load_hand
-from drakegrasp.manifest import BUILTIN_FOLDER, DECISIVE, claim_directory, installed_versions
-from drakegrasp.meshes import find_meshes
+from drakegrasp.manifest import BUILTIN_FOLDER, claim_directory
+from drakegrasp.meshes import MeshSource, find_meshes
 from drakegrasp.progress import progress_bar
 from drakegrasp.verification import Verification
 from drakegrasp.verify_grasps import verify_tasks
 from drakegrasp.verify_plan import TASK_GRASPS, Mesh, VerifyTask, plan_verification, split_task
+from drakegrasp.workers import SATURATION, WORKER_ENVIRONMENT, admitted_workers
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -39,17 +42,6 @@ R = TypeVar("R")
 IN_FLIGHT = 2
 #: How long to wait for a scheduler to answer [s].
 CONNECT_SECONDS = 10
-#: What stands for the built-in objects in place of a directory.
-BUILTIN = "builtin"
-#: Environment of the workers. Software OpenGL would start threads of its own beside the
-#: one process per core, and nothing that a worker does may need the network.
-WORKER_ENVIRONMENT = {
-    "LP_NUM_THREADS": "0",
-    "DRAKE_ALLOW_NETWORK": "none",
-    "OMP_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-}
 #: Settings of Dask: a worker's process must not be a fork, because a fork after the first
 #: image hangs; its profiler costs time; a worker takes no task before it can start it.
 DASK_SETTINGS: dict[str, Any] = {
@@ -57,7 +49,7 @@ DASK_SETTINGS: dict[str, Any] = {
     # Ctrl-C reaches every process of a terminal: the client stops, and then its workers.
     "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],
     "distributed.worker.profile.enabled": False,
-    "distributed.scheduler.worker-saturation": 1.0,
+    "distributed.scheduler.worker-saturation": SATURATION,
     "distributed.nanny.pre-spawn-environ": WORKER_ENVIRONMENT,
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
@@ -99,11 +91,47 @@ def build_dataset(
     _refuse_workers(workers, scheduler, scheduler_file)
     out, config = Path(out).absolute(), config or load_config()
     load_hand(config.hand)
-    builtin = str(objects) == BUILTIN
-    sources = [] if builtin else find_meshes(objects, units=units, manifest=manifest)
+    sources = find_sources(objects, units, manifest)
     with connect(workers, scheduler, scheduler_file) as client:
-        _refuse_unfit_workers(client, config)
-        if builtin:
+        return build_on(client, sources, out, config, show=show)
+
+
+def find_sources(
+    objects: str | Path, units: str, manifest: str | Path | None
+) -> list[MeshSource] | None:
+    """Return the meshes of a directory, or None for the built-in objects.
+
+    Raises:
+        MeshError: If there is no mesh.
+    """
+    if str(objects) == BUILTIN:
+        return None
+    return find_meshes(objects, units=units, manifest=manifest)
+
+
+def build_on(
+    client: Client,
+    sources: Sequence[MeshSource] | None,
+    out: Path,
+    config: Config,
+    *,
+    show: bool = True,
+) -> BuildReport:
+    """Build a dataset on the workers of a client; see `build_dataset`.
+
+    Args:
+        client: Of a cluster whose workers all see `out`.
+        sources: The meshes; None for the built-in objects.
+        out: Directory of the dataset, absolute.
+        config: All the rules.
+        show: Whether to show progress on standard error.
+
+    Raises:
+        DataError: If `out` cannot be used, or no mesh is fit to be simulated.
+        MachineError: If a worker would give other results than this machine.
+    """
+    with admitted_workers(client, config):
+        if sources is None:
             claim_directory(out, config)
             export_builtin(out / BUILTIN_FOLDER)
             sources = find_meshes(out / BUILTIN_FOLDER)
@@ -200,14 +228,17 @@ def run_verification(
 
 
 def _verify(tasks: Sequence[VerifyTask], client: Client | None, show: bool) -> list[Verification]:
-    execute: Executor = run_here
-    if client is not None:
-        if tasks:
-            _refuse_unfit_workers(client, parse_config(tasks[0].config))
-        execute = DaskExecutor(client)
-    else:
+    if client is None:
         # Here it costs nothing to report every grasp.
-        tasks = [part for task in tasks for part in split_task(task, 1)]
+        parts = [part for task in tasks for part in split_task(task, 1)]
+        return _verify_with(run_here, parts, show)
+    if not tasks:
+        return []
+    with admitted_workers(client, parse_config(tasks[0].config)):
+        return _verify_with(DaskExecutor(client), tasks, show)
+
+
+def _verify_with(execute: Executor, tasks: Sequence[VerifyTask], show: bool) -> list[Verification]:
     with progress_bar("verify", "grasps", show=show) as report:
         return verify_tasks(tasks, execute, report)
 
@@ -217,6 +248,9 @@ def connect(
     workers: int | None = None,
     scheduler: str | None = None,
     scheduler_file: str | Path | None = None,
+    *,
+    security: Security | None = None,
+    memory: str | None = None,
 ) -> Iterator[Client]:
     """Connect to a running scheduler, or start a cluster on this machine, while the block runs.
 
@@ -224,6 +258,8 @@ def connect(
         workers: Processes of a cluster on this machine; one per core if None.
         scheduler: Address of a running scheduler.
         scheduler_file: Its JSON file, instead of the address.
+        security: Certificates; without, nothing is encrypted.
+        memory: Limit per process on this machine, e.g. "2GB"; an equal share of it if None.
 
     Raises:
         MachineError: If there is no scheduler at the address.
@@ -232,7 +268,9 @@ def connect(
         if scheduler or scheduler_file:
             file = None if scheduler_file is None else str(scheduler_file)
             try:
-                client = Client(scheduler, scheduler_file=file, timeout=CONNECT_SECONDS)
+                client = Client(
+                    scheduler, scheduler_file=file, timeout=CONNECT_SECONDS, security=security
+                )
             except (OSError, ValueError) as error:
                 raise MachineError(
                     f"{scheduler or file}: must be a running Dask scheduler, got none ({error})"
@@ -247,6 +285,8 @@ def connect(
                     threads_per_worker=1,
                     dashboard_address="127.0.0.1:0",
                     silence_logs=logging.ERROR,
+                    security=security,
+                    memory_limit=memory or "auto",
                 ) as cluster,
                 Client(cluster) as client,
             ):
@@ -269,28 +309,6 @@ def _refuse_workers(
         raise ConfigError("workers must not be given with a scheduler, which has its own")
     if workers is not None and workers < 1:
         raise ConfigError(f"workers must be at least 1, got {workers}")
-
-
-def _refuse_unfit_workers(client: Client, config: Config) -> None:
-    """Refuse workers that would give other results than this machine, or give them badly.
-
-    Raises:
-        MachineError: If a worker has several threads, or other versions of what decides.
-    """
-    for address, threads in client.nthreads().items():
-        if threads != 1:
-            raise MachineError(
-                f"worker {address}: must have one thread (dask worker --nthreads 1), because the "
-                f"first that renders owns the images, got {threads}"
-            )
-    ours = installed_versions(config)
-    for address, theirs in client.run(installed_versions, config).items():
-        for name in DECISIVE:
-            if theirs[name] != ours[name]:
-                raise MachineError(
-                    f"worker {address}: must have {name} {ours[name]} like the client, "
-                    f"got {theirs[name]}"
-                )
 
 
 class DaskExecutor:

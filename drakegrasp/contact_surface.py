@@ -9,6 +9,9 @@ import trimesh
 from drakegrasp.frames import Array
 from drakegrasp.object_model import ObjectModel
 
+#: Least cosine between a normal that points out of a face and the face's own: 84 degrees.
+OUTWARD = 0.1
+
 
 def face_distances(model: ObjectModel, p_OQ: Array) -> Array:
     """Return the distance (k, m) [m] of points (k, 3) in {O} from each of m collision faces."""
@@ -33,5 +36,5 @@ def points_outward(
         nhat_Q_O: (k, 3), normals in {O}.
         within: What near is [m].
     """
-    outward = nhat_Q_O @ model.collision.face_normals.T > 0.0
+    outward = nhat_Q_O @ model.collision.face_normals.T > OUTWARD
     return np.asarray(np.any(outward & (distance <= within), axis=1))

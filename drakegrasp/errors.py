@@ -7,7 +7,9 @@
   * DataError            a dataset, shard or manifest that is missing, foreign or broken
   * GraspError           a grasp vector, or its frame, that cannot be verified
     * OffSurfaceError    a grasp whose contacts are not on the object
-  * MachineError         something that the machine lacks (EGL, a usable Drake, disk)
+  * MachineError         something that the machine lacks (EGL, a usable Drake, workers)
+    * DiskFullError      no room to write; what was begun is gone, and the work goes on later
+    * BlankImageError    OpenGL gave an image of nothing
 
 Failures of the physics are not here: they are values, see `drakegrasp.outcomes`.
 Messages follow one pattern: what, what it must be, what it was.
@@ -44,3 +46,11 @@ class OffSurfaceError(GraspError):
 
 class MachineError(DrakegraspError, RuntimeError):
     """Something that this machine lacks, with the line that mends it."""
+
+
+class DiskFullError(MachineError):
+    """No room to write a file: what was begun of it is gone."""
+
+
+class BlankImageError(MachineError):
+    """OpenGL gave an image of nothing, which must never become data."""

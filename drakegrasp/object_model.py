@@ -149,7 +149,9 @@ def make_object(
         vertices: (n, 3) [m].
         faces: (m, 3).
         config: Mass, and limits of size and faces.
-        name, class_name, mesh_sha256: Fields of the result.
+        name: Of the object.
+        class_name: Of the object.
+        mesh_sha256: Digest of where it comes from.
         unit: What to say of the unit of length where the size is refused.
 
     Raises:

@@ -15,14 +15,16 @@ from itertools import combinations
 import numpy as np
 from scipy.spatial import KDTree
 
-from drakegrasp.frames import Array, make_pose
-from drakegrasp.hand import load_hand
+from drakegrasp.frames import Array
+from drakegrasp.hand import Hand
 from drakegrasp.kinematics import coordinate_limits, fingertip_poses
 from drakegrasp.pads import touch
 from drakegrasp.wrist_problem import hand_constants
 
-#: Steps of the table's angles [rad].
+#: Steps of the table's angles [rad]; closing steps are longer where fingers are many.
 SPREAD_STEP, CLOSING_STEP = np.deg2rad(11.25), np.deg2rad(8.0)
+#: Closing postures of the table at most.
+MAX_CLOSINGS = 5000
 #: The table ends where fingers are almost in the fist, and where spread fingers look sideways.
 MAX_SPREAD, MAX_CLOSING = np.deg2rad(45.0), np.deg2rad(112.0)
 #: What a right angle counts as when contacts are compared [m].
@@ -59,12 +61,13 @@ class Postures:
 
 
 @lru_cache(maxsize=4)
-def make_postures(name: str) -> Postures:
-    """Return the postures of a hand by name or path, see `hand.load_hand`."""
-    hand, constants = load_hand(name), hand_constants(name)
+def make_postures(hand: Hand) -> Postures:
+    """Return the postures of a hand."""
+    constants = hand_constants(hand)
     lower, upper = coordinate_limits(hand).T
     most = np.r_[MAX_SPREAD, np.full(hand.num_fingers, MAX_CLOSING)]
-    step = np.r_[SPREAD_STEP, np.full(hand.num_fingers, CLOSING_STEP)]
+    fewest = MAX_CLOSINGS ** (1.0 / hand.num_fingers) - 1.0
+    step = np.r_[SPREAD_STEP, np.full(hand.num_fingers, max(CLOSING_STEP, MAX_CLOSING / fewest))]
     axes = [
         np.arange(low, min(high, limit) + 1e-9, s)
         for low, high, limit, s in zip(lower, upper, most, step, strict=True)
@@ -94,7 +97,7 @@ def find_starts(postures: Postures, p_OQ: Array, nhat_Q_O: Array, count: int) ->
 
 
 def _features(p: Array, n: Array) -> Array:
-    """Return lengths (..., f) [m] that say how points and normals (..., k, 3) stand to each other."""
+    """Return lengths (..., f) [m] that tell how points and normals (..., k, 3) are arranged."""
     values = [np.zeros(p.shape[:-2])]
     for i, j in combinations(range(p.shape[-2]), 2):
         d = p[..., i, :] - p[..., j, :]
@@ -132,4 +135,3 @@ def _lay_over(p_GP: Array, n_G: Array, p_OQ: Array, n_O: Array) -> tuple[Array, 
     X = np.tile(np.eye(4), (len(R), 1, 1))
     X[:, :3, :3], X[:, :3, 3] = R, p
     return X, misfit
-

@@ -38,7 +38,7 @@ from pydrake.systems.sensors import CameraInfo
 from drakegrasp.camera import intrinsics
 from drakegrasp.candidates import object_key
 from drakegrasp.config import CameraConfig
-from drakegrasp.errors import MachineError
+from drakegrasp.errors import BlankImageError
 from drakegrasp.frames import X_WT
 from drakegrasp.hand import make_parser
 from drakegrasp.hand_files import MODELS
@@ -121,7 +121,7 @@ def look(renderer: Renderer, X_TO: npt.ArrayLike, X_TC: npt.ArrayLike) -> Look:
     """Return what a camera at X_TC (4, 4) sees of an object at X_TO (4, 4).
 
     Raises:
-        MachineError: If the image is blank, which means that OpenGL failed.
+        BlankImageError: If the image is blank, which means that OpenGL failed.
     """
     plant, config = renderer.plant, renderer.config
     plant_context = plant.GetMyMutableContextFromRoot(renderer.context)
@@ -145,7 +145,7 @@ def look(renderer: Renderer, X_TO: npt.ArrayLike, X_TC: npt.ArrayLike) -> Look:
     labels = query.RenderLabelImage(colour_camera, world, X_WC).data[:, :, 0]
     rgb = query.RenderColorImage(colour_camera, world, X_WC).data[:, :, :3]
     if not rgb.any() or not depth.any():
-        raise MachineError(BLANK)
+        raise BlankImageError(BLANK)
     image = np.empty_like(rgb, shape=(4, config.size, config.size), dtype=np.float32)
     image[:3] = np.moveaxis(rgb, 2, 0) / np.float32(255.0)
     # Drake gives 0 for too near and infinity for too far.

@@ -8,11 +8,14 @@ HDF5 leaves free at a file's start, shows any change of a single bit.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
+import re
 import secrets
+import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from io import BufferedRandom, BufferedReader
 from pathlib import Path
@@ -22,7 +25,8 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.errors import DataError
+from drakegrasp.errors import DataError, DiskFullError
+from drakegrasp.processes import host_label, is_running
 from drakegrasp.schema import LOOK_FIELDS, SCHEMA_VERSION, TRIAL_FIELDS, Field
 
 AnyArray = npt.NDArray[Any]
@@ -35,6 +39,12 @@ SEAL_SIZE = 512
 COLUMN_CHUNK = 2048
 #: Suffix of a file that is being written; what is left of one after a crash may be deleted.
 TEMPORARY_SUFFIX = ".tmp"
+#: How it ends: which process, of which machine, writes it.
+_TEMPORARY = re.compile(r"\.(?P<host>[A-Za-z0-9-]+)~(?P<pid>\d+)~[0-9a-f]{12}\.tmp")
+#: Age after which another machine's temporary file is one of a dead process [s].
+STALE_SECONDS = 3600.0
+#: What the system says where there is no room: disk, quota, or a limit on a file's size.
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +72,10 @@ class ShardHeader:
     def path(self, out: Path) -> Path:
         """Return where the shard is in a dataset's directory."""
         return out / "shards" / self.object_name / self.file_name
+
+    def journal_path(self, out: Path) -> Path:
+        """Return where the journal of a run of the unit is, see `drakegrasp.journal`."""
+        return self.path(out).with_suffix(".journal")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -140,7 +154,69 @@ def sync_and_rename(temporary: Path, path: Path) -> None:
 
 def temporary_name(path: Path) -> Path:
     """Return a name beside a file under which it may be written, unlike any other process's."""
-    return path.with_name(f".{path.name}.{secrets.token_hex(6)}{TEMPORARY_SUFFIX}")
+    writer = f"{host_label()}~{os.getpid()}~{secrets.token_hex(6)}"
+    return path.with_name(f".{path.name}.{writer}{TEMPORARY_SUFFIX}")
+
+
+def sweep_temporary(out: Path) -> list[Path]:
+    """Remove what dead processes left half-written in a dataset's directory; return its names.
+
+    Another machine's processes cannot be asked: their files go when they are old.
+    """
+    return [path for path in _temporary_files(out) if _is_stale(path) and _remove(path)]
+
+
+def _temporary_files(out: Path) -> Iterator[Path]:
+    for pattern in ("", "objects", "shards/*"):
+        for folder in out.glob(pattern) if pattern else [out]:
+            with suppress(FileNotFoundError, NotADirectoryError), os.scandir(folder) as entries:
+                for entry in entries:
+                    if entry.name.startswith(".") and entry.name.endswith(TEMPORARY_SUFFIX):
+                        yield Path(entry.path)
+
+
+def _is_stale(path: Path) -> bool:
+    found = _TEMPORARY.search(path.name)
+    if found is not None and found["host"] == host_label():
+        return not is_running(int(found["pid"]))
+    try:
+        return time.time() - path.stat().st_mtime > STALE_SECONDS
+    except FileNotFoundError:
+        return False
+
+
+def _remove(path: Path) -> bool:
+    try:
+        path.unlink()
+    except FileNotFoundError:
+        return False
+    return True
+
+
+@contextmanager
+def disk_full_named(out: Path) -> Iterator[None]:
+    """Turn the system's word for a full disk, within the block, into one line.
+
+    Raises:
+        DiskFullError: If there is no room for what the block writes.
+    """
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        if not _is_no_room(error):
+            raise
+        raise DiskFullError(
+            f"{out}: must have room for what is written, got a full disk or quota "
+            f"({os.strerror(_NO_ROOM[0])}); make room, and the same command goes on from here"
+        ) from None
+
+
+def _is_no_room(error: BaseException) -> bool:
+    # HDF5 passes the number on in its own text only.
+    text = str(error)
+    return getattr(error, "errno", None) in _NO_ROOM or any(
+        f"errno = {number}," in text or os.strerror(number) in text for number in _NO_ROOM
+    )
 
 
 def _sync(path: Path) -> None:

@@ -113,8 +113,10 @@ def run_attempt(scene: Scene, X_TO: npt.ArrayLike, attempt: Attempt, config: Con
         return _simulate(scene, record, attempt, config)
     except _TimeoutError:
         return TrialRecord(outcome=Outcome.TIMEOUT, X_TO=X_TO, X_OG=attempt.X_OG)
+    except (MemoryError, OSError):
+        raise  # the machine's, not the attempt's
     # A failed assertion within Drake arrives as SystemExit, everything else as RuntimeError.
-    except (RuntimeError, SystemExit, _StateError) as error:
+    except (Exception, SystemExit) as error:
         lines = str(error).strip().splitlines() or [type(error).__name__]
         failed = TrialRecord(outcome=Outcome.SOLVER_ERROR, X_TO=X_TO, X_OG=attempt.X_OG)
         return replace(failed, message=lines[0])

@@ -2,7 +2,8 @@
 
 A work unit is plain data, so it can cross a process border; diagrams are built where it
 runs and kept for the next unit of the same object. What a shard holds depends on its
-header and the configuration alone: not on who runs it, nor on what ran before.
+header and the configuration alone: not on who runs it, nor on what ran before, nor on how
+often its process died on the way (see `drakegrasp.journal`).
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ import gc
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,19 +27,42 @@ from drakegrasp.candidates import Attempt, make_attempts
 from drakegrasp.config import Config, parse_config
 from drakegrasp.construction import build_scene
 from drakegrasp.contacts import Contacts
-from drakegrasp.errors import DataError
+from drakegrasp.errors import DataError, MachineError
+from drakegrasp.faults import strike
 from drakegrasp.frames import pack_pose
 from drakegrasp.hand import load_hand
+from drakegrasp.journal import (
+    ATTEMPT,
+    GIVE_UP_DEATHS,
+    NO_JOURNAL,
+    Journal,
+    Verdict,
+    open_journal,
+)
 from drakegrasp.outcomes import Outcome
 from drakegrasp.prepared import PreparedObject, load_prepared
 from drakegrasp.render import Renderer, build_renderer, look
 from drakegrasp.scene import Scene, hand_joint_names
 from drakegrasp.schema import CAMERAS, LOOK_FIELDS, sizes
-from drakegrasp.shards import AnyArray, Shard, ShardHeader, trial_columns, write_shard
+from drakegrasp.shards import (
+    AnyArray,
+    Shard,
+    ShardHeader,
+    disk_full_named,
+    read_outcomes,
+    trial_columns,
+    write_shard,
+)
 from drakegrasp.trial import TrialRecord, run_attempt
 
 #: Objects whose diagrams a process keeps; a unit follows units of the same object.
 KEPT_OBJECTS = 2
+#: An attempt that is that many times over its wall-clock limit will never look at the clock.
+HANG_FACTOR = 1.5
+#: Wall clock after which anything else that a unit does hangs [s].
+STAGE_SECONDS = 600.0
+#: What else a unit does, by the name of its step.
+_STAGES = {"build": "building its scene", "look": "its images", "write": "writing its shard"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,11 +73,14 @@ class WorkUnit:
         out: Directory of the dataset, seen by every worker.
         header: Object and range of candidates.
         config: `Config.to_dict()`.
+        expendable: Whether the process that runs it is started again when it dies. Then a
+            crash or a hang costs the guilty attempt; else it is the caller's to see.
     """
 
     out: str
     header: ShardHeader
     config: dict[str, Any]
+    expendable: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,26 +154,123 @@ def _leave_renderers_to_the_system() -> None:
 
 
 def run_unit(unit: WorkUnit) -> UnitSummary:
-    """Try all attempts of a unit, look at the successes, and write the shard."""
-    with _one_unit:
-        return _run_unit(unit)
+    """Try all attempts of a unit, look at the successes, and write the shard.
+
+    Raises:
+        DataError: If the object's files are damaged, or Drake cannot build its scene.
+        BlankImageError: If OpenGL gives nothing.
+        DiskFullError: If there is no room for the shard.
+        MachineError: If something other than an attempt kills the process again and again.
+    """
+    out, header = Path(unit.out), unit.header
+    with _one_unit, disk_full_named(out):
+        outcomes = _outcomes_there(out, header)
+        if outcomes is not None:  # its process died between the shard and the answer
+            summary = UnitSummary(header=header, outcomes=outcomes, seconds={}, errors={})
+        elif unit.expendable:
+            with open_journal(header.journal_path(out), asdict(header)) as journal:
+                summary = _run_unit(unit, journal)
+        else:
+            summary = _run_unit(unit, NO_JOURNAL)
+        header.journal_path(out).unlink(missing_ok=True)
+        return summary
 
 
-def _run_unit(unit: WorkUnit) -> UnitSummary:
+def find_outcomes(out: Path, header: ShardHeader) -> dict[Outcome, int] | None:
+    """Return the number of attempts by outcome of a unit that is done, or None if it is not.
+
+    Raises:
+        DataError: If its shard is there, but damaged or of something else.
+    """
+    path = header.path(out)
+    return count_outcomes(read_outcomes(path, header)) if path.exists() else None
+
+
+def _outcomes_there(out: Path, header: ShardHeader) -> dict[Outcome, int] | None:
+    try:
+        return find_outcomes(out, header)
+    except DataError:
+        return None
+
+
+def _run_unit(unit: WorkUnit, journal: Journal) -> UnitSummary:
     config, out, header = parse_config(unit.config), Path(unit.out), unit.header
+    _refuse_futile(journal, header)
     seconds: dict[str, float] = {}
-    bench = _timed(seconds, "build", lambda: workbench(out, header, config))
-    attempts = list(unit_attempts(bench.prepared, header, config))
-    records = _timed(seconds, "try", lambda: [try_on(bench, attempt) for attempt in attempts])
-    looks = _timed(seconds, "look", lambda: look_at_successes(bench, records))
-    shard = Shard(header=header, trials=trial_rows(bench, attempts, records), looks=looks)
-    _timed(seconds, "write", lambda: write_shard(out, shard))
+    with _stage(journal, "build", header, seconds):
+        bench = _workbench(out, header, config)
+        attempts = unit_attempts(bench.prepared, header, config)
+    with _timed(seconds, "try"):
+        records = _try_all(bench, attempts, journal)
+    with _timed(seconds, "look"):
+        looks = look_at_successes(bench, records, journal)
+    with _stage(journal, "write", header, seconds):
+        shard = Shard(header=header, trials=trial_rows(bench, attempts, records), looks=looks)
+        write_shard(out, shard)
     return UnitSummary(
         header=header,
         outcomes=count_outcomes(shard.trials["outcome"]),
         seconds=seconds,
         errors=dict(Counter(record.message for record in records if record.message)),
     )
+
+
+def _workbench(out: Path, header: ShardHeader, config: Config) -> Workbench:
+    try:
+        return workbench(out, header, config)
+    # A failed assertion within Drake arrives as SystemExit, which would end the worker.
+    except SystemExit as error:
+        raise DataError(
+            f"{header.object_name}: Drake must be able to build its scene, got: {error}"
+        ) from None
+
+
+def _try_all(bench: Workbench, attempts: Sequence[Attempt], journal: Journal) -> list[TrialRecord]:
+    """Return the records of attempts in their order; those under suspicion run first."""
+    steps = [f"{ATTEMPT} {row}" for row in range(len(attempts))]
+    suspects = set(journal.suspects)
+    order = sorted(range(len(attempts)), key=lambda row: steps[row] not in suspects)
+    records = {row: _try_step(bench, attempts[row], journal, steps[row]) for row in order}
+    return [records[row] for row in range(len(attempts))]
+
+
+def _try_step(bench: Workbench, attempt: Attempt, journal: Journal, step: str) -> TrialRecord:
+    verdict = journal.verdict(step)
+    if verdict is not None:
+        outcome = Outcome.TIMEOUT if verdict is Verdict.HUNG else Outcome.CRASHED
+        return TrialRecord(outcome=outcome, X_TO=bench.prepared.X_TO, X_OG=attempt.X_OG)
+    with journal.step(step, HANG_FACTOR * bench.config.attempt_seconds):
+        strike(bench.prepared.model.name, attempt.candidate, attempt.standoff_index)
+        return try_on(bench, attempt)
+
+
+def _refuse_futile(journal: Journal, header: ShardHeader) -> None:
+    if journal.is_futile:
+        raise MachineError(
+            f"{header.object_name}, palm poses {header.start} to {header.stop - 1}: the worker "
+            f"must stay alive for one work unit, got {GIVE_UP_DEATHS} deaths in a row; is there "
+            "enough memory? The same command goes on from here"
+        )
+
+
+def _refuse_guilty(journal: Journal, step: str, name: str) -> None:
+    """Refuse a step that is no attempt and ended its process: that is not the grasp's fault."""
+    verdict = journal.verdict(step)
+    if verdict is not None:
+        what = _STAGES[step.partition(" ")[0]]
+        raise MachineError(
+            f"{name}: {what} must not end the process, got one that {verdict.value}; see "
+            "`drakegrasp doctor`. The same command tries again"
+        )
+
+
+@contextmanager
+def _stage(
+    journal: Journal, step: str, header: ShardHeader, seconds: dict[str, float]
+) -> Iterator[None]:
+    _refuse_guilty(journal, step, header.object_name)
+    with _timed(seconds, step), journal.step(step, STAGE_SECONDS):
+        yield
 
 
 def unit_attempts(
@@ -190,26 +315,38 @@ def trial_rows(
     return columns
 
 
-def look_at_successes(bench: Workbench, records: Sequence[TrialRecord]) -> dict[str, AnyArray]:
+def look_at_successes(
+    bench: Workbench, records: Sequence[TrialRecord], journal: Journal = NO_JOURNAL
+) -> dict[str, AnyArray]:
     """Return the columns of `/looks`: both images of every success."""
     rows = [i for i, record in enumerate(records) if record.outcome is Outcome.SUCCESS]
     columns = {f.name: f.empty(len(rows), _sizes(bench)) for f in LOOK_FIELDS}
-    camera = bench.config.camera
-    poses = {"oto": camera_pose_oto, "otm": camera_pose_otm}
     for k, row in enumerate(rows):
-        record = records[row]
+        step = f"look {row}"
+        _refuse_guilty(journal, step, bench.prepared.model.name)
         columns["row"][k] = row
-        for name in CAMERAS:
-            X_TC = poses[name](record.X_TO @ record.X_OG, camera)
-            seen = look(bench.renderer, record.X_TO, X_TC)
-            columns[f"image_{name}"][k] = seen.image
-            columns[f"mask_{name}"][k] = seen.mask
-            columns[f"X_TC_{name}"][k] = pack_pose(X_TC)
-            # Where the object is out of sight the frame stays NaN, and a filter removes the row.
-            if name == "otm" and seen.mask.any():
-                X_CI = image_frame(intrinsics(camera), seen.mask, seen.image[3])
-                columns["X_CI_otm"][k] = pack_pose(X_CI)
+        with journal.step(step, STAGE_SECONDS):
+            for name, value in _images(bench, records[row]).items():
+                columns[name][k] = value
     return columns
+
+
+def _images(bench: Workbench, record: TrialRecord) -> dict[str, AnyArray]:
+    """Return both images of a success, by the names of LOOK_FIELDS."""
+    camera = bench.config.camera
+    found: dict[str, AnyArray] = {}
+    poses = {"oto": camera_pose_oto, "otm": camera_pose_otm}
+    for name in CAMERAS:
+        X_TC = poses[name](record.X_TO @ record.X_OG, camera)
+        seen = look(bench.renderer, record.X_TO, X_TC)
+        found[f"image_{name}"] = seen.image
+        found[f"mask_{name}"] = seen.mask
+        found[f"X_TC_{name}"] = pack_pose(X_TC)
+        # Where the object is out of sight the frame stays NaN, and a filter removes the row.
+        if name == "otm" and seen.mask.any():
+            X_CI = image_frame(intrinsics(camera), seen.mask, seen.image[3])
+            found["X_CI_otm"] = pack_pose(X_CI)
+    return found
 
 
 def _row(prepared: PreparedObject, attempt: Attempt, record: TrialRecord) -> dict[str, Any]:
@@ -261,8 +398,8 @@ def _sizes(bench: Workbench) -> dict[str, int]:
     )
 
 
-def _timed(seconds: dict[str, float], stage: str, step: Callable[[], Any]) -> Any:
+@contextmanager
+def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     start = time.perf_counter()
-    result = step()
+    yield
     seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start
-    return result

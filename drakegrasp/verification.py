@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drakegrasp.candidates import Attempt
+from drakegrasp.config import Config
 from drakegrasp.contacts import Contacts
 from drakegrasp.force_lift import ForceLift
 from drakegrasp.frames import Array
@@ -14,6 +17,9 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.placed import PlacedObject
 from drakegrasp.trial import TrialRecord
 from drakegrasp.wrist_fit import WristFit
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -25,6 +31,7 @@ class Verification:
         outcome: The verdict; as in a dataset, or `unreachable` or `off_surface`.
         reason: One sentence that says why.
         placed: The object and its pose on the table.
+        config: The rules that it was verified by.
         p_OQ, nhat_Q_O: (k, 3), the predicted contact points [m] and unit normals in {O}.
         surface_distance: (k,), of the points from the object's surface [m].
         fit: The wrist pose and joints that were tried last or held, with SLSQP's status.
@@ -43,6 +50,7 @@ class Verification:
     outcome: Outcome
     reason: str
     placed: PlacedObject
+    config: Config
     p_OQ: Array
     nhat_Q_O: Array
     surface_distance: Array
@@ -106,14 +114,33 @@ class Verification:
         """Positions of the hand's joints after the lift [rad], in the plant's order."""
         return None if self.trial is None else self.trial.q_lifted
 
+    def save_html(self, path: str | Path) -> None:
+        """Write what was simulated as a recording to turn about in a browser, in one file.
+
+        It is simulated again, which gives the same bits.
+
+        Raises:
+            OSError: If the file cannot be written.
+        """
+        from drakegrasp.recording import record_verification
+
+        record_verification(self, self.config, Path(path))
+
+    def figure(self) -> Figure:
+        """Return a figure of predicted and reached contacts on the mesh; it has `savefig`."""
+        from drakegrasp.verification_figure import verification_figure
+
+        return verification_figure(self, self.config)
+
     def explain(self) -> str:
         """Return the verdict in two or three sentences for a person."""
         verdict = "holds" if self.success else f"fails ({self.outcome.label})"
         sentences = [f"The grasp of {self.placed.model.name} {verdict}: {self.reason}."]
         if self.fit is not None:
             sentences.append(
-                f"Before closing the fingertips are within {_mm(self.fit.residual)} of the predicted "
-                f"points and {np.rad2deg(self.fit.normal_error).max():.0f}° of their normals"
+                f"Before closing the fingertips are within {_mm(self.fit.residual)} of the "
+                f"predicted points and {np.rad2deg(self.fit.normal_error).max():.0f}° of their "
+                "normals"
                 + (
                     f"; they touch within {_mm(self.contact_error)} of them."
                     if self.contact_error is not None

@@ -54,6 +54,8 @@ LIGHTS = (
 AWAY = make_pose(np.eye(3), [0.0, 0.0, -100.0])
 #: Height of the camera that looks at the object alone, above the horizontal [rad].
 ELEVATION = np.deg2rad(24.0)
+#: A contact is looked at where the cosine between its normal and the line of sight is larger.
+FACING = 0.1
 #: Length of the arrow of the largest force [m].
 LARGEST_FORCE = 0.05
 #: Distance of a number from its arrow [points].
@@ -241,12 +243,15 @@ def _two_sides(model: ObjectModel, X_WO: Array, marks: Sequence[Marks]) -> tuple
     azimuths = np.deg2rad(AZIMUTHS_DEG)
     cameras = [_camera(model, X_WO, marks, azimuth)[:3, 3] for azimuth in azimuths]
     seen = np.array([_is_seen(model, X_WO, marks[0], p_WC) for p_WC in cameras])
-    # An arrow that points at the camera or away from it says little.
     towards = np.array([_towards(marks[0], X_WO, p_WC) for p_WC in cameras])
-    worth = seen * (1.0 + 0.5 * np.linalg.norm(np.cross(towards, marks[0].nhat_Q_O), axis=2))
+    normals = np.broadcast_to(marks[0].nhat_Q_O, towards.shape)
+    facing = np.sum(towards * normals, axis=2) > FACING
+    # An arrow that points at the camera says little.
+    across = np.linalg.norm(np.cross(towards, normals), axis=2)
+    worth = (seen & facing) * (1.0 + 0.5 * across)
     first = int(np.argmax(worth.sum(axis=1)))
     opposite = 1e-3 * np.cos(azimuths - azimuths[first])
-    second = int(np.argmax((worth * ~seen[first]).sum(axis=1) - opposite))
+    second = int(np.argmax((worth * (worth[first] == 0.0)).sum(axis=1) - opposite))
     return float(azimuths[first]), float(azimuths[second])
 
 

@@ -24,10 +24,6 @@ class Verified(Protocol):
     """A `Verification`, as far as it is shown; see there for shapes and units."""
 
     @property
-    def method(self) -> str:
-        """Either "hand" or "forces"."""
-
-    @property
     def outcome(self) -> Outcome:
         """The verdict."""
 

@@ -94,6 +94,7 @@ def verify_contacts(
         outcome=Outcome.OFF_SURFACE,
         reason="",
         placed=placed,
+        config=config,
         p_OQ=p_OQ,
         nhat_Q_O=nhat_Q_O,
         surface_distance=distance.min(axis=1),
@@ -111,9 +112,7 @@ def verify_contacts(
         return replace(base, reason=f"normal {finger + 1} points into the object")
     with _timed(seconds, "margin"):
         margin = force_margin(placed.model, rest_pose(placed.X_TO), p_OQ, nhat_Q_O, config)
-    base = replace(
-        base, epsilon=margin.epsilon, smallest_friction=margin.smallest_friction
-    )
+    base = replace(base, epsilon=margin.epsilon, smallest_friction=margin.smallest_friction)
     by = _by_hand if method == "hand" else _by_forces
     return by(base, config)
 
@@ -122,7 +121,11 @@ def _by_hand(base: Verification, config: Config) -> Verification:
     rules, X_TO = config.verify, rest_pose(base.placed.X_TO)
     with _timed(base.seconds, "fit"):
         fits = fit_wrist(
-            config.hand, base.p_OQ, base.nhat_Q_O, up_O=X_TO[2, :3], height=float(X_TO[2, 3])
+            load_hand(config.hand),
+            base.p_OQ,
+            base.nhat_Q_O,
+            up_O=X_TO[2, :3],
+            height=float(X_TO[2, 3]),
         )
     near = [fit for fit in fits if not _misfit(fit, config)][: rules.max_tries]
     if not near:

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from drakegrasp.frames import Array
+from drakegrasp.hand import Hand
 from drakegrasp.pads import nearest_on_pads
 from drakegrasp.postures import find_starts, make_postures
 from drakegrasp.wrist_problem import POSE, Evaluation, WristProblem, evaluate, hand_constants
@@ -59,12 +60,12 @@ class WristFit:
 
 
 def fit_wrist(
-    hand: str, p_OQ: Array, nhat_Q_O: Array, *, up_O: Array, height: float
+    hand: Hand, p_OQ: Array, nhat_Q_O: Array, *, up_O: Array, height: float
 ) -> list[WristFit]:
     """Return the solutions from all starts, the one with the smallest objective first.
 
     Args:
-        hand: Name or path, see `hand.load_hand`.
+        hand: Of k fingers.
         p_OQ: (k, 3), contact points [m].
         nhat_Q_O: (k, 3), outward unit normals.
         up_O: (3,), the table's upward normal in {O}.

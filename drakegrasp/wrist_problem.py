@@ -23,8 +23,9 @@ from functools import lru_cache
 
 import numpy as np
 
+from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, make_pose
-from drakegrasp.hand import Hand, load_hand
+from drakegrasp.hand import Hand
 from drakegrasp.hand_shapes import link_shapes
 from drakegrasp.kinematics import coordinate_limits
 from drakegrasp.pads import PadContact, Pads, make_pads, touch
@@ -133,13 +134,19 @@ class Evaluation:
 
 
 @lru_cache(maxsize=4)
-def hand_constants(name: str) -> HandConstants:
-    """Return the constants of a hand by name or path, see `hand.load_hand`."""
-    hand = load_hand(name)
+def hand_constants(hand: Hand) -> HandConstants:
+    """Return the constants of a hand.
+
+    Raises:
+        HandError: If its palm or a fingertip has no shape, or one that is not convex.
+    """
     shapes = link_shapes(hand)
+    for link in (hand.palm_link, *hand.fingertip_links):
+        if not shapes[link]:
+            raise HandError(f"{hand.sdf_path}: link {link!r} must have a collision shape, got none")
     corners = [np.concatenate(shapes[finger.fingertip]) for finger in hand.fingers]
     most = max(map(len, corners))
-    # Repeating a corner changes no minimum but a smooth one, and that one by less than it rounds.
+    # Repeated corners lower a smooth minimum by up to its rounding times the log of their number.
     padded = np.stack([np.pad(c, ((0, most - len(c)), (0, 0)), mode="edge") for c in corners])
     X_GB = np.linalg.inv(hand.X_BG)
     palm = np.concatenate(shapes[hand.palm_link]) @ X_GB[:3, :3].T + X_GB[:3, 3]
@@ -315,7 +322,8 @@ def _clearance(
     base = problem.height + problem.up_O @ X_OG[:3, 3]
     palm, p_palm = _lowest((constants.palm @ up_G)[None], constants.palm[None])
     up_F = up_G @ X_GF[:, :3, :3]
-    tips, p_F = _lowest(np.matmul(constants.fingertips, up_F[:, :, None])[..., 0], constants.fingertips)
+    corners = constants.fingertips
+    tips, p_F = _lowest(np.matmul(corners, up_F[:, :, None])[..., 0], corners)
     p_tips = np.matmul(X_GF[:, :3, :3], p_F[:, :, None])[..., 0] + X_GF[:, :3, 3]
     jacobian = np.zeros((1 + len(tips), POSE + len(tips) + 1))
     jacobian[:, :3] = _cross(np.concatenate([p_palm, p_tips]), up_G) @ spin_G

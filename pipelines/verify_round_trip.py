@@ -1,5 +1,4 @@
-"""Hand a dataset's grasps back to be verified, and some that must fail: the figures of
-docs/verification.md.
+"""Hand a dataset's grasps back to be verified, and some that must fail: prints JSON.
 
     python pipelines/verify_round_trip.py OUT [OUT ...] --workers 2 > round_trip.json
 
@@ -61,7 +60,7 @@ def main(outs: tuple[Path, ...], workers: int, every: int) -> None:
                     for key, grasps in spoilt.items():
                         where = {"dataset": data["oto"], "rows": rows, "frame": "object"}
                         verify(key, method, grasps, **where)
-    print(json.dumps({m: figures(by_key) for m, by_key in results.items()}, indent=1))
+    click.echo(json.dumps({m: figures(by_key) for m, by_key in results.items()}, indent=1))
 
 
 def spoil(out: Path, data: GraspDataset, rows: list[int]) -> dict[str, Array]:
@@ -107,7 +106,9 @@ def figures(by_key: dict[str, list[Verification]]) -> dict[str, Any]:
         "objects": len({v.placed.model.name for v in plain}),
         "held": share(plain),
         "held by the first wrist pose": float(np.mean([v.success and v.tries <= 1 for v in plain])),
-        "same outcome in all frames": float(np.mean([len(set(o)) == 1 for o in zip(*frames)])),
+        "same outcome in all frames": float(
+            np.mean([len(set(o)) == 1 for o in zip(*frames, strict=True)])
+        ),
         "residual [mm] median, 95 %": percentiles(residual, (50, 95)),
         "normal error [deg] median, 95 %": percentiles(angle, (50, 95)),
         "seconds median": {

@@ -47,7 +47,7 @@ def main(out: Path, grasps: int) -> None:
         "seconds of the batch by number of workers": seconds,
         "two workers over one": seconds[1] / seconds[2],
     }
-    print(json.dumps(result, indent=1))
+    click.echo(json.dumps(result, indent=1))
 
 
 if __name__ == "__main__":

@@ -10,9 +10,9 @@ import trimesh
 from hypothesis import settings
 
 from drakegrasp.build import build
-from drakegrasp.executor import run_here
 from drakegrasp.builtin import export_builtin
 from drakegrasp.config import Config, load_config
+from drakegrasp.executor import run_here
 from drakegrasp.meshes import find_meshes
 
 # Software OpenGL must not start threads beside the test workers, and nothing needs the network.

@@ -14,12 +14,12 @@ from assertions import assert_same_dataset
 
 from drakegrasp.assemble import assemble
 from drakegrasp.build import build
-from drakegrasp.executor import run_here
 from drakegrasp.check import check_dataset
 from drakegrasp.cluster import build_dataset
 from drakegrasp.config import Config, load_config
 from drakegrasp.dataset import GraspDataset
 from drakegrasp.errors import ConfigError, DataError, MachineError, MeshError
+from drakegrasp.executor import run_here
 from drakegrasp.filters import Removal
 from drakegrasp.manifest import read_manifest
 from drakegrasp.meshes import find_meshes

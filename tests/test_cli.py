@@ -171,13 +171,15 @@ def test_build_reports_and_says_when_nothing_is_left_to_do(
 
 @pytest.mark.sim
 @pytest.mark.slow
-def test_check_stats_and_replay_speak_of_a_dataset(small_dataset: Path) -> None:
+def test_check_stats_and_replay_speak_of_a_dataset(small_dataset: Path, tmp_path: Path) -> None:
     assert "no broken invariants" in run("check", small_dataset).stdout
     stats = run("stats", small_dataset).stdout
     assert "8_wineglass_flute" in stats
     assert "Samples by split" in stats
-    again = run("replay", small_dataset, "--trial", "0")
+    page = tmp_path / "trial.html"
+    again = run("replay", small_dataset, "--trial", "0", "--html", page)
     assert again.exit_code == 0
+    assert page.read_text(encoding="utf-8").lstrip().startswith("<!DOCTYPE html>")
     assert "trial 0 of 10_box_tall: was" in again.stdout
     assert run("replay", small_dataset, "--trial", "100000").exit_code == 1
 

@@ -178,6 +178,7 @@ def test_file_that_cannot_be_written_leaves_nothing_behind(
     assert [p.name for p in tmp_path.iterdir()] == ["folder"]
 
 
+@pytest.mark.slow
 def test_trial_of_a_dataset_is_recorded(small_dataset: Path, tmp_path: Path) -> None:
     with h5py.File(small_dataset / "trials.hdf5") as file:
         outcomes = file["trials/outcome"][:]

@@ -71,6 +71,7 @@ def results() -> list[Verification]:
         outcome=Outcome.OFF_SURFACE,
         reason="contact 1 is 20.0 mm from the object's surface",
         placed=placed,
+        config=CONFIG,
         p_OQ=RNG.normal(size=(3, 3)),
         nhat_Q_O=np.tile([0.0, 0.0, 1.0], (3, 1)),
         surface_distance=np.array([0.02, 0.0, 0.0]),

@@ -53,7 +53,7 @@ def touched(
         closing_deg: Range of the closing angles.
     """
     rng = np.random.default_rng(seed)
-    hand, constants = hand_of(name), hand_constants(name)
+    hand, constants = hand_of(name), hand_constants(hand_of(name))
     k, (lower, upper) = hand.num_fingers, coordinate_limits(hand).T
     first, last = np.deg2rad(closing_deg)
     low = np.maximum(lower, [0.0, *[first] * k])
@@ -71,7 +71,7 @@ def touched(
 
 
 def fit(name: str, made: Touch, up_O: Array = UP, height: float = HIGH) -> list[WristFit]:
-    return fit_wrist(name, made.p_OQ, made.nhat_Q_O, up_O=up_O, height=height)
+    return fit_wrist(hand_of(name), made.p_OQ, made.nhat_Q_O, up_O=up_O, height=height)
 
 
 def coordinates(fit: WristFit) -> Array:
@@ -130,7 +130,11 @@ def test_a_hand_of_two_fingers_finds_its_contacts_again(pincer: str, seed: int) 
 @pytest.mark.parametrize("seed", SEEDS[:8])
 def test_a_fit_is_as_good_as_it_says(seed: int) -> None:
     """By the forward kinematics and the pads without rounding."""
-    made, hand, constants = touched("barrett", seed), hand_of("barrett"), hand_constants("barrett")
+    made, hand, constants = (
+        touched("barrett", seed),
+        hand_of("barrett"),
+        hand_constants(hand_of("barrett")),
+    )
     for found in fit("barrett", made):
         X_OF = found.X_OG @ fingertip_poses(hand, spread=found.spread, closing=found.closing)
         X_FO = invert_pose(X_OF)
@@ -161,7 +165,7 @@ def test_where_the_object_is_does_not_matter(seed: int) -> None:
     up_O = X_AO[:3, :3].T @ UP
     here = fit("barrett", made, up_O, HIGH)
     there = fit_wrist(
-        "barrett",
+        hand_of("barrett"),
         transform_points(X_AO, made.p_OQ),
         rotate_vectors(X_AO, made.nhat_Q_O),
         up_O=UP,
@@ -179,7 +183,7 @@ def test_the_hands_mirror_image_is_the_hand_with_two_fingers_swapped(seed: int) 
     made, mirror, swapped = touched("barrett", seed), np.diag([-1.0, 1.0, 1.0]), [1, 0, 2]
     best = fit("barrett", made)[0]
     image = fit_wrist(
-        "barrett",
+        hand_of("barrett"),
         made.p_OQ[swapped] @ mirror,
         made.nhat_Q_O[swapped] @ mirror,
         up_O=UP,
@@ -197,7 +201,7 @@ def test_contacts_given_to_other_fingers_fit_worse(seed: int) -> None:
     own = fit("barrett", made)[0].objective
     for order in list(permutations(range(3)))[1:]:
         p, n = made.p_OQ[list(order)], made.nhat_Q_O[list(order)]
-        other = fit_wrist("barrett", p, n, up_O=UP, height=HIGH)[0]
+        other = fit_wrist(hand_of("barrett"), p, n, up_O=UP, height=HIGH)[0]
         assert other.objective > own
 
 
@@ -237,7 +241,7 @@ def test_contacts_out_of_reach_leave_a_large_residual() -> None:
     angle = 2.0 * np.pi * np.arange(3) / 3.0
     outward = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(3)])
     p_OQ = 0.5 / np.sqrt(3.0) * outward  # an equilateral triangle with edges of 0.5 m
-    found = fit_wrist("barrett", p_OQ, outward, up_O=UP, height=HIGH)
+    found = fit_wrist(hand_of("barrett"), p_OQ, outward, up_O=UP, height=HIGH)
     assert found
     for each in found:
         assert each.residual.max() > 0.05
@@ -247,7 +251,7 @@ def test_contacts_out_of_reach_leave_a_large_residual() -> None:
 def test_contacts_in_one_point_are_no_crash() -> None:
     """Nonsense that a network may well predict."""
     for normals in (np.tile(UP, (3, 1)), np.eye(3)):
-        for each in fit_wrist("barrett", np.zeros((3, 3)), normals, up_O=UP, height=HIGH):
+        for each in fit_wrist(hand_of("barrett"), np.zeros((3, 3)), normals, up_O=UP, height=HIGH):
             assert np.isfinite(each.X_OG).all() and np.isfinite(each.objective)
 
 
@@ -266,7 +270,7 @@ def test_the_same_contacts_give_the_same_bits(seed: int) -> None:
 
 @pytest.mark.parametrize("row", [0, 1234, 9000, -1])
 def test_a_posture_of_the_table_is_its_own_first_start(row: int) -> None:
-    postures, rng = make_postures("barrett"), np.random.default_rng(row + 1)
+    postures, rng = make_postures(hand_of("barrett")), np.random.default_rng(row + 1)
     X_OG = make_pose(Rotation.random(random_state=rng).as_matrix(), rng.uniform(-1.0, 1.0, 3))
     p_OQ = transform_points(X_OG, postures.p_GP[row])
     first = find_starts(postures, p_OQ, -rotate_vectors(X_OG, postures.n_G[row]), 3)[0]
@@ -276,14 +280,14 @@ def test_a_posture_of_the_table_is_its_own_first_start(row: int) -> None:
 
 def test_postures_are_within_the_limits_and_where_kinematics_puts_them(pincer: str) -> None:
     for name in ("barrett", pincer):
-        hand, postures = hand_of(name), make_postures(name)
+        hand, postures = hand_of(name), make_postures(hand_of(name))
         lower, upper = coordinate_limits(hand).T
         c = postures.coordinates
         assert np.all((lower - 1e-8 <= c) & (c <= upper + 1e-8))
         assert len(np.unique(c, axis=0)) == len(c)
         X_GF = fingertip_poses(hand, spread=c[:, 0], closing=c[:, 1:])
         p_FP = np.einsum("nkba,nkb->nka", X_GF[..., :3, :3], postures.p_GP - X_GF[..., :3, 3])
-        constants = hand_constants(name)
+        constants = hand_constants(hand_of(name))
         for p in p_FP[:: len(p_FP) // 7]:
             # On the pad but for its rounding.
             assert np.abs(touch(constants.pads, p).distance).max() < 5e-4
@@ -292,7 +296,7 @@ def test_postures_are_within_the_limits_and_where_kinematics_puts_them(pincer: s
 
 def misfit(name: str, X_OG: Array, c: Array, made: Touch) -> float:
     """Return what is left between a posture's contacts, as arrows of length `LEVER`, and others."""
-    hand, constants = hand_of(name), hand_constants(name)
+    hand, constants = hand_of(name), hand_constants(hand_of(name))
     X_OF = X_OG @ fingertip_poses(hand, spread=c[0], closing=c[1:])
     contact = touch(constants.pads, constants.pad_points)
     on_pad = constants.pad_points - contact.distance[:, None] * contact.normal
@@ -305,7 +309,7 @@ def misfit(name: str, X_OG: Array, c: Array, made: Touch) -> float:
 def test_starts_differ_and_the_best_comes_first(pincer: str, seed: int) -> None:
     for name in ("barrett", pincer):
         made = touched(name, seed)
-        starts = find_starts(make_postures(name), made.p_OQ, made.nhat_Q_O, 5)
+        starts = find_starts(make_postures(hand_of(name)), made.p_OQ, made.nhat_Q_O, 5)
         assert 1 < len(starts) <= 5
         for a, b in combinations(starts, 2):
             assert np.abs(a.coordinates - b.coordinates).max() > DIFFERENT
@@ -326,7 +330,7 @@ def test_starts_differ_and_the_best_comes_first(pincer: str, seed: int) -> None:
 def test_starts_tell_left_from_right(monkeypatch: pytest.MonkeyPatch) -> None:
     """Mirrored contacts have the same lengths and angles; their posture must be another."""
     monkeypatch.setattr(drakegrasp.postures, "NEAREST", 1)
-    postures, mirror = make_postures("barrett"), np.diag([-1.0, 1.0, 1.0])
+    postures, mirror = make_postures(hand_of("barrett")), np.diag([-1.0, 1.0, 1.0])
     wanted = np.deg2rad([33.75, 32.0, 88.0, 56.0])
     row = int(np.abs(postures.coordinates - wanted).max(axis=1).argmin())
     p, n = postures.p_GP[row], postures.n_G[row]
@@ -340,7 +344,7 @@ def test_starts_tell_left_from_right(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_search_by_shape_finds_what_laying_over_every_posture_finds(
     monkeypatch: pytest.MonkeyPatch, seed: int
 ) -> None:
-    postures, made = make_postures("barrett"), touched("barrett", seed)
+    postures, made = make_postures(hand_of("barrett")), touched("barrett", seed)
     (quick,) = find_starts(postures, made.p_OQ, made.nhat_Q_O, 1)
     monkeypatch.setattr(drakegrasp.postures, "NEAREST", len(postures.coordinates))
     (best,) = find_starts(postures, made.p_OQ, made.nhat_Q_O, 1)

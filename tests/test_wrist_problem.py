@@ -60,7 +60,7 @@ def random_problem(name: str, seed: int) -> tuple[WristProblem, Array]:
     pads = np.array([finger.p_FiP for finger in hand.fingers])
     p_GQ = np.einsum("kab,kb->ka", X_GF[:, :3, :3], pads) + X_GF[:, :3, 3]
     problem = WristProblem(
-        constants=hand_constants(name),
+        constants=hand_constants(hand_of(name)),
         p_OQ=transform_points(X_OS, p_GQ + rng.normal(scale=0.015, size=(k, 3))),
         nhat_Q_O=unit(rng.normal(size=(k, 3))),
         up_O=unit(rng.normal(size=3)),
@@ -218,7 +218,7 @@ def test_where_the_object_is_does_not_matter(name: str, seed: int) -> None:
 
 def test_a_finger_closed_against_its_contact_leaves_little(name: str) -> None:
     """Contacts on the nominal points, normals against the pads: only rounding is left."""
-    hand, constants = hand_of(name), hand_constants(name)
+    hand, constants = hand_of(name), hand_constants(hand_of(name))
     c = coordinate_limits(hand).mean(axis=1) * [0.2, *[0.8] * hand.num_fingers]
     X_GF = fingertip_poses(hand, spread=c[0], closing=c[1:])
     contact = touch(constants.pads, constants.pad_points)

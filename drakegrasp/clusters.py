@@ -1,0 +1,353 @@
+"""Starting the workers: on this machine, over SSH, under SLURM, or on a running scheduler.
+
+In: a `ClusterRequest`, plain data from a command line. Out: a Dask client, while a block
+runs. What the workers need is set here for every kind of cluster, because those of other
+machines inherit nothing: SSH hands on the settings of this process, SLURM's jobs get them
+in their script, and a running scheduler's workers are set up when they are admitted (see
+`workers`). Nothing listens beyond this machine unless `host` or `interface` says so.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import math
+import shlex
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import dask
+from dask.utils import parse_timedelta
+from distributed import Client, SpecCluster, SSHCluster
+from distributed.security import Security
+from tornado.ioloop import PeriodicCallback
+
+from drakegrasp.cluster import DASK_SETTINGS, connect
+from drakegrasp.errors import ConfigError, MachineError
+from drakegrasp.workers import WORKER_ENVIRONMENT
+
+KINDS = ("local", "ssh", "slurm", "scheduler", "scheduler-file")
+#: Memory of a worker under SLURM, where neither the user nor jobqueue.yaml says it.
+WORKER_MEMORY = "2GB"
+#: How often lost jobs are looked for [s]; one is lost that is missing twice.
+REFILL_SECONDS = 20.0
+#: A worker ends by itself between these times before its job's walltime does [s], or
+#: fractions of it if that is shorter: then its unit is not cut off, and jobs do not all
+#: end together.
+LIFETIME_MARGIN, LIFETIME_STAGGER = 300.0, 120.0
+#: Address of this machine alone.
+LOOPBACK = "127.0.0.1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClusterRequest:
+    """What workers are wanted, as on the command line of `pipelines/submit_build.py`.
+
+    Attributes:
+        kind: One of `KINDS`.
+        where: Hosts, the address of a scheduler, or its file.
+        workers: Processes in all.
+        cores: Of each host or job, a worker on each.
+        memory: Of each worker, e.g. "2GB".
+        walltime: Of each SLURM job, as SLURM writes it: [D-]HH:MM:SS.
+        host: Address on which the scheduler listens.
+        interface: Name of the network interface on which scheduler and workers listen.
+        tls: Whether to make certificates for this run.
+        tls_files: Files in PEM format: authority, certificate and private key; every machine
+            must see them.
+    """
+
+    kind: str
+    where: tuple[str, ...] = ()
+    workers: int | None = None
+    cores: int | None = None
+    memory: str | None = None
+    walltime: str | None = None
+    host: str | None = None
+    interface: str | None = None
+    tls: bool = False
+    tls_files: tuple[Path, Path, Path] | None = None
+
+
+def worker_count(request: ClusterRequest) -> int | None:
+    """Return how many workers there will be, as far as that is known before they start.
+
+    Raises:
+        ConfigError: If the request contradicts itself, or lacks something.
+    """
+    _refuse_contradictions(request)
+    if request.kind == "ssh":
+        return len(request.where) * _cores_per_host(request)
+    if request.kind == "slurm":
+        cores = _cores_per_job(request)
+        return cores * math.ceil((request.workers or 0) / cores)
+    return request.workers
+
+
+def describe(request: ClusterRequest) -> list[str]:
+    """Return what will be started, in lines for the user; of an open port it warns."""
+    count = worker_count(request)
+    lines = [{
+        "local": "workers on this machine",
+        "ssh": f"{count} workers over ssh on {' '.join(dict.fromkeys(request.where))}, "
+        f"scheduler on {request.where[0] if request.where else ''}",
+        "slurm": f"{count} workers in SLURM jobs of {_cores_text(request)}",
+    }.get(request.kind, f"the workers of {' '.join(request.where)}")]
+    encrypted = request.tls or request.tls_files is not None
+    lines.append(f"connections: {'TLS' if encrypted else 'not encrypted'}")
+    if not encrypted and _listens_beyond(request):
+        lines.append(
+            "warning: whoever reaches the scheduler's port can run programs as you; give --tls"
+        )
+    return lines
+
+
+@contextmanager
+def start_cluster(request: ClusterRequest, out: Path) -> Iterator[Client]:
+    """Start the workers, and stop them when the block ends; yield a client.
+
+    Args:
+        request: What is wanted.
+        out: Directory that all machines see; certificates for this run are put there.
+
+    Raises:
+        ConfigError: If the request contradicts itself, or lacks something.
+        MachineError: If a package or a program is missing, or the workers do not start.
+    """
+    worker_count(request)
+    with _security(request, out) as security, dask.config.set(DASK_SETTINGS):
+        if request.kind == "ssh":
+            with _running(partial(_ssh, request, security)) as client:
+                yield client
+        elif request.kind == "slurm":
+            with _running(partial(_slurm, request, security)) as client:
+                yield client
+        else:
+            with _connected(request, security) as client:
+                yield client
+
+
+def _connected(
+    request: ClusterRequest, security: Security | None
+) -> AbstractContextManager[Client]:
+    address = request.where[0] if request.kind == "scheduler" else None
+    file = request.where[0] if request.kind == "scheduler-file" else None
+    return connect(
+        request.workers, address, file, security=security, memory=request.memory
+    )
+
+
+@contextmanager
+def _running(make: Callable[[], SpecCluster]) -> Iterator[Client]:
+    """Run a cluster while the block does."""
+    try:
+        cluster = make()
+    # Each kind of cluster has failures of its own, and none of them is this program's.
+    except Exception as error:
+        reason = str(error) or type(error).__name__
+        raise MachineError(f"the workers must start, got: {reason}") from None
+    with cluster, Client(cluster) as client:
+        yield client
+
+
+def _ssh(request: ClusterRequest, security: Security | None) -> SpecCluster:
+    # Settings of Dask go to the other machines with every command that SSHCluster runs there.
+    worker = {
+        "n_workers": _cores_per_host(request),
+        "nthreads": 1,
+        "memory_limit": request.memory or "auto",
+        "env": WORKER_ENVIRONMENT,
+        "interface": request.interface,
+        **_secured(security),
+    }
+    scheduler = {
+        "port": 0,
+        "dashboard_address": f"{LOOPBACK}:0",
+        **_listening(request),
+        **_secured(security),
+    }
+    return SSHCluster(
+        [request.where[0], *request.where],
+        worker_options={k: v for k, v in worker.items() if v is not None},
+        scheduler_options=scheduler,
+        security=security,
+    )
+
+
+def _slurm(request: ClusterRequest, security: Security | None) -> SpecCluster:
+    from dask_jobqueue import SLURMCluster
+
+    configured = partial(_jobqueue, request)
+    cores = _cores_per_job(request)
+    jobs = math.ceil((request.workers or 0) / cores)
+    memory = f"{cores * dask.utils.parse_bytes(request.memory)}B" if request.memory else None
+    listening = _listening(request) or configured("scheduler-options") or {}
+    cluster = SLURMCluster(
+        cores=cores,
+        processes=cores,
+        memory=memory or configured("memory") or f"{cores * dask.utils.parse_bytes(WORKER_MEMORY)}B",
+        walltime=request.walltime,
+        interface=request.interface,
+        security=security,
+        worker_extra_args=[
+            *(configured("worker-extra-args") or ()),
+            *_lifetime(request.walltime or configured("walltime")),
+            f"--dashboard-address={LOOPBACK}:0",
+        ],
+        job_script_prologue=[*(configured("job-script-prologue") or ()), *_exports()],
+        scheduler_options={"dashboard_address": f"{LOOPBACK}:0", **listening},
+    )
+    cluster.scale(jobs=jobs)
+    _refill(cluster, jobs)
+    return cluster
+
+
+class _Refill:
+    """Asks for a new job in place of each that is over: at its walltime, or with its machine."""
+
+    def __init__(self, cluster: SpecCluster, jobs: int) -> None:
+        self._cluster, self._jobs = cluster, jobs
+        self._seen: set[str] = set()
+        self._missing: set[str] = set()
+
+    async def __call__(self) -> None:
+        """Look for jobs that had workers and have none, twice in a row."""
+        cluster = self._cluster
+        names = {str(w["name"]) for w in cluster.scheduler_info["workers"].values()}
+        present = {job for job in cluster.worker_spec if _has_worker(str(job), names)}
+        missing = self._seen - present
+        for job in missing & self._missing:
+            if job in cluster.workers:
+                await cluster.workers.pop(job).close()
+            self._seen.discard(job)
+        self._missing = missing
+        self._seen |= present
+        cluster.scale(jobs=self._jobs)
+
+
+def _has_worker(job: str, names: set[str]) -> bool:
+    return job in names or any(name.startswith(f"{job}-") for name in names)
+
+
+def _refill(cluster: SpecCluster, jobs: int) -> None:
+    async def start() -> None:
+        PeriodicCallback(_Refill(cluster, jobs), 1000.0 * REFILL_SECONDS).start()
+
+    cluster.sync(start)
+
+
+def _exports() -> list[str]:
+    """Return the settings of Dask as lines of a job script, which inherits no others."""
+    lines = []
+    for key, value in DASK_SETTINGS.items():
+        name = "DASK_" + key.upper().replace(".", "__").replace("-", "_")
+        lines.append(f"export {name}={shlex.quote(repr(value))}")
+    return lines
+
+
+def _lifetime(walltime: str | None) -> list[str]:
+    """Return the options that end a worker before its job's walltime."""
+    if walltime is None:
+        return []
+    seconds = walltime_seconds(walltime)
+    margin = min(LIFETIME_MARGIN, seconds / 4.0)
+    stagger = min(LIFETIME_STAGGER, margin / 2.0)
+    return ["--lifetime", f"{seconds - margin:.0f}s", "--lifetime-stagger", f"{stagger:.0f}s"]
+
+
+def walltime_seconds(text: str) -> float:
+    """Return a time limit of SLURM in seconds.
+
+    SLURM's forms: M, M:S, H:M:S, D-H, D-H:M, D-H:M:S.
+
+    Raises:
+        ConfigError: If it is none of them.
+    """
+    days, dash, rest = text.partition("-") if "-" in text else ("0", "", text)
+    parts = rest.split(":")
+    if not (days.isdigit() and all(p.isdigit() for p in parts) and len(parts) <= 3):
+        raise ConfigError(f"walltime must be a time of SLURM such as 02:00:00, got {text!r}")
+    numbers = [int(p) for p in parts]
+    if dash or len(numbers) == 3:
+        hours, minutes, seconds = (numbers + [0, 0])[:3]
+    else:
+        hours, (minutes, seconds) = 0, (numbers + [0])[:2]
+    total = 86400.0 * int(days) + 3600.0 * hours + 60.0 * minutes + seconds
+    if total <= 0.0:
+        raise ConfigError(f"walltime must be longer than nothing, got {text!r}")
+    return total
+
+
+@contextmanager
+def _security(request: ClusterRequest, out: Path) -> Iterator[Security | None]:
+    """Yield the certificates; those that are made for other machines to read are removed."""
+    if request.tls_files is not None:
+        yield _from_files(request.tls_files)
+    elif not request.tls:
+        yield None
+    elif request.kind == "local":
+        yield _temporary()
+    else:
+        with _private_directory(out) as folder:
+            yield _from_files(_write_certificates(_temporary(), folder))
+
+
+def _temporary() -> Security:
+    try:
+        return Security.temporary()
+    except ImportError:
+        raise MachineError(
+            "--tls needs the package cryptography: pip install 'drakegrasp[tls]'"
+        ) from None
+
+
+def _write_certificates(security: Security, folder: Path) -> tuple[Path, Path, Path]:
+    """Write an authority that is its only certificate to a private folder."""
+    paths = folder / "ca.pem", folder / "cert.pem", folder / "key.pem"
+    texts = security.tls_ca_file, security.tls_worker_cert, security.tls_worker_key
+    for path, text in zip(paths, texts, strict=True):
+        path.touch(mode=0o600)
+        path.write_text(text, encoding="ascii")
+    return paths
+
+
+def _from_files(files: tuple[Path, Path, Path]) -> Security:
+    ca, cert, key = (str(path.absolute()) for path in files)
+    options: dict[str, Any] = {"require_encryption": True, "tls_ca_file": ca}
+    for role in ("client", "scheduler", "worker"):
+        options |= {f"tls_{role}_cert": cert, f"tls_{role}_key": key}
+    return Security(**options)
+
+
+@contextmanager
+def _private_directory(out: Path) -> Iterator[Path]:
+    """Yield a directory in `out` that only this user can enter, and remove it again."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        folder = Path(tempfile.mkdtemp(prefix=".tls-", dir=out))  # mode 0700
+    except OSError as error:
+        raise MachineError(f"{out}: must be a directory that can be written: {error}") from None
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        with suppress(OSError):  # nothing was built, and the directory is empty again
+            out.rmdir()
+
+
+def _secured(security: Security | None) -> dict[str, Any]:
+    """Return the options of a Dask server on another machine, as JSON types."""
+    if security is None:
+        return {}
+    return {
+        "protocol": "tls://",
+        "security": {
+            key: value
+            for key, value in vars_of(security).items()
+        },
+    }

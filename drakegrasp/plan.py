@@ -1,0 +1,285 @@
+"""What a build will take: hours, core-hours and bytes, before it is started.
+
+In: the number of objects, the configuration, the number of workers, and how long each stage
+takes. Out: the same schedule that `build` would follow, played through without doing the
+work. Stages follow one another; within one, the next task goes to the next free worker.
+"""
+
+from __future__ import annotations
+
+import heapq
+import json
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+
+from drakegrasp.assemble import DATA_FILES, TRIALS_FILE
+from drakegrasp.build_options import BUILTIN, BuildRequest
+from drakegrasp.builtin import BUILTIN_OBJECTS
+from drakegrasp.config import Config
+from drakegrasp.errors import ConfigError, DataError
+from drakegrasp.meshes import find_meshes
+
+#: Time that the scheduler and the client spend on a task, one after the other [s]; measured
+#: with distributed 2026.8 on two cores.
+TASK_SECONDS = 0.003
+#: Objects whose scenes a worker keeps, see `units`.
+KEPT_OBJECTS = 2
+#: Until a worker has imported Drake and takes its first task [s].
+START_SECONDS = 5.0
+#: Spreads any number of objects evenly over the measured shares, without a random draw.
+GOLDEN = 0.6180339887498949
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageTimes:
+    """How long the stages take on one core, and what they leave on the disk.
+
+    Attributes:
+        prepare: Mending, settling and sampling an object [s].
+        scene: Building an object's diagrams, once per worker that meets it [s].
+        attempt: An attempt, on average over all outcomes [s].
+        shares: How much longer than that attempts of an object take, from the quickest object
+            to the slowest; their mean is 1.
+        look: Both images of a success [s].
+        assemble: Filters and files, per attempt, on one core [s].
+        successes: Share of the attempts that succeed.
+        samples: Share of the successes that the filters leave.
+        attempt_bytes: Of a row of a failed attempt, in its shard and in trials.hdf5 [B].
+        success_bytes: What a success adds to its shard [B].
+        sample_bytes: Of a row, in grasping_oto.hdf5 and grasping_otm.hdf5 together [B].
+        object_bytes: Of an object's own files [B].
+        source: Where the figures are from, for the reader.
+    """
+
+    prepare: float
+    scene: float
+    attempt: float
+    shares: tuple[float, ...]
+    look: float
+    assemble: float
+    successes: float
+    samples: float
+    attempt_bytes: float
+    success_bytes: float
+    sample_bytes: float
+    object_bytes: float
+    source: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What a build is expected to take.
+
+    Attributes:
+        objects, attempts, units, workers: How many.
+        seconds: From start to end [s].
+        stages: The same by stage: start, prepare, simulate, assemble [s].
+        busy: Share of the workers' time in which they work, until the files are assembled.
+        samples: Expected rows of the data files.
+        bytes: Expected size of the directory [B].
+        source: Where the times are from.
+    """
+
+    objects: int
+    attempts: int
+    units: int
+    workers: int
+    seconds: float
+    stages: dict[str, float]
+    busy: float
+    samples: int
+    bytes: float
+    source: str
+
+    @property
+    def hours(self) -> float:
+        """Hours from start to end."""
+        return self.seconds / 3600.0
+
+    @property
+    def core_hours(self) -> float:
+        """Hours of all workers together, waiting included: what a cluster is asked for."""
+        return self.workers * self.hours
+
+
+def plan_build(objects: int, config: Config, workers: int, times: StageTimes) -> Plan:
+    """Return what the build of some objects is expected to take.
+
+    It is what a build from nothing takes if every object has as many candidates as it may
+    have, and if no object is cut short by `max_grasps`: never less than what will be done.
+
+    Raises:
+        ConfigError: If there is no object or no worker.
+    """
+    for name, count in (("objects", objects), ("workers", workers)):
+        if count < 1:
+            raise ConfigError(f"{name} must be at least 1, got {count}")
+    prepare = _run([times.prepare] * objects, [0.0] * workers)
+    tasks = _units(objects, config, times)
+    simulate, work = _run_units(tasks, workers, times.scene)
+    attempts = objects * config.candidates.max * len(config.candidates.standoffs)
+    stages = {
+        "start": START_SECONDS,
+        "prepare": prepare,
+        "simulate": simulate,
+        "assemble": attempts * times.assemble,
+    }
+    spent = times.prepare * objects + work
+    return Plan(
+        objects=objects,
+        attempts=attempts,
+        units=len(tasks),
+        workers=workers,
+        seconds=sum(stages.values()),
+        stages=stages,
+        busy=spent / (workers * (prepare + simulate)),
+        samples=round(attempts * times.successes * times.samples),
+        bytes=_bytes(objects, attempts, times),
+        source=times.source,
+    )
+
+
+def plan_request(
+    request: BuildRequest, workers: int | None = None, times: StageTimes | None = None
+) -> Plan:
+    """Return what a build that was asked for is expected to take.
+
+    Args:
+        request: What is to be built.
+        workers: One per core of this machine if None.
+        times: Of the stages; `MEASURED` if None.
+
+    Raises:
+        MeshError: If there is no mesh.
+        ConfigError: If there is no worker.
+    """
+    if request.objects == BUILTIN:
+        objects = len(BUILTIN_OBJECTS)
+    else:
+        meshes = find_meshes(request.objects, units=request.units, manifest=request.manifest)
+        objects = len(meshes)
+    count = len(os.sched_getaffinity(0)) if workers is None else workers
+    return plan_build(objects, request.config, count, times or MEASURED)
+
+
+def read_times(path: Path) -> StageTimes:
+    """Return the stage times that `pipelines/measure_stages.py` printed to a file.
+
+    Raises:
+        DataError: If it holds anything else.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return StageTimes(**{**content, "shares": tuple(content["shares"])})
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise DataError(
+            f"{path}: must be the output of pipelines/measure_stages.py, got other ({error})"
+        ) from None
+
+
+def plan_lines(plan: Plan) -> list[str]:
+    """Return a plan as the lines that are printed."""
+    stages = ", ".join(f"{name} {_duration(seconds)}" for name, seconds in plan.stages.items())
+    return [
+        f"{plan.objects:,} objects, {plan.attempts:,} attempts in {plan.units:,} work units",
+        f"expected {_duration(plan.seconds)} on {plan.workers:,} workers "
+        f"({stages}; {100 * plan.busy:.0f}% busy)",
+        f"expected {plan.core_hours:,.1f} core-hours",
+        f"expected {plan.samples:,} samples, {_size(plan.bytes)} on disk",
+        f"times and sizes: {plan.source}",
+    ]
+
+
+def measure_storage(out: Path) -> dict[str, float]:
+    """Return the sizes that `StageTimes` has, of a finished dataset [B].
+
+    Raises:
+        DataError: If there is none.
+    """
+    try:
+        with h5py.File(out / TRIALS_FILE, "r") as file:
+            attempts, successes = len(file["trials/outcome"]), len(file["successes/trial_id"])
+            objects = len(file["objects/name"])
+        with h5py.File(out / DATA_FILES["oto"], "r") as file:
+            samples = sum(len(split["grasps"]) for split in file.values() if "grasps" in split)
+        trials = (out / TRIALS_FILE).stat().st_size
+        data = sum((out / name).stat().st_size for name in DATA_FILES.values())
+    except (OSError, KeyError) as error:
+        raise DataError(f"{out}: must be a finished dataset, got none ({error})") from None
+    shards = sum(path.stat().st_size for path in (out / "shards").rglob("*.h5"))
+    looks = sum(_looks_bytes(path) for path in (out / "shards").rglob("*.h5"))
+    kept = sum(path.stat().st_size for path in (out / "objects").iterdir())
+    return {
+        "attempt_bytes": (trials + shards - looks) / attempts,
+        "success_bytes": looks / max(1, successes),
+        "sample_bytes": data / max(1, samples),
+        "object_bytes": kept / objects,
+    }
+
+
+def _looks_bytes(path: Path) -> int:
+    with h5py.File(path, "r") as file:
+        return sum(int(column.id.get_storage_size()) for column in file["looks"].values())
+
+
+def _bytes(objects: int, attempts: int, times: StageTimes) -> float:
+    successes = attempts * times.successes
+    return (
+        objects * times.object_bytes
+        + attempts * times.attempt_bytes
+        + successes * (times.success_bytes + times.samples * times.sample_bytes)
+    )
+
+
+def _units(objects: int, config: Config, times: StageTimes) -> list[tuple[int, float]]:
+    """Return object and seconds of every work unit, without the building of its scene."""
+    step, candidates = config.unit_candidates, config.candidates.max
+    look = times.successes * times.look
+    units = []
+    for i in range(objects):
+        share = times.shares[int(i * GOLDEN % 1.0 * len(times.shares))]
+        one = len(config.candidates.standoffs) * (times.attempt * share + look)
+        units += [(i, one * min(step, candidates - k)) for k in range(0, candidates, step)]
+    return units
+
+
+def _run(tasks: Iterable[float], free: list[float]) -> float:
+    """Return when tasks are done that go, in their order, each to the next free worker."""
+    heapq.heapify(free)
+    for k, seconds in enumerate(tasks):
+        start = max(free[0], k * TASK_SECONDS)
+        heapq.heapreplace(free, start + seconds)
+    return max(free)
+
+
+def _run_units(units: list[tuple[int, float]], workers: int, scene: float) -> tuple[float, float]:
+    """Return when all units are done, and how long all workers together worked on them [s]."""
+    free = [(0.0, worker) for worker in range(workers)]
+    kept: list[list[int]] = [[] for _ in range(workers)]
+    work = 0.0
+    for k, (thing, seconds) in enumerate(units):
+        at, worker = free[0]
+        if thing not in kept[worker]:
+            kept[worker] = [*kept[worker], thing][-KEPT_OBJECTS:]
+            seconds += scene
+        work += seconds
+        heapq.heapreplace(free, (max(at, k * TASK_SECONDS) + seconds, worker))
+    return max(at for at, _ in free), work
+
+
+def _duration(seconds: float) -> str:
+    for unit, length in (("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2.0 * length:
+            return f"{seconds / length:,.1f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+def _size(size: float) -> str:
+    for unit, length in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
+        if size >= length:
+            return f"{size / length:.1f} {unit}"
+    return f"{size / 1e3:.0f} kB"

@@ -1,0 +1,84 @@
+"""Which process did something, and whether it still runs.
+
+A process is known by its machine, its number and when it began: a number alone is given
+again. Nothing here can tell of another machine's processes.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+from dataclasses import dataclass
+from pathlib import Path
+
+#: Where Linux keeps a number that is new at every start of the machine.
+_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Process:
+    """A process of some machine.
+
+    Attributes:
+        host: Name of the machine.
+        pid: Number of the process there.
+        began: Clock ticks from the machine's start to the process's; -1 if unknown.
+        boot: What tells one start of the machine from the next; empty if unknown.
+    """
+
+    host: str
+    pid: int
+    began: int
+    boot: str
+
+    def runs(self) -> bool | None:
+        """Return whether the process still runs, or None where this machine cannot know."""
+        if self.host != socket.gethostname():
+            return None
+        if self.boot != _boot() or not is_running(self.pid):
+            return False
+        return self.began == _began(self.pid)
+
+
+def this_process() -> Process:
+    """Return the process that calls."""
+    pid = os.getpid()
+    return Process(host=socket.gethostname(), pid=pid, began=_began(pid), boot=_boot())
+
+
+def is_running(pid: int) -> bool:
+    """Return whether this machine runs a process of a number; a zombie is dead."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return _stat(pid)[:1] != ["Z"]
+
+
+def host_label() -> str:
+    """Return this machine's name as it may stand in a file's name: short, without dots."""
+    return re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())[:20] or "-"
+
+
+def _boot() -> str:
+    try:
+        return _BOOT_ID.read_text().strip()
+    except OSError:
+        return ""
+
+
+def _began(pid: int) -> int:
+    fields = _stat(pid)
+    return int(fields[19]) if len(fields) > 19 else -1
+
+
+def _stat(pid: int) -> list[str]:
+    """Return what Linux says of a process, from its state on; empty where it says nothing."""
+    try:
+        # The name before it stands in parentheses and may hold blanks.
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return []
