@@ -19,6 +19,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from drakegrasp.build_lock import build_lock
 from drakegrasp.camera import intrinsics, project
 from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal, Successes, judge_successes, split_samples
@@ -40,6 +41,7 @@ from drakegrasp.shards import (
     Shard,
     atomic_hdf5,
     create_field,
+    disk_full_named,
     trial_columns,
     write_field,
 )
@@ -74,11 +76,19 @@ def assemble(out: Path, *, rejected: Sequence[int] = (), progress: Report = sile
         progress: Called with the number of shards read and to read.
 
     Raises:
-        DataError: If a shard is missing or damaged; the old files stay as they were.
+        DataError: If a shard is missing or damaged, or another process builds there; the old
+            files stay as they were.
+        DiskFullError: If there is no room; likewise.
     """
+    read_manifest(out)  # nothing is made where no dataset is
+    with build_lock(out), disk_full_named(out):
+        return _assemble(out, rejected, progress)
+
+
+def _assemble(out: Path, rejected: Sequence[int], progress: Report) -> Assembly:
     manifest = read_manifest(out)
     K = intrinsics(manifest.config.camera)
-    total = len(manifest.headers())
+    total = manifest.units
     parts, found = [], []
     with ExitStack() as stack:
         trials = stack.enter_context(atomic_hdf5(out / TRIALS_FILE))
@@ -169,8 +179,10 @@ def is_assembled(out: Path) -> bool:
 
 def _signature(manifest: Manifest) -> str:
     """Return a hash of all that decides what the files hold, but for a reject list."""
-    content = [manifest.config.to_dict(), [repr(h) for h in manifest.headers()]]
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    digest = hashlib.sha256(json.dumps(manifest.config.to_dict(), sort_keys=True).encode())
+    for header in manifest.headers():
+        digest.update(f"\n{header}".encode())
+    return digest.hexdigest()
 
 
 def _write_attributes(file: h5py.File, manifest: Manifest) -> None:

@@ -61,9 +61,7 @@ _OPTIONS = (
     ),
     set_option,
     click.option("--candidates", type=int, help="Palm poses per object.  [10000]"),
-    click.option(
-        "--max-grasps", type=int, help="Grasps per object after which no more are tried."
-    ),
+    click.option("--max-grasps", type=int, help="Grasps per object after which no more are tried."),
     click.option("--seed", type=int, help="Of all random draws.  [0]"),
     units_option,
     manifest_option,

@@ -116,8 +116,7 @@ def _check_directory(out: Path, stack: ExitStack, findings: Findings, report: Re
             findings.add([of_file(name, "the file must be there and readable", got)])
             continue
         files[camera] = open_file(name, file, camera, findings)
-    headers = manifest.headers()
-    steps = _Steps(report, sum(map(_rows, files.values())) + len(headers))
+    steps = _Steps(report, sum(map(_rows, files.values())) + manifest.units)
     findings.add(dataset_rules.same_configuration(files.values(), manifest))
     trials = files.pop("", None)
     models = lru_cache(KEPT_OBJECTS)(partial(_load_model, out, manifest, findings))

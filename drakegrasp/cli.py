@@ -55,6 +55,7 @@ class OneCommand(click.Command):
     """A script's only command: a build, with errors in one line."""
 
     def invoke(self, ctx: click.Context) -> Any:
+        """Run the command."""
         with one_line_errors(ctx, builds=True):
             return super().invoke(ctx)
 

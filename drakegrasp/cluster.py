@@ -8,21 +8,21 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from itertools import islice
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import dask
 import numpy.typing as npt
-from distributed import Client, Future, KilledWorker, LocalCluster, as_completed
+from distributed import Client, LocalCluster
 from distributed.security import Security
 
 from drakegrasp.build import BuildReport, build
 from drakegrasp.build_options import BUILTIN
 from drakegrasp.builtin import export_builtin
 from drakegrasp.config import Config, load_config, parse_config
+from drakegrasp.crew import RESUBMISSIONS, DaskExecutor
 from drakegrasp.dataset import GraspDataset
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.executor import Executor, run_here
@@ -35,11 +35,6 @@ from drakegrasp.verify_grasps import verify_tasks
 from drakegrasp.verify_plan import TASK_GRASPS, Mesh, VerifyTask, plan_verification, split_task
 from drakegrasp.workers import SATURATION, WORKER_ENVIRONMENT, admitted_workers
 
-T = TypeVar("T")
-R = TypeVar("R")
-
-#: Tasks in flight per worker: one that runs, and one so that it never waits.
-IN_FLIGHT = 2
 #: How long to wait for a scheduler to answer [s].
 CONNECT_SECONDS = 10
 #: Settings of Dask: a worker's process must not be a fork, because a fork after the first
@@ -309,36 +304,3 @@ def _refuse_workers(
         raise ConfigError("workers must not be given with a scheduler, which has its own")
     if workers is not None and workers < 1:
         raise ConfigError(f"workers must be at least 1, got {workers}")
-
-
-class DaskExecutor:
-    """An `Executor` that keeps a few tasks per worker in flight on a Dask cluster."""
-
-    def __init__(self, client: Client) -> None:
-        self._client = client
-
-    def __call__(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-        """Yield function(item) of every item as they are done.
-
-        Raises:
-            MachineError: If the workers died of an item again and again.
-            Exception: What the function raised.
-        """
-        waiting = iter(items)
-        running = as_completed(
-            [self._submit(function, item) for item in islice(waiting, self._room())]
-        )
-        for future in running:
-            try:
-                yield future.result()
-            except KilledWorker as error:
-                raise MachineError(f"the workers must stay alive, got: {error}") from None
-            for item in islice(waiting, max(0, self._room() - running.count())):
-                running.add(self._submit(function, item))
-
-    def _room(self) -> int:
-        return IN_FLIGHT * max(1, len(self._client.ncores()))
-
-    def _submit(self, function: Callable[[T], R], item: T) -> Future:
-        # A task writes files, so it is never the same as one that was done before.
-        return self._client.submit(function, item, pure=False)

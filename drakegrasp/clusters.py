@@ -9,20 +9,22 @@ in their script, and a running scheduler's workers are set up when they are admi
 
 from __future__ import annotations
 
+import importlib.util
 import ipaddress
 import math
 import shlex
 import shutil
+import subprocess
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import dask
-from dask.utils import parse_timedelta
+from dask.utils import parse_bytes
 from distributed import Client, SpecCluster, SSHCluster
 from distributed.security import Security
 from tornado.ioloop import PeriodicCallback
@@ -42,6 +44,22 @@ REFILL_SECONDS = 20.0
 LIFETIME_MARGIN, LIFETIME_STAGGER = 300.0, 120.0
 #: Address of this machine alone.
 LOOPBACK = "127.0.0.1"
+#: Least and largest number of words after each kind, and what they are.
+_PLACES: dict[str, tuple[int, float, str]] = {
+    "local": (0, 0, "nothing"),
+    "ssh": (1, math.inf, "the names of the hosts"),
+    "slurm": (0, 0, "nothing"),
+    "scheduler": (1, 1, "its address"),
+    "scheduler-file": (1, 1, "its path"),
+}
+#: What may be asked of each kind; a running scheduler has its own workers.
+_TAKES: dict[str, tuple[str, ...]] = {
+    "local": ("workers", "memory", "tls"),
+    "ssh": ("workers", "cores", "memory", "host", "interface", "tls"),
+    "slurm": ("workers", "cores", "memory", "walltime", "host", "interface", "tls"),
+    "scheduler": (),
+    "scheduler-file": (),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,12 +110,14 @@ def worker_count(request: ClusterRequest) -> int | None:
 def describe(request: ClusterRequest) -> list[str]:
     """Return what will be started, in lines for the user; of an open port it warns."""
     count = worker_count(request)
-    lines = [{
-        "local": "workers on this machine",
-        "ssh": f"{count} workers over ssh on {' '.join(dict.fromkeys(request.where))}, "
-        f"scheduler on {request.where[0] if request.where else ''}",
-        "slurm": f"{count} workers in SLURM jobs of {_cores_text(request)}",
-    }.get(request.kind, f"the workers of {' '.join(request.where)}")]
+    lines = [
+        {
+            "local": "workers on this machine",
+            "ssh": f"{count} workers over ssh on {' '.join(dict.fromkeys(request.where))}, "
+            f"scheduler on {request.where[0] if request.where else ''}",
+            "slurm": f"{count} workers in SLURM jobs",
+        }.get(request.kind, f"the workers of {' '.join(request.where)}")
+    ]
     encrypted = request.tls or request.tls_files is not None
     lines.append(f"connections: {'TLS' if encrypted else 'not encrypted'}")
     if not encrypted and _listens_beyond(request):
@@ -137,9 +157,7 @@ def _connected(
 ) -> AbstractContextManager[Client]:
     address = request.where[0] if request.kind == "scheduler" else None
     file = request.where[0] if request.kind == "scheduler-file" else None
-    return connect(
-        request.workers, address, file, security=security, memory=request.memory
-    )
+    return connect(request.workers, address, file, security=security, memory=request.memory)
 
 
 @contextmanager
@@ -147,6 +165,8 @@ def _running(make: Callable[[], SpecCluster]) -> Iterator[Client]:
     """Run a cluster while the block does."""
     try:
         cluster = make()
+    except (ConfigError, MachineError):
+        raise
     # Each kind of cluster has failures of its own, and none of them is this program's.
     except Exception as error:
         reason = str(error) or type(error).__name__
@@ -180,31 +200,58 @@ def _ssh(request: ClusterRequest, security: Security | None) -> SpecCluster:
 
 
 def _slurm(request: ClusterRequest, security: Security | None) -> SpecCluster:
-    from dask_jobqueue import SLURMCluster
-
-    configured = partial(_jobqueue, request)
     cores = _cores_per_job(request)
     jobs = math.ceil((request.workers or 0) / cores)
-    memory = f"{cores * dask.utils.parse_bytes(request.memory)}B" if request.memory else None
-    listening = _listening(request) or configured("scheduler-options") or {}
+    default = None if _jobqueue("memory") else WORKER_MEMORY
+    memory = request.memory or default
+    # What is None or not named here is as jobqueue.yaml says.
+    from dask_jobqueue import SLURMCluster
+
     cluster = SLURMCluster(
         cores=cores,
         processes=cores,
-        memory=memory or configured("memory") or f"{cores * dask.utils.parse_bytes(WORKER_MEMORY)}B",
+        memory=None if memory is None else f"{cores * _bytes(memory)}B",
         walltime=request.walltime,
         interface=request.interface,
         security=security,
         worker_extra_args=[
-            *(configured("worker-extra-args") or ()),
-            *_lifetime(request.walltime or configured("walltime")),
+            *(_jobqueue("worker-extra-args") or ()),
+            *_lifetime(request.walltime or _jobqueue("walltime")),
             f"--dashboard-address={LOOPBACK}:0",
         ],
-        job_script_prologue=[*(configured("job-script-prologue") or ()), *_exports()],
-        scheduler_options={"dashboard_address": f"{LOOPBACK}:0", **listening},
+        job_script_prologue=[*(_jobqueue("job-script-prologue") or ()), *_exports()],
+        scheduler_options={
+            "dashboard_address": f"{LOOPBACK}:0",
+            **(_jobqueue("scheduler-options") or {}),
+            **_listening(request),
+        },
     )
+    try:
+        _refuse_bad_job(cluster.job_script())
+    except MachineError:
+        cluster.close()
+        raise
     cluster.scale(jobs=jobs)
     _refill(cluster, jobs)
     return cluster
+
+
+def _refuse_bad_job(script: str) -> None:
+    """Have SLURM look at a job before any is submitted: those that fail later fail unseen.
+
+    Raises:
+        MachineError: If there is no SLURM here, or it would not run the job.
+    """
+    try:
+        test = subprocess.run(
+            ["sbatch", "--test-only"], input=script, capture_output=True, text=True
+        )
+    except FileNotFoundError:
+        raise MachineError(
+            "sbatch must be on the PATH, got none: start this on a machine that submits jobs"
+        ) from None
+    if test.returncode:
+        raise MachineError(f"SLURM must accept the job, got: {test.stderr.strip()}")
 
 
 class _Refill:
@@ -274,9 +321,9 @@ def walltime_seconds(text: str) -> float:
         raise ConfigError(f"walltime must be a time of SLURM such as 02:00:00, got {text!r}")
     numbers = [int(p) for p in parts]
     if dash or len(numbers) == 3:
-        hours, minutes, seconds = (numbers + [0, 0])[:3]
+        hours, minutes, seconds = [*numbers, 0, 0][:3]
     else:
-        hours, (minutes, seconds) = 0, (numbers + [0])[:2]
+        hours, (minutes, seconds) = 0, [*numbers, 0][:2]
     total = 86400.0 * int(days) + 3600.0 * hours + 60.0 * minutes + seconds
     if total <= 0.0:
         raise ConfigError(f"walltime must be longer than nothing, got {text!r}")
@@ -344,10 +391,130 @@ def _secured(security: Security | None) -> dict[str, Any]:
     """Return the options of a Dask server on another machine, as JSON types."""
     if security is None:
         return {}
-    return {
-        "protocol": "tls://",
-        "security": {
-            key: value
-            for key, value in vars_of(security).items()
-        },
+    files = {
+        "tls_ca_file": security.tls_ca_file,
+        "tls_scheduler_cert": security.tls_scheduler_cert,
+        "tls_scheduler_key": security.tls_scheduler_key,
+        "tls_worker_cert": security.tls_worker_cert,
+        "tls_worker_key": security.tls_worker_key,
     }
+    return {"protocol": "tls://", "security": {"require_encryption": True, **files}}
+
+
+def _listening(request: ClusterRequest) -> dict[str, str]:
+    """Return where a scheduler listens, as its options; nothing if jobqueue.yaml says it.
+
+    Raises:
+        ConfigError: If the workers are on other machines and nobody said where to listen.
+    """
+    if request.host is not None:
+        return {"host": request.host}
+    if request.interface is not None:
+        return {"interface": request.interface}
+    if request.kind == "ssh" and all(_is_loopback(host) for host in request.where):
+        return {"host": LOOPBACK}
+    if request.kind == "slurm" and _jobqueue_listens():
+        return {}
+    raise ConfigError(
+        "--interface NAME or --host ADDRESS must be given for workers on other machines, because "
+        "the scheduler listens to nobody else's machine without"
+    )
+
+
+def _listens_beyond(request: ClusterRequest) -> bool:
+    if request.kind not in ("ssh", "slurm"):
+        return False
+    listening = _listening(request)
+    return not ("host" in listening and _is_loopback(listening["host"])) and (
+        listening.get("interface") != "lo"
+    )
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _jobqueue(key: str) -> Any:
+    """Return a value of the user's jobqueue.yaml, or of dask-jobqueue's own.
+
+    Raises:
+        MachineError: If dask-jobqueue is not installed.
+    """
+    try:
+        import dask_jobqueue  # noqa: F401  (it is what reads the file)
+    except ImportError:
+        raise MachineError(
+            "--cluster slurm needs dask-jobqueue: pip install 'drakegrasp[slurm]'"
+        ) from None
+    return dask.config.get(f"jobqueue.slurm.{key}", None)
+
+
+def _jobqueue_listens() -> bool:
+    options = _jobqueue("scheduler-options") or {}
+    return bool(_jobqueue("interface") or {"host", "interface"} & set(options))
+
+
+def _cores_per_host(request: ClusterRequest) -> int:
+    hosts = len(request.where)
+    if request.cores is not None:
+        return request.cores
+    if request.workers is None:
+        raise ConfigError("--workers or --cores must be given for workers over ssh")
+    if request.workers % hosts:
+        raise ConfigError(
+            f"--workers must be a multiple of the number of hosts, {hosts}, got {request.workers}; "
+            "a host may be named more than once"
+        )
+    return request.workers // hosts
+
+
+def _cores_per_job(request: ClusterRequest) -> int:
+    return int(request.cores or _jobqueue("cores") or 1)
+
+
+def _refuse_contradictions(request: ClusterRequest) -> None:
+    least, most, what = _PLACES[request.kind]
+    if not least <= len(request.where) <= most:
+        got = " ".join(request.where) or "nothing"
+        raise ConfigError(f"--cluster {request.kind} must be followed by {what}, got {got}")
+    for name in ("workers", "cores", "memory", "walltime", "host", "interface", "tls"):
+        value = getattr(request, name)
+        if value not in (None, False) and name not in _TAKES[request.kind]:
+            raise ConfigError(f"--{name} must not be given with --cluster {request.kind}")
+        if name in ("workers", "cores") and value is not None and value < 1:
+            raise ConfigError(f"{name} must be at least 1, got {value}")
+    if request.tls and request.tls_files is not None:
+        raise ConfigError("--tls makes certificates and must not be given with files of them")
+    if request.memory is not None:
+        _bytes(request.memory)
+    if request.walltime is not None:
+        walltime_seconds(request.walltime)
+    if request.kind == "slurm" and request.workers is None:
+        raise ConfigError("--workers must be given with --cluster slurm")
+    if request.kind == "ssh":
+        for host in request.where:
+            if "@" in host:
+                raise ConfigError(
+                    f"a host must be a name or address, got {host!r}: the user and "
+                    "the key for it go into ~/.ssh/config"
+                )
+        _cores_per_host(request)
+    if request.kind in ("ssh", "slurm"):
+        _listening(request)
+
+
+def _bytes(text: str) -> int:
+    try:
+        return int(parse_bytes(text))
+    except ValueError:
+        raise ConfigError(f"memory must be a size such as 2GB, got {text!r}") from None
+
+
+def dashboard_line(client: Client) -> str:
+    """Return where the dashboard of a client's cluster is, or what it takes to have one."""
+    if importlib.util.find_spec("bokeh") is None:
+        return "dashboard: none; pip install 'drakegrasp[dashboard]'"
+    return f"dashboard: {client.dashboard_link}"

@@ -12,7 +12,6 @@ G palm, Fi distal (fingertip) link of finger i, P a point on it.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -28,6 +27,7 @@ from pydrake.multibody.tree import ModelInstanceIndex, RevoluteJoint, RigidBody,
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, invert_pose, make_pose
 from drakegrasp.hand_files import hand_file
+from drakegrasp.network import allow_network
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -142,20 +142,11 @@ class _Description(BaseModel):
 def make_parser(plant: MultibodyPlant) -> Parser:
     """Return a parser for a plant that works where Drake is told to stay off the network.
 
-    A Drake parser registers a remote package that our models do not use. Under
-    `DRAKE_ALLOW_NETWORK=none`, as our workers run, that alone raises (1.51 to 1.58), so the
-    ban is eased while the parser is made; nothing is downloaded.
+    A Drake parser registers a remote package that our models do not use; under the ban that
+    alone raises. Nothing is downloaded.
     """
-    name = "DRAKE_ALLOW_NETWORK"
-    allowed = os.environ.get(name)
-    os.environ[name] = "package_map"
-    try:
+    with allow_network("package_map"):
         return Parser(plant)
-    finally:
-        if allowed is None:
-            del os.environ[name]
-        else:
-            os.environ[name] = allowed
 
 
 def load_hand(name_or_yaml: str | Path = "barrett") -> Hand:

@@ -216,8 +216,6 @@ def _read_history(path: Path, identity: Mapping[str, Any]) -> _History | None:
         for step, deaths in content["deaths"].items():
             history.deaths[step] = Deaths(**deaths)
         history.futile = int(content["futile"])
-    except FileNotFoundError:
-        return _History()
         passed, step = rest[:_RECORD_SIZE].decode("ascii").split(maxsplit=1)
         history.add(step.strip(), int(passed, 16), rest[_RECORD_SIZE:])
     except FileNotFoundError:

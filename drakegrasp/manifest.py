@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib import metadata
@@ -18,6 +18,7 @@ from typing import Any
 
 import h5py
 
+from drakegrasp import build_lock, build_log
 from drakegrasp.config import Config, override_config, parse_config
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.hand_files import hand_digest
@@ -34,6 +35,8 @@ FILE_NAME = "manifest.json"
 BUILTIN_FOLDER = "builtin"
 #: Folders that a build makes; alone they do not make a directory somebody else's.
 OWN_FOLDERS = (BUILTIN_FOLDER, "objects", "shards")
+#: Files that a build writes besides the manifest; likewise.
+OWN_FILES = (build_lock.FILE_NAME, build_log.FILE_NAME)
 #: Packages whose versions may change a result.
 VERSIONED = ("drakegrasp", "drake", "numpy", "scipy", "trimesh", "manifold3d", "embreex", "h5py")
 #: Those that a dataset is never continued with another version of.
@@ -56,20 +59,24 @@ class Manifest:
     refused: tuple[dict[str, str], ...] = ()
     versions: dict[str, str]
 
-    def headers(self) -> list[ShardHeader]:
-        """Return the work units of the dataset in the order of its rows."""
+    def headers(self) -> Iterator[ShardHeader]:
+        """Yield the work units of the dataset in the order of its rows."""
         step, config_hash = self.config.unit_candidates, self.config.simulation_hash()
-        return [
-            ShardHeader(
-                config_hash=config_hash,
-                mesh_sha256=entry["mesh_sha256"],
-                object_name=entry["name"],
-                start=start,
-                stop=min(start + step, entry["candidates"]),
-            )
-            for entry in self.objects
-            for start in range(0, entry["candidates"], step)
-        ]
+        for entry in self.objects:
+            for start in range(0, entry["candidates"], step):
+                yield ShardHeader(
+                    config_hash=config_hash,
+                    mesh_sha256=entry["mesh_sha256"],
+                    object_name=entry["name"],
+                    start=start,
+                    stop=min(start + step, entry["candidates"]),
+                )
+
+    @property
+    def units(self) -> int:
+        """Number of work units."""
+        step = self.config.unit_candidates
+        return sum(-(-entry["candidates"] // step) for entry in self.objects)
 
 
 def installed_versions(config: Config) -> dict[str, str]:
@@ -162,7 +169,7 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
         strangers = sorted(
             p.name
             for p in out.iterdir()
-            if not p.name.startswith(".") and p.name not in OWN_FOLDERS
+            if not p.name.startswith(".") and p.name not in (*OWN_FOLDERS, *OWN_FILES)
         )
         if strangers:
             raise DataError(
@@ -188,7 +195,8 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
 
 def release_directory(out: Path) -> None:
     """Take back a claim on a directory in which nothing was made."""
-    (out / FILE_NAME).unlink(missing_ok=True)
+    for name in (FILE_NAME, build_log.FILE_NAME):
+        (out / name).unlink(missing_ok=True)
     # A directory that holds anything else was there before.
     with suppress(OSError):
         out.rmdir()

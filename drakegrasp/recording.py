@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import gc
 import logging
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
@@ -26,6 +25,7 @@ from drakegrasp.construction import MESHCAT_RATE, build_scene
 from drakegrasp.force_lift import ForceLift, lift_by_forces
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand import load_hand
+from drakegrasp.network import allow_network
 from drakegrasp.object_model import ObjectModel
 from drakegrasp.placed import rest_pose
 from drakegrasp.scene import Scene, reset_attempt, reset_object
@@ -223,19 +223,15 @@ def _make_meshcat() -> Meshcat:
     eased meanwhile; nothing leaves the machine. Nobody is to open the address that Drake
     announces, so that is not said.
     """
-    name, logger = "DRAKE_ALLOW_NETWORK", logging.getLogger("drake")
-    allowed, level = os.environ.get(name), logger.level
-    os.environ[name] = "meshcat"
+    logger = logging.getLogger("drake")
+    level = logger.level
     logger.setLevel(logging.WARNING)
     try:
-        # Port 0 is any that is free, so any number of recordings can be made at once.
-        return Meshcat(MeshcatParams(host="localhost", port=0, show_stats_plot=False))
+        with allow_network("meshcat"):
+            # Port 0 is any that is free, so any number of recordings can be made at once.
+            return Meshcat(MeshcatParams(host="localhost", port=0, show_stats_plot=False))
     finally:
         logger.setLevel(level)
-        if allowed is None:
-            del os.environ[name]
-        else:
-            os.environ[name] = allowed
 
 
 def _write(path: Path, text: str) -> None:

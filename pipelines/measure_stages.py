@@ -1,8 +1,10 @@
-"""Measure the seconds and bytes of every stage of a build: the defaults of `drakegrasp.plan`.
+"""Measure the seconds and bytes of every stage of a build on some meshes.
 
-    python pipelines/measure_stages.py MESH_DIR OUT --candidates 20 > stages.json
+    python pipelines/measure_stages.py MESH_DIR OUT --candidates 20 > times.json
+    drakegrasp build --objects MESH_DIR ... --plan --times times.json
 
-Builds a dataset in this process alone, so that no other worker of it disturbs the clock.
+Builds a small dataset in this process alone, so no other worker of it disturbs the clock.
+The defaults of `drakegrasp.plan` are from here.
 """
 
 from __future__ import annotations
@@ -11,17 +13,20 @@ import json
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import click
 
 from drakegrasp.build import build
+from drakegrasp.build_options import manifest_option, set_option, units_option
 from drakegrasp.config import load_config
 from drakegrasp.manifest import read_manifest
 from drakegrasp.meshes import find_meshes
 from drakegrasp.outcomes import Outcome
-from drakegrasp.plan import measure_storage
+from drakegrasp.plan import StageTimes, measure_storage
+from drakegrasp.stats import count_splits
 from drakegrasp.units import UnitSummary
 
 
@@ -49,42 +54,58 @@ class Clock:
 @click.command(help=__doc__)
 @click.argument("meshes", type=click.Path(path_type=Path, exists=True))
 @click.argument("out", type=click.Path(path_type=Path))
+@click.option("--config", "config_name", metavar="YAML|PRESET", help="[paper]")
+@set_option
 @click.option("--candidates", type=int, default=20, show_default=True, help="Per object.")
-@click.option("--units", default="m", show_default=True, help="Of the meshes.")
-@click.option("--manifest", type=click.Path(path_type=Path), help="Units by mesh.")
-def main(meshes: Path, out: Path, candidates: int, units: str, manifest: Path | None) -> None:
+@units_option
+@manifest_option
+def main(
+    meshes: Path,
+    out: Path,
+    config_name: str | None,
+    overrides: tuple[str, ...],
+    candidates: int,
+    units: str,
+    manifest: Path | None,
+) -> None:
     """Print the figures as JSON."""
-    begin = time.perf_counter() - time.process_time()
-    clock = Clock()
-    config = load_config(overrides=[f"candidates.max={candidates}"])
     sources = find_meshes(meshes, units=units, manifest=manifest)
+    config = load_config(config_name, [*overrides, f"candidates.max={candidates}"])
+    clock, begin, begin_cpu = Clock(), time.perf_counter(), time.process_time()
     build(sources, out, config, clock, show=False)
-    assembled = time.perf_counter() - clock.last
+    end = time.perf_counter()
+    # Seconds of a whole core, whatever else this machine had to do.
+    core = (time.process_time() - begin_cpu) / (end - begin)
+    times = stage_times(clock, core, assembled=end - clock.last, out=out)
+    click.echo(json.dumps(asdict(times), indent=1))
+
+
+def stage_times(clock: Clock, core: float, *, assembled: float, out: Path) -> StageTimes:
+    """Return what a build took by stage, in seconds of a core of which it had a share."""
     outcomes: Counter[Outcome] = Counter()
     seconds: Counter[str] = Counter()
     for unit in clock.units:
         outcomes.update(unit.outcomes)
-        seconds.update(unit.seconds)
-    attempts = sum(outcomes.values())
-    by_object = [u.seconds["try"] / sum(u.outcomes.values()) for u in clock.units]
-    click.echo(
-        json.dumps(
-            {
-                "objects": len(read_manifest(out).objects),
-                "attempts": attempts,
-                "share of a core that was had": time.process_time() / (time.perf_counter() - begin),
-                "outcomes": {o.label: n for o, n in outcomes.items()},
-                "prepare [s/object]": sum(clock.prepare) / len(clock.prepare),
-                "build [s/object]": seconds["build"] / len(clock.units),
-                "try [s/attempt]": seconds["try"] / attempts,
-                "look [s/success]": seconds["look"] / max(1, outcomes[Outcome.SUCCESS]),
-                "write [s/unit]": seconds["write"] / len(clock.units),
-                "assemble [s/attempt]": assembled / attempts,
-                "try by object [s/attempt]": sorted(by_object),
-                "storage [B]": measure_storage(out),
-            },
-            indent=1,
-        )
+        seconds.update({stage: core * spent for stage, spent in unit.seconds.items()})
+    attempts, successes = sum(outcomes.values()), outcomes[Outcome.SUCCESS]
+    samples = sum(split.samples for split in count_splits(out))
+    objects = len(read_manifest(out).objects)
+    by_object: dict[str, float] = {}
+    for unit in clock.units:
+        name = unit.header.object_name
+        by_object[name] = by_object.get(name, 0.0) + core * unit.seconds["try"]
+    mean = seconds["try"] / objects
+    return StageTimes(
+        prepare=core * sum(clock.prepare) / len(clock.prepare),
+        scene=seconds["build"] / objects,
+        attempt=(seconds["try"] + seconds["write"]) / attempts,
+        shares=tuple(sorted(spent / mean for spent in by_object.values())),
+        look=seconds["look"] / max(1, successes),
+        assemble=core * assembled / attempts,
+        successes=successes / attempts,
+        samples=samples / max(1, successes),
+        **measure_storage(out),
+        source=f"measured on {objects} objects, {attempts} attempts",
     )
 
 

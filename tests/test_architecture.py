@@ -17,7 +17,7 @@ PACKAGE = Path(drakegrasp.__file__).parent
 LAYERS: tuple[frozenset[str], ...] = tuple(
     frozenset(line.split())
     for line in (
-        "errors frames progress executor",
+        "errors executor frames network progress",
         "grasp outcomes hand_files config curves surfaces pads prediction prediction_files",
         "schema hand solids bodies wavefront",
         "shards camera filters shapes vessels fruit holes union decimation hand_shapes",
@@ -37,7 +37,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
         "verify verification_files",
         "verify_plan",
         "verify_grasps verify_request",
-        "cluster doctor format_docs",
+        "workers doctor format_docs",
         "cli",
     )
 )

@@ -76,11 +76,22 @@ def test_commands_in_the_docs_exist(page: Path) -> None:
 def test_session_of_the_readme_runs(
     small_dataset: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """All but the build itself, on the small dataset."""
+    """All but the build itself, and then what is done with predictions, on the small dataset."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    (code,) = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
-    lines = [line for line in code.splitlines() if not line.startswith("dg.build_dataset")]
-    assert len(code.splitlines()) == len(lines) + 1
+    session, predictions = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    lines = [line for line in session.splitlines() if not line.startswith("dg.build_dataset")]
+    assert len(session.splitlines()) == len(lines) + 1
     monkeypatch.chdir(small_dataset.parent)
-    exec(compile("\n".join(lines).replace('"OUT', '"out'), "README.md", "exec"), {})
-    assert capsys.readouterr().out.rstrip().endswith("True")
+    names: dict[str, object] = {}
+    code = "\n".join([*lines, predictions]).replace('"OUT', '"out')
+    try:
+        exec(compile(code, "README.md", "exec"), names)
+        assert Path("grasp.html").stat().st_size > 1_000_000
+        assert Path("grasp.png").read_bytes().startswith(b"\x89PNG")
+    finally:
+        for made in ("grasp.html", "grasp.png"):
+            Path(made).unlink(missing_ok=True)
+    replayed, verdict, explanation = capsys.readouterr().out.splitlines()[-3:]
+    assert replayed == "True"
+    assert verdict.split()[0] in ("True", "False")
+    assert explanation.startswith("The grasp of ")

@@ -61,6 +61,7 @@ def write_data_file(
     }
     with h5py.File(path, "w") as file:
         file.attrs["schema_version"], file.attrs["K"] = SCHEMA_VERSION, K
+        file.attrs["camera"] = "oto"
         file.attrs["near"], file.attrs["far"] = CAMERA.near, CAMERA.far
         for name in SPLITS:
             group, rows = file.create_group(name), len(names) if name == split else 0

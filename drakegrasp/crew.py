@@ -1,0 +1,158 @@
+"""Tasks on Dask's workers, some of which die.
+
+In: a function and items. Out: the results, in any order. A few tasks per worker are in
+flight, whatever their number, and nothing is kept of those that are done. A task whose
+worker died is given to another: that it comes to an end is the task's own business (see
+`drakegrasp.journal`), so the number of deaths is bounded generously. One that got an image
+of nothing is tried again, too, as it may be one worker's OpenGL.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from itertools import islice
+from queue import Empty, SimpleQueue
+from typing import Any, Generic, TypeVar, cast
+
+from distributed import Client, Future, KilledWorker
+
+from drakegrasp.errors import BlankImageError, MachineError
+from drakegrasp.executor import Crew
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+#: Tasks in flight per worker: one that runs, and one so that it never waits.
+IN_FLIGHT = 2
+#: How often the workers are counted [s].
+COUNT_SECONDS = 2.0
+#: How long there may be no worker at all after there were some [s].
+LOST_SECONDS = 300.0
+#: How often a task is given out again after Dask gave it up (after four deaths each time).
+RESUBMISSIONS = 100
+#: How often a task may get an image of nothing.
+BLANKS = 3
+_GOES_ON = "the same command goes on from here"
+
+
+@dataclass(eq=False)
+class _Flight(Generic[T]):
+    """A task that was given out."""
+
+    item: T
+    future: Future | None = None
+    given_up: int = 0
+    blank: int = 0
+
+
+class DaskExecutor:
+    """An `Executor` that keeps a few tasks per worker in flight on a Dask cluster."""
+
+    def __init__(self, client: Client, *, resubmissions: int = 0) -> None:
+        """Work through a client.
+
+        Args:
+            client: Of the cluster.
+            resubmissions: How often a task is given out again that Dask gave up because its
+                workers died.
+        """
+        self._client, self._resubmissions = client, resubmissions
+        self._workers: set[str] = set()
+        self._counted = -float("inf")
+        self._lost: float | None = None
+        self.crew = Crew()
+
+    def __call__(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+        """Yield function(item) of every item as they are done.
+
+        Raises:
+            MachineError: If the workers died of an item again and again, or all of them or
+                the scheduler are lost.
+            Exception: What the function raised.
+        """
+        waiting = iter(items)
+        arrived: SimpleQueue[str] = SimpleQueue()
+        flights: dict[str, _Flight[T]] = {}
+
+        def launch(flight: _Flight[T]) -> None:
+            # A task writes files, so it is never the same as one that was done before.
+            flight.future = self._client.submit(function, flight.item, pure=False)
+            flights[flight.future.key] = flight
+            flight.future.add_done_callback(lambda done: arrived.put(done.key))
+
+        while True:
+            self._count()
+            for item in islice(waiting, max(0, self._room() - len(flights))):
+                launch(_Flight(item))
+            if not flights:
+                return
+            flight = flights.pop(self._next(arrived))
+            if self._may_go_again(flight):
+                launch(flight)
+            else:
+                yield cast(R, self._result(flight))
+
+    def _may_go_again(self, flight: _Flight[Any]) -> bool:
+        """Return whether a task failed in a way that is not its own, and not too often."""
+        assert flight.future is not None
+        if flight.future.status != "error":
+            return False
+        error = flight.future.exception()
+        if isinstance(error, KilledWorker):
+            flight.given_up += 1
+            return flight.given_up <= self._resubmissions
+        if isinstance(error, BlankImageError):
+            flight.blank += 1
+            return flight.blank < BLANKS
+        return False
+
+    def _result(self, flight: _Flight[Any]) -> Any:
+        assert flight.future is not None
+        if flight.future.cancelled():
+            raise MachineError(f"the scheduler must stay, got none any more; {_GOES_ON}")
+        try:
+            return flight.future.result()
+        except KilledWorker as error:
+            raise MachineError(f"the workers must stay alive, got: {error}") from None
+
+    def _next(self, arrived: SimpleQueue[str]) -> str:
+        """Return the key of the next task that is done.
+
+        Raises:
+            MachineError: If there is no worker for long.
+        """
+        while True:
+            try:
+                return arrived.get(timeout=COUNT_SECONDS)
+            except Empty:
+                self._count()
+
+    def _count(self) -> None:
+        """Count the workers, now and then.
+
+        Raises:
+            MachineError: If the scheduler is lost, or all workers are for long.
+        """
+        now = time.monotonic()
+        if now - self._counted < COUNT_SECONDS:
+            return
+        self._counted = now
+        try:
+            found = set(self._client.nthreads())
+        except (OSError, RuntimeError, TimeoutError) as error:
+            raise MachineError(f"the scheduler must stay, got: {error}; {_GOES_ON}") from None
+        joined, left = found - self._workers, self._workers - found
+        if joined or left:
+            self._workers, self.crew.size = found, len(found)
+            self.crew.on_change(joined, left)
+        if found or not (self._lost or left):
+            self._lost = None
+            return
+        self._lost = self._lost or now
+        if now - self._lost > LOST_SECONDS:
+            raise MachineError(f"there must be a worker, got none for {LOST_SECONDS:g} s; {_GOES_ON}")
+
+    def _room(self) -> int:
+        return IN_FLIGHT * max(1, len(self._workers))

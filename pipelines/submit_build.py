@@ -1,0 +1,118 @@
+r"""Build a dataset on a cluster: this machine, SSH, SLURM, or a running Dask scheduler.
+
+\b
+    python pipelines/submit_build.py --cluster local ...
+    python pipelines/submit_build.py --cluster ssh node1 node2 --cores 16 --interface eth0 --tls ...
+    python pipelines/submit_build.py --cluster slurm --workers 200 --walltime 04:00:00 ...
+    python pipelines/submit_build.py --cluster scheduler tcp://10.0.0.1:8786 ...
+    python pipelines/submit_build.py --cluster scheduler-file scheduler.json ...
+
+What will run and what it is expected to take is printed first; --dry-run stops there. The
+same command goes on where one stopped, on any cluster. docs/clusters.md has the details,
+pipelines/recipes/ an example of each.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from drakegrasp.build_options import build_options, parse_request, times_option
+from drakegrasp.cli import OneCommand, print_plan, print_report
+from drakegrasp.cluster import build_on, find_sources
+from drakegrasp.clusters import (
+    KINDS,
+    ClusterRequest,
+    dashboard_line,
+    describe,
+    start_cluster,
+    worker_count,
+)
+from drakegrasp.errors import ConfigError
+
+
+@click.command(cls=OneCommand, help=__doc__)
+@click.option(
+    "--cluster",
+    "kind",
+    type=click.Choice(KINDS),
+    default="local",
+    show_default=True,
+    help="What runs the work; ssh is followed by hosts, scheduler by its address, "
+    "scheduler-file by its path.",
+)
+@click.argument("where", nargs=-1, metavar="[HOST...|ADDRESS|PATH]")
+@build_options
+@click.option("--workers", type=int, help="Processes in all.  [local: one per core]")
+@click.option("--cores", type=int, help="Of each SSH host or SLURM job, a worker on each.")
+@click.option("--memory", metavar="SIZE", help="Of each worker, e.g. 2GB.")
+@click.option("--walltime", metavar="TIME", help="Of each SLURM job, [D-]HH:MM:SS.")
+@click.option("--interface", metavar="NAME", help="Network on which scheduler and workers listen.")
+@click.option("--host", metavar="ADDRESS", help="On which the scheduler listens, instead.")
+@click.option("--tls", is_flag=True, help="Encrypt, with certificates made for this run.")
+@click.option("--tls-ca-file", type=click.Path(path_type=Path, exists=True, dir_okay=False))
+@click.option("--tls-cert", type=click.Path(path_type=Path, exists=True, dir_okay=False))
+@click.option(
+    "--tls-key",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="Encrypt, with an authority, a certificate and a key of yours (PEM).",
+)
+@times_option
+@click.option("--dry-run", is_flag=True, help="Only print what would run.")
+def main(
+    kind: str,
+    where: tuple[str, ...],
+    workers: int | None,
+    cores: int | None,
+    memory: str | None,
+    walltime: str | None,
+    interface: str | None,
+    host: str | None,
+    tls: bool,
+    tls_ca_file: Path | None,
+    tls_cert: Path | None,
+    tls_key: Path | None,
+    times: Path | None,
+    dry_run: bool,
+    **options: Any,
+) -> None:
+    """Run the script."""
+    request = parse_request(**options)
+    cluster = ClusterRequest(
+        kind=kind,
+        where=where,
+        workers=workers,
+        cores=cores,
+        memory=memory,
+        walltime=walltime,
+        host=host,
+        interface=interface,
+        tls=tls,
+        tls_files=_tls_files(tls_ca_file, tls_cert, tls_key),
+    )
+    click.echo("\n".join(describe(cluster)))
+    print_plan(request, worker_count(cluster), times)
+    if dry_run:
+        return
+    sources = find_sources(request.objects, request.units, request.manifest)
+    with start_cluster(cluster, request.out) as client:
+        click.echo(dashboard_line(client), err=True)
+        if not client.nthreads():
+            click.echo("waiting for the first worker", err=True)
+            client.wait_for_workers(1)
+        print_report(build_on(client, sources, request.out, request.config, show=request.show))
+
+
+def _tls_files(*paths: Path | None) -> tuple[Path, Path, Path] | None:
+    match paths:
+        case (None, None, None):
+            return None
+        case (Path() as ca, Path() as cert, Path() as key):
+            return ca, cert, key
+    raise ConfigError("--tls-ca-file, --tls-cert and --tls-key must be given together")
+
+
+if __name__ == "__main__":
+    main()
