@@ -11,7 +11,7 @@ STAMP  := $(VENV)/.installed
 export LP_NUM_THREADS := 0
 export DRAKE_ALLOW_NETWORK := none
 
-.PHONY: help install demo test test-fast lint format docs clean
+.PHONY: help install demo test test-fast test-cluster lint format docs clean
 
 help:            ## what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -33,6 +33,13 @@ test: $(STAMP)   ## the whole test suite
 
 test-fast: $(STAMP)  ## without simulations and clusters
 	$(BIN)/python -m pytest -n 2 -m 'not sim and not cluster and not slow'
+
+test-cluster: $(STAMP)  ## with a real SLURM and a real sshd, which it installs; as root, on Debian
+	apt-get update -qq
+	DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends \
+	    slurm-wlm munge openssh-server openssh-client
+	$(BIN)/python -m pip install --quiet --editable '.[dev,slurm,ssh,tls]'
+	$(BIN)/python -m pytest -m server
 
 lint: $(STAMP)   ## style, types, and docs that are made from code
 	$(BIN)/ruff check .

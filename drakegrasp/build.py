@@ -6,21 +6,30 @@ and running a work unit. Results come back in any order and the files end up the
 
 from __future__ import annotations
 
+import socket
+import sys
+import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from drakegrasp.assemble import Assembly, assemble, is_assembled, summarise
+from drakegrasp.build_lock import build_lock
+from drakegrasp.build_log import BuildLog
 from drakegrasp.config import Config, parse_config
-from drakegrasp.errors import DataError, DrakegraspError, MeshError
-from drakegrasp.executor import Executor
+from drakegrasp.errors import DataError, DrakegraspError, MachineError, MeshError
+from drakegrasp.executor import Crew, Executor
+from drakegrasp.faults import strike
 from drakegrasp.hand import load_hand
+from drakegrasp.journal import GIVE_UP_DEATHS, Journal, open_journal
 from drakegrasp.manifest import (
     Manifest,
     claim_directory,
     installed_versions,
+    model_path,
     release_directory,
     write_manifest,
 )
@@ -28,8 +37,13 @@ from drakegrasp.meshes import MeshSource, source_sha256
 from drakegrasp.outcomes import Outcome
 from drakegrasp.prepared import load_prepared, prepare, save_prepared
 from drakegrasp.progress import Report, progress_bar
-from drakegrasp.shards import ShardHeader, read_outcomes
-from drakegrasp.units import WorkUnit, count_outcomes, run_unit
+from drakegrasp.shards import ShardHeader, disk_full_named, sweep_temporary
+from drakegrasp.units import UnitSummary, WorkUnit, find_outcomes, run_unit
+
+#: Wall clock after which preparing a mesh hangs [s].
+PREPARE_SECONDS = 1800.0
+#: How many of many things are named in one line.
+NAMED = 10
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +57,7 @@ class BuildReport:
         objects: Number of objects.
         refused: Name and reason of each mesh that was refused.
         errors: Number of solver errors by message, of the units that were run now.
+        notices: What was found that should not have been there, and what became of it.
         assembly: What the files hold.
     """
 
@@ -52,6 +67,7 @@ class BuildReport:
     objects: int
     refused: tuple[dict[str, str], ...]
     errors: dict[str, int]
+    notices: tuple[str, ...]
     assembly: Assembly
 
 
@@ -60,6 +76,18 @@ class _PrepareTask:
     source: MeshSource
     out: str
     config: dict[str, Any]
+    expendable: bool
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Job:
+    """What the steps of a build share."""
+
+    out: Path
+    execute: Executor
+    crew: Crew | None
+    log: BuildLog
+    show: bool
 
 
 def build(
@@ -68,6 +96,7 @@ def build(
     config: Config,
     execute: Executor,
     *,
+    crew: Crew | None = None,
     show: bool = True,
 ) -> BuildReport:
     """Build or complete the dataset of some meshes in a directory.
@@ -80,41 +109,110 @@ def build(
         out: Directory; new, empty, or of this configuration.
         config: All the rules.
         execute: Who does the work.
+        crew: Its processes, if they are started again when they die: then a crash or a hang
+            costs one attempt. In the caller's own process it is the caller's to see.
         show: Whether to show progress on standard error.
 
     Raises:
-        DataError: If the directory cannot be used, or no mesh is fit to be simulated.
+        DataError: If the directory cannot be used, another process builds there, or no mesh
+            is fit to be simulated.
         HandError: If the hand cannot be used.
+        DiskFullError: If there is no room; the same call goes on when there is.
+        MachineError: If the workers cannot do the work.
     """
     load_hand(config.hand)
-    known = claim_directory(out, config)
-    if known is not None:
-        _refuse_missing(known, sources, out)
+    job = _Job(out=out, execute=execute, crew=crew, log=BuildLog(out), show=show)
+    with build_lock(out) as dead, disk_full_named(out):
+        notices = [] if dead is None else [f"the lock of a dead build was taken over: {dead}"]
+        known = claim_directory(out, config)
+        if known is not None:
+            _refuse_missing(known, sources, out)
+        notices += _sweep(out)
+        try:
+            return _build(sources, config, known, notices, job)
+        except BaseException as error:
+            # What stopped a build is worth a line, but not another error.
+            with suppress(OSError):
+                if (out / "manifest.json").exists():
+                    job.log("stopped", reason=f"{type(error).__name__}: {error}")
+            raise
+
+
+def _sweep(out: Path) -> list[str]:
+    swept = [str(path.relative_to(out)) for path in sweep_temporary(out)]
+    return [f"{_count(swept, 'temporary file')} of dead processes removed"] if swept else []
+
+
+def _build(
+    sources: Sequence[MeshSource],
+    config: Config,
+    known: Manifest | None,
+    notices: list[str],
+    job: _Job,
+) -> BuildReport:
+    out, start = job.out, time.monotonic()
     new = Manifest(config=config, versions=installed_versions(config))
     manifest = replace(known or new, config=config)
     write_manifest(manifest, out)
-    with progress_bar("prepare", "objects", show=show) as report:
-        manifest = _prepare_all(sources, out, manifest, execute, report)
+    _log_start(manifest, notices, job)
+    with progress_bar("prepare", "objects", show=job.show) as report:
+        manifest = _prepare_all(sources, manifest, job, report)
     if not manifest.objects:
         if known is None:
             release_directory(out)
         reasons = "; ".join(f"{entry['name']}: {entry['reason']}" for entry in manifest.refused)
         raise DataError(f"at least one mesh must be fit to simulate, got none: {reasons}")
     write_manifest(manifest, out)
-    with progress_bar("simulate", "attempts", show=show) as report:
-        simulated, reused, errors = _run_all(manifest, out, execute, report)
-    if simulated or not is_assembled(out):
-        with progress_bar("assemble", "shards", show=show) as report:
+    with progress_bar("simulate", "attempts", show=job.show) as report:
+        tally = _run_all(manifest, job, report)
+    if tally.simulated or not is_assembled(out):
+        with progress_bar("assemble", "shards", show=job.show) as report:
             assemble(out, progress=report)
+    if tally.damaged:
+        notices.append(
+            f"{_count(tally.named, 'shard', tally.damaged)}: damaged, and simulated again"
+        )
+    seconds = round(time.monotonic() - start, 3)
+    job.log("finished", simulated=tally.simulated, reused=tally.reused, seconds=seconds)
     return BuildReport(
         out=out,
-        simulated=simulated,
-        reused=reused,
+        simulated=tally.simulated,
+        reused=tally.reused,
         objects=len(manifest.objects),
         refused=manifest.refused,
-        errors=errors,
+        errors=dict(tally.errors),
+        notices=tuple(notices),
         assembly=summarise(out),
     )
+
+
+def _log_start(manifest: Manifest, notices: Sequence[str], job: _Job) -> None:
+    job.log(
+        "started",
+        command=sys.argv,
+        host=socket.gethostname(),
+        config_hash=manifest.config.simulation_hash(),
+        seed=manifest.config.seed,
+        versions=manifest.versions,
+    )
+    for notice in notices:
+        job.log("notice", text=notice)
+    if job.crew is not None:
+        crew = job.crew
+
+        def change(joined: set[str], left: set[str]) -> None:
+            for event, addresses in (("worker joined", joined), ("worker lost", left)):
+                for address in sorted(addresses):
+                    job.log(event, address=address, workers=crew.size)
+
+        crew.on_change = change
+
+
+def _count(names: Sequence[str], what: str, total: int | None = None) -> str:
+    """Return e.g. `3 shards (a, b, c)`; of many only the first are named."""
+    total = len(names) if total is None else total
+    more = ", ..." if total > NAMED else ""
+    return f"{total} {what}{'s' * (total != 1)} ({', '.join(names[:NAMED])}{more})"
 
 
 def _refuse_missing(known: Manifest, sources: Sequence[MeshSource], out: Path) -> None:
@@ -129,20 +227,27 @@ def _refuse_missing(known: Manifest, sources: Sequence[MeshSource], out: Path) -
 
 
 def _prepare_all(
-    sources: Sequence[MeshSource], out: Path, manifest: Manifest, execute: Executor, report: Report
+    sources: Sequence[MeshSource], manifest: Manifest, job: _Job, report: Report
 ) -> Manifest:
     """Return the manifest with every object prepared or refused, in the order of the sources."""
-    config = manifest.config.to_dict()
+    out, config = job.out, manifest.config.to_dict()
     found, pending = {}, []
     for source in sources:
         entry = _known_entry(source, out, manifest)
         if entry is None:
-            pending.append(_PrepareTask(source=source, out=str(out), config=config))
+            expendable = job.crew is not None
+            pending.append(
+                _PrepareTask(source=source, out=str(out), config=config, expendable=expendable)
+            )
         else:
             found[source.name] = entry
     report(len(found), len(sources))
-    for name, entry in execute(_prepare_one, pending):
+    for name, entry in job.execute(_prepare_one, pending):
         found[name] = entry
+        if "reason" in entry:
+            job.log("mesh refused", name=name, reason=entry["reason"])
+        else:
+            job.log("mesh prepared", name=name, candidates=entry["candidates"])
         report(len(found), len(sources))
     entries = [found[source.name] for source in sources]
     return replace(
@@ -171,79 +276,145 @@ def _known_entry(source: MeshSource, out: Path, manifest: Manifest) -> dict[str,
 
 def _prepare_one(task: _PrepareTask) -> tuple[str, dict[str, Any]]:
     """Prepare one object; return its name and its entry in the manifest."""
-    config, out, source = parse_config(task.config), Path(task.out), task.source
+    out, source = Path(task.out), task.source
+    with disk_full_named(out):
+        if not task.expendable:
+            return source.name, _prepared_entry(task)
+        config_hash, digest = parse_config(task.config).simulation_hash(), source_sha256(source)
+        identity = {"name": source.name, "mesh_sha256": digest, "config_hash": config_hash}
+        path = model_path(out, source.name).with_suffix(".journal")
+        with open_journal(path, identity) as journal:
+            return source.name, _prepared_or_guilty(task, journal)
+
+
+def _prepared_or_guilty(task: _PrepareTask, journal: Journal) -> dict[str, Any]:
+    name = task.source.name
+    verdict = journal.verdict("prepare")
+    if verdict is not None:
+        return _refused(
+            task.source, f"{name}: must be fit to prepare, got one that {verdict.value}"
+        )
+    if journal.is_futile:
+        raise MachineError(
+            f"{name}: the worker must stay alive to prepare it, got {GIVE_UP_DEATHS} deaths in a "
+            "row; is there enough memory? The same command goes on from here"
+        )
+    with journal.step("prepare", PREPARE_SECONDS):
+        strike(name)
+        return _prepared_entry(task)
+
+
+def _prepared_entry(task: _PrepareTask) -> dict[str, Any]:
+    config = parse_config(task.config)
     try:
-        prepared = prepare(source, config)
+        prepared = prepare(task.source, config)
     except MeshError as error:
-        digest = source_sha256(source)
-        return source.name, {"name": source.name, "mesh_sha256": digest, "reason": str(error)}
-    save_prepared(prepared, out, config)
-    return source.name, prepared.summary()
+        return _refused(task.source, str(error))
+    save_prepared(prepared, Path(task.out), config)
+    return prepared.summary()
 
 
-def _run_all(
-    manifest: Manifest, out: Path, execute: Executor, report: Report
-) -> tuple[int, int, dict[str, int]]:
-    """Run the work units that are not done; return how many were run, how many reused, errors."""
-    progress = _Progress(manifest, report)
-    pending = []
-    for header in manifest.headers():
-        outcomes = _outcomes_on_disk(header, out)
-        if outcomes is None:
-            pending.append(header)
-        else:
-            progress.add(header, outcomes)
-    reused = len(progress.done)
-    config = manifest.config.to_dict()
-    units = (
-        WorkUnit(out=str(out), header=header, config=config)
-        for header in pending
-        if progress.wants(header)
-    )
-    errors: Counter[str] = Counter()
-    for summary in execute(run_unit, units):
-        progress.add(summary.header, summary.outcomes)
-        errors.update(summary.errors)
-    return len(progress.done) - reused, reused, dict(errors)
+def _refused(source: MeshSource, reason: str) -> dict[str, Any]:
+    return {"name": source.name, "mesh_sha256": source_sha256(source), "reason": reason}
 
 
-def _outcomes_on_disk(header: ShardHeader, out: Path) -> dict[Outcome, int] | None:
-    """Return the outcomes of a shard that is whole, or None: then it is done again."""
-    path = header.path(out)
-    if not path.exists():
-        return None
-    try:
-        return count_outcomes(read_outcomes(path, header))
-    except DataError:
-        return None
+def _run_all(manifest: Manifest, job: _Job, report: Report) -> _Tally:
+    """Run the work units that are not done; return what is done then."""
+    tally = _Tally(manifest, job.crew, report)
+    config, expendable = manifest.config.to_dict(), job.crew is not None
 
-
-class _Progress:
-    """What is done, by work unit, and whether an object needs more."""
-
-    def __init__(self, manifest: Manifest, report: Report) -> None:
-        self.done: dict[ShardHeader, dict[Outcome, int]] = {}
-        self._report, self._wanted = report, manifest.config.max_grasps
-        self._units: dict[str, list[ShardHeader]] = {}
+    def units() -> Iterator[WorkUnit]:
         for header in manifest.headers():
-            self._units.setdefault(header.object_name, []).append(header)
+            if not _is_done(header, tally, job) and tally.wants(header):
+                yield WorkUnit(
+                    out=str(job.out), header=header, config=config, expendable=expendable
+                )
+
+    for summary in job.execute(run_unit, units()):
+        tally.simulated += 1
+        tally.errors.update(summary.errors)
+        tally.add(summary.header, summary.outcomes)
+        _log_unit(summary, job)
+    return tally
+
+
+def _is_done(header: ShardHeader, tally: _Tally, job: _Job) -> bool:
+    """Return whether a shard is there and whole, and count it; one that is harmed is named."""
+    try:
+        outcomes = find_outcomes(job.out, header)
+    except DataError as error:
+        tally.add_damaged(str(header.path(job.out).relative_to(job.out)))
+        job.log("damaged shard", reason=str(error))
+        return False
+    if outcomes is None:
+        return False
+    # Its process may have died between the shard and the end of the journal.
+    header.journal_path(job.out).unlink(missing_ok=True)
+    tally.reused += 1
+    tally.add(header, outcomes)
+    return True
+
+
+def _log_unit(summary: UnitSummary, job: _Job) -> None:
+    header = summary.header
+    job.log(
+        "unit done",
+        object=header.object_name,
+        start=header.start,
+        stop=header.stop,
+        outcomes={outcome.label: count for outcome, count in summary.outcomes.items()},
+        seconds={stage: round(seconds, 4) for stage, seconds in summary.seconds.items()},
+        errors=summary.errors,
+    )
+
+
+class _Tally:
+    """What is done, in numbers: nothing here grows with the number of work units.
+
+    For `max_grasps` it knows, by object, how far its units are done without a gap, how many
+    grasps these have, and the units beyond the gap, which are those in flight.
+    """
+
+    def __init__(self, manifest: Manifest, crew: Crew | None, report: Report) -> None:
+        self.simulated = self.reused = self.damaged = 0
+        self.named: list[str] = []
+        self.errors: Counter[str] = Counter()
+        self._crew, self._report = crew, report
+        self._wanted, self._step = manifest.config.max_grasps, manifest.config.unit_candidates
         standoffs = len(manifest.config.candidates.standoffs)
         self._total = standoffs * sum(entry["candidates"] for entry in manifest.objects)
-        self._totals: Counter[str] = Counter()
+        self._outcomes: Counter[Outcome] = Counter()
+        self._grasps: Counter[str] = Counter()
+        self._gap: Counter[str] = Counter()
+        self._beyond: dict[str, dict[int, int]] = {}
+
+    def add_damaged(self, name: str) -> None:
+        """Count a harmed shard; the first are named."""
+        self.damaged += 1
+        if len(self.named) < NAMED:
+            self.named.append(name)
 
     def add(self, header: ShardHeader, outcomes: dict[Outcome, int]) -> None:
-        self.done[header] = outcomes
-        self._totals["attempts"] += sum(outcomes.values())
-        self._totals["grasps"] += outcomes.get(Outcome.SUCCESS, 0)
-        self._report(self._totals["attempts"], self._total, grasps=self._totals["grasps"])
+        """Count a unit that is done."""
+        self._outcomes.update(outcomes)
+        if self._wanted is not None:
+            self._close_gap(header, outcomes.get(Outcome.SUCCESS, 0))
+        figures = {"grasps": self._outcomes[Outcome.SUCCESS]}
+        for outcome in (Outcome.CRASHED, Outcome.TIMEOUT):
+            if self._outcomes[outcome]:
+                figures[outcome.label] = self._outcomes[outcome]
+        if self._crew is not None:
+            figures["workers"] = self._crew.size
+        self._report(self._outcomes.total(), self._total, **figures)
 
     def wants(self, header: ShardHeader) -> bool:
-        """Return whether a unit's object lacks grasps in the units before it."""
-        if self._wanted is None:
-            return True
-        grasps = 0
-        for earlier in self._units[header.object_name]:
-            if earlier == header or earlier not in self.done:
-                break
-            grasps += self.done[earlier].get(Outcome.SUCCESS, 0)
-        return grasps < self._wanted
+        """Return whether a unit's object lacks grasps in the units before the first gap."""
+        return self._wanted is None or self._grasps[header.object_name] < self._wanted
+
+    def _close_gap(self, header: ShardHeader, grasps: int) -> None:
+        name = header.object_name
+        beyond = self._beyond.setdefault(name, {})
+        beyond[header.start] = grasps
+        while (found := beyond.pop(self._gap[name], None)) is not None:
+            self._grasps[name] += found
+            self._gap[name] += self._step

@@ -106,7 +106,9 @@ def _take(path: Path) -> tuple[FileIO, Holder | None]:
         try:
             locked = _lock(file)
             before = _read(file)
-            if locked is False or (locked is None and before and before.process.runs() is not False):
+            if locked is False or (
+                locked is None and before and before.process.runs() is not False
+            ):
                 raise _refusal(path, before, certain=locked is False)
             if _is_at(path, file):
                 _write(file)

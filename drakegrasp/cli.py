@@ -427,6 +427,8 @@ def print_report(report: BuildReport) -> None:
         click.echo(f"all {report.reused} work units had been done before: nothing was simulated")
     for message, count in report.errors.items():
         click.echo(f"solver error in {count} attempts: {message}")
+    for notice in report.notices:
+        click.echo(notice)
     for entry in report.refused:
         click.echo(f"refused: {entry['name']}: {entry['reason']}")
     for name in ("grasping_oto.hdf5", "grasping_otm.hdf5", "trials.hdf5"):

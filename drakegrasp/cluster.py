@@ -19,6 +19,7 @@ from distributed import Client, LocalCluster
 from distributed.security import Security
 
 from drakegrasp.build import BuildReport, build
+from drakegrasp.build_lock import build_lock
 from drakegrasp.build_options import BUILTIN
 from drakegrasp.builtin import export_builtin
 from drakegrasp.config import Config, load_config, parse_config
@@ -81,13 +82,17 @@ def build_dataset(
     Raises:
         MeshError: If there is no mesh.
         ConfigError: If both workers and a scheduler are given.
-        DataError: If `out` cannot be used, or no mesh is fit to be simulated.
+        DataError: If `out` cannot be used, another process builds there, or no mesh is fit to be
+            simulated.
+        MachineError: If there is no scheduler, the workers cannot do the work, or no room is
+            left; the same call goes on when that is mended.
     """
     _refuse_workers(workers, scheduler, scheduler_file)
     out, config = Path(out).absolute(), config or load_config()
     load_hand(config.hand)
     sources = find_sources(objects, units, manifest)
-    with connect(workers, scheduler, scheduler_file) as client:
+    # Locked first: a second build is refused before it starts any worker.
+    with build_lock(out), connect(workers, scheduler, scheduler_file) as client:
         return build_on(client, sources, out, config, show=show)
 
 
@@ -125,12 +130,13 @@ def build_on(
         DataError: If `out` cannot be used, or no mesh is fit to be simulated.
         MachineError: If a worker would give other results than this machine.
     """
-    with admitted_workers(client, config):
+    with admitted_workers(client, config), build_lock(out):
         if sources is None:
             claim_directory(out, config)
             export_builtin(out / BUILTIN_FOLDER)
             sources = find_meshes(out / BUILTIN_FOLDER)
-        return build(sources, out, config, DaskExecutor(client), show=show)
+        execute = DaskExecutor(client, resubmissions=RESUBMISSIONS)
+        return build(sources, out, config, execute, crew=execute.crew, show=show)
 
 
 def verify_grasps(
@@ -266,7 +272,7 @@ def connect(
                 client = Client(
                     scheduler, scheduler_file=file, timeout=CONNECT_SECONDS, security=security
                 )
-            except (OSError, ValueError) as error:
+            except (OSError, RuntimeError, TypeError, ValueError) as error:
                 raise MachineError(
                     f"{scheduler or file}: must be a running Dask scheduler, got none ({error})"
                 ) from None

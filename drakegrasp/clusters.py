@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import importlib.util
 import ipaddress
+import logging
 import math
 import shlex
 import shutil
@@ -25,7 +26,7 @@ from typing import Any
 
 import dask
 from dask.utils import parse_bytes
-from distributed import Client, SpecCluster, SSHCluster
+from distributed import Client, SpecCluster, SSHCluster, Status
 from distributed.security import Security
 from tornado.ioloop import PeriodicCallback
 
@@ -44,6 +45,9 @@ REFILL_SECONDS = 20.0
 LIFETIME_MARGIN, LIFETIME_STAGGER = 300.0, 120.0
 #: Address of this machine alone.
 LOOPBACK = "127.0.0.1"
+#: A scheduler on another machine ends by itself when it had nothing to do for this long,
+#: because its client was killed.
+IDLE_TIME = "1 hour"
 #: Least and largest number of words after each kind, and what they are.
 _PLACES: dict[str, tuple[int, float, str]] = {
     "local": (0, 0, "nothing"),
@@ -177,30 +181,33 @@ def _running(make: Callable[[], SpecCluster]) -> Iterator[Client]:
 
 def _ssh(request: ClusterRequest, security: Security | None) -> SpecCluster:
     # Settings of Dask go to the other machines with every command that SSHCluster runs there.
+    listening = _listening(request)
     worker = {
         "n_workers": _cores_per_host(request),
         "nthreads": 1,
         "memory_limit": request.memory or "auto",
         "env": WORKER_ENVIRONMENT,
-        "interface": request.interface,
+        **_workers_listening(listening),
         **_secured(security),
     }
     scheduler = {
         "port": 0,
         "dashboard_address": f"{LOOPBACK}:0",
-        **_listening(request),
+        "idle_timeout": IDLE_TIME,
+        **listening,
         **_secured(security),
     }
     return SSHCluster(
         [request.where[0], *request.where],
-        worker_options={k: v for k, v in worker.items() if v is not None},
+        worker_options=worker,
         scheduler_options=scheduler,
         security=security,
+        silence_logs=logging.ERROR,
     )
 
 
 def _slurm(request: ClusterRequest, security: Security | None) -> SpecCluster:
-    cores = _cores_per_job(request)
+    cores, listening = _cores_per_job(request), _listening(request)
     jobs = math.ceil((request.workers or 0) / cores)
     default = None if _jobqueue("memory") else WORKER_MEMORY
     memory = request.memory or default
@@ -218,12 +225,13 @@ def _slurm(request: ClusterRequest, security: Security | None) -> SpecCluster:
             *(_jobqueue("worker-extra-args") or ()),
             *_lifetime(request.walltime or _jobqueue("walltime")),
             f"--dashboard-address={LOOPBACK}:0",
+            *([f"--host={LOOPBACK}"] if "host" in _workers_listening(listening) else []),
         ],
         job_script_prologue=[*(_jobqueue("job-script-prologue") or ()), *_exports()],
         scheduler_options={
             "dashboard_address": f"{LOOPBACK}:0",
             **(_jobqueue("scheduler-options") or {}),
-            **_listening(request),
+            **listening,
         },
     )
     try:
@@ -265,6 +273,8 @@ class _Refill:
     async def __call__(self) -> None:
         """Look for jobs that had workers and have none, twice in a row."""
         cluster = self._cluster
+        if cluster.status is not Status.running:
+            return
         names = {str(w["name"]) for w in cluster.scheduler_info["workers"].values()}
         present = {job for job in cluster.worker_spec if _has_worker(str(job), names)}
         missing = self._seen - present
@@ -419,6 +429,14 @@ def _listening(request: ClusterRequest) -> dict[str, str]:
         "--interface NAME or --host ADDRESS must be given for workers on other machines, because "
         "the scheduler listens to nobody else's machine without"
     )
+
+
+def _workers_listening(listening: dict[str, str]) -> dict[str, str]:
+    """Return where workers listen, as their options, given where their scheduler does."""
+    if "interface" in listening:
+        return listening
+    # Without, a worker takes an address of its machine by which others reach it.
+    return listening if _is_loopback(listening.get("host", "")) else {}
 
 
 def _listens_beyond(request: ClusterRequest) -> bool:

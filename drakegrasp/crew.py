@@ -152,7 +152,9 @@ class DaskExecutor:
             return
         self._lost = self._lost or now
         if now - self._lost > LOST_SECONDS:
-            raise MachineError(f"there must be a worker, got none for {LOST_SECONDS:g} s; {_GOES_ON}")
+            raise MachineError(
+                f"there must be a worker, got none for {LOST_SECONDS:g} s; {_GOES_ON}"
+            )
 
     def _room(self) -> int:
         return IN_FLIGHT * max(1, len(self._workers))

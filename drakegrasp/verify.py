@@ -34,6 +34,10 @@ from drakegrasp.wrist_fit import WristFit, fit_wrist
 Method = Literal["hand", "forces"]
 METHODS: tuple[str, ...] = get_args(Method)
 
+#: Digits of metres and of unit normals that count: 0.1 mm and 0.06 degrees, finer than any
+#: contact is known, coarser than single precision. So the same grasp in another frame is the
+#: same numbers, and a verdict on the edge does not hang on rounding.
+POINT_DIGITS, NORMAL_DIGITS = 4, 3
 #: Shares of `verify.open_margin_deg` that are tried until the opened hand is clear.
 MARGINS = (1.0, 0.5)
 #: Why a trial ended as it did, for a person.
@@ -80,12 +84,15 @@ def verify_contacts(
 
     Args:
         placed: The object on the table.
-        p_OQ: (k, 3), contact points [m].
+        p_OQ: (k, 3), contact points [m]; 0.1 mm count.
         nhat_Q_O: (k, 3), outward unit normals.
         method: "hand" or "forces".
         config: Hand, physics, lift and limits.
     """
     rules, seconds = config.verify, dict[str, float]()
+    # Adding zero takes the sign of a negative zero away.
+    p_OQ, nhat_Q_O = np.round(p_OQ, POINT_DIGITS) + 0.0, np.round(nhat_Q_O, NORMAL_DIGITS) + 0.0
+    nhat_Q_O /= np.linalg.norm(nhat_Q_O, axis=1, keepdims=True)
     with _timed(seconds, "surface"):
         distance = face_distances(placed.model, p_OQ)
         outward = points_outward(placed.model, distance, nhat_Q_O, rules.max_surface_distance)

@@ -93,7 +93,7 @@ def main(
         tls_files=_tls_files(tls_ca_file, tls_cert, tls_key),
     )
     click.echo("\n".join(describe(cluster)))
-    print_plan(request, worker_count(cluster), times)
+    print_plan(request, _count(cluster, request.out), times)
     if dry_run:
         return
     sources = find_sources(request.objects, request.units, request.manifest)
@@ -103,6 +103,14 @@ def main(
             click.echo("waiting for the first worker", err=True)
             client.wait_for_workers(1)
         print_report(build_on(client, sources, request.out, request.config, show=request.show))
+
+
+def _count(cluster: ClusterRequest, out: Path) -> int | None:
+    """Return how many workers there will be; those of a running scheduler are asked for."""
+    if cluster.kind not in ("scheduler", "scheduler-file"):
+        return worker_count(cluster)
+    with start_cluster(cluster, out) as client:
+        return max(1, len(client.nthreads()))
 
 
 def _tls_files(*paths: Path | None) -> tuple[Path, Path, Path] | None:

@@ -17,18 +17,19 @@ PACKAGE = Path(drakegrasp.__file__).parent
 LAYERS: tuple[frozenset[str], ...] = tuple(
     frozenset(line.split())
     for line in (
-        "errors executor frames network progress",
-        "grasp outcomes hand_files config curves surfaces pads prediction prediction_files",
-        "schema hand solids bodies wavefront",
+        "errors executor frames network progress processes build_log",
+        "grasp outcomes hand_files config curves surfaces pads prediction prediction_files "
+        "faults build_lock",
+        "schema hand solids bodies wavefront build_options",
         "shards camera filters shapes vessels fruit holes union decimation hand_shapes",
-        "builtin manifest mend",
+        "builtin manifest mend journal",
         "meshes",
         "object_model",
         "audit candidates kinematics violations wrenches contact_surface",
         "parts scene render dataset contact_forces wrist_problem",
         "samples construction contacts figures postures",
         "assemble layout_rules sample_rules image_rules trial_rules scenes wrist_fit",
-        "stats resting trial open_file doc_figures",
+        "stats resting trial open_file doc_figures plan",
         "prepared tables dataset_rules theatre lift_path placed",
         "units check force_lift force_margin",
         "build snapshots verified",
@@ -36,14 +37,15 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
         "replay verification",
         "verify verification_files",
         "verify_plan",
-        "verify_grasps verify_request",
-        "workers doctor format_docs",
+        "verify_grasps verify_request workers crew",
+        "cluster doctor format_docs",
+        "clusters",
         "cli",
     )
 )
 READERS = ("grasp", "schema", "shards", "dataset")
 #: Modules that may know Dask.
-KNOWS_DASK = {"cluster"}
+KNOWS_DASK = {"cluster", "clusters", "crew", "workers"}
 
 
 def imports_of(module: str) -> set[str]:
@@ -80,7 +82,7 @@ def test_imports_point_to_layers_above(module: str) -> None:
 
 
 @pytest.mark.parametrize("module", modules())
-def test_only_the_cluster_module_knows_dask(module: str) -> None:
+def test_only_the_cluster_modules_know_dask(module: str) -> None:
     knows = any(name.split(".")[0] in ("dask", "distributed") for name in imports_of(module))
     assert not knows or module in KNOWS_DASK
 
