@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from drakegrasp.placed import place_object
     from drakegrasp.replay import replay_trial
     from drakegrasp.verification import Verification
-    from drakegrasp.verify_grasps import verify_grasp
+    from drakegrasp.verifying import verify_grasp
 
 __version__ = metadata.version("drakegrasp")
 
@@ -38,7 +38,7 @@ _HOMES = {
     "replay_trial": "replay",
     "transform_grasp": "grasp",
     "unpack_grasp": "grasp",
-    "verify_grasp": "verify_grasps",
+    "verify_grasp": "verifying",
     "verify_grasps": "cluster",
 }
 

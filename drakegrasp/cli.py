@@ -8,6 +8,7 @@ answers at once.
 from __future__ import annotations
 
 import math
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -63,6 +64,7 @@ class OneCommand(click.Command):
 @contextmanager
 def one_line_errors(ctx: click.Context, *, builds: bool = False) -> Iterator[None]:
     """Turn errors within the block into one line on standard error and an exit code."""
+    before = signal.signal(signal.SIGTERM, _terminate)
     try:
         yield
     except DrakegraspError as error:
@@ -73,10 +75,20 @@ def one_line_errors(ctx: click.Context, *, builds: bool = False) -> Iterator[Non
             raise
         click.echo(f"error: {str(error).strip().splitlines()[0]}", err=True)
         ctx.exit(1)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         goes_on = builds or ctx.invoked_subcommand == "build"
         click.echo(f"stopped{'; the same command goes on from here' * goes_on}", err=True)
-        ctx.exit(130)
+        ctx.exit(143 if isinstance(stop, _Terminated) else 130)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM: what is begun is left as after Ctrl-C."""
+
+
+def _terminate(number: int, frame: object) -> None:
+    raise _Terminated
 
 
 out_argument = click.argument("out", type=click.Path(path_type=Path), metavar="OUT")
@@ -362,8 +374,8 @@ def verify(
     from drakegrasp.cluster import run_verification
     from drakegrasp.tables import verdict_table
     from drakegrasp.verification_files import refuse_unwritable, save_results, write_json_lines
-    from drakegrasp.verify_grasps import refuse_off_surface
     from drakegrasp.verify_request import VerifyRequest, plan_request
+    from drakegrasp.verifying import refuse_off_surface
 
     if out is not None:
         refuse_unwritable(out)

@@ -32,8 +32,8 @@ from drakegrasp.manifest import BUILTIN_FOLDER, claim_directory
 from drakegrasp.meshes import MeshSource, find_meshes
 from drakegrasp.progress import progress_bar
 from drakegrasp.verification import Verification
-from drakegrasp.verify_grasps import verify_tasks
 from drakegrasp.verify_plan import TASK_GRASPS, Mesh, VerifyTask, plan_verification, split_task
+from drakegrasp.verifying import verify_tasks
 from drakegrasp.workers import SATURATION, WORKER_ENVIRONMENT, admitted_workers
 
 #: How long to wait for a scheduler to answer [s].
@@ -47,6 +47,8 @@ DASK_SETTINGS: dict[str, Any] = {
     "distributed.worker.profile.enabled": False,
     "distributed.scheduler.worker-saturation": SATURATION,
     "distributed.nanny.pre-spawn-environ": WORKER_ENVIRONMENT,
+    # A busy machine takes its time to start a worker again; Dask would close its nanny.
+    "distributed.deploy.lost-worker-timeout": "60 s",
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
 }
@@ -285,7 +287,7 @@ def connect(
                     n_workers=count,
                     threads_per_worker=1,
                     dashboard_address="127.0.0.1:0",
-                    silence_logs=logging.ERROR,
+                    silence_logs=logging.CRITICAL,
                     security=security,
                     memory_limit=memory or "auto",
                 ) as cluster,

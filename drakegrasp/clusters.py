@@ -351,7 +351,18 @@ def _security(request: ClusterRequest, out: Path) -> Iterator[Security | None]:
         yield _temporary()
     else:
         with _private_directory(out) as folder:
-            yield _from_files(_write_certificates(_temporary(), folder))
+            yield _from_files(make_certificates(folder))
+
+
+def make_certificates(folder: Path) -> tuple[Path, Path, Path]:
+    """Write an authority, a certificate and its key to a folder: ca.pem, cert.pem, key.pem.
+
+    Whoever reads them can use the cluster, so the folder must be this user's alone.
+
+    Raises:
+        MachineError: If the package cryptography is missing.
+    """
+    return _write_certificates(_temporary(), folder)
 
 
 def _temporary() -> Security:

@@ -16,7 +16,8 @@ from itertools import islice
 from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar, cast
 
-from distributed import Client, Future, KilledWorker
+from distributed import Client, Future, KilledWorker, LocalCluster
+from distributed.core import Status
 
 from drakegrasp.errors import BlankImageError, MachineError
 from drakegrasp.executor import Crew
@@ -89,32 +90,42 @@ class DaskExecutor:
             if not flights:
                 return
             flight = flights.pop(self._next(arrived))
-            if self._may_go_again(flight):
+            try:
+                result = self._result(flight.future)
+            except (KilledWorker, BlankImageError) as error:
+                self._refuse_more(flight, error)
                 launch(flight)
             else:
-                yield cast(R, self._result(flight))
+                yield cast(R, result)
 
-    def _may_go_again(self, flight: _Flight[Any]) -> bool:
-        """Return whether a task failed in a way that is not its own, and not too often."""
-        assert flight.future is not None
-        if flight.future.status != "error":
-            return False
-        error = flight.future.exception()
-        if isinstance(error, KilledWorker):
-            flight.given_up += 1
-            return flight.given_up <= self._resubmissions
+    def _result(self, future: Future | None) -> Any:
+        """Return the result of a task that is done, or raise what it raised.
+
+        Where the worker died with the result, the scheduler has the task done again.
+        """
+        assert future is not None
+        while not future.cancelled():
+            try:
+                return future.result(timeout=COUNT_SECONDS)
+            except TimeoutError:
+                if future.status == "error":
+                    raise
+                self._count()
+        raise MachineError(f"the scheduler must stay, got none any more; {_GOES_ON}")
+
+    def _refuse_more(self, flight: _Flight[Any], error: Exception) -> None:
+        """Refuse to give a task out again for ever.
+
+        Raises:
+            MachineError: If it failed too often in ways that are not its own.
+        """
         if isinstance(error, BlankImageError):
             flight.blank += 1
-            return flight.blank < BLANKS
-        return False
-
-    def _result(self, flight: _Flight[Any]) -> Any:
-        assert flight.future is not None
-        if flight.future.cancelled():
-            raise MachineError(f"the scheduler must stay, got none any more; {_GOES_ON}")
-        try:
-            return flight.future.result()
-        except KilledWorker as error:
+            if flight.blank == BLANKS:
+                raise error
+            return
+        flight.given_up += 1
+        if flight.given_up > self._resubmissions:
             raise MachineError(f"the workers must stay alive, got: {error}") from None
 
     def _next(self, arrived: SimpleQueue[str]) -> str:
@@ -147,6 +158,8 @@ class DaskExecutor:
         if joined or left:
             self._workers, self.crew.size = found, len(found)
             self.crew.on_change(joined, left)
+        if isinstance(self._client.cluster, LocalCluster):
+            self._client.cluster.loop.add_callback(_reopen, self._client.cluster)
         if found or not (self._lost or left):
             self._lost = None
             return
@@ -158,3 +171,16 @@ class DaskExecutor:
 
     def _room(self) -> int:
         return IN_FLIGHT * max(1, len(self._workers))
+
+
+def _reopen(cluster: LocalCluster) -> None:
+    """Replace the nannies of a cluster on this machine that gave up.
+
+    One does when its worker dies while it starts; Dask drops one whose worker stays away for
+    long. To be called in the cluster's event loop.
+    """
+    for name, nanny in list(cluster.workers.items()):
+        if nanny.status in (Status.closed, Status.failed):
+            del cluster.workers[name]
+    if cluster.workers.keys() != cluster.worker_spec.keys():
+        cluster.scale(len(cluster.worker_spec))

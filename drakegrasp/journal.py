@@ -14,7 +14,7 @@ the step that it names is judged:
 
 Steps under suspicion run first, so a guilty one costs a start of the process and not the
 unit, and an innocent one is cleared by passing. Silent deaths must hit the very same step
-five times in a row: a machine that is switched off, or a random SIGKILL, does not.
+eight times in a row: a machine that is switched off, or a random SIGKILL, does not.
 
 The file is text: a line of JSON with the unit's identity and the deaths before, the
 record, and what faulthandler wrote.
@@ -40,7 +40,7 @@ from drakegrasp.shards import temporary_name
 #: Crashes in a row of one step after which it is not tried again: one may be the machine's.
 NATIVE_DEATHS = 2
 #: Unmarked deaths in a row of one step after which it is not tried again.
-SILENT_DEATHS = 5
+SILENT_DEATHS = 8
 #: Deaths of a unit since it last learned something, after which it is not tried again.
 GIVE_UP_DEATHS = 20
 #: Bytes of the record.

@@ -43,9 +43,7 @@ def numbers(
         "trial_id must be the row's number", batch["trial_id"] != batch.rows, batch["trial_id"]
     )
     outcome, known = batch["outcome"], [o.value for o in Outcome if not o.only_verified]
-    yield from batch.broken(
-        f"outcome must be 0..{max(known)}", ~np.isin(outcome, known), outcome
-    )
+    yield from batch.broken(f"outcome must be 0..{max(known)}", ~np.isin(outcome, known), outcome)
     index, candidate = batch["object"], batch["candidate"]
     wild = (index < 0) | (index >= objects)
     yield from batch.broken(f"object must be a row of /objects, 0..{objects - 1}", wild, index)

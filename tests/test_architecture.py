@@ -37,7 +37,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
         "replay verification",
         "verify verification_files",
         "verify_plan",
-        "verify_grasps verify_request workers crew",
+        "verifying verify_request workers crew",
         "cluster doctor format_docs",
         "clusters",
         "cli",
@@ -100,6 +100,11 @@ def test_reading_data_loads_no_drake_and_no_dask(module: str) -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert result.stdout.strip() == "[]"
+
+
+def test_no_module_hides_a_public_name() -> None:
+    """An imported module becomes an attribute of the package, in place of the name."""
+    assert not set(drakegrasp.__all__) & set(modules())
 
 
 def test_public_names_are_sorted_and_exist() -> None:

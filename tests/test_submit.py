@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import dask
 import psutil
@@ -26,8 +27,7 @@ from drakegrasp.clusters import (
     ClusterRequest,
     _exports,
     _private_directory,
-    _temporary,
-    _write_certificates,
+    make_certificates,
     start_cluster,
     walltime_seconds,
 )
@@ -156,7 +156,7 @@ def test_settings_survive_a_job_script() -> None:
 def test_keys_are_private_and_removed(tmp_path: Path) -> None:
     out = tmp_path / "out"
     with _private_directory(out) as folder:
-        files = _write_certificates(_temporary(), folder)
+        files = make_certificates(folder)
         assert stat.S_IMODE(folder.stat().st_mode) == 0o700
         assert {stat.S_IMODE(path.stat().st_mode) for path in files} == {0o600}
     assert not out.exists()
@@ -197,7 +197,7 @@ def test_scheduler_with_tls_refuses_a_client_without_a_certificate(
             connect(scheduler=other),
         ):
             pass
-    strange = _write_certificates(_temporary(), tmp_path)
+    strange = make_certificates(tmp_path)
     options = ["--tls-ca-file", strange[0], "--tls-cert", strange[1], "--tls-key", strange[2]]
     for given in ([], options):
         arguments = ["--objects", box, "--out", tmp_path / "out", "--cluster", "scheduler"]
@@ -224,6 +224,14 @@ def test_nothing_listens_beyond_this_machine(secure: Client) -> None:
 @pytest.mark.slow
 def test_running_scheduler_and_its_workers_are_set_up(tmp_path: Path) -> None:
     """Whoever started them: saturation, environment; and a late worker of two threads goes."""
+
+    # Other processes cannot import this module, so what they run is defined here.
+    def saturation(dask_scheduler: Any) -> float:
+        return float(dask_scheduler.WORKER_SATURATION)
+
+    def environment() -> dict[str, str | None]:
+        return {name: os.environ.get(name) for name in WORKER_ENVIRONMENT}
+
     command = [sys.executable, "-m"]
     file = tmp_path / "scheduler.json"
     plain = {k: v for k, v in os.environ.items() if k not in WORKER_ENVIRONMENT}
@@ -243,8 +251,8 @@ def test_running_scheduler_and_its_workers_are_set_up(tmp_path: Path) -> None:
         with start_cluster(request, tmp_path) as client:
             client.wait_for_workers(1, timeout=60)
             with admitted_workers(client, load_config()):
-                assert client.run_on_scheduler(_saturation) == 1.0
-                ((address, found),) = client.run(_environment).items()
+                assert client.run_on_scheduler(saturation) == 1.0
+                ((address, found),) = client.run(environment).items()
                 assert found == WORKER_ENVIRONMENT
                 late = [*join, "--nthreads", "2"]
                 refused = subprocess.run(late, env=plain, stderr=subprocess.PIPE, timeout=120)
@@ -254,14 +262,6 @@ def test_running_scheduler_and_its_workers_are_set_up(tmp_path: Path) -> None:
         for process in (worker, scheduler):
             process.terminate()
             process.wait(60)
-
-
-def _saturation(dask_scheduler: object) -> object:
-    return dask_scheduler.WORKER_SATURATION  # type: ignore[attr-defined]
-
-
-def _environment() -> dict[str, str | None]:
-    return {name: os.environ.get(name) for name in WORKER_ENVIRONMENT}
 
 
 @pytest.mark.cluster

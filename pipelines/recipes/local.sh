@@ -1,0 +1,9 @@
+#!/usr/bin/env bash
+# A build on this machine, a worker on every core. The same command goes on where it stopped.
+set -euo pipefail
+cd "$(dirname "$0")/../.."
+
+python pipelines/submit_build.py \
+    --cluster local \
+    --objects "${MESHES:-builtin}" --units "${UNITS:-m}" --out "${OUT:?directory of the dataset}" \
+    "$@"
