@@ -34,6 +34,9 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.processes import host_label
 from drakegrasp.stats import count_funnel
 
+#: They are not in `make test` yet: see the marker.
+pytestmark = pytest.mark.faults
+
 #: Attempts of a tenth of a second, of which one in ten succeeds.
 FAST = [
     "candidates.max=12",
