@@ -14,7 +14,7 @@ export DRAKE_ALLOW_NETWORK := none
 .PHONY: help install demo test test-fast test-cluster lint format docs clean
 
 help:            ## what can be made
-	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
 install: $(STAMP)  ## the virtual environment with the package and what its tests need
 
