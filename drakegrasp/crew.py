@@ -10,8 +10,10 @@ of nothing is tried again, too, as it may be one worker's OpenGL.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar, cast
@@ -27,6 +29,8 @@ R = TypeVar("R")
 
 #: Tasks in flight per worker: one that runs, and one so that it never waits.
 IN_FLIGHT = 2
+#: The same for tasks that take no time, so that the wire is no bottleneck.
+DEEPEST = 64
 #: How often the workers are counted [s].
 COUNT_SECONDS = 2.0
 #: How long there may be no worker at all after there were some [s].
@@ -48,6 +52,13 @@ class _Flight(Generic[T]):
     blank: int = 0
 
 
+@dataclass(frozen=True)
+class _Failure:
+    """Why a task is to be tried again."""
+
+    error: Exception
+
+
 class DaskExecutor:
     """An `Executor` that keeps a few tasks per worker in flight on a Dask cluster."""
 
@@ -63,6 +74,7 @@ class DaskExecutor:
         self._workers: set[str] = set()
         self._counted = -float("inf")
         self._lost: float | None = None
+        self._depth = IN_FLIGHT
         self.crew = Crew()
 
     def __call__(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
@@ -77,33 +89,51 @@ class DaskExecutor:
         arrived: SimpleQueue[str] = SimpleQueue()
         flights: dict[str, _Flight[T]] = {}
 
-        def launch(flight: _Flight[T]) -> None:
+        def launch(batch: Sequence[_Flight[T]]) -> None:
             # A task writes files, so it is never the same as one that was done before.
-            flight.future = self._client.submit(function, flight.item, pure=False)
-            flights[flight.future.key] = flight
-            flight.future.add_done_callback(lambda done: arrived.put(done.key))
+            futures = self._client.map(function, [flight.item for flight in batch], pure=False)
+            for flight, future in zip(batch, futures, strict=True):
+                flight.future, flights[future.key] = future, flight
+                future.add_done_callback(lambda done: arrived.put(done.key))
 
         while True:
             self._count()
-            for item in islice(waiting, max(0, self._room() - len(flights))):
-                launch(_Flight(item))
+            room = max(0, self._room() - len(flights))
+            launch([_Flight(item) for item in islice(waiting, room)])
             if not flights:
                 return
-            flight = flights.pop(self._next(arrived))
-            try:
-                result = self._result(flight.future)
-            except (KilledWorker, BlankImageError) as error:
-                self._refuse_more(flight, error)
-                launch(flight)
-            else:
-                yield cast(R, result)
+            landed = [flights.pop(key) for key in self._next(arrived)]
+            again = []
+            for flight, result in zip(landed, self._results(landed), strict=True):
+                if isinstance(result, _Failure):
+                    self._refuse_more(flight, result.error)
+                    again.append(flight)
+                else:
+                    yield cast(R, result)
+            launch(again)
 
-    def _result(self, future: Future | None) -> Any:
-        """Return the result of a task that is done, or raise what it raised.
+    def _results(self, landed: Sequence[_Flight[Any]]) -> Iterator[Any]:
+        """Yield the result of each task that is done, or what is no fault of its own.
 
         Where the worker died with the result, the scheduler has the task done again.
         """
-        assert future is not None
+        futures = [cast(Future, flight.future) for flight in landed]
+        if len(futures) > 1 and all(future.status == "finished" for future in futures):
+            with suppress(Exception):  # what it is comes out one by one
+                yield from self._client.sync(
+                    partial(self._client.gather, asynchronous=True),
+                    futures,
+                    callback_timeout=COUNT_SECONDS,
+                )
+                return
+        for future in futures:
+            try:
+                yield self._result(future)
+            except (KilledWorker, BlankImageError) as error:
+                yield _Failure(error)
+
+    def _result(self, future: Future) -> Any:
+        """Return the result of a task that is done, or raise what it raised."""
         while not future.cancelled():
             try:
                 return future.result(timeout=COUNT_SECONDS)
@@ -128,17 +158,25 @@ class DaskExecutor:
         if flight.given_up > self._resubmissions:
             raise MachineError(f"the workers must stay alive, got: {error}") from None
 
-    def _next(self, arrived: SimpleQueue[str]) -> str:
-        """Return the key of the next task that is done.
+    def _next(self, arrived: SimpleQueue[str]) -> list[str]:
+        """Return the keys of the tasks that are done, once there is one.
 
         Raises:
             MachineError: If there is no worker for long.
         """
-        while True:
+        found: list[str] = []
+        while not found:
             try:
-                return arrived.get(timeout=COUNT_SECONDS)
+                found.append(arrived.get(timeout=COUNT_SECONDS))
             except Empty:
                 self._count()
+        with suppress(Empty):
+            while True:
+                found.append(arrived.get_nowait())
+        # Tasks that are done at once come back in crowds: then more go out at a time.
+        crowd = len(found) > len(self._workers)
+        self._depth = min(2 * self._depth, DEEPEST) if crowd else max(IN_FLIGHT, self._depth // 2)
+        return found
 
     def _count(self) -> None:
         """Count the workers, now and then.
@@ -170,7 +208,7 @@ class DaskExecutor:
             )
 
     def _room(self) -> int:
-        return IN_FLIGHT * max(1, len(self._workers))
+        return self._depth * max(1, len(self._workers))
 
 
 def _reopen(cluster: LocalCluster) -> None:

@@ -198,8 +198,9 @@ def release_directory(out: Path) -> None:
     for name in (FILE_NAME, build_log.FILE_NAME):
         (out / name).unlink(missing_ok=True)
     # A directory that holds anything else was there before.
-    with suppress(OSError):
-        out.rmdir()
+    for folder in (*(out / name for name in OWN_FOLDERS), out):
+        with suppress(OSError):
+            folder.rmdir()
 
 
 def change_postprocessing(out: Path, overrides: Sequence[str]) -> None:

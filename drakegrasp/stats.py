@@ -1,4 +1,7 @@
-"""Counting what a dataset holds: the funnel by object and the paper's Table III."""
+"""Counting what a dataset holds: the funnel by object and the paper's Table III.
+
+While a build runs, or after one that was stopped, the funnel is counted from the shards.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +12,13 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.assemble import DATA_FILES, TRIALS_FILE
+from drakegrasp.assemble import DATA_FILES, TRIALS_FILE, is_assembled
 from drakegrasp.errors import DataError
 from drakegrasp.filters import Removal
+from drakegrasp.manifest import FILE_NAME, read_manifest
 from drakegrasp.outcomes import Outcome
 from drakegrasp.schema import SPLITS
+from drakegrasp.shards import read_outcomes
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,6 +51,54 @@ class SplitCount:
     samples: int
     objects: int
     classes: int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Unfinished:
+    """What a build that runs, or was stopped, has done.
+
+    Attributes:
+        funnel: Of the work units that are done; no success is a sample yet.
+        done, total: Number of work units; `max_grasps` may leave some out.
+    """
+
+    funnel: Funnel
+    done: int
+    total: int
+
+
+def count_unfinished(out: Path) -> Unfinished | None:
+    """Return what a build has done so far, or None if its files are complete.
+
+    Shards are counted as they are, without a look at their seals; what is being written is
+    not there yet.
+
+    Raises:
+        DataError: If the directory holds no dataset.
+    """
+    if not (out / FILE_NAME).exists() or is_assembled(out):
+        return None
+    manifest = read_manifest(out)
+    names = [entry["name"] for entry in manifest.objects]
+    rows = {name: i for i, name in enumerate(names)}
+    outcomes, done = np.zeros((len(names), 1 + max(Outcome)), dtype=np.int64), 0
+    for header in manifest.headers():
+        try:
+            found = read_outcomes(header.path(out), header, trust=True)
+        except DataError:
+            continue
+        outcomes[rows[header.object_name]] += np.bincount(found, minlength=1 + max(Outcome))
+        done += 1
+    funnel = Funnel(
+        names=tuple(names),
+        classes=tuple(entry["class"] for entry in manifest.objects),
+        candidates=np.array([entry["candidates"] for entry in manifest.objects], dtype=np.int64),
+        distinct=np.array([entry["distinct"] for entry in manifest.objects], dtype=np.int64),
+        valid=np.array([entry["valid"] for entry in manifest.objects], dtype=np.int64),
+        outcomes=outcomes,
+        removals=np.zeros((len(names), 1 + max(Removal)), dtype=np.int64),
+    )
+    return Unfinished(funnel=funnel, done=done, total=manifest.units)
 
 
 def count_funnel(out: Path) -> Funnel:

@@ -388,14 +388,14 @@ def test_items_are_taken_as_there_is_room(client: Client) -> None:
 
     def items() -> Iterator[int]:
         nonlocal taken
-        while taken < 100:
+        while taken < 1000:
             taken += 1
             yield taken
 
     results = DaskExecutor(client)(abs, items())
     for done, _ in enumerate(results):
-        assert taken <= done + 1 + 2 * crew.IN_FLIGHT
-    assert taken == 100
+        assert taken <= done + 1 + 2 * 2 * crew.DEEPEST
+    assert taken == 1000
 
 
 @pytest.mark.cluster
