@@ -101,6 +101,22 @@ class CandidateConfig(_Section):
     ] = (0.0, 11.25, 22.5)  # one is drawn per attempt (released code)
 
 
+class ScreenConfig(_Section):
+    """What geometry decides without a simulation; see docs/performance.md."""
+
+    mode: Literal["on", "off"] = "on"  # off simulates every attempt, from the open hand
+    start_margin: Positive = 0.0025  # [m], deeper in object or table is a collision for certain
+    reach_margin: Positive = 0.004  # [m], a fingertip that passes nearer than this may touch
+    block_margin: Positive = 0.006  # [m], no contact lets a finger sink in deeper than this
+    clearance: Positive = 0.004  # [m], fingers start to close this far from what they meet
+
+    @field_validator("mode", mode="before")
+    @classmethod
+    def _no_truth_values(cls, value: Any) -> Any:
+        # YAML reads "on" and "off" as true and false.
+        return {True: "on", False: "off"}.get(value, value) if isinstance(value, bool) else value
+
+
 class CloseConfig(_Section):
     """Closing the fingers on the static object."""
 
@@ -179,6 +195,7 @@ class Config(_Section):
     physics: PhysicsConfig = PhysicsConfig()
     settle: SettleConfig = SettleConfig()
     candidates: CandidateConfig = CandidateConfig()
+    screen: ScreenConfig = ScreenConfig()
     close: CloseConfig = CloseConfig()
     lift: LiftConfig = LiftConfig()
     camera: CameraConfig = CameraConfig()

@@ -80,16 +80,16 @@ class Spread:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Chain:
-    """The m revolute joints from the palm to one fingertip, as constants.
+    """The m revolute joints from the palm to one link, as constants.
 
-    With angles q = gain @ c the pose of the fingertip link in the palm frame is
+    With angles q = gain @ c the pose of the link in the palm frame is
     X_GFi = X_PJ[0] R(axis[0], q[0]) X_PJ[1] R(axis[1], q[1]) ... X_JFi.
     """
 
     X_PJ: Array  # (m, 4, 4), of each joint in the turning frame before it; the first in G
     axis: Array  # (m, 3), unit, in the joint's frame J
     gain: Array  # (m, 1 + k), angles per coordinate
-    X_JFi: Array  # (4, 4), fingertip link in the last joint's turning frame
+    X_JFi: Array  # (4, 4), the link in the last joint's turning frame
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -107,7 +107,8 @@ class Hand:
     joint_names: tuple[str, ...]  # the n revolute joints
     joint_gain: Array  # (n, 1 + k), angles per coordinate; one non-zero in each row
     joint_limits: Array  # (n, 2), lower and upper [rad]
-    chains: tuple[Chain, ...]  # one per finger
+    chains: tuple[Chain, ...]  # one per finger, to its fingertip
+    link_chains: dict[str, Chain]  # one per link that the palm carries, itself included
 
     @property
     def num_fingers(self) -> int:
@@ -246,6 +247,11 @@ def _build_hand(name: str, description: _Description, sdf_path: Path) -> Hand:
             [(j.position_lower_limit(), j.position_upper_limit()) for j in revolute.values()]
         ),
         chains=tuple(chains),
+        link_chains={
+            name: _chain(joints, body, base, gains, invert_pose(X_BG))
+            for name, body in bodies.items()
+            if _is_carried(joints, body, base)
+        },
     )
 
 
@@ -304,6 +310,15 @@ def _gains(description: _Description, joints: list[str]) -> dict[str, Array]:
             f"got {', '.join(idle)} driven by nothing"
         )
     return gains
+
+
+def _is_carried(joints: list[Any], body: RigidBody, base: RigidBody) -> bool:
+    """Return whether a link is the palm link or hangs on it."""
+    parents = {joint.child_body().index(): joint.parent_body().index() for joint in joints}
+    index = body.index()
+    while index != base.index() and index in parents:
+        index = parents.pop(index)
+    return bool(index == base.index())
 
 
 def _chain(

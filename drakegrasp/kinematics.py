@@ -57,6 +57,23 @@ def fingertip_poses(hand: Hand, *, spread: npt.ArrayLike, closing: npt.ArrayLike
     return np.stack([_chain_pose(chain, c) for chain in hand.chains], axis=-3)
 
 
+def link_poses(
+    hand: Hand, link: str, *, spread: npt.ArrayLike, closing: npt.ArrayLike
+) -> Array:
+    """Return the poses X_GL (..., 4, 4) of a link that the palm carries, in the palm frame.
+
+    Args:
+        hand: The hand.
+        link: Name of the link, a key of `hand.link_chains`.
+        spread: See `fingertip_poses`.
+        closing: See `fingertip_poses`.
+
+    Raises:
+        ValueError: If `closing` is not one angle per finger.
+    """
+    return _chain_pose(hand.link_chains[link], _coordinates(hand, spread, closing))
+
+
 def _coordinates(hand: Hand, spread: npt.ArrayLike, closing: npt.ArrayLike) -> Array:
     """Return (..., 1 + k) of a spread (...,) and closing angles (..., k)."""
     angles = np.asarray(closing, dtype=float)
@@ -72,7 +89,7 @@ def _coordinates(hand: Hand, spread: npt.ArrayLike, closing: npt.ArrayLike) -> A
 
 def _chain_pose(chain: Chain, c: Array) -> Array:
     q = c @ chain.gain.T
-    X = np.eye(4)
+    X = np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))
     for j, (X_PJ, axis) in enumerate(zip(chain.X_PJ, chain.axis, strict=True)):
         X = X @ X_PJ @ _turn(axis, q[..., j])
     return X @ chain.X_JFi

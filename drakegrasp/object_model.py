@@ -22,6 +22,7 @@ import trimesh
 from drakegrasp.bodies import count_parts
 from drakegrasp.config import ObjectConfig
 from drakegrasp.decimation import decimate
+from drakegrasp.distance_field import DistanceField, make_distance_field
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
 from drakegrasp.mend import mend_solid
@@ -101,6 +102,11 @@ class ObjectModel:
     def collision(self) -> trimesh.Trimesh:
         """The collision surface in {O}."""
         return trimesh.Trimesh(self.collision_vertices, self.collision_faces, process=False)
+
+    @cached_property
+    def field(self) -> DistanceField:
+        """Distances from the collision surface."""
+        return make_distance_field(self.collision_vertices, self.collision_faces)
 
 
 # Preparing
