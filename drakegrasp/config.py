@@ -106,8 +106,8 @@ class ScreenConfig(_Section):
 
     mode: Literal["on", "off"] = "on"  # off simulates every attempt, from the open hand
     start_margin: Positive = 0.0025  # [m], deeper in object or table is a collision for certain
-    reach_margin: Positive = 0.004  # [m], a fingertip that passes nearer than this may touch
-    block_margin: Positive = 0.006  # [m], no contact lets a finger sink in deeper than this
+    reach_margin: Positive = 0.0025  # [m], a fingertip that passes nearer than this may touch
+    block_margin: Positive = 0.005  # [m], no contact lets a finger sink in deeper than this
     clearance: Positive = 0.004  # [m], fingers start to close this far from what they meet
 
     @field_validator("mode", mode="before")

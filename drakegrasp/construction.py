@@ -249,6 +249,7 @@ def _add_hand(
         wrist_frame=wrist,
         wrist_trajectory=trajectory,
         fingertips=tuple(plant.GetBodyByName(f.fingertip, instance) for f in hand.fingers),
+        closing_joints=tuple(plant.GetJointByName(f.closing_joint, instance) for f in hand.fingers),
         parts=_points_inside(plant, scene_graph, instance),
     )
 

@@ -63,6 +63,22 @@ def read_contacts(scene: Scene) -> Contacts:
     return reader.contacts()
 
 
+def hand_touches_object(scene: Scene) -> bool:
+    """Return whether any part of the hand touches the object now, as `read_contacts` would."""
+    results = scene.plant.get_contact_results_output_port().Eval(scene.context)
+    ob, hand = scene.object.index(), _hand_bodies(scene, scene.handles)
+    forces: dict[BodyIndex, Array] = {}
+    for i in range(results.num_hydroelastic_contacts()):
+        info = results.hydroelastic_contact_info(i)
+        surface = info.contact_surface()
+        M, N = _body_of(scene, surface.id_M()), _body_of(scene, surface.id_N())
+        if ob in (M, N):
+            other = N if ob == M else M
+            forces[other] = forces.get(other, np.zeros(3)) + info.F_Ac_W().translational()
+    limit = scene.physics.contact_force
+    return any(b in hand and float(np.linalg.norm(f)) > limit for b, f in forces.items())
+
+
 def open_hand_collides(scene: Scene) -> bool:
     """Return whether any part of the hand meets or is inside the object, or meets the table.
 

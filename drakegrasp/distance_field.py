@@ -55,7 +55,7 @@ class DistanceField:
         return float(np.sqrt(3.0) / 2.0 * self.spacing)
 
     def nearest(self, x: Distances, y: Distances, z: Distances) -> Distances:
-        """Return the distance [m] at the grid point next to each point, given by coordinates.
+        """Return the distance [m] at the grid point next to each point.
 
         Points outside of the grid get a distance that is too small.
 

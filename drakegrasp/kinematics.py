@@ -57,9 +57,7 @@ def fingertip_poses(hand: Hand, *, spread: npt.ArrayLike, closing: npt.ArrayLike
     return np.stack([_chain_pose(chain, c) for chain in hand.chains], axis=-3)
 
 
-def link_poses(
-    hand: Hand, link: str, *, spread: npt.ArrayLike, closing: npt.ArrayLike
-) -> Array:
+def link_poses(hand: Hand, link: str, *, spread: npt.ArrayLike, closing: npt.ArrayLike) -> Array:
     """Return the poses X_GL (..., 4, 4) of a link that the palm carries, in the palm frame.
 
     Args:

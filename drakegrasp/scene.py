@@ -11,10 +11,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from pydrake.geometry import GeometryId, SceneGraph
+from pydrake.geometry import CollisionFilterDeclaration, GeometryId, GeometrySet, SceneGraph
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import FixedOffsetFrame, ModelInstanceIndex, PrismaticJoint, RigidBody
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    ModelInstanceIndex,
+    PrismaticJoint,
+    RevoluteJoint,
+    RigidBody,
+)
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 from pydrake.systems.primitives import TrajectorySource
@@ -38,6 +44,7 @@ class HandHandles:
     wrist_frame: FixedOffsetFrame
     wrist_trajectory: TrajectorySource
     fingertips: tuple[RigidBody, ...]
+    closing_joints: tuple[RevoluteJoint, ...]
     parts: tuple[tuple[GeometryId, Array], ...]  # each shape of the hand with a point inside it
 
 
@@ -121,6 +128,7 @@ def reset_attempt(
     for name in handles.hand.spread.joints:
         plant.GetJointByName(name, handles.instance).Lock(context)
     scene.object.Lock(context)
+    _let_object_meet_table(scene, False)
     handles.wrist_trajectory.UpdateTrajectory(PiecewisePolynomial(X[:3, 3:4]))
     scene.simulator.Initialize()
 
@@ -130,6 +138,24 @@ def release(scene: Scene) -> None:
     for joint in _handles(scene).wrist_joints:
         joint.Unlock(scene.context)
     scene.object.Unlock(scene.context)
+    _let_object_meet_table(scene, True)
+
+
+def _let_object_meet_table(scene: Scene, meet: bool) -> None:
+    """Look for contacts between object and table, or do not.
+
+    While both are static such a contact changes nothing, and finding it at each step costs
+    more than anything else that happens before a finger touches.
+    """
+    manager = scene.scene_graph.collision_filter_manager(
+        scene.scene_graph.GetMyMutableContextFromRoot(scene.simulator.get_mutable_context())
+    )
+    declare = CollisionFilterDeclaration()
+    sides = [
+        GeometrySet(scene.plant.GetCollisionGeometriesForBody(body))
+        for body in (scene.object, scene.table)
+    ]
+    manager.Apply(declare.AllowBetween(*sides) if meet else declare.ExcludeBetween(*sides))
 
 
 def move_wrist(scene: Scene, p_WG_target: npt.ArrayLike, duration: float) -> None:
@@ -157,12 +183,13 @@ def advance(scene: Scene, duration: float) -> None:
 
 def finger_speed(scene: Scene) -> float:
     """Return the largest speed of a closing joint [rad/s]."""
-    handles = _handles(scene)
-    joints = (
-        scene.plant.GetJointByName(finger.closing_joint, handles.instance)
-        for finger in handles.hand.fingers
-    )
-    return max(abs(float(joint.get_angular_rate(scene.context))) for joint in joints)
+    rates = (joint.get_angular_rate(scene.context) for joint in _handles(scene).closing_joints)
+    return max(abs(float(rate)) for rate in rates)
+
+
+def closing_angles(scene: Scene) -> Array:
+    """Return the angle of each finger's closing joint (k,) [rad]."""
+    return np.array([joint.get_angle(scene.context) for joint in _handles(scene).closing_joints])
 
 
 def hand_positions(scene: Scene) -> Array:

@@ -184,9 +184,7 @@ class _Sweep:
         last: Last angle at which it is within reach, or at which the finger is blocked.
     """
 
-    def __init__(
-        self, view: _View, path: FingerPath, rows: Counts, config: ScreenConfig
-    ) -> None:
+    def __init__(self, view: _View, path: FingerPath, rows: Counts, config: ScreenConfig) -> None:
         count, end = len(rows), len(path.angles) - 1
         self.start = np.zeros(count, dtype=np.int64)
         self.last = np.full(count, end)
@@ -211,9 +209,7 @@ class _Sweep:
             room = ((meets + block) * pace).min(axis=1)
             np.minimum(room, np.where(here, 0, ((tip - reach) * tip_pace).min(axis=1)), out=room)
             if far.any():
-                room[far] = np.minimum(
-                    room[far], ((meets[far] - clearance) * pace).min(axis=1)
-                )
+                room[far] = np.minimum(room[far], ((meets[far] - clearance) * pace).min(axis=1))
             done = (least < -block) | (k[active] == end)
             step = np.maximum(1, np.floor(room)).astype(np.int64)
             k[active] = np.minimum(k[active] + step, end)

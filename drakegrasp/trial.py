@@ -16,12 +16,18 @@ import numpy.typing as npt
 
 from drakegrasp.candidates import Attempt
 from drakegrasp.config import Config
-from drakegrasp.contacts import Contacts, open_hand_collides, read_contacts
+from drakegrasp.contacts import (
+    Contacts,
+    hand_touches_object,
+    open_hand_collides,
+    read_contacts,
+)
 from drakegrasp.frames import X_WT, Array, invert_pose, rotation_angle
 from drakegrasp.outcomes import Outcome
 from drakegrasp.scene import (
     Scene,
     advance,
+    closing_angles,
     finger_speed,
     hand_positions,
     move_wrist,
@@ -29,6 +35,7 @@ from drakegrasp.scene import (
     release,
     reset_attempt,
 )
+from drakegrasp.screen import Prediction, predict
 
 #: Peak speed of a minimum-jerk motion over its mean speed (Flash and Hogan, 1985).
 PEAK_SPEED = 15.0 / 8.0
@@ -36,6 +43,8 @@ PEAK_SPEED = 15.0 / 8.0
 PEAK_ACCELERATION = 10.0 / np.sqrt(3.0)
 #: Far below a time step, far above the rounding of a sum of them [s].
 ROUNDING = 1e-9
+#: A finger that is farther than this beyond where it can meet the object has missed it [rad].
+BEYOND = np.deg2rad(2.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -90,18 +99,28 @@ class _Clock:
             raise _TimeoutError
 
 
-def run_attempt(scene: Scene, X_TO: npt.ArrayLike, attempt: Attempt, config: Config) -> TrialRecord:
+def run_attempt(
+    scene: Scene,
+    X_TO: npt.ArrayLike,
+    attempt: Attempt,
+    config: Config,
+    prediction: Prediction | None = None,
+) -> TrialRecord:
     """Return what happens when the hand tries one attempt.
 
     The palm is placed, the fingers close on the static object, the contacts are judged,
-    the object is freed and lifted to `lift.p_TG`, and the contacts are judged again. The
-    same scene, attempt and configuration give the same bits, whatever ran before.
+    the object is freed and lifted to `lift.p_TG`, and the contacts are judged again. What
+    geometry has decided is not simulated (`screen`), and the fingers begin to close where
+    they are about to meet something. The same scene, attempt and configuration give the same
+    bits, whatever ran before.
 
     Args:
         scene: Of the object, with the hand.
         X_TO: Resting pose of the object in the table-top frame, (4, 4).
         attempt: What to try.
         config: The rules.
+        prediction: What `predict` says of the attempt, where it was asked before; the result
+            is the same without.
     """
     X_TO = np.asarray(X_TO, dtype=float)
     record = TrialRecord(outcome=Outcome.RAY_MISS, X_TO=X_TO, X_OG=attempt.X_OG)
@@ -110,7 +129,9 @@ def run_attempt(scene: Scene, X_TO: npt.ArrayLike, attempt: Attempt, config: Con
     if (X_TO @ attempt.X_OG)[2, 3] <= 0.0:
         return replace(record, outcome=Outcome.BELOW_TABLE)
     try:
-        return _simulate(scene, record, attempt, config)
+        if prediction is None:
+            prediction = _predict(scene, X_TO, attempt, config)
+        return _simulate(scene, record, attempt, config, prediction)
     except _TimeoutError:
         return TrialRecord(outcome=Outcome.TIMEOUT, X_TO=X_TO, X_OG=attempt.X_OG)
     except (MemoryError, OSError):
@@ -122,14 +143,35 @@ def run_attempt(scene: Scene, X_TO: npt.ArrayLike, attempt: Attempt, config: Con
         return replace(failed, message=lines[0])
 
 
-def _simulate(scene: Scene, record: TrialRecord, attempt: Attempt, config: Config) -> TrialRecord:
+def _predict(scene: Scene, X_TO: Array, attempt: Attempt, config: Config) -> Prediction | None:
+    if config.screen.mode == "off" or scene.handles is None:
+        return None
+    (found,) = predict(scene.model, scene.handles.hand, X_TO, [attempt], config.screen)
+    return found
+
+
+def _simulate(
+    scene: Scene,
+    record: TrialRecord,
+    attempt: Attempt,
+    config: Config,
+    prediction: Prediction | None,
+) -> TrialRecord:
+    lost = None if prediction is None else prediction.outcome
+    # Near a collision Drake has the last word on whether it is one.
+    if lost is Outcome.START_COLLISION or (lost is not None and prediction and prediction.clear):
+        return replace(record, outcome=lost)
     X_WO = X_WT @ record.X_TO
     clock = _Clock(scene, time.monotonic() + config.attempt_seconds)
     X_WG = X_WO @ attempt.X_OG
     reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=attempt.closing)
     if open_hand_collides(scene):
         return replace(record, outcome=Outcome.START_COLLISION)
-    record = _close(clock, record, config)
+    if lost is not None:
+        return replace(record, outcome=lost)
+    if prediction is not None:
+        reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=prediction.closing)
+    record = _close(clock, record, config, prediction)
     assert record.closed is not None
     verdict = judge_closed(record.closed)
     if verdict is not None:
@@ -166,13 +208,20 @@ def lift_duration(distance: float, config: Config) -> float:
     return float(max(at_speed_limit, at_acceleration_limit))
 
 
-def _close(clock: _Clock, record: TrialRecord, config: Config) -> TrialRecord:
+def _close(
+    clock: _Clock, record: TrialRecord, config: Config, prediction: Prediction | None
+) -> TrialRecord:
     scene, rules = clock.scene, config.close
+    end, limit = rules.max_time, np.inf
+    if prediction is not None:
+        assert scene.handles is not None
+        end -= float(prediction.closing.min()) / scene.handles.hand.closing_speed
+        limit = prediction.last + BEYOND
     # The last look may fall short of the end by rounding, never by a step.
-    while rules.max_time - scene.time > ROUNDING:
-        clock.advance(min(rules.check_period, rules.max_time - scene.time))
+    while end - scene.time > ROUNDING:
+        clock.advance(min(rules.check_period, end - scene.time))
         _refuse_explosion(scene, config)
-        if finger_speed(scene) < rules.stop_speed:
+        if finger_speed(scene) < rules.stop_speed or np.any(closing_angles(scene) > limit):
             break
     return replace(
         record,
@@ -197,10 +246,8 @@ def _lift(clock: _Clock, record: TrialRecord, config: Config) -> TrialRecord:
         remaining = end - scene.time
         clock.advance(min(config.lift.check_period, remaining))
         _refuse_explosion(scene, config)
-        now = read_contacts(scene)
-        lost = not now.touching.any() and not now.other_links
-        if lost or end - scene.time < ROUNDING:
-            contacts = now
+        if end - scene.time < ROUNDING or not hand_touches_object(scene):
+            contacts = read_contacts(scene)
     X_WO = scene.pose(scene.object)
     X_GO = invert_pose(palm_pose(scene)) @ X_WO
     moved = invert_pose(X_GO_before) @ X_GO

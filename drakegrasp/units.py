@@ -44,6 +44,7 @@ from drakegrasp.prepared import PreparedObject, load_prepared
 from drakegrasp.render import Renderer, build_renderer, look
 from drakegrasp.scene import Scene, hand_joint_names
 from drakegrasp.schema import CAMERAS, LOOK_FIELDS, sizes
+from drakegrasp.screen import Prediction, predict
 from drakegrasp.shards import (
     AnyArray,
     Shard,
@@ -230,18 +231,36 @@ def _try_all(bench: Workbench, attempts: Sequence[Attempt], journal: Journal) ->
     steps = [f"{ATTEMPT} {row}" for row in range(len(attempts))]
     suspects = set(journal.suspects)
     order = sorted(range(len(attempts)), key=lambda row: steps[row] not in suspects)
-    records = {row: _try_step(bench, attempts[row], journal, steps[row]) for row in order}
+    predictions = _predict_all(bench, attempts)
+    records = {
+        row: _try_step(bench, attempts[row], journal, steps[row], predictions[row]) for row in order
+    }
     return [records[row] for row in range(len(attempts))]
 
 
-def _try_step(bench: Workbench, attempt: Attempt, journal: Journal, step: str) -> TrialRecord:
+def _predict_all(bench: Workbench, attempts: Sequence[Attempt]) -> list[Prediction | None]:
+    """Return what geometry says of each attempt; asking for all at once is what is fast."""
+    config, prepared = bench.config, bench.prepared
+    if config.screen.mode == "off":
+        return [None] * len(attempts)
+    hand = load_hand(config.hand)
+    return predict(prepared.model, hand, prepared.X_TO, attempts, config.screen)
+
+
+def _try_step(
+    bench: Workbench,
+    attempt: Attempt,
+    journal: Journal,
+    step: str,
+    prediction: Prediction | None,
+) -> TrialRecord:
     verdict = journal.verdict(step)
     if verdict is not None:
         outcome = Outcome.TIMEOUT if verdict is Verdict.HUNG else Outcome.CRASHED
         return TrialRecord(outcome=outcome, X_TO=bench.prepared.X_TO, X_OG=attempt.X_OG)
     with journal.step(step, HANG_FACTOR * bench.config.attempt_seconds):
         strike(bench.prepared.model.name, attempt.candidate, attempt.standoff_index)
-        return try_on(bench, attempt)
+        return try_on(bench, attempt, prediction)
 
 
 def _refuse_futile(journal: Journal, header: ShardHeader) -> None:
@@ -288,9 +307,9 @@ def unit_attempts(
     )
 
 
-def try_on(bench: Workbench, attempt: Attempt) -> TrialRecord:
+def try_on(bench: Workbench, attempt: Attempt, prediction: Prediction | None = None) -> TrialRecord:
     """Run one attempt; a scene in which Drake failed is replaced, never used again."""
-    record = run_attempt(bench.scene, bench.prepared.X_TO, attempt, bench.config)
+    record = run_attempt(bench.scene, bench.prepared.X_TO, attempt, bench.config, prediction)
     if record.outcome is Outcome.SOLVER_ERROR:
         hand = load_hand(bench.config.hand)
         bench.scene = build_scene(bench.prepared.model, bench.config.physics, hand)

@@ -18,16 +18,16 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
     frozenset(line.split())
     for line in (
         "errors executor frames network progress processes build_log",
-        "grasp outcomes hand_files config curves surfaces pads prediction prediction_files "
-        "faults build_lock",
+        "grasp outcomes hand_files config curves surfaces distance_field pads prediction "
+        "prediction_files faults build_lock",
         "schema hand solids bodies wavefront build_options",
         "shards camera filters shapes vessels fruit holes union decimation hand_shapes",
         "builtin manifest mend journal",
         "meshes",
         "object_model",
         "audit candidates kinematics violations wrenches contact_surface",
-        "parts scene render dataset contact_forces wrist_problem",
-        "samples construction contacts figures postures",
+        "parts scene render dataset contact_forces wrist_problem hand_paths",
+        "samples construction contacts figures postures screen",
         "assemble layout_rules sample_rules image_rules trial_rules scenes wrist_fit",
         "stats resting trial open_file doc_figures plan",
         "prepared tables dataset_rules theatre lift_path placed",
