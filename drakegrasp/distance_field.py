@@ -1,9 +1,8 @@
 """How far points are from an object's surface: signed distances on a grid, looked up in bulk.
 
 In: a closed surface of triangles. Out: a `DistanceField`. Simulating asks Drake, which is exact;
-this is for deciding in bulk what need not be simulated, and its error is bounded by the grid's
-spacing: half of a cell's diagonal where it is asked with `nearest`, and less than that where the
-surface is smooth on the scale of a cell and it is asked with `interpolate`.
+this is for deciding in bulk what need not be simulated. Its error is a part of the grid's spacing:
+see `DistanceField.error`.
 """
 
 from __future__ import annotations
@@ -28,6 +27,9 @@ FINEST = 1.5e-3
 PADDING = 4
 #: Cells from the surface up to which distances are those to a triangle, not to a point on it.
 BAND = 2.5
+#: Error of a look-up at the nearest grid point in cells: half of a cell's diagonal, and what the
+#: grid's own distances may be wrong by.
+ERROR_CELLS = 1.3
 #: Part of a spacing between points by which the surface is found in the grid.
 DENSITY = 0.7
 
@@ -51,16 +53,22 @@ class DistanceField:
 
     @property
     def error(self) -> float:
-        """By how much `nearest` may be wrong [m]."""
-        return float(np.sqrt(3.0) / 2.0 * self.spacing)
+        """By how much `nearest` may be wrong [m].
+
+        `interpolate` is several times better near a surface that is smooth on the scale of a
+        cell, and not better than this where a wall is thinner than a cell.
+        """
+        return ERROR_CELLS * self.spacing
 
     def nearest(self, x: Distances, y: Distances, z: Distances) -> Distances:
-        """Return the distance [m] at the grid point next to each point.
+        """Return distances [m], each at the grid point next to where it is asked for.
 
-        Points outside of the grid get a distance that is too small.
+        Outside of the grid they are too small.
 
         Args:
-            x, y, z: Coordinates in {O} [m], of any one shape.
+            x: Coordinates in {O} [m], of any shape.
+            y: See x.
+            z: See x.
         """
         scale = np.float32(1.0 / self.spacing)
         index = np.zeros(np.shape(x), dtype=np.int32)
@@ -79,7 +87,7 @@ class DistanceField:
         return np.asarray(np.maximum(self.values.ravel().take(index), beside))
 
     def interpolate(self, x: Distances, y: Distances, z: Distances) -> Distances:
-        """Return the distance [m] at points, interpolated in their cell; see `nearest`."""
+        """Return distances [m], interpolated in the grid's cells; see `nearest`."""
         scale = np.float32(1.0 / self.spacing)
         index = np.zeros(np.shape(x), dtype=np.int32)
         parts = []
