@@ -22,6 +22,7 @@ from rich.table import Table
 
 from drakegrasp import __version__
 from drakegrasp.build_options import (
+    BUILTIN,
     build_options,
     manifest_option,
     parse_request,
@@ -396,6 +397,62 @@ def verify(
             click.echo(str(path))
     if not quiet:
         _console(stderr=True).print(verdict_table([result.outcome for result in results]))
+
+
+@main.command()
+@click.option(
+    "--objects", default=BUILTIN, show_default=True, metavar="MESH_DIR|builtin", help="Meshes."
+)
+@click.option("--only", multiple=True, metavar="NAME", help="Of these, the ones with this name.")
+@click.option("--config", "preset", metavar="YAML|PRESET", help="[paper]")
+@set_option
+@click.option("--candidates", type=int, default=100, show_default=True, help="Per object.")
+@click.option("--fidelity", type=int, default=0, metavar="N", help="Compare labels of N attempts.")
+@click.option("--compare", type=click.Path(path_type=Path, exists=True, dir_okay=False))
+@units_option
+@manifest_option
+def bench(
+    objects: str,
+    only: tuple[str, ...],
+    preset: str | None,
+    overrides: tuple[str, ...],
+    candidates: int,
+    fidelity: int,
+    compare: Path | None,
+    units: str,
+    manifest: Path | None,
+) -> None:
+    """Measure what attempts cost on this machine, in one process; print JSON.
+
+    With --fidelity, N random attempts of each object are simulated again without the screen, at
+    half the step and by Drake's other solvers. With --compare, the ratios to an earlier
+    report are added.
+    """
+    import json
+    import tempfile
+
+    from drakegrasp import bench as measuring
+    from drakegrasp.builtin import export_builtin
+    from drakegrasp.config import load_config
+    from drakegrasp.meshes import find_meshes
+
+    config = load_config(preset, [*overrides, f"candidates.max={candidates}"])
+    with tempfile.TemporaryDirectory() as folder:
+        if objects == BUILTIN:
+            export_builtin(Path(folder))
+            objects = folder
+        sources = [
+            s
+            for s in find_meshes(Path(objects), units=units, manifest=manifest)
+            if not only or s.name in only
+        ]
+        if not sources:
+            raise click.UsageError(f"--only must name objects of {objects}, got {', '.join(only)}")
+        found = list(measuring.measure(sources, config, sample=fidelity))
+    report = measuring.summarize(found, config)
+    if compare is not None:
+        report["ratio"] = measuring.compare(report, json.loads(compare.read_text()))
+    click.echo(json.dumps(report, indent=1))
 
 
 def _console(*, stderr: bool = False) -> Console:

@@ -231,14 +231,14 @@ def _try_all(bench: Workbench, attempts: Sequence[Attempt], journal: Journal) ->
     steps = [f"{ATTEMPT} {row}" for row in range(len(attempts))]
     suspects = set(journal.suspects)
     order = sorted(range(len(attempts)), key=lambda row: steps[row] not in suspects)
-    predictions = _predict_all(bench, attempts)
+    predictions = predict_all(bench, attempts)
     records = {
         row: _try_step(bench, attempts[row], journal, steps[row], predictions[row]) for row in order
     }
     return [records[row] for row in range(len(attempts))]
 
 
-def _predict_all(bench: Workbench, attempts: Sequence[Attempt]) -> list[Prediction | None]:
+def predict_all(bench: Workbench, attempts: Sequence[Attempt]) -> list[Prediction | None]:
     """Return what geometry says of each attempt; asking for all at once is what is fast."""
     config, prepared = bench.config, bench.prepared
     if config.screen.mode == "off":

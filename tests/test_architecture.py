@@ -32,7 +32,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
         "stats resting trial open_file doc_figures plan",
         "prepared tables dataset_rules theatre lift_path placed",
         "units check force_lift force_margin",
-        "build snapshots verified",
+        "build snapshots verified bench",
         "recording verification_figure",
         "replay verification",
         "verify verification_files",
