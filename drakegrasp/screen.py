@@ -42,8 +42,9 @@ class Prediction:
     Attributes:
         outcome: `start_collision` or `screened` where the attempt is lost for certain, else None.
         clear: Whether the open hand is farther from object and table than the margin.
-        closing: (k,), closing angles up to which nothing is met [rad].
-        last: (k,), closing angles beyond which a fingertip meets the object no more [rad].
+        closing: (k,), closing angles up to which nothing is met [rad]; empty with an outcome.
+        last: (k,), closing angles beyond which a fingertip meets the object no more [rad];
+            empty with an outcome.
     """
 
     outcome: Outcome | None
@@ -140,16 +141,25 @@ def _predict(view: _View, paths: HandPaths, config: ScreenConfig) -> list[Predic
         Prediction(outcome=Outcome.START_COLLISION, clear=False, closing=_NOTHING, last=_NOTHING)
     ] * len(view)
     for rows in _chunks(alive, SWEEP_CHUNK):
-        sweeps = [_Sweep(view, path, rows, config) for path in paths.fingers]
-        arrives = np.all([sweep.arrives for sweep in sweeps], axis=0)
-        starts = _clear_starts(paths, np.array([sweep.start for sweep in sweeps]).T)
-        lasts = np.array([sweep.last for sweep in sweeps]).T
-        for n, row in enumerate(rows):
+        # A finger that does not arrive decides, and the others need not be looked at.
+        left, sweeps = rows, []
+        for path in paths.fingers:
+            sweeps.append(_Sweep(view, path, left, config))
+            left = left[sweeps[-1].arrives]
+        among = [np.searchsorted(sweep.rows, left) for sweep in sweeps]
+        starts = np.stack([s.start[i] for s, i in zip(sweeps, among, strict=True)], axis=1)
+        lasts = np.stack([s.last[i] for s, i in zip(sweeps, among, strict=True)], axis=1)
+        angles = {
+            int(row): (_angles(paths, start), _angles(paths, last))
+            for row, start, last in zip(left, _clear_starts(paths, starts), lasts, strict=True)
+        }
+        for row in rows.tolist():
+            closing, last = angles.get(row, (_NOTHING, _NOTHING))
             predictions[row] = Prediction(
-                outcome=None if arrives[n] else Outcome.SCREENED,
+                outcome=None if row in angles else Outcome.SCREENED,
                 clear=bool(nearest[row] > margin),
-                closing=_angles(paths, starts[n]),
-                last=_angles(paths, lasts[n]),
+                closing=closing,
+                last=last,
             )
     return predictions
 
@@ -178,6 +188,7 @@ class _Sweep:
     threshold in, as a point moves by at most its `travel` from one angle to the next.
 
     Attributes:
+        rows: The attempts, ascending.
         start: Last angle that was looked at with everything farther away than the clearance.
         arrives: Whether the fingertip comes within reach of the object before the finger
             is blocked.
@@ -185,6 +196,7 @@ class _Sweep:
     """
 
     def __init__(self, view: _View, path: FingerPath, rows: Counts, config: ScreenConfig) -> None:
+        self.rows = rows
         count, end = len(rows), len(path.angles) - 1
         self.start = np.zeros(count, dtype=np.int64)
         self.last = np.full(count, end)
