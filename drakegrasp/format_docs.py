@@ -53,8 +53,8 @@ machine's name. `time_close` and `time_lift` are simulated seconds. This holds o
 one set of library versions (`manifest.json` names them); another CPU or another version of Drake
 may round differently. The one exception is the outcome `timeout`: an attempt that takes longer
 than `attempt_seconds` (60 s, where a usual one takes about one) says more about the machine than
-about the grasp, and may end otherwise elsewhere. `screened` and `crashed` are reserved: nothing
-makes them yet.
+about the grasp, and may end otherwise elsewhere. `screened` is an attempt that geometry has
+decided: it was not simulated, and would have been a `missing_fingertip`, see `performance.md`.
 
 Shards and the files in `objects/` are sealed: a changed bit in one of them is found when it is
 used, and by `drakegrasp check`. The three main files have no seal: `check` finds what breaks an
