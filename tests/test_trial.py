@@ -12,7 +12,7 @@ from models import CUBE, box_model, from_above, model_of, standing
 from drakegrasp import trial as trial_module
 from drakegrasp.camera import camera_pose_oto
 from drakegrasp.candidates import Attempt, make_attempts, sample_candidates
-from drakegrasp.config import Config, load_config
+from drakegrasp.config import Config, load_config, override_config
 from drakegrasp.construction import build_scene, object_friction, partner_friction
 from drakegrasp.contacts import is_inside
 from drakegrasp.frames import X_WT, invert_pose, make_pose
@@ -137,7 +137,8 @@ def test_slippery_cube_is_lost(cube, hand):
 
 
 def test_attempt_in_the_air_misses(scene, cube, config):
-    record = run_attempt(scene, standing(cube), from_above(cube, 0.25), config)
+    everything = override_config(config, ["screen.mode=off"])
+    record = run_attempt(scene, standing(cube), from_above(cube, 0.25), everything)
     assert record.outcome is Outcome.MISSING_FINGERTIP
     assert not record.closed.touching.any()
     assert np.isnan(record.closed.p_OQ).all()
@@ -331,7 +332,8 @@ def test_quarter_of_the_step_gives_the_same_verdicts(tmp_path, config, hand):
     candidates = sample_candidates(model, X_TO, config.candidates, 0)
     made = make_attempts(candidates, range(40), config.candidates, name=model.name, seed=0)
     attempts = [attempt for attempt in made if attempt.ray_hits]
-    fine = load_config(overrides=["physics.time_step=0.001"])
+    config = override_config(config, ["screen.mode=off"])
+    fine = override_config(config, ["physics.time_step=0.001"])
     coarse_scene = build_scene(model, config.physics, hand)
     fine_scene = build_scene(model, fine.physics, hand)
     coarse = [run_attempt(coarse_scene, X_TO, a, config) for a in attempts]
