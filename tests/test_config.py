@@ -60,6 +60,12 @@ candidates:
   jitter_deg: 5
   standoffs: [0.05]
   spreads_deg: [0, 90]
+screen:
+  mode: "off"
+  start_margin: 0.003
+  reach_margin: 0.004
+  block_margin: 0.006
+  clearance: 0.005
 close:
   max_time: 3.0
   stop_speed: 0.02
