@@ -91,6 +91,7 @@ def reset_object(scene: Scene, X_WO: npt.ArrayLike) -> None:
     scene.object.Unlock(scene.context)
     scene.plant.SetFreeBodyPose(scene.context, scene.object, RigidTransform(np.asarray(X_WO)))
     scene.plant.SetVelocities(scene.context, np.zeros(scene.plant.num_velocities()))
+    _let_object_meet_table(scene, True)
 
 
 def reset_attempt(

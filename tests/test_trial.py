@@ -343,3 +343,12 @@ def test_quarter_of_the_step_gives_the_same_verdicts(tmp_path, config, hand):
     assert len(alike) >= 20
     assert sum(coarse[i].outcome is Outcome.SUCCESS for i in simulated) >= 3
     assert np.mean(alike) >= 0.95
+
+
+def test_object_rests_on_the_table_after_an_attempt_that_ended_early(scene, cube, config):
+    """While fingers close, contacts of object and table are not looked for; afterwards they are."""
+    run_attempt(scene, standing(cube), from_above(cube, 0.001), config)
+    reset_object(scene, X_WT @ standing(cube))
+    scene.simulator.Initialize()
+    advance(scene, 0.2)
+    assert np.allclose(scene.pose(scene.object), X_WT @ standing(cube), atol=1e-3)
