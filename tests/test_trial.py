@@ -190,8 +190,10 @@ def test_hand_inside_of_a_ring_does_not_collide(tmp_path, config, hand):
         seed=0,
     )
     scene = build_scene(ring, config.physics, hand)
-    record = run_attempt(scene, standing(ring), attempt, config)
+    everything = override_config(config, ["screen.mode=off"])
+    record = run_attempt(scene, standing(ring), attempt, everything)
     assert record.outcome is Outcome.MISSING_FINGERTIP
+    assert run_attempt(scene, standing(ring), attempt, config).outcome is Outcome.SCREENED
 
 
 def test_geometry_alone_decides_below_the_table_and_ray_misses(scene, cube, config):
