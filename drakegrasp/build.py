@@ -38,6 +38,7 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.prepared import load_prepared, prepare, save_prepared
 from drakegrasp.progress import Report, progress_bar
 from drakegrasp.shards import ShardHeader, disk_full_named, sweep_temporary
+from drakegrasp.threads import one_thread
 from drakegrasp.units import UnitSummary, WorkUnit, find_outcomes, run_unit
 
 #: Wall clock after which preparing a mesh hangs [s].
@@ -274,6 +275,7 @@ def _known_entry(source: MeshSource, out: Path, manifest: Manifest) -> dict[str,
     return None
 
 
+@one_thread
 def _prepare_one(task: _PrepareTask) -> tuple[str, dict[str, Any]]:
     """Prepare one object; return its name and its entry in the manifest."""
     out, source = Path(task.out), task.source

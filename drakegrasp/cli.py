@@ -11,7 +11,7 @@ import math
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,6 +34,7 @@ from drakegrasp.errors import ConfigError, DrakegraspError, GraspError, HandErro
 if TYPE_CHECKING:
     from drakegrasp.build import BuildReport
     from drakegrasp.build_options import BuildRequest
+    from drakegrasp.verification import Verification
 
 #: Errors of what was asked for, as against errors of what was done.
 WRONG_USAGE = (ConfigError, GraspError, HandError, MeshError)
@@ -70,6 +71,11 @@ def one_line_errors(ctx: click.Context, *, builds: bool = False) -> Iterator[Non
     except DrakegraspError as error:
         click.echo(f"error: {' '.join(str(error).split())}", err=True)
         ctx.exit(2 if isinstance(error, WRONG_USAGE) else 1)
+    except click.UsageError as error:
+        if isinstance(error, click.exceptions.NoArgsIsHelpError):
+            raise
+        click.echo(f"error: {' '.join(error.format_message().split())}", err=True)
+        ctx.exit(2)
     except (OSError, RuntimeError) as error:
         if isinstance(error, click.exceptions.Exit | click.Abort):
             raise
@@ -298,7 +304,7 @@ def replay(out: Path, trial: int, html: Path | None) -> None:
     metavar="MESH",
     help="The object: a .obj, .stl, .ply or .glb file.",
 )
-@units_option
+@click.option("--units", help="Unit of length of the mesh: m, cm or mm.  [m]")
 @click.option(
     "--dataset",
     type=click.Path(path_type=Path),
@@ -373,27 +379,42 @@ def verify(
     """
     from drakegrasp.cluster import run_verification
     from drakegrasp.tables import verdict_table
-    from drakegrasp.verification_files import refuse_unwritable, save_results, write_json_lines
+    from drakegrasp.verification_files import (
+        json_lines,
+        part_path,
+        result_paths,
+        write_json_line,
+        write_results,
+    )
     from drakegrasp.verify_request import VerifyRequest, plan_request
     from drakegrasp.verifying import refuse_off_surface
 
-    if out is not None:
-        refuse_unwritable(out)
-    tasks, config = plan_request(VerifyRequest(**options))
-    results = run_verification(
-        tasks,
-        workers=workers,
-        scheduler=scheduler,
-        scheduler_file=scheduler_file,
-        show=not quiet,
-    )
-    if len(results) == 1:
-        refuse_off_surface(results[0])
-    if out is None:
-        write_json_lines(results, sys.stdout)
-    else:
-        for path in save_results(results, out, config):
-            click.echo(str(path))
+    tasks = plan_request(VerifyRequest(**options, out=out))
+    single = sum(len(task.indices) for task in tasks) == 1
+
+    def deliver(index: int, result: Verification) -> None:
+        if single:
+            refuse_off_surface(result)
+        write_json_line(index, result, stream)
+
+    try:
+        with nullcontext(sys.stdout) if out is None else json_lines(out) as stream:
+            results = run_verification(
+                tasks,
+                workers=workers,
+                scheduler=scheduler,
+                scheduler_file=scheduler_file,
+                deliver=deliver,
+                show=not quiet,
+            )
+            if out is not None:
+                write_results(results, result_paths(out)[1], results[0].config)
+    except BaseException:
+        if out is not None and part_path(out).exists():
+            click.echo(f"{part_path(out)}: the verdicts so far", err=True)
+        raise
+    for path in () if out is None else result_paths(out):
+        click.echo(str(path))
     if not quiet:
         _console(stderr=True).print(verdict_table([result.outcome for result in results]))
 

@@ -33,7 +33,7 @@ from drakegrasp.meshes import MeshSource, find_meshes
 from drakegrasp.progress import progress_bar
 from drakegrasp.verification import Verification
 from drakegrasp.verify_plan import TASK_GRASPS, Mesh, VerifyTask, plan_verification, split_task
-from drakegrasp.verifying import verify_tasks
+from drakegrasp.verifying import Deliver, verify_tasks
 from drakegrasp.workers import SATURATION, WORKER_ENVIRONMENT, admitted_workers
 
 #: How long to wait for a scheduler to answer [s].
@@ -148,7 +148,7 @@ def verify_grasps(
     frame: str | None = None,
     X: npt.ArrayLike | None = None,
     X_TO: npt.ArrayLike | None = None,
-    units: str = "m",
+    units: str | None = None,
     hand: str | Path | None = None,
     method: str = "hand",
     config: Config | None = None,
@@ -168,10 +168,11 @@ def verify_grasps(
         frame: What the grasps are expressed in, as there.
         X: With frame "camera": X_TC (4, 4), or one per grasp (n, 4, 4).
         X_TO: Pose of the object on the table (4, 4); dropped as in a build if None.
-        units: Unit of the mesh's lengths: m, cm or mm.
+        units: Unit of the mesh's lengths: m, cm or mm; metres if None.
         hand: Name or YAML file of the hand; the configuration's if None.
         method: "hand" or "forces".
-        config: Physics, lift and limits; the preset `paper`, or the dataset's, if None.
+        config: Physics, lift and limits; if None that of the dataset or of the placed object,
+            else the preset `paper`.
         dataset: In place of a mesh: a data file of a dataset.
         rows: The rows of its split that the grasps are for; all of them, in order, if None.
         client: A Dask client whose workers share the work; a plain loop here if None.
@@ -204,6 +205,7 @@ def run_verification(
     workers: int | None = None,
     scheduler: str | None = None,
     scheduler_file: str | Path | None = None,
+    deliver: Deliver,
     show: bool = True,
 ) -> list[Verification]:
     """Return the verdicts of tasks in the order of their grasps; what `drakegrasp verify` does.
@@ -216,6 +218,7 @@ def run_verification(
         workers: Processes on this machine; one per core if None.
         scheduler: Address of a running Dask scheduler to use instead.
         scheduler_file: Its JSON file, instead of the address.
+        deliver: Is given each verdict, in that order, as soon as those before it are there.
         show: Whether to show progress on standard error.
 
     Raises:
@@ -225,25 +228,32 @@ def run_verification(
     _refuse_workers(workers, scheduler, scheduler_file)
     few = sum(len(task.indices) for task in tasks) <= TASK_GRASPS
     if not (scheduler or scheduler_file) and (few or (workers or _cores()) == 1):
-        return _verify(tasks, None, show)
+        return _verify(tasks, None, show, deliver)
     with connect(workers, scheduler, scheduler_file) as client:
-        return _verify(tasks, client, show)
+        return _verify(tasks, client, show, deliver)
 
 
-def _verify(tasks: Sequence[VerifyTask], client: Client | None, show: bool) -> list[Verification]:
+def _verify(
+    tasks: Sequence[VerifyTask],
+    client: Client | None,
+    show: bool,
+    deliver: Deliver = lambda index, result: None,
+) -> list[Verification]:
     if client is None:
         # Here it costs nothing to report every grasp.
         parts = [part for task in tasks for part in split_task(task, 1)]
-        return _verify_with(run_here, parts, show)
+        return _verify_with(run_here, parts, show, deliver)
     if not tasks:
         return []
     with admitted_workers(client, parse_config(tasks[0].config)):
-        return _verify_with(DaskExecutor(client), tasks, show)
+        return _verify_with(DaskExecutor(client), tasks, show, deliver)
 
 
-def _verify_with(execute: Executor, tasks: Sequence[VerifyTask], show: bool) -> list[Verification]:
+def _verify_with(
+    execute: Executor, tasks: Sequence[VerifyTask], show: bool, deliver: Deliver
+) -> list[Verification]:
     with progress_bar("verify", "grasps", show=show) as report:
-        return verify_tasks(tasks, execute, report)
+        return verify_tasks(tasks, execute, report, deliver)
 
 
 @contextmanager

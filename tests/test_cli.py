@@ -348,6 +348,10 @@ def test_camera_ties_the_frame_to_the_table(cube: Path, tmp_path: Path) -> None:
         (pinch(), ["--hand", "octopus"], "octopus"),
         (pinch(), ["--set", "lift.speed=1"], "lift.speed: must be a known key"),
         (pinch(), ["--workers", "0"], "workers must be at least 1, got 0"),
+        (pinch(), ["--workers", "some"], "'some' is not a valid integer"),
+        (pinch(), ["--frame", "world"], "'world' is not one of 'object', 'camera', 'workspace'"),
+        (pinch(), ["--split", "test"], "--split must be given with --dataset or grasps in an HDF5"),
+        (pinch(), ["--set", "verify.max_tries=9"], "max_tries: must be less than or equal to 5"),
         (pinch(), ["--workers", "2", "--scheduler", "x"], "must not be given with a scheduler"),
     ],
 )
@@ -372,6 +376,9 @@ def test_what_cannot_be_verified_is_one_line_and_leaves_nothing(
         (["a.npy", "--dataset", "a.npy"], "a.npy: must be a data file of drakegrasp"),
         (["other.h5"], "other.h5: must be a data file of drakegrasp"),
         (["other.h5", "--frame", "object"], "--frame must be camera for a dataset's own grasps"),
+        (["other.h5", "--units", "cm"], "--units must be given with --object only, got cm"),
+        (["a.npy", "--object", "o.obj", "--out", "."], "must be a file, got a folder"),
+        (["a.npy", "--object", "o.obj", "--out", "a.npy/x"], "must be in a folder that can be"),
     ],
 )
 def test_wrong_files_are_one_line(
@@ -379,6 +386,7 @@ def test_wrong_files_are_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     np.save("a.npy", pinch())
+    Path("..jsonl").mkdir()
     with h5py.File("other.h5", "w") as file:
         file["grasps"] = pinch()
     result = run("verify", *arguments)
