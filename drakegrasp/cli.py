@@ -392,13 +392,16 @@ def verify(
     tasks = plan_request(VerifyRequest(**options, out=out))
     single = sum(len(task.indices) for task in tasks) == 1
 
+    def print_line(index: int, result: Verification) -> None:
+        write_json_line(index, result, sys.stdout)
+
     def deliver(index: int, result: Verification) -> None:
         if single:
             refuse_off_surface(result)
-        write_json_line(index, result, stream)
+        write(index, result)
 
     try:
-        with nullcontext(sys.stdout) if out is None else json_lines(out) as stream:
+        with nullcontext(print_line) if out is None else json_lines(out) as write:
             results = run_verification(
                 tasks,
                 workers=workers,

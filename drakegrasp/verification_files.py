@@ -10,8 +10,8 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -49,6 +49,8 @@ def refuse_unwritable(out: Path) -> None:
     Raises:
         DataError: If its folder, or the first above it that exists, cannot be written.
     """
+    if out.is_dir():
+        raise DataError(f"{out}: must be a name for files, got a folder; choose another --out")
     for path in (*result_paths(out), part_path(out)):
         if path.is_dir():
             raise DataError(f"{path}: must be a file, got a folder; choose another --out")
@@ -75,10 +77,11 @@ def _is_writable(folder: Path) -> bool:
 
 
 @contextmanager
-def json_lines(out: Path) -> Iterator[TextIO]:
-    """Write the JSON lines of a name while the block runs: whole in the end.
+def json_lines(out: Path) -> Iterator[Callable[[int, Verification], None]]:
+    """Give the block a function that writes the next JSON line of a name.
 
-    Until then they are in NAME.part.jsonl, and stay there if something stops the block.
+    The lines are whole at the end of the block. Until then they are in NAME.part.jsonl, and
+    stay there if something stops the block; nothing is made before the first.
 
     Args:
         out: The name, see `result_paths`.
@@ -87,15 +90,19 @@ def json_lines(out: Path) -> Iterator[TextIO]:
         OSError: If the disk is full or the folder cannot be written.
     """
     lines, _ = result_paths(out)
-    part = part_path(out)
-    lines.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        with part.open("w", encoding="utf-8") as stream:
-            yield stream
+    part, stream = part_path(out), None
+    with ExitStack() as stack:
+
+        def write(index: int, result: Verification) -> None:
+            nonlocal stream
+            if stream is None:
+                part.parent.mkdir(parents=True, exist_ok=True)
+                stream = stack.enter_context(part.open("w", encoding="utf-8"))
+            write_json_line(index, result, stream)
+
+        yield write
+    if stream is not None:
         sync_and_rename(part, lines)
-    finally:
-        if part.exists() and part.stat().st_size == 0:
-            part.unlink()
 
 
 def part_path(out: Path) -> Path:
