@@ -377,7 +377,7 @@ def test_what_cannot_be_verified_is_one_line_and_leaves_nothing(
         (["other.h5"], "other.h5: must be a data file of drakegrasp"),
         (["other.h5", "--frame", "object"], "--frame must be camera for a dataset's own grasps"),
         (["other.h5", "--units", "cm"], "--units must be given with --object only, got cm"),
-        (["a.npy", "--object", "o.obj", "--out", "."], "must be a file, got a folder"),
+        (["a.npy", "--object", "o.obj", "--out", "."], "must be a name for files, got a folder"),
         (["a.npy", "--object", "o.obj", "--out", "a.npy/x"], "must be in a folder that can be"),
     ],
 )
@@ -386,7 +386,6 @@ def test_wrong_files_are_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     np.save("a.npy", pinch())
-    Path("..jsonl").mkdir()
     with h5py.File("other.h5", "w") as file:
         file["grasps"] = pinch()
     result = run("verify", *arguments)

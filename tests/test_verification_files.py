@@ -235,18 +235,18 @@ def test_lines_are_whole_in_the_end_and_not_lost_before(
     found: list[Verification], tmp_path: Path
 ) -> None:
     out = tmp_path / "new folder" / "run.1"
-    with pytest.raises(KeyboardInterrupt), json_lines(out) as stream:
-        write_json_line(0, found[0], stream)
+    with pytest.raises(KeyboardInterrupt), json_lines(out) as write:
+        write(0, found[0])
         assert len(part_path(out).read_text(encoding="utf-8").splitlines()) == 1
         raise KeyboardInterrupt
     assert [p.name for p in out.parent.iterdir()] == ["run.1.part.jsonl"]
-    with json_lines(out) as stream:
+    with json_lines(out) as write:
         for index, result in enumerate(found):
-            write_json_line(index, result, stream)
+            write(index, result)
     (whole,) = out.parent.iterdir()
     assert whole.name == "run.1.jsonl"
     assert len(whole.read_text(encoding="utf-8").splitlines()) == 4
-    with pytest.raises(ValueError, match="nothing"), json_lines(tmp_path / "run"):
+    with pytest.raises(ValueError, match="nothing"), json_lines(tmp_path / "deep" / "run"):
         raise ValueError("nothing was verified")
     assert [p.name for p in tmp_path.iterdir()] == ["new folder"]
 
