@@ -6,8 +6,10 @@ comes back. A few tasks per worker are in flight at a time, whatever their numbe
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 import os
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -51,6 +53,8 @@ DASK_SETTINGS: dict[str, Any] = {
     "distributed.deploy.lost-worker-timeout": "60 s",
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
+    # A paused worker has no task whose end would free memory: it would wait for ever.
+    "distributed.worker.memory.pause": False,
 }
 
 
@@ -95,6 +99,8 @@ def build_dataset(
     sources = find_sources(objects, units, manifest)
     # Locked first: a second build is refused before it starts any worker.
     with build_lock(out), connect(workers, scheduler, scheduler_file) as client:
+        if show and _has_dashboard():
+            sys.stderr.write(f"{dashboard_line(client)}\n")
         return build_on(client, sources, out, config, show=show)
 
 
@@ -139,6 +145,17 @@ def build_on(
             sources = find_meshes(out / BUILTIN_FOLDER)
         execute = DaskExecutor(client, resubmissions=RESUBMISSIONS)
         return build(sources, out, config, execute, crew=execute.crew, show=show)
+
+
+def dashboard_line(client: Client) -> str:
+    """Return where the dashboard of a client's cluster is, or what it takes to have one."""
+    if not _has_dashboard():
+        return "dashboard: none; pip install 'drakegrasp[dashboard]'"
+    return f"dashboard: {client.dashboard_link}"
+
+
+def _has_dashboard() -> bool:
+    return importlib.util.find_spec("bokeh") is not None
 
 
 def verify_grasps(

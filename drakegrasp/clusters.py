@@ -9,7 +9,6 @@ in their script, and a running scheduler's workers are set up when they are admi
 
 from __future__ import annotations
 
-import importlib.util
 import ipaddress
 import logging
 import math
@@ -540,10 +539,3 @@ def _bytes(text: str) -> int:
         return int(parse_bytes(text))
     except ValueError:
         raise ConfigError(f"memory must be a size such as 2GB, got {text!r}") from None
-
-
-def dashboard_line(client: Client) -> str:
-    """Return where the dashboard of a client's cluster is, or what it takes to have one."""
-    if importlib.util.find_spec("bokeh") is None:
-        return "dashboard: none; pip install 'drakegrasp[dashboard]'"
-    return f"dashboard: {client.dashboard_link}"

@@ -19,13 +19,13 @@ from typing import Any
 
 import click
 
+from drakegrasp.build_lock import build_lock
 from drakegrasp.build_options import build_options, parse_request, times_option
 from drakegrasp.cli import OneCommand, print_plan, print_report
-from drakegrasp.cluster import build_on, find_sources
+from drakegrasp.cluster import build_on, dashboard_line, find_sources
 from drakegrasp.clusters import (
     KINDS,
     ClusterRequest,
-    dashboard_line,
     describe,
     start_cluster,
     worker_count,
@@ -97,8 +97,10 @@ def main(
     if dry_run:
         return
     sources = find_sources(request.objects, request.units, request.manifest)
-    with start_cluster(cluster, request.out) as client:
-        click.echo(dashboard_line(client), err=True)
+    # Locked first: a second build is refused before it starts any worker.
+    with build_lock(request.out), start_cluster(cluster, request.out) as client:
+        if request.show:
+            click.echo(dashboard_line(client), err=True)
         if not client.nthreads():
             click.echo("waiting for the first worker", err=True)
             client.wait_for_workers(1)
