@@ -393,9 +393,14 @@ def _from_files(files: tuple[Path, Path, Path]) -> Security:
 
 @contextmanager
 def _private_directory(out: Path) -> Iterator[Path]:
-    """Yield a directory in `out` that only this user can enter, and remove it again."""
+    """Yield a directory in `out` that only this user can enter, and remove it again.
+
+    Those of clients that were killed go as well: whoever calls holds the lock of `out`.
+    """
     try:
         out.mkdir(parents=True, exist_ok=True)
+        for dead in out.glob(".tls-*"):
+            shutil.rmtree(dead, ignore_errors=True)
         folder = Path(tempfile.mkdtemp(prefix=".tls-", dir=out))  # mode 0700
     except OSError as error:
         raise MachineError(f"{out}: must be a directory that can be written: {error}") from None

@@ -40,7 +40,7 @@ DEEPEST = 64
 COUNT_SECONDS = 2.0
 #: How long a result may take from a worker to here, until the workers are counted again [s].
 GATHER_SECONDS = 30.0
-#: How long there may be no worker at all, after there were some, where none come back [s].
+#: How long there may be no worker at all where none come by themselves [s].
 LOST_SECONDS = 300.0
 #: How long until it is said that there is none [s]; shorter gaps are those of restarts.
 SAY_SECONDS = 60.0
@@ -82,8 +82,8 @@ class DaskExecutor:
         self._client, self._resubmissions = client, resubmissions
         self._workers: set[str] = set()
         self._counted = -float("inf")
-        self._met, self._said = False, False
         self._lost: float | None = None
+        self._said = False
         self._depth = IN_FLIGHT
         self.crew = Crew()
 
@@ -225,8 +225,8 @@ class DaskExecutor:
         Raises:
             MachineError: If none will come either.
         """
-        if self._workers or not self._met:
-            self._met, self._lost = self._met or bool(self._workers), None
+        if self._workers:
+            self._lost = None
             return
         if self._lost is None:
             self._lost, self._said = now, False

@@ -146,12 +146,17 @@ def assert_clean(out: Path) -> None:
 @pytest.mark.sim
 @pytest.mark.slow
 def test_random_kills_change_nothing(meshes: Path, undisturbed: Path, tmp_path: Path) -> None:
-    """Twenty times a random one of four workers is killed, whatever it is at.
+    """All of four workers are killed while objects are prepared, and twenty times one of them.
 
     However quick they are: at the latest with the next shard.
     """
     out, rng, killed = tmp_path / "out", random.Random(0), 0
     process = start_build(meshes, out, workers=4)
+    while not list(out.glob("objects/*.journal")):
+        assert process.poll() is None
+        time.sleep(0.05)
+    for worker in workers_of(process.pid):
+        os.kill(worker, signal.SIGKILL)
     wait_for_shards(out, 1)
     while process.poll() is None and killed < KILLS:
         wait_for_shards(out, 2 + killed, patience=0.8)

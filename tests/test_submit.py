@@ -155,7 +155,11 @@ def test_settings_survive_a_job_script() -> None:
 
 def test_keys_are_private_and_removed(tmp_path: Path) -> None:
     out = tmp_path / "out"
+    dead = out / ".tls-dead"  # of a client that was killed
+    dead.mkdir(parents=True)
+    make_certificates(dead)
     with _private_directory(out) as folder:
+        assert list(out.iterdir()) == [folder]
         files = make_certificates(folder)
         assert stat.S_IMODE(folder.stat().st_mode) == 0o700
         assert {stat.S_IMODE(path.stat().st_mode) for path in files} == {0o600}
