@@ -285,15 +285,35 @@ def _known_entry(source: MeshSource, out: Path, manifest: Manifest) -> dict[str,
 
 def _prepare_one(task: _PrepareTask) -> tuple[str, dict[str, Any]]:
     """Prepare one object; return its name and its entry in the manifest."""
-    out, source = Path(task.out), task.source
+    out, source, config = Path(task.out), task.source, parse_config(task.config)
+    digest = source_sha256(source)
     with disk_full_named(out):
+        entry = _entry_there(source, digest, out, config)
+        if entry is not None:  # its process, or the client, died before the manifest was written
+            return source.name, entry
         if not task.expendable:
             return source.name, _prepared_entry(task)
-        config_hash, digest = parse_config(task.config).simulation_hash(), source_sha256(source)
-        identity = {"name": source.name, "mesh_sha256": digest, "config_hash": config_hash}
+        identity = {
+            "name": source.name,
+            "mesh_sha256": digest,
+            "config_hash": config.simulation_hash(),
+        }
         path = model_path(out, source.name).with_suffix(".journal")
         with open_journal(path, identity) as journal:
             return source.name, _prepared_or_guilty(task, journal)
+
+
+def _entry_there(
+    source: MeshSource, digest: str, out: Path, config: Config
+) -> dict[str, Any] | None:
+    """Return the entry of an object whose files are there and whole, or None."""
+    try:
+        prepared = load_prepared(out, source.name, config)
+    except DrakegraspError:
+        return None
+    model = prepared.model
+    same = (model.class_name, model.mesh_sha256) == (source.class_name, digest)
+    return prepared.summary() if same else None
 
 
 def _prepared_or_guilty(task: _PrepareTask, journal: Journal) -> dict[str, Any]:

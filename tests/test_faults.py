@@ -31,8 +31,9 @@ from drakegrasp.crew import DaskExecutor
 from drakegrasp.errors import BlankImageError, DiskFullError, MachineError
 from drakegrasp.executor import run_here
 from drakegrasp.faults import VARIABLE
-from drakegrasp.meshes import find_meshes
+from drakegrasp.meshes import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome
+from drakegrasp.prepared import PreparedObject
 from drakegrasp.processes import host_label
 from drakegrasp.stats import count_funnel
 
@@ -211,6 +212,25 @@ def test_client_that_is_killed_or_stopped_goes_on(
     assert_clean(out)
     assert len(events(out, "started")) == 4
     assert len(events(out, "finished")) == 1
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_objects_are_prepared_once_whatever_died(
+    meshes: Path, undisturbed: Path, config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The manifest names them when all are; a client that dies before loses none of them."""
+
+    def prepare(source: MeshSource, config: Config) -> PreparedObject:
+        raise AssertionError(f"{source.name} is prepared again")
+
+    out = tmp_path / "out"
+    for name in ("objects", "shards"):
+        shutil.copytree(undisturbed / name, out / name)
+    monkeypatch.setattr("drakegrasp.build.prepare", prepare)
+    build(find_meshes(meshes), out, config, run_here, show=False)
+    assert (out / "manifest.json").read_bytes() == (undisturbed / "manifest.json").read_bytes()
+    assert_same_dataset(undisturbed, out)
 
 
 @pytest.mark.cluster
