@@ -53,9 +53,9 @@ The same command gives the same arrays, whatever the number of workers, in which
 and how often the build was interrupted: nothing in these files depends on the clock or the
 machine's name. `time_close` and `time_lift` are simulated seconds. This holds on one machine with
 one set of library versions (`manifest.json` names them); another CPU or another version of Drake
-may round differently. The exceptions are the outcomes `timeout` and `crashed`: an attempt that takes
-longer than `attempt_seconds` (60 s, where a usual one takes about one), or ends its process again
-and again, says more about the machine than about the grasp, and may end otherwise elsewhere.
+may round differently. The exceptions are the outcomes `timeout` and `crashed`: an attempt that
+takes longer than `attempt_seconds` (60 s, where a usual one takes about one), or ends its process
+again and again, says more about the machine than about the grasp, and may end otherwise elsewhere.
 `screened` is reserved: nothing makes it yet.
 
 Shards and the files in `objects/` are sealed: a changed bit in one of them is found when it is
