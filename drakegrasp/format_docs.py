@@ -43,8 +43,8 @@ OUT/
   build.lock               while a build runs: by which process
 ```
 
-Only the data files, `grasping_*.hdf5`, are needed to train. With `objects/` and `manifest.json`, every trial can be
-replayed.
+Only the data files, `grasping_*.hdf5`, are needed to train. With `objects/` and `manifest.json`,
+every trial can be replayed.
 """
 
 _CONTRACT = """## What makes two files equal
