@@ -73,7 +73,8 @@ def one_line_errors(ctx: click.Context, *, builds: bool = False) -> Iterator[Non
     except (OSError, RuntimeError) as error:
         if isinstance(error, click.exceptions.Exit | click.Abort):
             raise
-        click.echo(f"error: {str(error).strip().splitlines()[0]}", err=True)
+        text = str(error).strip() or type(error).__name__
+        click.echo(f"error: {text.splitlines()[0]}", err=True)
         ctx.exit(1)
     except KeyboardInterrupt as stop:
         goes_on = builds or ctx.invoked_subcommand == "build"

@@ -11,13 +11,13 @@ import logging
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import dask
 import numpy.typing as npt
-from distributed import Client, LocalCluster
+from distributed import Client, LocalCluster, SpecCluster
 from distributed.security import Security
 
 from drakegrasp.build import BuildReport, build
@@ -298,19 +298,27 @@ def connect(
             with client:
                 yield client
         else:
-            count = workers or _cores()
-            with (
-                LocalCluster(
-                    n_workers=count,
-                    threads_per_worker=1,
-                    dashboard_address="127.0.0.1:0",
-                    silence_logs=logging.CRITICAL,
-                    security=security,
-                    memory_limit=memory or "auto",
-                ) as cluster,
-                Client(cluster) as client,
-            ):
+            cluster = LocalCluster(
+                n_workers=workers or _cores(),
+                threads_per_worker=1,
+                dashboard_address="127.0.0.1:0",
+                silence_logs=logging.CRITICAL,
+                security=security,
+                memory_limit=memory or "auto",
+            )
+            with closing_cluster(cluster), Client(cluster) as client:
                 yield client
+
+
+@contextmanager
+def closing_cluster(cluster: SpecCluster) -> Iterator[None]:
+    """Close a cluster when the block ends; a worker that takes its time changes nothing."""
+    try:
+        yield
+    finally:
+        # On a busy machine one may not end within Dask's limit: it ends with this process.
+        with suppress(TimeoutError):
+            cluster.close()
 
 
 def _cores() -> int:

@@ -29,7 +29,7 @@ from distributed import Client, SpecCluster, SSHCluster, Status
 from distributed.security import Security
 from tornado.ioloop import PeriodicCallback
 
-from drakegrasp.cluster import DASK_SETTINGS, connect
+from drakegrasp.cluster import DASK_SETTINGS, closing_cluster, connect
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.workers import WORKER_ENVIRONMENT
 
@@ -174,7 +174,7 @@ def _running(make: Callable[[], SpecCluster]) -> Iterator[Client]:
     except Exception as error:
         reason = str(error) or type(error).__name__
         raise MachineError(f"the workers must start, got: {reason}") from None
-    with cluster, Client(cluster) as client:
+    with closing_cluster(cluster), Client(cluster) as client:
         yield client
 
 
