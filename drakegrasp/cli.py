@@ -79,7 +79,8 @@ def one_line_errors(ctx: click.Context, *, builds: bool = False) -> Iterator[Non
     except (OSError, RuntimeError) as error:
         if isinstance(error, click.exceptions.Exit | click.Abort):
             raise
-        click.echo(f"error: {str(error).strip().splitlines()[0]}", err=True)
+        text = str(error).strip() or type(error).__name__
+        click.echo(f"error: {text.splitlines()[0]}", err=True)
         ctx.exit(1)
     except KeyboardInterrupt as stop:
         goes_on = builds or ctx.invoked_subcommand == "build"
@@ -263,7 +264,10 @@ def check(path: Path) -> None:
 @main.command()
 @out_argument
 def stats(out: Path) -> None:
-    """Print the funnel by object and the paper's Table III."""
+    """Print the funnel by object and the paper's Table III.
+
+    Of a build that still runs, or was stopped: what is done so far.
+    """
     _print_stats(out)
 
 
@@ -432,24 +436,29 @@ def _print(table: Table) -> None:
 
 
 def _print_stats(out: Path) -> None:
-    from drakegrasp.stats import count_funnel, count_splits
-    from drakegrasp.tables import funnel_table, split_table
+    from drakegrasp.stats import count_funnel, count_splits, count_unfinished
+    from drakegrasp.tables import funnel_table, split_table, unfinished_line
 
-    console, funnel = _console(), count_funnel(out)
+    console, unfinished = _console(), count_unfinished(out)
+    funnel = count_funnel(out) if unfinished is None else unfinished.funnel
     table = funnel_table(funnel)
     # Numbers are never cut: where the columns do not fit, fewer say the same.
     natural = Measurement.get(console, console.options.update(max_width=WIDTH), table).maximum
     if natural > console.width:
         table = funnel_table(funnel, compact=True)
     console.print(table)
-    console.print(split_table(count_splits(out)))
+    if unfinished is None:
+        console.print(split_table(count_splits(out)))
+    else:
+        click.echo(f"{out}: {unfinished_line(unfinished)}")
 
 
 def print_plan(request: BuildRequest, workers: int | None, times: Path | None) -> None:
     """Print what a build that was asked for is expected to take."""
-    from drakegrasp.plan import plan_lines, plan_request, read_times
+    from drakegrasp.plan import logged_times, plan_lines, plan_request, read_times
 
-    measured = None if times is None else read_times(times)
+    logged = logged_times(request.out, request.config)
+    measured = logged if times is None else read_times(times)
     click.echo("\n".join(plan_lines(plan_request(request, workers, measured))))
 
 

@@ -6,16 +6,18 @@ comes back. A few tasks per worker are in flight at a time, whatever their numbe
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 import os
+import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import dask
 import numpy.typing as npt
-from distributed import Client, LocalCluster
+from distributed import Client, LocalCluster, SpecCluster
 from distributed.security import Security
 
 from drakegrasp.build import BuildReport, build
@@ -51,6 +53,8 @@ DASK_SETTINGS: dict[str, Any] = {
     "distributed.deploy.lost-worker-timeout": "60 s",
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
+    # A paused worker has no task whose end would free memory: it would wait for ever.
+    "distributed.worker.memory.pause": False,
 }
 
 
@@ -95,6 +99,8 @@ def build_dataset(
     sources = find_sources(objects, units, manifest)
     # Locked first: a second build is refused before it starts any worker.
     with build_lock(out), connect(workers, scheduler, scheduler_file) as client:
+        if show and _has_dashboard():
+            sys.stderr.write(f"{dashboard_line(client)}\n")
         return build_on(client, sources, out, config, show=show)
 
 
@@ -139,6 +145,17 @@ def build_on(
             sources = find_meshes(out / BUILTIN_FOLDER)
         execute = DaskExecutor(client, resubmissions=RESUBMISSIONS)
         return build(sources, out, config, execute, crew=execute.crew, show=show)
+
+
+def dashboard_line(client: Client) -> str:
+    """Return where the dashboard of a client's cluster is, or what it takes to have one."""
+    if not _has_dashboard():
+        return "dashboard: none; pip install 'drakegrasp[dashboard]'"
+    return f"dashboard: {client.dashboard_link}"
+
+
+def _has_dashboard() -> bool:
+    return importlib.util.find_spec("bokeh") is not None
 
 
 def verify_grasps(
@@ -291,19 +308,27 @@ def connect(
             with client:
                 yield client
         else:
-            count = workers or _cores()
-            with (
-                LocalCluster(
-                    n_workers=count,
-                    threads_per_worker=1,
-                    dashboard_address="127.0.0.1:0",
-                    silence_logs=logging.CRITICAL,
-                    security=security,
-                    memory_limit=memory or "auto",
-                ) as cluster,
-                Client(cluster) as client,
-            ):
+            cluster = LocalCluster(
+                n_workers=workers or _cores(),
+                threads_per_worker=1,
+                dashboard_address="127.0.0.1:0",
+                silence_logs=logging.CRITICAL,
+                security=security,
+                memory_limit=memory or "auto",
+            )
+            with closing_cluster(cluster), Client(cluster) as client:
                 yield client
+
+
+@contextmanager
+def closing_cluster(cluster: SpecCluster) -> Iterator[None]:
+    """Close a cluster when the block ends; a worker that takes its time changes nothing."""
+    try:
+        yield
+    finally:
+        # On a busy machine one may not end within Dask's limit: it ends with this process.
+        with suppress(TimeoutError):
+            cluster.close()
 
 
 def _cores() -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -182,6 +183,24 @@ def test_check_stats_and_replay_speak_of_a_dataset(small_dataset: Path, tmp_path
     assert page.read_text(encoding="utf-8").lstrip().startswith("<!DOCTYPE html>")
     assert "trial 0 of 10_box_tall: was" in again.stdout
     assert run("replay", small_dataset, "--trial", "100000").exit_code == 1
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_stats_of_a_build_that_runs_count_what_is_done(small_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(small_dataset, out)
+    for path in [*out.glob("*.hdf5"), *sorted(out.glob("shards/*/*.h5"))[:2]]:
+        path.unlink()
+    # What is on its way is not there yet.
+    (out / "shards" / "10_box_tall" / ".0000000-0000010.h5.h~1~0123456789ab.tmp").touch()
+    result = run("stats", out)
+    assert result.exit_code == 0, result.output
+    assert f"{out}: not finished: 10 of 12 work units are done" in result.stdout
+    (everything,) = [line for line in result.stdout.splitlines() if line.startswith("all ")]
+    assert everything.split()[1:3] == ["120", "300"]
+    shutil.rmtree(out / "shards")
+    assert "not finished: 0 of 12 work units are done" in run("stats", out).stdout
 
 
 @pytest.mark.sim
