@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.prepared import load_prepared, prepare, save_prepared
 from drakegrasp.progress import Report, progress_bar
 from drakegrasp.shards import ShardHeader, disk_full_named, sweep_temporary
+from drakegrasp.threads import one_thread
 from drakegrasp.units import UnitSummary, WorkUnit, find_outcomes, run_unit
 
 #: Wall clock after which preparing a mesh hangs [s].
@@ -198,14 +200,21 @@ def _log_start(manifest: Manifest, notices: Sequence[str], job: _Job) -> None:
     for notice in notices:
         job.log("notice", text=notice)
     if job.crew is not None:
-        crew = job.crew
+        job.crew.on_change = partial(_log_change, job)
+        job.crew.on_none = partial(_say_none, job)
 
-        def change(joined: set[str], left: set[str]) -> None:
-            for event, addresses in (("worker joined", joined), ("worker lost", left)):
-                for address in sorted(addresses):
-                    job.log(event, address=address, workers=crew.size)
 
-        crew.on_change = change
+def _log_change(job: _Job, joined: set[str], left: set[str]) -> None:
+    assert job.crew is not None
+    for event, addresses in (("worker joined", joined), ("worker lost", left)):
+        for address in sorted(addresses):
+            job.log(event, address=address, workers=job.crew.size)
+
+
+def _say_none(job: _Job) -> None:
+    job.log("no worker")
+    if job.show:
+        sys.stderr.write("no worker is there: waiting for one\n")
 
 
 def _count(names: Sequence[str], what: str, total: int | None = None) -> str:
@@ -241,14 +250,15 @@ def _prepare_all(
             )
         else:
             found[source.name] = entry
-    report(len(found), len(sources))
+    known = len(found)
+    report(known, len(sources), found=known)
     for name, entry in job.execute(_prepare_one, pending):
         found[name] = entry
         if "reason" in entry:
             job.log("mesh refused", name=name, reason=entry["reason"])
         else:
             job.log("mesh prepared", name=name, candidates=entry["candidates"])
-        report(len(found), len(sources))
+        report(len(found), len(sources), found=known)
     entries = [found[source.name] for source in sources]
     return replace(
         manifest,
@@ -274,17 +284,38 @@ def _known_entry(source: MeshSource, out: Path, manifest: Manifest) -> dict[str,
     return None
 
 
+@one_thread
 def _prepare_one(task: _PrepareTask) -> tuple[str, dict[str, Any]]:
     """Prepare one object; return its name and its entry in the manifest."""
-    out, source = Path(task.out), task.source
+    out, source, config = Path(task.out), task.source, parse_config(task.config)
+    digest = source_sha256(source)
     with disk_full_named(out):
+        entry = _entry_there(source, digest, out, config)
+        if entry is not None:  # its process, or the client, died before the manifest was written
+            return source.name, entry
         if not task.expendable:
             return source.name, _prepared_entry(task)
-        config_hash, digest = parse_config(task.config).simulation_hash(), source_sha256(source)
-        identity = {"name": source.name, "mesh_sha256": digest, "config_hash": config_hash}
+        identity = {
+            "name": source.name,
+            "mesh_sha256": digest,
+            "config_hash": config.simulation_hash(),
+        }
         path = model_path(out, source.name).with_suffix(".journal")
         with open_journal(path, identity) as journal:
             return source.name, _prepared_or_guilty(task, journal)
+
+
+def _entry_there(
+    source: MeshSource, digest: str, out: Path, config: Config
+) -> dict[str, Any] | None:
+    """Return the entry of an object whose files are there and whole, or None."""
+    try:
+        prepared = load_prepared(out, source.name, config)
+    except DrakegraspError:
+        return None
+    model = prepared.model
+    same = (model.class_name, model.mesh_sha256) == (source.class_name, digest)
+    return prepared.summary() if same else None
 
 
 def _prepared_or_guilty(task: _PrepareTask, journal: Journal) -> dict[str, Any]:
@@ -322,6 +353,13 @@ def _run_all(manifest: Manifest, job: _Job, report: Report) -> _Tally:
     """Run the work units that are not done; return what is done then."""
     tally = _Tally(manifest, job.crew, report)
     config, expendable = manifest.config.to_dict(), job.crew is not None
+    if job.crew is not None:
+
+        def change(joined: set[str], left: set[str]) -> None:
+            _log_change(job, joined, left)
+            tally.show()
+
+        job.crew.on_change = change
 
     def units() -> Iterator[WorkUnit]:
         for header in manifest.headers():
@@ -351,7 +389,7 @@ def _is_done(header: ShardHeader, tally: _Tally, job: _Job) -> bool:
     # Its process may have died between the shard and the end of the journal.
     header.journal_path(job.out).unlink(missing_ok=True)
     tally.reused += 1
-    tally.add(header, outcomes)
+    tally.add(header, outcomes, found=True)
     return True
 
 
@@ -384,6 +422,7 @@ class _Tally:
         standoffs = len(manifest.config.candidates.standoffs)
         self._total = standoffs * sum(entry["candidates"] for entry in manifest.objects)
         self._outcomes: Counter[Outcome] = Counter()
+        self._found = 0
         self._grasps: Counter[str] = Counter()
         self._gap: Counter[str] = Counter()
         self._beyond: dict[str, dict[int, int]] = {}
@@ -394,18 +433,25 @@ class _Tally:
         if len(self.named) < NAMED:
             self.named.append(name)
 
-    def add(self, header: ShardHeader, outcomes: dict[Outcome, int]) -> None:
-        """Count a unit that is done."""
+    def add(
+        self, header: ShardHeader, outcomes: dict[Outcome, int], *, found: bool = False
+    ) -> None:
+        """Count a unit that is done, now or before."""
         self._outcomes.update(outcomes)
+        self._found += found * sum(outcomes.values())
         if self._wanted is not None:
             self._close_gap(header, outcomes.get(Outcome.SUCCESS, 0))
+        self.show()
+
+    def show(self) -> None:
+        """Report what is done, and by how many workers."""
         figures = {"grasps": self._outcomes[Outcome.SUCCESS]}
         for outcome in (Outcome.CRASHED, Outcome.TIMEOUT):
             if self._outcomes[outcome]:
                 figures[outcome.label] = self._outcomes[outcome]
         if self._crew is not None:
             figures["workers"] = self._crew.size
-        self._report(self._outcomes.total(), self._total, **figures)
+        self._report(self._outcomes.total(), self._total, found=self._found, **figures)
 
     def wants(self, header: ShardHeader) -> bool:
         """Return whether a unit's object lacks grasps in the units before the first gap."""

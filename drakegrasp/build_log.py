@@ -1,13 +1,14 @@
 """`log.jsonl`: what happened in a build and when, a line of JSON per event.
 
-In: events. Out: lines at the end of the file, for people and their tools; no part of the
-program reads it, and it is the one file of a dataset that has the clock in it.
+In: events. Out: lines at the end of the file, for people, their tools, and the plan of the
+rest; no data come from it, and it is the one file of a dataset that has the clock in it.
 """
 
 from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -38,3 +39,22 @@ class BuildLog:
             os.write(descriptor, line.encode())
         finally:
             os.close(descriptor)
+
+
+def read_log(out: Path) -> Iterator[dict[str, Any]]:
+    """Yield the events of a directory's builds, oldest first; none if there is no log.
+
+    A line that is cut off, by a full disk, is passed over.
+    """
+    try:
+        file = (out / FILE_NAME).open(encoding="utf-8")
+    except OSError:
+        return
+    with file:
+        for line in file:
+            try:
+                event = json.loads(line)
+            except ValueError:
+                continue
+            if isinstance(event, dict):
+                yield event

@@ -38,7 +38,8 @@ set_option = click.option(
 times_option = click.option(
     "--times",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="What pipelines/measure_stages.py printed, to plan by.  [measured on other meshes]",
+    help="What pipelines/measure_stages.py printed, to plan by.  [OUT/log.jsonl, or "
+    "measured on other meshes]",
 )
 
 _OPTIONS = (

@@ -11,7 +11,7 @@ import math
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +35,7 @@ from drakegrasp.errors import ConfigError, DrakegraspError, GraspError, HandErro
 if TYPE_CHECKING:
     from drakegrasp.build import BuildReport
     from drakegrasp.build_options import BuildRequest
+    from drakegrasp.verification import Verification
 
 #: Errors of what was asked for, as against errors of what was done.
 WRONG_USAGE = (ConfigError, GraspError, HandError, MeshError)
@@ -71,10 +72,16 @@ def one_line_errors(ctx: click.Context, *, builds: bool = False) -> Iterator[Non
     except DrakegraspError as error:
         click.echo(f"error: {' '.join(str(error).split())}", err=True)
         ctx.exit(2 if isinstance(error, WRONG_USAGE) else 1)
+    except click.UsageError as error:
+        if isinstance(error, click.exceptions.NoArgsIsHelpError):
+            raise
+        click.echo(f"error: {' '.join(error.format_message().split())}", err=True)
+        ctx.exit(2)
     except (OSError, RuntimeError) as error:
         if isinstance(error, click.exceptions.Exit | click.Abort):
             raise
-        click.echo(f"error: {str(error).strip().splitlines()[0]}", err=True)
+        text = str(error).strip() or type(error).__name__
+        click.echo(f"error: {text.splitlines()[0]}", err=True)
         ctx.exit(1)
     except KeyboardInterrupt as stop:
         goes_on = builds or ctx.invoked_subcommand == "build"
@@ -258,7 +265,10 @@ def check(path: Path) -> None:
 @main.command()
 @out_argument
 def stats(out: Path) -> None:
-    """Print the funnel by object and the paper's Table III."""
+    """Print the funnel by object and the paper's Table III.
+
+    Of a build that still runs, or was stopped: what is done so far.
+    """
     _print_stats(out)
 
 
@@ -299,7 +309,7 @@ def replay(out: Path, trial: int, html: Path | None) -> None:
     metavar="MESH",
     help="The object: a .obj, .stl, .ply or .glb file.",
 )
-@units_option
+@click.option("--units", help="Unit of length of the mesh: m, cm or mm.  [m]")
 @click.option(
     "--dataset",
     type=click.Path(path_type=Path),
@@ -374,27 +384,45 @@ def verify(
     """
     from drakegrasp.cluster import run_verification
     from drakegrasp.tables import verdict_table
-    from drakegrasp.verification_files import refuse_unwritable, save_results, write_json_lines
+    from drakegrasp.verification_files import (
+        json_lines,
+        part_path,
+        result_paths,
+        write_json_line,
+        write_results,
+    )
     from drakegrasp.verify_request import VerifyRequest, plan_request
     from drakegrasp.verifying import refuse_off_surface
 
-    if out is not None:
-        refuse_unwritable(out)
-    tasks, config = plan_request(VerifyRequest(**options))
-    results = run_verification(
-        tasks,
-        workers=workers,
-        scheduler=scheduler,
-        scheduler_file=scheduler_file,
-        show=not quiet,
-    )
-    if len(results) == 1:
-        refuse_off_surface(results[0])
-    if out is None:
-        write_json_lines(results, sys.stdout)
-    else:
-        for path in save_results(results, out, config):
-            click.echo(str(path))
+    tasks = plan_request(VerifyRequest(**options, out=out))
+    single = sum(len(task.indices) for task in tasks) == 1
+
+    def print_line(index: int, result: Verification) -> None:
+        write_json_line(index, result, sys.stdout)
+
+    def deliver(index: int, result: Verification) -> None:
+        if single:
+            refuse_off_surface(result)
+        write(index, result)
+
+    try:
+        with nullcontext(print_line) if out is None else json_lines(out) as write:
+            results = run_verification(
+                tasks,
+                workers=workers,
+                scheduler=scheduler,
+                scheduler_file=scheduler_file,
+                deliver=deliver,
+                show=not quiet,
+            )
+            if out is not None:
+                write_results(results, result_paths(out)[1], results[0].config)
+    except BaseException:
+        if out is not None and part_path(out).exists():
+            click.echo(f"{part_path(out)}: the verdicts so far", err=True)
+        raise
+    for path in () if out is None else result_paths(out):
+        click.echo(str(path))
     if not quiet:
         _console(stderr=True).print(verdict_table([result.outcome for result in results]))
 
@@ -465,24 +493,29 @@ def _print(table: Table) -> None:
 
 
 def _print_stats(out: Path) -> None:
-    from drakegrasp.stats import count_funnel, count_splits
-    from drakegrasp.tables import funnel_table, split_table
+    from drakegrasp.stats import count_funnel, count_splits, count_unfinished
+    from drakegrasp.tables import funnel_table, split_table, unfinished_line
 
-    console, funnel = _console(), count_funnel(out)
+    console, unfinished = _console(), count_unfinished(out)
+    funnel = count_funnel(out) if unfinished is None else unfinished.funnel
     table = funnel_table(funnel)
     # Numbers are never cut: where the columns do not fit, fewer say the same.
     natural = Measurement.get(console, console.options.update(max_width=WIDTH), table).maximum
     if natural > console.width:
         table = funnel_table(funnel, compact=True)
     console.print(table)
-    console.print(split_table(count_splits(out)))
+    if unfinished is None:
+        console.print(split_table(count_splits(out)))
+    else:
+        click.echo(f"{out}: {unfinished_line(unfinished)}")
 
 
 def print_plan(request: BuildRequest, workers: int | None, times: Path | None) -> None:
     """Print what a build that was asked for is expected to take."""
-    from drakegrasp.plan import plan_lines, plan_request, read_times
+    from drakegrasp.plan import logged_times, plan_lines, plan_request, read_times
 
-    measured = None if times is None else read_times(times)
+    logged = logged_times(request.out, request.config)
+    measured = logged if times is None else read_times(times)
     click.echo("\n".join(plan_lines(plan_request(request, workers, measured))))
 
 

@@ -6,16 +6,18 @@ comes back. A few tasks per worker are in flight at a time, whatever their numbe
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 import os
+import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import dask
 import numpy.typing as npt
-from distributed import Client, LocalCluster
+from distributed import Client, LocalCluster, SpecCluster
 from distributed.security import Security
 
 from drakegrasp.build import BuildReport, build
@@ -33,7 +35,7 @@ from drakegrasp.meshes import MeshSource, find_meshes
 from drakegrasp.progress import progress_bar
 from drakegrasp.verification import Verification
 from drakegrasp.verify_plan import TASK_GRASPS, Mesh, VerifyTask, plan_verification, split_task
-from drakegrasp.verifying import verify_tasks
+from drakegrasp.verifying import Deliver, verify_tasks
 from drakegrasp.workers import SATURATION, WORKER_ENVIRONMENT, admitted_workers
 
 #: How long to wait for a scheduler to answer [s].
@@ -51,6 +53,8 @@ DASK_SETTINGS: dict[str, Any] = {
     "distributed.deploy.lost-worker-timeout": "60 s",
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
+    # A paused worker has no task whose end would free memory: it would wait for ever.
+    "distributed.worker.memory.pause": False,
 }
 
 
@@ -95,6 +99,8 @@ def build_dataset(
     sources = find_sources(objects, units, manifest)
     # Locked first: a second build is refused before it starts any worker.
     with build_lock(out), connect(workers, scheduler, scheduler_file) as client:
+        if show and _has_dashboard():
+            sys.stderr.write(f"{dashboard_line(client)}\n")
         return build_on(client, sources, out, config, show=show)
 
 
@@ -141,6 +147,17 @@ def build_on(
         return build(sources, out, config, execute, crew=execute.crew, show=show)
 
 
+def dashboard_line(client: Client) -> str:
+    """Return where the dashboard of a client's cluster is, or what it takes to have one."""
+    if not _has_dashboard():
+        return "dashboard: none; pip install 'drakegrasp[dashboard]'"
+    return f"dashboard: {client.dashboard_link}"
+
+
+def _has_dashboard() -> bool:
+    return importlib.util.find_spec("bokeh") is not None
+
+
 def verify_grasps(
     grasps: npt.ArrayLike,
     mesh: Mesh | None = None,
@@ -148,7 +165,7 @@ def verify_grasps(
     frame: str | None = None,
     X: npt.ArrayLike | None = None,
     X_TO: npt.ArrayLike | None = None,
-    units: str = "m",
+    units: str | None = None,
     hand: str | Path | None = None,
     method: str = "hand",
     config: Config | None = None,
@@ -168,10 +185,11 @@ def verify_grasps(
         frame: What the grasps are expressed in, as there.
         X: With frame "camera": X_TC (4, 4), or one per grasp (n, 4, 4).
         X_TO: Pose of the object on the table (4, 4); dropped as in a build if None.
-        units: Unit of the mesh's lengths: m, cm or mm.
+        units: Unit of the mesh's lengths: m, cm or mm; metres if None.
         hand: Name or YAML file of the hand; the configuration's if None.
         method: "hand" or "forces".
-        config: Physics, lift and limits; the preset `paper`, or the dataset's, if None.
+        config: Physics, lift and limits; if None that of the dataset or of the placed object,
+            else the preset `paper`.
         dataset: In place of a mesh: a data file of a dataset.
         rows: The rows of its split that the grasps are for; all of them, in order, if None.
         client: A Dask client whose workers share the work; a plain loop here if None.
@@ -204,6 +222,7 @@ def run_verification(
     workers: int | None = None,
     scheduler: str | None = None,
     scheduler_file: str | Path | None = None,
+    deliver: Deliver,
     show: bool = True,
 ) -> list[Verification]:
     """Return the verdicts of tasks in the order of their grasps; what `drakegrasp verify` does.
@@ -216,6 +235,7 @@ def run_verification(
         workers: Processes on this machine; one per core if None.
         scheduler: Address of a running Dask scheduler to use instead.
         scheduler_file: Its JSON file, instead of the address.
+        deliver: Is given each verdict, in that order, as soon as those before it are there.
         show: Whether to show progress on standard error.
 
     Raises:
@@ -225,25 +245,32 @@ def run_verification(
     _refuse_workers(workers, scheduler, scheduler_file)
     few = sum(len(task.indices) for task in tasks) <= TASK_GRASPS
     if not (scheduler or scheduler_file) and (few or (workers or _cores()) == 1):
-        return _verify(tasks, None, show)
+        return _verify(tasks, None, show, deliver)
     with connect(workers, scheduler, scheduler_file) as client:
-        return _verify(tasks, client, show)
+        return _verify(tasks, client, show, deliver)
 
 
-def _verify(tasks: Sequence[VerifyTask], client: Client | None, show: bool) -> list[Verification]:
+def _verify(
+    tasks: Sequence[VerifyTask],
+    client: Client | None,
+    show: bool,
+    deliver: Deliver = lambda index, result: None,
+) -> list[Verification]:
     if client is None:
         # Here it costs nothing to report every grasp.
         parts = [part for task in tasks for part in split_task(task, 1)]
-        return _verify_with(run_here, parts, show)
+        return _verify_with(run_here, parts, show, deliver)
     if not tasks:
         return []
     with admitted_workers(client, parse_config(tasks[0].config)):
-        return _verify_with(DaskExecutor(client), tasks, show)
+        return _verify_with(DaskExecutor(client), tasks, show, deliver)
 
 
-def _verify_with(execute: Executor, tasks: Sequence[VerifyTask], show: bool) -> list[Verification]:
+def _verify_with(
+    execute: Executor, tasks: Sequence[VerifyTask], show: bool, deliver: Deliver
+) -> list[Verification]:
     with progress_bar("verify", "grasps", show=show) as report:
-        return verify_tasks(tasks, execute, report)
+        return verify_tasks(tasks, execute, report, deliver)
 
 
 @contextmanager
@@ -281,19 +308,27 @@ def connect(
             with client:
                 yield client
         else:
-            count = workers or _cores()
-            with (
-                LocalCluster(
-                    n_workers=count,
-                    threads_per_worker=1,
-                    dashboard_address="127.0.0.1:0",
-                    silence_logs=logging.CRITICAL,
-                    security=security,
-                    memory_limit=memory or "auto",
-                ) as cluster,
-                Client(cluster) as client,
-            ):
+            cluster = LocalCluster(
+                n_workers=workers or _cores(),
+                threads_per_worker=1,
+                dashboard_address="127.0.0.1:0",
+                silence_logs=logging.CRITICAL,
+                security=security,
+                memory_limit=memory or "auto",
+            )
+            with closing_cluster(cluster), Client(cluster) as client:
                 yield client
+
+
+@contextmanager
+def closing_cluster(cluster: SpecCluster) -> Iterator[None]:
+    """Close a cluster when the block ends; a worker that takes its time changes nothing."""
+    try:
+        yield
+    finally:
+        # On a busy machine one may not end within Dask's limit: it ends with this process.
+        with suppress(TimeoutError):
+            cluster.close()
 
 
 def _cores() -> int:

@@ -9,7 +9,6 @@ in their script, and a running scheduler's workers are set up when they are admi
 
 from __future__ import annotations
 
-import importlib.util
 import ipaddress
 import logging
 import math
@@ -30,7 +29,7 @@ from distributed import Client, SpecCluster, SSHCluster, Status
 from distributed.security import Security
 from tornado.ioloop import PeriodicCallback
 
-from drakegrasp.cluster import DASK_SETTINGS, connect
+from drakegrasp.cluster import DASK_SETTINGS, closing_cluster, connect
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.workers import WORKER_ENVIRONMENT
 
@@ -175,7 +174,7 @@ def _running(make: Callable[[], SpecCluster]) -> Iterator[Client]:
     except Exception as error:
         reason = str(error) or type(error).__name__
         raise MachineError(f"the workers must start, got: {reason}") from None
-    with cluster, Client(cluster) as client:
+    with closing_cluster(cluster), Client(cluster) as client:
         yield client
 
 
@@ -394,9 +393,14 @@ def _from_files(files: tuple[Path, Path, Path]) -> Security:
 
 @contextmanager
 def _private_directory(out: Path) -> Iterator[Path]:
-    """Yield a directory in `out` that only this user can enter, and remove it again."""
+    """Yield a directory in `out` that only this user can enter, and remove it again.
+
+    Those of clients that were killed go as well: whoever calls holds the lock of `out`.
+    """
     try:
         out.mkdir(parents=True, exist_ok=True)
+        for dead in out.glob(".tls-*"):
+            shutil.rmtree(dead, ignore_errors=True)
         folder = Path(tempfile.mkdtemp(prefix=".tls-", dir=out))  # mode 0700
     except OSError as error:
         raise MachineError(f"{out}: must be a directory that can be written: {error}") from None
@@ -540,10 +544,3 @@ def _bytes(text: str) -> int:
         return int(parse_bytes(text))
     except ValueError:
         raise ConfigError(f"memory must be a size such as 2GB, got {text!r}") from None
-
-
-def dashboard_line(client: Client) -> str:
-    """Return where the dashboard of a client's cluster is, or what it takes to have one."""
-    if importlib.util.find_spec("bokeh") is None:
-        return "dashboard: none; pip install 'drakegrasp[dashboard]'"
-    return f"dashboard: {client.dashboard_link}"

@@ -179,7 +179,8 @@ class VerifyConfig(_Section):
     max_normal_error_deg: Positive = 45.0  # between a pad's normal and the predicted one
     max_contact_error: Positive = 0.01  # [m], of a contact after closing from its point
     open_margin_deg: Positive = 20.0  # by which fingers are opened before they close
-    max_tries: Count = 5  # wrist poses that are simulated before the grasp has failed
+    # Wrist poses that are simulated before the grasp has failed.
+    max_tries: Annotated[int, Field(ge=1, le=5)] = 5
     max_position_error: Positive = 0.01  # [m], of an object lifted by forces alone
     max_angle_error_deg: Positive = 5.0  # of an object lifted by forces alone
 

@@ -8,7 +8,9 @@ Clarabel within Drake. A wrench that cannot be given is a value, never an except
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +23,14 @@ from drakegrasp.wrenches import contact_axes, grasp_map
 MAX_ERROR = 1e-7
 #: Friction coefficients above this are not looked for, and to what the smallest is found.
 MAX_FRICTION, FRICTION_TOLERANCE = 10.0, 1e-4
+
+
+def _is_for_people(record: logging.LogRecord) -> bool:
+    # Drake announces on standard error what its solver's result says anyway.
+    return not record.getMessage().startswith("Clarabel returns")
+
+
+logging.getLogger("drake").addFilter(_is_for_people)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,7 +49,7 @@ class ContactForces:
 
 
 class ForceProgram:
-    """The programmes of one grasp: built once, solved for many wrenches.
+    """The programmes of one grasp: each is built when first needed, solved for many wrenches.
 
     Unknown are the components of each force in the axes of its contact, tangential ones as
     shares of the friction coefficient, so that every cone is |tangential| <= normal. Forces
@@ -54,7 +64,7 @@ class ForceProgram:
         p_OOcm: npt.ArrayLike,
         friction: float,
     ) -> None:
-        """Build the programmes.
+        """Take in the grasp.
 
         Args:
             p_OQ: (k, 3), contact points in {O} [m].
@@ -71,8 +81,6 @@ class ForceProgram:
         A = np.einsum("wki,kij->wkj", blocks, self._axes).reshape(6, -1) / self._units[:, None]
         # Contacts that are not finite hold nothing, and neither does a map of zeros.
         self._map = A if np.isfinite(A).all() else np.zeros_like(A)
-        self._smallest, self._wrench = self._build_smallest()
-        self._closest, self._wish = self._build_closest()
 
     def smallest(self, wrench_O: npt.ArrayLike) -> ContactForces:
         """Return the forces that give a wrench with the smallest largest normal force.
@@ -86,8 +94,9 @@ class ForceProgram:
             return self._forces(np.zeros(3 * self._k), target)
         if not np.isfinite(load):
             return self._forces(None, target)
-        self._wrench.UpdateCoefficients(_widen(self._map, 1), target / load)
-        found = self._solve(self._smallest)
+        program, wrench = self._smallest
+        wrench.UpdateCoefficients(_widen(self._map, 1), target / load)
+        found = self._solve(program)
         forces = self._forces(None if found is None else load * found, target)
         return forces if forces.feasible else self._forces(None, target)
 
@@ -103,11 +112,13 @@ class ForceProgram:
         target = np.asarray(wrench_O, dtype=float) / self._units
         if not np.isfinite(target).all():
             return self._forces(None, target)
-        self._wish.UpdateCoefficients(_widen(self._map, 6), target / force_limit)
-        found = self._solve(self._closest)
+        program, wish = self._closest
+        wish.UpdateCoefficients(_widen(self._map, 6), target / force_limit)
+        found = self._solve(program)
         return self._forces(None if found is None else force_limit * found, target)
 
-    def _build_smallest(self) -> tuple[MathematicalProgram, LinearEqualityConstraint]:
+    @cached_property
+    def _smallest(self) -> tuple[MathematicalProgram, LinearEqualityConstraint]:
         """Minimise t with map @ x = wrench, x in the cones and every normal force <= t."""
         program, x = self._in_cones()
         t = program.NewContinuousVariables(1, "t")
@@ -121,7 +132,8 @@ class ForceProgram:
         program.AddLinearCost(t[0])
         return program, equality.evaluator()
 
-    def _build_closest(self) -> tuple[MathematicalProgram, LinearEqualityConstraint]:
+    @cached_property
+    def _closest(self) -> tuple[MathematicalProgram, LinearEqualityConstraint]:
         """Minimise |r|^2 with map @ x + r = wrench, x in the cones and normal forces <= 1."""
         program, x = self._in_cones()
         r = program.NewContinuousVariables(6, "r")

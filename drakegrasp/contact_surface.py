@@ -11,6 +11,9 @@ from drakegrasp.object_model import ObjectModel
 
 #: Least cosine between a normal that points out of a face and the face's own: 84 degrees.
 OUTWARD = 0.1
+#: How much farther than the nearest face another may be to count as well [m]: a prediction is
+#: as often on the wrong side of a cup's wall as it is beside it.
+WALL = 0.005
 
 
 def face_distances(model: ObjectModel, p_OQ: Array) -> Array:
@@ -22,19 +25,17 @@ def face_distances(model: ObjectModel, p_OQ: Array) -> Array:
     return np.asarray(np.linalg.norm(near - points, axis=1).reshape(k, m))
 
 
-def points_outward(
-    model: ObjectModel, distance: Array, nhat_Q_O: Array, within: float
-) -> npt.NDArray[np.bool_]:
-    """Return for each of k normals whether it points out of a face near its point.
+def points_outward(model: ObjectModel, distance: Array, nhat_Q_O: Array) -> npt.NDArray[np.bool_]:
+    """Return for each of k normals whether it points out of a face next to its point.
 
     A predicted point may be beside an edge or on the wrong side of a thin wall, so every
-    face near it is asked.
+    face that is not `WALL` farther than the nearest one is asked.
 
     Args:
         model: The object.
         distance: (k, m), of the points from the faces, see `face_distances` [m].
         nhat_Q_O: (k, 3), normals in {O}.
-        within: What near is [m].
     """
     outward = nhat_Q_O @ model.collision.face_normals.T > OUTWARD
-    return np.asarray(np.any(outward & (distance <= within), axis=1))
+    near = distance <= distance.min(axis=1, keepdims=True) + WALL
+    return np.asarray(np.any(outward & near, axis=1))

@@ -5,12 +5,16 @@ flight, whatever their number, and nothing is kept of those that are done. A tas
 worker died is given to another: that it comes to an end is the task's own business (see
 `drakegrasp.journal`), so the number of deaths is bounded generously. One that got an image
 of nothing is tried again, too, as it may be one worker's OpenGL.
+
+Without any worker the work waits where others may come: from SLURM's queue, or to a
+scheduler that somebody runs. Those that this process started itself do not come back.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -20,6 +24,7 @@ from typing import Any, Generic, TypeVar, cast
 
 from distributed import Client, Future, KilledWorker, LocalCluster
 from distributed.core import Status
+from distributed.deploy import Cluster
 
 from drakegrasp.errors import BlankImageError, MachineError
 from drakegrasp.executor import Crew
@@ -33,8 +38,12 @@ IN_FLIGHT = 2
 DEEPEST = 64
 #: How often the workers are counted [s].
 COUNT_SECONDS = 2.0
-#: How long there may be no worker at all after there were some [s].
+#: How long a result may take from a worker to here, until the workers are counted again [s].
+GATHER_SECONDS = 30.0
+#: How long there may be no worker at all where none come by themselves [s].
 LOST_SECONDS = 300.0
+#: How long until it is said that there is none [s]; shorter gaps are those of restarts.
+SAY_SECONDS = 60.0
 #: How often a task is given out again after Dask gave it up (after four deaths each time).
 RESUBMISSIONS = 100
 #: How often a task may get an image of nothing.
@@ -74,6 +83,7 @@ class DaskExecutor:
         self._workers: set[str] = set()
         self._counted = -float("inf")
         self._lost: float | None = None
+        self._said = False
         self._depth = IN_FLIGHT
         self.crew = Crew()
 
@@ -118,30 +128,39 @@ class DaskExecutor:
         Where the worker died with the result, the scheduler has the task done again.
         """
         futures = [cast(Future, flight.future) for flight in landed]
-        if len(futures) > 1 and all(future.status == "finished" for future in futures):
-            with suppress(Exception):  # what it is comes out one by one
-                yield from self._client.sync(
-                    partial(self._client.gather, asynchronous=True),
-                    futures,
-                    callback_timeout=COUNT_SECONDS,
-                )
-                return
+        found = self._gathered(futures)
+        if found is not None:
+            yield from found
+            return
         for future in futures:
             try:
                 yield self._result(future)
             except (KilledWorker, BlankImageError) as error:
                 yield _Failure(error)
 
+    def _gathered(self, futures: Sequence[Future]) -> list[Any] | None:
+        """Return the results of a crowd of tasks at once, or None if one of them has none."""
+        if len(futures) < 2 or not all(future.status == "finished" for future in futures):
+            return None
+        with suppress(Exception):  # what it is comes out one by one
+            found: list[Any] = self._client.sync(
+                partial(self._client.gather, asynchronous=True),
+                futures,
+                callback_timeout=GATHER_SECONDS,
+            )
+            return found
+        return None
+
     def _result(self, future: Future) -> Any:
         """Return the result of a task that is done, or raise what it raised."""
         while not future.cancelled():
             try:
-                return future.result(timeout=COUNT_SECONDS)
-            except TimeoutError:
+                return future.result(timeout=GATHER_SECONDS)
+            except (CancelledError, TimeoutError):
                 if future.status == "error":
                     raise
                 self._count()
-        raise MachineError(f"the scheduler must stay, got none any more; {_GOES_ON}")
+        raise _scheduler_lost("none any more")
 
     def _refuse_more(self, flight: _Flight[Any], error: Exception) -> None:
         """Refuse to give a task out again for ever.
@@ -191,24 +210,46 @@ class DaskExecutor:
         try:
             found = set(self._client.nthreads())
         except (OSError, RuntimeError, TimeoutError) as error:
-            raise MachineError(f"the scheduler must stay, got: {error}; {_GOES_ON}") from None
+            raise _scheduler_lost(str(error)) from None
         joined, left = found - self._workers, self._workers - found
         if joined or left:
             self._workers, self.crew.size = found, len(found)
             self.crew.on_change(joined, left)
         if isinstance(self._client.cluster, LocalCluster):
             self._client.cluster.loop.add_callback(_reopen, self._client.cluster)
-        if found or not (self._lost or left):
+        self._wait(now)
+
+    def _wait(self, now: float) -> None:
+        """Say that there is no worker, if there is none for long.
+
+        Raises:
+            MachineError: If none will come either.
+        """
+        if self._workers:
             self._lost = None
             return
-        self._lost = self._lost or now
-        if now - self._lost > LOST_SECONDS:
+        if self._lost is None:
+            self._lost, self._said = now, False
+        missed = now - self._lost
+        if missed > LOST_SECONDS and not _may_come(self._client.cluster):
             raise MachineError(
                 f"there must be a worker, got none for {LOST_SECONDS:g} s; {_GOES_ON}"
             )
+        if missed > SAY_SECONDS and not self._said:
+            self._said = True
+            self.crew.on_none()
 
     def _room(self) -> int:
         return self._depth * max(1, len(self._workers))
+
+
+def _scheduler_lost(got: str) -> MachineError:
+    return MachineError(f"the scheduler must stay, got: {got}; {_GOES_ON}")
+
+
+def _may_come(cluster: Cluster | None) -> bool:
+    """Return whether workers may come by themselves: to a scheduler of others, or from a queue."""
+    return cluster is None or hasattr(cluster, "job_script")
 
 
 def _reopen(cluster: LocalCluster) -> None:

@@ -27,10 +27,12 @@ class Crew:
     Attributes:
         size: Their number now.
         on_change: Called with the addresses of those that joined and of those that left.
+        on_none: Called once when there is none for long, and the work waits for one.
     """
 
     size: int = 0
     on_change: Callable[[set[str], set[str]], None] = lambda joined, lost: None
+    on_none: Callable[[], None] = lambda: None
 
 
 def run_here(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:

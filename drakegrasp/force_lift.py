@@ -11,6 +11,7 @@ cannot give the object does not get, and it strays.
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -46,6 +47,7 @@ class LiftEnd(StrEnum):
     OVER_LIMIT = "over_limit"  # they exist, but are larger than a fingertip's
     STRAYED = "strayed"  # simulated, and the object left its path or was elsewhere in the end
     ERROR = "error"  # Drake or the solver failed; says nothing about the grasp
+    TIMEOUT = "timeout"  # the attempt's wall-clock limit passed; neither does this
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -121,8 +123,10 @@ def lift_by_forces(
     fingers = _Fingers(scene, np.asarray(p_OQ, dtype=float), program, force_limit)
     try:
         return _simulate(fingers, force, path, config)
-    # A failed assertion within Drake arrives as SystemExit, everything else as RuntimeError.
-    except (RuntimeError, SystemExit, _StateError) as error:
+    except (MemoryError, OSError):
+        raise  # the machine's, not the grasp's
+    # A failed assertion within Drake arrives as SystemExit.
+    except (Exception, SystemExit) as error:
         lines = str(error).strip().splitlines() or [type(error).__name__]
         return ForceLift(end=LiftEnd.ERROR, planned_force=force, message=lines[0])
     finally:
@@ -174,7 +178,10 @@ def _simulate(fingers: _Fingers, planned: float, path: LiftPath, config: Config)
     scene.simulator.Initialize()
     largest, done = 0.0, 0
     deviation = (0.0, 0.0)
+    end = time.monotonic() + config.attempt_seconds
     while done < steps and _within(deviation, config, LOST):
+        if time.monotonic() > end:
+            return ForceLift(end=LiftEnd.TIMEOUT, planned_force=planned)
         wrench_O = _wanted_wrench(scene, path, FREQUENCY_TIMES_PERIOD / period)
         largest = max(largest, fingers.push(wrench_O))
         advance(scene, period)

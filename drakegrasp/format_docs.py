@@ -39,10 +39,12 @@ OUT/
   trials.hdf5              a row per attempt, whatever its outcome
   grasping_oto.hdf5        samples, camera rolled with the palm
   grasping_otm.hdf5        the same samples, image up is world up
+  log.jsonl                what happened while it was built, and when: a line of JSON per event
+  build.lock               while a build runs: by which process
 ```
 
-Only the last three are needed to train. With `objects/` and `manifest.json`, every trial can be
-replayed.
+Only the data files, `grasping_*.hdf5`, are needed to train. With `objects/` and `manifest.json`,
+every trial can be replayed.
 """
 
 _CONTRACT = """## What makes two files equal
@@ -51,10 +53,11 @@ The same command gives the same arrays, whatever the number of workers, in which
 and how often the build was interrupted: nothing in these files depends on the clock or the
 machine's name. `time_close` and `time_lift` are simulated seconds. This holds on one machine with
 one set of library versions (`manifest.json` names them); another CPU or another version of Drake
-may round differently. The one exception is the outcome `timeout`: an attempt that takes longer
-than `attempt_seconds` (60 s, where a usual one takes about one) says more about the machine than
-about the grasp, and may end otherwise elsewhere. `screened` is an attempt that geometry has
-decided: it was not simulated, and would have been a `missing_fingertip`, see `performance.md`.
+may round differently. The exceptions are the outcomes `timeout` and `crashed`: an attempt that
+takes longer than `attempt_seconds` (60 s, where a usual one takes about one), or ends its process
+again and again, says more about the machine than about the grasp, and may end otherwise elsewhere.
+`screened` is an attempt that geometry has decided: it was not simulated, and would have been a
+`missing_fingertip`, see `performance.md`.
 
 Shards and the files in `objects/` are sealed: a changed bit in one of them is found when it is
 used, and by `drakegrasp check`. The three main files have no seal: `check` finds what breaks an

@@ -206,7 +206,7 @@ def _read_history(path: Path, identity: Mapping[str, Any]) -> _History | None:
     """Return what earlier runs died of, or None if one of them is still alive."""
     history = _History()
     try:
-        with path.open("rb") as file:
+        with path.open("r+b") as file:  # NFS locks only what may be written
             if not _lock(file):
                 return None
             head, _, rest = file.read().partition(b"\n")

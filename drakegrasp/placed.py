@@ -8,7 +8,7 @@ computed at one pose, `rest_pose`, so a verdict cannot depend on it.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -17,12 +17,13 @@ import numpy.typing as npt
 import trimesh
 
 from drakegrasp.config import Config, load_config
-from drakegrasp.errors import GraspError, MeshError
+from drakegrasp.errors import ConfigError, GraspError, MeshError
 from drakegrasp.frames import Array, make_pose, transform_points
 from drakegrasp.meshes import UNITS, clean_triangles, find_mesh
 from drakegrasp.object_model import ObjectModel, make_object, prepare_object
 from drakegrasp.prediction import read_pose
 from drakegrasp.resting import settle
+from drakegrasp.threads import one_thread
 
 #: A given pose may leave this much between the object's lowest point and the table [m].
 MAX_GAP = 0.005
@@ -48,16 +49,19 @@ class PlacedObject:
     Attributes:
         model: Meshes and mass properties.
         X_TO: Pose in the table-top frame, (4, 4).
+        config: With which it was prepared and dropped; the preset `paper` if None.
     """
 
     model: ObjectModel
     X_TO: Array
+    config: Config = field(default_factory=load_config)
 
 
+@one_thread
 def place_object(
     mesh: str | Path | trimesh.Trimesh | Placed,
     *,
-    units: str = "m",
+    units: str | None = None,
     X_TO: npt.ArrayLike | None = None,
     config: Config | None = None,
 ) -> PlacedObject:
@@ -66,23 +70,32 @@ def place_object(
     Args:
         mesh: Path of a mesh file, a mesh, or an object that was placed before. The origin
             of {O} is the centre of its bounding box, not that of the file.
-        units: Unit of the mesh's lengths: m, cm or mm; an `objects.yaml` beside a file wins.
+        units: Unit of the mesh's lengths: m, cm or mm; metres if None. An `objects.yaml` beside
+            a file wins.
         X_TO: Pose of the object on the table; dropped as in a build if None.
-        config: Mass, friction and how it settles; the preset `paper` if None.
+        config: Mass, friction and how it settles; that of an object that was placed before, else
+            the preset `paper`, if None.
 
     Raises:
         MeshError: If the mesh cannot be simulated or does not come to rest.
         GraspError: If X_TO is no pose or does not stand on the table.
+        ConfigError: If config is none, or an object was placed before with other values.
     """
-    config = config or load_config()
-    if units not in UNITS:
+    if config is None:
+        config = mesh.config if isinstance(mesh, PlacedObject) else load_config()
+    refuse_no_config(config)
+    if units is not None and units not in UNITS:
         raise MeshError(f"units must be one of {', '.join(UNITS)}, got {units!r}")
     if isinstance(mesh, Placed):
+        if units is not None:
+            raise MeshError(f"units must be None for an object that is prepared, got {units!r}")
+        if isinstance(mesh, PlacedObject):
+            refuse_other_objects(config, mesh.config, "as the object was placed with")
         model, known = mesh.model, np.asarray(mesh.X_TO)
     elif isinstance(mesh, trimesh.Trimesh):
-        model, known = _model_of(mesh, units, config), None
+        model, known = _model_of(mesh, units or "m", config), None
     elif isinstance(mesh, str | Path):
-        model, known = _read(Path(mesh), units, config), None
+        model, known = _read(Path(mesh), units or "m", config), None
     else:
         raise MeshError(
             "mesh must be a mesh file, a trimesh.Trimesh or a placed object, "
@@ -90,7 +103,31 @@ def place_object(
         )
     if X_TO is not None:
         known = _standing(model, read_pose(X_TO, "X_TO"))
-    return PlacedObject(model=model, X_TO=settle(model, config).X_TO if known is None else known)
+    X_TO = settle(model, config).X_TO if known is None else known
+    return PlacedObject(model=model, X_TO=X_TO, config=config)
+
+
+def refuse_no_config(config: object) -> None:
+    """Refuse what is not a configuration, such as a preset's name.
+
+    Raises:
+        ConfigError: If so.
+    """
+    if not isinstance(config, Config):
+        raise ConfigError(
+            f"config must be a Config, see load_config, got a {type(config).__name__}"
+        )
+
+
+def refuse_other_objects(config: Config, known: Config, must_be: str) -> None:
+    """Refuse a configuration that an object was not prepared and dropped with.
+
+    Raises:
+        ConfigError: If it differs in that.
+    """
+    for name in ("objects", "settle"):
+        if getattr(config, name) != getattr(known, name):
+            raise ConfigError(f"{name} must be {must_be}, got other values; give the mesh instead")
 
 
 def rest_pose(X_TO: Array) -> Array:

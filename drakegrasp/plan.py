@@ -10,18 +10,21 @@ from __future__ import annotations
 import heapq
 import json
 import os
+from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import h5py
 
 from drakegrasp.assemble import DATA_FILES, TRIALS_FILE
+from drakegrasp.build_log import FILE_NAME, read_log
 from drakegrasp.build_options import BUILTIN, BuildRequest
 from drakegrasp.builtin import BUILTIN_OBJECTS
 from drakegrasp.config import Config
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.meshes import find_meshes
+from drakegrasp.outcomes import Outcome
 
 #: Time that the scheduler and the client spend on a task, one after the other [s]; measured
 #: with distributed 2026.8 on two cores.
@@ -201,6 +204,44 @@ def read_times(path: Path) -> StageTimes:
         raise DataError(
             f"{path}: must be the output of pipelines/measure_stages.py, got other ({error})"
         ) from None
+
+
+def logged_times(out: Path, config: Config) -> StageTimes | None:
+    """Return the times of a build's units so far, by its log, or None if none is done.
+
+    What a log does not tell, as the sizes of files, is as in `MEASURED`; its clock is that of
+    the wall, so whatever else the machines had to do is in it.
+
+    Args:
+        out: Directory of the dataset.
+        config: Whose units count.
+    """
+    seconds: Counter[str] = Counter()
+    by_object: dict[str, Counter[str]] = {}
+    ours = False
+    for event in read_log(out):
+        if event["event"] == "started":
+            ours = event["config_hash"] == config.simulation_hash()
+        # A unit that was found done has no seconds.
+        elif ours and event["event"] == "unit done" and event["seconds"]:
+            found = by_object.setdefault(event["object"], Counter())
+            found.update(attempts=sum(event["outcomes"].values()), seconds=event["seconds"]["try"])
+            seconds.update(event["seconds"])
+            seconds.update(success=event["outcomes"].get(Outcome.SUCCESS.label, 0))
+    attempts = sum(found["attempts"] for found in by_object.values())
+    if not attempts:
+        return None
+    one = seconds["try"] / attempts
+    shares = sorted(found["seconds"] / found["attempts"] / one for found in by_object.values())
+    look = seconds["look"] / seconds["success"] if seconds["success"] else MEASURED.look
+    return replace(
+        MEASURED,
+        attempt=(seconds["try"] + seconds["write"]) / attempts,
+        shares=tuple(shares),
+        look=look,
+        successes=seconds["success"] / attempts,
+        source=f"{attempts:,} attempts of {len(by_object)} objects in {out / FILE_NAME}",
+    )
 
 
 def plan_lines(plan: Plan) -> list[str]:

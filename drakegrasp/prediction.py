@@ -24,6 +24,9 @@ ROTATION_TOLERANCE = 1e-4
 #: Points farther out than so many times the bounding box are of another unit of length.
 UNIT_FACTOR = 3.0
 
+#: What else an array may hold, by NumPy's letter.
+_OTHER_KINDS = {"U": "text", "S": "text", "b": "truth values", "c": "complex numbers"}
+
 
 def read_grasps(grasps: npt.ArrayLike, fingers: int) -> tuple[Array, Array]:
     """Return points (n, k, 3) [m] and unit normals (n, k, 3) of grasp vectors (n, 6k).
@@ -37,12 +40,7 @@ def read_grasps(grasps: npt.ArrayLike, fingers: int) -> tuple[Array, Array]:
             within 5 %.
     """
     size = 6 * fingers
-    try:
-        array = np.asarray(grasps, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise GraspError(
-            f"a grasp must be {size} numbers, got {_not_numbers(grasps, error)}"
-        ) from None
+    array = as_numbers(grasps, f"a grasp must be {size} numbers")
     if array.ndim not in (1, 2) or array.shape[-1] != size:
         raise GraspError(
             f"a grasp must be {size} numbers ({fingers} points, then {fingers} outward normals), "
@@ -71,8 +69,26 @@ def _of(rows: Array, row: int) -> str:
     return f"grasp {row}: " if len(rows) > 1 else ""
 
 
-def _not_numbers(value: object, error: Exception) -> str:
-    return f"a {type(value).__name__} that is none ({str(error).splitlines()[0]})"
+def as_numbers(value: npt.ArrayLike, must: str) -> Array:
+    """Return an array of real numbers, of any shape; text and truth values are none.
+
+    Args:
+        value: The numbers.
+        must: What the error says that it must be.
+
+    Raises:
+        GraspError: If it is anything else.
+    """
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise GraspError(f"{must}, got a {type(value).__name__} that is none ({reason})") from None
+    # No grasps at all may come as an empty list, which NumPy takes for real numbers.
+    if array.dtype.kind not in "fiu":
+        got = _OTHER_KINDS.get(array.dtype.kind, f"a {type(value).__name__}")
+        raise GraspError(f"{must}, got {'None' if value is None else got}")
+    return array.astype(np.float64)
 
 
 def read_pose(X_AB: npt.ArrayLike, name: str) -> Array:
@@ -85,12 +101,7 @@ def read_pose(X_AB: npt.ArrayLike, name: str) -> Array:
     Raises:
         GraspError: If it is no pose.
     """
-    try:
-        X = np.asarray(X_AB, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise GraspError(
-            f"{name} must be a pose, 4 x 4 numbers, got {_not_numbers(X_AB, error)}"
-        ) from None
+    X = as_numbers(X_AB, f"{name} must be a pose, 4 x 4 numbers")
     if X.shape[-1:] == (12,):
         X = X.reshape(*X.shape[:-1], 3, 4)
     if X.shape[-2:] == (3, 4):

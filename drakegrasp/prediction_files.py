@@ -85,8 +85,9 @@ def _read_csv(path: Path) -> Array:
             f"{path}: must be a text file of numbers, got none ({_first_line(error)})"
         ) from None
     rows = [(n, line.split(",")) for n, line in enumerate(lines, start=1) if line.strip()]
-    # One number in the first line is enough: a mistyped grasp must not pass for a header.
-    if rows and not any(_is_number(cell) for cell in rows[0][1]):
+    # One number in the first line is enough: a mistyped grasp must not pass for a header, and
+    # neither must numbers that something else than commas divides.
+    if rows and len(rows[0][1]) > 1 and not any(_is_number(cell) for cell in rows[0][1]):
         del rows[0]
     for number, cells in rows:
         for column, cell in enumerate(cells, start=1):

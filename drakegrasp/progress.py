@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -18,17 +18,32 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.table import Column
 from rich.text import Text
+
+#: Window in which the speed is taken [s]: a task may take a minute, and workers come and go.
+SPEED_SECONDS = 600.0
+#: Width from which the figures stand in one line with the rest [characters].
+ONE_LINE = 150
+#: Width of all but the bar, and the least width from which there is one [characters].
+_BESIDES_BAR, _LEAST_BAR, _MOST_BAR = 70, 6, 24
 
 
 class Report(Protocol):
     """What long work calls as it goes on."""
 
-    def __call__(self, done: int, total: int, **figures: int) -> None:
-        """Say that `done` of `total` is done, with figures to show beside it."""
+    def __call__(self, done: int, total: int, *, found: int = 0, **figures: int) -> None:
+        """Say that `done` of `total` is done, with figures to show beside it.
+
+        Args:
+            done: How much is done.
+            total: How much there is to do.
+            found: How much of `done` was there before, and says nothing of the speed.
+            figures: More numbers, by what they count.
+        """
 
 
-def silent(done: int, total: int, **figures: int) -> None:
+def silent(done: int, total: int, *, found: int = 0, **figures: int) -> None:
     """Report nothing."""
 
 
@@ -36,12 +51,47 @@ class _Rate(ProgressColumn):
     """Steps per second."""
 
     def __init__(self, unit: str) -> None:
-        super().__init__()
+        super().__init__(Column(no_wrap=True))
         self._unit = unit
 
     def render(self, task: Task) -> Text:
         speed = task.finished_speed or task.speed
         return Text(f"{speed:.1f} {self._unit}/s" if speed else f"- {self._unit}/s")
+
+
+class _Bar(Progress):
+    """A progress bar with the figures in a line of their own where one is too narrow."""
+
+    def __init__(self, unit: str, console: Console) -> None:
+        self._wide = console.width >= ONE_LINE
+        bar = min(_MOST_BAR, console.width - _BESIDES_BAR)
+        roomy = bar >= _LEAST_BAR
+        super().__init__(
+            SpinnerColumn(),
+            _text("{task.description}"),
+            *([BarColumn(bar_width=bar)] if roomy else []),
+            MofNCompleteColumn(table_column=Column(no_wrap=True)),
+            _Rate(unit),
+            *([_text("{task.fields[figures]}")] if self._wide else []),
+            *([TimeElapsedColumn(Column(no_wrap=True))] if roomy else []),
+            _text("left"),
+            TimeRemainingColumn(table_column=Column(no_wrap=True)),
+            console=console,
+            speed_estimate_period=SPEED_SECONDS,
+        )
+
+    def get_renderables(self) -> Iterator[RenderableType]:
+        """Yield the lines to show; rich calls this."""
+        yield from super().get_renderables()
+        if not self._wide:
+            for task in self.tasks:
+                if task.fields["figures"]:
+                    figures = f"  {task.fields['figures']}"
+                    yield Text(figures, no_wrap=True, overflow="ellipsis")
+
+
+def _text(template: str) -> TextColumn:
+    return TextColumn(template, table_column=Column(no_wrap=True))
 
 
 @contextmanager
@@ -53,24 +103,20 @@ def progress_bar(title: str, unit: str, *, show: bool = True) -> Iterator[Report
     if not show:
         yield silent
         return
-    columns = (
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        BarColumn(bar_width=24),
-        MofNCompleteColumn(),
-        _Rate(unit),
-        TextColumn("{task.fields[figures]}"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    bar = Progress(*columns, console=Console(stderr=True))
+    console = Console(stderr=True)
+    bar = _Bar(unit, console if console.is_terminal else Console(stderr=True, width=ONE_LINE))
     task = bar.add_task(f"{title:<10}", total=None, figures="")
+    before = 0
 
-    def report(done: int, total: int, **figures: int) -> None:
+    def report(done: int, total: int, *, found: int = 0, **figures: int) -> None:
+        nonlocal before
         bar.start()  # only now, so that an error before the first report stands alone
         text = " ".join(f"{value} {name}" for name, value in figures.items())
-        bar.update(task, completed=done, total=total, figures=text)
+        if found > before:  # the clock begins when that is counted
+            bar.reset(task, total=total, completed=done, figures=text)
+            before = found
+        else:
+            bar.update(task, completed=done, total=total, figures=text)
 
     try:
         yield report

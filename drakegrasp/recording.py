@@ -117,16 +117,18 @@ def record_lift(
         _place(meshcat, scene, X_TO, config)
         # The scene is this function's own, so nobody else meets the monitor.
         scene.simulator.set_monitor(_ForceArrows(meshcat, scene, limit).record)
-        lift = lift_by_forces(scene, X_TO, p_OQ, nhat_Q_O, force_limit=limit, config=config)
-        # It holds the scene that holds it, which the garbage collector cannot see.
-        scene.simulator.clear_monitor()
+        try:
+            lift = lift_by_forces(scene, X_TO, p_OQ, nhat_Q_O, force_limit=limit, config=config)
+        finally:
+            # It holds the scene that holds it, which the garbage collector cannot see.
+            scene.simulator.clear_monitor()
         _draw_predicted(meshcat, p_OQ, nhat_Q_O)
         return lift
 
     return _record(run, path)
 
 
-def record_verification(verified: Verified, config: Config, path: Path) -> None:
+def record_verification(verified: Verified, path: Path) -> None:
     """Write what is seen of a verification, which is run again for it.
 
     A grasp that was not simulated is shown as it would have begun: with the hand where it
@@ -134,13 +136,13 @@ def record_verification(verified: Verified, config: Config, path: Path) -> None:
 
     Args:
         verified: The result.
-        config: With which it was verified.
         path: The HTML file.
 
     Raises:
         OSError: If the file cannot be written.
     """
     model, X_TO = verified.placed.model, rest_pose(verified.placed.X_TO)
+    config = verified.config
     p_OQ, nhat_Q_O = verified.p_OQ, verified.nhat_Q_O
     if verified.attempt is not None:
         record_attempt(model, X_TO, verified.attempt, config, path, p_OQ=p_OQ, nhat_Q_O=nhat_Q_O)
@@ -202,16 +204,18 @@ def _place(
 def _record(run: Callable[[Meshcat], Result], path: Path) -> Result:
     """Return what `run` does, and write what is seen of it when it ends well."""
     meshcat = _make_meshcat()
-    for part in ("/Grid", "/Axes"):
-        meshcat.SetProperty(part, "visible", False)
-    meshcat.StartRecording(frames_per_second=MESHCAT_RATE)
-    result = run(meshcat)
-    meshcat.StopRecording()
-    meshcat.PublishRecording()
-    _write(path, meshcat.StaticHtml())
-    # Diagrams sit in reference cycles; when the one of `run` is gone, the port is closed.
-    del meshcat
-    gc.collect()
+    try:
+        for part in ("/Grid", "/Axes"):
+            meshcat.SetProperty(part, "visible", False)
+        meshcat.StartRecording(frames_per_second=MESHCAT_RATE)
+        result = run(meshcat)
+        meshcat.StopRecording()
+        meshcat.PublishRecording()
+        _write(path, meshcat.StaticHtml())
+    finally:
+        # Diagrams sit in reference cycles; when the one of `run` is gone, the port is closed.
+        del meshcat
+        gc.collect()
     return result
 
 

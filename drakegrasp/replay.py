@@ -18,6 +18,7 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.prepared import PreparedObject, load_prepared
 from drakegrasp.recording import record_attempt
 from drakegrasp.shards import ShardHeader, trial_columns
+from drakegrasp.threads import one_thread
 from drakegrasp.units import Workbench, trial_rows, try_on, unit_attempts
 
 
@@ -46,6 +47,7 @@ class Replay:
         return not self.differences
 
 
+@one_thread
 def replay_trial(out: str | Path, trial_id: int) -> Replay:
     """Run one trial of a dataset again, from its prepared object and its candidate.
 

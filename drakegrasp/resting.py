@@ -72,9 +72,10 @@ def _settle(model: ObjectModel, config: Config) -> Resting:
     resting_for, stopped = 0.0, False
     while resting_for < rules.rest_time:
         if scene.time >= rules.max_time:
+            linear, angular = _speeds(scene)
             raise MeshError(
                 f"{model.name}: must come to rest on the table within {rules.max_time:g} s of "
-                f"simulation, got {_speeds(scene)[0]:.3g} m/s"
+                f"simulation, got {linear:.3g} m/s and {angular:.3g} rad/s"
             )
         advance(scene, LOOK_PERIOD)
         linear, angular = _speeds(scene)

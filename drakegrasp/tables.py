@@ -12,7 +12,7 @@ from rich.table import Table
 from drakegrasp.audit import AuditRow
 from drakegrasp.filters import Removal
 from drakegrasp.outcomes import Outcome
-from drakegrasp.stats import Funnel, SplitCount
+from drakegrasp.stats import Funnel, SplitCount, Unfinished
 
 #: Short heads of the outcomes, in the order of the funnel.
 _OUTCOME_HEADS = {
@@ -83,6 +83,16 @@ def split_table(counts: Sequence[SplitCount]) -> Table:
     for count in counts:
         table.add_row(count.split, f"{count.samples:,}", f"{count.objects:,}", f"{count.classes:,}")
     return table
+
+
+def unfinished_line(unfinished: Unfinished) -> str:
+    """Return how far a build is that runs or was stopped."""
+    if not unfinished.total:
+        return "not finished: its objects are not prepared yet"
+    return (
+        f"not finished: {unfinished.done:,} of {unfinished.total:,} work units are done; "
+        "samples are chosen at the end"
+    )
 
 
 def audit_table(rows: Sequence[AuditRow]) -> Table:

@@ -54,6 +54,7 @@ from drakegrasp.shards import (
     trial_columns,
     write_shard,
 )
+from drakegrasp.threads import one_thread
 from drakegrasp.trial import TrialRecord, run_attempt
 
 #: Objects whose diagrams a process keeps; a unit follows units of the same object.
@@ -154,6 +155,7 @@ def _leave_renderers_to_the_system() -> None:
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(bench))
 
 
+@one_thread
 def run_unit(unit: WorkUnit) -> UnitSummary:
     """Try all attempts of a unit, look at the successes, and write the shard.
 

@@ -124,13 +124,13 @@ class Verification:
         """
         from drakegrasp.recording import record_verification
 
-        record_verification(self, self.config, Path(path))
+        record_verification(self, Path(path))
 
     def figure(self) -> Figure:
         """Return a figure of predicted and reached contacts on the mesh; it has `savefig`."""
         from drakegrasp.verification_figure import verification_figure
 
-        return verification_figure(self, self.config)
+        return verification_figure(self)
 
     def explain(self) -> str:
         """Return the verdict in two or three sentences for a person."""
@@ -147,14 +147,21 @@ class Verification:
                     else "."
                 )
             )
-        if np.isfinite(self.smallest_friction):
-            sentences.append(
-                f"By the contacts alone a friction of {self.smallest_friction:.2f} is enough "
-                f"(epsilon {self.epsilon:.3f})."
-            )
-        elif self.smallest_friction == np.inf:
-            sentences.append("By the contacts alone no friction is enough to hold it.")
+        if not np.isnan(self.smallest_friction):
+            sentences.append(self._explain_margin())
         return " ".join(sentences)
+
+    def _explain_margin(self) -> str:
+        simulated = self.config.physics.friction_hand
+        if np.isfinite(self.smallest_friction):
+            needed = f"need a friction of {self.smallest_friction:.2f}"
+        else:
+            needed = "are not enough at any friction"
+        text = f"Forces at these points alone {needed}; {simulated:.2f} is simulated"
+        if self.success and self.method == "hand" and self.smallest_friction > simulated:
+            # A point has no area and does not resist twisting.
+            text += ", and the hand also holds by the areas of contact and by its other parts"
+        return f"{text} (epsilon {self.epsilon:.3f})."
 
     def __repr__(self) -> str:
         return f"Verification({self.method}, {self.outcome.label}: {self.reason})"

@@ -100,17 +100,16 @@ class View:
     marks: Sequence[Marks]
 
 
-def verification_figure(verified: Verified, config: Config) -> Figure:
+def verification_figure(verified: Verified) -> Figure:
     """Return the figure of a verified grasp.
 
     Args:
         verified: The result.
-        config: With which it was verified.
 
     Raises:
         MachineError: If a picture is blank, which means that OpenGL failed.
     """
-    stage = _Stage(verified.placed.model, load_hand(config.hand))
+    stage = _Stage(verified.placed.model, load_hand(verified.config.hand))
     X_WO = X_WT @ rest_pose(verified.placed.X_TO)
     closed = None if verified.trial is None else verified.trial.closed
     marks = [_predicted(verified), *_reached(closed, _force_scale(verified))]
@@ -118,13 +117,13 @@ def verification_figure(verified: Verified, config: Config) -> Figure:
     views = [
         stage.object("contacts", X_WO, marks, first),
         stage.object("from another side", X_WO, marks, second),
-        *_last_view(stage, verified, marks, first, config),
+        *_last_view(stage, verified, marks, first),
     ]
     return _draw_figure(verified, stage.model, views)
 
 
 def _last_view(
-    stage: _Stage, verified: Verified, marks: Sequence[Marks], azimuth: float, config: Config
+    stage: _Stage, verified: Verified, marks: Sequence[Marks], azimuth: float
 ) -> list[View]:
     """Return the view of the last instant that was reached, if anything was tried at all."""
     X_WO = X_WT @ rest_pose(verified.placed.X_TO)
@@ -132,7 +131,7 @@ def _last_view(
     if lift is not None and lift.X_TO_lifted is not None:
         return [stage.object("end of the lift", X_WT @ lift.X_TO_lifted, marks, azimuth)]
     if trial is not None and trial.X_TO_lifted is not None and trial.q_lifted is not None:
-        X_WG, X_WO = lifted_palm(trial, config), X_WT @ trial.X_TO_lifted
+        X_WG, X_WO = lifted_palm(trial, verified.config), X_WT @ trial.X_TO_lifted
         moment = Moment(X_WG=X_WG, X_WO=X_WO, q=trial.q_lifted)
         reached = _reached(trial.lifted, _force_scale(verified))
         return [stage.hand("end of the lift", moment, reached)]

@@ -10,7 +10,8 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -19,7 +20,7 @@ import numpy as np
 from drakegrasp.config import Config
 from drakegrasp.contacts import Contacts
 from drakegrasp.errors import DataError
-from drakegrasp.frames import pack_pose
+from drakegrasp.frames import Array, pack_pose
 from drakegrasp.hand import load_hand
 from drakegrasp.manifest import installed_versions, write_origin
 from drakegrasp.placed import rest_pose
@@ -48,46 +49,73 @@ def refuse_unwritable(out: Path) -> None:
     Raises:
         DataError: If its folder, or the first above it that exists, cannot be written.
     """
-    for path in result_paths(out):
+    if out.is_dir():
+        raise DataError(f"{out}: must be a name for files, got a folder; choose another --out")
+    for path in (*result_paths(out), part_path(out)):
         if path.is_dir():
             raise DataError(f"{path}: must be a file, got a folder; choose another --out")
     folder = out.absolute().parent
     while not os.path.lexists(folder):
         folder = folder.parent
-    if not folder.is_dir() or not os.access(folder, os.W_OK):
+    if not (folder.is_dir() and _is_writable(folder)):
         raise DataError(
             f"{out}: must be in a folder that can be written, got {folder}; choose another --out"
         )
 
 
-def save_results(results: Sequence[Verification], out: Path, config: Config) -> tuple[Path, Path]:
-    """Write both files of a name and return their paths; each appears whole or not at all.
-
-    Args:
-        results: In the order of the grasps.
-        out: The name, see `result_paths`.
-        config: With which they were verified.
-    """
-    lines, arrays = result_paths(out)
-    write_results(results, arrays, config)
-    temporary = temporary_name(lines)
+def _is_writable(folder: Path) -> bool:
+    probe = temporary_name(folder / "probe")
     try:
-        with temporary.open("w", encoding="utf-8") as stream:
-            write_json_lines(results, stream)
-        sync_and_rename(temporary, lines)
-    finally:
-        temporary.unlink(missing_ok=True)
-    return lines, arrays
+        probe.touch()
+        probe.unlink()
+    except OSError:
+        return False
+    return True
 
 
 # JSON
 
 
-def write_json_lines(results: Sequence[Verification], stream: TextIO) -> None:
-    """Write a line of strict JSON per result; what is NaN or infinite is null."""
-    for index, result in enumerate(results):
-        text = json.dumps(_plain(as_dict(index, result)), ensure_ascii=False, allow_nan=False)
-        stream.write(text + "\n")
+@contextmanager
+def json_lines(out: Path) -> Iterator[Callable[[int, Verification], None]]:
+    """Give the block a function that writes the next JSON line of a name.
+
+    The lines are whole at the end of the block. Until then they are in NAME.part.jsonl, and
+    stay there if something stops the block; nothing is made before the first.
+
+    Args:
+        out: The name, see `result_paths`.
+
+    Raises:
+        OSError: If the disk is full or the folder cannot be written.
+    """
+    lines, _ = result_paths(out)
+    part, stream = part_path(out), None
+    with ExitStack() as stack:
+
+        def write(index: int, result: Verification) -> None:
+            nonlocal stream
+            if stream is None:
+                part.parent.mkdir(parents=True, exist_ok=True)
+                stream = stack.enter_context(part.open("w", encoding="utf-8"))
+            write_json_line(index, result, stream)
+
+        yield write
+    if stream is not None:
+        sync_and_rename(part, lines)
+
+
+def part_path(out: Path) -> Path:
+    """Return the path of the JSON lines of a name that are not all there yet."""
+    lines, _ = result_paths(out)
+    return lines.with_suffix(f".part{JSON_SUFFIX}")
+
+
+def write_json_line(index: int, result: Verification, stream: TextIO) -> None:
+    """Write a line of strict JSON for a result, at once; what is NaN or infinite is null."""
+    text = json.dumps(_plain(as_dict(index, result)), ensure_ascii=False, allow_nan=False)
+    stream.write(text + "\n")
+    stream.flush()
 
 
 def as_dict(index: int, result: Verification) -> dict[str, Any]:
@@ -101,6 +129,7 @@ def as_dict(index: int, result: Verification) -> dict[str, Any]:
         "outcome": result.outcome.label,
         "reason": result.reason,
         "explain": result.explain(),
+        "X_TO": result.placed.X_TO,
         "p_OQ": result.p_OQ,
         "nhat_Q_O": result.nhat_Q_O,
         "surface_distance": result.surface_distance,
@@ -114,14 +143,19 @@ def as_dict(index: int, result: Verification) -> dict[str, Any]:
         "solver": None
         if fit is None
         else {"status": fit.status, "message": fit.message, "iterations": fit.iterations},
-        "closed": _contacts_as_dict(result.closed),
-        "lifted": _contacts_as_dict(result.lifted),
+        "closed": _contacts_as_dict(result.closed, result.q_closed),
+        "lifted": _contacts_as_dict(result.lifted, result.q_lifted),
         "slip": None if trial is None else trial.slip,
         "epsilon": result.epsilon,
         "smallest_friction": result.smallest_friction,
+        # Null above may be infinity, or that it was not asked.
+        "friction_can_hold": None
+        if math.isnan(result.smallest_friction)
+        else math.isfinite(result.smallest_friction),
         "forces": None
         if lift is None
         else {
+            "end": lift.end.value,
             "planned_force": lift.planned_force,
             "applied_force": lift.applied_force,
             "position_error": lift.position_error,
@@ -131,11 +165,11 @@ def as_dict(index: int, result: Verification) -> dict[str, Any]:
     }
 
 
-def _contacts_as_dict(contacts: Contacts | None) -> dict[str, Any] | None:
+def _contacts_as_dict(contacts: Contacts | None, q: Array | None) -> dict[str, Any] | None:
     if contacts is None:
         return None
     names = ("touching", "p_OQ", "nhat_Q_O", "f_Q_O", "other_links", "hand_on_table")
-    return {name: getattr(contacts, name) for name in (*names, "object_on_table")}
+    return {name: getattr(contacts, name) for name in (*names, "object_on_table")} | {"q": q}
 
 
 def _plain(value: Any) -> Any:

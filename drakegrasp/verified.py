@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from drakegrasp.candidates import Attempt
+from drakegrasp.config import Config
 from drakegrasp.force_lift import ForceLift
 from drakegrasp.frames import Array
 from drakegrasp.outcomes import Outcome
@@ -34,6 +35,10 @@ class Verified(Protocol):
     @property
     def placed(self) -> PlacedObject:
         """The object on the table."""
+
+    @property
+    def config(self) -> Config:
+        """The rules that it was verified by."""
 
     @property
     def p_OQ(self) -> Array:

@@ -60,6 +60,7 @@ _ENDS = {
     LiftEnd.OVER_LIMIT: Outcome.DROPPED,
     LiftEnd.STRAYED: Outcome.SLIPPED,
     LiftEnd.ERROR: Outcome.SOLVER_ERROR,
+    LiftEnd.TIMEOUT: Outcome.TIMEOUT,
 }
 #: What a failed grasp is called when several wrist poses failed differently: the last that
 #: applies, as that one came farthest.
@@ -95,7 +96,7 @@ def verify_contacts(
     nhat_Q_O /= np.linalg.norm(nhat_Q_O, axis=1, keepdims=True)
     with _timed(seconds, "surface"):
         distance = face_distances(placed.model, p_OQ)
-        outward = points_outward(placed.model, distance, nhat_Q_O, rules.max_surface_distance)
+        outward = points_outward(placed.model, distance, nhat_Q_O)
     base = Verification(
         method=method,
         outcome=Outcome.OFF_SURFACE,
@@ -145,7 +146,9 @@ def _by_hand(base: Verification, config: Config) -> Verification:
         results.append(_judge(replace(base, fit=fit, attempt=attempt, trial=trial), config))
         if results[-1].success:
             return replace(results[-1], tries=tries)
-    farthest = max(results, key=lambda result: _RANK.index(result.outcome))
+    # As long as one of them has no verdict, the grasp has none.
+    unknown = [result for result in results if result.outcome.says_nothing]
+    farthest = max(unknown or results, key=lambda result: _RANK.index(result.outcome))
     return replace(farthest, tries=len(near))
 
 
@@ -161,7 +164,7 @@ def _by_forces(base: Verification, config: Config) -> Verification:
             force_limit=limit,
             config=config,
         )
-    if lift.end is LiftEnd.ERROR:
+    if _ENDS[lift.end].says_nothing:
         forget_scenes()
     moved = f"{_mm(lift.position_error)} and {np.rad2deg(lift.angle_error):.1f}°"
     reasons = {
@@ -171,7 +174,8 @@ def _by_forces(base: Verification, config: Config) -> Verification:
         LiftEnd.OVER_LIMIT: f"it takes a normal force of {lift.planned_force:.1f} N, more than a "
         f"fingertip's {limit:g} N",
         LiftEnd.STRAYED: f"under the forces it strays from its path, by {moved}",
-        LiftEnd.ERROR: f"the simulator failed, which says nothing about the grasp: {lift.message}",
+        LiftEnd.ERROR: f"{_REASONS[Outcome.SOLVER_ERROR]}: {lift.message}",
+        LiftEnd.TIMEOUT: _REASONS[Outcome.TIMEOUT],
     }
     return replace(base, outcome=_ENDS[lift.end], reason=reasons[lift.end], lift=lift)
 
@@ -181,15 +185,15 @@ def _misfit(fit: WristFit, config: Config) -> str:
     rules, finger = config.verify, int(np.argmax(fit.residual))
     if fit.residual[finger] > rules.max_residual:
         return (
-            f"no pose of the palm brings fingertip {finger + 1} nearer to its point than "
-            f"{_mm(fit.residual[finger])} with the others at theirs"
+            f"no pose of the palm was found that brings fingertip {finger + 1} nearer to its "
+            f"point than {_mm(fit.residual[finger])} with the others at theirs"
         )
     finger = int(np.argmax(fit.normal_error))
     angle = np.rad2deg(fit.normal_error[finger])
     if angle > rules.max_normal_error_deg:
         return (
-            f"no pose of the palm turns pad {finger + 1} nearer to its normal than {angle:.0f}° "
-            "with all fingertips at their points"
+            f"no pose of the palm was found that turns pad {finger + 1} nearer to its normal "
+            f"than {angle:.0f}° with all fingertips at their points"
         )
     return ""
 

@@ -18,11 +18,17 @@ import trimesh
 
 from drakegrasp.config import Config, load_config, parse_config
 from drakegrasp.dataset import GraspDataset
-from drakegrasp.errors import ConfigError, GraspError
+from drakegrasp.errors import GraspError
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.hand import load_hand
 from drakegrasp.manifest import read_manifest
-from drakegrasp.placed import Placed, PlacedObject, place_object
+from drakegrasp.placed import (
+    Placed,
+    PlacedObject,
+    place_object,
+    refuse_no_config,
+    refuse_other_objects,
+)
 from drakegrasp.prediction import (
     boxes_away,
     read_grasps,
@@ -31,6 +37,7 @@ from drakegrasp.prediction import (
     to_object_frame,
 )
 from drakegrasp.prepared import load_prepared
+from drakegrasp.threads import one_thread
 from drakegrasp.verification import Verification
 from drakegrasp.verify import METHODS, verify_contacts
 
@@ -60,6 +67,7 @@ class VerifyTask:
     config: dict[str, Any]
 
 
+@one_thread
 def run_task(task: VerifyTask) -> tuple[tuple[int, ...], list[Verification]]:
     """Verify the grasps of a task, one after the other."""
     config = parse_config(task.config)
@@ -77,7 +85,7 @@ def plan_verification(
     frame: str | None,
     X: npt.ArrayLike | None,
     X_TO: npt.ArrayLike | None,
-    units: str,
+    units: str | None,
     hand: str | Path | None,
     method: str,
     config: Config | None,
@@ -94,25 +102,35 @@ def plan_verification(
     if method not in METHODS:
         raise GraspError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
     if (mesh is None) == (dataset is None):
-        raise GraspError("a mesh or a dataset must be given, and not both")
+        got = "neither" if mesh is None else "both"
+        raise GraspError(f"a mesh or a dataset must be given, got {got}")
+    if config is not None:
+        refuse_no_config(config)
     if dataset is None:
-        config = _with_hand(config or load_config(), hand)
-        points, normals = read_grasps(grasps, load_hand(config.hand).num_fingers)
         if rows is not None:
             raise GraspError("rows must be those of a dataset, got some without a dataset")
         assert mesh is not None
+        if config is None:
+            config = mesh.config if isinstance(mesh, PlacedObject) else load_config()
+        config = _with_hand(config, hand)
+        points, normals = read_grasps(grasps, load_hand(config.hand).num_fingers)
         placed = place_object(mesh, units=units, X_TO=X_TO, config=config)
         pose = None if X is None else read_pose(X, "X")
         groups = [(placed, np.arange(len(points)), pose)]
         frame = frame or "object"
     else:
-        for name, value in (("X", X), ("X_TO", X_TO)):
+        if not isinstance(dataset, GraspDataset):
+            raise GraspError(
+                "dataset must be a GraspDataset, which says of which split, "
+                f"got a {type(dataset).__name__}"
+            )
+        for name, value in (("X", X), ("X_TO", X_TO), ("units", units)):
             if value is not None:
-                raise GraspError(f"{name} must be None with a dataset, which has it, got a pose")
+                raise GraspError(f"{name} must be None with a dataset, which has it, got a value")
         out = dataset.path.parent
         known = read_manifest(out).config
-        config = _with_hand(config or known, hand)
-        _refuse_other_objects(config, known)
+        config = _with_hand(known if config is None else config, hand)
+        refuse_other_objects(config, known, "as in the dataset, whose objects are prepared")
         points, normals = read_grasps(grasps, load_hand(config.hand).num_fingers)
         chosen = _chosen_rows(dataset, rows, len(points))
         frame = frame or "camera"
@@ -156,16 +174,6 @@ def _refuse_other_units(tasks: Sequence[VerifyTask]) -> None:
         refuse_other_units(nearest.p_OQ, nearest.placed.model.half_extents)
 
 
-def _refuse_other_objects(config: Config, known: Config) -> None:
-    """Refuse a configuration that a dataset's objects were not prepared and dropped with."""
-    for name in ("objects", "settle"):
-        if getattr(config, name) != getattr(known, name):
-            raise ConfigError(
-                f"{name} must be as in the dataset, whose objects are prepared already, "
-                "got other values; give the mesh instead"
-            )
-
-
 def _with_hand(config: Config, hand: str | Path | None) -> Config:
     return config if hand is None else parse_config({**config.to_dict(), "hand": str(hand)})
 
@@ -174,7 +182,8 @@ def _chosen_rows(
     dataset: GraspDataset, rows: Sequence[int] | None, count: int
 ) -> npt.NDArray[np.int64]:
     chosen = np.arange(count) if rows is None else np.asarray(rows)
-    if chosen.dtype.kind not in "iu":
+    # An empty list is one of real numbers to NumPy.
+    if chosen.size and chosen.dtype.kind not in "iu":
         raise GraspError(f"rows must be whole numbers, got values of type {chosen.dtype}")
     chosen = chosen.astype(np.int64).ravel()
     if len(chosen) != count:

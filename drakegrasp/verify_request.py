@@ -14,6 +14,7 @@ from drakegrasp.dataset import GraspDataset
 from drakegrasp.errors import DataError, GraspError
 from drakegrasp.manifest import read_manifest
 from drakegrasp.prediction_files import HDF5_SUFFIXES, read_numbers, read_predictions
+from drakegrasp.verification_files import refuse_unwritable
 from drakegrasp.verify_plan import VerifyTask, plan_verification
 
 #: The split that is meant where a dataset is given and none is named.
@@ -30,15 +31,16 @@ class VerifyRequest:
     split: str | None = None
     frame: str | None = None
     camera: Path | None = None
-    units: str = "m"
+    units: str | None = None
     method: str = "hand"
     hand: str | None = None
     config: str | None = None
     overrides: tuple[str, ...] = ()
+    out: Path | None = None
 
 
-def plan_request(request: VerifyRequest) -> tuple[list[VerifyTask], Config]:
-    """Return the tasks of a request, and the configuration that they have.
+def plan_request(request: VerifyRequest) -> list[VerifyTask]:
+    """Return the tasks of a request, at least one.
 
     Raises:
         GraspError, MeshError, ConfigError, HandError: If something cannot be used.
@@ -49,27 +51,27 @@ def plan_request(request: VerifyRequest) -> tuple[list[VerifyTask], Config]:
         raise GraspError(str(error)) from None
 
 
-def _plan(request: VerifyRequest) -> tuple[list[VerifyTask], Config]:
+def _plan(request: VerifyRequest) -> list[VerifyTask]:
+    if request.out is not None:
+        refuse_unwritable(request.out)
     path = _dataset_path(request)
+    _refuse_idle(request, path)
     split = request.split if path is None else request.split or DEFAULT_SPLIT
-    _refuse_camera(request, path)
     data = None if path is None else GraspDataset(path, split=split or DEFAULT_SPLIT)
     predicted = read_predictions(request.grasps, split=split)
-    config = _config(request, path)
-    tasks = plan_verification(
+    return plan_verification(
         predicted.grasps,
         request.mesh,
         frame=request.frame,
         X=None if request.camera is None else read_numbers(request.camera),
         X_TO=None,
         units=request.units,
-        hand=None,
+        hand=request.hand,
         method=request.method,
-        config=config,
+        config=_config(request, path),
         dataset=data,
         rows=None if predicted.rows is None else predicted.rows.tolist(),
     )
-    return tasks, config
 
 
 def _dataset_path(request: VerifyRequest) -> Path | None:
@@ -88,8 +90,16 @@ def _dataset_path(request: VerifyRequest) -> Path | None:
     return request.grasps
 
 
-def _refuse_camera(request: VerifyRequest, dataset: Path | None) -> None:
-    """Refuse a camera's pose where it is not needed, and its lack where it is."""
+def _refuse_idle(request: VerifyRequest, dataset: Path | None) -> None:
+    """Refuse options that would do nothing, and the lack of a camera where one is needed."""
+    if dataset is not None and request.units is not None:
+        raise GraspError(f"--units must be given with --object only, got {request.units}")
+    grouped = request.grasps.suffix.lower() in HDF5_SUFFIXES
+    if request.split is not None and dataset is None and not grouped:
+        raise GraspError(
+            "--split must be given with --dataset or grasps in an HDF5 file only, "
+            f"got {request.split}"
+        )
     needed = dataset is None and request.frame == "camera"
     if needed and request.camera is None:
         raise GraspError("--camera FILE must be given with --object and --frame camera, got none")
@@ -102,7 +112,5 @@ def _refuse_camera(request: VerifyRequest, dataset: Path | None) -> None:
 def _config(request: VerifyRequest, dataset: Path | None) -> Config:
     """Return the configuration: the one given, or the dataset's, with overrides on top."""
     if dataset is None or request.config is not None:
-        config = load_config(request.config, request.overrides)
-    else:
-        config = override_config(read_manifest(dataset.parent).config, request.overrides)
-    return config if request.hand is None else config.model_copy(update={"hand": request.hand})
+        return load_config(request.config, request.overrides)
+    return override_config(read_manifest(dataset.parent).config, request.overrides)

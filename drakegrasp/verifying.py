@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeAlias
 
-import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import Config
@@ -14,9 +14,13 @@ from drakegrasp.dataset import GraspDataset
 from drakegrasp.errors import GraspError, OffSurfaceError
 from drakegrasp.executor import Executor
 from drakegrasp.outcomes import Outcome
+from drakegrasp.prediction import as_numbers
 from drakegrasp.progress import Report
 from drakegrasp.verification import Verification
 from drakegrasp.verify_plan import Mesh, VerifyTask, plan_verification, run_task
+
+#: Who takes results as they come: called with a grasp's index and its result.
+Deliver: TypeAlias = Callable[[int, Verification], None]
 
 
 def verify_grasp(
@@ -26,7 +30,7 @@ def verify_grasp(
     frame: str | None = None,
     X: npt.ArrayLike | None = None,
     X_TO: npt.ArrayLike | None = None,
-    units: str = "m",
+    units: str | None = None,
     hand: str | Path | None = None,
     method: str = "hand",
     config: Config | None = None,
@@ -46,11 +50,13 @@ def verify_grasp(
             "workspace" {T}. With a dataset the default is the camera of its file.
         X: With frame "camera": pose of the camera in the table-top frame, X_TC (4, 4).
         X_TO: Pose of the object on the table (4, 4); dropped as in a build if None.
-        units: Unit of the mesh's lengths: m, cm or mm. The grasp is in metres always.
+        units: Unit of the mesh's lengths: m, cm or mm; metres if None. The grasp is in metres
+            always.
         hand: Name or YAML file of the hand; the configuration's ("barrett") if None.
         method: "hand" closes a simulated hand on the contacts and lifts; "forces" lifts by
             forces at the contacts alone.
-        config: Physics, lift and limits; the preset `paper`, or the dataset's, if None.
+        config: Physics, lift and limits; if None that of the dataset or of the placed object,
+            else the preset `paper`.
         dataset: In place of a mesh: a data file of a dataset, whose row has the object, its
             pose and the camera's.
         row: The row of its split that the grasp is for.
@@ -62,13 +68,16 @@ def verify_grasp(
         MeshError: If the mesh cannot be simulated.
         ConfigError, HandError, DataError: If configuration, hand or dataset cannot be used.
     """
-    if np.ndim(grasp) != 1:
+    vector = as_numbers(grasp, "a grasp must be a vector of numbers")
+    if vector.ndim != 1:
         raise GraspError(
-            f"one grasp must be a vector, got an array of shape {np.shape(grasp)}; "
+            f"one grasp must be a vector, got an array of shape {vector.shape}; "
             "verify_grasps takes many"
         )
+    if dataset is not None and row is None:
+        raise GraspError("row must be that of the dataset that the grasp is for, got None")
     (task,) = plan_verification(
-        grasp,
+        vector,
         mesh,
         frame=frame,
         X=X,
@@ -96,7 +105,10 @@ def refuse_off_surface(result: Verification) -> None:
 
 
 def verify_tasks(
-    tasks: Sequence[VerifyTask], execute: Executor, report: Report
+    tasks: Sequence[VerifyTask],
+    execute: Executor,
+    report: Report,
+    deliver: Deliver = lambda index, result: None,
 ) -> list[Verification]:
     """Return the results of tasks in the order of the caller's grasps.
 
@@ -104,9 +116,10 @@ def verify_tasks(
         tasks: From `verify_plan.plan_verification`.
         execute: Who does the work.
         report: Is told how many are done and how many hold.
+        deliver: Is given each result, in that order, as soon as those before it are there.
     """
     by_indices = {task.indices: task for task in tasks}
-    total = sum(map(len, by_indices))
+    total, delivered = sum(map(len, by_indices)), 0
     found: dict[int, Verification] = {}
     report(0, total, holding=0)
     for indices, results in execute(run_task, tasks):
@@ -114,5 +127,8 @@ def verify_tasks(
         placed = by_indices[indices].placed
         for index, result in zip(indices, results, strict=True):
             found[index] = replace(result, placed=placed)
+        while delivered in found:
+            deliver(delivered, found[delivered])
+            delivered += 1
         report(len(found), total, holding=sum(r.success for r in found.values()))
     return [found[i] for i in range(total)]

@@ -40,7 +40,8 @@ class WristFit:
         X_OG: (4, 4), palm pose.
         spread: [rad]
         closing: (k,), closing angles at which the pads meet the points [rad].
-        objective: Sum of squared weighted misfits [m^2].
+        objective: Sum of squared weighted misfits where SLSQP ended, before each finger was
+            brought onto its point [m^2].
         residual: (k,), distance of each predicted point from its fingertip's surface [m].
         normal_error: (k,), angle between each pad's inward and the predicted normal [rad].
         status, message: SLSQP's exit mode, 0 for success, and its text.

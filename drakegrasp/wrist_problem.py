@@ -34,7 +34,7 @@ from drakegrasp.pads import PadContact, Pads, make_pads, touch
 POSE = 6
 #: What a small angle of one radian between a pad and the predicted normal counts as [m]. Like
 #: the next weights it is the size of what simulated grasps show: half a millimetre between
-#: point and pad goes with 7 degrees here, 25 degrees, 5 mm and 7 degrees there.
+#: point and pad goes with 7 degrees here, 24 degrees, 5 mm and 7 degrees there.
 NORMAL_WEIGHT = 0.004
 #: The same between a finger's closing motion and the predicted normal [m].
 CLOSING_WEIGHT = 0.0012

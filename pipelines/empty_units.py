@@ -54,7 +54,7 @@ def memory() -> float:
     return pages * 4096 / 1e6
 
 
-@click.command()
+@click.command(help=__doc__)
 @click.option("--units", "count", default=100_000, show_default=True)
 @click.option("--workers", default=2, show_default=True)
 def main(count: int, workers: int) -> None:
@@ -62,17 +62,19 @@ def main(count: int, workers: int) -> None:
     with connect(workers) as client:
         execute = DaskExecutor(client)
         done = sum(1 for _ in execute(run_nothing, units(WARM_UP)))
-        before, start, peak = memory(), time.monotonic(), 0.0
+        before, peak = memory(), 0.0
+        start, start_cpu = time.monotonic(), time.process_time()
         for done, _ in enumerate(execute(run_nothing, units(count)), start=1):
             if done % 1000 == 0:
                 peak = max(peak, memory())
-        seconds = time.monotonic() - start
+        seconds, cpu = time.monotonic() - start, time.process_time() - start_cpu
     print(  # noqa: T201
         json.dumps(
             {
                 "units": done,
                 "workers": workers,
                 "seconds": round(seconds, 1),
+                "CPU seconds of client and scheduler": round(cpu, 1),
                 "milliseconds per unit": round(1e3 * seconds / done, 3),
                 "memory before [MB]": round(before, 1),
                 "growth at most [MB]": round(max(peak, memory()) - before, 1),

@@ -1,4 +1,4 @@
-r"""Build a dataset on a cluster: this machine, SSH, SLURM, or a running Dask scheduler.
+"""Build a dataset on a cluster: this machine, SSH, SLURM, or a running Dask scheduler.
 
 \b
     python pipelines/submit_build.py --cluster local ...
@@ -10,7 +10,7 @@ r"""Build a dataset on a cluster: this machine, SSH, SLURM, or a running Dask sc
 What will run and what it is expected to take is printed first; --dry-run stops there. The
 same command goes on where one stopped, on any cluster. docs/clusters.md has the details,
 pipelines/recipes/ an example of each.
-"""
+"""  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from typing import Any
 
 import click
 
+from drakegrasp.build_lock import build_lock
 from drakegrasp.build_options import build_options, parse_request, times_option
 from drakegrasp.cli import OneCommand, print_plan, print_report
-from drakegrasp.cluster import build_on, find_sources
+from drakegrasp.cluster import build_on, dashboard_line, find_sources
 from drakegrasp.clusters import (
     KINDS,
     ClusterRequest,
-    dashboard_line,
     describe,
     start_cluster,
     worker_count,
@@ -52,12 +52,20 @@ from drakegrasp.errors import ConfigError
 @click.option("--interface", metavar="NAME", help="Network on which scheduler and workers listen.")
 @click.option("--host", metavar="ADDRESS", help="On which the scheduler listens, instead.")
 @click.option("--tls", is_flag=True, help="Encrypt, with certificates made for this run.")
-@click.option("--tls-ca-file", type=click.Path(path_type=Path, exists=True, dir_okay=False))
-@click.option("--tls-cert", type=click.Path(path_type=Path, exists=True, dir_okay=False))
+@click.option(
+    "--tls-ca-file",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="Encrypt, with an authority of yours (PEM); needs the next two.",
+)
+@click.option(
+    "--tls-cert",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="A certificate by it, of client, scheduler and workers.",
+)
 @click.option(
     "--tls-key",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="Encrypt, with an authority, a certificate and a key of yours (PEM).",
+    help="The certificate's private key.",
 )
 @times_option
 @click.option("--dry-run", is_flag=True, help="Only print what would run.")
@@ -97,8 +105,10 @@ def main(
     if dry_run:
         return
     sources = find_sources(request.objects, request.units, request.manifest)
-    with start_cluster(cluster, request.out) as client:
-        click.echo(dashboard_line(client), err=True)
+    # Locked first: a second build is refused before it starts any worker.
+    with build_lock(request.out), start_cluster(cluster, request.out) as client:
+        if request.show:
+            click.echo(dashboard_line(client), err=True)
         if not client.nthreads():
             click.echo("waiting for the first worker", err=True)
             client.wait_for_workers(1)

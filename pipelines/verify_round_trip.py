@@ -39,6 +39,8 @@ Array = npt.NDArray[np.float64]
 def main(outs: tuple[Path, ...], workers: int, every: int) -> None:
     """Print the figures as JSON."""
     results: dict[str, dict[str, list[Verification]]] = {}
+    for out in outs:  # what cannot be read is known before anything is simulated
+        GraspDataset(out / DATA_FILES["oto"])
     with connect(workers) as client:
 
         def verify(key: str, method: str, grasps: Array, **where: Any) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -17,7 +19,7 @@ PACKAGE = Path(drakegrasp.__file__).parent
 LAYERS: tuple[frozenset[str], ...] = tuple(
     frozenset(line.split())
     for line in (
-        "errors executor frames network progress processes build_log",
+        "errors executor frames network progress processes build_log threads",
         "grasp outcomes hand_files config curves surfaces distance_field pads prediction "
         "prediction_files faults build_lock",
         "schema hand solids bodies wavefront build_options",
@@ -108,9 +110,14 @@ def test_no_module_hides_a_public_name() -> None:
 
 
 def test_public_names_are_sorted_and_exist() -> None:
+    """Also after every module was imported."""
     assert drakegrasp.__all__ == sorted(drakegrasp.__all__)
+    for name in modules():
+        importlib.import_module(f"drakegrasp.{name}")
     for name in drakegrasp.__all__:
-        assert getattr(drakegrasp, name) is not None
+        found = getattr(drakegrasp, name)
+        assert found is not None
+        assert not isinstance(found, ModuleType)
     with pytest.raises(AttributeError, match="no attribute 'magic'"):
         _ = drakegrasp.magic
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -186,6 +187,24 @@ def test_check_stats_and_replay_speak_of_a_dataset(small_dataset: Path, tmp_path
 
 @pytest.mark.sim
 @pytest.mark.slow
+def test_stats_of_a_build_that_runs_count_what_is_done(small_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(small_dataset, out)
+    for path in [*out.glob("*.hdf5"), *sorted(out.glob("shards/*/*.h5"))[:2]]:
+        path.unlink()
+    # What is on its way is not there yet.
+    (out / "shards" / "10_box_tall" / ".0000000-0000010.h5.h~1~0123456789ab.tmp").touch()
+    result = run("stats", out)
+    assert result.exit_code == 0, result.output
+    assert f"{out}: not finished: 10 of 12 work units are done" in result.stdout
+    lines = [line.split() for line in result.stdout.splitlines()]
+    assert [line[1:3] for line in lines if line[:1] == ["all"]] == [["120", "300"]]
+    shutil.rmtree(out / "shards")
+    assert "not finished: 0 of 12 work units are done" in run("stats", out).stdout
+
+
+@pytest.mark.sim
+@pytest.mark.slow
 def test_check_fails_on_a_broken_file(small_dataset: Path, tmp_path: Path) -> None:
     path = tmp_path / "grasping_oto.hdf5"
     path.write_bytes((small_dataset / path.name).read_bytes())
@@ -348,6 +367,10 @@ def test_camera_ties_the_frame_to_the_table(cube: Path, tmp_path: Path) -> None:
         (pinch(), ["--hand", "octopus"], "octopus"),
         (pinch(), ["--set", "lift.speed=1"], "lift.speed: must be a known key"),
         (pinch(), ["--workers", "0"], "workers must be at least 1, got 0"),
+        (pinch(), ["--workers", "some"], "'some' is not a valid integer"),
+        (pinch(), ["--frame", "world"], "'world' is not one of 'object', 'camera', 'workspace'"),
+        (pinch(), ["--split", "test"], "--split must be given with --dataset or grasps in an HDF5"),
+        (pinch(), ["--set", "verify.max_tries=9"], "max_tries: must be less than or equal to 5"),
         (pinch(), ["--workers", "2", "--scheduler", "x"], "must not be given with a scheduler"),
     ],
 )
@@ -372,6 +395,9 @@ def test_what_cannot_be_verified_is_one_line_and_leaves_nothing(
         (["a.npy", "--dataset", "a.npy"], "a.npy: must be a data file of drakegrasp"),
         (["other.h5"], "other.h5: must be a data file of drakegrasp"),
         (["other.h5", "--frame", "object"], "--frame must be camera for a dataset's own grasps"),
+        (["other.h5", "--units", "cm"], "--units must be given with --object only, got cm"),
+        (["a.npy", "--object", "o.obj", "--out", "."], "must be a name for files, got a folder"),
+        (["a.npy", "--object", "o.obj", "--out", "a.npy/x"], "must be in a folder that can be"),
     ],
 )
 def test_wrong_files_are_one_line(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
 from models import box_model, model_of
 
-from drakegrasp.contact_surface import face_distances, points_outward
+from drakegrasp.contact_surface import WALL, face_distances, points_outward
 from drakegrasp.frames import Array
 from drakegrasp.object_model import ObjectModel
 
@@ -69,8 +71,8 @@ def test_distances_from_a_box_are_those_of_the_formula(box: ObjectModel) -> None
     np.testing.assert_allclose(nearest, [0.01, 0.005, half.min(), 0.0], atol=1e-9)
 
 
-def outward(model: ObjectModel, p: Array, n: Array, within: float) -> list[bool]:
-    found = points_outward(model, face_distances(model, p), n, within)
+def outward(model: ObjectModel, p: Array, n: Array) -> list[bool]:
+    found = points_outward(model, face_distances(model, p), n)
     assert found.shape == (len(p),)
     assert found.dtype == bool
     return [bool(each) for each in found]
@@ -85,40 +87,37 @@ def test_a_boxs_normals_point_out(box: ObjectModel, axis: int, side: float, off:
     p = np.tile(out * (EXTENTS / 2.0 + off), (4, 1))
     lean = np.roll(out, 1)
     n = np.array([out, -out, (out + lean) / np.sqrt(2.0), (lean - out) / np.sqrt(2.0)])
-    assert outward(box, p, n, 0.005) == [True, False, True, False]
+    assert outward(box, p, n) == [True, False, True, False]
 
 
 def test_beside_an_edge_either_face_will_do(box: ObjectModel) -> None:
     p = np.array([[EXTENTS[0] / 2.0, EXTENTS[1] / 2.0 - 0.001, 0.0]])
     x, y = np.eye(3)[:2]
     for normal, expected in ((x, True), (y, True), (-x, False), (-y, False)):
-        assert outward(box, p, normal[None], 0.003) == [expected]
-    # The other face is a millimetre away: with half of that only the first is near.
-    assert outward(box, p, y[None], 0.0005) == [False]
-
-
-def test_far_from_the_surface_no_normal_points_out_of_it(box: ObjectModel) -> None:
-    p = np.array([[0.0, 0.0, 0.2]])
-    for normal in (*np.eye(3), *-np.eye(3)):
-        assert outward(box, p, normal[None], 0.01) == [False]
+        assert outward(box, p, normal[None]) == [expected]
+    # Farther from the edge than a wall is thick only the first is near.
+    assert outward(box, p - [[0.0, 2.0 * WALL, 0.0]], y[None]) == [False]
 
 
 def test_both_sides_of_a_thin_wall_are_asked(pot: ObjectModel) -> None:
-    """A point that is a wall's thickness off is not of an inward normal."""
+    """A point may be a few millimetres off, on the wrong side of the wall."""
     x = np.eye(3)[:1]
-    on_the_outside, on_the_inside = OUTER * x, INNER * x
-    # Within less than the wall each side has its own normal.
-    assert outward(pot, on_the_outside, x, 0.001) == [True]
-    assert outward(pot, on_the_outside, -x, 0.001) == [False]
-    assert outward(pot, on_the_inside, -x, 0.001) == [True]
-    assert outward(pot, on_the_inside, x, 0.001) == [False]
-    # Within more than the wall both will do, and along it still neither does.
-    for p in (on_the_outside, on_the_inside):
-        assert outward(pot, p, x, 0.003) == outward(pot, p, -x, 0.003) == [True]
-        assert outward(pot, p, np.eye(3)[1:2], 0.003) == [False]
+    for at in (OUTER, INNER, OUTER + 0.004, INNER - 0.004):
+        assert outward(pot, at * x, x) == outward(pot, at * x, -x) == [True]
+        # Along the wall it still does not point out of it.
+        assert outward(pot, at * x, np.eye(3)[1:2]) == [False]
+
+
+def test_sides_of_a_thick_plate_are_told_apart(tmp_path: Path) -> None:
+    """Also when the point is off the surface: the other side is no nearer for it."""
+    plate = box_model(tmp_path, [0.1, 0.1, 0.008])
+    z = np.eye(3)[2:]
+    for off in (-0.001, 0.0, 0.003, 0.009):
+        assert outward(plate, (0.004 + off) * z, z) == [True]
+        assert outward(plate, (0.004 + off) * z, -z) == [False]
 
 
 def test_normals_are_judged_one_by_one(box: ObjectModel) -> None:
     half = EXTENTS / 2.0
     p, n = np.diag(half), np.diag([1.0, -1.0, 1.0])
-    assert outward(box, p, n, 0.002) == [True, False, True]
+    assert outward(box, p, n) == [True, False, True]

@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,18 +25,17 @@ from distributed import Client, LocalCluster
 
 from drakegrasp import crew, render, units
 from drakegrasp.build import build
+from drakegrasp.cluster import connect
 from drakegrasp.config import Config, load_config
 from drakegrasp.crew import DaskExecutor
 from drakegrasp.errors import BlankImageError, DiskFullError, MachineError
 from drakegrasp.executor import run_here
 from drakegrasp.faults import VARIABLE
-from drakegrasp.meshes import find_meshes
+from drakegrasp.meshes import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome
+from drakegrasp.prepared import PreparedObject
 from drakegrasp.processes import host_label
 from drakegrasp.stats import count_funnel
-
-#: They are not in `make test` yet: see the marker.
-pytestmark = pytest.mark.faults
 
 #: Attempts of a tenth of a second, of which one in ten succeeds.
 FAST = [
@@ -45,7 +45,6 @@ FAST = [
     "candidates.global_z_deg=[0,45,90]",
     "candidates.local_z_deg=[0,90]",
     "unit_candidates=1",
-    "attempt_seconds=3",
     "settle.drop_height=0.01",
     "settle.max_linear_speed=0.1",
     "settle.max_angular_speed=1",
@@ -83,13 +82,14 @@ def undisturbed(meshes: Path, config: Config, tmp_path_factory: pytest.TempPathF
 
 
 def start_build(
-    meshes: Path, out: Path, workers: int, fault: str = "", **options: Any
+    meshes: Path, out: Path, workers: int, *arguments: str, fault: str = "", **options: Any
 ) -> subprocess.Popen[str]:
     """Start the command of a build in a process of its own."""
     command = [sys.executable, "-c", "from drakegrasp.cli import main; main()", "build", "--quiet"]
     command += ["--objects", str(meshes), "--out", str(out), "--workers", str(workers)]
     for value in FAST:
         command += ["--set", value]
+    command += arguments
     environment = {**os.environ, VARIABLE: fault} if fault else None
     return subprocess.Popen(
         command,
@@ -108,11 +108,14 @@ def finish(process: subprocess.Popen[str]) -> tuple[str, str]:
     return said, errors
 
 
-def wait_for_shards(out: Path, count: int) -> None:
-    end = time.monotonic() + 120
+def wait_for_shards(out: Path, count: int, patience: float | None = None) -> None:
+    """Wait until there are some shards: as long as it takes, or for some seconds at most."""
+    end = time.monotonic() + (120.0 if patience is None else patience)
     while len(list(out.glob("shards/*/*.h5"))) < count:
-        assert time.monotonic() < end, "the build must go on"
-        time.sleep(0.1)
+        if time.monotonic() > end:
+            assert patience is not None, "the build must go on"
+            return
+        time.sleep(0.05)
 
 
 def workers_of(client: int) -> list[int]:
@@ -134,9 +137,9 @@ def events(out: Path, name: str) -> list[dict[str, Any]]:
     return [line for line in map(json.loads, lines) if line["event"] == name]
 
 
-def assert_clean(out: Path) -> None:
+def assert_clean(out: Path, *patterns: str) -> None:
     """Nothing is left of what was on the way."""
-    for pattern in (".*.tmp", "*.journal", "build.lock"):
+    for pattern in patterns or (".*.tmp", "*.journal", "build.lock"):
         assert list(out.rglob(pattern)) == []
 
 
@@ -144,12 +147,20 @@ def assert_clean(out: Path) -> None:
 @pytest.mark.sim
 @pytest.mark.slow
 def test_random_kills_change_nothing(meshes: Path, undisturbed: Path, tmp_path: Path) -> None:
-    """Twenty times a random one of four workers is killed, whatever it is at."""
+    """All of four workers are killed while objects are prepared, and twenty times one of them.
+
+    However quick they are: at the latest with the next shard.
+    """
     out, rng, killed = tmp_path / "out", random.Random(0), 0
     process = start_build(meshes, out, workers=4)
+    while not list(out.glob("objects/*.journal")):
+        assert process.poll() is None
+        time.sleep(0.05)
+    for worker in workers_of(process.pid):
+        os.kill(worker, signal.SIGKILL)
     wait_for_shards(out, 1)
     while process.poll() is None and killed < KILLS:
-        time.sleep(1.0)
+        wait_for_shards(out, 2 + killed, patience=0.8)
         workers = workers_of(process.pid)
         if workers:
             os.kill(rng.choice(workers), signal.SIGKILL)
@@ -160,6 +171,18 @@ def test_random_kills_change_nothing(meshes: Path, undisturbed: Path, tmp_path: 
     assert_clean(out)
     done = [(e["object"], e["start"]) for e in events(out, "unit done")]
     assert len(done) == len(set(done)) == UNITS
+
+
+@pytest.mark.cluster
+@pytest.mark.sim
+@pytest.mark.slow
+def test_four_workers_change_nothing(meshes: Path, undisturbed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    said, errors = finish(start_build(meshes, out, workers=4))
+    assert f"{UNITS} work units simulated\n" in said
+    assert errors == ""
+    assert_same_dataset(undisturbed, out)
+    assert_clean(out)
 
 
 @pytest.mark.cluster
@@ -191,6 +214,25 @@ def test_client_that_is_killed_or_stopped_goes_on(
     assert len(events(out, "finished")) == 1
 
 
+@pytest.mark.sim
+@pytest.mark.slow
+def test_objects_are_prepared_once_whatever_died(
+    meshes: Path, undisturbed: Path, config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The manifest names them when all are; a client that dies before loses none of them."""
+
+    def prepare(source: MeshSource, config: Config) -> PreparedObject:
+        raise AssertionError(f"{source.name} is prepared again")
+
+    out = tmp_path / "out"
+    for name in ("objects", "shards"):
+        shutil.copytree(undisturbed / name, out / name)
+    monkeypatch.setattr("drakegrasp.build.prepare", prepare)
+    build(find_meshes(meshes), out, config, run_here, show=False)
+    assert (out / "manifest.json").read_bytes() == (undisturbed / "manifest.json").read_bytes()
+    assert_same_dataset(undisturbed, out)
+
+
 @pytest.mark.cluster
 @pytest.mark.sim
 @pytest.mark.slow
@@ -202,7 +244,9 @@ def test_fault_costs_what_is_guilty_and_nothing_else(
     trimesh.creation.box([0.05, 0.05, 0.1]).export(more / "3_box_c.obj")
     faults = "crash:1_box_a:3:1 hang:1_box_a:5:0 freeze:2_box_b:4:2 crash:3_box_c"
     out = tmp_path / "out"
-    said, errors = finish(start_build(more, out, workers=2, fault=faults))
+    # Long enough for the innocent on a busy machine.
+    limit = ("--set", "attempt_seconds=8")
+    said, errors = finish(start_build(more, out, 2, *limit, fault=faults))
     assert "refused: 3_box_c: 3_box_c: must be fit to prepare, got one that crashed" in said
     assert errors == ""
     guilty = {
@@ -291,7 +335,8 @@ def test_full_disk_stops_and_goes_on(meshes: Path, undisturbed: Path, tmp_path: 
     assert process.returncode == 1
     assert "must have room for what is written" in errors.splitlines()[-1]
     assert "Traceback" not in errors, errors
-    assert_clean(out)
+    # A unit that was begun meanwhile, and dropped, keeps its journal for its next run.
+    assert_clean(out, ".*.tmp", "build.lock")
     finish(start_build(meshes, out, workers=1))
     assert_same_dataset(undisturbed, out)
 
@@ -354,6 +399,20 @@ def test_second_build_is_refused_before_it_starts(
 # The executor
 
 
+@pytest.mark.cluster
+def test_worker_that_takes_its_time_to_end_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def late(cluster: LocalCluster, timeout: float | None = None) -> None:
+        close(cluster, timeout)
+        raise TimeoutError
+
+    close = LocalCluster.close
+    monkeypatch.setattr(LocalCluster, "close", late)
+    with connect(workers=1) as client:
+        assert client.submit(abs, -1).result() == 1
+    with pytest.raises(KeyboardInterrupt), connect(workers=1):
+        raise KeyboardInterrupt
+
+
 @pytest.fixture(scope="module")
 def client() -> Iterator[Client]:
     with (
@@ -398,22 +457,83 @@ def test_items_are_taken_as_there_is_room(client: Client) -> None:
     assert taken == 1000
 
 
-@pytest.mark.cluster
-def test_without_any_worker_for_long_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(crew, "COUNT_SECONDS", 0.1)
+    monkeypatch.setattr(crew, "SAY_SECONDS", 0.2)
     monkeypatch.setattr(crew, "LOST_SECONDS", 0.5)
-    with (
-        LocalCluster(
-            n_workers=1, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
-        ) as cluster,
-        Client(cluster) as client,
-    ):
+
+
+@pytest.fixture
+def cluster() -> Iterator[LocalCluster]:
+    """A cluster of one worker, in this process."""
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
+    ) as cluster:
+        yield cluster
+
+
+@pytest.mark.cluster
+@pytest.mark.usefixtures("impatient")
+def test_where_no_worker_comes_back_it_says_so(cluster: LocalCluster) -> None:
+    with Client(cluster) as client:
         execute = DaskExecutor(client)
         changes: list[tuple[int, int]] = []
         execute.crew.on_change = lambda joined, left: changes.append((len(joined), len(left)))
-        results = execute(time.sleep, [0.0, 60.0])
+        results = execute(time.sleep, [0.0, 5.0])
         assert next(results) is None
         cluster.scale(0)
         with pytest.raises(MachineError, match=r"must be a worker, got none for 0\.5 s; the same"):
             next(results)
         assert changes == [(1, 0), (0, 1)]
+
+
+@pytest.mark.cluster
+@pytest.mark.usefixtures("impatient")
+def test_where_workers_may_come_the_work_waits(cluster: LocalCluster) -> None:
+    """As under SLURM, where all jobs reached their walltime and the next ones queue."""
+    with Client(cluster.scheduler_address) as client:
+        execute, said = DaskExecutor(client), 0
+
+        def say() -> None:
+            nonlocal said
+            said += 1
+
+        execute.crew.on_none = say
+        results = execute(str, [1, 2, 3, 4])
+        found = [next(results)]
+        cluster.scale(0)
+        threading.Timer(2.0, lambda: cluster.scale(1)).start()
+        client.run_on_scheduler(lambda dask_scheduler: None)
+        while client.nthreads():
+            time.sleep(0.05)
+        found += list(results)
+        assert sorted(found) == ["1", "2", "3", "4"]
+
+
+@pytest.mark.cluster
+def test_lost_scheduler_is_one_error(tmp_path: Path) -> None:
+    command, file = [sys.executable, "-m"], tmp_path / "scheduler.json"
+    options = ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
+    scheduler = subprocess.Popen(
+        [*command, "distributed.cli.dask_scheduler", *options, "--scheduler-file", str(file)],
+        stderr=subprocess.DEVNULL,
+    )
+    worker = subprocess.Popen(
+        [*command, "distributed.cli.dask_worker", "--scheduler-file", str(file), "--no-nanny"],
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        while not file.exists():
+            time.sleep(0.1)
+        with connect(scheduler_file=file) as client:
+            client.wait_for_workers(1, timeout=60)
+            results = DaskExecutor(client)(time.sleep, [0.0, 0.0, 600.0, 600.0])
+            assert [next(results), next(results)] == [None, None]
+            scheduler.kill()
+            with pytest.raises(MachineError, match=r"the scheduler must stay, got: .*; the same"):
+                next(results)
+    finally:
+        for process in (worker, scheduler):
+            process.kill()
+            process.wait(60)

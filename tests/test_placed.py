@@ -214,7 +214,7 @@ def test_pose_may_be_off_the_table_by_a_little() -> None:
         (np.full((4, 4), np.nan), "X_TO must be finite"),
         (np.eye(3), "X_TO must be a pose, 4 x 4 numbers, got an array of shape (3, 3)"),
         (np.tile(X_TO, (2, 1, 1)), "X_TO must be one pose, got an array of shape (2, 4, 4)"),
-        ("upright", "X_TO must be a pose, 4 x 4 numbers, got a str"),
+        ("upright", "X_TO must be a pose, 4 x 4 numbers, got text"),
         (X_TO.T, "X_TO must have 0 0 0 1 as its last row"),
     ],
 )

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drakegrasp import units
+from drakegrasp.build_log import BuildLog
 from drakegrasp.cli import main
 from drakegrasp.config import load_config
 from drakegrasp.errors import ConfigError, DataError
@@ -19,6 +20,7 @@ from drakegrasp.plan import (
     KEPT_OBJECTS,
     MEASURED,
     START_SECONDS,
+    logged_times,
     measure_storage,
     plan_build,
     plan_lines,
@@ -99,6 +101,35 @@ def test_times_are_read_as_written(tmp_path: Path) -> None:
     path.write_text('{"prepare": 1}')
     with pytest.raises(DataError, match="must be the output of"):
         read_times(path)
+
+
+def _log_unit(log: BuildLog, name: str, seconds: float, successes: int) -> None:
+    outcomes = {"dropped": 10 - successes, "success": successes}
+    spent = {"build": 0.5, "try": seconds, "look": 0.1 * successes, "write": 1.0}
+    log("unit done", object=name, outcomes=outcomes, seconds=spent)
+
+
+def test_plan_goes_by_the_log_of_the_build(tmp_path: Path) -> None:
+    """Attempts of 0.2 s on average, of one object three times as long as of the other."""
+    assert logged_times(tmp_path, SMALL) is None
+    log = BuildLog(tmp_path)
+    log("started", config_hash="another")
+    _log_unit(log, "mug", 70.0, 5)
+    log("started", config_hash=SMALL.simulation_hash())
+    assert logged_times(tmp_path, SMALL) is None
+    _log_unit(log, "mug", 1.0, 0)
+    _log_unit(log, "cup", 3.0, 2)
+    log("unit done", object="cup", outcomes={"dropped": 10}, seconds={})
+    with (tmp_path / "log.jsonl").open("a") as file:
+        file.write('{"event": "unit do')
+    times = logged_times(tmp_path, SMALL)
+    assert times is not None
+    assert times.attempt == pytest.approx(0.2 + 0.1)
+    assert times.shares == pytest.approx((0.5, 1.5))
+    assert times.look == pytest.approx(0.1)
+    assert times.successes == pytest.approx(0.1)
+    assert times.prepare == MEASURED.prepare
+    assert times.source == f"20 attempts of 2 objects in {tmp_path / 'log.jsonl'}"
 
 
 def test_lines_name_the_source() -> None:

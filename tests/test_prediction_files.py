@@ -174,7 +174,7 @@ def _absurd(path: Path) -> Path:
         (_array(np.zeros((0, 18))), "must hold at least one grasp, got none"),
         (_of("a.csv", b"1,2\n1,two\n"), "line 2: must be numbers .*, got 'two' as number 2"),
         (_of("a.csv", b"1,two\n1,2\n"), "line 1: must be numbers .*, got 'two' as number 2"),
-        (_of("a.csv", b"\n1;2\n3;4\n"), "line 3: must be numbers .*, got '3;4' as number 1"),
+        (_of("a.csv", b"\n1;2\n3;4\n"), "line 2: must be numbers .*, got '1;2' as number 1"),
         (_of("a.csv", b"a,b\n1,2\n1,2,3\n"), "line 3: must have 2 numbers like line 2, got 3"),
         (_of("a.csv", b"1,2,\n"), "line 1: must be numbers .*, got '' as number 3"),
         (_of("a.csv", b"a,b\n\n"), "must hold at least one grasp, got none"),

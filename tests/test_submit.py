@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import dask
@@ -20,6 +21,7 @@ from distributed import Client
 from scripts import PIPELINES, load_script
 
 import drakegrasp
+from drakegrasp import cluster
 from drakegrasp.build import build
 from drakegrasp.builtin import export_builtin
 from drakegrasp.cluster import DASK_SETTINGS, connect
@@ -155,7 +157,11 @@ def test_settings_survive_a_job_script() -> None:
 
 def test_keys_are_private_and_removed(tmp_path: Path) -> None:
     out = tmp_path / "out"
+    dead = out / ".tls-dead"  # of a client that was killed
+    dead.mkdir(parents=True)
+    make_certificates(dead)
     with _private_directory(out) as folder:
+        assert list(out.iterdir()) == [folder]
         files = make_certificates(folder)
         assert stat.S_IMODE(folder.stat().st_mode) == 0o700
         assert {stat.S_IMODE(path.stat().st_mode) for path in files} == {0o600}
@@ -174,6 +180,16 @@ def test_nothing_that_is_read_can_run() -> None:
                 assert name not in ("yaml.load", "yaml.full_load", "yaml.unsafe_load"), path
             if isinstance(node, ast.keyword) and node.arg == "allow_pickle":
                 assert isinstance(node.value, ast.Constant) and node.value.value is False, path
+
+
+@pytest.mark.parametrize(("there", "words"), [(True, "http://127.0.0.1:1"), (False, "pip install")])
+def test_dashboard_is_linked_where_it_is_served(
+    monkeypatch: pytest.MonkeyPatch, there: bool, words: str
+) -> None:
+    monkeypatch.setattr(cluster, "_has_dashboard", lambda: there)
+    line = cluster.dashboard_line(SimpleNamespace(dashboard_link="http://127.0.0.1:1/status"))
+    assert line.startswith("dashboard: ")
+    assert words in line
 
 
 @pytest.fixture

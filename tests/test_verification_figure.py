@@ -63,6 +63,7 @@ def verified(cube: ObjectModel) -> Callable[..., SimpleNamespace]:
             "placed": SimpleNamespace(model=cube, X_TO=standing(cube)),
             "p_OQ": P_OQ, "nhat_Q_O": NHAT_Q_O,
             "fit": None, "attempt": None, "trial": None, "lift": None,
+            "config": load_config(),
         }  # fmt: skip
         return SimpleNamespace(**result | values)
 
@@ -83,7 +84,7 @@ def texts_of(figure: Figure) -> list[str]:
 def test_contacts_on_opposite_sides_are_each_seen_once(
     verified: Callable[..., SimpleNamespace], config: Config, tmp_path: Path
 ) -> None:
-    figure = verification_figure(verified(), config)
+    figure = verification_figure(verified())
     assert len(figure.axes) == 2
     first, second = dots_of(figure, 0), dots_of(figure, 1)
     assert list(first) == list(second) == ["predicted 0", "predicted 1", "predicted 2"]
@@ -109,7 +110,7 @@ def test_dots_are_on_the_object_and_its_hand_is_shown(
         p_OQ=held.closed.p_OQ,
         nhat_Q_O=held.closed.nhat_Q_O,
     )
-    figure = verification_figure(result, config)
+    figure = verification_figure(result)
     assert texts_of(figure)[0] == "1_box_a  holds"
     assert [axes.get_title(loc="left") for axes in figure.axes][2] == "end of the lift"
     # Predicted where they were reached: dots lie on each other.
@@ -144,10 +145,10 @@ def test_last_panel_shows_the_last_instant(
         ({"fit": fit}, "the hand where it comes closest"),
         ({"lift": lift}, "end of the lift"),
     ):
-        figure = verification_figure(verified(**values), config)
+        figure = verification_figure(verified(**values))
         assert figure.axes[2].get_title(loc="left") == title
     refused = ForceLift(end=LiftEnd.INFEASIBLE, planned_force=np.inf)
-    assert len(verification_figure(verified(lift=refused), config).axes) == 2
+    assert len(verification_figure(verified(lift=refused)).axes) == 2
 
 
 @pytest.mark.parametrize("friction", [0.71, 0.1])

@@ -28,10 +28,11 @@ from drakegrasp.schema import CONVENTIONS, SCHEMA_VERSION, VERIFICATION_FIELDS, 
 from drakegrasp.trial import TrialRecord
 from drakegrasp.verification import Verification
 from drakegrasp.verification_files import (
+    json_lines,
+    part_path,
     refuse_unwritable,
     result_paths,
-    save_results,
-    write_json_lines,
+    write_json_line,
     write_results,
 )
 from drakegrasp.wrist_fit import WristFit
@@ -145,7 +146,8 @@ def found() -> list[Verification]:
 
 def lines_of(found: list[Verification]) -> list[dict[str, Any]]:
     stream = io.StringIO()
-    write_json_lines(found, stream)
+    for index, result in enumerate(found):
+        write_json_line(index, result, stream)
 
     def refuse(constant: str) -> None:
         raise AssertionError(f"{constant} is not strict JSON")
@@ -168,6 +170,8 @@ def test_a_line_says_all_of_a_grasp_in_strict_json(found: list[Verification]) ->
     assert held["closed"]["touching"] == [True, False, True]
     assert held["closed"]["p_OQ"][1] == [None, None, None]
     assert held["closed"]["other_links"] == 2
+    assert len(held["lifted"]["q"]) == 8
+    assert by_forces["forces"]["end"] == "held"
     assert held["solver"]["iterations"] == 12
     assert held["slip"] == 0.002
     assert held["forces"] is None
@@ -175,6 +179,8 @@ def test_a_line_says_all_of_a_grasp_in_strict_json(found: list[Verification]) ->
     assert by_forces["closed"] is None
     assert unreachable["normal_error_deg"] == pytest.approx([1.0, 2.0, 60.0])
     assert unreachable["smallest_friction"] is None
+    can_hold = [line["friction_can_hold"] for line in (held, unreachable, off)]
+    assert can_hold == [True, False, None]
     assert (off["X_OG"], off["spread"], off["epsilon"], off["slip"]) == (None, None, None, None)
     assert off["seconds"] == {"surface": 0.001}
 
@@ -225,11 +231,27 @@ def test_equal_results_give_equal_bytes(found: list[Verification], tmp_path: Pat
     assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
 
 
-def test_a_name_stands_for_two_files(found: list[Verification], tmp_path: Path) -> None:
-    lines, arrays = save_results(found, tmp_path / "new folder" / "run.1", CONFIG)
-    assert (lines.name, arrays.name) == ("run.1.jsonl", "run.1.h5")
-    assert len(lines.read_text(encoding="utf-8").splitlines()) == 4
-    assert sorted(p.name for p in lines.parent.iterdir()) == ["run.1.h5", "run.1.jsonl"]
+def test_lines_are_whole_in_the_end_and_not_lost_before(
+    found: list[Verification], tmp_path: Path
+) -> None:
+    out = tmp_path / "new folder" / "run.1"
+    with pytest.raises(KeyboardInterrupt), json_lines(out) as write:
+        write(0, found[0])
+        assert len(part_path(out).read_text(encoding="utf-8").splitlines()) == 1
+        raise KeyboardInterrupt
+    assert [p.name for p in out.parent.iterdir()] == ["run.1.part.jsonl"]
+    with json_lines(out) as write:
+        for index, result in enumerate(found):
+            write(index, result)
+    (whole,) = out.parent.iterdir()
+    assert whole.name == "run.1.jsonl"
+    assert len(whole.read_text(encoding="utf-8").splitlines()) == 4
+    with pytest.raises(ValueError, match="nothing"), json_lines(tmp_path / "deep" / "run"):
+        raise ValueError("nothing was verified")
+    assert [p.name for p in tmp_path.iterdir()] == ["new folder"]
+
+
+def test_a_name_stands_for_two_files(tmp_path: Path) -> None:
     for name in ("run.h5", "run.jsonl", "run.hdf5", "run"):
         assert [p.name for p in result_paths(tmp_path / name)] == ["run.jsonl", "run.h5"]
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from models import CUBE, box_model, standing
 from scipy.spatial.transform import Rotation
+from threadpoolctl import threadpool_limits
 
 import drakegrasp as dg
 from drakegrasp.candidates import R_OG0, Attempt
@@ -19,8 +20,9 @@ from drakegrasp.frames import X_WT, invert_pose, make_pose
 from drakegrasp.hand import load_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.placed import PlacedObject
-from drakegrasp.trial import run_attempt
+from drakegrasp.trial import TrialRecord, run_attempt
 from drakegrasp.verify import verify_contacts
+from drakegrasp.verify_plan import VerifyTask, plan_verification, run_task
 
 pytestmark = pytest.mark.sim
 
@@ -149,7 +151,7 @@ def test_three_contacts_on_one_face_hold_nothing(cube: PlacedObject, method: str
     found = verify(cube, p, np.tile([1.0, 0.0, 0.0], (3, 1)), method)
     assert not found.success
     assert found.smallest_friction == np.inf
-    assert "no friction is enough" in found.explain()
+    assert "are not enough at any friction" in found.explain()
 
 
 def test_contacts_that_no_hand_spans_are_unreachable(tmp_path: Path) -> None:
@@ -195,6 +197,52 @@ def test_a_drake_error_is_a_value_and_the_next_grasp_is_untouched(
     again = verify(cube, p, n)
     assert again.closed is not None and held.closed is not None
     np.testing.assert_array_equal(again.closed.p_OQ, held.closed.p_OQ)
+
+
+def test_without_a_verdict_on_one_try_there_is_none(
+    cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A palm pose that timed out might have held."""
+    outcomes = iter([Outcome.SLIPPED, Outcome.TIMEOUT, *[Outcome.DROPPED] * 3])
+    monkeypatch.setattr(
+        "drakegrasp.verify.run_attempt",
+        lambda scene, X_TO, attempt, config: TrialRecord(
+            outcome=next(outcomes), X_TO=X_TO, X_OG=attempt.X_OG
+        ),
+    )
+    found = verify(cube, *grasp)
+    assert found.tries > 1
+    assert found.outcome is Outcome.TIMEOUT
+    assert "says nothing about the grasp" in found.explain()
+
+
+def test_lift_by_forces_has_a_wall_clock_limit(
+    cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
+) -> None:
+    hasty = override_config(CONFIG, ["attempt_seconds=1e-3"])
+    found = verify_contacts(cube, *grasp, method="forces", config=hasty)
+    assert found.outcome is Outcome.TIMEOUT
+    assert "says nothing about the grasp" in found.reason
+
+
+def test_number_of_threads_changes_no_bit(
+    cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
+) -> None:
+    """Workers have one thread for linear algebra; a caller's own process has many."""
+    fits = []
+    for threads in (1, 4):
+        with threadpool_limits(threads):
+            (task,) = plan_of(cube, grasp)
+            _, (found,) = run_task(task)
+        assert found.fit is not None
+        fits.append(found.fit)
+    np.testing.assert_array_equal(fits[0].X_OG, fits[1].X_OG)
+    np.testing.assert_array_equal(fits[0].closing, fits[1].closing)
+
+
+def plan_of(cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]) -> list[VerifyTask]:
+    nothing = dict.fromkeys(("frame", "X", "X_TO", "units", "hand", "config", "dataset", "rows"))
+    return plan_verification(dg.pack_grasp(*grasp), cube, method="hand", **nothing)
 
 
 def _fail(scene: object) -> float:

@@ -9,14 +9,15 @@ import pytest
 import trimesh
 
 from drakegrasp.cluster import connect, verify_grasps
-from drakegrasp.config import load_config
+from drakegrasp.config import load_config, parse_config
 from drakegrasp.dataset import GraspDataset
-from drakegrasp.errors import ConfigError, GraspError
+from drakegrasp.errors import ConfigError, GraspError, MeshError
 from drakegrasp.manifest import read_manifest
 from drakegrasp.outcomes import Outcome
 from drakegrasp.placed import PlacedObject, place_object
 from drakegrasp.verification_files import write_results
 from drakegrasp.verify_plan import TASK_GRASPS, plan_verification, split_task
+from drakegrasp.verifying import verify_grasp
 
 pytestmark = pytest.mark.sim
 
@@ -35,7 +36,7 @@ def cube() -> PlacedObject:
 def plan(grasps: np.ndarray, mesh: PlacedObject | None = None, **options: object):
     defaults = dict.fromkeys(("frame", "X", "X_TO", "hand", "config", "dataset", "rows"))
     return plan_verification(
-        grasps, mesh, **{**defaults, "units": "m", "method": "forces", **options}
+        grasps, mesh, **{**defaults, "units": None, "method": "forces", **options}
     )
 
 
@@ -122,6 +123,48 @@ def test_wrong_rows_are_refused(test_split: GraspDataset, rows: list | None, wor
 def test_rows_without_a_dataset_are_refused(cube: PlacedObject) -> None:
     with pytest.raises(GraspError, match="rows must be those of a dataset"):
         plan(GRASP.ravel(), cube, rows=[0])
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"units": "cm"}, "units must be None with a dataset"),
+        ({"X": np.eye(4)}, "X must be None with a dataset"),
+        ({"mesh": "cup.obj"}, "a mesh or a dataset must be given, got both"),
+        ({"dataset": "grasps.hdf5"}, "dataset must be a GraspDataset, .*, got a str"),
+        ({"dataset": None}, "a mesh or a dataset must be given, got neither"),
+        ({"config": "paper"}, "config must be a Config, see load_config, got a str"),
+        ({"config": {}}, "config must be a Config, see load_config, got a dict"),
+        ({"rows": []}, r"rows must be one per grasp \(1\), got 0"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(
+    test_split: GraspDataset, options: dict, words: str
+) -> None:
+    asked = {"dataset": test_split, "rows": [0], **options}
+    with pytest.raises((GraspError, ConfigError), match=words):
+        plan(test_split.column("grasps")[:1], **asked)
+
+
+def test_row_must_be_named(test_split: GraspDataset) -> None:
+    with pytest.raises(GraspError, match=r"row must be that of the dataset .* got None"):
+        verify_grasp(test_split.column("grasps")[0], dataset=test_split)
+
+
+def test_object_keeps_the_rules_that_it_was_placed_by() -> None:
+    heavy = load_config(overrides=["objects.mass=2", "physics.friction_hand=0.3"])
+    box = trimesh.creation.box([EDGE] * 3)
+    placed = place_object(box, config=heavy)
+    (task,) = plan(GRASP.ravel(), placed)
+    assert parse_config(task.config) == heavy
+    # Friction is no matter of the object, its mass is.
+    slick = load_config(overrides=["objects.mass=2", "physics.friction_hand=0.1"])
+    (task,) = plan(GRASP.ravel(), placed, config=slick)
+    assert parse_config(task.config) == slick
+    with pytest.raises(ConfigError, match="objects must be as the object was placed with"):
+        plan(GRASP.ravel(), placed, config=load_config())
+    with pytest.raises(MeshError, match="units must be None for an object that is prepared"):
+        plan(GRASP.ravel(), placed, units="cm")
 
 
 def test_other_mass_than_the_datasets_is_refused(test_split: GraspDataset) -> None:
