@@ -11,12 +11,15 @@ import platform
 import resource
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
+import trimesh
 
 from drakegrasp.candidates import Attempt, make_attempts
 from drakegrasp.config import Config, override_config
@@ -24,22 +27,48 @@ from drakegrasp.construction import build_scene
 from drakegrasp.hand import load_hand
 from drakegrasp.manifest import installed_versions
 from drakegrasp.meshes import MeshSource
+from drakegrasp.object_model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.prepared import PreparedObject, prepare
+from drakegrasp.progress import Report, silent
 from drakegrasp.trial import TrialRecord
 from drakegrasp.units import Workbench, look_at_successes, predict_all, try_on
 
-#: Other ways to simulate an attempt, by which labels are judged.
+#: Verdicts before which nothing is simulated.
+DECIDED = (Outcome.SCREENED, Outcome.START_COLLISION)
+#: Attempts from one report of progress to the next.
+STRIDE = 50
+
+
+@dataclass(frozen=True)
+class Variant:
+    """Another way to simulate an attempt, by which labels are judged.
+
+    Attributes:
+        overrides: Of the configuration; `{half}` stands for half of its time step.
+        fine: Whether each face of the object is cut into four, so that edges are half as long.
+    """
+
+    overrides: tuple[str, ...] = ()
+    fine: bool = False
+
+
 VARIANTS = {
-    "screen_off": ["screen.mode=off"],
-    "half_step": ["physics.time_step={half}"],
-    "similar": ["physics.solver=similar"],
-    "sap": ["physics.solver=sap"],
+    "screen_off": Variant(("screen.mode=off",)),
+    "half_step": Variant(("physics.time_step={half}",)),
+    "double_resolution": Variant(fine=True),
+    "similar": Variant(("physics.solver=similar",)),
+    "sap": Variant(("physics.solver=sap",)),
 }
 
 
 def measure(
-    sources: Iterable[MeshSource], config: Config, *, sample: int = 0
+    sources: Sequence[MeshSource],
+    config: Config,
+    *,
+    sample: int = 0,
+    peer: bool = False,
+    progress: Report = silent,
 ) -> Iterator[dict[str, Any]]:
     """Yield what was measured on each object, see `docs/performance.md`.
 
@@ -48,29 +77,54 @@ def measure(
         config: What to run; `candidates.max` says how much.
         sample: Attempts per object that are run again in other ways for `fidelity`, drawn
             with the seed from those whose palm ray meets the object.
+        peer: Whether to run all attempts in MuJoCo as well; needs the extra `[peer]`.
+        progress: Called with the attempts that are done, as far as objects are known.
 
     Raises:
         MeshError: If a mesh cannot be prepared.
     """
+    counter = _Counter(progress, len(sources), (2 if peer else 1), sample)
     for source in sources:
-        yield _measure_object(source, config, sample)
+        yield _measure_object(source, config, sample, peer, counter)
+
+
+class _Counter:
+    """Counts attempts for the progress; objects to come count as those before did."""
+
+    def __init__(self, progress: Report, objects: int, runs: int, sample: int) -> None:
+        self._progress, self._objects, self._runs, self._sample = progress, objects, runs, sample
+        self._done = self._begun = self._known = self._grasps = 0
+
+    def begin(self, attempts: int, hits: int) -> None:
+        """Add the attempts of the next object."""
+        self._begun += 1
+        self._known += self._runs * attempts + len(VARIANTS) * min(self._sample, hits)
+
+    def add(self, outcome: Outcome) -> None:
+        """Count an attempt."""
+        self._done += 1
+        self._grasps += outcome is Outcome.SUCCESS
+        if self._done % STRIDE == 0 or self._done == self._known:
+            total = self._known * self._objects // self._begun
+            self._progress(self._done, total, grasps=self._grasps)
 
 
 def summarize(objects: Sequence[dict[str, Any]], config: Config) -> dict[str, Any]:
     """Return the whole report: machine, versions, each object and all together."""
     outcomes: Counter[str] = Counter()
-    seconds: dict[str, float] = {}
+    seconds: Counter[str] = Counter()
     for found in objects:
         outcomes.update(found["outcomes"])
-        for stage, spent in found["seconds"].items():
-            seconds[stage] = seconds.get(stage, 0.0) + spent
+        seconds.update(found["seconds"])
     total = {"objects": len(objects), **_rates(outcomes, seconds)}
     if any("fidelity" in found for found in objects):
         total["fidelity"] = _add_fidelity([found["fidelity"] for found in objects])
+    if any("peer" in found for found in objects):
+        total["peer"] = _add_peer([found["peer"] for found in objects])
     return {
         "all": total,
         "objects": list(objects),
-        "peak_memory": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
+        "peak_memory": _peak_memory(),
         "cpu": _cpu(),
         "versions": installed_versions(config),
         "config": config.to_dict(),
@@ -78,38 +132,51 @@ def summarize(objects: Sequence[dict[str, Any]], config: Config) -> dict[str, An
 
 
 def compare(now: dict[str, Any], then: dict[str, Any]) -> dict[str, float]:
-    """Return the ratio of each rate to that of an earlier report, over the same attempts."""
+    """Return the ratio of each rate to that of an earlier report."""
     keys = ("resolved_per_core_second", "grasps_per_core_hour")
     return {key: now["all"][key] / then["all"][key] for key in keys if then["all"][key]}
 
 
-def _measure_object(source: MeshSource, config: Config, sample: int) -> dict[str, Any]:
+def _measure_object(
+    source: MeshSource, config: Config, sample: int, peer: bool, counter: _Counter
+) -> dict[str, Any]:
     seconds: dict[str, float] = {}
     with _timed(seconds, "prepare"):
         prepared = prepare(source, config)
+    attempts = _attempts(prepared, config)
+    hits = [row for row, attempt in enumerate(attempts) if attempt.ray_hits]
+    counter.begin(len(attempts), len(hits))
     with _timed(seconds, "scene"):
         scene = build_scene(prepared.model, config.physics, load_hand(config.hand))
         bench = Workbench(prepared=prepared, config=config, scene=scene)
     with _timed(seconds, "field"):
         _ = prepared.model.field
-    attempts = _attempts(prepared, config)
     with _timed(seconds, "screen"):
         predictions = predict_all(bench, attempts)
     records: list[TrialRecord] = []
     for attempt, prediction in zip(attempts, predictions, strict=True):
         with _timed(seconds, "try"):
             records.append(try_on(bench, attempt, prediction))
+        counter.add(records[-1].outcome)
     with _timed(seconds, "look"):
         look_at_successes(bench, records)
-    outcomes = Counter(record.outcome.label for record in records)
     found = {
         "name": source.name,
         "faces": len(prepared.model.collision_faces),
         "candidates": len(prepared.candidates),
-        **_rates(outcomes, seconds),
+        **_rates(Counter(record.outcome.label for record in records), seconds),
+        "peak_memory": _peak_memory(),
     }
+    if peer:
+        found["peer"] = _run_peer(prepared, attempts, config, counter)
+        ours, theirs = found["grasps_per_core_hour"], found["peer"]["grasps_per_core_hour"]
+        found["peer"]["ratio"] = ours / theirs if theirs else None
     if sample:
-        found["fidelity"] = _fidelity(prepared, attempts, records, config, sample)
+        rows = np.random.default_rng(config.seed).permutation(hits)[:sample].tolist()
+        found["fidelity"] = {
+            name: _compare_labels(prepared, attempts, records, rows, config, variant, counter)
+            for name, variant in VARIANTS.items()
+        }
     return found
 
 
@@ -131,41 +198,81 @@ def _rates(outcomes: Counter[str], seconds: Mapping[str, float]) -> dict[str, An
     }
 
 
-def _fidelity(
+def _run_peer(
+    prepared: PreparedObject, attempts: Sequence[Attempt], config: Config, counter: _Counter
+) -> dict[str, Any]:
+    """Return what MuJoCo makes of the same attempts; cutting the object into parts is prepared."""
+    from drakegrasp.peer import Peer
+
+    seconds: dict[str, float] = {}
+    with _timed(seconds, "prepare"):
+        peer = Peer(prepared.model, prepared.X_TO, config)
+    outcomes: Counter[str] = Counter()
+    for attempt in attempts:
+        with _timed(seconds, "try"):
+            outcome = peer.run(attempt)
+        outcomes[outcome.label] += 1
+        counter.add(outcome)
+    return {"parts": peer.parts, **_rates(outcomes, seconds)}
+
+
+def _add_peer(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    outcomes: Counter[str] = Counter()
+    seconds: Counter[str] = Counter()
+    for each in found:
+        outcomes.update(each["outcomes"])
+        seconds.update(each["seconds"])
+    ratios = [each["ratio"] for each in found if each["ratio"] is not None]
+    middle = median(ratios) if ratios else None
+    return {**_rates(outcomes, seconds), "median_ratio": middle}
+
+
+def _compare_labels(
     prepared: PreparedObject,
     attempts: Sequence[Attempt],
     records: Sequence[TrialRecord],
+    rows: Sequence[int],
     config: Config,
-    sample: int,
-) -> dict[str, dict[str, int]]:
-    """Return counts for each variant over a random sample of an object's attempts."""
-    hits = [row for row, attempt in enumerate(attempts) if attempt.ray_hits]
-    rng = np.random.default_rng(config.seed)
-    rows = rng.permutation(hits)[:sample].tolist()
+    variant: Variant,
+    counter: _Counter,
+) -> dict[str, int]:
+    """Return counts for one variant over some of an object's attempts."""
     half = config.physics.time_step / 2.0
-    found = {}
-    for name, overrides in VARIANTS.items():
-        other = override_config(config, [text.format(half=half) for text in overrides])
-        scene = build_scene(prepared.model, other.physics, load_hand(other.hand))
-        bench = Workbench(prepared=prepared, config=other, scene=scene)
-        pairs = [(records[row].outcome, try_on(bench, attempts[row]).outcome) for row in rows]
-        found[name] = _count(pairs)
-    return found
+    other = override_config(config, [text.format(half=half) for text in variant.overrides])
+    if variant.fine:
+        prepared = replace(prepared, model=_finer(prepared.model))
+    scene = build_scene(prepared.model, other.physics, load_hand(other.hand))
+    bench = Workbench(prepared=prepared, config=other, scene=scene)
+    some = [attempts[row] for row in rows]
+    pairs = []
+    for row, attempt, prediction in zip(rows, some, predict_all(bench, some), strict=True):
+        outcome = try_on(bench, attempt, prediction).outcome
+        counter.add(outcome)
+        pairs.append((records[row].outcome, outcome))
+    return _count(pairs)
+
+
+def _finer(model: ObjectModel) -> ObjectModel:
+    """Return an object whose collision surface is the same in four times as many faces."""
+    vertices, faces = trimesh.remesh.subdivide(model.collision_vertices, model.collision_faces)
+    return replace(model, collision_vertices=vertices, collision_faces=faces.astype(np.int32))
 
 
 def _count(pairs: Sequence[tuple[Outcome, Outcome]]) -> dict[str, int]:
+    """Return counts of pairs of verdicts: as measured, and in another way."""
     success = Outcome.SUCCESS
-    decided = (Outcome.SCREENED, Outcome.START_COLLISION)
     # What geometry said instead of the simulation is no other label.
     alike = {Outcome.SCREENED: Outcome.MISSING_FINGERTIP}
+    flips = [(a, b) for a, b in pairs if alike.get(a, a) is not alike.get(b, b)]
     return {
         "attempts": len(pairs),
-        "flips": sum(alike.get(a, a) is not alike.get(b, b) for a, b in pairs),
-        "simulated": sum(a not in decided for a, _ in pairs),
+        "flips": len(flips),
+        "simulated": sum(a not in DECIDED for a, _ in pairs),
         "successes": sum(a is success for a, _ in pairs),
         "successes_other": sum(b is success for _, b in pairs),
-        "decided": sum(a in decided for a, _ in pairs),
-        "successes_lost_by_screen": sum(a in decided and b is success for a, b in pairs),
+        "success_flips": sum(success in pair for pair in flips),
+        "decided": sum(a in DECIDED for a, _ in pairs),
+        "successes_lost_by_screen": sum(a in DECIDED and b is success for a, b in pairs),
     }
 
 
@@ -175,12 +282,21 @@ def _add_fidelity(found: Sequence[dict[str, dict[str, int]]]) -> dict[str, dict[
         counts: Counter[str] = Counter()
         for each in found:
             counts.update(each[name])
-        added[name] = {**counts, "flip_share": counts["flips"] / max(1, counts["attempts"])}
+        flips = counts["flips"]
+        added[name] = {
+            **counts,
+            "flip_share": flips / max(1, counts["attempts"]),
+            "flip_share_of_simulated": flips / max(1, counts["simulated"]),
+        }
     off = added["screen_off"]
     lost, successes = off["successes_lost_by_screen"], off["successes_other"]
     off["recall"] = 1.0 - lost / successes if successes else None
     off["precision"] = 1.0 - lost / off["decided"] if off["decided"] else None
     return added
+
+
+def _peak_memory() -> int:
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def _cpu() -> str:

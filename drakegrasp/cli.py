@@ -431,14 +431,41 @@ def verify(
 @click.option(
     "--objects", default=BUILTIN, show_default=True, metavar="MESH_DIR|builtin", help="Meshes."
 )
-@click.option("--only", multiple=True, metavar="NAME", help="Of these, the ones with this name.")
+@click.option("--only", multiple=True, metavar="NAME", help="Those whose names begin so.")
 @click.option("--config", "preset", metavar="YAML|PRESET", help="[paper]")
 @set_option
-@click.option("--candidates", type=int, default=100, show_default=True, help="Per object.")
-@click.option("--fidelity", type=int, default=0, metavar="N", help="Compare labels of N attempts.")
-@click.option("--compare", type=click.Path(path_type=Path, exists=True, dir_okay=False))
+@click.option(
+    "--candidates",
+    type=click.IntRange(min=1),
+    default=100,
+    show_default=True,
+    help="Palm poses per object.",
+)
+@click.option(
+    "--fidelity",
+    type=click.IntRange(min=0),
+    default=0,
+    metavar="N",
+    help="Compare the labels of N attempts per object.",
+)
+@click.option("--peer", is_flag=True, help="Run the same attempts in MuJoCo.")
+@click.option(
+    "--compare",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    metavar="FILE",
+    help="An earlier report; print the ratios to it.",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    default=Path("bench.json"),
+    show_default=True,
+    metavar="FILE",
+    help="Where the report goes, as JSON.",
+)
 @units_option
 @manifest_option
+@click.option("--quiet", is_flag=True, help="No progress bar.")
 def bench(
     objects: str,
     only: tuple[str, ...],
@@ -446,15 +473,18 @@ def bench(
     overrides: tuple[str, ...],
     candidates: int,
     fidelity: int,
+    peer: bool,
     compare: Path | None,
+    out: Path,
     units: str,
     manifest: Path | None,
+    quiet: bool,
 ) -> None:
-    """Measure what attempts cost on this machine, in one process; print JSON.
+    """Measure what attempts cost on this machine, in one process.
 
     With --fidelity, N random attempts of each object are simulated again without the screen, at
-    half the step and by Drake's other solvers. With --compare, the ratios to an earlier
-    report are added.
+    half the step, with four times the faces and by Drake's other solvers. With --peer (extra
+    [peer]), all are simulated plainly in MuJoCo as well.
     """
     import json
     import tempfile
@@ -463,24 +493,58 @@ def bench(
     from drakegrasp.builtin import export_builtin
     from drakegrasp.config import load_config
     from drakegrasp.meshes import find_meshes
+    from drakegrasp.progress import progress_bar
+    from drakegrasp.tables import bench_table, fidelity_table
 
+    if peer:
+        _need_peer()
     config = load_config(preset, [*overrides, f"candidates.max={candidates}"])
+    then = None if compare is None else _read_report(compare)
     with tempfile.TemporaryDirectory() as folder:
         if objects == BUILTIN:
             export_builtin(Path(folder))
-            objects = folder
-        sources = [
-            s
-            for s in find_meshes(Path(objects), units=units, manifest=manifest)
-            if not only or s.name in only
-        ]
+        meshes = Path(folder) if objects == BUILTIN else Path(objects)
+        every = find_meshes(meshes, units=units, manifest=manifest)
+        sources = [s for s in every if not only or s.name.startswith(only)]
         if not sources:
             raise click.UsageError(f"--only must name objects of {objects}, got {', '.join(only)}")
-        found = list(measuring.measure(sources, config, sample=fidelity))
-    report = measuring.summarize(found, config)
-    if compare is not None:
-        report["ratio"] = measuring.compare(report, json.loads(compare.read_text()))
-    click.echo(json.dumps(report, indent=1))
+        with progress_bar("bench", "attempts", show=not quiet) as progress:
+            measured = measuring.measure(
+                sources, config, sample=fidelity, peer=peer, progress=progress
+            )
+            report = measuring.summarize(list(measured), config)
+    if then is not None:
+        report["ratio"] = measuring.compare(report, then)
+    out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    _print(bench_table(report))
+    if fidelity:
+        _print(fidelity_table(report["all"]["fidelity"]))
+    for key, ratio in report.get("ratio", {}).items():
+        click.echo(f"{key.replace('_', ' ')}: {ratio:.2f} times that of {compare}")
+    click.echo(str(out))
+
+
+def _need_peer() -> None:
+    from importlib.util import find_spec
+
+    for module in ("mujoco", "coacd"):
+        if find_spec(module) is None:
+            raise click.UsageError(
+                f"--peer must find {module}, got none: pip install 'drakegrasp[peer]'"
+            )
+
+
+def _read_report(path: Path) -> dict[str, Any]:
+    import json
+
+    try:
+        report: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        _ = report["all"]["resolved_per_core_second"] + report["all"]["grasps_per_core_hour"]
+    except (ValueError, KeyError, TypeError):
+        raise click.UsageError(
+            f"--compare must be a report of `drakegrasp bench`, got {path}"
+        ) from None
+    return report
 
 
 def _console(*, stderr: bool = False) -> Console:

@@ -60,7 +60,7 @@ class ObjectConfig(_Section):
 class PhysicsConfig(_Section):
     """Contact and time stepping; reasons and sources in docs/physics.md."""
 
-    time_step: Annotated[float, Field(gt=0.0, le=0.02)] = 0.004  # [s]
+    time_step: Annotated[float, Field(gt=0.0, le=0.02)] = 0.008  # [s]
     friction_hand: Positive = 0.71  # effective coefficient between hand and object
     friction_table: Positive = 0.71  # effective coefficient between table and object
     fingertip_modulus: Annotated[float, Field(gt=0.0, le=1e8)] = 1e7  # hydroelastic [Pa]

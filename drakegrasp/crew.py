@@ -1,8 +1,9 @@
 """Tasks on Dask's workers, some of which die.
 
 In: a function and items. Out: the results, in any order. A few tasks per worker are in
-flight, whatever their number, and nothing is kept of those that are done. A task whose
-worker died is given to another: that it comes to an end is the task's own business (see
+flight, whatever their number, and nothing is kept of those that are done. Items that take
+next to no time go several to a task, as each task costs some messages. A task whose
+worker died is given to another: that it comes to an end is the items' own business (see
 `drakegrasp.journal`), so the number of deaths is bounded generously. One that got an image
 of nothing is tried again, too, as it may be one worker's OpenGL.
 
@@ -15,9 +16,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
-from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from itertools import islice
 from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar, cast
@@ -34,8 +33,10 @@ R = TypeVar("R")
 
 #: Tasks in flight per worker: one that runs, and one so that it never waits.
 IN_FLIGHT = 2
-#: The same for tasks that take no time, so that the wire is no bottleneck.
-DEEPEST = 64
+#: Items go together until their task takes about so long [s]: many times what its messages do.
+TASK_SECONDS = 0.25
+#: Most items of a task: the next ones may take far longer than the last ones did.
+LARGEST = 16
 #: How often the workers are counted [s].
 COUNT_SECONDS = 2.0
 #: How long a result may take from a worker to here, until the workers are counted again [s].
@@ -53,19 +54,36 @@ _GOES_ON = "the same command goes on from here"
 
 @dataclass(eq=False)
 class _Flight(Generic[T]):
-    """A task that was given out."""
+    """A task that was given out: some items, one after the other."""
 
-    item: T
+    items: Sequence[T]
     future: Future | None = None
     given_up: int = 0
     blank: int = 0
 
 
 @dataclass(frozen=True)
-class _Failure:
-    """Why a task is to be tried again."""
+class _Landing(Generic[R]):
+    """What a task brings back: the results of its first items, one at least."""
 
-    error: Exception
+    results: list[R]
+    seconds: float
+
+
+def _run_items(function: Callable[[T], R], items: Sequence[T]) -> _Landing[R]:
+    """Return the results up to the first item that raises; if that is the first, raise it.
+
+    So an error comes back as Dask sends errors, and costs no results.
+    """
+    start, results = time.monotonic(), list[R]()
+    for item in items:
+        try:
+            results.append(function(item))
+        except Exception:
+            if not results:
+                raise
+            break
+    return _Landing(results, time.monotonic() - start)
 
 
 class DaskExecutor:
@@ -84,7 +102,7 @@ class DaskExecutor:
         self._counted = -float("inf")
         self._lost: float | None = None
         self._said = False
-        self._depth = IN_FLIGHT
+        self._together = 1
         self.crew = Crew()
 
     def __call__(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
@@ -99,57 +117,38 @@ class DaskExecutor:
         arrived: SimpleQueue[str] = SimpleQueue()
         flights: dict[str, _Flight[T]] = {}
 
-        def launch(batch: Sequence[_Flight[T]]) -> None:
+        def launch(flight: _Flight[T]) -> None:
             # A task writes files, so it is never the same as one that was done before.
-            futures = self._client.map(function, [flight.item for flight in batch], pure=False)
-            for flight, future in zip(batch, futures, strict=True):
-                flight.future, flights[future.key] = future, flight
-                future.add_done_callback(lambda done: arrived.put(done.key))
+            future = self._client.submit(_run_items, function, flight.items, pure=False)
+            flight.future, flights[future.key] = future, flight
+            future.add_done_callback(lambda done: arrived.put(done.key))
 
         while True:
             self._count()
-            room = max(0, self._room() - len(flights))
-            launch([_Flight(item) for item in islice(waiting, room)])
+            while len(flights) < IN_FLIGHT * max(1, len(self._workers)):
+                together = tuple(islice(waiting, self._together))
+                if not together:
+                    break
+                launch(_Flight(together))
             if not flights:
                 return
-            landed = [flights.pop(key) for key in self._next(arrived)]
-            again = []
-            for flight, result in zip(landed, self._results(landed), strict=True):
-                if isinstance(result, _Failure):
-                    self._refuse_more(flight, result.error)
-                    again.append(flight)
-                else:
-                    yield cast(R, result)
-            launch(again)
-
-    def _results(self, landed: Sequence[_Flight[Any]]) -> Iterator[Any]:
-        """Yield the result of each task that is done, or what is no fault of its own.
-
-        Where the worker died with the result, the scheduler has the task done again.
-        """
-        futures = [cast(Future, flight.future) for flight in landed]
-        found = self._gathered(futures)
-        if found is not None:
-            yield from found
-            return
-        for future in futures:
+            flight = flights.pop(self._next(arrived))
             try:
-                yield self._result(future)
+                landing: _Landing[R] = self._result(cast(Future, flight.future))
             except (KilledWorker, BlankImageError) as error:
-                yield _Failure(error)
+                self._refuse_more(flight, error)
+                launch(flight)
+                continue
+            self._adapt(landing)
+            left = flight.items[len(landing.results) :]
+            if left:
+                launch(_Flight(left))
+            yield from landing.results
 
-    def _gathered(self, futures: Sequence[Future]) -> list[Any] | None:
-        """Return the results of a crowd of tasks at once, or None if one of them has none."""
-        if len(futures) < 2 or not all(future.status == "finished" for future in futures):
-            return None
-        with suppress(Exception):  # what it is comes out one by one
-            found: list[Any] = self._client.sync(
-                partial(self._client.gather, asynchronous=True),
-                futures,
-                callback_timeout=GATHER_SECONDS,
-            )
-            return found
-        return None
+    def _adapt(self, landing: _Landing[Any]) -> None:
+        """Choose how many of the next items go together, by how long the last ones took."""
+        fit = TASK_SECONDS * len(landing.results) / max(landing.seconds, 1e-6)
+        self._together = int(max(1, min(fit, 2 * self._together, LARGEST)))
 
     def _result(self, future: Future) -> Any:
         """Return the result of a task that is done, or raise what it raised."""
@@ -177,25 +176,17 @@ class DaskExecutor:
         if flight.given_up > self._resubmissions:
             raise MachineError(f"the workers must stay alive, got: {error}") from None
 
-    def _next(self, arrived: SimpleQueue[str]) -> list[str]:
-        """Return the keys of the tasks that are done, once there is one.
+    def _next(self, arrived: SimpleQueue[str]) -> str:
+        """Return the key of a task that is done, once there is one.
 
         Raises:
             MachineError: If there is no worker for long.
         """
-        found: list[str] = []
-        while not found:
+        while True:
             try:
-                found.append(arrived.get(timeout=COUNT_SECONDS))
+                return arrived.get(timeout=COUNT_SECONDS)
             except Empty:
                 self._count()
-        with suppress(Empty):
-            while True:
-                found.append(arrived.get_nowait())
-        # Tasks that are done at once come back in crowds: then more go out at a time.
-        crowd = len(found) > len(self._workers)
-        self._depth = min(2 * self._depth, DEEPEST) if crowd else max(IN_FLIGHT, self._depth // 2)
-        return found
 
     def _count(self) -> None:
         """Count the workers, now and then.
@@ -238,9 +229,6 @@ class DaskExecutor:
         if missed > SAY_SECONDS and not self._said:
             self._said = True
             self.crew.on_none()
-
-    def _room(self) -> int:
-        return self._depth * max(1, len(self._workers))
 
 
 def _scheduler_lost(got: str) -> MachineError:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from rich.box import SIMPLE
 from rich.markup import escape
@@ -132,6 +133,67 @@ def verdict_table(outcomes: Sequence[Outcome]) -> Table:
         table.add_row(outcome.label, f"{counts[outcome]:,}", share)
     table.add_section()
     table.add_row("all", f"{len(outcomes):,}", "")
+    return table
+
+
+def bench_table(report: Mapping[str, Any]) -> Table:
+    """Return what `bench.summarize` found: rates, and seconds of a core by stage."""
+    table = _table("Attempts on one core")
+    stages = ("scene", "field", "screen", "try", "look")
+    with_peer = "peer" in report["all"]
+    heads = ["faces", "attempts", "grasps", "attempts\nper s", "grasps\nper h"]
+    heads += [f"{stage}\n{escape('[s]')}" for stage in stages]
+    heads += ["MuJoCo\ngrasps/h", "ratio"] if with_peer else []
+    table.add_column("object", no_wrap=True, overflow="ellipsis", max_width=24)
+    for head in heads:
+        table.add_column(head, justify="right", no_wrap=True)
+
+    def row(name: str, found: Mapping[str, Any]) -> None:
+        peer = found.get("peer", {})
+        ratio = peer.get("ratio", peer.get("median_ratio"))
+        cells = [
+            f"{found['faces']:,}" if "faces" in found else "",
+            f"{found['attempts']:,}",
+            f"{found['outcomes'].get(Outcome.SUCCESS.label, 0):,}",
+            f"{found['resolved_per_core_second']:.1f}",
+            f"{found['grasps_per_core_hour']:,.0f}",
+            *(f"{found['seconds'][stage]:.1f}" for stage in stages),
+        ]
+        if with_peer:
+            cells += [f"{peer['grasps_per_core_hour']:,.0f}", f"{ratio:.2f}" if ratio else "-"]
+        table.add_row(escape(name), *cells)
+
+    for found in report["objects"]:
+        row(found["name"], found)
+    table.add_section()
+    row("all (ratio: median)" if with_peer else "all", report["all"])
+    return table
+
+
+def fidelity_table(found: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Return how labels differ where the same attempts are simulated in other ways."""
+    table = _table("The same attempts in other ways")
+    table.add_column("way", no_wrap=True)
+    heads = (
+        "attempts",
+        "simulated",
+        "other\nlabels",
+        "of the\nsimulated",
+        "grasps",
+        "grasps\nthere",
+    )
+    for head in heads:
+        table.add_column(head, justify="right", no_wrap=True)
+    for name, counts in found.items():
+        numbers = [counts[key] for key in ("attempts", "simulated", "flips")]
+        grasps = [counts[key] for key in ("successes", "successes_other")]
+        share = f"{counts['flip_share_of_simulated']:.1%}"
+        cells = [*(f"{n:,}" for n in numbers), share, *(f"{n:,}" for n in grasps)]
+        table.add_row(name.replace("_", " "), *cells)
+    off = found["screen_off"]
+    lost, successes = off["successes_lost_by_screen"], off["successes_other"]
+    table.caption = f"grasps that the screen took out: {lost:,} of {successes:,}"
+    table.caption_justify = "left"
     return table
 
 

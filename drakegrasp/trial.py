@@ -43,6 +43,8 @@ PEAK_SPEED = 15.0 / 8.0
 PEAK_ACCELERATION = 10.0 / np.sqrt(3.0)
 #: Far below a time step, far above the rounding of a sum of them [s].
 ROUNDING = 1e-9
+#: An object that moved less than this in the hand since the last look is still held [m], [rad].
+STILL, STILL_ANGLE = 5e-4, np.deg2rad(0.5)
 #: A finger that is farther than this beyond where it can meet the object has missed it [rad].
 BEYOND = np.deg2rad(2.0)
 
@@ -241,15 +243,16 @@ def _lift(clock: _Clock, record: TrialRecord, config: Config) -> TrialRecord:
     release(scene)
     move_wrist(scene, target, duration)
     end = start + duration + config.lift.hold_time
-    contacts = None
+    contacts, X_GO_seen = None, X_GO_before
     while contacts is None:
-        remaining = end - scene.time
-        clock.advance(min(config.lift.check_period, remaining))
+        clock.advance(min(config.lift.check_period, end - scene.time))
         _refuse_explosion(scene, config)
-        if end - scene.time < ROUNDING or not hand_touches_object(scene):
+        X_GO = invert_pose(palm_pose(scene)) @ scene.pose(scene.object)
+        lost = _moved(X_GO_seen, X_GO) and not hand_touches_object(scene)
+        X_GO_seen = X_GO
+        if lost or end - scene.time < ROUNDING:
             contacts = read_contacts(scene)
     X_WO = scene.pose(scene.object)
-    X_GO = invert_pose(palm_pose(scene)) @ X_WO
     moved = invert_pose(X_GO_before) @ X_GO
     return replace(
         record,
@@ -261,6 +264,13 @@ def _lift(clock: _Clock, record: TrialRecord, config: Config) -> TrialRecord:
         slip=float(np.linalg.norm(X_GO[:3, 3] - X_GO_before[:3, 3])),
         slip_angle=rotation_angle(moved[:3, :3]),
     )
+
+
+def _moved(X_GO_before: Array, X_GO: Array) -> bool:
+    """Return whether the object moved in the hand: looking for contacts costs a step's time."""
+    shift = float(np.linalg.norm(X_GO[:3, 3] - X_GO_before[:3, 3]))
+    turn = rotation_angle((invert_pose(X_GO_before) @ X_GO)[:3, :3])
+    return shift > STILL or turn > STILL_ANGLE
 
 
 def _refuse_explosion(scene: Scene, config: Config) -> None:

@@ -31,7 +31,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
         "parts scene render dataset contact_forces wrist_problem hand_paths",
         "samples construction contacts figures postures screen",
         "assemble layout_rules sample_rules image_rules trial_rules scenes wrist_fit",
-        "stats resting trial open_file doc_figures plan",
+        "stats resting trial open_file doc_figures plan peer",
         "prepared tables dataset_rules theatre lift_path placed",
         "units check force_lift force_margin",
         "build snapshots verified bench",

@@ -10,7 +10,11 @@ from click.testing import CliRunner
 
 from drakegrasp import bench
 from drakegrasp.cli import main
+from drakegrasp.config import load_config
+from drakegrasp.meshes import find_meshes
+from drakegrasp.object_model import prepare_object
 from drakegrasp.outcomes import Outcome
+from drakegrasp.surfaces import signed_volume
 
 pytestmark = pytest.mark.sim
 
@@ -23,22 +27,43 @@ def meshes(tmp_path_factory):
 
 
 def test_report_says_what_attempts_cost(meshes, tmp_path):
-    arguments = ["bench", "--objects", str(meshes), "--candidates", "4", "--fidelity", "2"]
-    first = CliRunner().invoke(main, arguments)
+    path, other = tmp_path / "first.json", tmp_path / "second.json"
+    arguments = ["bench", "--objects", str(meshes), "--candidates", "4", "--quiet"]
+    first = CliRunner().invoke(main, [*arguments, "--fidelity", "2", "--peer", "--out", str(path)])
     assert first.exit_code == 0, first.output
-    report = json.loads(first.stdout)
+    report = json.loads(path.read_text())
     (found,) = report["objects"]
     assert found["attempts"] == report["all"]["attempts"] == 12
-    assert sum(found["outcomes"].values()) == 12
+    assert sum(found["outcomes"].values()) == sum(found["peer"]["outcomes"].values()) == 12
     assert {"prepare", "scene", "field", "screen", "try", "look"} == set(found["seconds"])
     assert found["resolved_per_core_second"] > 0.0
     assert report["peak_memory"] > 50e6
     assert report["versions"]["drake"]
     assert set(report["all"]["fidelity"]) == set(bench.VARIANTS)
-    path = tmp_path / "before.json"
-    path.write_text(first.stdout)
-    again = CliRunner().invoke(main, [*arguments[:-2], "--compare", str(path)])
-    assert json.loads(again.stdout)["ratio"]["resolved_per_core_second"] > 0.0
+    assert all(counts["attempts"] == 2 for counts in report["all"]["fidelity"].values())
+    assert "MuJoCo" in first.stdout
+    assert "double resolution" in first.stdout
+    again = CliRunner().invoke(main, [*arguments, "--out", str(other), "--compare", str(path)])
+    ratio = json.loads(other.read_text())["ratio"]["resolved_per_core_second"]
+    assert f"{ratio:.2f} times that of {path}" in again.stdout.replace("\n", "")
+
+
+def test_finer_surface_is_the_same_surface(meshes):
+    (source,) = find_meshes(meshes)
+    model = prepare_object(source, load_config().objects)
+    finer = bench._finer(model)
+    assert len(finer.collision_faces) == 4 * len(model.collision_faces)
+    volumes = [signed_volume(m.collision_vertices, m.collision_faces) for m in (model, finer)]
+    assert volumes[1] == pytest.approx(volumes[0])
+
+
+def test_report_of_something_else_is_wrong_usage(meshes, tmp_path):
+    path = tmp_path / "report.json"
+    path.write_text("[]")
+    arguments = ["bench", "--objects", str(meshes), "--compare", str(path)]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 2
+    assert "--compare must be a report" in result.output
 
 
 def test_name_that_no_mesh_has_is_wrong_usage(meshes):
