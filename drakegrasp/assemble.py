@@ -31,6 +31,7 @@ from drakegrasp.progress import Report, silent
 from drakegrasp.samples import create_splits, write_samples
 from drakegrasp.schema import (
     CAMERAS,
+    CERTIFICATE_FIELDS,
     OBJECT_FIELDS,
     SPLITS,
     SUCCESS_FIELDS,
@@ -242,6 +243,7 @@ def _successes(part: Part, shard: Shard, K: Array) -> Successes:
         camera_height=unpack_pose(looks["X_TC_otm"])[:, 2, 3],
         depth_variance=looks["image_otm"][:, 3].astype(float).var(axis=(1, 2)),
         surface_distance=trials["surface_distance"].max(axis=1, initial=0.0),
+        **{field.name: looks[field.name] for field in CERTIFICATE_FIELDS},
     )
 
 
@@ -260,7 +262,8 @@ def _concatenate(found: Sequence[Successes]) -> Successes:
 def _write_removal(file: h5py.File, successes: Successes, removal: AnyArray) -> None:
     """Keep beside the trials why each success is, or is not, a sample."""
     group = file.create_group("successes")
-    for field, values in zip(SUCCESS_FIELDS, (successes.trial_id, removal), strict=True):
+    for field in SUCCESS_FIELDS:
+        values = removal if field.name == "removal" else getattr(successes, field.name)
         write_field(group, field, values)
 
 

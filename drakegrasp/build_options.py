@@ -63,6 +63,12 @@ _OPTIONS = (
     set_option,
     click.option("--candidates", type=int, help="Palm poses per object.  [10000]"),
     click.option("--max-grasps", type=int, help="Grasps per object after which no more are tried."),
+    click.option(
+        "--certify",
+        type=click.IntRange(min=0),
+        metavar="K",
+        help="Repeat each success K times with noise, to store how robust it is.  [0]",
+    ),
     click.option("--seed", type=int, help="Of all random draws.  [0]"),
     units_option,
     manifest_option,
@@ -106,6 +112,7 @@ def parse_request(
     overrides: Sequence[str],
     candidates: int | None,
     max_grasps: int | None,
+    certify: int | None,
     seed: int | None,
     units: str,
     manifest: Path | None,
@@ -122,6 +129,8 @@ def parse_request(
     chosen = list(overrides)
     if candidates is not None:
         chosen.append(f"candidates.max={candidates}")
+    if certify is not None:
+        chosen.append(f"certify.repeats={certify}")
     return BuildRequest(
         objects=objects,
         out=out.absolute(),

@@ -24,6 +24,7 @@ Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
+NonNegativeCount = Annotated[int, Field(ge=0)]
 Angles = Annotated[tuple[Annotated[float, Field(allow_inf_nan=False)], ...], Field(min_length=1)]
 
 
@@ -81,6 +82,7 @@ class SettleConfig(_Section):
     max_linear_speed: Positive = 1e-3  # [m/s], slower than this is at rest
     max_angular_speed: Positive = 1e-2  # [rad/s], slower than this is at rest
     rest_time: Positive = 0.2  # [s], at rest for this long
+    time_step: Annotated[float, Field(gt=0.0, le=0.02)] = 0.004  # [s]; longer ones turn what lands
 
 
 class CandidateConfig(_Section):
@@ -137,6 +139,17 @@ class LiftConfig(_Section):
     max_acceleration: Positive = 1.0  # [m/s^2] of the wrist
     hold_time: NonNegative = 0.3  # [s] at the target before the second judgement
     check_period: Positive = 0.1  # [s] of simulation between two looks
+
+
+class CertifyConfig(_Section):
+    """How robust each success is; see docs/performance.md."""
+
+    repeats: NonNegativeCount = 0  # of each success with noise; 0 certifies nothing
+    palm_noise: NonNegative = 0.002  # [m], standard deviation along each axis of the palm
+    palm_noise_deg: NonNegative = 1.0  # standard deviation about each axis of the palm
+    friction_noise: NonNegative = 0.1  # standard deviation of the coefficient's logarithm
+    mass_noise: NonNegative = 0.1  # standard deviation of the mass's logarithm
+    friction_steps: Annotated[int, Field(ge=1, le=16)] = 4  # halvings to the least friction
 
 
 class CameraConfig(_Section):
@@ -199,6 +212,7 @@ class Config(_Section):
     screen: ScreenConfig = ScreenConfig()
     close: CloseConfig = CloseConfig()
     lift: LiftConfig = LiftConfig()
+    certify: CertifyConfig = CertifyConfig()
     camera: CameraConfig = CameraConfig()
     max_grasps: Count | None = None  # successes per object after which no more are tried
     filters: FilterConfig = FilterConfig()

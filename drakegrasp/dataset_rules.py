@@ -68,6 +68,17 @@ def successes(trials: OpenFile, expected: AnyArray) -> Iterator[Violation]:
             what=f"removal must be 0..{max(Removal)}",
             got=str(removal[row]),
         )
+    for name, largest in (("certified_share", 1.0), ("certified_friction", np.inf)):
+        values = group[name][:]
+        bad = ~np.isnan(values) & ~((values >= 0.0) & (values <= largest))
+        for row in np.flatnonzero(bad).tolist():
+            yield Violation(
+                file=trials.name,
+                group="/successes",
+                row=row,
+                what=f"{name} must be 0..{largest:g} or NaN",
+                got=f"{values[row]:g}",
+            )
 
 
 def kept_are_samples(data: OpenFile, trials: OpenFile) -> Iterator[Violation]:

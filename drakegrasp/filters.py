@@ -50,6 +50,7 @@ class Successes:
         camera_height: (n,), of the cameras above the table [m].
         depth_variance: (n,), of the otm depth image [m^2].
         surface_distance: (n,), largest of the contacts' distances from the surface [m].
+        certified_share, certified_friction: (n,), see the schema; no filter asks for them.
     """
 
     trial_id: npt.NDArray[np.int64]
@@ -60,6 +61,8 @@ class Successes:
     camera_height: Array
     depth_variance: Array
     surface_distance: Array
+    certified_share: Array
+    certified_friction: Array
 
 
 def judge_successes(

@@ -29,6 +29,8 @@ from drakegrasp.outcomes import Outcome
 #: Time that the scheduler and the client spend on a task, one after the other [s]; measured
 #: with distributed 2026.8 on two cores.
 TASK_SECONDS = 0.003
+#: One simulation of `certify` [s]: twice the mean of 48 successes on ten G3DB meshes.
+CERTIFY_SECONDS = 1.0
 #: Objects whose scenes a worker keeps, see `units`.
 KEPT_OBJECTS = 2
 #: Until a worker has imported Drake and takes its first task [s].
@@ -305,13 +307,20 @@ def _bytes(objects: int, units: int, attempts: int, times: StageTimes) -> float:
 def _units(objects: int, config: Config, times: StageTimes) -> list[tuple[int, float]]:
     """Return object and seconds of every work unit, without the building of its scene."""
     step, candidates = config.unit_candidates, config.candidates.max
-    look = times.successes * times.look
+    look = times.successes * (times.look + _certify_seconds(config))
     units = []
     for i in range(objects):
         share = times.shares[int(i * GOLDEN % 1.0 * len(times.shares))]
         one = len(config.candidates.standoffs) * (times.attempt * share + look)
         units += [(i, one * min(step, candidates - k)) for k in range(0, candidates, step)]
     return units
+
+
+def _certify_seconds(config: Config) -> float:
+    """Return how long certifying a success takes [s]."""
+    rules = config.certify
+    trials = rules.repeats + rules.friction_steps + 1 if rules.repeats else 0
+    return CERTIFY_SECONDS * trials
 
 
 def _run(tasks: Iterable[float], free: list[float]) -> float:

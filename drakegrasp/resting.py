@@ -63,8 +63,8 @@ def settle(model: ObjectModel, config: Config) -> Resting:
 
 
 def _settle(model: ObjectModel, config: Config) -> Resting:
-    scene = build_scene(model, config.physics)
     rules = config.settle
+    scene = build_scene(model, config.physics.model_copy(update={"time_step": rules.time_step}))
     lowest = float(model.collision_vertices[:, 2].min())
     X_WO = X_WT @ make_pose(np.eye(3), [0.0, 0.0, rules.drop_height - lowest])
     reset_object(scene, X_WO)

@@ -353,6 +353,27 @@ TRIAL_FIELDS: tuple[Field, ...] = (
     ),
 )
 
+#: How robust a success is; see `drakegrasp.certify`.
+CERTIFICATE_FIELDS: tuple[Field, ...] = (
+    Field(
+        name="certified_share",
+        shape=(),
+        dtype="float64",
+        unit="-",
+        frame="-",
+        meaning="share of `certify.repeats` repeats with noise that hold; NaN if not certified",
+    ),
+    Field(
+        name="certified_friction",
+        shape=(),
+        dtype="float64",
+        unit="-",
+        frame="-",
+        meaning="least friction of hand and object at which it holds, inf if not even at the "
+        "configured one; NaN if not certified",
+    ),
+)
+
 #: A row per success, in `/looks` of a shard.
 LOOK_FIELDS: tuple[Field, ...] = (
     Field(
@@ -403,6 +424,7 @@ LOOK_FIELDS: tuple[Field, ...] = (
         frame="C (otm)",
         meaning="image frame estimated from the otm mask",
     ),
+    *CERTIFICATE_FIELDS,
 )
 
 #: A row per success, in `/successes` of trials.hdf5.
@@ -417,6 +439,7 @@ SUCCESS_FIELDS: tuple[Field, ...] = (
         meaning="why it is no sample: 0 kept, 1 not_seen, 2 out_of_view, 3 bisects_table, "
         "4 flat_depth, 5 off_surface, 6 outlier, 7 rejected",
     ),
+    *CERTIFICATE_FIELDS,
 )
 
 #: A row per object, in `/objects` of trials.hdf5.

@@ -24,6 +24,7 @@ import numpy as np
 
 from drakegrasp.camera import camera_pose_otm, camera_pose_oto, image_frame, intrinsics
 from drakegrasp.candidates import Attempt, make_attempts
+from drakegrasp.certify import UNKNOWN, Certificate, certify
 from drakegrasp.config import Config, parse_config
 from drakegrasp.construction import build_scene
 from drakegrasp.contacts import Contacts
@@ -65,6 +66,8 @@ HANG_FACTOR = 1.5
 STAGE_SECONDS = 600.0
 #: What else a unit does, by the name of its step.
 _STAGES = {"build": "building its scene", "look": "its images", "write": "writing its shard"}
+#: How many attempts' time a certificate may take before it hangs.
+CERTIFY_FACTOR = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +95,8 @@ class UnitSummary:
     Attributes:
         header: Of the unit.
         outcomes: Number of attempts by outcome.
-        seconds: Wall clock by stage (`build`, `try`, `look`, `write`) [s]; for logs only.
+        seconds: Wall clock by stage (`build`, `try`, `look`, `certify` if there are repeats,
+            `write`) [s]; for logs only.
         errors: Number of solver errors by their message.
     """
 
@@ -207,6 +211,9 @@ def _run_unit(unit: WorkUnit, journal: Journal) -> UnitSummary:
         records = _try_all(bench, attempts, journal)
     with _timed(seconds, "look"):
         looks = look_at_successes(bench, records, journal)
+    if config.certify.repeats:
+        with _timed(seconds, "certify"):
+            _certify_all(bench, attempts, looks, journal)
     with _stage(journal, "write", header, seconds):
         shard = Shard(header=header, trials=trial_rows(bench, attempts, records), looks=looks)
         write_shard(out, shard)
@@ -350,6 +357,28 @@ def look_at_successes(
             for name, value in _images(bench, records[row]).items():
                 columns[name][k] = value
     return columns
+
+
+def _certify_all(
+    bench: Workbench,
+    attempts: Sequence[Attempt],
+    looks: dict[str, AnyArray],
+    journal: Journal,
+) -> None:
+    """Fill in how robust each success is."""
+    for k, row in enumerate(looks["row"].tolist()):
+        found = _certify_step(bench, attempts[row], journal, f"certify {row}")
+        looks["certified_share"][k] = found.share
+        looks["certified_friction"][k] = found.friction
+
+
+def _certify_step(bench: Workbench, attempt: Attempt, journal: Journal, step: str) -> Certificate:
+    if journal.verdict(step) is not None:  # it ended its process: the grasp itself held
+        return UNKNOWN
+    rules, config = bench.config.certify, bench.config
+    trials = rules.repeats + rules.friction_steps + 1
+    with journal.step(step, CERTIFY_FACTOR * trials * config.attempt_seconds):
+        return certify(bench.prepared.model, bench.prepared.X_TO, attempt, config)
 
 
 def _images(bench: Workbench, record: TrialRecord) -> dict[str, AnyArray]:

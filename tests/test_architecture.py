@@ -32,7 +32,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
         "samples construction contacts figures postures screen",
         "assemble layout_rules sample_rules image_rules trial_rules scenes wrist_fit",
         "stats resting trial open_file doc_figures plan peer",
-        "prepared tables dataset_rules theatre lift_path placed",
+        "prepared tables dataset_rules theatre lift_path placed certify",
         "units check force_lift force_margin",
         "build snapshots verified bench",
         "recording verification_figure",

@@ -25,6 +25,8 @@ def good(count: int) -> Successes:
         camera_height=np.full(count, 0.3),
         depth_variance=np.full(count, 0.01),
         surface_distance=np.full(count, 1e-4),
+        certified_share=np.full(count, np.nan),
+        certified_friction=np.full(count, np.nan),
     )
 
 

@@ -266,7 +266,7 @@ def test_lift_keeps_its_speed_and_acceleration_limits(scene, cube, config):
     target = X_WT[:3, 3] + config.lift.p_TG
     duration = lift_duration(float(np.linalg.norm(target - start)), config)
     move_wrist(scene, target, duration)
-    heights, step = [], 0.02
+    heights, step = [], 5.0 * config.physics.time_step
     for _ in range(int(duration / step) + 10):
         advance(scene, step)
         heights.append(palm_pose(scene)[2, 3])
@@ -327,23 +327,24 @@ def test_camera_stands_behind_the_palm(cube, config):
 
 
 @pytest.mark.slow
-def test_quarter_of_the_step_gives_the_same_verdicts(tmp_path, config, hand):
-    """At 4 ms and at 1 ms at least 95 % of the attempts that are simulated end alike."""
+@pytest.mark.parametrize("step", [0.004, 0.008])
+def test_smaller_step_gives_the_same_verdicts(tmp_path, config, hand, step):
+    """At the default of 8 ms, or at 4 ms, 95 % of what is simulated ends as at 1 ms."""
     model = box_model(tmp_path, [0.05, 0.07, 0.15], name="1_box_tall")
     X_TO = standing(model)
     candidates = sample_candidates(model, X_TO, config.candidates, 0)
     made = make_attempts(candidates, range(40), config.candidates, name=model.name, seed=0)
     attempts = [attempt for attempt in made if attempt.ray_hits]
-    config = override_config(config, ["screen.mode=off"])
-    fine = override_config(config, ["physics.time_step=0.001"])
-    coarse_scene = build_scene(model, config.physics, hand)
+    coarse = override_config(config, ["screen.mode=off", f"physics.time_step={step}"])
+    fine = override_config(config, ["screen.mode=off", "physics.time_step=0.001"])
+    coarse_scene = build_scene(model, coarse.physics, hand)
     fine_scene = build_scene(model, fine.physics, hand)
-    coarse = [run_attempt(coarse_scene, X_TO, a, config) for a in attempts]
-    simulated = [i for i, record in enumerate(coarse) if record.closed is not None]
+    records = [run_attempt(coarse_scene, X_TO, a, coarse) for a in attempts]
+    simulated = [i for i, record in enumerate(records) if record.closed is not None]
     again = [run_attempt(fine_scene, X_TO, attempts[i], fine) for i in simulated]
-    alike = [coarse[i].outcome is b.outcome for i, b in zip(simulated, again, strict=True)]
+    alike = [records[i].outcome is b.outcome for i, b in zip(simulated, again, strict=True)]
     assert len(alike) >= 20
-    assert sum(coarse[i].outcome is Outcome.SUCCESS for i in simulated) >= 3
+    assert sum(records[i].outcome is Outcome.SUCCESS for i in simulated) >= 3
     assert np.mean(alike) >= 0.95
 
 

@@ -1,0 +1,62 @@
+"""What a certificate says: robust grasps hold when disturbed, and friction is found by halving."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from models import CUBE, box_model, from_above, standing
+
+from drakegrasp.certify import certify
+from drakegrasp.config import Config, load_config, override_config
+from drakegrasp.construction import build_scene
+from drakegrasp.hand import load_hand
+from drakegrasp.object_model import ObjectModel
+from drakegrasp.outcomes import Outcome
+from drakegrasp.trial import run_attempt
+
+pytestmark = pytest.mark.sim
+
+STANDOFF = 0.06
+
+
+@pytest.fixture(scope="module")
+def cube(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
+    return box_model(tmp_path_factory.mktemp("cube"), [CUBE, CUBE, CUBE])
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return load_config(overrides=["certify.repeats=3", "certify.friction_steps=3"])
+
+
+def test_same_grasp_has_the_same_certificate_and_others_another(cube, config):
+    attempt = from_above(cube, STANDOFF)
+    first = certify(cube, standing(cube), attempt, config)
+    assert first == certify(cube, standing(cube), attempt, config)
+    assert first.share == 1.0
+    assert 0.0 < first.friction <= config.physics.friction_hand
+
+
+def test_least_friction_holds_and_less_does_not(cube, config):
+    attempt, X_TO = from_above(cube, STANDOFF), standing(cube)
+    found = certify(cube, X_TO, attempt, config).friction
+    gap = config.physics.friction_hand / 2**config.certify.friction_steps
+    half = config.physics.time_step / 2.0
+    for friction, holds in ((found, True), (found - gap, False)):
+        assert friction > 0.0
+        changed = [f"physics.friction_hand={friction}", f"physics.time_step={half}"]
+        other = override_config(config, changed)
+        scene = build_scene(cube, other.physics, load_hand(other.hand))
+        record = run_attempt(scene, X_TO, attempt, other)
+        assert (record.outcome is Outcome.SUCCESS) == holds
+
+
+def test_noise_of_centimetres_spoils_grasps(cube, config):
+    wild = override_config(config, ["certify.palm_noise=0.04", "certify.palm_noise_deg=20"])
+    assert certify(cube, standing(cube), from_above(cube, STANDOFF), wild).share < 1.0
+
+
+def test_grasp_that_does_not_hold_at_half_the_step_has_no_friction(cube, config):
+    slick = override_config(config, ["physics.friction_hand=0.02"])
+    found = certify(cube, standing(cube), from_above(cube, STANDOFF), slick)
+    assert (found.share, found.friction) == (0.0, np.inf)
