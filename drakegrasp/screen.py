@@ -31,6 +31,8 @@ Counts = npt.NDArray[np.int64]
 
 #: Attempts that are looked at together, so that their points fit into a processor's cache.
 START_CHUNK, SWEEP_CHUNK = 8, 32
+#: Of the open hand's points every so many are looked at first.
+START_STRIDE = 8
 #: Fingertips nearer to each other than this while they would be skipped forward may meet [m].
 FINGER_GAP = 0.01
 
@@ -133,10 +135,11 @@ def _affine(row: Points, p: Points) -> Points:
 def _predict(view: _View, paths: HandPaths, config: ScreenConfig) -> list[Prediction]:
     every, margin = np.arange(len(view)), config.start_margin
     opened = np.concatenate([paths.still, *(path.points[0] for path in paths.fingers)])
-    nearest = np.concatenate(
-        [_open_distance(view, rows, opened, margin) for rows in _chunks(every, START_CHUNK)]
-    )
+    # What some of the points decide, all of them would: the nearest of all is no farther.
+    nearest = _open_distance(view, every, opened[::START_STRIDE], margin)
     alive = np.flatnonzero(nearest >= -margin)
+    nearest[alive] = _open_distance(view, alive, opened, margin)
+    alive = alive[nearest[alive] >= -margin]
     predictions = [
         Prediction(outcome=Outcome.START_COLLISION, clear=False, closing=_NOTHING, last=_NOTHING)
     ] * len(view)
@@ -177,8 +180,11 @@ def _angles(paths: HandPaths, indices: Counts) -> Array:
 
 def _open_distance(view: _View, rows: Counts, opened: Points, margin: float) -> Points:
     """Return the distance (a,) of the open hand from object and table, where it is small."""
-    to_object = view.distances(rows, opened, margin).min(axis=1)
-    return np.asarray(np.minimum(to_object, view.heights(rows, opened).min(axis=1)))
+    found = np.zeros(len(rows), dtype=np.float32)
+    for at in _chunks(np.arange(len(rows)), START_CHUNK):
+        to_object = view.distances(rows[at], opened, margin).min(axis=1)
+        found[at] = np.minimum(to_object, view.heights(rows[at], opened).min(axis=1))
+    return found
 
 
 class _Sweep:

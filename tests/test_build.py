@@ -16,7 +16,7 @@ from drakegrasp.assemble import assemble
 from drakegrasp.build import build
 from drakegrasp.check import check_dataset
 from drakegrasp.cluster import build_dataset
-from drakegrasp.config import Config, load_config
+from drakegrasp.config import Config, load_config, override_config
 from drakegrasp.dataset import GraspDataset
 from drakegrasp.errors import ConfigError, DataError, MachineError, MeshError
 from drakegrasp.executor import run_here
@@ -303,3 +303,24 @@ def test_wrong_use_of_workers_is_refused(tmp_path: Path, small_meshes: Path) -> 
 def test_scheduler_that_is_not_there_is_named(tmp_path: Path, small_meshes: Path) -> None:
     with pytest.raises(MachineError, match="must be a running Dask scheduler"):
         build_dataset(small_meshes, tmp_path / "out", scheduler="tcp://127.0.0.1:9")
+
+
+def test_certificates_come_with_the_grasps_and_change_none(
+    small_meshes: Path, small_config: Config, small_dataset: Path, tmp_path: Path
+) -> None:
+    certified = ["certify.repeats=2", "certify.friction_steps=1"]
+    config = override_config(small_config, certified)
+    build(find_meshes(small_meshes), tmp_path / "out", config, run_here, show=False)
+    with (
+        h5py.File(tmp_path / "out" / "trials.hdf5", "r") as file,
+        h5py.File(small_dataset / "trials.hdf5", "r") as plain,
+    ):
+        share = file["successes/certified_share"][:]
+        friction = file["successes/certified_friction"][:]
+        assert np.array_equal(file["trials/outcome"][:], plain["trials/outcome"][:])
+        assert np.isnan(plain["successes/certified_share"][:]).all()
+    assert set(share.tolist()) <= {0.0, 0.5, 1.0}
+    mu = config.physics.friction_hand
+    assert set(friction.tolist()) <= {mu / 2.0, mu, np.inf}
+    assert (share == 1.0).any()
+    assert [str(v) for v in check_dataset(tmp_path / "out")] == []

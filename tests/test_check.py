@@ -612,6 +612,19 @@ def test_successes_and_removals_are_checked(out: Path) -> None:
     )
 
 
+def test_certificates_are_checked(out: Path) -> None:
+    change(out, TRIALS, "successes/certified_share", 1, lambda _: 1.0)
+    change(out, TRIALS, "successes/certified_friction", 1, lambda _: np.inf)
+    must_find(out)
+    change(out, TRIALS, "successes/certified_share", 1, lambda _: 1.5)
+    change(out, TRIALS, "successes/certified_friction", 1, lambda _: -0.1)
+    must_find(
+        out,
+        (TRIALS, "/successes", 1, "certified_share must be 0..1 or NaN"),
+        (TRIALS, "/successes", 1, "certified_friction must be 0..inf or NaN"),
+    )
+
+
 def test_objects_are_those_of_the_manifest(out: Path) -> None:
     change(out, TRIALS, "objects/class_name", 1, lambda _: "ball")
     must_find(out, (TRIALS, "/objects", 1, "class_name must be that of manifest.json, 'box'"))

@@ -48,6 +48,7 @@ settle:
   max_linear_speed: 2.0e-3
   max_angular_speed: 2.0e-2
   rest_time: 0.3
+  time_step: 0.002
 candidates:
   method: normals
   max: 100
@@ -76,6 +77,13 @@ lift:
   max_acceleration: 2.0
   hold_time: 0.5
   check_period: 0.05
+certify:
+  repeats: 5
+  palm_noise: 0.001
+  palm_noise_deg: 2.0
+  friction_noise: 0.2
+  mass_noise: 0.3
+  friction_steps: 3
 camera:
   distance: 0.3
   size: 64

@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from drakegrasp import units
 from drakegrasp.build_log import BuildLog
 from drakegrasp.cli import main
-from drakegrasp.config import load_config
+from drakegrasp.config import load_config, override_config
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.plan import (
+    CERTIFY_SECONDS,
     KEPT_OBJECTS,
     MEASURED,
     START_SECONDS,
@@ -48,6 +49,14 @@ def test_workers_wait_where_work_does_not_divide() -> None:
     assert plan.stages["simulate"] == pytest.approx(30.0, abs=0.1)
     assert plan.busy == pytest.approx(96.0 / (4 * 32.0), abs=0.01)
     assert plan.core_hours == pytest.approx(4 * plan.hours)
+
+
+def test_certificates_cost_their_trials() -> None:
+    """Two successes, each tried twice more with noise and five times for its friction."""
+    times = replace(EVEN, successes=2.0 / 300.0)
+    certified = override_config(SMALL, ["certify.repeats=2"])
+    seconds = [plan_build(1, c, 1, times).stages["simulate"] for c in (SMALL, certified)]
+    assert seconds[1] - seconds[0] == pytest.approx(2 * (2 + 5) * CERTIFY_SECONDS)
 
 
 def test_scenes_are_built_once_per_worker_and_object() -> None:
