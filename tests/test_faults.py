@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ import numpy as np
 import pytest
 import trimesh
 from assertions import assert_same_dataset
-from distributed import Client, LocalCluster
+from distributed import Client, LocalCluster, get_worker
 
 from drakegrasp import crew, render, units
 from drakegrasp.build import build
@@ -456,6 +457,32 @@ def test_items_are_taken_as_there_is_room(client: Client) -> None:
     for done, _ in enumerate(results):
         assert taken <= done + 1 + 2 * 2 * crew.LARGEST
     assert taken == 1000
+
+
+def _task_of(seconds: float) -> str:
+    """Return which task an item is in, after a while."""
+    time.sleep(seconds)
+    return str(get_worker().get_current_task())
+
+
+@pytest.mark.cluster
+def test_quick_items_go_together_and_slow_ones_alone(client: Client) -> None:
+    execute = DaskExecutor(client)
+    together = list(execute(_task_of, [0.0] * 400))
+    assert len(together) == 400
+    assert len(set(together)) < 100
+    assert max(Counter(together).values()) <= crew.LARGEST
+    alone = list(execute(_task_of, [1.5 * crew.TASK_SECONDS] * 40))
+    assert len(set(alone)) == 40
+
+
+def test_error_costs_no_results_of_the_items_before_it() -> None:
+    def invert(value: float) -> float:
+        return 1.0 / value
+
+    assert crew._run_items(invert, [1.0, 2.0, 0.0, 4.0]).results == [1.0, 0.5]
+    with pytest.raises(ZeroDivisionError):
+        crew._run_items(invert, [0.0, 4.0])
 
 
 @pytest.fixture
