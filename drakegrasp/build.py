@@ -9,7 +9,6 @@ from __future__ import annotations
 import socket
 import sys
 import time
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -35,17 +34,15 @@ from drakegrasp.manifest import (
     write_manifest,
 )
 from drakegrasp.meshes import MeshSource, source_sha256
-from drakegrasp.outcomes import Outcome
 from drakegrasp.prepared import load_prepared, prepare, save_prepared
 from drakegrasp.progress import Report, progress_bar
 from drakegrasp.shards import ShardHeader, disk_full_named, sweep_temporary
+from drakegrasp.tally import NAMED, Tally
 from drakegrasp.threads import one_thread
 from drakegrasp.units import UnitSummary, WorkUnit, find_outcomes, run_unit
 
 #: Wall clock after which preparing a mesh hangs [s].
 PREPARE_SECONDS = 1800.0
-#: How many of many things are named in one line.
-NAMED = 10
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -349,9 +346,9 @@ def _refused(source: MeshSource, reason: str) -> dict[str, Any]:
     return {"name": source.name, "mesh_sha256": source_sha256(source), "reason": reason}
 
 
-def _run_all(manifest: Manifest, job: _Job, report: Report) -> _Tally:
+def _run_all(manifest: Manifest, job: _Job, report: Report) -> Tally:
     """Run the work units that are not done; return what is done then."""
-    tally = _Tally(manifest, job.crew, report)
+    tally = Tally(manifest, job.crew, report)
     config, expendable = manifest.config.to_dict(), job.crew is not None
     if job.crew is not None:
 
@@ -376,7 +373,7 @@ def _run_all(manifest: Manifest, job: _Job, report: Report) -> _Tally:
     return tally
 
 
-def _is_done(header: ShardHeader, tally: _Tally, job: _Job) -> bool:
+def _is_done(header: ShardHeader, tally: Tally, job: _Job) -> bool:
     """Return whether a shard is there and whole, and count it; one that is harmed is named."""
     try:
         outcomes = find_outcomes(job.out, header)
@@ -404,63 +401,3 @@ def _log_unit(summary: UnitSummary, job: _Job) -> None:
         seconds={stage: round(seconds, 4) for stage, seconds in summary.seconds.items()},
         errors=summary.errors,
     )
-
-
-class _Tally:
-    """What is done, in numbers: nothing here grows with the number of work units.
-
-    For `max_grasps` it knows, by object, how far its units are done without a gap, how many
-    grasps these have, and the units beyond the gap, which are those in flight.
-    """
-
-    def __init__(self, manifest: Manifest, crew: Crew | None, report: Report) -> None:
-        self.simulated = self.reused = self.damaged = 0
-        self.named: list[str] = []
-        self.errors: Counter[str] = Counter()
-        self._crew, self._report = crew, report
-        self._wanted, self._step = manifest.config.max_grasps, manifest.config.unit_candidates
-        standoffs = len(manifest.config.candidates.standoffs)
-        self._total = standoffs * sum(entry["candidates"] for entry in manifest.objects)
-        self._outcomes: Counter[Outcome] = Counter()
-        self._found = 0
-        self._grasps: Counter[str] = Counter()
-        self._gap: Counter[str] = Counter()
-        self._beyond: dict[str, dict[int, int]] = {}
-
-    def add_damaged(self, name: str) -> None:
-        """Count a harmed shard; the first are named."""
-        self.damaged += 1
-        if len(self.named) < NAMED:
-            self.named.append(name)
-
-    def add(
-        self, header: ShardHeader, outcomes: dict[Outcome, int], *, found: bool = False
-    ) -> None:
-        """Count a unit that is done, now or before."""
-        self._outcomes.update(outcomes)
-        self._found += found * sum(outcomes.values())
-        if self._wanted is not None:
-            self._close_gap(header, outcomes.get(Outcome.SUCCESS, 0))
-        self.show()
-
-    def show(self) -> None:
-        """Report what is done, and by how many workers."""
-        figures = {"grasps": self._outcomes[Outcome.SUCCESS]}
-        for outcome in (Outcome.CRASHED, Outcome.TIMEOUT):
-            if self._outcomes[outcome]:
-                figures[outcome.label] = self._outcomes[outcome]
-        if self._crew is not None:
-            figures["workers"] = self._crew.size
-        self._report(self._outcomes.total(), self._total, found=self._found, **figures)
-
-    def wants(self, header: ShardHeader) -> bool:
-        """Return whether a unit's object lacks grasps in the units before the first gap."""
-        return self._wanted is None or self._grasps[header.object_name] < self._wanted
-
-    def _close_gap(self, header: ShardHeader, grasps: int) -> None:
-        name = header.object_name
-        beyond = self._beyond.setdefault(name, {})
-        beyond[header.start] = grasps
-        while (found := beyond.pop(self._gap[name], None)) is not None:
-            self._grasps[name] += found
-            self._gap[name] += self._step

@@ -13,11 +13,9 @@ import ipaddress
 import logging
 import math
 import shlex
-import shutil
 import subprocess
-import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -31,6 +29,13 @@ from tornado.ioloop import PeriodicCallback
 
 from drakegrasp.cluster import DASK_SETTINGS, closing_cluster, connect
 from drakegrasp.errors import ConfigError, MachineError
+from drakegrasp.tls import (
+    make_certificates,
+    private_directory,
+    security_of,
+    server_options,
+    temporary_security,
+)
 from drakegrasp.workers import WORKER_ENVIRONMENT
 
 KINDS = ("local", "ssh", "slurm", "scheduler", "scheduler-file")
@@ -187,14 +192,14 @@ def _ssh(request: ClusterRequest, security: Security | None) -> SpecCluster:
         "memory_limit": request.memory or "auto",
         "env": WORKER_ENVIRONMENT,
         **_workers_listening(listening),
-        **_secured(security),
+        **server_options(security),
     }
     scheduler = {
         "port": 0,
         "dashboard_address": f"{LOOPBACK}:0",
         "idle_timeout": IDLE_TIME,
         **listening,
-        **_secured(security),
+        **server_options(security),
     }
     return SSHCluster(
         [request.where[0], *request.where],
@@ -343,87 +348,14 @@ def walltime_seconds(text: str) -> float:
 def _security(request: ClusterRequest, out: Path) -> Iterator[Security | None]:
     """Yield the certificates; those that are made for other machines to read are removed."""
     if request.tls_files is not None:
-        yield _from_files(request.tls_files)
+        yield security_of(request.tls_files)
     elif not request.tls:
         yield None
     elif request.kind == "local":
-        yield _temporary()
+        yield temporary_security()
     else:
-        with _private_directory(out) as folder:
-            yield _from_files(make_certificates(folder))
-
-
-def make_certificates(folder: Path) -> tuple[Path, Path, Path]:
-    """Write an authority, a certificate and its key to a folder: ca.pem, cert.pem, key.pem.
-
-    Whoever reads them can use the cluster, so the folder must be this user's alone.
-
-    Raises:
-        MachineError: If the package cryptography is missing.
-    """
-    return _write_certificates(_temporary(), folder)
-
-
-def _temporary() -> Security:
-    try:
-        return Security.temporary()
-    except ImportError:
-        raise MachineError(
-            "--tls needs the package cryptography: pip install 'drakegrasp[tls]'"
-        ) from None
-
-
-def _write_certificates(security: Security, folder: Path) -> tuple[Path, Path, Path]:
-    """Write an authority that is its only certificate to a private folder."""
-    paths = folder / "ca.pem", folder / "cert.pem", folder / "key.pem"
-    texts = security.tls_ca_file, security.tls_worker_cert, security.tls_worker_key
-    for path, text in zip(paths, texts, strict=True):
-        path.touch(mode=0o600)
-        path.write_text(text, encoding="ascii")
-    return paths
-
-
-def _from_files(files: tuple[Path, Path, Path]) -> Security:
-    ca, cert, key = (str(path.absolute()) for path in files)
-    options: dict[str, Any] = {"require_encryption": True, "tls_ca_file": ca}
-    for role in ("client", "scheduler", "worker"):
-        options |= {f"tls_{role}_cert": cert, f"tls_{role}_key": key}
-    return Security(**options)
-
-
-@contextmanager
-def _private_directory(out: Path) -> Iterator[Path]:
-    """Yield a directory in `out` that only this user can enter, and remove it again.
-
-    Those of clients that were killed go as well: whoever calls holds the lock of `out`.
-    """
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        for dead in out.glob(".tls-*"):
-            shutil.rmtree(dead, ignore_errors=True)
-        folder = Path(tempfile.mkdtemp(prefix=".tls-", dir=out))  # mode 0700
-    except OSError as error:
-        raise MachineError(f"{out}: must be a directory that can be written: {error}") from None
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-        with suppress(OSError):  # nothing was built, and the directory is empty again
-            out.rmdir()
-
-
-def _secured(security: Security | None) -> dict[str, Any]:
-    """Return the options of a Dask server on another machine, as JSON types."""
-    if security is None:
-        return {}
-    files = {
-        "tls_ca_file": security.tls_ca_file,
-        "tls_scheduler_cert": security.tls_scheduler_cert,
-        "tls_scheduler_key": security.tls_scheduler_key,
-        "tls_worker_cert": security.tls_worker_cert,
-        "tls_worker_key": security.tls_worker_key,
-    }
-    return {"protocol": "tls://", "security": {"require_encryption": True, **files}}
+        with private_directory(out) as folder:
+            yield security_of(make_certificates(folder))
 
 
 def _listening(request: ClusterRequest) -> dict[str, str]:

@@ -27,7 +27,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
         "builtin manifest mend journal",
         "meshes",
         "object_model",
-        "audit candidates kinematics violations wrenches contact_surface",
+        "audit candidates kinematics violations wrenches contact_surface tally",
         "parts scene render dataset contact_forces wrist_problem hand_paths",
         "samples construction contacts figures postures screen",
         "assemble layout_rules sample_rules image_rules trial_rules scenes wrist_fit",
@@ -39,7 +39,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
         "replay verification",
         "verify verification_files",
         "verify_plan",
-        "verifying verify_request workers crew",
+        "verifying verify_request workers crew tls",
         "cluster doctor format_docs",
         "clusters",
         "cli",
@@ -47,7 +47,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
 )
 READERS = ("grasp", "schema", "shards", "dataset")
 #: Modules that may know Dask.
-KNOWS_DASK = {"cluster", "clusters", "crew", "workers"}
+KNOWS_DASK = {"cluster", "clusters", "crew", "tls", "workers"}
 
 
 def imports_of(module: str) -> set[str]:

@@ -28,8 +28,6 @@ from drakegrasp.cluster import DASK_SETTINGS, connect
 from drakegrasp.clusters import (
     ClusterRequest,
     _exports,
-    _private_directory,
-    make_certificates,
     start_cluster,
     walltime_seconds,
 )
@@ -37,6 +35,7 @@ from drakegrasp.config import load_config
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.executor import run_here
 from drakegrasp.meshes import find_meshes
+from drakegrasp.tls import make_certificates, private_directory
 from drakegrasp.workers import WORKER_ENVIRONMENT, admitted_workers
 
 #: A build of a few seconds.
@@ -160,7 +159,7 @@ def test_keys_are_private_and_removed(tmp_path: Path) -> None:
     dead = out / ".tls-dead"  # of a client that was killed
     dead.mkdir(parents=True)
     make_certificates(dead)
-    with _private_directory(out) as folder:
+    with private_directory(out) as folder:
         assert list(out.iterdir()) == [folder]
         files = make_certificates(folder)
         assert stat.S_IMODE(folder.stat().st_mode) == 0o700

@@ -1,0 +1,100 @@
+"""Certificates of a cluster: made for one run, or somebody's own.
+
+Dask's servers and clients then refuse whoever has none. Those that processes on other machines
+must read are files that only this user can.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from distributed.security import Security
+
+from drakegrasp.errors import MachineError
+
+
+def make_certificates(folder: Path) -> tuple[Path, Path, Path]:
+    """Write an authority, a certificate and its key to a folder: ca.pem, cert.pem, key.pem.
+
+    Whoever reads them can use the cluster, so the folder must be this user's alone.
+
+    Raises:
+        MachineError: If the package cryptography is missing.
+    """
+    return _write(temporary_security(), folder)
+
+
+def temporary_security() -> Security:
+    """Return an authority and a certificate that are in this process's memory only.
+
+    Raises:
+        MachineError: If the package cryptography is missing.
+    """
+    try:
+        return Security.temporary()
+    except ImportError:
+        raise MachineError(
+            "--tls needs the package cryptography: pip install 'drakegrasp[tls]'"
+        ) from None
+
+
+def _write(security: Security, folder: Path) -> tuple[Path, Path, Path]:
+    """Write an authority that is its only certificate to a private folder."""
+    paths = folder / "ca.pem", folder / "cert.pem", folder / "key.pem"
+    texts = security.tls_ca_file, security.tls_worker_cert, security.tls_worker_key
+    for path, text in zip(paths, texts, strict=True):
+        path.touch(mode=0o600)
+        path.write_text(text, encoding="ascii")
+    return paths
+
+
+def security_of(files: tuple[Path, Path, Path]) -> Security:
+    """Return what Dask needs of an authority, a certificate and its key, for every role."""
+    ca, cert, key = (str(path.absolute()) for path in files)
+    options: dict[str, Any] = {"require_encryption": True, "tls_ca_file": ca}
+    for role in ("client", "scheduler", "worker"):
+        options |= {f"tls_{role}_cert": cert, f"tls_{role}_key": key}
+    return Security(**options)
+
+
+@contextmanager
+def private_directory(out: Path) -> Iterator[Path]:
+    """Yield a directory in `out` that only this user can enter, and remove it again.
+
+    Those of clients that were killed go as well: whoever calls holds the lock of `out`.
+
+    Raises:
+        MachineError: If there can be none.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for dead in out.glob(".tls-*"):
+            shutil.rmtree(dead, ignore_errors=True)
+        folder = Path(tempfile.mkdtemp(prefix=".tls-", dir=out))  # mode 0700
+    except OSError as error:
+        raise MachineError(f"{out}: must be a directory that can be written: {error}") from None
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        with suppress(OSError):  # nothing was built, and the directory is empty again
+            out.rmdir()
+
+
+def server_options(security: Security | None) -> dict[str, Any]:
+    """Return the options of a Dask server on another machine, as JSON types."""
+    if security is None:
+        return {}
+    files = {
+        "tls_ca_file": security.tls_ca_file,
+        "tls_scheduler_cert": security.tls_scheduler_cert,
+        "tls_scheduler_key": security.tls_scheduler_key,
+        "tls_worker_cert": security.tls_worker_cert,
+        "tls_worker_key": security.tls_worker_key,
+    }
+    return {"protocol": "tls://", "security": {"require_encryption": True, **files}}
