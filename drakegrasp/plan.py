@@ -77,22 +77,22 @@ class StageTimes:
     source: str
 
 
-#: By `pipelines/measure_stages.py` on thirty G3DB meshes with 20 palm poses each (1,800
-#: attempts, preset `paper`, Drake 1.51.1), and the shares and sizes of 27,000 attempts there.
+#: By the log and the files of thirty G3DB meshes with 300 palm poses each (27,000 attempts, preset
+#: `paper`, Drake 1.51.1) on two workers; preparing and assembling by `pipelines/measure_stages.py`.
 MEASURED = StageTimes(
     prepare=3.2,
     scene=0.19,
-    attempt=0.070,
-    shares=(0.0, 0.01, 0.31, 0.56, 0.70, 0.96, 1.17, 1.46, 2.0, 2.83),
-    look=0.060,
+    attempt=0.013,
+    shares=(0.04, 0.17, 0.39, 0.66, 0.98, 1.04, 1.11, 1.34, 1.64, 2.63),
+    look=0.024,
     assemble=0.0005,
-    successes=0.0088,
-    samples=0.89,
-    unit_bytes=134e3,
-    attempt_bytes=290.0,
+    successes=0.0089,
+    samples=0.88,
+    unit_bytes=136e3,
+    attempt_bytes=260.0,
     success_bytes=67e3,
-    sample_bytes=81e3,
-    object_bytes=128e3,
+    sample_bytes=82e3,
+    object_bytes=124e3,
     source="measured on 30 G3DB meshes, preset paper; --times for those of your own",
 )
 
