@@ -494,7 +494,7 @@ def bench(
     from drakegrasp.config import load_config
     from drakegrasp.meshes import find_meshes
     from drakegrasp.progress import progress_bar
-    from drakegrasp.tables import bench_table, fidelity_table
+    from drakegrasp.tables import bench_lines, bench_table, fidelity_table
 
     if peer:
         _need_peer()
@@ -517,6 +517,8 @@ def bench(
         report["ratio"] = measuring.compare(report, then)
     out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     _print(bench_table(report))
+    for line in bench_lines(report):
+        click.echo(line)
     if fidelity:
         _print(fidelity_table(report["all"]["fidelity"]))
     for key, ratio in report.get("ratio", {}).items():

@@ -56,6 +56,11 @@ class PlacedObject:
     X_TO: Array
     config: Config = field(default_factory=load_config)
 
+    def __repr__(self) -> str:
+        model, z = self.model, self.X_TO[2, 3]
+        size = " x ".join(f"{2e3 * half:.0f}" for half in model.half_extents)
+        return f"PlacedObject({model.name!r}): {size} mm, {model.mass:g} kg, p_TO at z = {z:.4f} m"
+
 
 @one_thread
 def place_object(

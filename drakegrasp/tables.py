@@ -170,6 +170,20 @@ def bench_table(report: Mapping[str, Any]) -> Table:
     return table
 
 
+def bench_lines(report: Mapping[str, Any]) -> list[str]:
+    """Return the funnel, the memory and the machine of a report as lines."""
+    outcomes = Counter(report["all"]["outcomes"])
+    funnel = ", ".join(
+        f"{outcomes[o.label]:,} {o.label}" for o in _OUTCOME_HEADS if outcomes[o.label]
+    )
+    versions = ", ".join(f"{name} {version}" for name, version in report["versions"].items())
+    return [
+        f"outcomes: {funnel}",
+        f"peak memory: {report['peak_memory'] / 1e6:,.0f} MB",
+        f"on {report['cpu']}; {versions}",
+    ]
+
+
 def fidelity_table(found: Mapping[str, Mapping[str, Any]]) -> Table:
     """Return how labels differ where the same attempts are simulated in other ways."""
     table = _table("The same attempts in other ways")

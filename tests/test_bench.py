@@ -42,6 +42,9 @@ def test_report_says_what_attempts_cost(meshes, tmp_path):
     assert set(report["all"]["fidelity"]) == set(bench.VARIANTS)
     assert all(counts["attempts"] == 2 for counts in report["all"]["fidelity"].values())
     assert "MuJoCo" in first.stdout
+    assert "peak memory" in first.stdout
+    for outcome, count in report["all"]["outcomes"].items():
+        assert f"{count} {outcome}" in first.stdout
     assert "double resolution" in first.stdout
     again = CliRunner().invoke(main, [*arguments, "--out", str(other), "--compare", str(path)])
     ratio = json.loads(other.read_text())["ratio"]["resolved_per_core_second"]

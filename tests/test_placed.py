@@ -290,3 +290,10 @@ def test_rest_pose_of_an_upright_object_is_the_identity() -> None:
     np.testing.assert_array_equal(rest_pose(X_TO), make_pose(np.eye(3), [0.0, 0.0, 0.05]))
     again = rest_pose(pose_of(1.0, 0.3, 0.2))
     np.testing.assert_allclose(rest_pose(again), again, atol=1e-12)
+
+
+def test_placed_object_says_what_it_is_in_a_line(tmp_path: Path) -> None:
+    mesh = trimesh.creation.box([0.05, 0.04, 0.1])
+    placed = place_object(mesh, X_TO=make_pose(np.eye(3), [0.0, 0.0, 0.05]))
+    assert repr(placed).endswith("50 x 40 x 100 mm, 1 kg, p_TO at z = 0.0500 m")
+    assert "\n" not in repr(placed)
