@@ -24,18 +24,19 @@ import trimesh
 from drakegrasp.candidates import Attempt, make_attempts
 from drakegrasp.config import Config, override_config
 from drakegrasp.construction import build_scene
+from drakegrasp.errors import DataError
 from drakegrasp.hand import load_hand
 from drakegrasp.manifest import installed_versions
 from drakegrasp.meshes import MeshSource
 from drakegrasp.object_model import ObjectModel
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.prepared import PreparedObject, prepare
 from drakegrasp.progress import Report, silent
+from drakegrasp.screen import Prediction
+from drakegrasp.threads import one_thread
 from drakegrasp.trial import TrialRecord
 from drakegrasp.units import Workbench, look_at_successes, predict_all, try_on
 
-#: Verdicts before which nothing is simulated.
-DECIDED = (Outcome.SCREENED, Outcome.START_COLLISION)
 #: Attempts from one report of progress to the next.
 STRIDE = 50
 
@@ -131,12 +132,23 @@ def summarize(objects: Sequence[dict[str, Any]], config: Config) -> dict[str, An
     }
 
 
-def compare(now: dict[str, Any], then: dict[str, Any]) -> dict[str, float]:
-    """Return the ratio of each rate to that of an earlier report."""
+def compare(now: dict[str, Any], then: dict[str, Any]) -> dict[str, float | None]:
+    """Return the ratio of each rate to that of an earlier report; None where that was zero.
+
+    Raises:
+        DataError: If the reports are not of as many attempts at the same objects.
+    """
+    tried = [{o["name"]: o["attempts"] for o in report["objects"]} for report in (now, then)]
+    odd = sorted(name for name, _ in tried[0].items() ^ tried[1].items())
+    if odd:
+        raise DataError(
+            f"reports must be of the same attempts to be compared, got other ones of {odd[0]}"
+        )
     keys = ("resolved_per_core_second", "grasps_per_core_hour")
-    return {key: now["all"][key] / then["all"][key] for key in keys if then["all"][key]}
+    return {key: now["all"][key] / old if (old := then["all"][key]) else None for key in keys}
 
 
+@one_thread
 def _measure_object(
     source: MeshSource, config: Config, sample: int, peer: bool, counter: _Counter
 ) -> dict[str, Any]:
@@ -174,7 +186,7 @@ def _measure_object(
     if sample:
         rows = np.random.default_rng(config.seed).permutation(hits)[:sample].tolist()
         found["fidelity"] = {
-            name: _compare_labels(prepared, attempts, records, rows, config, variant, counter)
+            name: _compare_labels(bench, attempts, records, predictions, rows, variant, counter)
             for name, variant in VARIANTS.items()
         }
     return found
@@ -224,32 +236,37 @@ def _add_peer(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
         seconds.update(each["seconds"])
     ratios = [each["ratio"] for each in found if each["ratio"] is not None]
     middle = median(ratios) if ratios else None
-    return {**_rates(outcomes, seconds), "median_ratio": middle}
+    return {**_rates(outcomes, seconds), "median_ratio": middle, "ratios": len(ratios)}
 
 
 def _compare_labels(
-    prepared: PreparedObject,
+    bench: Workbench,
     attempts: Sequence[Attempt],
     records: Sequence[TrialRecord],
+    predictions: Sequence[Prediction | None],
     rows: Sequence[int],
-    config: Config,
     variant: Variant,
     counter: _Counter,
 ) -> dict[str, int]:
     """Return counts for one variant over some of an object's attempts."""
-    half = config.physics.time_step / 2.0
-    other = override_config(config, [text.format(half=half) for text in variant.overrides])
+    half = bench.config.physics.time_step / 2.0
+    other = override_config(bench.config, [t.format(half=half) for t in variant.overrides])
+    some = [attempts[row] for row in rows]
+    # What geometry says is asked of the same surface, however fine its faces are.
+    seen = predict_all(replace(bench, config=other), some)
+    prepared = bench.prepared
     if variant.fine:
         prepared = replace(prepared, model=_finer(prepared.model))
     scene = build_scene(prepared.model, other.physics, load_hand(other.hand))
     bench = Workbench(prepared=prepared, config=other, scene=scene)
-    some = [attempts[row] for row in rows]
-    pairs = []
-    for row, attempt, prediction in zip(rows, some, predict_all(bench, some), strict=True):
+    pairs, decided = [], []
+    for row, attempt, prediction in zip(rows, some, seen, strict=True):
         outcome = try_on(bench, attempt, prediction).outcome
         counter.add(outcome)
         pairs.append((records[row].outcome, outcome))
-    return _count(pairs)
+        said = predictions[row]
+        decided.append(said is not None and said.outcome is not None)
+    return _count(pairs, decided)
 
 
 def _finer(model: ObjectModel) -> ObjectModel:
@@ -258,21 +275,22 @@ def _finer(model: ObjectModel) -> ObjectModel:
     return replace(model, collision_vertices=vertices, collision_faces=faces.astype(np.int32))
 
 
-def _count(pairs: Sequence[tuple[Outcome, Outcome]]) -> dict[str, int]:
-    """Return counts of pairs of verdicts: as measured, and in another way."""
+def _count(pairs: Sequence[tuple[Outcome, Outcome]], decided: Sequence[bool]) -> dict[str, int]:
+    """Return counts of pairs of verdicts: as measured, where geometry decided, and otherwise."""
     success = Outcome.SUCCESS
     # What geometry said instead of the simulation is no other label.
     alike = {Outcome.SCREENED: Outcome.MISSING_FINGERTIP}
     flips = [(a, b) for a, b in pairs if alike.get(a, a) is not alike.get(b, b)]
+    both = list(zip(pairs, decided, strict=True))
     return {
         "attempts": len(pairs),
         "flips": len(flips),
-        "simulated": sum(a not in DECIDED for a, _ in pairs),
+        "simulated": sum(a.stage > Stage.PLACED for a, _ in pairs),
         "successes": sum(a is success for a, _ in pairs),
         "successes_other": sum(b is success for _, b in pairs),
         "success_flips": sum(success in pair for pair in flips),
-        "decided": sum(a in DECIDED for a, _ in pairs),
-        "successes_lost_by_screen": sum(a in DECIDED and b is success for a, b in pairs),
+        "decided": sum(decided),
+        "successes_lost_by_screen": sum(sure and b is success for (_, b), sure in both),
     }
 
 

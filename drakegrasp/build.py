@@ -360,7 +360,7 @@ def _run_all(manifest: Manifest, job: _Job, report: Report) -> Tally:
 
     def units() -> Iterator[WorkUnit]:
         for header in manifest.headers():
-            if not _is_done(header, tally, job) and tally.wants(header):
+            if tally.wants(header) and not _is_done(header, tally, job):
                 yield WorkUnit(
                     out=str(job.out), header=header, config=config, expendable=expendable
                 )

@@ -7,7 +7,7 @@ is drawn depends on the attempt's own seed alone.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +20,7 @@ from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand import load_hand
 from drakegrasp.object_model import ObjectModel
 from drakegrasp.outcomes import Outcome
+from drakegrasp.screen import Prediction, predict
 from drakegrasp.trial import run_attempt
 
 #: The step of these simulations over that of the trial: an artefact of the step does not hold.
@@ -34,7 +35,7 @@ class Certificate:
         share: Of the repeats that hold, 0..1; NaN if no repeat came to a verdict.
         friction: Least coefficient of hand and object at which it holds, to within
             `physics.friction_hand` / 2^`certify.friction_steps`; inf if it does not hold at
-            `physics.friction_hand` at half the step.
+            `physics.friction_hand` at half the step, NaN if a simulation came to no verdict.
     """
 
     share: float
@@ -54,14 +55,42 @@ def certify(model: ObjectModel, X_TO: Array, attempt: Attempt, config: Config) -
         attempt: One that succeeds under the configuration.
         config: The rules; `certify` says how often and with how much noise.
     """
-    rules = config.certify
     rng = np.random.default_rng([attempt.seed, attempt.standoff_index])
     held = list(_repeats(rng, model, X_TO, attempt, config))
     judged = [one for one in held if one is not None]
+    (prediction,) = predict(model, load_hand(config.hand), X_TO, [attempt], config.screen)
+
+    def holds(friction: float) -> bool | None:
+        return _holds(model, X_TO, attempt, prediction, config, friction)
+
     return Certificate(
         share=float(np.mean(judged)) if judged else np.nan,
-        friction=_least_friction(model, X_TO, attempt, config, rules.friction_steps),
+        friction=least_friction(holds, config.physics.friction_hand, config.certify.friction_steps),
     )
+
+
+def least_friction(holds: Callable[[float], bool | None], highest: float, steps: int) -> float:
+    """Return the least friction that holds by bisection: what holds is taken to hold above, too.
+
+    Args:
+        holds: Whether a coefficient does, or None if that was not found out.
+        highest: The coefficient from which it goes down.
+        steps: How often the interval is halved.
+
+    Returns:
+        The coefficient; inf if the highest does not hold, NaN if one that was asked is unknown.
+    """
+    low, high = 0.0, highest
+    answer = holds(high)
+    if not answer:
+        return np.nan if answer is None else np.inf
+    for _ in range(steps):
+        middle = (low + high) / 2.0
+        answer = holds(middle)
+        if answer is None:
+            return np.nan
+        low, high = (low, middle) if answer else (middle, high)
+    return high
 
 
 def _repeats(
@@ -73,7 +102,9 @@ def _repeats(
         friction = mu * float(np.exp(rules.friction_noise * rng.standard_normal()))
         factor = float(np.exp(rules.mass_noise * rng.standard_normal()))
         heavy = replace(model, mass=factor * model.mass, I_OOcm_O=factor * model.I_OOcm_O)
-        yield _holds(heavy, X_TO, other, config, friction)
+        # The shape is the same, and so is what geometry says.
+        (prediction,) = predict(model, load_hand(config.hand), X_TO, [other], config.screen)
+        yield _holds(heavy, X_TO, other, prediction, config, friction)
 
 
 def _palm_noise(rng: np.random.Generator, rules: CertifyConfig) -> Array:
@@ -83,24 +114,13 @@ def _palm_noise(rng: np.random.Generator, rules: CertifyConfig) -> Array:
     return make_pose(Rotation.from_rotvec(turn).as_matrix(), shift)
 
 
-def _least_friction(
-    model: ObjectModel, X_TO: Array, attempt: Attempt, config: Config, steps: int
-) -> float:
-    """Return the least friction that holds by bisection: what holds is taken to hold above, too."""
-    low, high = 0.0, config.physics.friction_hand
-    if not _holds(model, X_TO, attempt, config, high):
-        return np.inf
-    for _ in range(steps):
-        middle = (low + high) / 2.0
-        if _holds(model, X_TO, attempt, config, middle):
-            high = middle
-        else:
-            low = middle
-    return high
-
-
 def _holds(
-    model: ObjectModel, X_TO: Array, attempt: Attempt, config: Config, friction: float
+    model: ObjectModel,
+    X_TO: Array,
+    attempt: Attempt,
+    prediction: Prediction | None,
+    config: Config,
+    friction: float,
 ) -> bool | None:
     """Return whether an attempt succeeds, or None if that was not found out."""
     changed = {
@@ -111,5 +131,5 @@ def _holds(
     config = config.model_copy(update={"physics": physics})
     # A scene has its friction and its masses from when it was built.
     scene = build_scene(model, physics, load_hand(config.hand))
-    outcome = run_attempt(scene, X_TO, attempt, config).outcome
+    outcome = run_attempt(scene, X_TO, attempt, config, prediction).outcome
     return None if outcome.says_nothing else outcome is Outcome.SUCCESS

@@ -8,6 +8,7 @@ answers at once.
 from __future__ import annotations
 
 import math
+import os
 import signal
 import sys
 from collections.abc import Iterator
@@ -498,6 +499,9 @@ def bench(
 
     if peer:
         _need_peer()
+    if not os.access(out if out.exists() else out.absolute().parent, os.W_OK):
+        raise click.UsageError(f"--out must be a file that can be written, got {out}")
+    os.environ.setdefault("LP_NUM_THREADS", "0")  # threads of OpenGL would count as this core's
     config = load_config(preset, [*overrides, f"candidates.max={candidates}"])
     then = None if compare is None else _read_report(compare)
     with tempfile.TemporaryDirectory() as folder:
@@ -513,16 +517,17 @@ def bench(
                 sources, config, sample=fidelity, peer=peer, progress=progress
             )
             report = measuring.summarize(list(measured), config)
-    if then is not None:
-        report["ratio"] = measuring.compare(report, then)
-    out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     _print(bench_table(report))
     for line in bench_lines(report):
         click.echo(line)
     if fidelity:
         _print(fidelity_table(report["all"]["fidelity"]))
-    for key, ratio in report.get("ratio", {}).items():
-        click.echo(f"{key.replace('_', ' ')}: {ratio:.2f} times that of {compare}")
+    if then is not None:
+        report["ratio"] = measuring.compare(report, then)
+        for key, ratio in report["ratio"].items():
+            times = "none to compare with" if ratio is None else f"{ratio:.2f} times that"
+            click.echo(f"{key.replace('_', ' ')}: {times} of {compare}")
+    out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     click.echo(str(out))
 
 

@@ -297,6 +297,11 @@ def connect(
     with dask.config.set(DASK_SETTINGS):
         if scheduler or scheduler_file:
             file = None if scheduler_file is None else str(scheduler_file)
+            # Dask waits for the file for ever.
+            if file is not None and not scheduler and not Path(file).is_file():
+                raise MachineError(
+                    f"{file}: must be the file of a running Dask scheduler, got none"
+                )
             try:
                 client = Client(
                     scheduler, scheduler_file=file, timeout=CONNECT_SECONDS, security=security

@@ -198,6 +198,10 @@ class VerifyConfig(_Section):
     max_angle_error_deg: Positive = 5.0  # of an object lifted by forces alone
 
 
+#: What acts on assembled shards, or on nothing that a shard holds.
+LATE_KEYS = ("filters", "split", "max_grasps", "attempt_seconds", "verify")
+
+
 class Config(_Section):
     """Everything that decides what is in a dataset, but for the meshes themselves."""
 
@@ -230,8 +234,10 @@ class Config(_Section):
         `max_grasps`, which only says where to stop, the wall-clock limit, and `verify`.
         """
         values = self.to_dict()
-        for key in ("filters", "split", "max_grasps", "attempt_seconds", "verify"):
+        for key in LATE_KEYS:
             del values[key]
+        if not self.certify.repeats:
+            del values["certify"]  # without repeats the noise is not asked for
         canonical = json.dumps(values, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 

@@ -36,7 +36,7 @@ IN_FLIGHT = 2
 #: Items go together until their task takes about so long [s]: many times what its messages do.
 TASK_SECONDS = 0.25
 #: Most items of a task: the next ones may take far longer than the last ones did.
-LARGEST = 8
+LARGEST = 4
 #: How often the workers are counted [s].
 COUNT_SECONDS = 2.0
 #: How long a result may take from a worker to here, until the workers are counted again [s].

@@ -60,6 +60,14 @@ class DistanceField:
         """
         return ERROR_CELLS * self.spacing
 
+    @property
+    def blur(self) -> float:
+        """By how much `interpolate` may be wrong at walls and slots thinner than a cell [m].
+
+        No grid point need lie in one: then its surface reads as half of the spacing.
+        """
+        return self.spacing / 2.0
+
     def nearest(self, x: Distances, y: Distances, z: Distances) -> Distances:
         """Return distances [m], each at the grid point next to where it is asked for.
 

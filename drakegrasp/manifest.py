@@ -19,7 +19,7 @@ from typing import Any
 import h5py
 
 from drakegrasp import build_lock, build_log
-from drakegrasp.config import Config, override_config, parse_config
+from drakegrasp.config import LATE_KEYS, Config, override_config, parse_config
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.hand_files import hand_digest
 from drakegrasp.schema import CONVENTIONS, SCHEMA_VERSION
@@ -230,8 +230,7 @@ def _differences(theirs: Config, ours: Config) -> str:
         return found
 
     a, b = flat(theirs.to_dict()), flat(ours.to_dict())
-    ignored = ("filters.", "split.", "max_grasps", "attempt_seconds")
-    keys = [k for k in a if a[k] != b[k] and not k.startswith(ignored)]
+    keys = [k for k in a if a[k] != b[k] and k.partition(".")[0] not in LATE_KEYS]
     return ", ".join(f"{k} ({a[k]} there, {b[k]} here)" for k in keys)
 
 

@@ -69,10 +69,9 @@ def _settle(model: ObjectModel, config: Config) -> Resting:
     X_WO = X_WT @ make_pose(np.eye(3), [0.0, 0.0, rules.drop_height - lowest])
     reset_object(scene, X_WO)
     scene.simulator.Initialize()
-    resting_for, stopped = 0.0, False
+    resting_for, stopped, linear, angular = 0.0, False, 0.0, 0.0
     while resting_for < rules.rest_time:
         if scene.time >= rules.max_time:
-            linear, angular = _speeds(scene)
             raise MeshError(
                 f"{model.name}: must come to rest on the table within {rules.max_time:g} s of "
                 f"simulation, got {linear:.3g} m/s and {angular:.3g} rad/s"

@@ -33,6 +33,8 @@ Counts = npt.NDArray[np.int64]
 START_CHUNK, SWEEP_CHUNK = 8, 32
 #: Of the open hand's points every so many are looked at first.
 START_STRIDE = 8
+#: Half of the largest spacing for which the margins stand as they are [m].
+COVERED = 1.25e-3
 #: Fingertips nearer to each other than this while they would be skipped forward may meet [m].
 FINGER_GAP = 0.01
 
@@ -65,7 +67,7 @@ def predict(
     """Return what geometry says about attempts; None where it is not asked.
 
     It is not asked where the palm ray misses, where the attempt begins with closed fingers,
-    and for hands of which `hand_paths` knows nothing.
+    for hands of which `hand_paths` knows nothing, and if the mode is off.
 
     Args:
         model: The object.
@@ -75,6 +77,9 @@ def predict(
         config: The margins.
     """
     found: list[Prediction | None] = [None] * len(attempts)
+    if config.mode == "off":
+        return found
+    config = _widened(config, model.field)
     rows: dict[float, list[int]] = {}
     for row, attempt in enumerate(attempts):
         if attempt.ray_hits and attempt.closing is None:
@@ -88,6 +93,13 @@ def predict(
         for row, prediction in zip(group, _predict(view, paths, config), strict=True):
             found[row] = prediction
     return found
+
+
+def _widened(config: ScreenConfig, field: DistanceField) -> ScreenConfig:
+    """Return the margins for a field whose grid is coarser than those they were measured on."""
+    more = max(0.0, field.blur - COVERED)
+    names = ("start_margin", "reach_margin", "block_margin", "clearance")
+    return config.model_copy(update={name: getattr(config, name) + more for name in names})
 
 
 class _View:
@@ -198,7 +210,7 @@ class _Sweep:
         start: Last angle that was looked at with everything farther away than the clearance.
         arrives: Whether the fingertip comes within reach of the object before the finger
             is blocked.
-        last: Last angle at which it is within reach, or at which the finger is blocked.
+        last: Last angle that was looked at with the fingertip within reach.
     """
 
     def __init__(self, view: _View, path: FingerPath, rows: Counts, config: ScreenConfig) -> None:

@@ -206,7 +206,8 @@ def fidelity_table(found: Mapping[str, Mapping[str, Any]]) -> Table:
         table.add_row(name.replace("_", " "), *cells)
     off = found["screen_off"]
     lost, successes = off["successes_lost_by_screen"], off["successes_other"]
-    table.caption = f"grasps that the screen took out: {lost:,} of {successes:,}"
+    counted = f"{lost:,} of {successes:,}" if successes else "unknown, as there is none"
+    table.caption = f"grasps that the screen took out: {counted}"
     table.caption_justify = "left"
     return table
 

@@ -146,7 +146,7 @@ def run_attempt(
 
 
 def _predict(scene: Scene, X_TO: Array, attempt: Attempt, config: Config) -> Prediction | None:
-    if config.screen.mode == "off" or scene.handles is None:
+    if scene.handles is None:
         return None
     (found,) = predict(scene.model, scene.handles.hand, X_TO, [attempt], config.screen)
     return found

@@ -250,8 +250,6 @@ def _try_all(bench: Workbench, attempts: Sequence[Attempt], journal: Journal) ->
 def predict_all(bench: Workbench, attempts: Sequence[Attempt]) -> list[Prediction | None]:
     """Return what geometry says of each attempt; asking for all at once is what is fast."""
     config, prepared = bench.config, bench.prepared
-    if config.screen.mode == "off":
-        return [None] * len(attempts)
     hand = load_hand(config.hand)
     return predict(prepared.model, hand, prepared.X_TO, attempts, config.screen)
 

@@ -11,6 +11,7 @@ from click.testing import CliRunner
 from drakegrasp import bench
 from drakegrasp.cli import main
 from drakegrasp.config import load_config
+from drakegrasp.errors import DataError
 from drakegrasp.meshes import find_meshes
 from drakegrasp.object_model import prepare_object
 from drakegrasp.outcomes import Outcome
@@ -82,7 +83,26 @@ def test_screened_attempt_that_would_miss_a_fingertip_is_no_flip():
         (Outcome.SUCCESS, Outcome.SLIPPED),
         (Outcome.SCREENED, Outcome.SUCCESS),
     ]
-    counts = bench._count(pairs)
+    counts = bench._count(pairs, [True, False, False, True])
     assert counts["flips"] == 2
     assert counts["successes_lost_by_screen"] == 1
-    assert (counts["decided"], counts["simulated"]) == (3, 1)
+    assert (counts["decided"], counts["simulated"]) == (2, 1)
+
+
+def test_only_the_same_attempts_are_compared():
+    def report(name, attempts, grasps):
+        rates = {"resolved_per_core_second": 10.0, "grasps_per_core_hour": grasps}
+        return {"objects": [{"name": name, "attempts": attempts}], "all": rates}
+
+    same = bench.compare(report("a", 12, 3.0), report("a", 12, 0.0))
+    assert same == {"resolved_per_core_second": 1.0, "grasps_per_core_hour": None}
+    for other in (report("b", 12, 3.0), report("a", 15, 3.0)):
+        with pytest.raises(DataError, match="must be of the same attempts"):
+            bench.compare(report("a", 12, 3.0), other)
+
+
+def test_report_that_cannot_be_written_is_refused_before_measuring(meshes, tmp_path):
+    arguments = ["bench", "--objects", str(meshes), "--out", str(tmp_path / "no" / "x.json")]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 2
+    assert "--out must be a file that can be written" in result.output

@@ -165,6 +165,24 @@ def test_max_grasps_cuts_after_the_last_wanted_one(
     assert [str(v) for v in check_dataset(tmp_path / "out")] == []
 
 
+def test_damage_beyond_the_last_wanted_grasp_is_nobodys(
+    small_meshes: Path, small_config: Config, small_dataset: Path, tmp_path: Path
+) -> None:
+    out = _copy(small_dataset, tmp_path)
+    with h5py.File(out / "trials.hdf5") as file:
+        success = file["trials/outcome"][:] == Outcome.SUCCESS
+        early = success & (file["trials/candidate"][:] < small_config.candidates.max // 2)
+        index = int(file["trials/object"][:][early][0])
+        name = file["objects/name"].asstr()[index]
+    _flip_byte(max((out / "shards" / name).glob("*.h5")))
+    config = small_config.model_copy(update={"max_grasps": 1})
+    report = build(find_meshes(small_meshes), out, config, _nothing_runs, show=False)
+    assert report.notices == ()
+    full = build(find_meshes(small_meshes), out, small_config, run_here, show=False)
+    assert "damaged, and simulated again" in full.notices[0]
+    assert_same_dataset(small_dataset, out)
+
+
 def test_other_configuration_is_refused_and_nothing_changes(
     small_meshes: Path, small_dataset: Path, tmp_path: Path
 ) -> None:
@@ -303,6 +321,8 @@ def test_wrong_use_of_workers_is_refused(tmp_path: Path, small_meshes: Path) -> 
 def test_scheduler_that_is_not_there_is_named(tmp_path: Path, small_meshes: Path) -> None:
     with pytest.raises(MachineError, match="must be a running Dask scheduler"):
         build_dataset(small_meshes, tmp_path / "out", scheduler="tcp://127.0.0.1:9")
+    with pytest.raises(MachineError, match=r"none\.json: must be the file of a running Dask"):
+        build_dataset(small_meshes, tmp_path / "out", scheduler_file=tmp_path / "none.json")
 
 
 def test_certificates_come_with_the_grasps_and_change_none(

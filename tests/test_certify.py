@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from models import CUBE, box_model, from_above, standing
 
-from drakegrasp.certify import certify
+from drakegrasp.certify import certify, least_friction
 from drakegrasp.config import Config, load_config, override_config
 from drakegrasp.construction import build_scene
 from drakegrasp.hand import load_hand
@@ -49,6 +49,13 @@ def test_least_friction_holds_and_less_does_not(cube, config):
         scene = build_scene(cube, other.physics, load_hand(other.hand))
         record = run_attempt(scene, X_TO, attempt, other)
         assert (record.outcome is Outcome.SUCCESS) == holds
+
+
+def test_bisection_ends_at_the_least_that_holds_or_knows_nothing():
+    assert least_friction(lambda mu: mu >= 0.3, 0.8, 10) == pytest.approx(0.3, abs=0.8 / 2**10)
+    assert least_friction(lambda _: False, 0.8, 4) == np.inf
+    assert np.isnan(least_friction(lambda _: None, 0.8, 4))
+    assert np.isnan(least_friction(lambda mu: None if mu < 0.3 else True, 0.8, 4))
 
 
 def test_noise_of_centimetres_spoils_grasps(cube, config):

@@ -6,14 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from hands import write_pincer
-from models import CUBE, box_model, from_above, standing
+from models import CUBE, box_model, from_above, model_of, standing
 
+from drakegrasp import screen
 from drakegrasp.candidates import make_attempts, sample_candidates
 from drakegrasp.config import Config, ScreenConfig, load_config
 from drakegrasp.construction import build_scene
 from drakegrasp.frames import make_pose
 from drakegrasp.hand import Hand, load_hand
+from drakegrasp.hand_paths import hand_paths
 from drakegrasp.object_model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.scene import Scene
@@ -178,3 +181,42 @@ def test_margins_are_lengths(key):
 @pytest.mark.parametrize(("text", "mode"), [("on", "on"), ("off", "off"), ("false", "off")])
 def test_mode_is_a_word_that_yaml_takes_for_a_truth_value(text, mode):
     assert load_config(overrides=[f"screen.mode={text}"]).screen.mode == mode
+
+
+def crate(folder, length: float) -> ObjectModel:
+    """Return an open crate of a metre with walls of 2 mm, far thinner than a cell of its grid."""
+    outer = trimesh.creation.box([1.0, length, 0.5])
+    inner = trimesh.creation.box([0.996, length - 0.004, 0.5])
+    inner.apply_translation([0.0, 0.0, 0.002])
+    return model_of(trimesh.boolean.difference([outer, inner], engine="manifold"), folder)
+
+
+def test_wall_between_the_points_of_a_coarse_grid_is_met(tmp_path, hand):
+    """Wherever it lies in its cell: fingers around its rim meet it, and never start within it."""
+    for length in 0.8 + 0.0017 * np.arange(6):
+        model = crate(tmp_path, length)
+        assert model.field.spacing > 3 * 0.002
+        wall = length / 2.0 - 0.001
+        attempt = from_above(model, STANDOFF)
+        attempt.X_OG[:3, 3] += [0.0, wall, 0.0]
+        (found,) = predict(model, hand, standing(model), [attempt], ScreenConfig())
+        assert found.outcome is None
+        tips = [tip_distance(hand, i, q, attempt, wall) for i, q in enumerate(found.closing)]
+        assert min(tips) > 0.0
+
+
+def tip_distance(hand: Hand, finger: int, angle: float, attempt, wall: float) -> float:
+    """Return how far a fingertip is in front of a wall across y that is 2 mm thick [m]."""
+    path = hand_paths(hand, attempt.spread).fingers[finger]
+    points = path.points[np.searchsorted(path.angles, angle), : path.tip]
+    y = points @ attempt.X_OG[1, :3] + attempt.X_OG[1, 3]
+    return float(np.abs(y - wall).min()) - 0.001
+
+
+def test_grid_that_is_fine_enough_leaves_the_margins(cube, tmp_path):
+    margins = ScreenConfig()
+    assert screen._widened(margins, cube.field) == margins
+    wide = screen._widened(margins, crate(tmp_path, 0.8).field)
+    assert wide.reach_margin > margins.reach_margin + 0.002
+    more = wide.reach_margin - margins.reach_margin
+    assert wide.clearance == pytest.approx(margins.clearance + more)
