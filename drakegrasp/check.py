@@ -337,7 +337,7 @@ def _check_shards(dataset: _Dataset, findings: Findings, steps: _Steps) -> None:
             outcome = read_shard(path, header).trials["outcome"]
         except DataError as error:
             what = "the shard must be there, whole and of its work unit"
-            got = str(error).removeprefix(f"{path}: ") if path.exists() else "none"
+            got = str(error).rpartition(", got ")[2] if path.exists() else "none"
             findings.add([of_file(str(path.relative_to(dataset.out)), what, got)])
             continue
         if left is not None:

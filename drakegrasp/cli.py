@@ -58,6 +58,14 @@ class _Commands(click.Group):
 class OneCommand(click.Command):
     """A script's only command: a build, with errors in one line."""
 
+    def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
+        """Read the command line."""
+        try:
+            return super().make_context(*args, **kwargs)
+        except click.UsageError as error:
+            click.echo(f"error: {' '.join(error.format_message().split())}", err=True)
+            raise SystemExit(2) from None
+
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command."""
         with one_line_errors(ctx, builds=True):
@@ -78,6 +86,10 @@ def one_line_errors(ctx: click.Context, *, builds: bool = False) -> Iterator[Non
             raise
         click.echo(f"error: {' '.join(error.format_message().split())}", err=True)
         ctx.exit(2)
+    except BrokenPipeError:
+        # Whoever reads has what it wanted; at the end Python would complain once more.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        ctx.exit(1)
     except (OSError, RuntimeError) as error:
         if isinstance(error, click.exceptions.Exit | click.Abort):
             raise

@@ -123,7 +123,7 @@ def describe(request: ClusterRequest) -> list[str]:
             "local": "workers on this machine",
             "ssh": f"{count} workers over ssh on {' '.join(dict.fromkeys(request.where))}, "
             f"scheduler on {request.where[0] if request.where else ''}",
-            "slurm": f"{count} workers in SLURM jobs",
+            "slurm": f"{count} workers in SLURM jobs{_job_size(request)}",
         }.get(request.kind, f"the workers of {' '.join(request.where)}")
     ]
     encrypted = request.tls or request.tls_files is not None
@@ -425,6 +425,11 @@ def _jobqueue_listens() -> bool:
 def _cores_per_host(request: ClusterRequest) -> int:
     hosts = len(request.where)
     if request.cores is not None:
+        if request.workers not in (None, hosts * request.cores):
+            raise ConfigError(
+                f"--workers must be --cores on each of {hosts} hosts, {hosts * request.cores}, or "
+                f"not be given, got {request.workers}"
+            )
         return request.cores
     if request.workers is None:
         raise ConfigError("--workers or --cores must be given for workers over ssh")
@@ -434,6 +439,20 @@ def _cores_per_host(request: ClusterRequest) -> int:
             "a host may be named more than once"
         )
     return request.workers // hosts
+
+
+def _job_size(request: ClusterRequest) -> str:
+    """Return what each of SLURM's jobs asks for, in words; nothing for other clusters."""
+    if request.kind != "slurm":
+        return ""
+    memory = request.memory or (None if _jobqueue("memory") else WORKER_MEMORY)
+    walltime = request.walltime or _jobqueue("walltime")
+    asked = [
+        f"of {_cores_per_job(request)}",
+        "memory as in jobqueue.yaml" if memory is None else f"{memory} each",
+        f"walltime {walltime or 'as the queue has it'}",
+    ]
+    return f" {', '.join(asked)}"
 
 
 def _cores_per_job(request: ClusterRequest) -> int:

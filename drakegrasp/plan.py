@@ -250,10 +250,11 @@ def plan_lines(plan: Plan) -> list[str]:
     """Return a plan as the lines that are printed."""
     stages = ", ".join(f"{name} {_duration(seconds)}" for name, seconds in plan.stages.items())
     return [
-        f"{plan.objects:,} objects, {plan.attempts:,} attempts in {plan.units:,} work units",
+        f"from the beginning: {plan.objects:,} objects, {plan.attempts:,} attempts "
+        f"in {plan.units:,} work units",
         f"expected {_duration(plan.seconds)} on {plan.workers:,} workers "
         f"({stages}; {100 * plan.busy:.0f}% busy)",
-        f"expected {plan.core_hours:,.1f} core-hours",
+        f"expected {plan.core_hours:,.2f} core-hours",
         f"expected {plan.samples:,} samples, {_size(plan.bytes)} on disk",
         f"times and sizes: {plan.source}",
     ]

@@ -66,6 +66,14 @@ class ShardHeader:
     stop: int
 
     @property
+    def label(self) -> str:
+        """What it is of, in words."""
+        return (
+            f"{self.object_name}, palm poses {self.start} to {self.stop - 1}, "
+            f"configuration {self.config_hash}, mesh {self.mesh_sha256[:12]}"
+        )
+
+    @property
     def file_name(self) -> str:
         """Name of the shard in its object's folder."""
         return f"{self.start:07d}-{self.stop:07d}.h5"
@@ -343,7 +351,9 @@ def _open_shard(
                 stop=int(file.attrs["stop"]),
             )
             if header is not None and found != header:
-                raise DataError(f"{path}: must be a shard of {header}, got one of {found}")
+                raise DataError(
+                    f"{path}: must be a shard of {header.label}, got one of {found.label}"
+                )
             yield file, found
     except (OSError, KeyError) as error:
         raise DataError(f"{path}: must be a complete shard, got another file ({error})") from None

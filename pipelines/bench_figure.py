@@ -40,6 +40,7 @@ def draw(report: Mapping[str, Any], png: Path) -> None:
     figure = Figure(figsize=(10.0, 1.2 + 0.3 * len(objects)), dpi=130, layout="constrained")
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, sharey=True)
+    left.invert_yaxis()
     names = [found["name"].removesuffix("_final").replace("_", " ") for found in objects]
     shares = {
         what: [100.0 * _count(found, outcomes) / found["attempts"] for found in objects]
@@ -75,7 +76,6 @@ def _stack(
     for what, widths in values.items():
         axes.barh(names, widths, left=start, color=colours[what], label=what, height=0.72)
         start = [a + b for a, b in zip(start, widths, strict=True)]
-    axes.invert_yaxis()
     axes.set_xlim(0.0, max(start))
     axes.set_xlabel(title)
     axes.spines[["top", "right"]].set_visible(False)

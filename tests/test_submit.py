@@ -96,6 +96,11 @@ def test_open_port_is_warned_of(tmp_path: Path) -> None:
         (["--cluster", "ssh"], "must be followed by the names of the hosts, got nothing"),
         (["--cluster", "ssh", "a", "b"], "--workers or --cores must be given"),
         (["--cluster", "ssh", "a", "b", "--workers", "3"], "must be a multiple of"),
+        (
+            ["--cluster", "ssh", "a", "b", "--cores", "4", "--workers", "9"],
+            "--workers must be --cores on each of 2 hosts, 8, or not be given, got 9",
+        ),
+        (["--cluster", "pbs"], "error: Invalid value for '--cluster': 'pbs' is not one of"),
         (["--cluster", "ssh", "a", "--cores", "2"], "--interface NAME or --host ADDRESS must be"),
         (["--cluster", "ssh", "me@a", "--cores", "2", "--host", "x"], "go into ~/.ssh/config"),
         (["--cluster", "scheduler"], "must be followed by its address"),
