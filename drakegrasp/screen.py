@@ -79,7 +79,6 @@ def predict(
     found: list[Prediction | None] = [None] * len(attempts)
     if config.mode == "off":
         return found
-    config = _widened(config, model.field)
     rows: dict[float, list[int]] = {}
     for row, attempt in enumerate(attempts):
         if attempt.ray_hits and attempt.closing is None:
@@ -90,7 +89,8 @@ def predict(
             continue
         poses = np.stack([attempts[row].X_OG for row in group])
         view = _View(model.field, np.asarray(X_TO, dtype=float), poses)
-        for row, prediction in zip(group, _predict(view, paths, config), strict=True):
+        margins = _widened(config, model.field)
+        for row, prediction in zip(group, _predict(view, paths, margins), strict=True):
             found[row] = prediction
     return found
 

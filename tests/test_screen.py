@@ -220,3 +220,13 @@ def test_grid_that_is_fine_enough_leaves_the_margins(cube, tmp_path):
     assert wide.reach_margin > margins.reach_margin + 0.002
     more = wide.reach_margin - margins.reach_margin
     assert wide.clearance == pytest.approx(margins.clearance + more)
+
+
+def test_no_field_is_made_where_nobody_asks(cube, hand):
+    """Verification's attempts say where they begin, and a field takes longer than a close."""
+    model = replace(cube)
+    started = replace(from_above(cube, STANDOFF), closing=np.zeros(3))
+    assert predict(model, hand, standing(model), [started], ScreenConfig()) == [None]
+    off = ScreenConfig(mode="off")
+    assert predict(model, hand, standing(model), [from_above(cube, STANDOFF)], off) == [None]
+    assert "field" not in vars(model)
