@@ -33,6 +33,7 @@ from drakegrasp.manifest import (
     release_directory,
     write_manifest,
 )
+from drakegrasp.memory import release_memory
 from drakegrasp.meshes import MeshSource, source_sha256
 from drakegrasp.prepared import load_prepared, prepare, save_prepared
 from drakegrasp.progress import Report, progress_bar
@@ -164,6 +165,8 @@ def _build(
     write_manifest(manifest, out)
     with progress_bar("simulate", "attempts", show=job.show) as report:
         tally = _run_all(manifest, job, report)
+    if job.crew is not None:
+        sweep_temporary(out)  # what workers that were killed were writing
     if tally.simulated or not is_assembled(out):
         with progress_bar("assemble", "shards", show=job.show) as report:
             assemble(out, progress=report)
@@ -292,6 +295,7 @@ def _prepare_one(task: _PrepareTask) -> tuple[str, dict[str, Any]]:
             return source.name, entry
         if not task.expendable:
             return source.name, _prepared_entry(task)
+        release_memory()  # of the mesh before
         identity = {
             "name": source.name,
             "mesh_sha256": digest,

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import atexit
 import ctypes
-import gc
 import threading
 import time
 from collections import Counter
@@ -40,6 +39,7 @@ from drakegrasp.journal import (
     Verdict,
     open_journal,
 )
+from drakegrasp.memory import release_memory
 from drakegrasp.outcomes import Outcome
 from drakegrasp.prepared import PreparedObject, load_prepared
 from drakegrasp.render import Renderer, build_renderer, look
@@ -141,8 +141,7 @@ def workbench(out: Path, header: ShardHeader, config: Config) -> Workbench:
             raise DataError(f"{out}: {header.object_name} must be of the unit's mesh, got another")
         while len(_workbenches) >= KEPT_OBJECTS:
             del _workbenches[next(iter(_workbenches))]
-            # Diagrams sit in reference cycles and own memory that Python does not count.
-            gc.collect()
+        release_memory()  # what other objects left, also in preparing them
         scene = build_scene(prepared.model, config.physics, load_hand(config.hand))
         _workbenches[key] = Workbench(prepared=prepared, config=config, scene=scene)
     return _workbenches[key]

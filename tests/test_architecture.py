@@ -19,7 +19,7 @@ PACKAGE = Path(drakegrasp.__file__).parent
 LAYERS: tuple[frozenset[str], ...] = tuple(
     frozenset(line.split())
     for line in (
-        "errors executor frames network progress processes build_log threads",
+        "errors executor frames memory network progress processes build_log threads",
         "grasp outcomes hand_files config curves surfaces distance_field pads prediction "
         "prediction_files faults build_lock",
         "schema hand solids bodies wavefront build_options",

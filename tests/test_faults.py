@@ -41,7 +41,7 @@ from drakegrasp.stats import count_funnel
 #: Attempts of a tenth of a second, of which one in ten succeeds.
 FAST = [
     "screen.mode=off",
-    "candidates.max=12",
+    "candidates.max=18",
     "candidates.global_x_deg=[0]",
     "candidates.global_y_deg=[0]",
     "candidates.global_z_deg=[0,45,90]",
@@ -57,7 +57,7 @@ FAST = [
     "camera.size=32",
     "filters.outlier_sigma=0",
 ]
-UNITS = 24
+UNITS = 36
 KILLS = 20
 
 
@@ -201,7 +201,7 @@ def test_client_that_is_killed_or_stopped_goes_on(
     for number, code in ((signal.SIGINT, 130), (signal.SIGTERM, 143)):
         before = len(list(out.glob("shards/*/*.h5")))
         process = start_build(meshes, out, workers=2)
-        wait_for_shards(out, before + 2)
+        wait_for_shards(out, before + 1)
         process.send_signal(number)
         _, errors = process.communicate(timeout=60)
         assert process.returncode == code
