@@ -38,7 +38,8 @@ from drakegrasp.prepared import PreparedObject
 from drakegrasp.processes import host_label
 from drakegrasp.stats import count_funnel
 
-#: Attempts of a tenth of a second, of which one in ten succeeds.
+#: Units of half a second, so that none goes with another and a build can be stopped in time; of ten
+#: attempts one succeeds.
 FAST = [
     "screen.mode=off",
     "candidates.max=18",
@@ -50,7 +51,7 @@ FAST = [
     "settle.drop_height=0.01",
     "settle.max_linear_speed=0.1",
     "settle.max_angular_speed=1",
-    "physics.time_step=0.005",
+    "physics.time_step=0.002",
     "lift.max_speed=2",
     "lift.max_acceleration=20",
     "lift.hold_time=0.1",
