@@ -100,6 +100,8 @@ def start_build(
         stderr=subprocess.PIPE,
         text=True,
         env=environment,
+        # A test that was started in the background of a shell ignores Ctrl-C, and so would this.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         **options,
     )
 
