@@ -85,9 +85,21 @@ def undisturbed(meshes: Path, config: Config, tmp_path_factory: pytest.TempPathF
 
 
 def start_build(
-    meshes: Path, out: Path, workers: int, *arguments: str, fault: str = "", **options: Any
+    meshes: Path,
+    out: Path,
+    workers: int,
+    *arguments: str,
+    fault: str = "",
+    largest_file: int = resource.RLIM_INFINITY,
+    **options: Any,
 ) -> subprocess.Popen[str]:
-    """Start the command of a build in a process of its own."""
+    """Start the command of a build in a process of its own, which can write files up to a size."""
+
+    def prepare() -> None:
+        # A test that was started in the background of a shell ignores Ctrl-C, and so would this.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
+
     command = [sys.executable, "-c", "from drakegrasp.cli import main; main()", "build", "--quiet"]
     command += ["--objects", str(meshes), "--out", str(out), "--workers", str(workers)]
     for value in FAST:
@@ -100,8 +112,7 @@ def start_build(
         stderr=subprocess.PIPE,
         text=True,
         env=environment,
-        # A test that was started in the background of a shell ignores Ctrl-C, and so would this.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        preexec_fn=prepare,
         **options,
     )
 
@@ -334,11 +345,7 @@ def test_full_disk_stops_and_goes_on(meshes: Path, undisturbed: Path, tmp_path: 
     out = tmp_path / "out"
     shutil.copytree(undisturbed / "objects", out / "objects")
     size = max(path.stat().st_size for path in undisturbed.glob("shards/*/*.h5")) - 1
-
-    def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
-
-    process = start_build(meshes, out, workers=1, preexec_fn=limit)
+    process = start_build(meshes, out, workers=1, largest_file=size)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 1
     assert "must have room for what is written" in errors.splitlines()[-1]
