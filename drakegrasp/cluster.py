@@ -303,7 +303,7 @@ def connect(
                     f"{file}: must be the file of a running Dask scheduler, got none"
                 )
             try:
-                client = Client(
+                client = _RemoteClient(
                     scheduler, scheduler_file=file, timeout=CONNECT_SECONDS, security=security
                 )
             except (OSError, RuntimeError, TypeError, ValueError) as error:
@@ -323,6 +323,22 @@ def connect(
             )
             with closing_cluster(cluster), Client(cluster) as client:
                 yield client
+
+
+class _RemoteClient(Client):
+    """A client that closes at once where it cannot start.
+
+    Dask leaves that to the garbage collector. Should it run while the next client starts, it waits
+    for ever for the lock that this one holds (distributed 2026.8, `LoopRunner.stop`).
+    """
+
+    def start(self, **kwargs: Any) -> None:
+        """Start the client's loop and connect."""
+        try:
+            super().start(**kwargs)
+        except BaseException:
+            self.close()
+            raise
 
 
 @contextmanager
