@@ -119,7 +119,15 @@ def verdicts(batch: Batch) -> Iterator[Violation]:
 
 
 def contacts(batch: Batch) -> Iterator[Violation]:
-    """Fingertips that touch have a patch, a unit normal, and push into the object."""
+    """Fingertips that touch have a patch, a unit normal, and push into an object that is held.
+
+    Where an object slides through the hand a patch may lie across a rim, with faces that look in
+    opposite directions: their mean normal then says nothing of the force.
+    """
+    held = {
+        "closed": _stages(batch) >= Stage.CLOSED,
+        "lifted": batch["outcome"] == Outcome.SUCCESS.value,
+    }
     for stage in ("closed", "lifted"):
         touching = batch[f"{stage}_touching"]
         normals, forces = batch[f"{stage}_nhat_Q_O"], batch[f"{stage}_f_Q_O"]
@@ -131,7 +139,7 @@ def contacts(batch: Batch) -> Iterator[Violation]:
             touches = touching[:, k]
             yield from batch.broken(
                 f"{stage}_f_Q_O of finger {k + 1} must push into the object [N]",
-                touches & ~(push[:, k] < PULL),
+                held[stage] & touches & ~(push[:, k] < PULL),
                 push[:, k],
             )
             yield from batch.broken(

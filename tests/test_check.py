@@ -571,7 +571,7 @@ TRIAL_CASES: Mapping[str, tuple[str, int, Edit, str]] = {
     ),
     "pull": (
         "lifted_f_Q_O",
-        SLIPPED,
+        SUCCESS,
         set_at(1, to=[-10, 0, 0]),
         "lifted_f_Q_O of finger 2 must push",
     ),
@@ -595,6 +595,11 @@ def test_a_wrong_value_of_a_trial_is_found(out: Path, case: str) -> None:
     name, row, edit, what = TRIAL_CASES[case]
     change(out, TRIALS, f"trials/{name}", row, edit)
     must_find(out, (TRIALS, "/trials", row, what))
+
+
+def test_contact_that_slides_may_be_pressed_from_any_side(out: Path) -> None:
+    change(out, TRIALS, "trials/lifted_f_Q_O", SLIPPED, set_at(1, to=[-10, 0, 0]))
+    must_find(out)
 
 
 def test_successes_and_removals_are_checked(out: Path) -> None:

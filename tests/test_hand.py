@@ -184,6 +184,37 @@ def test_parts_are_closed_convex_and_wound_outwards_with_normals(path: Path) -> 
     assert mesh.volume == pytest.approx(mesh.convex_hull.volume, rel=1e-6)
 
 
+def cad_sections() -> Array:
+    """Return points (58, 3) on the outline of six sections of the fingertip's CAD mesh [mm]."""
+    x = np.array([0.0, 17.0, 34.5, 41.0, 48.0, 53.0])
+    pad = np.array([9.5, 11.0, 11.0, 10.5, 9.6, 7.9])
+    back = np.array([-9.5, -7.8, -6.2, -5.6, -5.0, -4.5])
+    outline = [
+        *((pad - dy, np.full(6, z)) for dy, z in ((0.0, 5.0), (2.5, 10.1), (4.8, 11.5))),
+        *((back + dy, np.full(6, z)) for dy, z in ((2.2, 11.2), (0.0, 7.8))),
+    ]
+    ends = """-9.5 0 8.3  -6.7 6.7 10.5  -6.7 -6.7 10.5  55.6 5.7 4.6
+              55.6 -4.2 9.4  59 -2.8 4  59 -4 4.6"""
+    right = [np.column_stack((x, y, z)) for y, z in outline]
+    right.append(np.array(ends.split(), dtype=float).reshape(-1, 3))
+    half = np.concatenate(right)
+    return np.concatenate((half, half * [1.0, 1.0, -1.0]))
+
+
+def test_fingertip_deviates_from_its_sections_as_the_models_readme_says() -> None:
+    """The largest distance between convex bodies is that of their extents along a direction."""
+    corners = np.unique(1e3 * trimesh.load(MODELS / "barrett_distal.obj").vertices, axis=0)
+    assert len(corners) == 32
+    # Corners are up to 60 mm from the origin, so that half a degree matters.
+    directions = trimesh.creation.icosphere(subdivisions=7).vertices
+    extents = [(directions @ points.T).max(axis=1) for points in (corners, cad_sections())]
+    deviation = np.abs(extents[0] - extents[1])
+    pad = (directions[:, 1] > 0.2) & (directions[:, 0] > -0.25)
+    for side, most, usual in ((pad, 0.43, 0.21), (~pad, 0.56, 0.39)):
+        assert np.percentile(deviation[side], 95) == pytest.approx(usual, abs=0.01)
+        assert deviation[side].max() == pytest.approx(most, abs=0.01)
+
+
 def shape_points(shape: object) -> Array:
     """Return points (n, 3) whose bounding box and hull are the shape's."""
     if isinstance(shape, Box):
