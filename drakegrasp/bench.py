@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import platform
 import resource
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -35,7 +36,8 @@ from drakegrasp.progress import Report, silent
 from drakegrasp.screen import Prediction
 from drakegrasp.threads import one_thread
 from drakegrasp.trial import TrialRecord
-from drakegrasp.units import Workbench, look_at_successes, predict_all, try_on
+from drakegrasp.units import look_at_successes
+from drakegrasp.workbench import Workbench, predict_all, try_on
 
 #: Attempts from one report of progress to the next.
 STRIDE = 50
@@ -314,7 +316,9 @@ def _add_fidelity(found: Sequence[dict[str, dict[str, int]]]) -> dict[str, dict[
 
 
 def _peak_memory() -> int:
-    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    # Linux counts in KiB, macOS in bytes.
+    unit = 1 if sys.platform == "darwin" else 1024
+    return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def _cpu() -> str:

@@ -17,9 +17,11 @@ from drakegrasp.manifest import Manifest, installed_versions, read_manifest
 from drakegrasp.outcomes import Outcome
 from drakegrasp.prepared import PreparedObject, load_prepared
 from drakegrasp.recording import record_attempt
+from drakegrasp.rows import trial_rows
 from drakegrasp.shards import ShardHeader, trial_columns
 from drakegrasp.threads import one_thread
-from drakegrasp.units import Workbench, trial_rows, try_on, unit_attempts
+from drakegrasp.units import unit_attempts
+from drakegrasp.workbench import Workbench, try_on
 
 
 @dataclass(frozen=True, kw_only=True)

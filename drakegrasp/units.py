@@ -1,15 +1,12 @@
 """Work units: a range of one object's candidates, tried one after the other, to one shard.
 
-A work unit is plain data, so it can cross a process border; diagrams are built where it
-runs and kept for the next unit of the same object. What a shard holds depends on its
+A work unit is plain data, so it can cross a process border. What a shard holds depends on its
 header and the configuration alone: not on who runs it, nor on what ran before, nor on how
 often its process died on the way (see `drakegrasp.journal`).
 """
 
 from __future__ import annotations
 
-import atexit
-import ctypes
 import threading
 import time
 from collections import Counter
@@ -21,16 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from drakegrasp.camera import camera_pose_otm, camera_pose_oto, image_frame, intrinsics
 from drakegrasp.candidates import Attempt, make_attempts
 from drakegrasp.certify import UNKNOWN, Certificate, certify
 from drakegrasp.config import Config, parse_config
-from drakegrasp.construction import build_scene
-from drakegrasp.contacts import Contacts
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.faults import strike
-from drakegrasp.frames import pack_pose
-from drakegrasp.hand import load_hand
 from drakegrasp.journal import (
     ATTEMPT,
     GIVE_UP_DEATHS,
@@ -39,27 +31,23 @@ from drakegrasp.journal import (
     Verdict,
     open_journal,
 )
-from drakegrasp.memory import release_memory
 from drakegrasp.outcomes import Outcome
-from drakegrasp.prepared import PreparedObject, load_prepared
-from drakegrasp.render import Renderer, build_renderer, look
-from drakegrasp.scene import Scene, hand_joint_names
-from drakegrasp.schema import CAMERAS, LOOK_FIELDS, sizes
-from drakegrasp.screen import Prediction, predict
+from drakegrasp.prepared import PreparedObject
+from drakegrasp.rows import array_sizes, look_values, trial_rows
+from drakegrasp.schema import LOOK_FIELDS
+from drakegrasp.screen import Prediction
 from drakegrasp.shards import (
     AnyArray,
     Shard,
     ShardHeader,
     disk_full_named,
     read_outcomes,
-    trial_columns,
     write_shard,
 )
 from drakegrasp.threads import one_thread
-from drakegrasp.trial import TrialRecord, run_attempt
+from drakegrasp.trial import TrialRecord
+from drakegrasp.workbench import Workbench, predict_all, try_on, workbench
 
-#: Objects whose diagrams a process keeps; a unit follows units of the same object.
-KEPT_OBJECTS = 2
 #: An attempt that is that many times over its wall-clock limit will never look at the clock.
 HANG_FACTOR = 1.5
 #: Wall clock after which anything else that a unit does hangs [s].
@@ -106,56 +94,8 @@ class UnitSummary:
     errors: dict[str, int]
 
 
-@dataclass(eq=False)
-class Workbench:
-    """The diagrams of one object in this process; the renderer is made when first needed."""
-
-    prepared: PreparedObject
-    config: Config
-    scene: Scene
-    _renderer: Renderer | None = None
-
-    @property
-    def renderer(self) -> Renderer:
-        """The object's renderer."""
-        if self._renderer is None:
-            self._renderer = build_renderer(self.prepared.model, self.config.camera)
-        return self._renderer
-
-
-_workbenches: dict[tuple[Path, str, str, str], Workbench] = {}
 #: Two threads in one scene would give each other's results: only one unit runs at a time.
 _one_unit = threading.Lock()
-
-
-def workbench(out: Path, header: ShardHeader, config: Config) -> Workbench:
-    """Return the diagrams of a unit's object, built now or kept from an earlier unit.
-
-    Raises:
-        DataError: If the object's files are damaged, or of another configuration or mesh.
-    """
-    key = (out, header.config_hash, header.object_name, header.mesh_sha256)
-    if key not in _workbenches:
-        prepared = load_prepared(out, header.object_name, config)
-        if prepared.model.mesh_sha256 != header.mesh_sha256:
-            raise DataError(f"{out}: {header.object_name} must be of the unit's mesh, got another")
-        while len(_workbenches) >= KEPT_OBJECTS:
-            del _workbenches[next(iter(_workbenches))]
-        release_memory()  # what other objects left, also in preparing them
-        scene = build_scene(prepared.model, config.physics, load_hand(config.hand))
-        _workbenches[key] = Workbench(prepared=prepared, config=config, scene=scene)
-    return _workbenches[key]
-
-
-@atexit.register
-def _leave_renderers_to_the_system() -> None:
-    """Keep the renderers from being destroyed when the process ends.
-
-    That would happen in another thread than the one that made them, which VTK answers with a
-    page of warnings. A reference that nobody gives back keeps them until the process is gone.
-    """
-    for bench in _workbenches.values():
-        ctypes.pythonapi.Py_IncRef(ctypes.py_object(bench))
 
 
 @one_thread
@@ -246,13 +186,6 @@ def _try_all(bench: Workbench, attempts: Sequence[Attempt], journal: Journal) ->
     return [records[row] for row in range(len(attempts))]
 
 
-def predict_all(bench: Workbench, attempts: Sequence[Attempt]) -> list[Prediction | None]:
-    """Return what geometry says of each attempt; asking for all at once is what is fast."""
-    config, prepared = bench.config, bench.prepared
-    hand = load_hand(config.hand)
-    return predict(prepared.model, hand, prepared.X_TO, attempts, config.screen)
-
-
 def _try_step(
     bench: Workbench,
     attempt: Attempt,
@@ -313,31 +246,10 @@ def unit_attempts(
     )
 
 
-def try_on(bench: Workbench, attempt: Attempt, prediction: Prediction | None = None) -> TrialRecord:
-    """Run one attempt; a scene in which Drake failed is replaced, never used again."""
-    record = run_attempt(bench.scene, bench.prepared.X_TO, attempt, bench.config, prediction)
-    if record.outcome is Outcome.SOLVER_ERROR:
-        hand = load_hand(bench.config.hand)
-        bench.scene = build_scene(bench.prepared.model, bench.config.physics, hand)
-    return record
-
-
 def count_outcomes(outcomes: AnyArray) -> dict[Outcome, int]:
     """Return the number of attempts by outcome, of a column of outcomes."""
     values, counts = np.unique(outcomes, return_counts=True)
     return {Outcome(int(v)): int(n) for v, n in zip(values, counts, strict=True)}
-
-
-def trial_rows(
-    bench: Workbench, attempts: Sequence[Attempt], records: Sequence[TrialRecord]
-) -> dict[str, AnyArray]:
-    """Return the columns of `/trials` of attempts and their records."""
-    shape = _sizes(bench)
-    columns = {f.name: f.empty(len(records), shape) for f in trial_columns()}
-    for row, (attempt, record) in enumerate(zip(attempts, records, strict=True)):
-        for name, value in _row(bench.prepared, attempt, record).items():
-            columns[name][row] = value
-    return columns
 
 
 def look_at_successes(
@@ -345,13 +257,13 @@ def look_at_successes(
 ) -> dict[str, AnyArray]:
     """Return the columns of `/looks`: both images of every success."""
     rows = [i for i, record in enumerate(records) if record.outcome is Outcome.SUCCESS]
-    columns = {f.name: f.empty(len(rows), _sizes(bench)) for f in LOOK_FIELDS}
+    columns = {f.name: f.empty(len(rows), array_sizes(bench)) for f in LOOK_FIELDS}
     for k, row in enumerate(rows):
         step = f"look {row}"
         _refuse_guilty(journal, step, bench.prepared.model.name)
         columns["row"][k] = row
         with journal.step(step, STAGE_SECONDS):
-            for name, value in _images(bench, records[row]).items():
+            for name, value in look_values(bench, records[row]).items():
                 columns[name][k] = value
     return columns
 
@@ -376,73 +288,6 @@ def _certify_step(bench: Workbench, attempt: Attempt, journal: Journal, step: st
     trials = rules.repeats + rules.friction_steps + 1
     with journal.step(step, CERTIFY_FACTOR * trials * config.attempt_seconds):
         return certify(bench.prepared.model, bench.prepared.X_TO, attempt, config)
-
-
-def _images(bench: Workbench, record: TrialRecord) -> dict[str, AnyArray]:
-    """Return both images of a success, by the names of LOOK_FIELDS."""
-    camera = bench.config.camera
-    found: dict[str, AnyArray] = {}
-    poses = {"oto": camera_pose_oto, "otm": camera_pose_otm}
-    for name in CAMERAS:
-        X_TC = poses[name](record.X_TO @ record.X_OG, camera)
-        seen = look(bench.renderer, record.X_TO, X_TC)
-        found[f"image_{name}"] = seen.image
-        found[f"mask_{name}"] = seen.mask
-        found[f"X_TC_{name}"] = pack_pose(X_TC)
-        # Where the object is out of sight the frame stays NaN, and a filter removes the row.
-        if name == "otm" and seen.mask.any():
-            X_CI = image_frame(intrinsics(camera), seen.mask, seen.image[3])
-            found["X_CI_otm"] = pack_pose(X_CI)
-    return found
-
-
-def _row(prepared: PreparedObject, attempt: Attempt, record: TrialRecord) -> dict[str, Any]:
-    row: dict[str, Any] = {
-        "candidate": attempt.candidate,
-        "standoff_index": attempt.standoff_index,
-        "spread": attempt.spread,
-        "seed": attempt.seed,
-        "outcome": record.outcome,
-        "X_TO": pack_pose(record.X_TO),
-        "X_OG": pack_pose(record.X_OG),
-    }
-    if record.closed is not None:
-        row |= {"time_close": record.time_close, "closed_q": record.q_closed}
-        row |= _contact_values("closed", record.closed)
-    if record.lifted is not None and record.closed is not None and record.X_TO_lifted is not None:
-        row |= {"time_lift": record.time_lift, "lifted_q": record.q_lifted}
-        row |= _contact_values("lifted", record.lifted)
-        row |= {"slip": record.slip, "slip_angle": record.slip_angle}
-        row["X_TO_lifted"] = pack_pose(record.X_TO_lifted)
-        _, distance, _ = prepared.model.visual.nearest.on_surface(record.closed.p_OQ)
-        row["surface_distance"] = distance
-    return row
-
-
-def _contact_values(prefix: str, contacts: Contacts) -> dict[str, Any]:
-    names = (
-        "touching",
-        "p_OQ",
-        "nhat_Q_O",
-        "f_Q_O",
-        "area",
-        "penetration",
-        "other_links",
-        "hand_on_table",
-        "object_on_table",
-        "point_contacts",
-    )
-    return {f"{prefix}_{name}": getattr(contacts, name) for name in names}
-
-
-def _sizes(bench: Workbench) -> dict[str, int]:
-    handles = bench.scene.handles
-    assert handles is not None
-    return sizes(
-        fingers=handles.hand.num_fingers,
-        joints=len(hand_joint_names(bench.scene)),
-        image=bench.config.camera.size,
-    )
 
 
 @contextmanager

@@ -24,7 +24,7 @@ import trimesh
 from assertions import assert_same_dataset
 from distributed import Client, LocalCluster, get_worker
 
-from drakegrasp import crew, render, units
+from drakegrasp import crew, render, rows
 from drakegrasp.build import build
 from drakegrasp.cluster import connect
 from drakegrasp.config import Config, load_config
@@ -385,7 +385,7 @@ def test_blank_image_never_becomes_data(
     shard = out / "shards" / name / f"{start:07d}-{start + 1:07d}.h5"
     shard.unlink()
     with monkeypatch.context() as patch:
-        patch.setattr(units, "look", blank)
+        patch.setattr(rows, "look", blank)
         with pytest.raises(BlankImageError, match="must not be blank"):
             build(find_meshes(meshes), out, config, run_here, show=False)
     assert not shard.exists()

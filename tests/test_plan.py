@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drakegrasp import units
+from drakegrasp import workbench
 from drakegrasp.build_log import BuildLog
 from drakegrasp.cli import main
 from drakegrasp.config import load_config, override_config
@@ -62,7 +62,7 @@ def test_certificates_cost_their_trials() -> None:
 def test_scenes_are_built_once_per_worker_and_object() -> None:
     plan = plan_build(1, SMALL, 1, replace(EVEN, scene=7.0))
     assert plan.stages["simulate"] == pytest.approx(30.0 + 7.0)
-    assert KEPT_OBJECTS == units.KEPT_OBJECTS
+    assert KEPT_OBJECTS == workbench.KEPT_OBJECTS
 
 
 @given(objects=st.integers(1, 40), workers=st.integers(1, 200), candidates=st.integers(1, 500))
