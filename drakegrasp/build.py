@@ -19,31 +19,24 @@ from typing import Any
 from drakegrasp.assemble import Assembly, assemble, is_assembled, summarise
 from drakegrasp.build_lock import build_lock
 from drakegrasp.build_log import BuildLog
-from drakegrasp.config import Config, parse_config
-from drakegrasp.errors import DataError, DrakegraspError, MachineError, MeshError
+from drakegrasp.config import Config
+from drakegrasp.errors import DataError, DrakegraspError
 from drakegrasp.executor import Crew, Executor
-from drakegrasp.faults import strike
 from drakegrasp.hand import load_hand
-from drakegrasp.journal import GIVE_UP_DEATHS, Journal, open_journal
 from drakegrasp.manifest import (
     Manifest,
     claim_directory,
     installed_versions,
-    model_path,
     release_directory,
     write_manifest,
 )
-from drakegrasp.memory import release_memory
 from drakegrasp.meshes import MeshSource, source_sha256
-from drakegrasp.prepared import load_prepared, prepare, save_prepared
+from drakegrasp.prepared import load_prepared
+from drakegrasp.preparing import PrepareTask, prepare_one
 from drakegrasp.progress import Report, progress_bar
 from drakegrasp.shards import ShardHeader, disk_full_named, sweep_temporary
 from drakegrasp.tally import NAMED, Tally
-from drakegrasp.threads import one_thread
 from drakegrasp.units import UnitSummary, WorkUnit, find_outcomes, run_unit
-
-#: Wall clock after which preparing a mesh hangs [s].
-PREPARE_SECONDS = 1800.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,14 +62,6 @@ class BuildReport:
     errors: dict[str, int]
     notices: tuple[str, ...]
     assembly: Assembly
-
-
-@dataclass(frozen=True, kw_only=True)
-class _PrepareTask:
-    source: MeshSource
-    out: str
-    config: dict[str, Any]
-    expendable: bool
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -246,13 +231,13 @@ def _prepare_all(
         if entry is None:
             expendable = job.crew is not None
             pending.append(
-                _PrepareTask(source=source, out=str(out), config=config, expendable=expendable)
+                PrepareTask(source=source, out=str(out), config=config, expendable=expendable)
             )
         else:
             found[source.name] = entry
     known = len(found)
     report(known, len(sources), found=known)
-    for name, entry in job.execute(_prepare_one, pending):
+    for name, entry in job.execute(prepare_one, pending):
         found[name] = entry
         if "reason" in entry:
             job.log("mesh refused", name=name, reason=entry["reason"])
@@ -282,72 +267,6 @@ def _known_entry(source: MeshSource, out: Path, manifest: Manifest) -> dict[str,
                 return None
             return dict(entry)
     return None
-
-
-@one_thread
-def _prepare_one(task: _PrepareTask) -> tuple[str, dict[str, Any]]:
-    """Prepare one object; return its name and its entry in the manifest."""
-    out, source, config = Path(task.out), task.source, parse_config(task.config)
-    digest = source_sha256(source)
-    with disk_full_named(out):
-        entry = _entry_there(source, digest, out, config)
-        if entry is not None:  # its process, or the client, died before the manifest was written
-            return source.name, entry
-        if not task.expendable:
-            return source.name, _prepared_entry(task)
-        release_memory()  # of the mesh before
-        identity = {
-            "name": source.name,
-            "mesh_sha256": digest,
-            "config_hash": config.simulation_hash(),
-        }
-        path = model_path(out, source.name).with_suffix(".journal")
-        with open_journal(path, identity) as journal:
-            return source.name, _prepared_or_guilty(task, journal)
-
-
-def _entry_there(
-    source: MeshSource, digest: str, out: Path, config: Config
-) -> dict[str, Any] | None:
-    """Return the entry of an object whose files are there and whole, or None."""
-    try:
-        prepared = load_prepared(out, source.name, config)
-    except DrakegraspError:
-        return None
-    model = prepared.model
-    same = (model.class_name, model.mesh_sha256) == (source.class_name, digest)
-    return prepared.summary() if same else None
-
-
-def _prepared_or_guilty(task: _PrepareTask, journal: Journal) -> dict[str, Any]:
-    name = task.source.name
-    verdict = journal.verdict("prepare")
-    if verdict is not None:
-        return _refused(
-            task.source, f"{name}: must be fit to prepare, got one that {verdict.value}"
-        )
-    if journal.is_futile:
-        raise MachineError(
-            f"{name}: the worker must stay alive to prepare it, got {GIVE_UP_DEATHS} deaths in a "
-            "row; is there enough memory? The same command goes on from here"
-        )
-    with journal.step("prepare", PREPARE_SECONDS):
-        strike(name)
-        return _prepared_entry(task)
-
-
-def _prepared_entry(task: _PrepareTask) -> dict[str, Any]:
-    config = parse_config(task.config)
-    try:
-        prepared = prepare(task.source, config)
-    except MeshError as error:
-        return _refused(task.source, str(error))
-    save_prepared(prepared, Path(task.out), config)
-    return prepared.summary()
-
-
-def _refused(source: MeshSource, reason: str) -> dict[str, Any]:
-    return {"name": source.name, "mesh_sha256": source_sha256(source), "reason": reason}
 
 
 def _run_all(manifest: Manifest, job: _Job, report: Report) -> Tally:

@@ -21,7 +21,7 @@ import click
 
 from drakegrasp.build_lock import build_lock
 from drakegrasp.build_options import build_options, parse_request, times_option
-from drakegrasp.cli import OneCommand, print_plan, print_report
+from drakegrasp.cli import print_plan, print_report
 from drakegrasp.cluster import build_on, dashboard_line, find_sources
 from drakegrasp.clusters import (
     KINDS,
@@ -30,6 +30,7 @@ from drakegrasp.clusters import (
     start_cluster,
     worker_count,
 )
+from drakegrasp.commands import OneCommand
 from drakegrasp.errors import ConfigError
 
 

@@ -22,7 +22,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
         "errors executor frames memory network progress processes build_log threads",
         "grasp outcomes hand_files config curves surfaces distance_field pads prediction "
         "prediction_files faults build_lock",
-        "schema hand solids bodies wavefront build_options",
+        "schema hand solids bodies wavefront build_options commands",
         "shards camera filters shapes vessels fruit holes union decimation hand_shapes",
         "builtin manifest mend journal",
         "meshes",
@@ -34,7 +34,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
         "stats resting trial open_file doc_figures plan peer",
         "prepared tables dataset_rules theatre lift_path placed certify",
         "workbench check force_lift force_margin",
-        "rows",
+        "rows preparing",
         "units",
         "build snapshots verified bench",
         "recording verification_figure",

@@ -246,7 +246,7 @@ def test_objects_are_prepared_once_whatever_died(
     out = tmp_path / "out"
     for name in ("objects", "shards"):
         shutil.copytree(undisturbed / name, out / name)
-    monkeypatch.setattr("drakegrasp.build.prepare", prepare)
+    monkeypatch.setattr("drakegrasp.preparing.prepare", prepare)
     build(find_meshes(meshes), out, config, run_here, show=False)
     assert (out / "manifest.json").read_bytes() == (undisturbed / "manifest.json").read_bytes()
     assert_same_dataset(undisturbed, out)
