@@ -23,13 +23,8 @@ from drakegrasp.build_lock import build_lock
 from drakegrasp.build_options import build_options, parse_request, times_option
 from drakegrasp.cli import print_plan, print_report
 from drakegrasp.cluster import build_on, dashboard_line, find_sources
-from drakegrasp.clusters import (
-    KINDS,
-    ClusterRequest,
-    describe,
-    start_cluster,
-    worker_count,
-)
+from drakegrasp.cluster_request import KINDS, ClusterRequest, describe, worker_count
+from drakegrasp.clusters import start_cluster
 from drakegrasp.commands import OneCommand
 from drakegrasp.errors import ConfigError
 

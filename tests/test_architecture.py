@@ -42,14 +42,14 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
         "verify verification_files",
         "verify_plan",
         "verifying verify_request workers crew tls",
-        "cluster doctor format_docs",
+        "cluster cluster_request doctor format_docs",
         "clusters",
         "cli",
     )
 )
 READERS = ("grasp", "schema", "shards", "dataset")
 #: Modules that may know Dask.
-KNOWS_DASK = {"cluster", "clusters", "crew", "tls", "workers"}
+KNOWS_DASK = {"cluster", "cluster_request", "clusters", "crew", "tls", "workers"}
 
 
 def imports_of(module: str) -> set[str]:

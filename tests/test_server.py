@@ -22,7 +22,8 @@ from server.ssh import running_sshd
 from drakegrasp import clusters
 from drakegrasp.build import build
 from drakegrasp.builtin import export_builtin
-from drakegrasp.clusters import ClusterRequest, start_cluster
+from drakegrasp.cluster_request import ClusterRequest
+from drakegrasp.clusters import start_cluster
 from drakegrasp.config import load_config
 from drakegrasp.executor import run_here
 from drakegrasp.meshes import find_meshes

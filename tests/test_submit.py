@@ -26,12 +26,8 @@ from drakegrasp import cluster
 from drakegrasp.build import build
 from drakegrasp.builtin import export_builtin
 from drakegrasp.cluster import DASK_SETTINGS, connect
-from drakegrasp.clusters import (
-    ClusterRequest,
-    _exports,
-    start_cluster,
-    walltime_seconds,
-)
+from drakegrasp.cluster_request import ClusterRequest, walltime_seconds
+from drakegrasp.clusters import _exports, start_cluster
 from drakegrasp.config import load_config
 from drakegrasp.errors import ConfigError, MachineError
 from drakegrasp.executor import run_here
