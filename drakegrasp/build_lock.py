@@ -13,7 +13,6 @@ the message says which file to remove if it is not.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import sys
@@ -25,7 +24,7 @@ from io import FileIO
 from pathlib import Path
 
 from drakegrasp.errors import DataError
-from drakegrasp.processes import Process, this_process
+from drakegrasp.processes import Process, lock_file, this_process
 
 FILE_NAME = "build.lock"
 
@@ -104,7 +103,7 @@ def _take(path: Path) -> tuple[FileIO, Holder | None]:
         except OSError as error:
             raise _unwritable(path.parent, error) from None
         try:
-            locked = _lock(file)
+            locked = lock_file(file)
             before = _read(file)
             if locked is False or (
                 locked is None and before and before.process.runs() is not False
@@ -117,17 +116,6 @@ def _take(path: Path) -> tuple[FileIO, Holder | None]:
             file.close()
             raise
         file.close()  # its holder removed it between our opening and locking: once more
-
-
-def _lock(file: FileIO) -> bool | None:
-    """Return whether we have the kernel's lock, or None where the file system has none."""
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        return None
-    return True
 
 
 def _is_at(path: Path, file: FileIO) -> bool:

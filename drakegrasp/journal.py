@@ -23,7 +23,6 @@ record, and what faulthandler wrote.
 from __future__ import annotations
 
 import faulthandler
-import fcntl
 import json
 import os
 import sys
@@ -35,6 +34,7 @@ from io import FileIO
 from pathlib import Path
 from typing import Any
 
+from drakegrasp.processes import lock_file
 from drakegrasp.shards import temporary_name
 
 #: Crashes in a row of one step after which it is not tried again: one may be the machine's.
@@ -188,7 +188,7 @@ def open_journal(path: Path, identity: Mapping[str, Any]) -> Iterator[Journal]:
     try:
         temporary.write_bytes(line + b"\n" + _record("start", 0))
         with temporary.open("r+b", buffering=0) as file:
-            _lock(file)
+            lock_file(file)
             file.seek(0, os.SEEK_END)  # faulthandler writes here
             temporary.replace(path)
             with _crashes_marked(file):
@@ -207,7 +207,8 @@ def _read_history(path: Path, identity: Mapping[str, Any]) -> _History | None:
     history = _History()
     try:
         with path.open("r+b") as file:  # NFS locks only what may be written
-            if not _lock(file):
+            # Where the file system knows no locks, nobody holds any.
+            if lock_file(file) is False:
                 return None
             head, _, rest = file.read().partition(b"\n")
         content = json.loads(head)
@@ -223,20 +224,6 @@ def _read_history(path: Path, identity: Mapping[str, Any]) -> _History | None:
     except (KeyError, TypeError, ValueError):
         return _History()  # nothing that this program wrote
     return history
-
-
-def _lock(file: Any) -> bool:
-    """Return whether no other process that is alive holds a file; the kernel frees a dead one's.
-
-    Where the file system knows no locks, nobody holds any.
-    """
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        return True
-    return True
 
 
 @contextmanager

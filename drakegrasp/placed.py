@@ -86,8 +86,7 @@ def place_object(
         GraspError: If X_TO is no pose or does not stand on the table.
         ConfigError: If config is none, or an object was placed before with other values.
     """
-    if config is None:
-        config = mesh.config if isinstance(mesh, PlacedObject) else load_config()
+    config = config_of(mesh) if config is None else config
     refuse_no_config(config)
     if units is not None and units not in UNITS:
         raise MeshError(f"units must be one of {', '.join(UNITS)}, got {units!r}")
@@ -110,6 +109,11 @@ def place_object(
         known = _standing(model, read_pose(X_TO, "X_TO"))
     X_TO = settle(model, config).X_TO if known is None else known
     return PlacedObject(model=model, X_TO=X_TO, config=config)
+
+
+def config_of(mesh: object) -> Config:
+    """Return the configuration that goes with a mesh: a placed object's own, else `paper`."""
+    return mesh.config if isinstance(mesh, PlacedObject) else load_config()
 
 
 def refuse_no_config(config: object) -> None:

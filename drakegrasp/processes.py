@@ -1,16 +1,19 @@
 """Which process did something, and whether it still runs.
 
 A process is known by its machine, its number and when it began: a number alone is given
-again. Nothing here can tell of another machine's processes.
+again. Nothing here can tell of another machine's processes, but for the kernel's locks, where
+a network file system has them for all machines.
 """
 
 from __future__ import annotations
 
+import fcntl
 import os
 import re
 import socket
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 #: Where Linux keeps a number that is new at every start of the machine.
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
@@ -82,3 +85,21 @@ def _stat(pid: int) -> list[str]:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:
         return []
+
+
+def lock_file(file: IO[bytes]) -> bool | None:
+    """Take the kernel's lock on an open file, which it frees when this process closes it or dies.
+
+    Args:
+        file: Open for writing; NFS locks no other.
+
+    Returns:
+        Whether it is ours now; None where the file system knows no locks.
+    """
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
+    return True

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from drakegrasp.config import Config, load_config, parse_config
+from drakegrasp.config import Config, parse_config
 from drakegrasp.dataset import GraspDataset
 from drakegrasp.errors import GraspError
 from drakegrasp.frames import Array, unpack_pose
@@ -25,6 +25,7 @@ from drakegrasp.manifest import read_manifest
 from drakegrasp.placed import (
     Placed,
     PlacedObject,
+    config_of,
     place_object,
     refuse_no_config,
     refuse_other_objects,
@@ -110,9 +111,7 @@ def plan_verification(
         if rows is not None:
             raise GraspError("rows must be those of a dataset, got some without a dataset")
         assert mesh is not None
-        if config is None:
-            config = mesh.config if isinstance(mesh, PlacedObject) else load_config()
-        config = _with_hand(config, hand)
+        config = _with_hand(config_of(mesh) if config is None else config, hand)
         points, normals = read_grasps(grasps, load_hand(config.hand).num_fingers)
         placed = place_object(mesh, units=units, X_TO=X_TO, config=config)
         pose = None if X is None else read_pose(X, "X")
