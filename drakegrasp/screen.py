@@ -29,8 +29,9 @@ from drakegrasp.outcomes import Outcome
 
 Counts = npt.NDArray[np.int64]
 
-#: Attempts that are looked at together, so that their points fit into a processor's cache.
-START_CHUNK, SWEEP_CHUNK = 8, 32
+#: Attempts that are looked at together: few enough for a cache to hold their points; for closing
+#: fingers, whose attempts end one after the other, enough for each look to be worth its call.
+START_CHUNK, SWEEP_CHUNK = 8, 128
 #: Of the open hand's points every so many are looked at first.
 START_STRIDE = 8
 #: Half of the largest spacing for which the margins stand as they are [m].
