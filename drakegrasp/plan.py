@@ -31,7 +31,7 @@ from drakegrasp.outcomes import Outcome
 TASK_SECONDS = 0.003
 #: One simulation of `certify` [s]: twice the mean of 48 successes on ten G3DB meshes.
 CERTIFY_SECONDS = 1.0
-#: Objects whose scenes a worker keeps, see `units`.
+#: Objects whose scenes a worker keeps, see `workbench`.
 KEPT_OBJECTS = 2
 #: Until a worker has imported Drake and takes its first task [s].
 START_SECONDS = 5.0
