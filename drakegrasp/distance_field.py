@@ -27,6 +27,8 @@ FINEST = 1.5e-3
 PADDING = 4
 #: Cells from the surface up to which distances are those to a triangle, not to a point on it.
 BAND = 2.5
+#: Points for which triangles are measured at a time: all of them would take hundreds of megabytes.
+BAND_CHUNK = 20_000
 #: Error of a look-up at the nearest grid point in cells: half of a cell's diagonal, and what the
 #: grid's own distances may be wrong by.
 ERROR_CELLS = 1.3
@@ -173,9 +175,12 @@ def _unsigned(
         squared += (place - sample[seed, axis]) ** 2
     distance = np.sqrt(squared)
     band = np.flatnonzero(far.ravel() <= BAND)
-    at = np.column_stack(np.unravel_index(band, shape)) * spacing + origin
-    on_triangle = trimesh.triangles.closest_point(triangles[owner[first[seed.ravel()[band]]]], at)
-    distance.ravel()[band] = np.linalg.norm(at - on_triangle, axis=1)
+    for start in range(0, len(band), BAND_CHUNK):
+        some = band[start : start + BAND_CHUNK]
+        at = np.column_stack(np.unravel_index(some, shape)) * spacing + origin
+        near = triangles[owner[first[seed.ravel()[some]]]]
+        on_triangle = trimesh.triangles.closest_point(near, at)
+        distance.ravel()[some] = np.linalg.norm(at - on_triangle, axis=1)
     return distance
 
 

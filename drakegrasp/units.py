@@ -31,6 +31,7 @@ from drakegrasp.journal import (
     Verdict,
     open_journal,
 )
+from drakegrasp.memory import trim_memory
 from drakegrasp.outcomes import Outcome
 from drakegrasp.prepared import PreparedObject
 from drakegrasp.rows import array_sizes, look_values, trial_rows
@@ -119,6 +120,7 @@ def run_unit(unit: WorkUnit) -> UnitSummary:
         else:
             summary = _run_unit(unit, NO_JOURNAL)
         header.journal_path(out).unlink(missing_ok=True)
+        trim_memory()
         return summary
 
 
