@@ -124,11 +124,8 @@ def contacts(batch: Batch) -> Iterator[Violation]:
     Where an object slides through the hand a patch may lie across a rim, with faces that look in
     opposite directions: their mean normal then says nothing of the force.
     """
-    held = {
-        "closed": _stages(batch) >= Stage.CLOSED,
-        "lifted": batch["outcome"] == Outcome.SUCCESS.value,
-    }
-    for stage in ("closed", "lifted"):
+    success = batch["outcome"] == Outcome.SUCCESS.value
+    for stage, held in (("closed", True), ("lifted", success)):
         touching = batch[f"{stage}_touching"]
         normals, forces = batch[f"{stage}_nhat_Q_O"], batch[f"{stage}_f_Q_O"]
         lengths = np.where(touching, np.linalg.norm(normals, axis=2), 1.0)
@@ -139,7 +136,7 @@ def contacts(batch: Batch) -> Iterator[Violation]:
             touches = touching[:, k]
             yield from batch.broken(
                 f"{stage}_f_Q_O of finger {k + 1} must push into the object [N]",
-                held[stage] & touches & ~(push[:, k] < PULL),
+                held & touches & ~(push[:, k] < PULL),
                 push[:, k],
             )
             yield from batch.broken(

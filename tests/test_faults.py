@@ -91,7 +91,6 @@ def start_build(
     *arguments: str,
     fault: str = "",
     largest_file: int = resource.RLIM_INFINITY,
-    **options: Any,
 ) -> subprocess.Popen[str]:
     """Start the command of a build in a process of its own, which can write files up to a size."""
 
@@ -113,7 +112,6 @@ def start_build(
         text=True,
         env=environment,
         preexec_fn=prepare,
-        **options,
     )
 
 
