@@ -62,6 +62,7 @@ class PhysicsConfig(_Section):
     """Contact and time stepping; reasons and sources in docs/physics.md."""
 
     time_step: Annotated[float, Field(gt=0.0, le=0.02)] = 0.008  # [s]
+    calm_steps: Annotated[int, Field(ge=1, le=8)] = 3  # time steps in one of a calm lift
     friction_hand: Positive = 0.71  # effective coefficient between hand and object
     friction_table: Positive = 0.71  # effective coefficient between table and object
     fingertip_modulus: Annotated[float, Field(gt=0.0, le=1e8)] = 1e7  # hydroelastic [Pa]

@@ -13,6 +13,9 @@ leaks the plant; sampled output ports report the contacts of the step before.
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import cache, partial
+
 import numpy as np
 from pydrake.common import MemoryFile
 from pydrake.geometry import (
@@ -86,6 +89,8 @@ def build_scene(
 ) -> Scene:
     """Return the scene of an object and the table, with the hand if one is given.
 
+    With a hand, the scene for the calm part of a lift is built when it is first asked for.
+
     The object is a rigid hydroelastic surface of its exact collision mesh; the table and
     every part of the hand are compliant, so that each contact with the object is a
     hydroelastic one.
@@ -96,6 +101,17 @@ def build_scene(
         hand: The hand.
         meshcat: Where to show the scene while it is simulated; that changes no bit of it.
     """
+    scene = _build(model, physics, hand, meshcat)
+    if hand is None or physics.calm_steps == 1:
+        return scene
+    longer = {"time_step": physics.calm_steps * physics.time_step}
+    make_calm = cache(partial(_build, model, physics.model_copy(update=longer), hand, meshcat))
+    return replace(scene, make_calm=make_calm)
+
+
+def _build(
+    model: ObjectModel, physics: PhysicsConfig, hand: Hand | None, meshcat: Meshcat | None
+) -> Scene:
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(_plant_config(physics), builder)
     object_body = _add_object(plant, model, physics)

@@ -17,7 +17,7 @@ from pydrake.multibody.plant import HydroelasticContactInfo
 from pydrake.multibody.tree import BodyIndex
 
 from drakegrasp.frames import Array, invert_pose, rotate_vectors, transform_points
-from drakegrasp.scene import HandHandles, Scene
+from drakegrasp.scene import Scene
 from drakegrasp.surfaces import winding_numbers
 
 
@@ -63,10 +63,10 @@ def read_contacts(scene: Scene) -> Contacts:
     return reader.contacts()
 
 
-def hand_touches_object(scene: Scene) -> bool:
-    """Return whether any part of the hand touches the object now, as `read_contacts` would."""
+def bodies_on_object(scene: Scene) -> set[BodyIndex]:
+    """Return what touches the object now, of hand and table, as `read_contacts` would see it."""
     results = scene.plant.get_contact_results_output_port().Eval(scene.context)
-    ob, hand = scene.object.index(), _hand_bodies(scene, scene.handles)
+    ob = scene.object.index()
     forces: dict[BodyIndex, Array] = {}
     for i in range(results.num_hydroelastic_contacts()):
         info = results.hydroelastic_contact_info(i)
@@ -76,7 +76,7 @@ def hand_touches_object(scene: Scene) -> bool:
             other = N if ob == M else M
             forces[other] = forces.get(other, np.zeros(3)) + info.F_Ac_W().translational()
     limit = scene.physics.contact_force
-    return any(b in hand and float(np.linalg.norm(f)) > limit for b, f in forces.items())
+    return {body for body, force in forces.items() if float(np.linalg.norm(force)) > limit}
 
 
 def open_hand_collides(scene: Scene) -> bool:
@@ -90,7 +90,7 @@ def open_hand_collides(scene: Scene) -> bool:
     if handles is None:
         return False
     query = scene.plant.get_geometry_query_input_port().Eval(scene.context)
-    hand = _hand_bodies(scene, handles)
+    hand = hand_bodies(scene)
     surfaces, pairs = query.ComputeContactSurfacesWithFallback(
         HydroelasticContactRepresentation.kPolygon
     )
@@ -126,7 +126,7 @@ class _Reader:
         self._X_OW = invert_pose(scene.pose(scene.object))
         handles = scene.handles
         self._tips = [] if handles is None else [b.index() for b in handles.fingertips]
-        self._hand = _hand_bodies(scene, handles)
+        self._hand = hand_bodies(scene)
         k = len(self._tips)
         self._force_W, self._area = np.zeros((k, 3)), np.zeros(k)
         self._weight, self._penetration = np.zeros(k), np.zeros(k)
@@ -196,7 +196,9 @@ class _Reader:
         )
 
 
-def _hand_bodies(scene: Scene, handles: HandHandles | None) -> set[BodyIndex]:
+def hand_bodies(scene: Scene) -> set[BodyIndex]:
+    """Return the links of the scene's hand, if it has one."""
+    handles = scene.handles
     return set() if handles is None else set(scene.plant.GetBodyIndices(handles.instance))
 
 

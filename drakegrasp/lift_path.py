@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import Config
-from drakegrasp.frames import X_WT, Array
+from drakegrasp.frames import X_WT, Array, make_pose
+from drakegrasp.lifting import PEAK_ACCELERATION, lift_duration
 from drakegrasp.object_model import ObjectModel
 from drakegrasp.resting import GRAVITY
-from drakegrasp.trial import PEAK_ACCELERATION, lift_duration
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -77,3 +77,12 @@ def lift_path(X_TO: npt.ArrayLike, config: Config) -> LiftPath:
     # The object may start at its target.
     duration = max(duration, config.physics.time_step)
     return LiftPath(X_WO=X_WO, p_WO_end=p_WO_end, duration=duration)
+
+
+def lifted_palm(X_TG: Array, time: float, config: Config) -> Array:
+    """Return X_WG (4, 4) at a time [s] of the lift of a trial whose palm begins at X_TG (4, 4).
+
+    A lift that has lost its object ends early. The palm's motion is that of an object lifted by
+    forces: to the same place, in the same way.
+    """
+    return make_pose(X_TG[:3, :3], lift_path(X_TG, config).at(time)[0])

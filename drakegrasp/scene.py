@@ -7,6 +7,7 @@ It takes no decisions; `resting` and `trial` drive it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,6 +60,8 @@ class Scene:
         object, table: The bodies.
         handles: The hand's part, or None in a scene without a hand.
         physics: The configuration that it was built with.
+        make_calm: Returns the same scene with `calm_steps` steps in one, always the same; None
+            where there is none.
     """
 
     model: ObjectModel
@@ -69,6 +72,7 @@ class Scene:
     table: RigidBody
     handles: HandHandles | None
     physics: PhysicsConfig
+    make_calm: Callable[[], Scene] | None = None
 
     @property
     def context(self) -> Context:
@@ -159,8 +163,10 @@ def _let_object_meet_table(scene: Scene, meet: bool) -> None:
     manager.Apply(declare.AllowBetween(*sides) if meet else declare.ExcludeBetween(*sides))
 
 
-def move_wrist(scene: Scene, p_WG_target: npt.ArrayLike, duration: float) -> None:
+def move_wrist(scene: Scene, p_WG_target: npt.ArrayLike, duration: float) -> BezierCurve:
     """Command a straight minimum-jerk motion of the wrist from where it is, starting now.
+
+    The curve is returned, for `go_on_in`.
 
     Args:
         scene: A scene with a hand.
@@ -172,9 +178,33 @@ def move_wrist(scene: Scene, p_WG_target: npt.ArrayLike, duration: float) -> Non
     # A quintic Bezier curve with threefold ends starts and stops with zero speed and
     # acceleration: the minimum-jerk motion (Flash and Hogan, 1985).
     points = np.column_stack([start] * 3 + [np.asarray(p_WG_target, dtype=float)] * 3)
-    handles.wrist_trajectory.UpdateTrajectory(
-        BezierCurve(scene.time, scene.time + duration, points)
-    )
+    curve = BezierCurve(scene.time, scene.time + duration, points)
+    handles.wrist_trajectory.UpdateTrajectory(curve)
+    return curve
+
+
+def go_on_in(other: Scene, scene: Scene, time: float, curve: BezierCurve) -> None:
+    """Give a scene of the same systems the state that another has reached in its lift.
+
+    Args:
+        other: The scene that goes on.
+        scene: The scene whose state, locks and wrist it takes over.
+        time: Of the state [s], at which a step of both begins.
+        curve: The wrist's motion, see `move_wrist`.
+    """
+    theirs, ours = _handles(scene), _handles(other)
+    step = other.physics.time_step
+    # Drake begins steps at whole multiples: one a rounding before `time` would be left out.
+    other.simulator.get_mutable_context().SetTime(round(time / step) * step)
+    # Not the context as a whole: that of a plant knows the shapes of its own diagram.
+    X = theirs.wrist_frame.GetPoseInParentFrame(scene.context)
+    ours.wrist_frame.SetPoseInParentFrame(other.context, X)
+    state = scene.plant.GetPositionsAndVelocities(scene.context)
+    other.plant.SetPositionsAndVelocities(other.context, state)
+    for name in ours.hand.spread.joints:
+        other.plant.GetJointByName(name, ours.instance).Lock(other.context)
+    ours.wrist_trajectory.UpdateTrajectory(curve)
+    other.simulator.Initialize()
 
 
 def advance(scene: Scene, duration: float) -> None:

@@ -28,6 +28,7 @@ from drakegrasp.frames import (
     unpack_pose,
 )
 from drakegrasp.hand import load_hand
+from drakegrasp.lift_path import lifted_palm
 from drakegrasp.manifest import read_manifest
 from drakegrasp.object_model import ObjectModel
 from drakegrasp.outcomes import Outcome, Stage
@@ -98,7 +99,8 @@ def stage_trial(out: Path, trial_id: int, *, table_size: float = TABLE_SIZE) -> 
         raise DataError(f"{path}: trial {trial_id} must have been lifted, got {outcome.label}")
     X_WO = X_WT @ unpack_pose(row["X_TO"])
     X_WG = X_WO @ unpack_pose(row["X_OG"])
-    X_WG_lifted = make_pose(X_WG[:3, :3], X_WT[:3, 3] + config.lift.p_TG)
+    X_TG = unpack_pose(row["X_TO"]) @ unpack_pose(row["X_OG"])
+    X_WG_lifted = lifted_palm(X_TG, float(row["time_lift"]), config)
     X_WO_lifted = X_WT @ unpack_pose(row["X_TO_lifted"])
     hand = load_hand(config.hand)
     model = load_prepared(out, name, config).model

@@ -8,43 +8,29 @@ Drake becomes an outcome is `run_attempt`.
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.candidates import Attempt
+from drakegrasp.clock import Clock, LateError, start_clock
 from drakegrasp.config import Config
-from drakegrasp.contacts import (
-    Contacts,
-    hand_touches_object,
-    open_hand_collides,
-    read_contacts,
-)
-from drakegrasp.frames import X_WT, Array, invert_pose, rotation_angle
+from drakegrasp.contacts import Contacts, open_hand_collides, read_contacts
+from drakegrasp.frames import X_WT, Array
+from drakegrasp.lifting import lift
 from drakegrasp.outcomes import Outcome
 from drakegrasp.scene import (
     Scene,
-    advance,
     closing_angles,
     finger_speed,
     hand_positions,
-    move_wrist,
-    palm_pose,
-    release,
     reset_attempt,
 )
 from drakegrasp.screen import Prediction, predict
 
-#: Peak speed of a minimum-jerk motion over its mean speed (Flash and Hogan, 1985).
-PEAK_SPEED = 15.0 / 8.0
-#: Peak acceleration of a minimum-jerk motion times duration squared over distance.
-PEAK_ACCELERATION = 10.0 / np.sqrt(3.0)
 #: Far below a time step, far above the rounding of a sum of them [s].
 ROUNDING = 1e-9
-#: An object that moved less than this in the hand since the last look is still held [m], [rad].
-STILL, STILL_ANGLE = 5e-4, np.deg2rad(0.5)
 #: A finger that is farther than this beyond where it can meet the object has missed it [rad].
 BEYOND = np.deg2rad(2.0)
 
@@ -80,27 +66,6 @@ class TrialRecord:
     message: str = field(default="")
 
 
-class _StateError(Exception):
-    """The state left the range in which it means anything."""
-
-
-class _TimeoutError(Exception):
-    """The attempt's wall-clock limit passed."""
-
-
-@dataclass(frozen=True)
-class _Clock:
-    """Simulates in pieces, within the attempt's wall-clock limit."""
-
-    scene: Scene
-    end: float  # of the wall clock [s]
-
-    def advance(self, duration: float) -> None:
-        advance(self.scene, duration)
-        if time.monotonic() > self.end:
-            raise _TimeoutError
-
-
 def run_attempt(
     scene: Scene,
     X_TO: npt.ArrayLike,
@@ -134,7 +99,7 @@ def run_attempt(
         if prediction is None:
             prediction = _predict(scene, X_TO, attempt, config)
         return _simulate(scene, record, attempt, config, prediction)
-    except _TimeoutError:
+    except LateError:
         return TrialRecord(outcome=Outcome.TIMEOUT, X_TO=X_TO, X_OG=attempt.X_OG)
     except (MemoryError, OSError):
         raise  # the machine's, not the attempt's
@@ -164,7 +129,7 @@ def _simulate(
     if lost is Outcome.START_COLLISION or (lost is not None and prediction and prediction.clear):
         return replace(record, outcome=lost)
     X_WO = X_WT @ record.X_TO
-    clock = _Clock(scene, time.monotonic() + config.attempt_seconds)
+    clock = start_clock(config)
     X_WG = X_WO @ attempt.X_OG
     reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=attempt.closing)
     if open_hand_collides(scene):
@@ -173,12 +138,22 @@ def _simulate(
         return replace(record, outcome=lost)
     if prediction is not None:
         reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=prediction.closing)
-    record = _close(clock, record, config, prediction)
+    record = _close(scene, clock, record, config, prediction)
     assert record.closed is not None
     verdict = judge_closed(record.closed)
     if verdict is not None:
         return replace(record, outcome=verdict)
-    return _lift(clock, record, config)
+    end = lift(scene, clock, config)
+    return replace(
+        record,
+        outcome=judge_lifted(end.contacts),
+        lifted=end.contacts,
+        q_lifted=end.q,
+        time_lift=end.duration,
+        X_TO_lifted=end.X_TO,
+        slip=end.slip,
+        slip_angle=end.slip_angle,
+    )
 
 
 def judge_closed(contacts: Contacts) -> Outcome | None:
@@ -203,17 +178,14 @@ def judge_lifted(contacts: Contacts) -> Outcome:
     return Outcome.SUCCESS
 
 
-def lift_duration(distance: float, config: Config) -> float:
-    """Return how long a minimum-jerk motion over a distance [m] takes within the limits [s]."""
-    at_speed_limit = PEAK_SPEED * distance / config.lift.max_speed
-    at_acceleration_limit = np.sqrt(PEAK_ACCELERATION * distance / config.lift.max_acceleration)
-    return float(max(at_speed_limit, at_acceleration_limit))
-
-
 def _close(
-    clock: _Clock, record: TrialRecord, config: Config, prediction: Prediction | None
+    scene: Scene,
+    clock: Clock,
+    record: TrialRecord,
+    config: Config,
+    prediction: Prediction | None,
 ) -> TrialRecord:
-    scene, rules = clock.scene, config.close
+    rules = config.close
     end, limit = rules.max_time, np.inf
     if prediction is not None:
         assert scene.handles is not None
@@ -221,8 +193,7 @@ def _close(
         limit = prediction.last + BEYOND
     # The last look may fall short of the end by rounding, never by a step.
     while end - scene.time > ROUNDING:
-        clock.advance(min(rules.check_period, end - scene.time))
-        _refuse_explosion(scene, config)
+        clock.advance(scene, min(rules.check_period, end - scene.time))
         if finger_speed(scene) < rules.stop_speed or np.any(closing_angles(scene) > limit):
             break
     return replace(
@@ -231,54 +202,3 @@ def _close(
         q_closed=hand_positions(scene),
         time_close=scene.time,
     )
-
-
-def _lift(clock: _Clock, record: TrialRecord, config: Config) -> TrialRecord:
-    scene = clock.scene
-    X_GO_before = invert_pose(palm_pose(scene)) @ scene.pose(scene.object)
-    start = scene.time
-    target = X_WT[:3, 3] + config.lift.p_TG
-    duration = lift_duration(float(np.linalg.norm(target - palm_pose(scene)[:3, 3])), config)
-    duration = max(duration, config.physics.time_step)  # the palm may start at its target
-    release(scene)
-    move_wrist(scene, target, duration)
-    end = start + duration + config.lift.hold_time
-    contacts, X_GO_seen = None, X_GO_before
-    while contacts is None:
-        clock.advance(min(config.lift.check_period, end - scene.time))
-        _refuse_explosion(scene, config)
-        X_GO = invert_pose(palm_pose(scene)) @ scene.pose(scene.object)
-        lost = _moved(X_GO_seen, X_GO) and not hand_touches_object(scene)
-        X_GO_seen = X_GO
-        if lost or end - scene.time < ROUNDING:
-            contacts = read_contacts(scene)
-    X_WO = scene.pose(scene.object)
-    moved = invert_pose(X_GO_before) @ X_GO
-    return replace(
-        record,
-        outcome=judge_lifted(contacts),
-        lifted=contacts,
-        q_lifted=hand_positions(scene),
-        time_lift=scene.time - start,
-        X_TO_lifted=invert_pose(X_WT) @ X_WO,
-        slip=float(np.linalg.norm(X_GO[:3, 3] - X_GO_before[:3, 3])),
-        slip_angle=rotation_angle(moved[:3, :3]),
-    )
-
-
-def _moved(X_GO_before: Array, X_GO: Array) -> bool:
-    """Return whether the object moved in the hand: looking for contacts costs a step's time."""
-    shift = float(np.linalg.norm(X_GO[:3, 3] - X_GO_before[:3, 3]))
-    turn = rotation_angle((invert_pose(X_GO_before) @ X_GO)[:3, :3])
-    return shift > STILL or turn > STILL_ANGLE
-
-
-def _refuse_explosion(scene: Scene, config: Config) -> None:
-    if not np.isfinite(hand_positions(scene)).all():
-        raise _StateError("the hand's joints must have finite positions, got others")
-    velocity = scene.plant.EvalBodySpatialVelocityInWorld(scene.context, scene.object)
-    speed = float(np.linalg.norm(velocity.translational()))
-    if not speed <= config.physics.max_speed:
-        raise _StateError(
-            f"the object's speed must stay below {config.physics.max_speed:g} m/s, got {speed:.3g}"
-        )

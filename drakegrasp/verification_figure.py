@@ -19,14 +19,13 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from pydrake.geometry import LightParameter
 
-from drakegrasp.config import Config
 from drakegrasp.contacts import Contacts
 from drakegrasp.doc_figures import Picture
 from drakegrasp.figures import ARROW, HIDDEN, INK, add_axes, hide_ticks
 from drakegrasp.frames import X_WT, Array, invert_pose, make_pose, transform_points
 from drakegrasp.hand import Hand, load_hand
 from drakegrasp.kinematics import joint_positions
-from drakegrasp.lift_path import lift_path
+from drakegrasp.lift_path import lifted_palm
 from drakegrasp.object_model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.placed import rest_pose
@@ -40,7 +39,6 @@ from drakegrasp.theatre import (
     take,
     view,
 )
-from drakegrasp.trial import TrialRecord
 from drakegrasp.verified import PREDICTED, REACHED, Verified
 
 #: Lamps beside the camera and above the table that cast no shadow: contacts are on all sides of
@@ -131,7 +129,8 @@ def _last_view(
     if lift is not None and lift.X_TO_lifted is not None:
         return [stage.object("end of the lift", X_WT @ lift.X_TO_lifted, marks, azimuth)]
     if trial is not None and trial.X_TO_lifted is not None and trial.q_lifted is not None:
-        X_WG, X_WO = lifted_palm(trial, verified.config), X_WT @ trial.X_TO_lifted
+        X_WG = lifted_palm(trial.X_TO @ trial.X_OG, trial.time_lift, verified.config)
+        X_WO = X_WT @ trial.X_TO_lifted
         moment = Moment(X_WG=X_WG, X_WO=X_WO, q=trial.q_lifted)
         reached = _reached(trial.lifted, _force_scale(verified))
         return [stage.hand("end of the lift", moment, reached)]
@@ -172,14 +171,6 @@ class _Stage:
         show(self._theatre, moment)
         picture = take(self._theatre, X_WC, (PIXELS, PIXELS))
         return View(title=title, picture=picture, X_WO=moment.X_WO, marks=marks)
-
-
-def lifted_palm(trial: TrialRecord, config: Config) -> Array:
-    """Return X_WG (4, 4) at the end of a trial's lift, which a lost object ends early."""
-    X_TG = trial.X_TO @ trial.X_OG
-    # The palm's motion is that of an object lifted by forces: to the same place, in the same way.
-    p_WG = lift_path(X_TG, config).at(trial.time_lift)[0]
-    return make_pose(X_TG[:3, :3], p_WG)
 
 
 def _predicted(verified: Verified) -> Marks:

@@ -16,9 +16,9 @@ from drakegrasp.force_lift import ForceLift, LiftEnd, lift_by_forces
 from drakegrasp.force_margin import force_margin
 from drakegrasp.frames import X_WT, make_pose
 from drakegrasp.hand import load_hand
+from drakegrasp.lifting import PEAK_ACCELERATION, lift_duration
 from drakegrasp.object_model import ObjectModel
 from drakegrasp.scene import Scene, advance, reset_object
-from drakegrasp.trial import PEAK_ACCELERATION, lift_duration
 
 pytestmark = pytest.mark.sim
 

@@ -204,13 +204,13 @@ def cad_sections() -> Array:
 def test_fingertip_deviates_from_its_sections_as_the_models_readme_says() -> None:
     """The largest distance between convex bodies is that of their extents along a direction."""
     corners = np.unique(1e3 * trimesh.load(MODELS / "barrett_distal.obj").vertices, axis=0)
-    assert len(corners) == 32
+    assert len(corners) == 24
     # Corners are up to 60 mm from the origin, so that half a degree matters.
     directions = trimesh.creation.icosphere(subdivisions=7).vertices
     extents = [(directions @ points.T).max(axis=1) for points in (corners, cad_sections())]
     deviation = np.abs(extents[0] - extents[1])
     pad = (directions[:, 1] > 0.2) & (directions[:, 0] > -0.25)
-    for side, most, usual in ((pad, 0.43, 0.21), (~pad, 0.56, 0.39)):
+    for side, most, usual in ((pad, 0.49, 0.32), (~pad, 0.61, 0.51)):
         assert np.percentile(deviation[side], 95) == pytest.approx(usual, abs=0.01)
         assert deviation[side].max() == pytest.approx(most, abs=0.01)
 

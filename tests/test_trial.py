@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from models import CUBE, box_model, from_above, model_of, standing
 
-from drakegrasp import trial as trial_module
+from drakegrasp import clock as clock_module
 from drakegrasp.camera import camera_pose_oto
 from drakegrasp.candidates import Attempt, make_attempts, sample_candidates
 from drakegrasp.config import Config, load_config, override_config
@@ -17,6 +17,7 @@ from drakegrasp.construction import build_scene, object_friction, partner_fricti
 from drakegrasp.contacts import is_inside
 from drakegrasp.frames import X_WT, invert_pose, make_pose
 from drakegrasp.hand import Hand, load_hand
+from drakegrasp.lifting import lift_duration
 from drakegrasp.meshes import MeshSource
 from drakegrasp.object_model import ObjectModel, prepare_object
 from drakegrasp.outcomes import Outcome, Stage
@@ -30,7 +31,7 @@ from drakegrasp.scene import (
     reset_attempt,
     reset_object,
 )
-from drakegrasp.trial import TrialRecord, judge_closed, judge_lifted, lift_duration, run_attempt
+from drakegrasp.trial import TrialRecord, judge_closed, judge_lifted, run_attempt
 
 pytestmark = pytest.mark.sim
 
@@ -209,7 +210,7 @@ def test_error_within_drake_is_an_outcome(scene, cube, config, monkeypatch, erro
     def fail(*_):
         raise error
 
-    monkeypatch.setattr(trial_module, "advance", fail)
+    monkeypatch.setattr(clock_module, "advance", fail)
     record = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), config)
     assert record.outcome is Outcome.SOLVER_ERROR
     assert record.message == str(error).splitlines()[0]

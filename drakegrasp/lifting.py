@@ -1,0 +1,152 @@
+"""The lift of an attempt: the object is freed, and the wrist brings it to its target.
+
+In: a scene whose closed hand may lift, and the rules. Out: what touches what at the end, and where
+the object is. Two things keep a lift from costing more than it tells:
+
+* While nothing moves in the hand, steps are `physics.calm_steps` times as long: a grasp at rest
+  needs no short ones. They are taken by a second diagram with the same state.
+* It ends where its end is known: nothing of the hand touches the object any more, or object and
+  fingers stand still with a fingertip off the object.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.multibody.tree import BodyIndex
+
+from drakegrasp.clock import Clock
+from drakegrasp.config import Config
+from drakegrasp.contacts import Contacts, bodies_on_object, hand_bodies, read_contacts
+from drakegrasp.frames import X_WT, Array, invert_pose, rotation_angle
+from drakegrasp.scene import (
+    Scene,
+    finger_speed,
+    go_on_in,
+    hand_positions,
+    move_wrist,
+    palm_pose,
+    release,
+)
+
+#: Peak speed of a minimum-jerk motion over its mean speed (Flash and Hogan, 1985).
+PEAK_SPEED = 15.0 / 8.0
+#: Peak acceleration of a minimum-jerk motion times duration squared over distance.
+PEAK_ACCELERATION = 10.0 / np.sqrt(3.0)
+#: An object that moved less than this in the hand since the last look is still held [m], [rad].
+STILL, STILL_ANGLE = 5e-4, np.deg2rad(0.5)
+#: A lift in which it moved less than this is calm [m], [rad].
+CALM, CALM_ANGLE = 1e-4, np.deg2rad(0.1)
+#: A part of a step, far above the rounding of times.
+ROUNDING = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Lift:
+    """How a lift ended.
+
+    Attributes:
+        contacts: What touched what.
+        q: Positions of the hand's joints [rad], in the plant's order.
+        duration: Simulated time [s].
+        X_TO: Pose of the object, (4, 4).
+        slip: Distance that {O} moved in {G} during the lift [m].
+        slip_angle: Angle that it turned in {G} [rad].
+    """
+
+    contacts: Contacts
+    q: Array
+    duration: float
+    X_TO: Array
+    slip: float
+    slip_angle: float
+
+
+def lift_duration(distance: float, config: Config) -> float:
+    """Return how long a minimum-jerk motion over a distance [m] takes within the limits [s]."""
+    at_speed_limit = PEAK_SPEED * distance / config.lift.max_speed
+    at_acceleration_limit = np.sqrt(PEAK_ACCELERATION * distance / config.lift.max_acceleration)
+    return float(max(at_speed_limit, at_acceleration_limit))
+
+
+def lift(scene: Scene, clock: Clock, config: Config) -> Lift:
+    """Free the object, bring the wrist to `lift.p_TG` and hold it there, and return what is left.
+
+    Args:
+        scene: With the object in the closed hand.
+        clock: The attempt's limits.
+        config: The rules.
+
+    Raises:
+        LateError: See `Clock`.
+        StateError: See `Clock`.
+    """
+    X_GO_before = X_GO = _object_in_hand(scene)
+    start = scene.time
+    target = X_WT[:3, 3] + config.lift.p_TG
+    duration = lift_duration(float(np.linalg.norm(target - palm_pose(scene)[:3, 3])), config)
+    duration = max(duration, config.physics.time_step)  # the palm may start at its target
+    release(scene)
+    curve = move_wrist(scene, target, duration)
+    now, end = start, start + duration + config.lift.hold_time
+    tips = _fingertips(scene)
+    stage, held, over = scene, False, False
+    while not over:
+        look = min(_next_look(now, config), end)
+        # Between two steps, so that rounding moves none from one look to another.
+        margin = stage.physics.time_step / 2.0 if look < end else 0.0
+        clock.advance(stage, look - margin - stage.time)
+        X_GO_seen, X_GO, now = X_GO, _object_in_hand(stage), look
+        standing = finger_speed(stage) <= config.close.stop_speed
+        if _moved(X_GO_seen, X_GO, STILL, STILL_ANGLE):
+            held, over = False, not bodies_on_object(stage) & hand_bodies(stage)
+        elif standing and not held:
+            touching = bodies_on_object(stage)
+            held = tips <= touching
+            over = not held and scene.table.index() not in touching
+        held, over = held and standing, over or now >= end
+        calm = standing and not _moved(X_GO_seen, X_GO, CALM, CALM_ANGLE)
+        other = _stage_for(scene, calm)
+        if not over and other is not stage:
+            go_on_in(other, stage, now, curve)
+            stage = other
+    shift, angle = _motion(X_GO_before, X_GO)
+    return Lift(
+        contacts=read_contacts(stage),
+        q=hand_positions(stage),
+        duration=now - start,
+        X_TO=invert_pose(X_WT) @ stage.pose(stage.object),
+        slip=shift,
+        slip_angle=angle,
+    )
+
+
+def _next_look(now: float, config: Config) -> float:
+    """Return when to look again [s]: after the period, where a long step begins."""
+    step = config.physics.calm_steps * config.physics.time_step
+    return float(np.ceil((now + config.lift.check_period) / step - ROUNDING) * step)
+
+
+def _stage_for(scene: Scene, calm: bool) -> Scene:
+    return scene.make_calm() if calm and scene.make_calm is not None else scene
+
+
+def _fingertips(scene: Scene) -> set[BodyIndex]:
+    assert scene.handles is not None
+    return {body.index() for body in scene.handles.fingertips}
+
+
+def _object_in_hand(scene: Scene) -> Array:
+    return invert_pose(palm_pose(scene)) @ scene.pose(scene.object)
+
+
+def _motion(X_GO_before: Array, X_GO: Array) -> tuple[float, float]:
+    """Return by how much the object moved [m] and turned [rad] in the hand."""
+    shift = float(np.linalg.norm(X_GO[:3, 3] - X_GO_before[:3, 3]))
+    return shift, rotation_angle((invert_pose(X_GO_before) @ X_GO)[:3, :3])
+
+
+def _moved(X_GO_before: Array, X_GO: Array, limit: float, angle_limit: float) -> bool:
+    shift, angle = _motion(X_GO_before, X_GO)
+    return shift > limit or angle > angle_limit
