@@ -66,7 +66,7 @@ from drakegrasp.wavefront import obj_text
 
 #: Mass of each of the three bodies that carry the wrist [kg]; light beside the hand.
 WRIST_BODY_MASS = 0.02
-#: Wrist gains [N/m], [N s/m]: 2 kg sag by 0.02 mm, and the lag is one time step.
+#: Wrist gains [N/m], [N s/m]: 2 kg sag by 0.02 mm.
 WRIST_STIFFNESS, WRIST_DAMPING = 1e6, 1e4
 #: Damping of the velocity-controlled fingers [N m s/rad]: the torque limit is reached at a
 #: tenth of a radian per second of lag.

@@ -88,7 +88,7 @@ def lift(scene: Scene, clock: Clock, config: Config) -> Lift:
     duration = lift_duration(float(np.linalg.norm(target - palm_pose(scene)[:3, 3])), config)
     duration = max(duration, config.physics.time_step)  # the palm may start at its target
     release(scene)
-    curve = move_wrist(scene, target, duration)
+    motion = move_wrist(scene, target, duration)
     now, end = start, start + duration + config.lift.hold_time
     tips = _fingertips(scene)
     stage, held, over = scene, False, False
@@ -109,7 +109,7 @@ def lift(scene: Scene, clock: Clock, config: Config) -> Lift:
         calm = standing and not _moved(X_GO_seen, X_GO, CALM, CALM_ANGLE)
         other = _stage_for(scene, calm)
         if not over and other is not stage:
-            go_on_in(other, stage, now, curve)
+            go_on_in(other, stage, now, motion)
             stage = other
     shift, angle = _motion(X_GO_before, X_GO)
     return Lift(

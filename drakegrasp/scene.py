@@ -163,34 +163,60 @@ def _let_object_meet_table(scene: Scene, meet: bool) -> None:
     manager.Apply(declare.AllowBetween(*sides) if meet else declare.ExcludeBetween(*sides))
 
 
-def move_wrist(scene: Scene, p_WG_target: npt.ArrayLike, duration: float) -> BezierCurve:
-    """Command a straight minimum-jerk motion of the wrist from where it is, starting now.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WristMotion:
+    """A straight minimum-jerk motion of the palm's origin; it stays at the end.
 
-    The curve is returned, for `go_on_in`.
+    Attributes:
+        p_start, p_end: Where it begins and ends in {W}, (3,) [m].
+        begin: When it begins [s].
+        duration: Of the motion [s].
+    """
+
+    p_start: Array
+    p_end: Array
+    begin: float
+    duration: float
+
+
+def move_wrist(scene: Scene, p_WG_target: npt.ArrayLike, duration: float) -> WristMotion:
+    """Command a straight minimum-jerk motion of the wrist from where it is, starting now.
 
     Args:
         scene: A scene with a hand.
         p_WG_target: Where the palm's origin goes, (3,) [m]; it stays there afterwards.
         duration: Of the motion [s].
     """
-    handles = _handles(scene)
-    start = [joint.get_translation(scene.context) for joint in handles.wrist_joints]
+    joints = _handles(scene).wrist_joints
+    motion = WristMotion(
+        p_start=np.array([joint.get_translation(scene.context) for joint in joints]),
+        p_end=np.asarray(p_WG_target, dtype=float),
+        begin=scene.time,
+        duration=duration,
+    )
+    _follow(scene, motion)
+    return motion
+
+
+def _follow(scene: Scene, motion: WristMotion) -> None:
     # A quintic Bezier curve with threefold ends starts and stops with zero speed and
     # acceleration: the minimum-jerk motion (Flash and Hogan, 1985).
-    points = np.column_stack([start] * 3 + [np.asarray(p_WG_target, dtype=float)] * 3)
-    curve = BezierCurve(scene.time, scene.time + duration, points)
-    handles.wrist_trajectory.UpdateTrajectory(curve)
-    return curve
+    points = np.column_stack([motion.p_start] * 3 + [motion.p_end] * 3)
+    # What is commanded at the begin of a step is where its end comes to be: said a step ahead,
+    # the wrist lags behind in no scene, whatever its step.
+    begin = motion.begin - scene.physics.time_step
+    curve = BezierCurve(begin, begin + motion.duration, points)
+    _handles(scene).wrist_trajectory.UpdateTrajectory(curve)
 
 
-def go_on_in(other: Scene, scene: Scene, time: float, curve: BezierCurve) -> None:
+def go_on_in(other: Scene, scene: Scene, time: float, motion: WristMotion) -> None:
     """Give a scene of the same systems the state that another has reached in its lift.
 
     Args:
         other: The scene that goes on.
         scene: The scene whose state, locks and wrist it takes over.
         time: Of the state [s], at which a step of both begins.
-        curve: The wrist's motion, see `move_wrist`.
+        motion: Of the wrist.
     """
     theirs, ours = _handles(scene), _handles(other)
     step = other.physics.time_step
@@ -203,7 +229,7 @@ def go_on_in(other: Scene, scene: Scene, time: float, curve: BezierCurve) -> Non
     other.plant.SetPositionsAndVelocities(other.context, state)
     for name in ours.hand.spread.joints:
         other.plant.GetJointByName(name, ours.instance).Lock(other.context)
-    ours.wrist_trajectory.UpdateTrajectory(curve)
+    _follow(other, motion)
     other.simulator.Initialize()
 
 
