@@ -12,6 +12,7 @@ from types import SimpleNamespace
 from urllib.parse import urlsplit
 
 import h5py
+import msgpack
 import numpy as np
 import pytest
 from models import CUBE, box_model, from_above, standing
@@ -19,7 +20,7 @@ from models import CUBE, box_model, from_above, standing
 from drakegrasp import recording
 from drakegrasp.candidates import Attempt
 from drakegrasp.config import Config, load_config
-from drakegrasp.construction import build_scene
+from drakegrasp.construction import MESHCAT_RATE, build_scene
 from drakegrasp.force_lift import LiftEnd, lift_by_forces
 from drakegrasp.hand import load_hand
 from drakegrasp.object_model import ObjectModel
@@ -89,6 +90,15 @@ def test_recording_a_trial_changes_no_bit_of_it(
     assert all(part in everything for part in (OBJECT, HAND, b"predicted/3/shaft"))
     # Object and fingers move; contacts go with the object.
     keys = keys_of(path)
+    # Two diagrams take turns in a lift, and no picture is missing.
+    clips = {
+        part["path"]: part["clip"]
+        for part in msgpack.unpackb(keys, strict_map_key=False)["animations"]
+    }
+    times = [key["time"] for key in clips["/drake/visualizer/object/object"]["tracks"][0]["keys"]]
+    end = plain.time_close + plain.time_lift
+    assert times == list(range(len(times)))
+    assert len(times) / MESHCAT_RATE == pytest.approx(end, abs=2.0 / MESHCAT_RATE)
     assert OBJECT in keys
     assert b"finger" in keys
     assert b"predicted" not in keys
