@@ -58,7 +58,7 @@ class Variant:
 
 VARIANTS = {
     "screen_off": Variant(("screen.mode=off",)),
-    "half_step": Variant(("physics.time_step={half}",)),
+    "half_step": Variant(("physics.time_step={half}", "physics.calm_steps=1")),
     "calm_off": Variant(("physics.calm_steps=1",)),
     "double_resolution": Variant(fine=True),
     "similar": Variant(("physics.solver=similar",)),

@@ -58,6 +58,10 @@ class ObjectConfig(_Section):
         return self
 
 
+#: Of steps that contact can still be resolved with [s].
+MAX_CALM_STEP = 0.06
+
+
 class PhysicsConfig(_Section):
     """Contact and time stepping; reasons and sources in docs/physics.md."""
 
@@ -73,6 +77,15 @@ class PhysicsConfig(_Section):
     solver: Literal["lagged", "similar", "sap"] = "lagged"  # Drake's contact approximation
     contact_force: Positive = 0.05  # [N], a weaker contact does not count as one
     max_speed: Positive = 10.0  # [m/s], a faster object means that the state exploded
+
+    @model_validator(mode="after")
+    def _short_enough(self) -> PhysicsConfig:
+        if not self.calm_steps * self.time_step <= MAX_CALM_STEP:
+            raise ValueError(
+                f"calm_steps times time_step must be at most {MAX_CALM_STEP} s, "
+                f"got {self.calm_steps} times {self.time_step}"
+            )
+        return self
 
 
 class SettleConfig(_Section):
@@ -139,7 +152,7 @@ class LiftConfig(_Section):
     max_speed: Positive = 0.5  # [m/s] of the wrist
     max_acceleration: Positive = 1.0  # [m/s^2] of the wrist
     hold_time: NonNegative = 0.3  # [s] at the target before the second judgement
-    check_period: Positive = 0.1  # [s] of simulation between two looks
+    check_period: Positive = 0.1  # [s] of simulation between two looks, and up to a calm step more
 
 
 class CertifyConfig(_Section):

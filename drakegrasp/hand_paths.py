@@ -79,7 +79,7 @@ def hand_paths(hand: Hand, spread: float) -> HandPaths | None:
     limits = coordinate_limits(hand)[1:, 1]
     if max(map(len, movers.values())) > 1 or not np.all((limits > 0.0) & np.isfinite(limits)):
         return None
-    surfaces = _link_points(hand)
+    surfaces = link_points(hand)
     opened = np.zeros(hand.num_fingers)
     still = [
         _place(link_poses(hand, link, spread=spread, closing=opened), surfaces[link])
@@ -160,7 +160,7 @@ def _tip_fields(hand: Hand) -> tuple[DistanceField, ...]:
 
 
 @cache
-def _link_points(hand: Hand) -> dict[str, Array]:
+def link_points(hand: Hand) -> dict[str, Array]:
     """Return points on the surface of each link (n, 3) in its own frame [m]."""
     points = {}
     for link, shapes in link_shapes(hand).items():

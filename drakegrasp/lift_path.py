@@ -82,7 +82,7 @@ def lift_path(X_TO: npt.ArrayLike, config: Config) -> LiftPath:
 def lifted_palm(X_TG: Array, time: float, config: Config) -> Array:
     """Return X_WG (4, 4) at a time [s] of the lift of a trial whose palm begins at X_TG (4, 4).
 
-    A lift that has lost its object ends early. The palm's motion is that of an object lifted by
+    A lift whose end is known ends early. The palm's motion is that of an object lifted by
     forces: to the same place, in the same way.
     """
     return make_pose(X_TG[:3, :3], lift_path(X_TG, config).at(time)[0])

@@ -6,7 +6,7 @@ the object is. Two things keep a lift from costing more than it tells:
 * While nothing moves in the hand, steps are `physics.calm_steps` times as long: a grasp at rest
   needs no short ones. They are taken by a second diagram with the same state.
 * It ends where its end is known: nothing of the hand touches the object any more, or object and
-  fingers stand still with a fingertip off the object.
+  fingers stand still with a fingertip well off the object.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ from pydrake.multibody.tree import BodyIndex
 from drakegrasp.clock import Clock
 from drakegrasp.config import Config
 from drakegrasp.contacts import Contacts, bodies_on_object, hand_bodies, read_contacts
-from drakegrasp.frames import X_WT, Array, invert_pose, rotation_angle
+from drakegrasp.frames import X_WT, Array, invert_pose, rotation_angle, transform_points
+from drakegrasp.hand_paths import link_points
 from drakegrasp.scene import (
     Scene,
-    finger_speed,
+    closing_angles,
     go_on_in,
     hand_positions,
     move_wrist,
@@ -38,6 +39,9 @@ PEAK_ACCELERATION = 10.0 / np.sqrt(3.0)
 STILL, STILL_ANGLE = 5e-4, np.deg2rad(0.5)
 #: A lift in which it moved less than this is calm [m], [rad].
 CALM, CALM_ANGLE = 1e-4, np.deg2rad(0.1)
+#: A fingertip this far from the object has lost it: one that still counts as standing creeps
+#: towards it by less than half of that until the end of a lift [m].
+LOST = 3e-3
 #: A part of a step, far above the rounding of times.
 ROUNDING = 1e-6
 
@@ -90,33 +94,38 @@ def lift(scene: Scene, clock: Clock, config: Config) -> Lift:
     release(scene)
     motion = move_wrist(scene, target, duration)
     now, end = start, start + duration + config.lift.hold_time
-    tips = _fingertips(scene)
-    stage, held, over = scene, False, False
+    tips, angles = _fingertips(scene), closing_angles(scene)
+    # `scene` takes short steps, `current` those that it needs now. `held`: all fingertips have been
+    # seen on the object since anything moved, and need not be looked for again.
+    current, held, over = scene, False, False
     while not over:
         look = min(_next_look(now, config), end)
-        # Between two steps, so that rounding moves none from one look to another.
-        margin = stage.physics.time_step / 2.0 if look < end else 0.0
-        clock.advance(stage, look - margin - stage.time)
-        X_GO_seen, X_GO, now = X_GO, _object_in_hand(stage), look
-        standing = finger_speed(stage) <= config.close.stop_speed
+        # Just before a step, so that rounding moves none from one look to another.
+        margin = ROUNDING * current.physics.time_step if look < end else 0.0
+        clock.advance(current, look - margin - current.time)
+        X_GO_seen, X_GO = X_GO, _object_in_hand(current)
+        angles_seen, angles = angles, closing_angles(current)
+        speed = float(np.abs(angles - angles_seen).max()) / (look - now)
+        now, standing = look, speed <= config.close.stop_speed
         if _moved(X_GO_seen, X_GO, STILL, STILL_ANGLE):
-            held, over = False, not bodies_on_object(stage) & hand_bodies(stage)
-        elif standing and not held:
-            touching = bodies_on_object(stage)
+            held, over = False, not bodies_on_object(current) & hand_bodies(current)
+        elif not standing:
+            held = False
+        elif not held:
+            touching = bodies_on_object(current)
             held = tips <= touching
-            over = not held and scene.table.index() not in touching
-        held, over = held and standing, over or now >= end
+            over = current.table.index() not in touching and _has_lost_tip(current)
+        over = over or now >= end
         calm = standing and not _moved(X_GO_seen, X_GO, CALM, CALM_ANGLE)
-        other = _stage_for(scene, calm)
-        if not over and other is not stage:
-            go_on_in(other, stage, now, motion)
-            stage = other
+        if not over and current is not (fitting := _scene_for(scene, calm)):
+            go_on_in(fitting, current, now, motion)
+            current = fitting
     shift, angle = _motion(X_GO_before, X_GO)
     return Lift(
-        contacts=read_contacts(stage),
-        q=hand_positions(stage),
+        contacts=read_contacts(current),
+        q=hand_positions(current),
         duration=now - start,
-        X_TO=invert_pose(X_WT) @ stage.pose(stage.object),
+        X_TO=invert_pose(X_WT) @ current.pose(current.object),
         slip=shift,
         slip_angle=angle,
     )
@@ -128,13 +137,24 @@ def _next_look(now: float, config: Config) -> float:
     return float(np.ceil((now + config.lift.check_period) / step - ROUNDING) * step)
 
 
-def _stage_for(scene: Scene, calm: bool) -> Scene:
+def _scene_for(scene: Scene, calm: bool) -> Scene:
     return scene.make_calm() if calm and scene.make_calm is not None else scene
 
 
 def _fingertips(scene: Scene) -> set[BodyIndex]:
     assert scene.handles is not None
     return {body.index() for body in scene.handles.fingertips}
+
+
+def _has_lost_tip(scene: Scene) -> bool:
+    """Return whether some fingertip is well off the object."""
+    assert scene.handles is not None
+    points, X_OW = link_points(scene.handles.hand), invert_pose(scene.pose(scene.object))
+    for tip in scene.handles.fingertips:
+        p_OQ = transform_points(X_OW @ scene.pose(tip), points[tip.name()]).astype(np.float32)
+        if scene.model.field.interpolate(*p_OQ.T).min() > LOST:
+            return True
+    return False
 
 
 def _object_in_hand(scene: Scene) -> Array:

@@ -186,6 +186,9 @@ def move_wrist(scene: Scene, p_WG_target: npt.ArrayLike, duration: float) -> Wri
         scene: A scene with a hand.
         p_WG_target: Where the palm's origin goes, (3,) [m]; it stays there afterwards.
         duration: Of the motion [s].
+
+    Raises:
+        ValueError: If the scene has no hand.
     """
     joints = _handles(scene).wrist_joints
     motion = WristMotion(
@@ -209,28 +212,31 @@ def _follow(scene: Scene, motion: WristMotion) -> None:
     _handles(scene).wrist_trajectory.UpdateTrajectory(curve)
 
 
-def go_on_in(other: Scene, scene: Scene, time: float, motion: WristMotion) -> None:
-    """Give a scene of the same systems the state that another has reached in its lift.
+def go_on_in(scene: Scene, before: Scene, time: float, motion: WristMotion) -> None:
+    """Give a scene the state that another one of the same systems has reached in its lift.
 
     Args:
-        other: The scene that goes on.
-        scene: The scene whose state, locks and wrist it takes over.
+        scene: The scene that goes on.
+        before: The scene whose state, orientation and wrist's motion it takes over.
         time: Of the state [s], at which a step of both begins.
         motion: Of the wrist.
+
+    Raises:
+        ValueError: If one of them has no hand.
     """
-    theirs, ours = _handles(scene), _handles(other)
-    step = other.physics.time_step
+    theirs, ours = _handles(before), _handles(scene)
+    step = scene.physics.time_step
     # Drake begins steps at whole multiples: one a rounding before `time` would be left out.
-    other.simulator.get_mutable_context().SetTime(round(time / step) * step)
+    scene.simulator.get_mutable_context().SetTime(round(time / step) * step)
     # Not the context as a whole: that of a plant knows the shapes of its own diagram.
-    X = theirs.wrist_frame.GetPoseInParentFrame(scene.context)
-    ours.wrist_frame.SetPoseInParentFrame(other.context, X)
-    state = scene.plant.GetPositionsAndVelocities(scene.context)
-    other.plant.SetPositionsAndVelocities(other.context, state)
+    X = theirs.wrist_frame.GetPoseInParentFrame(before.context)
+    ours.wrist_frame.SetPoseInParentFrame(scene.context, X)
+    state = before.plant.GetPositionsAndVelocities(before.context)
+    scene.plant.SetPositionsAndVelocities(scene.context, state)
     for name in ours.hand.spread.joints:
-        other.plant.GetJointByName(name, ours.instance).Lock(other.context)
-    _follow(other, motion)
-    other.simulator.Initialize()
+        scene.plant.GetJointByName(name, ours.instance).Lock(scene.context)
+    _follow(scene, motion)
+    scene.simulator.Initialize()
 
 
 def advance(scene: Scene, duration: float) -> None:

@@ -44,7 +44,11 @@ def test_least_friction_holds_and_less_does_not(cube, config):
     half = config.physics.time_step / 2.0
     for friction, holds in ((found, True), (found - gap, False)):
         assert friction > 0.0
-        changed = [f"physics.friction_hand={friction}", f"physics.time_step={half}"]
+        changed = [
+            f"physics.friction_hand={friction}",
+            f"physics.time_step={half}",
+            "physics.calm_steps=1",
+        ]
         other = override_config(config, changed)
         scene = build_scene(cube, other.physics, load_hand(other.hand))
         record = run_attempt(scene, X_TO, attempt, other)

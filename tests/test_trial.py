@@ -339,7 +339,9 @@ def test_smaller_step_gives_the_same_verdicts(tmp_path, config, hand, step):
     made = make_attempts(candidates, range(40), config.candidates, name=model.name, seed=0)
     attempts = [attempt for attempt in made if attempt.ray_hits]
     coarse = override_config(config, ["screen.mode=off", f"physics.time_step={step}"])
-    fine = override_config(config, ["screen.mode=off", "physics.time_step=0.001"])
+    fine = override_config(
+        config, ["screen.mode=off", "physics.time_step=0.001", "physics.calm_steps=1"]
+    )
     coarse_scene = build_scene(model, coarse.physics, hand)
     fine_scene = build_scene(model, fine.physics, hand)
     records = [run_attempt(coarse_scene, X_TO, a, coarse) for a in attempts]
