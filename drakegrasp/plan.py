@@ -45,7 +45,7 @@ class StageTimes:
 
     Attributes:
         prepare: Mending, settling and sampling an object [s].
-        scene: Building an object's diagrams, once per worker that meets it [s].
+        scene: Building an object's diagrams and distance field, once per worker that meets it [s].
         attempt: An attempt, on average over all outcomes [s].
         shares: How much longer than that attempts of an object take, from the quickest object
             to the slowest; their mean is 1.
@@ -81,12 +81,12 @@ class StageTimes:
 #: `paper`, Drake 1.51.1) on two workers; preparing and assembling by `pipelines/measure_stages.py`.
 MEASURED = StageTimes(
     prepare=3.2,
-    scene=0.19,
-    attempt=0.013,
-    shares=(0.04, 0.17, 0.39, 0.66, 0.98, 1.04, 1.11, 1.34, 1.64, 2.63),
-    look=0.024,
+    scene=0.3,
+    attempt=0.011,
+    shares=(0.05, 0.23, 0.45, 0.7, 0.93, 1.01, 1.13, 1.36, 1.67, 2.45),
+    look=0.029,
     assemble=0.0005,
-    successes=0.0089,
+    successes=0.0087,
     samples=0.88,
     unit_bytes=136e3,
     attempt_bytes=260.0,
