@@ -30,6 +30,7 @@ from drakegrasp.scene import (
     palm_pose,
     release,
 )
+from drakegrasp.screen import extra_margin
 
 #: Peak speed of a minimum-jerk motion over its mean speed (Flash and Hogan, 1985).
 PEAK_SPEED = 15.0 / 8.0
@@ -150,9 +151,11 @@ def _has_lost_tip(scene: Scene) -> bool:
     """Return whether some fingertip is well off the object."""
     assert scene.handles is not None
     points, X_OW = link_points(scene.handles.hand), invert_pose(scene.pose(scene.object))
+    field = scene.model.field
+    margin = LOST + extra_margin(field)
     for tip in scene.handles.fingertips:
         p_OQ = transform_points(X_OW @ scene.pose(tip), points[tip.name()]).astype(np.float32)
-        if scene.model.field.interpolate(*p_OQ.T).min() > LOST:
+        if field.interpolate(*p_OQ.T).min() > margin:
             return True
     return False
 

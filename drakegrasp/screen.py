@@ -96,9 +96,14 @@ def predict(
     return found
 
 
+def extra_margin(field: DistanceField) -> float:
+    """Return what a margin [m] must be wider by, where a field's grid is coarse."""
+    return max(0.0, field.blur - COVERED)
+
+
 def _widened(config: ScreenConfig, field: DistanceField) -> ScreenConfig:
     """Return the margins for a field whose grid is coarser than those they were measured on."""
-    more = max(0.0, field.blur - COVERED)
+    more = extra_margin(field)
     names = ("start_margin", "reach_margin", "block_margin", "clearance")
     return config.model_copy(update={name: getattr(config, name) + more for name in names})
 
