@@ -23,7 +23,8 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.screen import Prediction, predict
 from drakegrasp.trial import run_attempt
 
-#: The step of these simulations over that of the trial: an artefact of the step does not hold.
+#: The step of these simulations, in calm lifts too, over the short one of the trial: an artefact
+#: of the step does not hold.
 STEP_RATIO = 0.5
 
 
