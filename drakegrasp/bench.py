@@ -34,6 +34,7 @@ from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.prepared import PreparedObject, prepare
 from drakegrasp.progress import Report, silent
 from drakegrasp.screen import Prediction
+from drakegrasp.seeding import Stream
 from drakegrasp.threads import one_thread
 from drakegrasp.trial import TrialRecord
 from drakegrasp.units import look_at_successes
@@ -187,7 +188,7 @@ def _measure_object(
         ours, theirs = found["grasps_per_core_hour"], found["peer"]["grasps_per_core_hour"]
         found["peer"]["ratio"] = ours / theirs if theirs else None
     if sample:
-        rows = np.random.default_rng(config.seed).permutation(hits)[:sample].tolist()
+        rows = [hits[k] for k in Stream(config.seed).permutation(len(hits))[:sample]]
         found["fidelity"] = {
             name: _compare_labels(bench, attempts, records, predictions, rows, variant, counter)
             for name, variant in VARIANTS.items()

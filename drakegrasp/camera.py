@@ -11,8 +11,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos_deg
 from drakegrasp.config import CameraConfig
-from drakegrasp.frames import Array, make_pose
+from drakegrasp.frames import make_pose
 
 #: Below this sine of the angle between view and vertical, up is taken from +Ty (0.06 degree).
 LOOKS_VERTICALLY = 1e-3
@@ -20,14 +21,15 @@ LOOKS_VERTICALLY = 1e-3
 
 def intrinsics(config: CameraConfig) -> Array:
     """Return the camera matrix K (3, 3) [px]: square pixels, centre in the image's middle."""
-    focal = config.size / (2.0 * np.tan(np.deg2rad(config.fov_y_deg) / 2.0))
+    sine, cosine = sin_cos_deg(config.fov_y_deg / 2.0)
+    focal = float(config.size * cosine / (2.0 * sine))
     centre = (config.size - 1) / 2.0
     return np.array([[focal, 0.0, centre], [0.0, focal, centre], [0.0, 0.0, 1.0]])
 
 
 def camera_pose_oto(X_TG: npt.ArrayLike, config: CameraConfig) -> Array:
     """Return X_TC (4, 4) of the camera that is rolled with the palm: R_GC is the identity."""
-    return np.asarray(X_TG) @ make_pose(np.eye(3), [0.0, 0.0, -config.distance])
+    return multiply(X_TG, make_pose(np.eye(3), [0.0, 0.0, -config.distance]))
 
 
 def camera_pose_otm(X_TG: npt.ArrayLike, config: CameraConfig) -> Array:
@@ -38,26 +40,25 @@ def camera_pose_otm(X_TG: npt.ArrayLike, config: CameraConfig) -> Array:
     X_TC = camera_pose_oto(X_TG, config)
     z = X_TC[:3, 2]
     up = np.array([0.0, 0.0, 1.0])
-    if np.linalg.norm(np.cross(z, up)) < LOOKS_VERTICALLY:
+    if norm(np.cross(z, up)) < LOOKS_VERTICALLY:
         up = np.array([0.0, 1.0, 0.0])
-    y = -(up - (up @ z) * z)
-    y /= np.linalg.norm(y)
+    y = -(up - dot(up, z) * z)
+    y /= norm(y)
     X_TC[:3, 0], X_TC[:3, 1] = np.cross(y, z), y
     return X_TC
 
 
 def project(K: npt.ArrayLike, p_CQ: npt.ArrayLike) -> Array:
     """Return pixel coordinates (n, 2), (u to the right, v down), of points (n, 3) [m]."""
-    points = np.asarray(p_CQ, dtype=float) @ np.asarray(K, dtype=float).T
+    points = multiply(p_CQ, np.asarray(K, dtype=float).T)
     return points[:, :2] / points[:, 2:]
 
 
 def unproject(K: npt.ArrayLike, pixels: npt.ArrayLike, depth: npt.ArrayLike) -> Array:
     """Return points p_CQ (n, 3) [m] of pixels (n, 2) at depths (n,) [m]."""
-    uv = np.asarray(pixels, dtype=float)
-    homogeneous = np.column_stack([uv, np.ones(len(uv))])
-    rays = np.linalg.solve(np.asarray(K, dtype=float), homogeneous.T).T
-    return rays * np.asarray(depth, dtype=float)[:, None]
+    uv, lens = np.asarray(pixels, dtype=float), np.asarray(K, dtype=float)
+    at_one = (uv - lens[:2, 2]) / lens[[0, 1], [0, 1]]
+    return np.column_stack([at_one, np.ones(len(uv))]) * np.asarray(depth, dtype=float)[:, None]
 
 
 def image_frame(K: npt.ArrayLike, mask: npt.ArrayLike, depth: npt.ArrayLike) -> Array:
@@ -70,7 +71,7 @@ def image_frame(K: npt.ArrayLike, mask: npt.ArrayLike, depth: npt.ArrayLike) -> 
     points away from the camera (+Cz). A mask of one pixel has Iz along +Cx.
 
     Args:
-        K: Camera matrix (3, 3).
+        K: Camera matrix (3, 3), as `intrinsics` makes it.
         mask: (S, S), 1 where the object is.
         depth: (S, S) [m].
 
@@ -84,9 +85,7 @@ def image_frame(K: npt.ArrayLike, mask: npt.ArrayLike, depth: npt.ArrayLike) -> 
     centroid = pixels.mean(axis=0)
     nearest = np.argmin(np.sum((pixels - centroid) ** 2, axis=1))
     z = float(np.asarray(depth)[rows[nearest], columns[nearest]])
-    centred = pixels - centroid
-    _, vectors = np.linalg.eigh(centred.T @ centred)
-    first = vectors[:, -1] if len(pixels) > 1 else np.array([1.0, 0.0])
+    first = _principal_axis(pixels - centroid)
     if first[0] < -1e-9 or (abs(first[0]) <= 1e-9 and first[1] < 0.0):
         first = -first
     # Square pixels at one depth: a direction in pixels is a direction in Cx, Cy.
@@ -94,3 +93,17 @@ def image_frame(K: npt.ArrayLike, mask: npt.ArrayLike, depth: npt.ArrayLike) -> 
     Ix = np.array([0.0, 0.0, 1.0])
     R_CI = np.column_stack([Ix, np.cross(Iz, Ix), Iz])
     return make_pose(R_CI, unproject(K, centroid[None], [z])[0])
+
+
+def _principal_axis(centred: Array) -> Array:
+    """Return the direction (2,) in which points (n, 2) about their mean spread most.
+
+    In closed form: LAPACK's last bits depend on the CPU. Without any direction it is +u.
+    """
+    (uu, vv), uv = (centred**2).sum(axis=0), (centred[:, 0] * centred[:, 1]).sum()
+    half = (uu - vv) / 2.0
+    length = np.sqrt(half * half + uv * uv)
+    # Of the two rows of (C - smallest eigenvalue) the longer one.
+    axis = np.array([half + length, uv] if half >= 0.0 else [uv, length - half])
+    size = norm(axis)
+    return np.asarray(axis / size) if size > 0.0 else np.array([1.0, 0.0])

@@ -7,20 +7,22 @@ is drawn depends on the attempt's own seed alone.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from drakegrasp.arithmetic import Array, multiply, norm
 from drakegrasp.candidates import Attempt
 from drakegrasp.config import CertifyConfig, Config
 from drakegrasp.construction import build_scene
-from drakegrasp.frames import Array, make_pose
+from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.hand import load_hand
 from drakegrasp.object_model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.screen import Prediction, predict
+from drakegrasp.seeding import Stream
 from drakegrasp.trial import run_attempt
 
 #: The step of these simulations, in calm lifts too, over the short one of the trial: an artefact
@@ -43,6 +45,8 @@ class Certificate:
     friction: float
 
 
+#: Drawn factors are multiples of this: the C library's exponential may differ by far less.
+FACTOR_GRID = 2.0**-32
 #: Of a grasp about which nothing is known.
 UNKNOWN = Certificate(share=np.nan, friction=np.nan)
 
@@ -56,8 +60,8 @@ def certify(model: ObjectModel, X_TO: Array, attempt: Attempt, config: Config) -
         attempt: One that succeeds under the configuration.
         config: The rules; `certify` says how often and with how much noise.
     """
-    rng = np.random.default_rng([attempt.seed, attempt.standoff_index])
-    held = list(_repeats(rng, model, X_TO, attempt, config))
+    stream = Stream(attempt.seed, attempt.standoff_index)
+    held = list(_repeats(stream, model, X_TO, attempt, config))
     judged = [one for one in held if one is not None]
     (prediction,) = predict(model, load_hand(config.hand), X_TO, [attempt], config.screen)
 
@@ -95,24 +99,31 @@ def least_friction(holds: Callable[[float], bool | None], highest: float, steps:
 
 
 def _repeats(
-    rng: np.random.Generator, model: ObjectModel, X_TO: Array, attempt: Attempt, config: Config
+    stream: Stream, model: ObjectModel, X_TO: Array, attempt: Attempt, config: Config
 ) -> Iterator[bool | None]:
     rules, mu = config.certify, config.physics.friction_hand
     for _ in range(rules.repeats):
-        other = replace(attempt, X_OG=attempt.X_OG @ _palm_noise(rng, rules))
-        friction = mu * float(np.exp(rules.friction_noise * rng.standard_normal()))
-        factor = float(np.exp(rules.mass_noise * rng.standard_normal()))
+        other = replace(attempt, X_OG=multiply(attempt.X_OG, _palm_noise(stream, rules)))
+        friction = mu * _noise_factor(stream, rules.friction_noise)
+        factor = _noise_factor(stream, rules.mass_noise)
         heavy = replace(model, mass=factor * model.mass, I_OOcm_O=factor * model.I_OOcm_O)
         # The shape is the same, and so is what geometry says.
         (prediction,) = predict(model, load_hand(config.hand), X_TO, [other], config.screen)
         yield _holds(heavy, X_TO, other, prediction, config, friction)
 
 
-def _palm_noise(rng: np.random.Generator, rules: CertifyConfig) -> Array:
+def _noise_factor(stream: Stream, deviation: float) -> float:
+    """Return exp(deviation times a normal number), a multiple of `FACTOR_GRID`."""
+    return round(math.exp(deviation * stream.normal(1)[0]) / FACTOR_GRID) * FACTOR_GRID
+
+
+def _palm_noise(stream: Stream, rules: CertifyConfig) -> Array:
     """Return a pose (4, 4) of the palm in the one that was meant."""
-    shift = rules.palm_noise * rng.standard_normal(3)
-    turn = np.deg2rad(rules.palm_noise_deg) * rng.standard_normal(3)
-    return make_pose(Rotation.from_rotvec(turn).as_matrix(), shift)
+    shift = rules.palm_noise * stream.normal(3)
+    turn = np.deg2rad(rules.palm_noise_deg) * stream.normal(3)
+    angle = float(norm(turn))
+    axis = turn / angle if angle > 0.0 else np.array([0.0, 0.0, 1.0])
+    return make_pose(rotation_about(axis, angle), shift)
 
 
 def _holds(

@@ -16,6 +16,7 @@ from pydrake.geometry import ContactSurface, HydroelasticContactRepresentation
 from pydrake.multibody.plant import HydroelasticContactInfo
 from pydrake.multibody.tree import BodyIndex
 
+from drakegrasp.arithmetic import norm
 from drakegrasp.frames import Array, invert_pose, rotate_vectors, transform_points
 from drakegrasp.scene import Scene
 from drakegrasp.surfaces import winding_numbers
@@ -76,7 +77,7 @@ def bodies_on_object(scene: Scene) -> set[BodyIndex]:
             other = N if ob == M else M
             forces[other] = forces.get(other, np.zeros(3)) + info.F_Ac_W().translational()
     limit = scene.physics.contact_force
-    return {body for body, force in forces.items() if float(np.linalg.norm(force)) > limit}
+    return {body for body, force in forces.items() if float(norm(force)) > limit}
 
 
 def open_hand_collides(scene: Scene) -> bool:
@@ -142,7 +143,7 @@ class _Reader:
         ob, table = scene.object.index(), scene.table.index()
         if ob not in (M, N):
             if table in (M, N) and self._hand & {M, N}:
-                self._hand_table_force += float(np.linalg.norm(force_on_M))
+                self._hand_table_force += float(norm(force_on_M))
             return
         other = N if ob == M else M
         force_on_object = force_on_M if ob == M else -force_on_M
@@ -151,7 +152,7 @@ class _Reader:
         elif other in self._tips:
             self._add_tip_patch(self._tips.index(other), surface, force_on_object, ob == M)
         else:
-            magnitude = float(np.linalg.norm(force_on_object))
+            magnitude = float(norm(force_on_object))
             self._other_force[other] = self._other_force.get(other, 0.0) + magnitude
 
     def _add_tip_patch(
@@ -177,9 +178,9 @@ class _Reader:
 
     def contacts(self) -> Contacts:
         limit = self._scene.physics.contact_force
-        touching = (np.linalg.norm(self._force_W, axis=1) > limit) & (self._weight > 0.0)
+        touching = (norm(self._force_W) > limit) & (self._weight > 0.0)
         weight = np.where(touching, self._weight, np.nan)[:, None]
-        length = np.linalg.norm(self._moment_n, axis=1, keepdims=True)
+        length = norm(self._moment_n)[:, None]
         normal_W = self._moment_n / np.where(touching[:, None] & (length > 0), length, np.nan)
         return Contacts(
             touching=touching,
@@ -190,7 +191,7 @@ class _Reader:
             penetration=np.where(touching, self._penetration, 0.0),
             other_links=sum(force > limit for force in self._other_force.values()),
             hand_on_table=self._hand_on_table or self._hand_table_force > limit,
-            object_on_table=bool(np.linalg.norm(self._table_force) > limit),
+            object_on_table=bool(norm(self._table_force) > limit),
             table_force=self._table_force,
             point_contacts=self._point_contacts,
         )
@@ -215,7 +216,7 @@ def _faces(
     for face in range(surface.num_faces()):
         centre = np.array(surface.centroid(face))
         pressure = float(field.EvaluateCartesian(face, centre))
-        slope = float(np.linalg.norm(gradient(face))) if has_gradient else np.inf
+        slope = float(norm(gradient(face))) if has_gradient else np.inf
         yield (
             float(surface.area(face)),
             centre,

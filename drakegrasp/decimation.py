@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import fast_simplification
 import numpy as np
 import trimesh
@@ -12,9 +14,10 @@ from drakegrasp.surfaces import (
     MAX_OVERLAP,
     Solid,
     diagonal,
-    face_areas,
+    even_points,
     from_manifold,
     is_solid_surface,
+    on_faces,
     overlap_share,
     signed_volume,
     stack,
@@ -66,12 +69,9 @@ def surface_deviation(first: Solid, second: Solid) -> float:
     meshes = [trimesh.Trimesh(s.vertices, s.faces, process=False) for s in (first, second)]
     worst = 0.0
     for here, there in (meshes, meshes[::-1]):
-        rng = np.random.default_rng(0)
-        areas = face_areas(here.vertices, here.faces)
-        picked = rng.choice(len(areas), DEVIATION_POINTS, p=areas / areas.sum())
-        weights = rng.dirichlet((1.0, 1.0, 1.0), DEVIATION_POINTS)
-        points = np.einsum("ij,ijk->ik", weights, here.vertices[here.faces[picked]])
-        corners = rng.permutation(len(here.vertices))[:DEVIATION_POINTS]
+        points = on_faces(here.vertices, here.faces, even_points(DEVIATION_POINTS))[0]
+        count = min(DEVIATION_POINTS, len(here.vertices))
+        corners = np.linspace(0, len(here.vertices) - 1, count).astype(int)
         points = np.vstack((points, here.vertices[corners]))
         worst = max(worst, float(trimesh.proximity.closest_point(there, points)[1].max()))
     return worst
@@ -108,11 +108,11 @@ def _decimate_quadric(solid: Solid, max_faces: int) -> Solid | None:
 def _simplify_manifold(solid: Solid, max_faces: int) -> Solid | None:
     """Find the smallest tolerance that gives few enough faces, by bisection of its logarithm."""
     source = to_manifold(solid.vertices, solid.faces).as_original()
-    low, high = np.log(1e-6 * diagonal(solid.vertices)), np.log(0.05 * diagonal(solid.vertices))
+    low, high = 1e-6 * diagonal(solid.vertices), 0.05 * diagonal(solid.vertices)
     best = None
     for _ in range(14):
-        middle = (low + high) / 2.0
-        reduced = source.simplify(float(np.exp(middle)))
+        middle = math.sqrt(low * high)
+        reduced = source.simplify(middle)
         if 0 < reduced.num_tri() <= max_faces:
             best, high = reduced, middle
         else:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 import trimesh
 from scipy.ndimage import distance_transform_edt
 
+from drakegrasp.arithmetic import multiply, norm
 from drakegrasp.frames import Array
 
 Distances = npt.NDArray[np.float32]
@@ -180,13 +181,13 @@ def _unsigned(
         at = np.column_stack(np.unravel_index(some, shape)) * spacing + origin
         near = triangles[owner[first[seed.ravel()[some]]]]
         on_triangle = trimesh.triangles.closest_point(near, at)
-        distance.ravel()[some] = np.linalg.norm(at - on_triangle, axis=1)
+        distance.ravel()[some] = norm(at - on_triangle)
     return distance
 
 
 def _surface_points(triangles: Array, spacing: float) -> tuple[Array, npt.NDArray[np.int64]]:
     """Return points on triangles at most a spacing [m] apart, and the triangle of each."""
-    edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
+    edges = norm(triangles - np.roll(triangles, 1, axis=1)).max(axis=1)
     parts = np.maximum(1, np.ceil(edges / spacing)).astype(int)
     points, owners = [], []
     for n in np.unique(parts):
@@ -194,7 +195,7 @@ def _surface_points(triangles: Array, spacing: float) -> tuple[Array, npt.NDArra
         i, j = (a.ravel() for a in np.indices((n + 1, n + 1)))
         i, j = i[i + j <= n], j[i + j <= n]
         weights = np.column_stack([i, j, n - i - j]) / n
-        points.append(np.einsum("wc,tcx->twx", weights, triangles[which]).reshape(-1, 3))
+        points.append(multiply(weights, triangles[which]).reshape(-1, 3))
         owners.append(np.repeat(which, len(weights)))
     return np.concatenate(points), np.concatenate(owners)
 

@@ -7,7 +7,6 @@ trials.hdf5; every removal has one reason, the first that applies (Veres et al.,
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -17,6 +16,7 @@ import numpy.typing as npt
 
 from drakegrasp.config import FilterConfig, SplitConfig
 from drakegrasp.frames import Array
+from drakegrasp.seeding import Stream, object_key
 
 
 class Removal(IntEnum):
@@ -129,17 +129,16 @@ def split_samples(
     for class_name in sorted(members):
         indices = sorted(members[class_name], key=lambda i: names[i])
         # Three numbers, so it is never the stream of a candidate of an object of this name.
-        key = int.from_bytes(hashlib.sha256(class_name.encode()).digest()[:4], "big")
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(key, 0, 1)))
+        stream = Stream(seed, object_key(class_name), 0, 1)
         trains = config.train_classes is None or class_name in config.train_classes
         if len(indices) < 2 or not trains:
             tested, others = indices, []
         else:
-            tested = [indices[int(rng.integers(len(indices)))]]
+            tested = [indices[int(stream.integers(len(indices), 1)[0])]]
             others = [i for i in indices if i not in tested]
         parts["test"].append(np.flatnonzero(np.isin(objects, tested)))
         pool = np.flatnonzero(np.isin(objects, others))
-        shuffled = rng.permutation(pool)
+        shuffled = pool[stream.permutation(len(pool))]
         count = round(config.valid_fraction * len(pool))
         parts["valid"].append(shuffled[:count])
         parts["train"].append(shuffled[count:])

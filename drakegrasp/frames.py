@@ -3,7 +3,7 @@
 Drake's monogram notation is used everywhere: `X_AB` is the pose of frame B
 expressed in frame A (it maps coordinates in B to coordinates in A), `R_AB` its
 rotation, `p_AB` its translation. Composition matches neighbouring letters:
-`X_AC = X_AB @ X_BC`.
+`X_AC = multiply(X_AB, X_BC)` (`arithmetic.multiply`, whose bits no CPU changes).
 
 Letters: W world, T table-top centre, O object (centre of the mesh's bounding box),
 Ocm its centre of mass, G palm (+Gz out of the palm), Fi distal link of finger i,
@@ -18,7 +18,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from drakegrasp.arithmetic import Array as Array
+from drakegrasp.arithmetic import multiply, sin_cos
 
 #: Position of the table-top centre T in the world [m] (Veres et al., "Coordinate frames").
 P_WT = np.array([0.0, 0.0, 0.65])
@@ -38,7 +39,7 @@ def invert_pose(X_AB: npt.ArrayLike) -> Array:
     R_BA = np.swapaxes(X[..., :3, :3], -1, -2)
     X_BA = np.zeros_like(X)
     X_BA[..., :3, :3] = R_BA
-    X_BA[..., :3, 3] = -np.einsum("...ij,...j->...i", R_BA, X[..., :3, 3])
+    X_BA[..., :3, 3] = -multiply(R_BA, X[..., :3, 3, None])[..., 0]
     X_BA[..., 3, 3] = 1.0
     return X_BA
 
@@ -61,7 +62,7 @@ def unpack_pose(packed: npt.ArrayLike) -> Array:
 def transform_points(X_AB: npt.ArrayLike, p_BQ: npt.ArrayLike) -> Array:
     """Return points p_AQ (n, 3) [m] of p_BQ (n, 3) under X_AB (4, 4)."""
     X = np.asarray(X_AB, dtype=float)
-    return np.asarray(p_BQ, dtype=float) @ X[:3, :3].T + X[:3, 3]
+    return multiply(p_BQ, X[:3, :3].T) + X[:3, 3]
 
 
 def rotate_vectors(X_AB: npt.ArrayLike, v_B: npt.ArrayLike) -> Array:
@@ -70,7 +71,18 @@ def rotate_vectors(X_AB: npt.ArrayLike, v_B: npt.ArrayLike) -> Array:
     Only the rotation of X_AB acts: a normal has no position.
     """
     X = np.asarray(X_AB, dtype=float)
-    return np.asarray(v_B, dtype=float) @ X[:3, :3].T
+    return multiply(v_B, X[:3, :3].T)
+
+
+def rotation_about(axis: npt.ArrayLike, angle: npt.ArrayLike) -> Array:
+    """Return the rotations (..., 3, 3) by angles (...,) [rad] about a unit axis (3,).
+
+    Rodrigues' formula: R = 1 + sin(a) K + (1 - cos(a)) K^2, with K the cross product by the axis.
+    """
+    x, y, z = np.asarray(axis, dtype=float)
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    s, c = (f[..., None, None] for f in sin_cos(angle))
+    return np.asarray(np.eye(3) + s * K + (1.0 - c) * multiply(K, K))
 
 
 def rotation_angle(R_AB: npt.ArrayLike) -> float:

@@ -24,6 +24,7 @@ from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RevoluteJoint, RigidBody, WeldJoint
 
+from drakegrasp.arithmetic import multiply
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, invert_pose, make_pose
 from drakegrasp.hand_files import hand_file
@@ -339,14 +340,16 @@ def _chain(
         body = joint.parent_body()
     X, X_PJ, axes = X_GB, [], []
     for joint in path:
-        X = X @ joint.frame_on_parent().GetFixedPoseInBodyFrame().GetAsMatrix4()
+        X = multiply(X, joint.frame_on_parent().GetFixedPoseInBodyFrame().GetAsMatrix4())
         if isinstance(joint, RevoluteJoint):
             X_PJ.append(X)
             axes.append(joint.revolute_axis())
             X = np.eye(4)
         else:
-            X = X @ joint.X_FM().GetAsMatrix4()
-        X = X @ invert_pose(joint.frame_on_child().GetFixedPoseInBodyFrame().GetAsMatrix4())
+            X = multiply(X, joint.X_FM().GetAsMatrix4())
+        X = multiply(
+            X, invert_pose(joint.frame_on_child().GetFixedPoseInBodyFrame().GetAsMatrix4())
+        )
     gain = [gains[joint.name()] for joint in path if isinstance(joint, RevoluteJoint)]
     k = len(next(iter(gains.values())))
     return Chain(

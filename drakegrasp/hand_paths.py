@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import ConvexHull
 
+from drakegrasp.arithmetic import dot, multiply, norm
 from drakegrasp.distance_field import DistanceField, make_distance_field
 from drakegrasp.frames import Array, invert_pose
 from drakegrasp.hand import Hand
@@ -110,7 +111,7 @@ def _finger_path(
 
     tip = placed(hand.fingers[i].fingertip)
     points = np.concatenate([tip, *map(placed, rest)], axis=1)
-    travel = np.linalg.norm(np.diff(points, axis=0), axis=2).max(axis=0)
+    travel = norm(np.diff(points, axis=0)).astype(np.float32).max(axis=0)
     moving = travel > STILL
     return FingerPath(
         angles=angles,
@@ -122,7 +123,7 @@ def _finger_path(
 
 def _place(X_GL: Array, p_LQ: Array) -> Points:
     """Return points (..., n, 3) in {G} of points (n, 3) of links with poses (..., 4, 4)."""
-    moved = np.einsum("...ij,nj->...ni", X_GL[..., :3, :3], p_LQ)
+    moved = multiply(p_LQ, np.swapaxes(X_GL[..., :3, :3], -1, -2))
     return np.asarray(moved + X_GL[..., None, :3, 3], dtype=np.float32)
 
 
@@ -144,7 +145,7 @@ def _gaps(
 def _gap(field: DistanceField, X_FbG: Array, p_GQ: Points) -> npt.NDArray[np.float32]:
     """Return the least distance (m,) of points (m, n, 3) from a fingertip, given its pose."""
     X = X_FbG.astype(np.float32)
-    x, y, z = (p_GQ @ X[axis, :3] + X[axis, 3] for axis in range(3))
+    x, y, z = (dot(p_GQ, X[axis, :3]).astype(np.float32) + X[axis, 3] for axis in range(3))
     return np.asarray(field.nearest(x, y, z).min(axis=1))
 
 
@@ -175,7 +176,7 @@ def _triangles(corners: Array) -> Array:
     hull = ConvexHull(corners)
     triangles = corners[hull.simplices]
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    inward = np.einsum("ij,ij->i", normals, hull.equations[:, :3]) < 0.0
+    inward = dot(normals, hull.equations[:, :3]) < 0.0
     triangles[inward] = triangles[inward][:, ::-1]
     return triangles
 
@@ -183,13 +184,13 @@ def _triangles(corners: Array) -> Array:
 def _surface_points(corners: Array, spacing: float) -> Array:
     """Return the corners of a convex shape and evenly spread points of its surface."""
     triangles, fine = _triangles(corners), spacing / 2.0
-    edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
+    edges = norm(triangles - np.roll(triangles, 1, axis=1)).max(axis=1)
     parts = np.ceil(edges / fine).astype(int)
     points = [corners]
     for triangle, n in zip(triangles, parts, strict=True):
         i, j = (a.ravel() for a in np.indices((n + 1, n + 1)))
         inside = i + j <= n
-        points.append(np.column_stack([i, j, n - i - j])[inside] / n @ triangle)
+        points.append(multiply(np.column_stack([i, j, n - i - j])[inside] / n, triangle))
     dense = np.concatenate(points)
     # The corners come first, so they are the ones that stay in their cells.
     cells = np.floor(dense / spacing).astype(np.int64)

@@ -22,6 +22,7 @@ from pydrake.geometry import (
 )
 from pydrake.multibody.plant import MultibodyPlant
 
+from drakegrasp.arithmetic import sin_cos
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, transform_points
 from drakegrasp.hand import Hand, make_parser
@@ -85,7 +86,8 @@ def _box(half: Array) -> Array:
 
 def _prism(radius: float, half_length: float) -> Array:
     angles = 2.0 * np.pi * np.arange(CIRCLE) / CIRCLE
-    ring = radius / np.cos(np.pi / CIRCLE) * np.column_stack([np.cos(angles), np.sin(angles)])
+    sine, cosine = sin_cos(angles)
+    ring = radius / sin_cos(np.pi / CIRCLE)[1] * np.column_stack([cosine, sine])
     ends = [np.column_stack([ring, np.full(CIRCLE, z)]) for z in (-half_length, half_length)]
     return np.concatenate(ends)
 
@@ -96,4 +98,5 @@ def _ball(radius: float) -> Array:
     i = np.arange(CIRCLE**2) + 0.5
     z, turn = 1.0 - 2.0 * i / CIRCLE**2, np.pi * (1.0 + np.sqrt(5.0)) * i
     across = np.sqrt(1.0 - z**2)
-    return radius * np.column_stack([across * np.cos(turn), across * np.sin(turn), z])
+    sine, cosine = sin_cos(turn)
+    return radius * np.column_stack([across * cosine, across * sine, z])

@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.frames import Array
+from drakegrasp.arithmetic import Array, multiply
+from drakegrasp.frames import rotation_about
 from drakegrasp.hand import Chain, Hand
 
 
@@ -35,7 +36,7 @@ def joint_positions(hand: Hand, spread: float, closing: npt.ArrayLike) -> dict[s
     Raises:
         ValueError: If `closing` is not one angle per finger.
     """
-    q = hand.joint_gain @ _coordinates(hand, spread, closing)
+    q = multiply(hand.joint_gain, _coordinates(hand, spread, closing))
     return dict(zip(hand.joint_names, q.tolist(), strict=True))
 
 
@@ -86,19 +87,16 @@ def _coordinates(hand: Hand, spread: npt.ArrayLike, closing: npt.ArrayLike) -> A
 
 
 def _chain_pose(chain: Chain, c: Array) -> Array:
-    q = c @ chain.gain.T
+    q = multiply(c[..., None, :], chain.gain.T)[..., 0, :]
     X = np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))
     for j, (X_PJ, axis) in enumerate(zip(chain.X_PJ, chain.axis, strict=True)):
-        X = X @ X_PJ @ _turn(axis, q[..., j])
-    return X @ chain.X_JFi
+        X = multiply(multiply(X, X_PJ), _turn(axis, q[..., j]))
+    return multiply(X, chain.X_JFi)
 
 
 def _turn(axis: Array, angle: Array) -> Array:
-    """Return the poses (..., 4, 4) that turn by angles (...,) about an axis (Rodrigues)."""
-    x, y, z = axis
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    s, c = np.sin(angle)[..., None, None], np.cos(angle)[..., None, None]
+    """Return the poses (..., 4, 4) that turn by angles (...,) about an axis."""
     X = np.zeros((*np.shape(angle), 4, 4))
-    X[..., :3, :3] = np.eye(3) + s * K + (1.0 - c) * (K @ K)
+    X[..., :3, :3] = rotation_about(axis, angle)
     X[..., 3, 3] = 1.0
     return X

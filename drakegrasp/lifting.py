@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.multibody.tree import BodyIndex
 
+from drakegrasp.arithmetic import multiply, norm
 from drakegrasp.clock import Clock
 from drakegrasp.config import Config
 from drakegrasp.contacts import Contacts, bodies_on_object, hand_bodies, read_contacts
@@ -90,7 +91,7 @@ def lift(scene: Scene, clock: Clock, config: Config) -> Lift:
     X_GO_before = X_GO = _object_in_hand(scene)
     start = scene.time
     target = X_WT[:3, 3] + config.lift.p_TG
-    duration = lift_duration(float(np.linalg.norm(target - palm_pose(scene)[:3, 3])), config)
+    duration = lift_duration(float(norm(target - palm_pose(scene)[:3, 3])), config)
     duration = max(duration, config.physics.time_step)  # the palm may start at its target
     release(scene)
     motion = move_wrist(scene, target, duration)
@@ -126,7 +127,7 @@ def lift(scene: Scene, clock: Clock, config: Config) -> Lift:
         contacts=read_contacts(current),
         q=hand_positions(current),
         duration=now - start,
-        X_TO=invert_pose(X_WT) @ current.pose(current.object),
+        X_TO=multiply(invert_pose(X_WT), current.pose(current.object)),
         slip=shift,
         slip_angle=angle,
     )
@@ -154,20 +155,22 @@ def _has_lost_tip(scene: Scene) -> bool:
     field = scene.model.field
     margin = LOST + extra_margin(field)
     for tip in scene.handles.fingertips:
-        p_OQ = transform_points(X_OW @ scene.pose(tip), points[tip.name()]).astype(np.float32)
+        p_OQ = transform_points(multiply(X_OW, scene.pose(tip)), points[tip.name()]).astype(
+            np.float32
+        )
         if field.interpolate(*p_OQ.T).min() > margin:
             return True
     return False
 
 
 def _object_in_hand(scene: Scene) -> Array:
-    return invert_pose(palm_pose(scene)) @ scene.pose(scene.object)
+    return multiply(invert_pose(palm_pose(scene)), scene.pose(scene.object))
 
 
 def _motion(X_GO_before: Array, X_GO: Array) -> tuple[float, float]:
     """Return by how much the object moved [m] and turned [rad] in the hand."""
-    shift = float(np.linalg.norm(X_GO[:3, 3] - X_GO_before[:3, 3]))
-    return shift, rotation_angle((invert_pose(X_GO_before) @ X_GO)[:3, :3])
+    shift = float(norm(X_GO[:3, 3] - X_GO_before[:3, 3]))
+    return shift, rotation_angle(multiply(invert_pose(X_GO_before), X_GO)[:3, :3])
 
 
 def _moved(X_GO_before: Array, X_GO: Array, limit: float, angle_limit: float) -> bool:

@@ -35,14 +35,15 @@ from pydrake.multibody.tree import RigidBody, SpatialInertia
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
+from drakegrasp.arithmetic import multiply
 from drakegrasp.camera import intrinsics
-from drakegrasp.candidates import object_key
 from drakegrasp.config import CameraConfig
 from drakegrasp.errors import BlankImageError
 from drakegrasp.frames import X_WT
 from drakegrasp.hand import make_parser
 from drakegrasp.hand_files import MODELS
 from drakegrasp.object_model import ObjectModel
+from drakegrasp.seeding import object_key
 from drakegrasp.wavefront import obj_text
 
 #: Colour of what lies beyond the table.
@@ -125,10 +126,8 @@ def look(renderer: Renderer, X_TO: npt.ArrayLike, X_TC: npt.ArrayLike) -> Look:
     """
     plant, config = renderer.plant, renderer.config
     plant_context = plant.GetMyMutableContextFromRoot(renderer.context)
-    plant.SetFreeBodyPose(
-        plant_context, renderer.object, RigidTransform(X_WT @ np.asarray(X_TO, dtype=float))
-    )
-    X_WC = RigidTransform(X_WT @ np.asarray(X_TC, dtype=float))
+    plant.SetFreeBodyPose(plant_context, renderer.object, RigidTransform(multiply(X_WT, X_TO)))
+    X_WC = RigidTransform(multiply(X_WT, X_TC))
     K = intrinsics(config)
     core = RenderCameraCore(
         _ENGINE,

@@ -9,7 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from pydrake.math import RotationMatrix
 
+from drakegrasp.arithmetic import multiply, norm
 from drakegrasp.config import Config
 from drakegrasp.construction import build_scene
 from drakegrasp.contacts import read_contacts
@@ -22,6 +24,9 @@ from drakegrasp.scene import Scene, advance, reset_object
 LOOK_PERIOD = 0.05
 #: Drake's gravity [m/s^2], and by how much the table's force at rest may miss the weight.
 GRAVITY, MAX_FORCE_ERROR = 9.81, 0.01
+#: A resting pose is snapped to multiples of this, in p_TO [m] and in the quaternion of R_TO: about
+#: a micrometre and a microradian. Drake's last bits depend on the CPU, and the palm poses on it.
+POSE_GRID = 2.0**-20
 #: When a rolling object is stopped by hand, as a share of the longest time; see `settle`.
 STOP_FRACTION = 0.6
 
@@ -66,7 +71,7 @@ def _settle(model: ObjectModel, config: Config) -> Resting:
     rules = config.settle
     scene = build_scene(model, config.physics.model_copy(update={"time_step": rules.time_step}))
     lowest = float(model.collision_vertices[:, 2].min())
-    X_WO = X_WT @ make_pose(np.eye(3), [0.0, 0.0, rules.drop_height - lowest])
+    X_WO = multiply(X_WT, make_pose(np.eye(3), [0.0, 0.0, rules.drop_height - lowest]))
     reset_object(scene, X_WO)
     scene.simulator.Initialize()
     resting_for, stopped, linear, angular = 0.0, False, 0.0, 0.0
@@ -85,10 +90,10 @@ def _settle(model: ObjectModel, config: Config) -> Resting:
         if not slow and scene.time > STOP_FRACTION * rules.max_time:
             scene.plant.SetVelocities(scene.context, np.zeros(scene.plant.num_velocities()))
             stopped = True
-    X_TO = invert_pose(X_WT) @ scene.pose(scene.object)
+    X_TO = multiply(invert_pose(X_WT), scene.pose(scene.object))
     if X_TO[2, 3] < 0.0:
         raise MeshError(f"{model.name}: must come to rest on the table, got an object that left it")
-    X_TO[:2, 3] = 0.0
+    X_TO = snapped(X_TO)
     force = float(read_contacts(scene).table_force[2])
     weight = model.mass * GRAVITY
     if abs(force - weight) > MAX_FORCE_ERROR * weight:
@@ -98,8 +103,28 @@ def _settle(model: ObjectModel, config: Config) -> Resting:
     return Resting(X_TO=X_TO, seconds=scene.time, table_force=force, stopped=stopped)
 
 
+def snapped(X_TO: Array) -> Array:
+    """Return a resting pose (4, 4) moved to p_TO = (0, 0, z) and to the next point of a fine grid.
+
+    The same pose but for rounding gives the same bits, unless it lies between two points of the
+    grid: of a rounding error e that is one pose in POSE_GRID / e.
+    """
+    wxyz = RotationMatrix(X_TO[:3, :3]).ToQuaternion().wxyz()
+    # A quaternion and its negative are one rotation: the largest entry is positive.
+    wxyz = np.rint(wxyz * np.sign(wxyz[np.argmax(np.abs(wxyz))]) / POSE_GRID)
+    w, x, y, z = wxyz / norm(wxyz)
+    R_TO = np.array(
+        [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+        ]
+    )
+    return make_pose(R_TO, [0.0, 0.0, np.rint(X_TO[2, 3] / POSE_GRID) * POSE_GRID])
+
+
 def _speeds(scene: Scene) -> tuple[float, float]:
     """Return the object's linear [m/s] and angular [rad/s] speed."""
     velocity = scene.plant.EvalBodySpatialVelocityInWorld(scene.context, scene.object)
-    linear = float(np.linalg.norm(velocity.translational()))
-    return linear, float(np.linalg.norm(velocity.rotational()))
+    linear = float(norm(velocity.translational()))
+    return linear, float(norm(velocity.rotational()))

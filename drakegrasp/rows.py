@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from drakegrasp.arithmetic import multiply
 from drakegrasp.camera import camera_pose_otm, camera_pose_oto, image_frame, intrinsics
 from drakegrasp.candidates import Attempt
 from drakegrasp.contacts import Contacts
@@ -39,7 +40,7 @@ def look_values(bench: Workbench, record: TrialRecord) -> dict[str, AnyArray]:
     found: dict[str, AnyArray] = {}
     poses = {"oto": camera_pose_oto, "otm": camera_pose_otm}
     for name in CAMERAS:
-        X_TC = poses[name](record.X_TO @ record.X_OG, camera)
+        X_TC = poses[name](multiply(record.X_TO, record.X_OG), camera)
         seen = look(bench.renderer, record.X_TO, X_TC)
         found[f"image_{name}"] = seen.image
         found[f"mask_{name}"] = seen.mask

@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from drakegrasp.arithmetic import multiply
 from drakegrasp.frames import X_WT, invert_pose, pack_pose, transform_points, unpack_pose
 from drakegrasp.grasp import pack_grasp, transform_grasp
 from drakegrasp.manifest import model_path
@@ -82,19 +83,19 @@ def _sample(model: ObjectModel, shard: Shard, row: int, k: int, camera: str) -> 
         "object_name": model.name,
         "class_name": model.class_name,
         "work2com": transform_points(X_TO, model.p_OOcm[None])[0],
-        "work2inertia": (R_TO @ model.I_OOcm_O @ R_TO.T).ravel(),
+        "work2inertia": multiply(multiply(R_TO, model.I_OOcm_O), R_TO.T).ravel(),
         "work2mass": [model.mass],
         "frame_cam2img_otm": looks["X_CI_otm"][k],
         "frame_cam2work_otm": pack_pose(invert_pose(X_TC["otm"])),
         "frame_cam2work_oto": pack_pose(invert_pose(X_TC["oto"])),
         "frame_work2cam_otm": pack_pose(X_TC["otm"]),
         "frame_work2cam_oto": pack_pose(X_TC["oto"]),
-        "frame_world2obj": pack_pose(X_WT @ X_TO),
+        "frame_world2obj": pack_pose(multiply(X_WT, X_TO)),
         "frame_world2work": pack_pose(X_WT),
     }
     return {
         "images": looks[f"image_{camera}"][k],
         "masks": looks[f"mask_{camera}"][k],
-        "grasps": transform_grasp(invert_pose(X_TC[camera]) @ X_TO, grasp_O),
+        "grasps": transform_grasp(multiply(invert_pose(X_TC[camera]), X_TO), grasp_O),
         **{f"object_props/{name}": value for name, value in properties.items()},
     }

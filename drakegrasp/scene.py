@@ -27,6 +27,7 @@ from pydrake.systems.framework import Context
 from pydrake.systems.primitives import TrajectorySource
 from pydrake.trajectories import BezierCurve, PiecewisePolynomial
 
+from drakegrasp.arithmetic import multiply
 from drakegrasp.config import PhysicsConfig
 from drakegrasp.frames import Array
 from drakegrasp.hand import Hand
@@ -272,7 +273,7 @@ def palm_pose(scene: Scene) -> Array:
     """Return the pose X_WG (4, 4) of the palm now."""
     handles = _handles(scene)
     base = scene.plant.GetBodyByName(handles.hand.palm_link, handles.instance)
-    return scene.pose(base) @ handles.hand.X_BG
+    return multiply(scene.pose(base), handles.hand.X_BG)
 
 
 def _handles(scene: Scene) -> HandHandles:

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from drakegrasp.arithmetic import multiply
 from drakegrasp.candidates import Attempt
 from drakegrasp.config import ScreenConfig
 from drakegrasp.distance_field import DistanceField
@@ -114,8 +115,7 @@ class _View:
     def __init__(self, field: DistanceField, X_TO: Array, X_OG: Array) -> None:
         self.field = field
         self._X_OG = X_OG.astype(np.float32)
-        X_TG = np.matmul(X_TO, X_OG)  # one product per attempt, whatever their number
-        self._up = X_TG[:, 2].astype(np.float32)
+        self._up = multiply(X_TO, X_OG)[:, 2].astype(np.float32)
 
     def __len__(self) -> int:
         return len(self._X_OG)

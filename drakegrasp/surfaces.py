@@ -12,6 +12,7 @@ import manifold3d
 import numpy as np
 import numpy.typing as npt
 
+from drakegrasp.arithmetic import dot, norm
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
 
@@ -43,18 +44,18 @@ class Solid:
 def signed_volume(vertices: Array, faces: Faces) -> float:
     """Return the volume enclosed by a closed surface [m^3], negative if inside out."""
     a, b, c = np.moveaxis((vertices - vertices.mean(axis=0))[faces], 1, 0)
-    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+    return float(dot(a, np.cross(b, c)).sum() / 6.0)
 
 
 def face_areas(vertices: Array, faces: Faces) -> Array:
     """Return the area of every triangle (m,) [m^2]."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2.0)
+    return norm(np.cross(b - a, c - a)) / 2.0
 
 
 def diagonal(vertices: Array) -> float:
     """Return the diagonal of the bounding box [m]."""
-    return float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    return float(norm(np.ptp(vertices, axis=0)))
 
 
 def is_solid_surface(faces: Faces) -> bool:
@@ -86,9 +87,9 @@ def winding_numbers(p_OQ: Array, vertices: Array, faces: Faces) -> Array:
     step = max(1, 400_000 // len(faces))
     for start in range(0, len(p_OQ), step):
         a, b, c = np.moveaxis(triangles[None] - p_OQ[start : start + step, None, None], 2, 0)
-        la, lb, lc = (np.sqrt(np.einsum("...i,...i", x, x)) for x in (a, b, c))
-        numerator = np.einsum("...i,...i", a, np.cross(b, c))
-        ab, bc, ca = (np.einsum("...i,...i", x, y) for x, y in ((a, b), (b, c), (c, a)))
+        la, lb, lc = (norm(x) for x in (a, b, c))
+        numerator = dot(a, np.cross(b, c))
+        ab, bc, ca = (dot(x, y) for x, y in ((a, b), (b, c), (c, a)))
         angle = np.arctan2(numerator, la * lb * lc + ab * lc + bc * la + ca * lb)
         out[start : start + step] = angle.sum(axis=1) / (2.0 * np.pi)
     return out
@@ -105,14 +106,11 @@ def overlap_share(vertices: Array, faces: Faces, *, points: int = CHECK_POINTS) 
     low, size = vertices.min(axis=0), np.ptp(vertices, axis=0)
     inside, wrong = _count_wrong(low + spread * size, vertices, faces)
     if inside < count // 20:
-        areas = face_areas(vertices, faces)
-        picked = np.searchsorted(np.cumsum(areas), spread[: count // 2, 2] * areas.sum())
-        a, b, c = np.moveaxis(vertices[faces[np.minimum(picked, len(faces) - 1)]], 1, 0)
-        root, part = np.sqrt(spread[: count // 2, :1]), spread[: count // 2, 1:2]
-        on_face = (1.0 - root) * a + root * (1.0 - part) * b + root * part * c
+        on_face, picked = on_faces(vertices, faces, spread[: count // 2])
+        a, b, c = np.moveaxis(vertices[faces[picked]], 1, 0)
         normals = np.cross(b - a, c - a)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-        offsets = NEAR * float(np.linalg.norm(size)) * normals
+        normals /= np.maximum(norm(normals), 1e-300)[:, None]
+        offsets = NEAR * float(norm(size)) * normals
         both_sides = np.vstack((on_face - offsets, on_face + offsets))
         inside, wrong = _count_wrong(both_sides, vertices, faces)
     return wrong / max(1, inside)
@@ -122,6 +120,21 @@ def _count_wrong(points: Array, vertices: Array, faces: Faces) -> tuple[int, int
     w = winding_numbers(points, vertices, faces)
     wrong = np.minimum(np.abs(w), np.abs(w - 1.0)) > 0.05
     return int((np.abs(w) > 0.5).sum()), int(wrong.sum())
+
+
+def on_faces(vertices: Array, faces: Faces, spread: Array) -> tuple[Array, Faces]:
+    """Return points (k, 3) [m] of a surface and the face (k,) of each.
+
+    Args:
+        vertices: (n, 3) [m].
+        faces: (m, 3).
+        spread: Points (k, 3) of the unit cube; even ones give points that are even over the area.
+    """
+    until = np.cumsum(face_areas(vertices, faces))
+    picked = np.minimum(np.searchsorted(until, spread[:, 2] * until[-1]), len(faces) - 1)
+    a, b, c = np.moveaxis(vertices[faces[picked]], 1, 0)
+    root, part = np.sqrt(spread[:, :1]), spread[:, 1:2]
+    return (1.0 - root) * a + root * (1.0 - part) * b + root * part * c, picked
 
 
 def even_points(count: int) -> Array:

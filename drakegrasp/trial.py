@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
+from drakegrasp.arithmetic import multiply
 from drakegrasp.candidates import Attempt
 from drakegrasp.clock import Clock, LateError, start_clock
 from drakegrasp.config import Config
@@ -93,7 +94,7 @@ def run_attempt(
     record = TrialRecord(outcome=Outcome.RAY_MISS, X_TO=X_TO, X_OG=attempt.X_OG)
     if not attempt.ray_hits:
         return record
-    if (X_TO @ attempt.X_OG)[2, 3] <= 0.0:
+    if multiply(X_TO, attempt.X_OG)[2, 3] <= 0.0:
         return replace(record, outcome=Outcome.BELOW_TABLE)
     try:
         if prediction is None:
@@ -128,9 +129,9 @@ def _simulate(
     # Near a collision Drake has the last word on whether it is one.
     if lost is Outcome.START_COLLISION or (lost is not None and prediction and prediction.clear):
         return replace(record, outcome=lost)
-    X_WO = X_WT @ record.X_TO
+    X_WO = multiply(X_WT, record.X_TO)
     clock = start_clock(config)
-    X_WG = X_WO @ attempt.X_OG
+    X_WG = multiply(X_WO, attempt.X_OG)
     reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=attempt.closing)
     if open_hand_collides(scene):
         return replace(record, outcome=Outcome.START_COLLISION)

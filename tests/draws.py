@@ -1,0 +1,123 @@
+"""Prints what is drawn, as hashes: run in processes that compute with other kernels.
+
+Run as a script: `python draws.py [MESHES]`, with a directory of the real meshes or without. On
+standard output: a JSON object of a hash by name, and under `kernels` what the process ran with.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from threadpoolctl import threadpool_info
+
+from drakegrasp.builtin import export_builtin
+from drakegrasp.candidates import make_attempts, normal_candidates
+from drakegrasp.certify import _noise_factor, _palm_noise
+from drakegrasp.config import SplitConfig, load_config
+from drakegrasp.filters import split_samples
+from drakegrasp.hand import load_hand
+from drakegrasp.meshes import MeshSource, find_meshes
+from drakegrasp.prepared import prepare
+from drakegrasp.screen import predict
+from drakegrasp.seeding import Stream
+
+#: Of the real meshes: a thin one, one with many faces, one that lies on its side.
+REAL = ("24_mug_final", "42_wineglass_final", "110_bunny_final")
+#: Attempts whose predictions by geometry are hashed.
+PREDICTED = 600
+
+
+def digest(*parts: object) -> str:
+    """Return a hash of arrays and bytes."""
+    found = hashlib.sha256()
+    for part in parts:
+        found.update(part if isinstance(part, bytes) else np.ascontiguousarray(part).tobytes())
+    return found.hexdigest()[:16]
+
+
+def objects(folder: Path, meshes: Path | None) -> Iterator[MeshSource]:
+    """Yield a cube, a cylinder and, where they are, three real meshes."""
+    cube, cylinder = trimesh.creation.box([0.07] * 3), trimesh.creation.cylinder(0.03, 0.12)
+    cylinder.vertices = np.round(cylinder.vertices, 6)  # trimesh's own sines
+    for name, mesh in (("1_cube", cube), ("2_cylinder", cylinder)):
+        mesh.subdivide().subdivide().export(folder / f"{name}.stl")
+    yield from find_meshes(folder)
+    if meshes is not None:
+        yield from (s for s in find_meshes(meshes, units="cm") if s.name in REAL)
+
+
+def object_draws(source: MeshSource) -> Iterator[tuple[str, str]]:
+    """Yield the draws of one object under the preset `paper`."""
+    config = load_config(overrides=["candidates.max=1000"])
+    hand = load_hand(config.hand)
+    prepared = prepare(source, config)
+    model, candidates = prepared.model, prepared.candidates
+    attempts = list(
+        make_attempts(candidates, range(len(candidates)), config.candidates, name=source.name, seed=7)
+    )
+    yield "mesh", digest(model.visual_vertices, model.collision_vertices, model.collision_faces)
+    yield "X_TO", digest(prepared.X_TO)
+    yield "palm poses", digest(candidates.X_OG, candidates.distance)
+    yield "counts", f"{candidates.combinations} {candidates.valid} {candidates.distinct}"
+    yield (
+        "attempts",
+        digest(
+            np.array([a.X_OG for a in attempts]),
+            np.array([a.spread for a in attempts]),
+            np.array([a.seed for a in attempts], dtype=np.uint64),
+        ),
+    )
+    yield "normals", digest(normal_candidates(model, 1000, Stream(7)))
+    predictions = predict(model, hand, prepared.X_TO, attempts[:PREDICTED], config.screen)
+    yield (
+        "predictions",
+        digest(
+            np.array([-1 if p is None or p.outcome is None else p.outcome for p in predictions]),
+            *[p.closing for p in predictions if p is not None],
+        ),
+    )
+
+
+def main(meshes: Path | None) -> dict[str, object]:
+    """Return all hashes, and what this process computes with."""
+    found: dict[str, object] = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        builtin = export_builtin(folder / "builtin")
+        found["builtin meshes"] = digest(*(path.read_bytes() for path in builtin))
+        for source in objects(folder, meshes):
+            for what, value in object_draws(source):
+                found[f"{source.name}: {what}"] = value
+    split = split_samples(
+        np.repeat(np.arange(12, dtype=np.int32), 40),
+        [f"{i}_thing" for i in range(12)],
+        [f"class {i // 3}" for i in range(12)],
+        SplitConfig(),
+        7,
+    )
+    found["split"] = digest(*split.values())
+    config = load_config().certify
+    stream = Stream(7, 1)
+    found["certificate noise"] = digest(
+        *(_palm_noise(stream, config) for _ in range(100)),
+        np.array([_noise_factor(stream, 0.1) for _ in range(100)]),
+    )
+    x = np.linspace(-3.0, 3.0, 10_001)
+    found["kernels"] = {
+        "blas": sorted({info["architecture"] for info in threadpool_info() if "architecture" in info}),
+        "numpy": digest(np.exp(x), np.arctan(x)),
+        "libm": digest(np.array([[math.sin(v), math.exp(v)] for v in x.tolist()])),
+    }
+    return found
+
+
+if __name__ == "__main__":
+    print(json.dumps(main(Path(sys.argv[1]) if len(sys.argv) > 1 else None)))  # noqa: T201
