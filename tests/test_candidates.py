@@ -19,7 +19,6 @@ from drakegrasp.candidates import (
     Candidates,
     make_attempts,
     normal_candidates,
-    object_key,
     palm_ray_distance,
     ray_meets_box,
     rotation_candidates,
@@ -29,6 +28,7 @@ from drakegrasp.config import CandidateConfig, load_config
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.meshes import MeshSource
 from drakegrasp.object_model import ObjectModel, prepare_object
+from drakegrasp.seeding import Stream, object_key
 
 #: Full extents of three of the paper's meshes [m]; their files are in centimetres. Counts
 #: of valid and of distinct poses, and the distinct ones of an earlier reference that took
@@ -61,8 +61,8 @@ class Reference(NamedTuple):
     every_valid: Array
 
 
-def rng() -> np.random.Generator:
-    return np.random.default_rng(0)
+def stream() -> Stream:
+    return Stream(0)
 
 
 def standing(half: Array) -> Array:
@@ -130,7 +130,7 @@ def coordinates(R: Array, p: Array, half: Array) -> Array:
 def reference(request: pytest.FixtureRequest) -> Reference:
     half = np.array(BOXES[request.param][0]) / 2.0
     poses, combinations, valid = rotation_candidates(
-        half, standing(half), CandidateConfig(), np.random.default_rng(0)
+        half, standing(half), CandidateConfig(), Stream(0)
     )
     every = coordinates(*every_valid_pose(half), half)
     return Reference(request.param, half, poses, combinations, valid, every)
@@ -163,7 +163,7 @@ def test_full_turn_counts_once() -> None:
     closed = COARSE.model_copy(update={"global_z_deg": (0, 45, 360), "local_x_deg": (0, 20, 160)})
     opened = closed.model_copy(update={"global_z_deg": (0, 45)})
     results = [
-        rotation_candidates([0.1, 0.1, 0.1], standing(np.full(3, 0.1)), c, np.random.default_rng(0))
+        rotation_candidates([0.1, 0.1, 0.1], standing(np.full(3, 0.1)), c, Stream(0))
         for c in (closed, opened)
     ]
     np.testing.assert_array_equal(results[0][0], results[1][0])
@@ -227,7 +227,7 @@ def test_first_pose_looks_down_from_above() -> None:
     """With all angles zero: d on +Oz, Gz = -Oz, Gx = Ox (equation 1 of the paper)."""
     zero = {f"{w}_{a}_deg": (0,) for w in ("global", "local") for a in "xyz"}
     poses, combinations, valid = rotation_candidates(
-        [0.02, 0.03, 0.06], standing(np.array([0.02, 0.03, 0.06])), CandidateConfig(**zero), rng()
+        [0.02, 0.03, 0.06], standing(np.array([0.02, 0.03, 0.06])), CandidateConfig(**zero), stream()
     )
     assert (combinations, valid) == (1, 1)
     np.testing.assert_allclose(poses, [make_pose(np.diag([1, -1, -1]), [0, 0, 0.07])], atol=1e-16)
@@ -237,7 +237,7 @@ def test_table_cuts_what_lies_below_it_in_world_axes() -> None:
     """An object turned upside down keeps the poses that an upright one loses."""
     half = np.array([0.05, 0.05, 0.05])
     flipped = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.05])
-    up, down = (rotation_candidates(half, X, COARSE, rng())[0] for X in (standing(half), flipped))
+    up, down = (rotation_candidates(half, X, COARSE, stream())[0] for X in (standing(half), flipped))
     assert up[:, 2, 3].min() > -0.05 < 0.05 < up[:, 2, 3].max()
     assert down[:, 2, 3].max() < 0.05
     assert down[:, 2, 3].min() < -0.05
@@ -292,7 +292,7 @@ def test_jitter_keeps_the_number_of_combinations() -> None:
     """The released code: 8^6 combinations, every angle moved by 0 to 44 degrees."""
     half = np.array(BOXES["24_mug"][0]) / 2.0
     config = load_config("released").candidates
-    poses, combinations, valid = rotation_candidates(half, standing(half), config, rng())
+    poses, combinations, valid = rotation_candidates(half, standing(half), config, stream())
     assert combinations == 8**6 == 262_144
     # Jittered poses hardly ever repeat, in contrast to the grid's.
     assert 0.9 * valid < len(poses) <= valid < combinations
@@ -306,10 +306,10 @@ def test_jitter_moves_every_angle_by_whole_degrees_below_its_bound() -> None:
     moved = still.model_copy(update={"jitter_deg": 4.0})
     half = np.full(3, 0.05)
     # Whole degrees below one are zero.
-    poses, *_ = rotation_candidates(half, standing(half), still, rng())
+    poses, *_ = rotation_candidates(half, standing(half), still, stream())
     np.testing.assert_allclose(poses[:, 2, 2], -1.0, atol=1e-15)
     assert len(poses) == 360
-    poses, *_ = rotation_candidates(half, standing(half), moved, rng())
+    poses, *_ = rotation_candidates(half, standing(half), moved, stream())
     lean = np.rad2deg(np.arccos(np.clip(-poses[:, 2, 2], -1.0, 1.0)))
     assert 4.0 < lean.max() < 12.0
     # Global X and Y alone move the palm; of their 4 x 4 pairs of degrees all come up.
@@ -356,7 +356,7 @@ def test_smaller_number_is_a_prefix(box: ObjectModel) -> None:
 
 def test_enough_room_keeps_every_distinct_pose(box: ObjectModel) -> None:
     drawn = sample_candidates(box, BOX_X_TO, COARSE, 0)
-    poses, combinations, valid = rotation_candidates(box.half_extents, BOX_X_TO, COARSE, rng())
+    poses, combinations, valid = rotation_candidates(box.half_extents, BOX_X_TO, COARSE, stream())
     assert (drawn.combinations, drawn.valid, drawn.distinct) == (combinations, valid, len(poses))
     assert 0 < len(drawn) == drawn.distinct < drawn.valid < drawn.combinations
     assert {X.tobytes() for X in drawn.X_OG} == {X.tobytes() for X in poses}
@@ -426,7 +426,7 @@ def test_normals_approach_the_faces_of_a_box_squarely(box: ObjectModel) -> None:
 
 def test_normals_spread_over_the_area_and_roll_freely(box: ObjectModel) -> None:
     """Each pair of faces gets its share of the area; rolls fill the circle."""
-    poses = normal_candidates(box, 4000, rng())
+    poses = normal_candidates(box, 4000, stream())
     share = np.bincount(np.abs(poses[:, :3, 2]).argmax(axis=1), minlength=3) / len(poses)
     areas = np.array([0.08 * 0.10, 0.06 * 0.10, 0.06 * 0.08])
     # Four standard deviations of a binomial.
@@ -449,7 +449,7 @@ def test_normals_that_start_under_the_table_are_dropped(box: ObjectModel) -> Non
 def test_normals_start_outside_of_a_hollow_object(make_object: Callable[..., ObjectModel]) -> None:
     """Backing off from a tube's inner wall must not end within the wall across."""
     tube = make_object(trimesh.creation.annulus(r_min=0.08, r_max=0.13, height=0.06), "tube")
-    poses = normal_candidates(tube, 300, rng())
+    poses = normal_candidates(tube, 300, stream())
     assert not tube.visual.contains(poses[:, :3, 3]).any()
 
 
