@@ -61,7 +61,9 @@ def object_draws(source: MeshSource) -> Iterator[tuple[str, str]]:
     prepared = prepare(source, config)
     model, candidates = prepared.model, prepared.candidates
     attempts = list(
-        make_attempts(candidates, range(len(candidates)), config.candidates, name=source.name, seed=7)
+        make_attempts(
+            candidates, range(len(candidates)), config.candidates, name=source.name, seed=7
+        )
     )
     yield "mesh", digest(model.visual_vertices, model.collision_vertices, model.collision_faces)
     yield "X_TO", digest(prepared.X_TO)
@@ -112,7 +114,9 @@ def main(meshes: Path | None) -> dict[str, object]:
     )
     x = np.linspace(-3.0, 3.0, 10_001)
     found["kernels"] = {
-        "blas": sorted({info["architecture"] for info in threadpool_info() if "architecture" in info}),
+        "blas": sorted(
+            {info["architecture"] for info in threadpool_info() if "architecture" in info}
+        ),
         "numpy": digest(np.exp(x), np.arctan(x)),
         "libm": digest(np.array([[math.sin(v), math.exp(v)] for v in x.tolist()])),
     }

@@ -227,7 +227,10 @@ def test_first_pose_looks_down_from_above() -> None:
     """With all angles zero: d on +Oz, Gz = -Oz, Gx = Ox (equation 1 of the paper)."""
     zero = {f"{w}_{a}_deg": (0,) for w in ("global", "local") for a in "xyz"}
     poses, combinations, valid = rotation_candidates(
-        [0.02, 0.03, 0.06], standing(np.array([0.02, 0.03, 0.06])), CandidateConfig(**zero), stream()
+        [0.02, 0.03, 0.06],
+        standing(np.array([0.02, 0.03, 0.06])),
+        CandidateConfig(**zero),
+        stream(),
     )
     assert (combinations, valid) == (1, 1)
     np.testing.assert_allclose(poses, [make_pose(np.diag([1, -1, -1]), [0, 0, 0.07])], atol=1e-16)
@@ -237,7 +240,9 @@ def test_table_cuts_what_lies_below_it_in_world_axes() -> None:
     """An object turned upside down keeps the poses that an upright one loses."""
     half = np.array([0.05, 0.05, 0.05])
     flipped = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.05])
-    up, down = (rotation_candidates(half, X, COARSE, stream())[0] for X in (standing(half), flipped))
+    up, down = (
+        rotation_candidates(half, X, COARSE, stream())[0] for X in (standing(half), flipped)
+    )
     assert up[:, 2, 3].min() > -0.05 < 0.05 < up[:, 2, 3].max()
     assert down[:, 2, 3].max() < 0.05
     assert down[:, 2, 3].min() < -0.05
