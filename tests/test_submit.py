@@ -187,7 +187,7 @@ def test_nothing_that_is_read_can_run() -> None:
 def test_dashboard_is_linked_where_it_is_served(
     monkeypatch: pytest.MonkeyPatch, there: bool, words: str
 ) -> None:
-    monkeypatch.setattr(cluster, "_has_dashboard", lambda: there)
+    monkeypatch.setattr(cluster, "has_dashboard", lambda: there)
     line = cluster.dashboard_line(SimpleNamespace(dashboard_link="http://127.0.0.1:1/status"))
     assert line.startswith("dashboard: ")
     assert words in line
