@@ -29,6 +29,7 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.placement import rest_pose
 from drakegrasp.simulation.trajectory import lifted_palm
+from drakegrasp.vision.camera import Picture
 from drakegrasp.visualization.style import (
     ARROW,
     HIDDEN,
@@ -41,7 +42,6 @@ from drakegrasp.visualization.style import (
 from drakegrasp.visualization.third_person import (
     AZIMUTHS_DEG,
     Moment,
-    Picture,
     build_theatre,
     choose_view,
     outline,

@@ -8,11 +8,13 @@ coordinates, as in Drake's `CameraInfo`.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import CameraConfig
-from drakegrasp.frames import Array, make_pose
+from drakegrasp.frames import Array, invert_pose, make_pose, transform_points
 
 #: Below this sine of the angle between view and vertical, up is taken from +Ty (0.06 degree).
 LOOKS_VERTICALLY = 1e-3
@@ -94,3 +96,22 @@ def image_frame(K: npt.ArrayLike, mask: npt.ArrayLike, depth: npt.ArrayLike) -> 
     Ix = np.array([0.0, 0.0, 1.0])
     R_CI = np.column_stack([Ix, np.cross(Iz, Ix), Iz])
     return make_pose(R_CI, unproject(K, centroid[None], [z])[0])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Picture:
+    """An image and the camera that took it.
+
+    Attributes:
+        image: (height, width, 3) uint8.
+        K: Camera matrix (3, 3) [px].
+        X_WC: Pose of the camera (4, 4).
+    """
+
+    image: npt.NDArray[np.uint8]
+    K: Array
+    X_WC: Array
+
+    def pixels(self, p_WA: npt.ArrayLike) -> Array:
+        """Return where points (n, 3) of the world are in the image, (n, 2) [px]."""
+        return project(self.K, transform_points(invert_pose(self.X_WC), p_WA))

@@ -35,11 +35,11 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
 from drakegrasp.errors import MachineError
-from drakegrasp.frames import X_WT, Array, invert_pose, make_pose, transform_points
+from drakegrasp.frames import X_WT, Array, make_pose, transform_points
 from drakegrasp.hand.description import Hand, make_parser
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import ObjectModel, object_colour
-from drakegrasp.vision.camera import project
+from drakegrasp.vision.camera import Picture
 from drakegrasp.vision.rendering import BLANK
 
 #: Vertical field of view [deg]: narrow, so that nothing is distorted.
@@ -256,22 +256,3 @@ def _camera(
     query = plant.get_geometry_query_input_port().Eval(plant.GetMyContextFromRoot(theatre.context))
     world = plant.GetBodyFrameIdOrThrow(plant.world_body().index())
     return query, ColorRenderCamera(core, False), world
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Picture:
-    """An image and the camera that took it.
-
-    Attributes:
-        image: (height, width, 3) uint8.
-        K: Camera matrix (3, 3) [px].
-        X_WC: Pose of the camera (4, 4).
-    """
-
-    image: npt.NDArray[np.uint8]
-    K: Array
-    X_WC: Array
-
-    def pixels(self, p_WA: npt.ArrayLike) -> Array:
-        """Return where points (n, 3) of the world are in the image, (n, 2) [px]."""
-        return project(self.K, transform_points(invert_pose(self.X_WC), p_WA))

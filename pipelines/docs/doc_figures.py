@@ -21,6 +21,7 @@ from drakegrasp.dataset.reader import GraspDataset, Sample
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, invert_pose, transform_points
+from drakegrasp.vision.camera import Picture
 from drakegrasp.visualization.style import (
     FINGER_COLOURS,
     INK,
@@ -32,7 +33,6 @@ from drakegrasp.visualization.style import (
     read_far,
     save_figure,
 )
-from drakegrasp.visualization.third_person import Picture
 
 #: Colours of the x, y and z axes of a frame.
 AXIS_COLOURS = ("#D62728", "#2CA02C", "#1F4FD8")

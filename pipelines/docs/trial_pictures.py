@@ -24,12 +24,11 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.simulation.trajectory import lifted_palm
-from drakegrasp.vision.camera import unproject
+from drakegrasp.vision.camera import Picture, unproject
 from drakegrasp.visualization.style import ARROW
 from drakegrasp.visualization.third_person import (
     TABLE_SIZE,
     Moment,
-    Picture,
     Theatre,
     build_theatre,
     choose_view,

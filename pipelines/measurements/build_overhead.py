@@ -1,6 +1,6 @@
 """What a build spends on anything but its work, and what a second worker is worth.
 
-    python pipelines/measurements/build_overhead.py [--objects MESH_DIR] [--candidates N] \
+    python pipelines/measurements/build_overhead.py [--objects MESH_DIR] [--candidates N]
         [--set KEY=VALUE]
 
 Builds the same dataset with one worker and with two, and reads the logs. With one worker,

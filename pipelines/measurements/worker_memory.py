@@ -1,6 +1,6 @@
 """How much memory one worker holds while it tries attempts on many objects.
 
-    python pipelines/measurements/worker_memory.py MESH_DIR [--only NAME ...] \
+    python pipelines/measurements/worker_memory.py MESH_DIR [--only NAME ...]
         [--trials N] [--set KEY=VALUE]
 
 Builds a dataset with one worker process and looks at its memory after every work unit, until
