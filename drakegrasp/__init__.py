@@ -10,36 +10,35 @@ from importlib import import_module, metadata
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from drakegrasp.check import check_dataset
-    from drakegrasp.cluster import build_dataset, verify_grasps
+    from drakegrasp.api import build_dataset, verify_grasp, verify_grasps
+    from drakegrasp.build.replay import replay_trial
     from drakegrasp.config import Config, load_config
-    from drakegrasp.dataset import GraspDataset
+    from drakegrasp.dataset.checks.run import check_dataset
+    from drakegrasp.dataset.reader import GraspDataset
     from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp
-    from drakegrasp.hand import load_hand
+    from drakegrasp.hand.description import load_hand
     from drakegrasp.outcomes import Outcome
-    from drakegrasp.placed import place_object
-    from drakegrasp.replay import replay_trial
-    from drakegrasp.verification import Verification
-    from drakegrasp.verifying import verify_grasp
+    from drakegrasp.simulation.placement import place_object
+    from drakegrasp.verification.result import Verification
 
 __version__ = metadata.version("drakegrasp")
 
 _HOMES = {
     "Config": "config",
-    "GraspDataset": "dataset",
+    "GraspDataset": "dataset.reader",
     "Outcome": "outcomes",
-    "Verification": "verification",
-    "build_dataset": "cluster",
-    "check_dataset": "check",
+    "Verification": "verification.result",
+    "build_dataset": "api",
+    "check_dataset": "dataset.checks.run",
     "load_config": "config",
-    "load_hand": "hand",
+    "load_hand": "hand.description",
     "pack_grasp": "grasp",
-    "place_object": "placed",
-    "replay_trial": "replay",
+    "place_object": "simulation.placement",
+    "replay_trial": "build.replay",
     "transform_grasp": "grasp",
     "unpack_grasp": "grasp",
-    "verify_grasp": "verifying",
-    "verify_grasps": "cluster",
+    "verify_grasp": "api",
+    "verify_grasps": "api",
 }
 
 __all__ = [

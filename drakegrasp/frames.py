@@ -20,9 +20,16 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array as Array
 from drakegrasp.arithmetic import multiply, sin_cos
+from drakegrasp.errors import GraspError
 
 #: Position of the table-top centre T in the world [m] (Veres et al., "Coordinate frames").
 P_WT = np.array([0.0, 0.0, 0.65])
+
+
+#: How far a rotation matrix may be from orthogonal: files hold them in single precision.
+ROTATION_TOLERANCE = 1e-4
+#: What else an array may hold, by NumPy's letter.
+_OTHER_KINDS = {"U": "text", "S": "text", "b": "truth values", "c": "complex numbers"}
 
 
 def make_pose(R_AB: npt.ArrayLike, p_AB: npt.ArrayLike) -> Array:
@@ -93,3 +100,62 @@ def rotation_angle(R_AB: npt.ArrayLike) -> float:
 
 #: Pose of the table-top frame T in the world.
 X_WT = make_pose(np.eye(3), P_WT)
+
+
+def as_numbers(value: npt.ArrayLike, must: str) -> Array:
+    """Return an array of real numbers, of any shape; text and truth values are none.
+
+    Args:
+        value: The numbers.
+        must: What the error says that it must be.
+
+    Raises:
+        GraspError: If it is anything else.
+    """
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise GraspError(f"{must}, got a {type(value).__name__} that is none ({reason})") from None
+    # No grasps at all may come as an empty list, which NumPy takes for real numbers.
+    if array.dtype.kind not in "fiu":
+        got = _OTHER_KINDS.get(array.dtype.kind, f"a {type(value).__name__}")
+        raise GraspError(f"{must}, got {'None' if value is None else got}")
+    return array.astype(np.float64)
+
+
+def read_pose(X_AB: npt.ArrayLike, name: str) -> Array:
+    """Return a pose (4, 4), or poses (n, 4, 4), with exact rotations.
+
+    Args:
+        X_AB: (4, 4), (3, 4) or (12,), or many of them.
+        name: What to call it in an error.
+
+    Raises:
+        GraspError: If it is no pose.
+    """
+    X = as_numbers(X_AB, f"{name} must be a pose, 4 x 4 numbers")
+    if X.shape[-1:] == (12,):
+        X = X.reshape(*X.shape[:-1], 3, 4)
+    if X.shape[-2:] == (3, 4):
+        last = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (*X.shape[:-2], 1, 4))
+        X = np.concatenate([X, last], axis=-2)
+    if X.ndim not in (2, 3) or X.shape[-2:] != (4, 4):
+        raise GraspError(f"{name} must be a pose, 4 x 4 numbers, got an array of shape {X.shape}")
+    if not np.isfinite(X).all():
+        raise GraspError(f"{name} must be finite, got numbers that are not")
+    if np.any(np.abs(X[..., 3, :] - [0.0, 0.0, 0.0, 1.0]) > ROTATION_TOLERANCE):
+        raise GraspError(
+            f"{name} must have 0 0 0 1 as its last row, got another: are rows and columns swapped?"
+        )
+    R = X[..., :3, :3]
+    off = float(np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(initial=0.0))
+    if off > ROTATION_TOLERANCE or np.any(np.linalg.det(R) < 0.0):
+        raise GraspError(
+            f"{name} must hold a rotation, an orthogonal matrix with determinant +1, "
+            f"got one that is off by {off:.2g} with determinant {np.linalg.det(R).min():.3g}"
+        )
+    U, _, Vt = np.linalg.svd(R)
+    exact = X.copy()
+    exact[..., :3, :3], exact[..., 3, :] = U @ Vt, [0.0, 0.0, 0.0, 1.0]
+    return exact

@@ -13,15 +13,14 @@ from pathlib import Path
 
 from rich.console import Console
 
-from drakegrasp.assemble import DATA_FILES, TRIALS_FILE
-from drakegrasp.builtin import export_builtin
-from drakegrasp.cli import WIDTH
-from drakegrasp.cluster import build_dataset
+from drakegrasp.api import build_dataset
+from drakegrasp.cli.tables import WIDTH, funnel_table, split_table
 from drakegrasp.config import load_config
+from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
+from drakegrasp.dataset.statistics import count_funnel, count_splits
 from drakegrasp.errors import DrakegraspError
-from drakegrasp.figures import contact_sheet
-from drakegrasp.stats import count_funnel, count_splits
-from drakegrasp.tables import funnel_table, split_table
+from drakegrasp.objects.builtin.catalog import export_builtin
+from drakegrasp.visualization.contact_sheet import contact_sheet
 
 #: Objects that this hand can grasp, two of each class.
 OBJECTS = (

@@ -19,13 +19,14 @@ from typing import Any
 
 import click
 
-from drakegrasp.build_lock import build_lock
-from drakegrasp.build_options import build_options, parse_request, times_option
-from drakegrasp.cli import print_plan, print_report
-from drakegrasp.cluster import build_on, dashboard_line, find_sources
-from drakegrasp.cluster_request import KINDS, ClusterRequest, describe, worker_count
-from drakegrasp.clusters import start_cluster
-from drakegrasp.commands import OneCommand
+from drakegrasp.api import build_on, find_sources
+from drakegrasp.cli.build import print_plan, print_report
+from drakegrasp.cli.errors import OneCommand
+from drakegrasp.cli.options import build_options, parse_request, times_option
+from drakegrasp.cluster.connect import dashboard_line
+from drakegrasp.cluster.launch import start_cluster
+from drakegrasp.cluster.request import KINDS, ClusterRequest, describe, worker_count
+from drakegrasp.dataset.lock import build_lock
 from drakegrasp.errors import ConfigError
 
 

@@ -9,11 +9,11 @@ import pytest
 import trimesh
 from hypothesis import settings
 
-from drakegrasp.build import build
-from drakegrasp.builtin import export_builtin
+from drakegrasp.build.pipeline import build
 from drakegrasp.config import Config, load_config
-from drakegrasp.executor import run_here
-from drakegrasp.meshes import find_meshes
+from drakegrasp.objects.builtin.catalog import export_builtin
+from drakegrasp.objects.sources import find_meshes
+from drakegrasp.runtime.executor import run_here
 
 # Software OpenGL must not start threads beside the test workers, and nothing needs the network.
 os.environ.setdefault("LP_NUM_THREADS", "0")

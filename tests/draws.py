@@ -16,17 +16,17 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from threadpoolctl import threadpool_info
-
 from drakegrasp.builtin import export_builtin
 from drakegrasp.candidates import make_attempts, normal_candidates
 from drakegrasp.certify import _noise_factor, _palm_noise
-from drakegrasp.config import SplitConfig, load_config
 from drakegrasp.filters import split_samples
-from drakegrasp.hand import load_hand
 from drakegrasp.meshes import MeshSource, find_meshes
 from drakegrasp.prepared import prepare
 from drakegrasp.screen import predict
+from threadpoolctl import threadpool_info
+
+from drakegrasp.config import SplitConfig, load_config
+from drakegrasp.hand import load_hand
 from drakegrasp.seeding import Stream
 
 #: Of the real meshes: a thin one, one with many faces, one that lies on its side.

@@ -6,6 +6,8 @@ import ast
 import importlib
 import subprocess
 import sys
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from types import ModuleType
 
@@ -15,106 +17,189 @@ import drakegrasp
 
 PACKAGE = Path(drakegrasp.__file__).parent
 
-#: Each line may import only from lines above it (docs/architecture.md).
-LAYERS: tuple[frozenset[str], ...] = tuple(
-    frozenset(line.split())
-    for line in (
-        "errors executor frames memory network progress processes build_log threads",
-        "grasp outcomes hand_files config curves surfaces distance_field pads prediction "
-        "prediction_files faults build_lock",
-        "schema hand solids bodies wavefront build_options commands",
-        "shards camera filters shapes vessels fruit holes union decimation hand_shapes",
-        "builtin manifest mend journal",
-        "meshes",
-        "object_model",
-        "audit candidates kinematics violations wrenches contact_surface tally",
-        "parts scene render dataset contact_forces wrist_problem hand_paths",
-        "samples construction contacts clock figures postures screen",
-        "assemble layout_rules sample_rules image_rules trial_rules scenes wrist_fit lifting",
-        "stats resting trial open_file doc_figures plan peer",
-        "prepared tables dataset_rules theatre lift_path placed certify",
-        "workbench check force_lift force_margin",
-        "rows preparing",
-        "units",
-        "build snapshots verified bench",
-        "recording verification_figure",
-        "replay verification",
-        "verify verification_files",
-        "verify_plan",
-        "verifying verify_request workers crew tls",
-        "cluster cluster_request doctor format_docs",
-        "clusters",
-        "cli",
-    )
+#: The rooms; each may import only from those before it (docs/architecture.md). The first is
+#: the vocabulary: the modules at the top of the package, but for `api`.
+ORDER = (
+    "(root)",
+    "runtime",
+    "mesh",
+    "objects",
+    "hand",
+    "vision",
+    "simulation",
+    "dataset",
+    "visualization",
+    "build",
+    "cluster",
+    "verification",
+    "bench",
+    "api",
+    "cli",
 )
-READERS = ("grasp", "schema", "shards", "dataset")
-#: Modules that may know Dask.
-KNOWS_DASK = {"cluster", "cluster_request", "clusters", "crew", "tls", "workers"}
+#: Folders of data, without code.
+DATA = {"models", "presets"}
+#: Modules in a folder, and at the top of the package, at most.
+MODULES, TOP_MODULES = 15, 10
+#: What only some places may import, at any depth of their code.
+WALLS = {
+    "dask": ("cluster",),
+    "distributed": ("cluster",),
+    "click": ("cli",),
+    "matplotlib": ("visualization", "verification.figure"),
+    "pydrake": ("hand", "vision", "simulation", "visualization", "verification", "bench"),
+}
+#: Modules that name a type of a library for the type checker alone: what callers give or get.
+NAMES_TYPES = {("api", "distributed"), ("verification.result", "matplotlib")}
+#: Reading data: NumPy and h5py, and nothing of these.
+HEAVY = (
+    *("pydrake", "dask", "distributed", "trimesh", "scipy", "matplotlib", "rich", "pydantic"),
+    *("yaml", "click"),
+)
+READERS = ("grasp", "dataset.schema", "dataset.shards", "dataset.reader")
+CHECKERS = ("dataset.checks.run", "dataset.assemble")
 
 
-def imports_of(module: str) -> set[str]:
-    """Return what a module imports at any depth of its code, as dotted names."""
-    tree = ast.parse((PACKAGE / f"{module}.py").read_text(encoding="utf-8"))
+def modules() -> dict[str, Path]:
+    """Return every module that is no `__init__`, by its name below the package."""
+    paths = sorted(path for path in PACKAGE.rglob("*.py") if path.stem != "__init__")
+    return {".".join(path.relative_to(PACKAGE).with_suffix("").parts): path for path in paths}
+
+
+MODULE_NAMES = modules()
+
+
+def folders() -> list[Path]:
+    return [PACKAGE, *sorted({path.parent for path in PACKAGE.rglob("__init__.py")} - {PACKAGE})]
+
+
+def room_of(module: str) -> str:
+    """Return the place of a module in the order."""
+    top, _, rest = module.partition(".")
+    return top if rest or top == "api" else "(root)"
+
+
+def imports_of(module: str, *, types: bool = True) -> set[str]:
+    """Return what a module imports at any depth of its code, as dotted names.
+
+    Args:
+        module: Its name below the package.
+        types: Whether imports for the type checker alone count.
+    """
+    tree = ast.parse(MODULE_NAMES[module].read_text(encoding="utf-8"))
     found: set[str] = set()
-    for node in ast.walk(tree):
+    for node in _nodes(tree, types):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{module} must import by absolute names"
             found.add(node.module or "")
             found |= {f"{node.module}.{alias.name}" for alias in node.names}
     return found
 
 
-def modules() -> list[str]:
-    return sorted(p.stem for p in PACKAGE.glob("*.py") if p.stem != "__init__")
+def _nodes(node: ast.AST, types: bool) -> Iterator[ast.AST]:
+    yield node
+    for child in ast.iter_child_nodes(node):
+        skipped = isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING"
+        if types or not skipped:
+            yield from _nodes(child, types)
 
 
-def test_every_module_has_its_layer() -> None:
-    assert sorted(name for layer in LAYERS for name in layer) == modules()
+def libraries_of(module: str, *, types: bool) -> set[str]:
+    return {name.partition(".")[0] for name in imports_of(module, types=types)}
 
 
-@pytest.mark.parametrize("module", modules())
-def test_imports_point_to_layers_above(module: str) -> None:
-    (own,) = (i for i, layer in enumerate(LAYERS) if module in layer)
-    allowed = {name for layer in LAYERS[:own] for name in layer}
-    ours = {
-        name.split(".")[1]
-        for name in imports_of(module)
-        if name.startswith("drakegrasp.") and name.split(".")[1] in modules()
+def own_imports(module: str, *, types: bool = True) -> set[str]:
+    """Return which modules of the package a module imports."""
+    names = {
+        name.removeprefix("drakegrasp.")
+        for name in imports_of(module, types=types)
+        if name.startswith("drakegrasp.")
     }
-    assert ours <= allowed, f"{module} imports {sorted(ours - allowed)}"
+    return names & MODULE_NAMES.keys()
 
 
-@pytest.mark.parametrize("module", modules())
-def test_only_the_cluster_modules_know_dask(module: str) -> None:
-    knows = any(name.split(".")[0] in ("dask", "distributed") for name in imports_of(module))
-    assert not knows or module in KNOWS_DASK
-
-
-@pytest.mark.parametrize("module", [*READERS, "check"])
-def test_reading_data_loads_no_drake_and_no_dask(module: str) -> None:
-    forbidden = ["pydrake", "dask", "distributed"]
-    if module in READERS:
-        forbidden += ["trimesh", "matplotlib", "rich", "scipy"]
+def loaded_by(module: str, names: tuple[str, ...]) -> str:
     code = (
-        f"import sys, drakegrasp.{module}; "
-        f"print([name for name in {forbidden} if name in sys.modules])"
+        f"import sys, {module}; "
+        f"print(sorted(name for name in {names} if sys.modules.get(name) is not None))"
     )
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
-    assert result.stdout.strip() == "[]"
+    return result.stdout.strip()
 
 
-def test_no_module_hides_a_public_name() -> None:
+def test_every_folder_is_in_the_order() -> None:
+    rooms = {path.name for path in PACKAGE.iterdir() if path.is_dir() and path.name[0] != "_"}
+    assert rooms - DATA == set(ORDER) - {"(root)", "api"}
+    assert {room_of(module) for module in MODULE_NAMES} == set(ORDER)
+    assert not [path for name in DATA for path in (PACKAGE / name).rglob("*.py")]
+
+
+@pytest.mark.parametrize("module", MODULE_NAMES)
+def test_imports_point_to_rooms_before(module: str) -> None:
+    own = ORDER.index(room_of(module))
+    behind = {name for name in own_imports(module) if ORDER.index(room_of(name)) > own}
+    assert not behind, f"{module} imports {sorted(behind)}"
+
+
+def test_no_module_imports_itself_through_others() -> None:
+    """Imports within functions count; those for the type checker alone do not."""
+    graph = {module: own_imports(module, types=False) for module in MODULE_NAMES}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(" -> ".join(error.args[1]))
+
+
+@pytest.mark.parametrize("folder", folders(), ids=lambda path: path.name)
+def test_no_folder_is_a_wall_of_files(folder: Path) -> None:
+    assert len(list(folder.glob("*.py"))) <= (TOP_MODULES if folder == PACKAGE else MODULES + 1)
+
+
+@pytest.mark.parametrize("folder", folders()[1:], ids=lambda path: path.name)
+def test_rooms_load_nothing_by_themselves(folder: Path) -> None:
+    """The walls below depend on it."""
+    body = ast.parse((folder / "__init__.py").read_text(encoding="utf-8")).body
+    assert all(isinstance(node, ast.Expr) for node in body)
+    assert len(body) == 1
+
+
+@pytest.mark.parametrize("library", WALLS)
+def test_libraries_stay_in_their_rooms(library: str) -> None:
+    strangers = {
+        module
+        for module in MODULE_NAMES
+        if not any(f"{module}.".startswith(f"{place}.") for place in WALLS[library])
+        and library in libraries_of(module, types=(module, library) not in NAMES_TYPES)
+    }
+    assert not strangers
+
+
+@pytest.mark.parametrize("module", READERS)
+def test_reading_data_loads_numpy_and_h5py_only(module: str) -> None:
+    assert loaded_by(f"drakegrasp.{module}", HEAVY) == "[]"
+
+
+@pytest.mark.parametrize("module", CHECKERS)
+def test_checking_data_loads_no_drake_and_no_dask(module: str) -> None:
+    assert loaded_by(f"drakegrasp.{module}", ("pydrake", "dask", "distributed")) == "[]"
+
+
+def test_importing_the_package_loads_nothing_heavy() -> None:
+    assert loaded_by("drakegrasp", (*HEAVY, "numpy", "h5py")) == "[]"
+
+
+def test_no_package_hides_a_public_name() -> None:
     """An imported module becomes an attribute of the package, in place of the name."""
-    assert not set(drakegrasp.__all__) & set(modules())
+    assert not set(drakegrasp.__all__) & {path.stem for path in PACKAGE.iterdir()}
 
 
 def test_public_names_are_sorted_and_exist() -> None:
     """Also after every module was imported."""
     assert drakegrasp.__all__ == sorted(drakegrasp.__all__)
-    for name in modules():
+    for name in MODULE_NAMES:
         importlib.import_module(f"drakegrasp.{name}")
     for name in drakegrasp.__all__:
         found = getattr(drakegrasp, name)
@@ -124,9 +209,9 @@ def test_public_names_are_sorted_and_exist() -> None:
         _ = drakegrasp.magic
 
 
-@pytest.mark.parametrize("module", modules())
+@pytest.mark.parametrize("module", MODULE_NAMES)
 def test_code_names_a_hand_only_as_a_default(module: str) -> None:
-    tree = ast.parse((PACKAGE / f"{module}.py").read_text(encoding="utf-8"))
+    tree = ast.parse(MODULE_NAMES[module].read_text(encoding="utf-8"))
     texts = [n.value for n in ast.walk(tree) if isinstance(n, ast.Constant)]
     named = [t for t in texts if isinstance(t, str) and t.lower().startswith("barrett")]
-    assert named == (["barrett"] if module in ("config", "hand") else [])
+    assert named == (["barrett"] if module in ("config", "hand.description") else [])

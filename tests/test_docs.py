@@ -5,12 +5,11 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import dataset_format
 import pytest
 
-from drakegrasp import format_docs
-from drakegrasp.cli import main
-from drakegrasp.outcomes import Outcome
-from drakegrasp.schema import (
+from drakegrasp.cli.main import main
+from drakegrasp.dataset.schema import (
     DATA_FIELDS,
     LOOK_FIELDS,
     OBJECT_FIELDS,
@@ -18,6 +17,7 @@ from drakegrasp.schema import (
     TRIAL_FIELDS,
     VERIFICATION_FIELDS,
 )
+from drakegrasp.outcomes import Outcome
 
 ROOT = Path(__file__).resolve().parents[1]
 TABLES = (
@@ -33,11 +33,11 @@ DOCS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 
 def test_format_page_is_what_the_schema_says(tmp_path: Path) -> None:
     page = ROOT / "docs" / "dataset-format.md"
-    assert format_docs.main(["--check", str(page)]) == 0
+    assert dataset_format.main(["--check", str(page)]) == 0
     stale = tmp_path / "page.md"
     stale.write_text(page.read_text(encoding="utf-8").replace("float64", "float16"))
-    assert format_docs.main(["--check", str(stale)]) == 1
-    assert format_docs.main([str(stale)]) == 0
+    assert dataset_format.main(["--check", str(stale)]) == 1
+    assert dataset_format.main([str(stale)]) == 0
     assert stale.read_bytes() == page.read_bytes()
 
 

@@ -1,0 +1,1 @@
+"""What attempts cost: throughput, and the same attempts in MuJoCo."""

@@ -1,0 +1,1 @@
+"""Building a dataset: objects prepared, work units simulated, what they cost."""

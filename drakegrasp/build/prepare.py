@@ -1,0 +1,135 @@
+"""Preparing one mesh as a task: what a crash or a hang of its process then means.
+
+In: a mesh and the configuration, as plain data. Out: the object's files, and its entry in the
+manifest: what it is, or why it was refused.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from drakegrasp.config import Config, parse_config
+from drakegrasp.dataset.paths import model_path
+from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared, save_prepared
+from drakegrasp.errors import DrakegraspError, MachineError, MeshError
+from drakegrasp.objects.model import prepare_object
+from drakegrasp.objects.sources import MeshSource, source_sha256
+from drakegrasp.runtime.blas import one_thread
+from drakegrasp.runtime.environment import release_memory
+from drakegrasp.runtime.fault_injection import inject_fault
+from drakegrasp.runtime.files import disk_full_named
+from drakegrasp.runtime.journal import GIVE_UP_DEATHS, Journal, open_journal
+from drakegrasp.simulation.candidates import sample_candidates
+from drakegrasp.simulation.settle import settle
+
+#: Wall clock after which preparing a mesh hangs [s].
+PREPARE_SECONDS = 1800.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class PrepareTask:
+    """What one task does: plain data.
+
+    Attributes:
+        source: The mesh.
+        out: Directory of the dataset, seen by every worker.
+        config: `Config.to_dict()`.
+        expendable: Whether the process that runs it is started again when it dies. Then a
+            crash or a hang costs the mesh; else it is the caller's to see.
+    """
+
+    source: MeshSource
+    out: str
+    config: dict[str, Any]
+    expendable: bool
+
+
+@one_thread
+def prepare_one(task: PrepareTask) -> tuple[str, dict[str, Any]]:
+    """Prepare one mesh; return its name and its entry in the manifest, a refusal among them.
+
+    Raises:
+        DiskFullError: If there is no room for the object's files.
+        MachineError: If something other than the mesh kills the process again and again.
+    """
+    out, source, config = Path(task.out), task.source, parse_config(task.config)
+    digest = source_sha256(source)
+    with disk_full_named(out):
+        entry = _entry_there(source, digest, out, config)
+        if entry is not None:  # its process, or the client, died before the manifest was written
+            return source.name, entry
+        if not task.expendable:
+            return source.name, _prepared_entry(task)
+        release_memory()  # of the mesh before
+        identity = {
+            "name": source.name,
+            "mesh_sha256": digest,
+            "config_hash": config.simulation_hash(),
+        }
+        path = model_path(out, source.name).with_suffix(".journal")
+        with open_journal(path, identity) as journal:
+            return source.name, _prepared_or_guilty(task, journal)
+
+
+def _entry_there(
+    source: MeshSource, digest: str, out: Path, config: Config
+) -> dict[str, Any] | None:
+    """Return the entry of an object whose files are there and whole, or None."""
+    try:
+        prepared = load_prepared(out, source.name, config)
+    except DrakegraspError:
+        return None
+    model = prepared.model
+    same = (model.class_name, model.mesh_sha256) == (source.class_name, digest)
+    return prepared.summary() if same else None
+
+
+def _prepared_or_guilty(task: PrepareTask, journal: Journal) -> dict[str, Any]:
+    name = task.source.name
+    verdict = journal.verdict("prepare")
+    if verdict is not None:
+        return _refused(
+            task.source, f"{name}: must be fit to prepare, got one that {verdict.value}"
+        )
+    if journal.is_futile:
+        raise MachineError(
+            f"{name}: the worker must stay alive to prepare it, got {GIVE_UP_DEATHS} deaths in a "
+            "row; is there enough memory? The same command goes on from here"
+        )
+    with journal.step("prepare", PREPARE_SECONDS):
+        inject_fault(name)
+        return _prepared_entry(task)
+
+
+def _prepared_entry(task: PrepareTask) -> dict[str, Any]:
+    config = parse_config(task.config)
+    try:
+        prepared = prepare(task.source, config)
+    except MeshError as error:
+        return _refused(task.source, str(error))
+    save_prepared(prepared, Path(task.out), config)
+    return prepared.summary()
+
+
+def _refused(source: MeshSource, reason: str) -> dict[str, Any]:
+    return {"name": source.name, "mesh_sha256": source_sha256(source), "reason": reason}
+
+
+def prepare(source: MeshSource, config: Config) -> PreparedObject:
+    """Return a mesh as an object at rest with its palm poses.
+
+    Raises:
+        MeshError: If the mesh cannot be mended, its size is implausible, or the object does
+            not come to rest.
+    """
+    model = prepare_object(source, config.objects)
+    resting = settle(model, config)
+    return PreparedObject(
+        model=model,
+        X_TO=resting.X_TO,
+        candidates=sample_candidates(model, resting.X_TO, config.candidates, config.seed),
+        table_force=resting.table_force,
+        stopped=resting.stopped,
+    )

@@ -1,0 +1,144 @@
+"""Running a trial of a dataset again: the same outcome and the same contacts, or it says so."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from drakegrasp.build.attempts import Workbench, try_on
+from drakegrasp.build.columns import trial_rows
+from drakegrasp.build.work_unit import unit_attempts
+from drakegrasp.dataset.manifest import Manifest, installed_versions, read_manifest
+from drakegrasp.dataset.paths import TRIALS_FILE
+from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
+from drakegrasp.dataset.shards import ShardHeader, trial_columns
+from drakegrasp.errors import DataError
+from drakegrasp.hand.description import load_hand
+from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.blas import one_thread
+from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.construction import build_scene
+from drakegrasp.visualization.recording import record_attempt
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay:
+    """A trial that was run again.
+
+    Attributes:
+        trial_id: Its row.
+        object_name: Its object.
+        recorded, found: The outcome in the file and the one now.
+        differences: Largest absolute difference of each field that is not the same.
+        versions: Packages whose versions differ, as "then -> now".
+    """
+
+    trial_id: int
+    object_name: str
+    recorded: Outcome
+    found: Outcome
+    differences: dict[str, float]
+    versions: dict[str, str]
+
+    @property
+    def same(self) -> bool:
+        """Whether every stored value came out bit for bit."""
+        return not self.differences
+
+
+@one_thread
+def replay_trial(out: str | Path, trial_id: int) -> Replay:
+    """Run one trial of a dataset again, from its prepared object and its candidate.
+
+    The same machine and versions give the same bits. Other versions may not: `versions`
+    then says which differ.
+
+    Raises:
+        DataError: If the dataset or the trial is not there.
+    """
+    stored = _stored_trial(Path(out), trial_id)
+    prepared, config = stored.prepared, stored.manifest.config
+    scene = build_scene(prepared.model, config.physics, load_hand(config.hand))
+    bench = Workbench(prepared=prepared, config=config, scene=scene)
+    again = trial_rows(bench, [stored.attempt], [try_on(bench, stored.attempt)])
+    now = installed_versions(config)
+    return Replay(
+        trial_id=trial_id,
+        object_name=prepared.model.name,
+        recorded=Outcome(int(stored.row["outcome"])),
+        found=Outcome(int(again["outcome"][0])),
+        differences={
+            field.name: _difference(stored.row[field.name], again[field.name][0])
+            for field in trial_columns()
+            if not np.array_equal(stored.row[field.name], again[field.name][0], equal_nan=True)
+        },
+        versions={
+            key: f"{then} -> {now.get(key)}"
+            for key, then in stored.manifest.versions.items()
+            if now.get(key) != then
+        },
+    )
+
+
+def record_trial(out: str | Path, trial_id: int, path: str | Path) -> Outcome:
+    """Run one trial of a dataset again and write an HTML file that plays it.
+
+    Returns:
+        The outcome now.
+
+    Raises:
+        DataError: If the dataset or the trial is not there.
+        OSError: If the file cannot be written.
+    """
+    stored = _stored_trial(Path(out), trial_id)
+    model, X_TO = stored.prepared.model, stored.prepared.X_TO
+    config = stored.manifest.config
+    return record_attempt(model, X_TO, stored.attempt, config, Path(path)).outcome
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _StoredTrial:
+    """A row of trials.hdf5 and what it was tried with."""
+
+    row: dict[str, np.ndarray]
+    prepared: PreparedObject
+    attempt: Attempt
+    manifest: Manifest
+
+
+def _stored_trial(out: Path, trial_id: int) -> _StoredTrial:
+    manifest = read_manifest(out)
+    config = manifest.config
+    row, name = _stored_row(out, trial_id)
+    prepared = load_prepared(out, name, config)
+    candidate = int(row["candidate"])
+    header = ShardHeader(
+        config_hash=config.simulation_hash(),
+        mesh_sha256=prepared.model.mesh_sha256,
+        object_name=name,
+        start=candidate,
+        stop=candidate + 1,
+    )
+    attempt = unit_attempts(prepared, header, config)[int(row["standoff_index"])]
+    return _StoredTrial(row=row, prepared=prepared, attempt=attempt, manifest=manifest)
+
+
+def _stored_row(out: Path, trial_id: int) -> tuple[dict[str, np.ndarray], str]:
+    path = out / TRIALS_FILE
+    try:
+        with h5py.File(path, "r") as file:
+            count = len(file["trials/outcome"])
+            if not 0 <= trial_id < count:
+                raise DataError(f"{path}: trial must be 0 to {count - 1}, got {trial_id}")
+            row = {f.name: np.asarray(file["trials"][f.name][trial_id]) for f in trial_columns()}
+            name = file["objects/name"][int(file["trials/object"][trial_id])].decode()
+    except (OSError, KeyError) as error:
+        raise DataError(f"{path}: must be the trials of a dataset, got none ({error})") from None
+    return row, name
+
+
+def _difference(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.max(np.abs(np.asarray(a, dtype=float) - np.asarray(b, dtype=float))))

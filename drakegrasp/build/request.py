@@ -1,0 +1,35 @@
+"""What is to be built, whoever does the work."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from drakegrasp.config import Config
+
+
+#: What stands for the built-in objects in place of a directory.
+BUILTIN = "builtin"
+
+
+@dataclass(frozen=True, kw_only=True)
+class BuildRequest:
+    """What is to be built, whoever does the work.
+
+    Attributes:
+        objects: Directory of meshes, or "builtin".
+        out: Directory of the dataset.
+        config: All the rules.
+        units: Unit of length of the meshes.
+        manifest: YAML file with units and classes by mesh.
+        show: Whether to show progress on standard error.
+    """
+
+    objects: str
+    out: Path
+    config: Config
+    units: str
+    manifest: Path | None
+    show: bool

@@ -1,0 +1,138 @@
+"""`drakegrasp bench`: what attempts cost on this machine."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import click
+
+from drakegrasp.build.request import BUILTIN
+from drakegrasp.cli.options import manifest_option, set_option, units_option
+
+
+@click.command()
+@click.option(
+    "--objects", default=BUILTIN, show_default=True, metavar="MESH_DIR|builtin", help="Meshes."
+)
+@click.option("--only", multiple=True, metavar="NAME", help="Those whose names begin so.")
+@click.option("--config", "preset", metavar="YAML|PRESET", help="[paper]")
+@set_option
+@click.option(
+    "--candidates",
+    type=click.IntRange(min=1),
+    default=100,
+    show_default=True,
+    help="Palm poses per object.",
+)
+@click.option(
+    "--fidelity",
+    type=click.IntRange(min=0),
+    default=0,
+    metavar="N",
+    help="Compare the labels of N attempts per object.",
+)
+@click.option("--peer", is_flag=True, help="Run the same attempts in MuJoCo.")
+@click.option(
+    "--compare",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    metavar="FILE",
+    help="An earlier report; print the ratios to it.",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    default=Path("bench.json"),
+    show_default=True,
+    metavar="FILE",
+    help="Where the report goes, as JSON.",
+)
+@units_option
+@manifest_option
+@click.option("--quiet", is_flag=True, help="No progress bar.")
+def bench(
+    objects: str,
+    only: tuple[str, ...],
+    preset: str | None,
+    overrides: tuple[str, ...],
+    candidates: int,
+    fidelity: int,
+    peer: bool,
+    compare: Path | None,
+    out: Path,
+    units: str,
+    manifest: Path | None,
+    quiet: bool,
+) -> None:
+    """Measure what attempts cost on this machine, in one process.
+
+    With --fidelity, N random attempts of each object are simulated again without the screen, at
+    half the step, with four times the faces and by Drake's other solvers. With --peer (extra
+    [peer]), all are simulated plainly in MuJoCo as well.
+    """
+    import json
+    import tempfile
+
+    from drakegrasp.bench import measure as measuring
+    from drakegrasp.cli.tables import bench_lines, bench_table, fidelity_table, print_table
+    from drakegrasp.config import load_config
+    from drakegrasp.objects.builtin.catalog import export_builtin
+    from drakegrasp.objects.sources import find_meshes
+    from drakegrasp.runtime.progress import progress_bar
+
+    if peer:
+        _need_peer()
+    if not os.access(out if out.exists() else out.absolute().parent, os.W_OK):
+        raise click.UsageError(f"--out must be a file that can be written, got {out}")
+    os.environ.setdefault("LP_NUM_THREADS", "0")  # threads of OpenGL would count as this core's
+    config = load_config(preset, [*overrides, f"candidates.max={candidates}"])
+    then = None if compare is None else _read_report(compare)
+    with tempfile.TemporaryDirectory() as folder:
+        if objects == BUILTIN:
+            export_builtin(Path(folder))
+        meshes = Path(folder) if objects == BUILTIN else Path(objects)
+        every = find_meshes(meshes, units=units, manifest=manifest)
+        sources = [s for s in every if not only or s.name.startswith(only)]
+        if not sources:
+            raise click.UsageError(f"--only must name objects of {objects}, got {', '.join(only)}")
+        with progress_bar("bench", "attempts", show=not quiet) as progress:
+            measured = measuring.measure(
+                sources, config, sample=fidelity, peer=peer, progress=progress
+            )
+            report = measuring.summarize(list(measured), config)
+    print_table(bench_table(report))
+    for line in bench_lines(report):
+        click.echo(line)
+    if fidelity:
+        print_table(fidelity_table(report["all"]["fidelity"]))
+    if then is not None:
+        report["ratio"] = measuring.compare(report, then)
+        for key, ratio in report["ratio"].items():
+            times = "none to compare with" if ratio is None else f"{ratio:.2f} times that"
+            click.echo(f"{key.replace('_', ' ')}: {times} of {compare}")
+    out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    click.echo(str(out))
+
+
+def _need_peer() -> None:
+    from importlib.util import find_spec
+
+    for module in ("mujoco", "coacd"):
+        if find_spec(module) is None:
+            raise click.UsageError(
+                f"--peer must find {module}, got none: pip install 'drakegrasp[peer]'"
+            )
+
+
+def _read_report(path: Path) -> dict[str, Any]:
+    import json
+
+    try:
+        report: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        _ = report["all"]["resolved_per_core_second"] + report["all"]["grasps_per_core_hour"]
+    except (ValueError, KeyError, TypeError):
+        raise click.UsageError(
+            f"--compare must be a report of `drakegrasp bench`, got {path}"
+        ) from None
+    return report

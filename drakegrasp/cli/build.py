@@ -1,0 +1,150 @@
+"""`drakegrasp build`, `assemble` and `stats`, and what they print."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from drakegrasp.cli.options import (
+    build_options,
+    out_argument,
+    parse_request,
+    scheduler_file_option,
+    scheduler_option,
+    times_option,
+    workers_option,
+)
+
+if TYPE_CHECKING:
+    from drakegrasp.build.pipeline import BuildReport
+    from drakegrasp.build.request import BuildRequest
+
+
+@click.command()
+@build_options
+@workers_option
+@scheduler_option
+@scheduler_file_option
+@click.option("--plan", is_flag=True, help="Only print the hours and bytes that it would take.")
+@times_option
+def build(
+    workers: int | None,
+    scheduler: str | None,
+    scheduler_file: Path | None,
+    plan: bool,
+    times: Path | None,
+    **options: Any,
+) -> None:
+    """Build the dataset of a directory of meshes."""
+    from drakegrasp.api import build_dataset
+
+    request = parse_request(**options)
+    if plan:
+        print_plan(request, workers, times)
+        return
+    report = build_dataset(
+        request.objects,
+        request.out,
+        config=request.config,
+        units=request.units,
+        manifest=request.manifest,
+        workers=workers,
+        scheduler=scheduler,
+        scheduler_file=scheduler_file,
+        show=request.show,
+    )
+    print_report(report)
+
+
+@click.command()
+@out_argument
+@click.option(
+    "--reject",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="File with the ids of trials that are no samples, one per line; # starts a comment.",
+)
+@click.option(
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Set a value of the filters or the split, e.g. filters.outlier_sigma=3.",
+)
+def assemble(out: Path, reject: Path | None, overrides: tuple[str, ...]) -> None:
+    """Write the three files again from the shards: filters, split, samples."""
+    from drakegrasp.dataset.assemble import assemble as assemble_files
+    from drakegrasp.dataset.assemble import read_reject_list
+    from drakegrasp.dataset.manifest import change_postprocessing
+    from drakegrasp.runtime.progress import progress_bar
+
+    rejected = () if reject is None else read_reject_list(reject)
+    if overrides:
+        change_postprocessing(out, overrides)
+    with progress_bar("assemble", "shards") as progress:
+        assemble_files(out, rejected=rejected, progress=progress)
+    _print_stats(out)
+
+
+@click.command()
+@out_argument
+def stats(out: Path) -> None:
+    """Print the funnel by object and the paper's Table III.
+
+    Of a build that still runs, or was stopped: what is done so far.
+    """
+    _print_stats(out)
+
+
+def _print_stats(out: Path) -> None:
+    from rich.measure import Measurement
+
+    from drakegrasp.cli.tables import (
+        WIDTH,
+        funnel_table,
+        make_console,
+        split_table,
+        unfinished_line,
+    )
+    from drakegrasp.dataset.statistics import count_funnel, count_splits, count_unfinished
+
+    console, unfinished = make_console(), count_unfinished(out)
+    funnel = count_funnel(out) if unfinished is None else unfinished.funnel
+    table = funnel_table(funnel)
+    # Numbers are never cut: where the columns do not fit, fewer say the same.
+    natural = Measurement.get(console, console.options.update(max_width=WIDTH), table).maximum
+    if natural > console.width:
+        table = funnel_table(funnel, compact=True)
+    console.print(table)
+    if unfinished is None:
+        console.print(split_table(count_splits(out)))
+    else:
+        click.echo(f"{out}: {unfinished_line(unfinished)}")
+
+
+def print_plan(request: BuildRequest, workers: int | None, times: Path | None) -> None:
+    """Print what a build that was asked for is expected to take."""
+    from drakegrasp.build.estimate import logged_times, plan_lines, plan_request, read_times
+
+    logged = logged_times(request.out, request.config)
+    measured = logged if times is None else read_times(times)
+    click.echo("\n".join(plan_lines(plan_request(request, workers, measured))))
+
+
+def print_report(report: BuildReport) -> None:
+    """Print what a build did, and where it put it."""
+    _print_stats(report.out)
+    if report.simulated:
+        reused = f" ({report.reused} had been done before)" if report.reused else ""
+        click.echo(f"{report.simulated} work units simulated{reused}")
+    else:
+        click.echo(f"all {report.reused} work units had been done before: nothing was simulated")
+    for message, count in report.errors.items():
+        click.echo(f"solver error in {count} attempts: {message}")
+    for notice in report.notices:
+        click.echo(notice)
+    for entry in report.refused:
+        click.echo(f"refused: {entry['name']}: {entry['reason']}")
+    for name in ("grasping_oto.hdf5", "grasping_otm.hdf5", "trials.hdf5"):
+        click.echo(str(report.out / name))

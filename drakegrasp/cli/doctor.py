@@ -1,0 +1,326 @@
+"""What this machine lacks: every need of drakegrasp, measured, with the line that mends it.
+
+Nothing is imported that might be missing: a library that cannot be loaded is a finding,
+not an error. The test image is rendered in a child process, because a broken OpenGL kills
+its process, and because the first thread of a process that renders owns its GL context.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+PYTHON = (3, 11)
+#: Drake's wheels are built for this C library (manylinux_2_34).
+GLIBC = (2, 34)
+DRAKE = (1, 51, 1)
+#: Segfaults when it makes a renderer on Linux (RobotLocomotion/drake#24421).
+BROKEN_DRAKE = (1, 52, 0)
+DRAKE_REQUIREMENT = "drake>=1.51.1,!=1.52.0"
+EGL_LIBRARY = "libEGL.so.1"
+EGL_PACKAGES = "apt-get install libegl1 libgl1-mesa-dri"
+#: The first image may compile shaders on a slow file system [s].
+IMAGE_SECONDS = 60.0
+#: About 3,500 successes: two views of 128 x 128 pixels and 17 bytes, before compression.
+FREE_BYTES = 2e9
+#: A worker holds the scenes of a few objects.
+BYTES_PER_CORE = 1e9
+#: Limits of the control group, version 2 and 1; absent outside of containers.
+CGROUP_LIMITS = (
+    Path("/sys/fs/cgroup/memory.max"),
+    Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
+)
+MEMINFO = Path("/proc/meminfo")
+
+#: The test box's edge and its front's distance from the camera [m].
+BOX_EDGE, BOX_DISTANCE = 0.1, 0.25
+#: What the child process runs; its last line of output is `object pixels, expected pixels`.
+_CHILD = "from drakegrasp.cli.doctor import render_test_image; print(*render_test_image())"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One need of drakegrasp and whether this machine meets it.
+
+    Attributes:
+        name: Of the need.
+        ok: Whether it is met.
+        what: What was measured.
+        mend: The line that mends it; empty if it is met.
+    """
+
+    name: str
+    ok: bool
+    what: str
+    mend: str = ""
+
+
+def diagnose(directory: Path | None = None) -> list[Finding]:
+    """Return all findings about this machine, met needs too.
+
+    Args:
+        directory: Where datasets will be written; None is the current one. It need not
+            exist: then its nearest existing parent is tried.
+    """
+    place = _existing(Path.cwd() if directory is None else Path(directory))
+    return [
+        check_python(),
+        check_glibc(),
+        check_drake(),
+        check_egl(),
+        check_image(),
+        check_embree(),
+        check_writing(place),
+        check_disk(place),
+        check_cores(),
+        check_memory(),
+    ]
+
+
+def check_python() -> Finding:
+    """Return whether Python is new enough."""
+    return _finding(
+        "Python",
+        sys.version_info[:2] >= PYTHON,
+        platform.python_version(),
+        f"install Python {_dotted(PYTHON)} or newer",
+    )
+
+
+def check_glibc() -> Finding:
+    """Return whether the C library can load Drake's wheels."""
+    if sys.platform != "linux":
+        return Finding(name="glibc", ok=True, what=f"not needed on {sys.platform}")
+    library, version = platform.libc_ver()
+    return _finding(
+        "glibc",
+        library == "glibc" and _numbers(version) >= GLIBC,
+        f"{library} {version}".strip() or "another C library",
+        f"use a system or container with glibc {_dotted(GLIBC)} or newer, such as Ubuntu 22.04",
+    )
+
+
+def check_drake() -> Finding:
+    """Return whether a Drake is installed that works."""
+    try:
+        version = metadata.version("drake")
+    except metadata.PackageNotFoundError:
+        return _finding("Drake", False, "not installed", f"pip install '{DRAKE_REQUIREMENT}'")
+    ok = _numbers(version) >= DRAKE and _numbers(version) != BROKEN_DRAKE
+    return _finding("Drake", ok, version, f"pip install '{DRAKE_REQUIREMENT}'")
+
+
+def check_egl() -> Finding:
+    """Return whether the library that Drake renders with, without a display, can be loaded."""
+    if sys.platform != "linux":
+        return Finding(name="EGL", ok=True, what=f"not needed on {sys.platform}")
+    try:
+        ctypes.CDLL(EGL_LIBRARY)
+    except OSError as error:
+        return _finding("EGL", False, str(error), EGL_PACKAGES)
+    return Finding(name="EGL", ok=True, what=EGL_LIBRARY)
+
+
+def check_image() -> Finding:
+    """Return whether a box that is rendered in a child process shows up in its image."""
+    # The child finds what this process finds, and nothing that merely lies in its directory.
+    paths = os.pathsep.join(str(Path(p).resolve()) for p in sys.path if p)
+    try:
+        child = subprocess.run(
+            [sys.executable, "-P", "-c", _CHILD],
+            env={**os.environ, "PYTHONPATH": paths},
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=IMAGE_SECONDS,
+        )
+    except subprocess.TimeoutExpired:
+        return _bad_image(f"no image within {IMAGE_SECONDS:g} s")
+    except OSError as error:
+        return _bad_image(f"no child process: {error}")
+    if child.returncode < 0:
+        return _bad_image(f"the renderer crashed with {_signal_name(-child.returncode)}")
+    lines = (child.stderr if child.returncode else child.stdout).strip().splitlines()
+    last = lines[-1] if lines else "nothing"
+    if child.returncode:
+        missing = last.startswith("ModuleNotFoundError")
+        return _bad_image(last, f"pip install '{DRAKE_REQUIREMENT}' drakegrasp" if missing else "")
+    match = re.fullmatch(r"(\d+) (\d+)", last)
+    if match is None:
+        return _bad_image(f"the renderer must print two numbers, got {last!r}")
+    seen, expected = int(match[1]), int(match[2])
+    what = f"{seen} pixels of a box that has {expected}"
+    # An edge of the mask may be off by a pixel at either end.
+    if not 0.9 * expected <= seen <= 1.1 * expected:
+        return _bad_image(what if seen else f"blank image: {what}")
+    return Finding(name="test image", ok=True, what=what)
+
+
+def check_embree() -> Finding:
+    """Return whether trimesh casts its rays with embree, a hundred times faster than without."""
+    mend = "pip install embreex"
+    # A wheel for another machine fails in its own ways when it is loaded.
+    try:
+        from trimesh import ray
+
+        if ray.has_embree:
+            return Finding(name="embree", ok=True, what=f"embreex {_version('embreex')}")
+    except Exception as error:
+        return _finding("embree", False, f"{type(error).__name__}: {error}", "pip install trimesh")
+    return _finding("embree", False, "trimesh does not find it", mend)
+
+
+def check_writing(directory: Path) -> Finding:
+    """Return whether a file can be written in a directory, by writing one."""
+    try:
+        with tempfile.TemporaryFile(dir=directory) as file:
+            file.write(b"drakegrasp")
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        what = f"{directory}: {error.strerror or error}"
+        return _finding("writing", False, what, "choose another --out, or mend its permissions")
+    return Finding(name="writing", ok=True, what=str(directory))
+
+
+def check_disk(directory: Path) -> Finding:
+    """Return whether a directory's disk has room for a small dataset."""
+    try:
+        free = shutil.disk_usage(directory).free
+    except OSError as error:
+        what = f"{directory}: {error.strerror or error}"
+        return _finding("disk", False, what, "choose another --out")
+    return _finding(
+        "disk",
+        free >= FREE_BYTES,
+        f"{free / 1e9:.1f} GB free",
+        f"free {FREE_BYTES / 1e9:g} GB or choose another --out: a success takes up to 0.6 MB",
+    )
+
+
+def check_cores() -> Finding:
+    """Return how many cores this process may use; any number will do."""
+    return Finding(name="cores", ok=True, what=str(_cores()))
+
+
+def check_memory() -> Finding:
+    """Return whether there is memory for a worker on every core."""
+    total, cores = _memory(), _cores()
+    if total is None:
+        return Finding(name="memory", ok=True, what="unknown")
+    return _finding(
+        "memory",
+        total >= BYTES_PER_CORE * cores,
+        f"{total / 1e9:.1f} GB for {cores} cores",
+        f"use fewer workers: drakegrasp build --workers {max(1, int(total / BYTES_PER_CORE))}",
+    )
+
+
+def render_test_image() -> tuple[int, int]:
+    """Return the object's pixels in an image of a box seen squarely, and how many it has.
+
+    Call it in a process of its own: it needs Drake and may crash.
+    """
+    import numpy as np
+    import trimesh
+
+    from drakegrasp.config import CameraConfig
+    from drakegrasp.frames import make_pose
+    from drakegrasp.objects.model import ObjectModel
+    from drakegrasp.vision.camera import intrinsics
+    from drakegrasp.vision.rendering import build_renderer, look
+
+    config = CameraConfig()
+    box = trimesh.creation.box((BOX_EDGE,) * 3)
+    model = ObjectModel(
+        name="box",
+        class_name="box",
+        mesh_sha256="",
+        visual_vertices=box.vertices,
+        visual_faces=box.faces,
+        collision_vertices=box.vertices,
+        collision_faces=box.faces,
+        mass=1.0,
+        p_OOcm=np.zeros(3),
+        I_OOcm_O=np.eye(3) * BOX_EDGE**2 / 6.0,
+        collision_error=0.0,
+    )
+    X_TO = make_pose(np.eye(3), [0.0, 0.0, BOX_EDGE / 2.0])
+    X_TC = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, BOX_EDGE + BOX_DISTANCE])
+    seen = look(build_renderer(model, config), X_TO, X_TC)
+    edge = intrinsics(config)[0, 0] * BOX_EDGE / BOX_DISTANCE
+    return int(seen.mask.sum()), round(edge**2)
+
+
+def _finding(name: str, ok: bool, what: str, mend: str) -> Finding:
+    return Finding(name=name, ok=ok, what=what, mend="" if ok else mend)
+
+
+def _bad_image(what: str, mend: str = "") -> Finding:
+    return _finding("test image", False, what, mend or EGL_PACKAGES)
+
+
+def _existing(directory: Path) -> Path:
+    """Return a directory or its nearest parent that exists; a file in the way is returned."""
+    path = directory.absolute()
+    while not os.path.lexists(path) and path != path.parent:
+        path = path.parent
+    return path
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "of unknown version"
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    """Return the leading numbers of a version: `1.52.0.post1` is (1, 52, 0)."""
+    match = re.match(r"\d+(\.\d+)*", version)
+    return tuple(int(part) for part in match[0].split(".")) if match else ()
+
+
+def _dotted(version: tuple[int, ...]) -> str:
+    return ".".join(map(str, version))
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
+def _cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _memory() -> int | None:
+    """Return the memory [B] that this machine, or its container, has; None if unknown."""
+    limits = []
+    try:
+        match = re.search(r"^MemTotal:\s*(\d+) kB", MEMINFO.read_text(), re.MULTILINE)
+        limits += [int(match[1]) * 1024] if match else []
+    except OSError:
+        pass
+    for path in CGROUP_LIMITS:
+        # "max", or a number near 2^63, is no limit.
+        try:
+            limits.append(int(path.read_text()))
+        except (OSError, ValueError):
+            continue
+    return min(limits, default=None)

@@ -1,0 +1,135 @@
+"""The command line: thin, one function per command.
+
+Results go to standard output, progress and errors to standard error. Exit codes: 0 done,
+1 the work failed, 2 wrong usage. Heavy imports are within the commands, so that `--help`
+answers at once.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+
+import click
+
+from drakegrasp.cli.bench import bench
+from drakegrasp.cli.build import assemble, build, stats
+from drakegrasp.cli.group import main
+from drakegrasp.cli.options import (
+    manifest_option,
+    out_argument,
+    units_option,
+)
+from drakegrasp.cli.verify import verify
+
+
+@click.command()
+@click.argument("directory", type=click.Path(path_type=Path), default=Path("."))
+def doctor(directory: Path) -> None:
+    """Say what this machine lacks, with the line that mends it.
+
+    DIRECTORY is where data would be written.
+    """
+    from drakegrasp.cli.doctor import diagnose
+
+    findings = diagnose(directory)
+    for finding in findings:
+        mark = (
+            click.style("ok     ", fg="green") if finding.ok else click.style("MISSING", fg="red")
+        )
+        click.echo(f"{mark}  {finding.name:<18} {finding.what}")
+        if not finding.ok:
+            click.echo(f"         -> {finding.mend}")
+    if not all(finding.ok for finding in findings):
+        sys.exit(1)
+
+
+@click.group()
+def objects() -> None:
+    """List or export the built-in objects."""
+
+
+@objects.command("list")
+def list_objects() -> None:
+    """Print the name and class of every built-in object."""
+    from drakegrasp.objects.builtin.catalog import BUILTIN_OBJECTS
+
+    for item in BUILTIN_OBJECTS:
+        click.echo(f"{item.name:<26} {item.class_name}")
+
+
+@objects.command("export")
+@click.argument("directory", type=click.Path(path_type=Path))
+def export_objects(directory: Path) -> None:
+    """Write the built-in objects' meshes (.obj, metres) to DIRECTORY."""
+    from drakegrasp.objects.builtin.catalog import export_builtin
+
+    click.echo(f"{len(export_builtin(directory))} meshes in {directory}")
+
+
+@click.command()
+@click.argument("mesh_dir", type=click.Path(path_type=Path))
+@units_option
+@manifest_option
+def audit(mesh_dir: Path, units: str, manifest: Path | None) -> None:
+    """Say mesh by mesh: fit to simulate, mended, or refused, and why.
+
+    A build also drops each object on the table, and refuses one that does not come to rest.
+    """
+    from drakegrasp.cli.tables import audit_table, print_table
+    from drakegrasp.objects.audit import audit as audit_meshes
+
+    rows = audit_meshes(mesh_dir, units=units, manifest=manifest)
+    print_table(audit_table(rows))
+    if all(row.status == "refused" for row in rows):
+        sys.exit(1)
+
+
+@click.command()
+@click.argument("path", type=click.Path(path_type=Path), metavar="OUT|FILE")
+def check(path: Path) -> None:
+    """Check every invariant of a dataset, or of one of its files."""
+    from drakegrasp.dataset.checks.run import check_dataset
+    from drakegrasp.runtime.progress import progress_bar
+
+    with progress_bar("check", "steps") as progress:
+        violations = check_dataset(path, progress=progress)
+    for violation in violations:
+        click.echo(str(violation))
+    click.echo(f"{path}: {len(violations) or 'no'} broken invariants")
+    if violations:
+        sys.exit(1)
+
+
+@click.command()
+@out_argument
+@click.option("--trial", required=True, type=int, help="Row of trials.hdf5.")
+@click.option(
+    "--html",
+    type=click.Path(path_type=Path),
+    help="File to write that plays the trial in a browser.",
+)
+def replay(out: Path, trial: int, html: Path | None) -> None:
+    """Run a trial again: the same outcome and contacts, or exit code 1."""
+    from drakegrasp.build.replay import record_trial, replay_trial
+
+    again = replay_trial(out, trial)
+    click.echo(
+        f"trial {trial} of {again.object_name}: was {again.recorded.label}, is {again.found.label}"
+    )
+    for name, difference in again.differences.items():
+        how = "is missing in one" if math.isnan(difference) else f"by up to {difference:.3g}"
+        click.echo(f"  {name} differs: {how}")
+    for package, change in again.versions.items():
+        click.echo(f"  {package}: {change}")
+    if html is not None:
+        record_trial(out, trial, html)
+        click.echo(str(html))
+    if not again.same:
+        sys.exit(1)
+
+
+# Their order is that of the help.
+for _command in (doctor, objects, audit, build, assemble, check, stats, replay, verify, bench):
+    main.add_command(_command)

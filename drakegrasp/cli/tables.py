@@ -1,0 +1,239 @@
+"""What is counted, as tables for a terminal."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.box import SIMPLE
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from drakegrasp.dataset.filters import Removal
+from drakegrasp.dataset.statistics import Funnel, SplitCount, Unfinished
+from drakegrasp.objects.audit import AuditRow
+from drakegrasp.outcomes import Outcome
+
+#: Short heads of the outcomes, in the order of the funnel.
+_OUTCOME_HEADS = {
+    Outcome.RAY_MISS: "ray\nmiss",
+    Outcome.BELOW_TABLE: "below\ntable",
+    Outcome.START_COLLISION: "start\ncollis.",
+    Outcome.SCREENED: "screened",
+    Outcome.MISSING_FINGERTIP: "missing\ntip",
+    Outcome.HAND_CONTACT: "hand\ncontact",
+    Outcome.TABLE_CONTACT: "table\ncontact",
+    Outcome.DROPPED: "dropped",
+    Outcome.SLIPPED: "slipped",
+    Outcome.SOLVER_ERROR: "solver\nerror",
+    Outcome.TIMEOUT: "timeout",
+    Outcome.CRASHED: "crashed",
+    Outcome.SUCCESS: "success",
+}
+
+
+#: What the outcomes amount to, for terminals that are too narrow for all of them.
+_COMPACT_HEADS = {
+    "no ray": (Outcome.RAY_MISS, Outcome.BELOW_TABLE),
+    "collis.": (Outcome.START_COLLISION, Outcome.SCREENED),
+    "no grip": (Outcome.MISSING_FINGERTIP, Outcome.HAND_CONTACT, Outcome.TABLE_CONTACT),
+    "lost": (Outcome.DROPPED, Outcome.SLIPPED),
+    "errors": (Outcome.SOLVER_ERROR, Outcome.TIMEOUT, Outcome.CRASHED),
+    "success": (Outcome.SUCCESS,),
+}
+
+
+#: Width of tables where standard output is not a terminal [characters]: as wide as they are.
+WIDTH = 1000
+
+
+def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
+    """Return the funnel, a row per object and one of all.
+
+    Args:
+        funnel: The counts.
+        compact: Whether to put outcomes together; else columns that are all zero are left out.
+    """
+    shown = [o for o in _OUTCOME_HEADS if funnel.outcomes[:, o].any() or o is Outcome.SUCCESS]
+    groups = _COMPACT_HEADS if compact else {_OUTCOME_HEADS[o]: (o,) for o in shown}
+    removed = [r for r in Removal if r is not Removal.KEPT and funnel.removals[:, r].any()]
+    heads = ["poses", "attempts", *groups]
+    heads += [] if compact else [f"- {r.label}".replace("_", "\n") for r in removed]
+    table = _table("From palm poses to samples")
+    table.add_column("object", no_wrap=True, overflow="ellipsis", max_width=24)
+    for head in [*heads, "samples"]:
+        table.add_column(head, justify="right", no_wrap=True)
+
+    def row(outcomes: Sequence[int], removals: Sequence[int], poses: int) -> list[str]:
+        cells = [poses, sum(outcomes), *(sum(outcomes[o] for o in g) for g in groups.values())]
+        cells += [] if compact else [removals[r] for r in removed]
+        return [f"{int(cell):,}" for cell in (*cells, removals[Removal.KEPT])]
+
+    for i, name in enumerate(funnel.names):
+        counts = (funnel.outcomes[i], funnel.removals[i], int(funnel.candidates[i]))
+        table.add_row(escape(name), *row(*counts))
+    table.add_section()
+    totals = (funnel.outcomes.sum(0), funnel.removals.sum(0), int(funnel.candidates.sum()))
+    table.add_row("all", *row(*totals))
+    return table
+
+
+def split_table(counts: Sequence[SplitCount]) -> Table:
+    """Return the paper's Table III with a column of objects."""
+    table = _table("Samples by split")
+    table.add_column("split")
+    for head in ("samples", "objects", "classes"):
+        table.add_column(head, justify="right")
+    for count in counts:
+        table.add_row(count.split, f"{count.samples:,}", f"{count.objects:,}", f"{count.classes:,}")
+    return table
+
+
+def unfinished_line(unfinished: Unfinished) -> str:
+    """Return how far a build is that runs or was stopped."""
+    if not unfinished.total:
+        return "not finished: its objects are not prepared yet"
+    return (
+        f"not finished: {unfinished.done:,} of {unfinished.total:,} work units are done; "
+        "samples are chosen at the end"
+    )
+
+
+def audit_table(rows: Sequence[AuditRow]) -> Table:
+    """Return what would become of each mesh."""
+    table = _table("Meshes")
+    table.add_column("object", no_wrap=True)
+    table.add_column("class", no_wrap=True)
+    table.add_column("status", no_wrap=True)
+    table.add_column("faces", justify="right")
+    table.add_column(escape("size [mm]"), justify="right", no_wrap=True)
+    table.add_column("notes", overflow="fold")
+    colours = {"fit": "green", "mended": "yellow", "refused": "red"}
+    for row in rows:
+        size = "-" if row.extents is None else "x".join(f"{1e3 * e:.0f}" for e in row.extents)
+        table.add_row(
+            escape(row.name),
+            escape(row.class_name),
+            f"[{colours[row.status]}]{row.status}[/]",
+            "-" if row.faces is None else f"{row.faces:,}",
+            size,
+            escape("; ".join(row.notes)),
+        )
+    return table
+
+
+def verdict_table(outcomes: Sequence[Outcome]) -> Table:
+    """Return how many grasps had each outcome, and which share of those that were judged."""
+    counts = Counter(outcomes)
+    judged = sum(n for outcome, n in counts.items() if not outcome.says_nothing)
+    table = _table("Verdicts")
+    table.add_column("outcome", no_wrap=True)
+    for head in ("grasps", "share"):
+        table.add_column(head, justify="right", no_wrap=True)
+    others = sorted(counts.keys() - {Outcome.SUCCESS}, key=lambda o: (-counts[o], o))
+    for outcome in (Outcome.SUCCESS, *others):
+        share = "-" if outcome.says_nothing or not judged else f"{counts[outcome] / judged:.1%}"
+        table.add_row(outcome.label, f"{counts[outcome]:,}", share)
+    table.add_section()
+    table.add_row("all", f"{len(outcomes):,}", "")
+    return table
+
+
+def bench_table(report: Mapping[str, Any]) -> Table:
+    """Return what `measure.summarize` found: rates, and seconds of a core by stage."""
+    table = _table("Attempts on one core")
+    stages = ("scene", "field", "screen", "try", "look")
+    with_peer = "peer" in report["all"]
+    heads = ["faces", "attempts", "grasps", "attempts\nper s", "grasps\nper h"]
+    heads += [f"{stage}\n{escape('[s]')}" for stage in stages]
+    heads += ["MuJoCo\ngrasps/h", "ratio"] if with_peer else []
+    table.add_column("object", no_wrap=True, overflow="ellipsis", max_width=24)
+    for head in heads:
+        table.add_column(head, justify="right", no_wrap=True)
+
+    def row(name: str, found: Mapping[str, Any]) -> None:
+        peer = found.get("peer", {})
+        ratio = peer.get("ratio", peer.get("median_ratio"))
+        cells = [
+            f"{found['faces']:,}" if "faces" in found else "",
+            f"{found['attempts']:,}",
+            f"{found['outcomes'].get(Outcome.SUCCESS.label, 0):,}",
+            f"{found['resolved_per_core_second']:.1f}",
+            f"{found['grasps_per_core_hour']:,.0f}",
+            *(f"{found['seconds'][stage]:.1f}" for stage in stages),
+        ]
+        if with_peer:
+            cells += [f"{peer['grasps_per_core_hour']:,.0f}", f"{ratio:.2f}" if ratio else "-"]
+        table.add_row(escape(name), *cells)
+
+    for found in report["objects"]:
+        row(found["name"], found)
+    table.add_section()
+    row("all (ratio: median)" if with_peer else "all", report["all"])
+    return table
+
+
+def bench_lines(report: Mapping[str, Any]) -> list[str]:
+    """Return the funnel, the memory and the machine of a report as lines."""
+    outcomes = Counter(report["all"]["outcomes"])
+    funnel = ", ".join(
+        f"{outcomes[o.label]:,} {o.label}" for o in _OUTCOME_HEADS if outcomes[o.label]
+    )
+    versions = ", ".join(f"{name} {version}" for name, version in report["versions"].items())
+    return [
+        f"outcomes: {funnel}",
+        f"peak memory: {report['peak_memory'] / 1e6:,.0f} MB",
+        f"on {report['cpu']}; {versions}",
+    ]
+
+
+def fidelity_table(found: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Return how labels differ where the same attempts are simulated in other ways."""
+    table = _table("The same attempts in other ways")
+    table.add_column("way", no_wrap=True)
+    heads = (
+        "attempts",
+        "simulated",
+        "other\nlabels",
+        "of the\nsimulated",
+        "grasps",
+        "grasps\nthere",
+    )
+    for head in heads:
+        table.add_column(head, justify="right", no_wrap=True)
+    for name, counts in found.items():
+        numbers = [counts[key] for key in ("attempts", "simulated", "flips")]
+        grasps = [counts[key] for key in ("successes", "successes_other")]
+        share = f"{counts['flip_share_of_simulated']:.1%}"
+        cells = [*(f"{n:,}" for n in numbers), share, *(f"{n:,}" for n in grasps)]
+        table.add_row(name.replace("_", " "), *cells)
+    off = found["screen_off"]
+    lost, successes = off["successes_lost_by_screen"], off["successes_other"]
+    counted = f"{lost:,} of {successes:,}" if successes else "unknown, as there is none"
+    table.caption = f"grasps that the screen took out: {counted}"
+    table.caption_justify = "left"
+    return table
+
+
+def _table(title: str) -> Table:
+    return Table(
+        title=title,
+        title_justify="left",
+        box=SIMPLE,
+        pad_edge=False,
+        collapse_padding=True,
+        padding=(0, 1, 0, 0),
+    )
+
+
+def make_console(*, stderr: bool = False) -> Console:
+    """Return a console for tables; where there is no terminal, as wide as they are."""
+    console = Console(stderr=stderr)
+    return console if console.is_terminal else Console(width=WIDTH, stderr=stderr)
+
+
+def print_table(table: Table) -> None:
+    """Print a table to standard output."""
+    make_console().print(table)

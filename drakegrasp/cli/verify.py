@@ -1,0 +1,147 @@
+"""`drakegrasp verify`: predicted grasps in, a line of JSON per grasp out."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from drakegrasp.cli.options import (
+    scheduler_file_option,
+    scheduler_option,
+    set_option,
+    workers_option,
+)
+
+if TYPE_CHECKING:
+    from drakegrasp.verification.result import Verification
+
+
+@click.command()
+@click.argument("grasps", type=click.Path(path_type=Path), metavar="GRASPS")
+@click.option(
+    "--object",
+    "mesh",
+    type=click.Path(path_type=Path),
+    metavar="MESH",
+    help="The object: a .obj, .stl, .ply or .glb file.",
+)
+@click.option("--units", help="Unit of length of the mesh: m, cm or mm.  [m]")
+@click.option(
+    "--dataset",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="In place of --object: a data file, OUT/grasping_oto.hdf5 or _otm; object, its pose and "
+    "the camera's come with the row.",
+)
+@click.option(
+    "--split",
+    type=click.Choice(["train", "valid", "test"]),
+    help="Which rows of the dataset, and which group of an HDF5 file of grasps.  [test]",
+)
+@click.option(
+    "--frame",
+    type=click.Choice(["object", "camera", "workspace"]),
+    help="What the grasps are expressed in.  [object; camera with a dataset]",
+)
+@click.option(
+    "--camera",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="With --object and --frame camera: .npy file with the camera's pose in the table-top "
+    "frame, X_TC (4, 4), or one per grasp (n, 4, 4) or (n, 12).",
+)
+@click.option(
+    "--method",
+    type=click.Choice(["hand", "forces"]),
+    default="hand",
+    show_default=True,
+    help="Close a simulated hand on the contacts and lift, or lift by forces at the contacts "
+    "alone.",
+)
+@click.option("--hand", metavar="NAME|YAML", help="The hand.  [the configuration's: barrett]")
+@click.option(
+    "--config",
+    metavar="YAML|PRESET",
+    help="Configuration: a file, or paper or released.  [the dataset's, else paper]",
+)
+@set_option
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    metavar="NAME",
+    help="Write NAME.jsonl and NAME.h5 instead of JSON lines to standard output.",
+)
+@workers_option
+@scheduler_option
+@scheduler_file_option
+@click.option("--quiet", is_flag=True, help="Show neither progress nor the table.")
+def verify(
+    out: Path | None,
+    workers: int | None,
+    scheduler: str | None,
+    scheduler_file: Path | None,
+    quiet: bool,
+    **options: Any,
+) -> None:
+    """Try predicted grasps in the simulator: does each hold its object, and if not, why?
+
+    GRASPS is a .npy array with a row per grasp, a .csv file with a line per grasp, or an HDF5
+    file with an array `grasps` at its root or in a group, and maybe `rows` beside it: the rows of
+    the dataset that they are for. A grasp is 6 numbers per finger (18 for the Barrett Hand): the
+    contact points in metres, then the unit normals out of the object, in the hand file's order
+    of fingers.
+
+    If GRASPS is a data file of a dataset, and neither --object nor --dataset is given, its own
+    grasps are tried.
+
+    A line of JSON per grasp goes to standard output or NAME.jsonl, a table of the outcomes to
+    standard error. Exit code: 0 when every grasp was tried, whatever came of it; 2 for input
+    that cannot be used, such as a single grasp that is not on the object.
+    """
+    from drakegrasp.api import run_verification
+    from drakegrasp.cli.tables import make_console, verdict_table
+    from drakegrasp.cli.verify_request import VerifyRequest, plan_request
+    from drakegrasp.verification.result_files import (
+        json_lines,
+        part_path,
+        result_paths,
+        write_json_line,
+        write_results,
+    )
+    from drakegrasp.verification.tasks import refuse_off_surface
+
+    tasks = plan_request(VerifyRequest(**options, out=out))
+    single = sum(len(task.indices) for task in tasks) == 1
+
+    def print_line(index: int, result: Verification) -> None:
+        write_json_line(index, result, sys.stdout)
+
+    def deliver(index: int, result: Verification) -> None:
+        if single:
+            refuse_off_surface(result)
+        write(index, result)
+
+    try:
+        with nullcontext(print_line) if out is None else json_lines(out) as write:
+            results = run_verification(
+                tasks,
+                workers=workers,
+                scheduler=scheduler,
+                scheduler_file=scheduler_file,
+                deliver=deliver,
+                show=not quiet,
+            )
+            if out is not None:
+                write_results(results, result_paths(out)[1], results[0].config)
+    except BaseException:
+        if out is not None and part_path(out).exists():
+            click.echo(f"{part_path(out)}: the verdicts so far", err=True)
+        raise
+    for path in () if out is None else result_paths(out):
+        click.echo(str(path))
+    if not quiet:
+        make_console(stderr=True).print(verdict_table([result.outcome for result in results]))

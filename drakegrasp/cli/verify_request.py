@@ -1,0 +1,116 @@
+"""What `drakegrasp verify` is asked, as tasks: files and options in, nothing simulated.
+
+All that may be wrong with what was asked is a `GraspError`, `MeshError`, `ConfigError` or
+`HandError`: wrong usage.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from drakegrasp.config import Config, load_config, override_config
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.errors import DataError, GraspError
+from drakegrasp.verification.prediction import HDF5_SUFFIXES, read_numbers, read_predictions
+from drakegrasp.verification.result_files import refuse_unwritable
+from drakegrasp.verification.tasks import VerifyTask, plan_verification
+
+#: The split that is meant where a dataset is given and none is named.
+DEFAULT_SPLIT = "test"
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerifyRequest:
+    """The options of the command, see its help; None where one was not given."""
+
+    grasps: Path
+    mesh: Path | None = None
+    dataset: Path | None = None
+    split: str | None = None
+    frame: str | None = None
+    camera: Path | None = None
+    units: str | None = None
+    method: str = "hand"
+    hand: str | None = None
+    config: str | None = None
+    overrides: tuple[str, ...] = ()
+    out: Path | None = None
+
+
+def plan_request(request: VerifyRequest) -> list[VerifyTask]:
+    """Return the tasks of a request, at least one.
+
+    Raises:
+        GraspError, MeshError, ConfigError, HandError: If something cannot be used.
+    """
+    try:
+        return _plan(request)
+    except DataError as error:
+        raise GraspError(str(error)) from None
+
+
+def _plan(request: VerifyRequest) -> list[VerifyTask]:
+    if request.out is not None:
+        refuse_unwritable(request.out)
+    path = _dataset_path(request)
+    _refuse_idle(request, path)
+    split = request.split if path is None else request.split or DEFAULT_SPLIT
+    data = None if path is None else GraspDataset(path, split=split or DEFAULT_SPLIT)
+    predicted = read_predictions(request.grasps, split=split)
+    return plan_verification(
+        predicted.grasps,
+        request.mesh,
+        frame=request.frame,
+        X=None if request.camera is None else read_numbers(request.camera),
+        X_TO=None,
+        units=request.units,
+        hand=request.hand,
+        method=request.method,
+        config=_config(request, path),
+        dataset=data,
+        rows=None if predicted.rows is None else predicted.rows.tolist(),
+    )
+
+
+def _dataset_path(request: VerifyRequest) -> Path | None:
+    """Return the data file whose objects are meant; grasps that are in one are its own."""
+    if request.mesh is not None and request.dataset is not None:
+        raise GraspError("--object or --dataset must be given, got both")
+    if request.mesh is not None or request.dataset is not None:
+        return request.dataset
+    if request.grasps.suffix.lower() not in HDF5_SUFFIXES:
+        raise GraspError(
+            "--object MESH or --dataset FILE must be given where the grasps are not in a data "
+            f"file of a dataset, got neither for {request.grasps}"
+        )
+    if request.frame not in (None, "camera"):
+        raise GraspError(f"--frame must be camera for a dataset's own grasps, got {request.frame}")
+    return request.grasps
+
+
+def _refuse_idle(request: VerifyRequest, dataset: Path | None) -> None:
+    """Refuse options that would do nothing, and the lack of a camera where one is needed."""
+    if dataset is not None and request.units is not None:
+        raise GraspError(f"--units must be given with --object only, got {request.units}")
+    grouped = request.grasps.suffix.lower() in HDF5_SUFFIXES
+    if request.split is not None and dataset is None and not grouped:
+        raise GraspError(
+            "--split must be given with --dataset or grasps in an HDF5 file only, "
+            f"got {request.split}"
+        )
+    needed = dataset is None and request.frame == "camera"
+    if needed and request.camera is None:
+        raise GraspError("--camera FILE must be given with --object and --frame camera, got none")
+    if not needed and request.camera is not None:
+        raise GraspError(
+            f"--camera must be given with --object and --frame camera only, got {request.camera}"
+        )
+
+
+def _config(request: VerifyRequest, dataset: Path | None) -> Config:
+    """Return the configuration: the one given, or the dataset's, with overrides on top."""
+    if dataset is None or request.config is not None:
+        return load_config(request.config, request.overrides)
+    return override_config(read_manifest(dataset.parent).config, request.overrides)

@@ -1,0 +1,1 @@
+"""Running the work on Dask: the only room that knows it."""

@@ -1,0 +1,278 @@
+"""What workers are wanted: plain data from a command line, its contradictions, and its words.
+
+In: a `ClusterRequest` and the user's jobqueue.yaml. Out: numbers and options for `launch`, and
+lines for the user. Nothing is started here.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import dask
+from dask.utils import parse_bytes
+
+from drakegrasp.errors import ConfigError, MachineError
+
+KINDS = ("local", "ssh", "slurm", "scheduler", "scheduler-file")
+#: Memory of a worker under SLURM, where neither the user nor jobqueue.yaml says it.
+WORKER_MEMORY = "2GB"
+#: Address of this machine alone.
+LOOPBACK = "127.0.0.1"
+#: Least and largest number of words after each kind, and what they are.
+_PLACES: dict[str, tuple[int, float, str]] = {
+    "local": (0, 0, "nothing"),
+    "ssh": (1, math.inf, "the names of the hosts"),
+    "slurm": (0, 0, "nothing"),
+    "scheduler": (1, 1, "its address"),
+    "scheduler-file": (1, 1, "its path"),
+}
+#: What may be asked of each kind; a running scheduler has its own workers.
+_TAKES: dict[str, tuple[str, ...]] = {
+    "local": ("workers", "memory", "tls"),
+    "ssh": ("workers", "cores", "memory", "host", "interface", "tls"),
+    "slurm": ("workers", "cores", "memory", "walltime", "host", "interface", "tls"),
+    "scheduler": (),
+    "scheduler-file": (),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClusterRequest:
+    """What workers are wanted, as on the command line of `pipelines/submit_build.py`.
+
+    Attributes:
+        kind: One of `KINDS`.
+        where: Hosts, the address of a scheduler, or its file.
+        workers: Processes in all.
+        cores: Of each host or job, a worker on each.
+        memory: Of each worker, e.g. "2GB".
+        walltime: Of each SLURM job, as SLURM writes it: [D-]HH:MM:SS.
+        host: Address on which the scheduler listens.
+        interface: Name of the network interface on which scheduler and workers listen.
+        tls: Whether to make certificates for this run.
+        tls_files: Files in PEM format: authority, certificate and private key; every machine
+            must see them.
+    """
+
+    kind: str
+    where: tuple[str, ...] = ()
+    workers: int | None = None
+    cores: int | None = None
+    memory: str | None = None
+    walltime: str | None = None
+    host: str | None = None
+    interface: str | None = None
+    tls: bool = False
+    tls_files: tuple[Path, Path, Path] | None = None
+
+
+def worker_count(request: ClusterRequest) -> int | None:
+    """Return how many workers there will be, as far as that is known before they start.
+
+    Raises:
+        ConfigError: If the request contradicts itself, or lacks something.
+    """
+    _refuse_contradictions(request)
+    if request.kind == "ssh":
+        return len(request.where) * cores_per_host(request)
+    if request.kind == "slurm":
+        cores = cores_per_job(request)
+        return cores * math.ceil((request.workers or 0) / cores)
+    return request.workers
+
+
+def describe(request: ClusterRequest) -> list[str]:
+    """Return what will be started, in lines for the user; of an open port it warns."""
+    count = worker_count(request)
+    lines = [
+        {
+            "local": "workers on this machine",
+            "ssh": f"{count} workers over ssh on {' '.join(dict.fromkeys(request.where))}, "
+            f"scheduler on {request.where[0] if request.where else ''}",
+            "slurm": f"{count} workers in SLURM jobs{_job_size(request)}",
+        }.get(request.kind, f"the workers of {' '.join(request.where)}")
+    ]
+    encrypted = request.tls or request.tls_files is not None
+    lines.append(f"connections: {'TLS' if encrypted else 'not encrypted'}")
+    if not encrypted and _listens_beyond(request):
+        lines.append(
+            "warning: whoever reaches the scheduler's port can run programs as you; give --tls"
+        )
+    return lines
+
+
+def walltime_seconds(text: str) -> float:
+    """Return a time limit of SLURM in seconds.
+
+    SLURM's forms: M, M:S, H:M:S, D-H, D-H:M, D-H:M:S.
+
+    Raises:
+        ConfigError: If it is none of them.
+    """
+    days, dash, rest = text.partition("-") if "-" in text else ("0", "", text)
+    parts = rest.split(":")
+    if not (days.isdigit() and all(p.isdigit() for p in parts) and len(parts) <= 3):
+        raise ConfigError(f"walltime must be a time of SLURM such as 02:00:00, got {text!r}")
+    numbers = [int(p) for p in parts]
+    if dash or len(numbers) == 3:
+        hours, minutes, seconds = [*numbers, 0, 0][:3]
+    else:
+        hours, (minutes, seconds) = 0, [*numbers, 0][:2]
+    total = 86400.0 * int(days) + 3600.0 * hours + 60.0 * minutes + seconds
+    if total <= 0.0:
+        raise ConfigError(f"walltime must be longer than nothing, got {text!r}")
+    return total
+
+
+def scheduler_listening(request: ClusterRequest) -> dict[str, str]:
+    """Return where a scheduler listens, as its options; nothing if jobqueue.yaml says it.
+
+    Raises:
+        ConfigError: If the workers are on other machines and nobody said where to listen.
+    """
+    if request.host is not None:
+        return {"host": request.host}
+    if request.interface is not None:
+        return {"interface": request.interface}
+    if request.kind == "ssh" and all(_is_loopback(host) for host in request.where):
+        return {"host": LOOPBACK}
+    if request.kind == "slurm" and _jobqueue_listens():
+        return {}
+    raise ConfigError(
+        "--interface NAME or --host ADDRESS must be given for workers on other machines, because "
+        "the scheduler listens to nobody else's machine without"
+    )
+
+
+def workers_listening(listening: dict[str, str]) -> dict[str, str]:
+    """Return where workers listen, as their options, given where their scheduler does."""
+    if "interface" in listening:
+        return listening
+    # Without, a worker takes an address of its machine by which others reach it.
+    return listening if _is_loopback(listening.get("host", "")) else {}
+
+
+def _listens_beyond(request: ClusterRequest) -> bool:
+    if request.kind not in ("ssh", "slurm"):
+        return False
+    listening = scheduler_listening(request)
+    return not ("host" in listening and _is_loopback(listening["host"])) and (
+        listening.get("interface") != "lo"
+    )
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def jobqueue(key: str) -> Any:
+    """Return a value of the user's jobqueue.yaml, or of dask-jobqueue's own.
+
+    Raises:
+        MachineError: If dask-jobqueue is not installed.
+    """
+    try:
+        import dask_jobqueue  # noqa: F401  (it is what reads the file)
+    except ImportError:
+        raise MachineError(
+            "--cluster slurm needs dask-jobqueue: pip install 'drakegrasp[slurm]'"
+        ) from None
+    return dask.config.get(f"jobqueue.slurm.{key}", None)
+
+
+def _jobqueue_listens() -> bool:
+    options = jobqueue("scheduler-options") or {}
+    return bool(jobqueue("interface") or {"host", "interface"} & set(options))
+
+
+def cores_per_host(request: ClusterRequest) -> int:
+    """Return how many workers run on each host over SSH.
+
+    Raises:
+        ConfigError: If the request does not say it, or says two things.
+    """
+    hosts = len(request.where)
+    if request.cores is not None:
+        if request.workers not in (None, hosts * request.cores):
+            raise ConfigError(
+                f"--workers must be --cores on each of {hosts} hosts, {hosts * request.cores}, or "
+                f"not be given, got {request.workers}"
+            )
+        return request.cores
+    if request.workers is None:
+        raise ConfigError("--workers or --cores must be given for workers over ssh")
+    if request.workers % hosts:
+        raise ConfigError(
+            f"--workers must be a multiple of the number of hosts, {hosts}, got {request.workers}; "
+            "a host may be named more than once"
+        )
+    return request.workers // hosts
+
+
+def _job_size(request: ClusterRequest) -> str:
+    """Return what each of SLURM's jobs asks for, in words; nothing for other clusters."""
+    if request.kind != "slurm":
+        return ""
+    memory = request.memory or (None if jobqueue("memory") else WORKER_MEMORY)
+    walltime = request.walltime or jobqueue("walltime")
+    asked = [
+        f"of {cores_per_job(request)}",
+        "memory as in jobqueue.yaml" if memory is None else f"{memory} each",
+        f"walltime {walltime or 'as the queue has it'}",
+    ]
+    return f" {', '.join(asked)}"
+
+
+def cores_per_job(request: ClusterRequest) -> int:
+    """Return how many workers run in each SLURM job."""
+    return int(request.cores or jobqueue("cores") or 1)
+
+
+def _refuse_contradictions(request: ClusterRequest) -> None:
+    least, most, what = _PLACES[request.kind]
+    if not least <= len(request.where) <= most:
+        got = " ".join(request.where) or "nothing"
+        raise ConfigError(f"--cluster {request.kind} must be followed by {what}, got {got}")
+    for name in ("workers", "cores", "memory", "walltime", "host", "interface", "tls"):
+        value = getattr(request, name)
+        if value not in (None, False) and name not in _TAKES[request.kind]:
+            raise ConfigError(f"--{name} must not be given with --cluster {request.kind}")
+        if name in ("workers", "cores") and value is not None and value < 1:
+            raise ConfigError(f"{name} must be at least 1, got {value}")
+    if request.tls and request.tls_files is not None:
+        raise ConfigError("--tls makes certificates and must not be given with files of them")
+    if request.memory is not None:
+        memory_bytes(request.memory)
+    if request.walltime is not None:
+        walltime_seconds(request.walltime)
+    if request.kind == "slurm" and request.workers is None:
+        raise ConfigError("--workers must be given with --cluster slurm")
+    if request.kind == "ssh":
+        for host in request.where:
+            if "@" in host:
+                raise ConfigError(
+                    f"a host must be a name or address, got {host!r}: the user and "
+                    "the key for it go into ~/.ssh/config"
+                )
+        cores_per_host(request)
+    if request.kind in ("ssh", "slurm"):
+        scheduler_listening(request)
+
+
+def memory_bytes(text: str) -> int:
+    """Return a size of memory such as "2GB" in bytes.
+
+    Raises:
+        ConfigError: If it is none.
+    """
+    try:
+        return int(parse_bytes(text))
+    except ValueError:
+        raise ConfigError(f"memory must be a size such as 2GB, got {text!r}") from None

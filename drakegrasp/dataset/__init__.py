@@ -1,0 +1,1 @@
+"""The files of a dataset: schema, shards, manifest, assembly, reading."""

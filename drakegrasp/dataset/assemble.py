@@ -1,0 +1,272 @@
+"""Stage "build": from shards to trials.hdf5, grasping_oto.hdf5 and grasping_otm.hdf5.
+
+In: a directory whose work units are all done. Out: the three files, all or none. Two
+passes over the shards, so memory holds one shard's images and a few numbers per success,
+whatever the size of the dataset. No simulation, no Drake.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.dataset.filters import Removal, Successes, judge_successes, split_samples
+from drakegrasp.dataset.hdf5 import AnyArray, create_field, write_field
+from drakegrasp.dataset.lock import build_lock
+from drakegrasp.dataset.manifest import Manifest, read_manifest, write_origin
+from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
+from drakegrasp.dataset.samples import Part, create_splits, walk_parts, write_samples
+from drakegrasp.dataset.schema import (
+    CAMERAS,
+    CERTIFICATE_FIELDS,
+    OBJECT_FIELDS,
+    SPLITS,
+    SUCCESS_FIELDS,
+    TRIAL_FIELDS,
+)
+from drakegrasp.dataset.shards import Shard, trial_columns
+from drakegrasp.errors import DataError
+from drakegrasp.frames import Array, invert_pose, transform_points, unpack_pose
+from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp
+from drakegrasp.runtime.files import atomic_hdf5, disk_full_named
+from drakegrasp.runtime.progress import Report, silent
+from drakegrasp.vision.camera import intrinsics, project
+
+
+@dataclass(frozen=True, kw_only=True)
+class Assembly:
+    """What the files hold.
+
+    Attributes:
+        trials: Number of attempts.
+        grasps: Number of successes.
+        removed: Successes by reason of removal; `Removal.KEPT` are the samples.
+        samples: Samples by split.
+    """
+
+    trials: int
+    grasps: int
+    removed: dict[Removal, int]
+    samples: dict[str, int]
+
+
+def assemble(out: Path, *, rejected: Sequence[int] = (), progress: Report = silent) -> Assembly:
+    """Write the three files of a dataset whose work units are all done.
+
+    Args:
+        out: Directory of the dataset.
+        rejected: Ids of trials that inspection found wrong; they become no samples.
+        progress: Called with the number of shards read and to read.
+
+    Raises:
+        DataError: If a shard is missing or damaged, or another process builds there; the old
+            files stay as they were.
+        DiskFullError: If there is no room; likewise.
+    """
+    read_manifest(out)  # nothing is made where no dataset is
+    with build_lock(out), disk_full_named(out):
+        return _assemble(out, rejected, progress)
+
+
+def _assemble(out: Path, rejected: Sequence[int], progress: Report) -> Assembly:
+    manifest = read_manifest(out)
+    K = intrinsics(manifest.config.camera)
+    total = manifest.units
+    parts, found = [], []
+    with ExitStack() as stack:
+        trials = stack.enter_context(atomic_hdf5(out / TRIALS_FILE))
+        _write_attributes(trials, manifest)
+        _write_objects(trials, manifest)
+        for part, shard in walk_parts(out, manifest):
+            _append_trials(trials, part, shard)
+            parts.append(part)
+            found.append(_successes(part, shard, K))
+            progress(len(parts), 2 * total)
+        if not parts:
+            raise DataError(f"{out}: at least one object must have a palm pose to try, got none")
+        successes = _concatenate(found)
+        unknown = sorted(set(rejected) - set(successes.trial_id.tolist()))
+        if unknown:
+            raise DataError(
+                f"{out}: rejected trials must be successes, got {unknown[0]}, which is none"
+            )
+        removal = judge_successes(successes, manifest.config.filters, rejected)
+        _write_removal(trials, successes, removal)
+        ids = _split_ids(manifest, successes, removal)
+        files = {c: stack.enter_context(atomic_hdf5(out / DATA_FILES[c])) for c in CAMERAS}
+        for camera, file in files.items():
+            _write_attributes(file, manifest)
+            file.attrs["camera"] = camera
+            create_splits(file, ids, parts[0].shapes)
+        for number, part in enumerate(parts):
+            write_samples(files, out, part, ids)
+            progress(len(parts) + number + 1, 2 * len(parts))
+    return summarise(out)
+
+
+def summarise(out: Path) -> Assembly:
+    """Return what the files of a dataset hold.
+
+    Raises:
+        DataError: If they are missing or damaged.
+    """
+    try:
+        with (
+            h5py.File(out / TRIALS_FILE, "r") as trials,
+            h5py.File(out / DATA_FILES["oto"], "r") as data,
+        ):
+            removal = trials["successes/removal"][:]
+            reasons, counts = np.unique(removal, return_counts=True)
+            return Assembly(
+                trials=len(trials["trials/outcome"]),
+                grasps=len(removal),
+                removed={Removal(int(r)): int(n) for r, n in zip(reasons, counts, strict=True)},
+                samples={split: len(data[split]["trial_id"]) for split in SPLITS},
+            )
+    except (OSError, KeyError) as error:
+        raise DataError(f"{out}: must hold the files of a dataset, got none ({error})") from None
+
+
+def read_reject_list(path: Path) -> list[int]:
+    """Return the trial ids in a text file: one per line, # starts a comment.
+
+    Raises:
+        DataError: If a line is no id.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError:
+        raise DataError(f"{path}: must be a text file of trial ids, got other bytes") from None
+    ids = []
+    for number, line in enumerate(lines, start=1):
+        text = line.partition("#")[0].strip()
+        if text and not text.isdecimal():
+            raise DataError(f"{path}, line {number}: must be the id of a trial, got {text!r}")
+        if text:
+            ids.append(int(text))
+    return ids
+
+
+def is_assembled(out: Path) -> bool:
+    """Return whether the three files are there and of the manifest's configuration and units."""
+    signature = _signature(read_manifest(out))
+    try:
+        for name in (TRIALS_FILE, *DATA_FILES.values()):
+            with h5py.File(out / name, "r") as file:
+                if file.attrs["signature"] != signature:
+                    return False
+    except (OSError, KeyError):
+        return False
+    return True
+
+
+def _signature(manifest: Manifest) -> str:
+    """Return a hash of all that decides what the files hold, but for a reject list."""
+    digest = hashlib.sha256(json.dumps(manifest.config.to_dict(), sort_keys=True).encode())
+    for header in manifest.headers():
+        digest.update(f"\n{header}".encode())
+    return digest.hexdigest()
+
+
+def _write_attributes(file: h5py.File, manifest: Manifest) -> None:
+    camera = manifest.config.camera
+    write_origin(file, manifest.config, manifest.versions)
+    file.attrs["signature"] = _signature(manifest)
+    file.attrs["K"] = intrinsics(camera)
+    file.attrs["near"], file.attrs["far"] = camera.near, camera.far
+
+
+def _write_objects(file: h5py.File, manifest: Manifest) -> None:
+    group = file.create_group("objects")
+    keys = {"class_name": "class"}
+    for field in OBJECT_FIELDS:
+        values = [entry[keys.get(field.name, field.name)] for entry in manifest.objects]
+        dtype = object if field.dtype == "str" else field.dtype
+        write_field(group, field, np.array(values, dtype=dtype))
+
+
+def _append_trials(file: h5py.File, part: Part, shard: Shard) -> None:
+    group = file.require_group("trials")
+    columns = {f.name: shard.trials[f.name][: part.rows] for f in trial_columns()}
+    columns["trial_id"] = np.arange(part.first, part.first + part.rows, dtype=np.int64)
+    columns["object"] = np.full(part.rows, part.object, dtype=np.int32)
+    for field in TRIAL_FIELDS:
+        values = columns[field.name]
+        if field.name not in group:
+            create_field(group, field, values.shape[1:])
+        dataset = group[field.name]
+        dataset.resize(part.first + part.rows, axis=0)
+        dataset[part.first :] = values
+
+
+def _successes(part: Part, shard: Shard, K: Array) -> Successes:
+    """Return what the filters must know of a shard's successes."""
+    taken = shard.looks["row"] < part.rows
+    rows = shard.looks["row"][taken]
+    trials = {name: values[rows] for name, values in shard.trials.items()}
+    looks = {name: values[taken] for name, values in shard.looks.items()}
+    X_TO = unpack_pose(trials["X_TO"])
+    grasps = [
+        transform_grasp(X, pack_grasp(p, n))
+        for X, p, n in zip(X_TO, trials["closed_p_OQ"], trials["closed_nhat_Q_O"], strict=True)
+    ]
+    length = 6 * trials["closed_touching"].shape[1]
+    in_view = [
+        all(_in_view(K, looks[f"mask_{c}"][i], looks[f"X_TC_{c}"][i], grasp) for c in CAMERAS)
+        for i, grasp in enumerate(grasps)
+    ]
+    return Successes(
+        trial_id=part.first + rows.astype(np.int64),
+        object=np.full(len(rows), part.object, dtype=np.int32),
+        grasp_T=np.array(grasps).reshape(-1, length),
+        seen=np.all([looks[f"mask_{c}"].any(axis=(1, 2)) for c in CAMERAS], axis=0),
+        in_view=np.array(in_view, dtype=bool),
+        # Both cameras stand at the same point.
+        camera_height=unpack_pose(looks["X_TC_otm"])[:, 2, 3],
+        depth_variance=looks["image_otm"][:, 3].astype(float).var(axis=(1, 2)),
+        surface_distance=trials["surface_distance"].max(axis=1, initial=0.0),
+        **{field.name: looks[field.name] for field in CERTIFICATE_FIELDS},
+    )
+
+
+def _in_view(K: Array, mask: AnyArray, X_TC: Array, grasp_T: Array) -> bool:
+    p_TQ, _ = unpack_grasp(grasp_T)
+    p_CQ = transform_points(invert_pose(unpack_pose(X_TC)), p_TQ)
+    uv = project(K, p_CQ)
+    return bool(np.all(p_CQ[:, 2] > 0.0) and np.all(uv >= 0.0) and np.all(uv <= len(mask) - 1))
+
+
+def _concatenate(found: Sequence[Successes]) -> Successes:
+    names = [f.name for f in dataclasses.fields(Successes)]
+    return Successes(**{n: np.concatenate([getattr(s, n) for s in found]) for n in names})
+
+
+def _write_removal(file: h5py.File, successes: Successes, removal: AnyArray) -> None:
+    """Keep beside the trials why each success is, or is not, a sample."""
+    group = file.create_group("successes")
+    for field in SUCCESS_FIELDS:
+        values = removal if field.name == "removal" else getattr(successes, field.name)
+        write_field(group, field, values)
+
+
+def _split_ids(
+    manifest: Manifest, successes: Successes, removal: AnyArray
+) -> dict[str, npt.NDArray[np.int64]]:
+    kept = np.flatnonzero(removal == Removal.KEPT)
+    split = split_samples(
+        successes.object[kept],
+        [entry["name"] for entry in manifest.objects],
+        [entry["class"] for entry in manifest.objects],
+        manifest.config.split,
+        manifest.config.seed,
+    )
+    return {name: successes.trial_id[kept[rows]] for name, rows in split.items()}

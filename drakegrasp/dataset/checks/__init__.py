@@ -1,0 +1,1 @@
+"""Every invariant of a dataset, and what breaks it."""

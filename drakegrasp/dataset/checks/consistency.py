@@ -1,0 +1,131 @@
+"""What must hold between the rows and the files of a dataset.
+
+In: open files of a dataset, and its manifest. Out: a `Violation` for all that does not fit
+together: splits, successes, objects, configurations. Only columns of numbers and names are
+read here, whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from drakegrasp.dataset.checks.findings import AnyArray, Violation, of_file
+from drakegrasp.dataset.checks.open_file import OpenFile, column
+from drakegrasp.dataset.filters import Removal
+from drakegrasp.dataset.manifest import Manifest
+from drakegrasp.dataset.paths import FILE_NAME
+from drakegrasp.dataset.schema import OBJECT_FIELDS, SPLITS
+
+
+def splits(data: OpenFile) -> Iterator[Violation]:
+    """A trial is one sample, and a tested object or a class left out is nowhere else."""
+    seen: dict[int, str] = {}
+    objects: dict[str, dict[str, str]] = {}
+    for split, group in data.groups.items():
+        for row, number in enumerate(group["trial_id"][:].tolist()):
+            if number in seen:
+                what = "trial_id must be unique in all splits"
+                got = f"{number}, which is in /{seen[number]} too"
+                yield Violation(file=data.name, group=f"/{split}", row=row, what=what, got=got)
+            seen.setdefault(number, split)
+        names, classes = (
+            group[f"object_props/{key}"].asstr()[:] for key in ("object_name", "class_name")
+        )
+        objects[split] = dict(zip(names.tolist(), classes.tolist(), strict=True))
+    tested = objects.pop("test", {})
+    allowed = data.config.split.train_classes if data.config else None
+    for split, members in objects.items():
+        for name, class_name in sorted(members.items()):
+            if name in tested:
+                what = "an object of /test must be in no other split"
+                yield of_file(data.name, what, f"{name} in both", f"/{split}")
+            if allowed is not None and class_name not in allowed:
+                what = "a class must be one of split.train_classes"
+                yield of_file(data.name, what, class_name, f"/{split}")
+    trained = {c for members in objects.values() for c in members.values()}
+    if len(data.groups) == len(SPLITS):
+        for class_name in sorted(trained):
+            count = sum(c == class_name for c in tested.values())
+            if count != 1:
+                what = f"class {class_name} must have one object in /test, as it has others outside"
+                yield of_file(data.name, what, str(count))
+
+
+def successes(trials: OpenFile, expected: AnyArray) -> Iterator[Violation]:
+    """Every success is in /successes, in order, with a legal reason of removal."""
+    group = trials.groups["successes"]
+    ids, removal = group["trial_id"][:], group["removal"][:]
+    if not np.array_equal(ids, expected):
+        odd = sorted(set(ids.tolist()) ^ set(expected.tolist()))
+        got = f"differences at trials {odd[:5]}" if odd else "another order"
+        yield of_file(trials.name, "trial_id must list the successes of /trials", got, "/successes")
+    for row in np.flatnonzero(~np.isin(removal, [r.value for r in Removal])).tolist():
+        yield Violation(
+            file=trials.name,
+            group="/successes",
+            row=row,
+            what=f"removal must be 0..{max(Removal)}",
+            got=str(removal[row]),
+        )
+    for name, largest in (("certified_share", 1.0), ("certified_friction", np.inf)):
+        values = group[name][:]
+        bad = ~np.isnan(values) & ~((values >= 0.0) & (values <= largest))
+        for row in np.flatnonzero(bad).tolist():
+            yield Violation(
+                file=trials.name,
+                group="/successes",
+                row=row,
+                what=f"{name} must be 0..{largest:g} or NaN",
+                got=f"{values[row]:g}",
+            )
+
+
+def kept_are_samples(data: OpenFile, trials: OpenFile) -> Iterator[Violation]:
+    """The samples are exactly the successes that no filter removed."""
+    if len(data.groups) < len(SPLITS) or "successes" not in trials.groups:
+        return
+    group = trials.groups["successes"]
+    kept = set(group["trial_id"][:][group["removal"][:] == Removal.KEPT].tolist())
+    ids = {i for split in data.groups.values() for i in split["trial_id"][:].tolist()}
+    for what, odd in (
+        (f"every success that /successes of {trials.name} keeps must be a sample", kept - ids),
+        (f"every sample must be a success that /successes of {trials.name} keeps", ids - kept),
+    ):
+        if odd:
+            yield of_file(data.name, what, f"{len(odd)} otherwise: trials {sorted(odd)[:5]}")
+
+
+def same_objects(trials: OpenFile, manifest: Manifest) -> Iterator[Violation]:
+    """/objects says the same as the manifest."""
+    if "objects" not in trials.groups:
+        return
+    if trials.count("objects") != len(manifest.objects):
+        what = f"number of objects must be that of {FILE_NAME}, {len(manifest.objects)}"
+        yield of_file(trials.name, what, str(trials.count("objects")), "/objects")
+        return
+    for f in OBJECT_FIELDS:
+        values = column(trials.groups["objects"][f.name], f)[:].tolist()
+        key = {"class_name": "class"}.get(f.name, f.name)
+        for row, (value, entry) in enumerate(zip(values, manifest.objects, strict=True)):
+            if value != entry[key]:
+                what = f"{f.name} must be that of {FILE_NAME}, {entry[key]!r}"
+                yield Violation(
+                    file=trials.name, group="/objects", row=row, what=what, got=repr(value)
+                )
+
+
+def same_configuration(files: Iterable[OpenFile], manifest: Manifest) -> Iterator[Violation]:
+    """All files are of the manifest's configuration."""
+    expected = manifest.config.simulation_hash()
+    for file in files:
+        if file.config is None:
+            continue
+        found = file.config.simulation_hash()
+        if found != expected:
+            what = f"configuration must be that of {FILE_NAME}, {expected}"
+            yield of_file(file.name, what, found)
+        elif file.config != manifest.config:
+            what = f"filters, split and limits must be those of {FILE_NAME}"
+            yield of_file(file.name, what, "others; run `drakegrasp assemble` again")

@@ -1,0 +1,124 @@
+"""An HDF5 file of a dataset while it is checked.
+
+In: a file, whatever is in it. Out: batches of its rows, of the groups whose layout is sound.
+A row that broke a rule, or that cannot be read, is remembered, so that no other rule is
+asked about it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import h5py
+import numpy as np
+
+from drakegrasp.config import Config
+from drakegrasp.dataset.checks import layout as layout_rules
+from drakegrasp.dataset.checks.findings import AnyArray, Batch, Findings, Violation, of_file
+from drakegrasp.dataset.schema import (
+    DATA_FIELDS,
+    OBJECT_FIELDS,
+    SPLITS,
+    SUCCESS_FIELDS,
+    TRIAL_FIELDS,
+    Field,
+)
+
+Rule = Callable[[Batch], Iterator[Violation]]
+
+
+@dataclass(eq=False)
+class OpenFile:
+    """An open file.
+
+    Attributes:
+        name: Of the file, for the violations.
+        file: The file.
+        config: That it holds, if it is sound.
+        fields: Of each group, by its name.
+        groups: By name, without those whose layout is broken.
+        bad_rows: Of each group, those that broke a rule or cannot be read.
+    """
+
+    name: str
+    file: h5py.File
+    config: Config | None
+    fields: Mapping[str, tuple[Field, ...]]
+    groups: dict[str, h5py.Group] = field(default_factory=dict)
+    bad_rows: dict[str, set[int]] = field(default_factory=dict)
+
+    def count(self, group: str) -> int:
+        """Return the number of rows of a group."""
+        return len(self.groups[group][self.fields[group][0].name]) if group in self.groups else 0
+
+    def bad(self, group: str) -> list[int]:
+        """Return the rows of a group that broke a rule or cannot be read."""
+        return sorted(self.bad_rows.get(group, ()))
+
+    def read(self, group: str, rows: AnyArray, names: Sequence[str] | None = None) -> Batch:
+        """Return some rows, in rising order, of a group; of all fields unless some are named."""
+        fields = [f for f in self.fields[group] if names is None or f.name in names]
+        # A slice is read far faster than the same rows as a list.
+        dense = len(rows) > 0 and rows[-1] - rows[0] + 1 == len(rows)
+        choice = slice(int(rows[0]), int(rows[-1]) + 1) if dense else rows
+        columns = {f.name: column(self.groups[group][f.name], f)[choice] for f in fields}
+        return Batch(file=self.name, group=f"/{group}", rows=rows, columns=columns)
+
+    def batches(self, group: str, size: int, findings: Findings) -> Iterator[Batch]:
+        """Yield all rows of a group; rows that cannot be read are a finding."""
+        for start in range(0, self.count(group), size):
+            rows = np.arange(start, min(start + size, self.count(group)))
+            try:
+                yield self.read(group, rows)
+            except (OSError, UnicodeDecodeError) as error:
+                what = f"rows {start} to {rows[-1]} must be readable"
+                findings.add([of_file(self.name, what, first_line(error), f"/{group}")])
+                self.bad_rows.setdefault(group, set()).update(rows.tolist())
+
+    def judge(self, batch: Batch, findings: Findings, *rules: Rule) -> Batch:
+        """Apply rules that do not build on each other; return the rows that hold."""
+        if not len(batch):
+            return batch
+        rows: set[int] = set()
+        for rule in rules:
+            rows |= findings.add(rule(batch))
+        self.bad_rows.setdefault(batch.group[1:], set()).update(rows)
+        return batch.without(rows)
+
+
+def open_file(name: str, file: h5py.File, camera: str, findings: Findings) -> OpenFile:
+    """Return a file, once it is checked what it says of itself and how it is laid out.
+
+    Args:
+        name: Of the file, for the violations.
+        file: The file.
+        camera: `oto` or `otm`; empty for the trials.
+        findings: Where violations go.
+    """
+    config, broken = layout_rules.read_config(name, file)
+    findings.add([*broken, *layout_rules.attributes(name, file, config, camera)])
+    fields = (
+        {split: DATA_FIELDS for split in SPLITS}
+        if camera
+        else {"objects": OBJECT_FIELDS, "trials": TRIAL_FIELDS, "successes": SUCCESS_FIELDS}
+    )
+    opened = OpenFile(name, file, config, fields)
+    broken_groups = set()
+    for violation in layout_rules.structure(name, file, fields, config):
+        findings.add([violation])
+        if not violation.what.startswith("attribute"):
+            broken_groups.add(violation.group[1:].split("/")[0])
+    opened.groups = {g: file[g] for g in fields if g in file and g not in broken_groups}
+    return opened
+
+
+def column(dataset: h5py.Dataset, field: Field) -> Any:
+    """Return a dataset as it is indexed for values: text for a field of text."""
+    return dataset.asstr() if field.dtype == "str" else dataset
+
+
+def first_line(error: Exception) -> str:
+    """Return what an exception says, in a line."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -1,0 +1,232 @@
+"""What must hold in the numbers of a sample: its grasp, frames and mass properties.
+
+In: a `Batch` of samples of one data file, and what it is compared with: the object's model,
+its trials, the other data file. Out: a `Violation` for every row and figure that is wrong.
+A rule may rely on those that `check` applies before it, because it is given no row that
+broke one of them. No file is read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from drakegrasp.config import CameraConfig
+from drakegrasp.dataset.checks.findings import (
+    POSITION_TOLERANCE,
+    UNIT_TOLERANCE,
+    AnyArray,
+    Batch,
+    Violation,
+    all_per_row,
+    rotation,
+    unit_length,
+)
+from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS
+from drakegrasp.frames import P_WT, X_WT, Array, invert_pose, unpack_pose
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.vision.camera import LOOKS_VERTICALLY, camera_pose_otm, camera_pose_oto
+
+#: Mass properties are float32 copies of the object's own.
+RELATIVE_TOLERANCE = 1e-5
+FRAMES = tuple(f.name for f in DATA_FIELDS if f.name.startswith("object_props/frame_"))
+
+
+# Values, one by one
+
+
+def finite(batch: Batch) -> Iterator[Violation]:
+    """No number of a sample is NaN or infinite."""
+    for f in DATA_FIELDS:
+        if f.dtype.startswith("float"):
+            bad = ~all_per_row(np.isfinite(batch[f.name]))
+            yield from batch.broken(
+                f"{f.name} must be finite", bad, lambda i: "NaN or an infinite value"
+            )
+
+
+def normals(batch: Batch) -> Iterator[Violation]:
+    """Normals have length one."""
+    lengths = np.linalg.norm(batch.contacts()[1], axis=2)
+    yield from unit_length(batch, lengths, "normal of finger")
+
+
+def frames(batch: Batch) -> Iterator[Violation]:
+    """Every frame's rotation is orthonormal with determinant +1."""
+    for name in FRAMES:
+        yield from rotation(batch, name)
+
+
+def work_frame(batch: Batch) -> Iterator[Violation]:
+    """The table-top frame is where it always is."""
+    off = np.abs(batch.frame("world2work") - X_WT).max(axis=(1, 2))
+    yield from batch.broken(
+        f"frame_world2work must be the identity at {P_WT.tolist()} m",
+        off > POSITION_TOLERANCE,
+        lambda i: f"a pose that is off by {off[i]:.4g}",
+    )
+
+
+def mass_properties(batch: Batch) -> Iterator[Violation]:
+    """Masses are positive; inertias are symmetric and those of a real body."""
+    mass = batch["object_props/work2mass"][:, 0].astype(float)
+    yield from batch.broken("work2mass must be positive [kg]", mass <= 0.0, mass)
+    inertia = batch["object_props/work2inertia"].astype(float).reshape(-1, 3, 3)
+    skew = np.abs(inertia - np.swapaxes(inertia, 1, 2)).max(axis=(1, 2))
+    scale = np.trace(inertia, axis1=1, axis2=2)
+    moments = np.linalg.eigvalsh(inertia)
+    slack = moments[:, 0] + moments[:, 1] - moments[:, 2]
+    bad = (skew > RELATIVE_TOLERANCE * scale) | (slack < -RELATIVE_TOLERANCE * scale)
+    yield from batch.broken(
+        "work2inertia must be symmetric with moments of a real body [kg m^2]",
+        bad | (moments[:, 0] <= 0.0),
+        lambda i: f"moments {np.array2string(moments[i], precision=4)}, skew by {skew[i]:.3g}",
+    )
+
+
+# How the frames of a sample belong together
+
+
+def inverse_frames(batch: Batch) -> Iterator[Violation]:
+    """work2cam and cam2work are each other's inverse."""
+    for camera in CAMERAS:
+        product = batch.frame(f"work2cam_{camera}") @ batch.frame(f"cam2work_{camera}")
+        off = np.abs(product - np.eye(4)).max(axis=(1, 2))
+        yield from batch.broken(
+            f"frame_work2cam_{camera} times frame_cam2work_{camera} must be the identity",
+            off > POSITION_TOLERANCE,
+            lambda i, off=off: f"a product that is off by {off[i]:.4g}",  # type: ignore[misc]
+        )
+
+
+def camera_pair(batch: Batch) -> Iterator[Violation]:
+    """Both cameras stand at one point and look the same way; otm has world up at the top."""
+    oto, otm = (batch.frame(f"work2cam_{camera}") for camera in CAMERAS)
+    off = np.abs(oto[:, :3, 2:] - otm[:, :3, 2:]).max(axis=(1, 2))
+    yield from batch.broken(
+        "both cameras must have the same place and view",
+        off > POSITION_TOLERANCE,
+        lambda i: f"poses that are off by {off[i]:.4g}",
+    )
+    tilt = np.abs(otm[:, 2, 0])
+    yield from batch.broken(
+        "the otm camera must have world up at the top of its image",
+        (tilt > LOOKS_VERTICALLY + UNIT_TOLERANCE) | (otm[:, 2, 1] > LOOKS_VERTICALLY),
+        lambda i: f"+Cx and +Cy that rise by {otm[i, 2, 0]:.4g} and {otm[i, 2, 1]:.4g}",
+    )
+
+
+# The samples of one object, against its mesh
+
+
+def contacts_on_mesh(
+    batch: Batch, camera: str, model: ObjectModel, max_distance: float
+) -> Iterator[Violation]:
+    """Contacts are on the mesh, and their normals point out of it.
+
+    A normal counts as outward if it agrees with the face that is nearest to the contact, or
+    to a point that far ahead of it: in a thin wall, the wrong side may be the nearest.
+    """
+    X_OC = invert_pose(batch.object_in_camera(camera))
+    p_CQ, n_C = batch.contacts()
+    p_OQ, n_O = _move(X_OC, p_CQ), _rotate(X_OC, n_C)
+    nearest, face_normals = model.visual.nearest, model.visual.face_normals
+    shape = p_OQ.shape[:2]
+    _, distance, face = nearest.on_surface(p_OQ.reshape(-1, 3))
+    _, _, ahead = nearest.on_surface((p_OQ + max_distance * n_O).reshape(-1, 3))
+    off = distance.reshape(shape)
+    flat = n_O.reshape(-1, 3)
+    cosine = np.maximum((flat * face_normals[face]).sum(1), (flat * face_normals[ahead]).sum(1))
+    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).reshape(shape)
+    limit = max_distance + POSITION_TOLERANCE
+    for k in range(shape[1]):
+        yield from batch.broken(
+            f"contact of finger {k + 1} must be on the object's mesh within {max_distance:g} m",
+            off[:, k] > limit,
+            off[:, k],
+        )
+        yield from batch.broken(
+            f"normal of finger {k + 1} must point out of the object, within 90 deg of its face's",
+            (angle[:, k] > 90.0) & (off[:, k] <= limit),
+            lambda i, k=k: f"{angle[i, k]:.4g} deg",  # type: ignore[misc]
+        )
+
+
+def object_values(batch: Batch, model: ObjectModel) -> Iterator[Violation]:
+    """Class and mass properties are those of the object at rest."""
+    X_TO = invert_pose(X_WT) @ batch.frame("world2obj")
+    R_TO = X_TO[:, :3, :3]
+    com = R_TO @ model.p_OOcm + X_TO[:, :3, 3]
+    inertia = (R_TO @ model.I_OOcm_O @ np.swapaxes(R_TO, 1, 2)).reshape(-1, 9)
+    for name, unit, values, tolerance in (
+        ("work2com", "m", com, POSITION_TOLERANCE),
+        ("work2inertia", "kg m^2", inertia, RELATIVE_TOLERANCE * np.trace(model.I_OOcm_O)),
+        ("work2mass", "kg", np.full((len(batch), 1), model.mass), RELATIVE_TOLERANCE * model.mass),
+    ):
+        off = np.abs(batch[f"object_props/{name}"] - values).max(axis=1)
+        yield from batch.broken(
+            f"{name} must be the resting object's within {tolerance:.1g} {unit}",
+            off > tolerance,
+            lambda i, off=off: f"a difference of {off[i]:.4g}",  # type: ignore[misc]
+        )
+    found = batch["object_props/class_name"]
+    yield from batch.broken(
+        f"class_name of {model.name} must be {model.class_name!r}",
+        found != model.class_name,
+        lambda i: repr(found[i]),
+    )
+
+
+# A sample against its trial, and against its row in the other data file
+
+
+def same_as_trial(
+    batch: Batch, trials: Mapping[str, AnyArray], camera: str, config: CameraConfig
+) -> Iterator[Violation]:
+    """Pose, cameras and contacts of a sample are those of its trial, given row by row."""
+    X_TO, X_OG = unpack_pose(trials["X_TO"]), unpack_pose(trials["X_OG"])
+    poses = {"frame_world2obj": X_WT @ X_TO}
+    for name, pose in zip(CAMERAS, (camera_pose_oto, camera_pose_otm), strict=True):
+        poses[f"frame_work2cam_{name}"] = np.array([pose(X, config) for X in X_TO @ X_OG]).reshape(
+            -1, 4, 4
+        )
+    for name, expected in poses.items():
+        off = np.abs(batch.pose(f"object_props/{name}") - expected).max(axis=(1, 2))
+        yield from batch.broken(
+            f"{name} must follow from its trial within {POSITION_TOLERANCE:g} m",
+            off > POSITION_TOLERANCE,
+            lambda i, off=off: f"a pose that is off by {off[i]:.4g}",  # type: ignore[misc]
+        )
+    X_CO = batch.frame(f"cam2work_{camera}") @ X_TO
+    p_CQ, n_C = _move(X_CO, trials["closed_p_OQ"]), _rotate(X_CO, trials["closed_nhat_Q_O"])
+    points, normals = batch.contacts()
+    off = np.maximum(np.abs(points - p_CQ).max(axis=(1, 2)), np.abs(normals - n_C).max(axis=(1, 2)))
+    yield from batch.broken(
+        f"grasp must be its trial's contacts within {POSITION_TOLERANCE:g} m",
+        ~(off <= POSITION_TOLERANCE),
+        lambda i: f"a difference of {off[i]:.4g}",
+    )
+
+
+def same_properties(batch: Batch, other: Batch) -> Iterator[Violation]:
+    """Both data files hold the same trial and the same properties in a row."""
+    same_trial = batch["trial_id"] == other["trial_id"]
+    yield from other.broken(
+        f"trial_id must be that of {batch.file}", ~same_trial, other["trial_id"]
+    )
+    for name in (f.name for f in DATA_FIELDS if f.name.startswith("object_props/")):
+        differs = same_trial & ~all_per_row(batch[name] == other[name])
+        yield from batch.broken(
+            f"{name} must be equal to that of {other.file}", differs, lambda i: "another value"
+        )
+
+
+def _move(X_AB: Array, p_BQ: Array) -> Array:
+    """Return points (n, k, 3), moved by the pose (n, 4, 4) of their row."""
+    return _rotate(X_AB, p_BQ) + X_AB[:, None, :3, 3]
+
+
+def _rotate(X_AB: Array, v_B: Array) -> Array:
+    """Return vectors (n, k, 3), rotated by the pose (n, 4, 4) of their row."""
+    return np.asarray(np.einsum("nij,nkj->nki", X_AB[:, :3, :3], v_B))

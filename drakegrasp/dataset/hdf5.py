@@ -1,0 +1,45 @@
+"""How a field of the schema is written into an HDF5 file."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.dataset.schema import Field
+
+AnyArray = npt.NDArray[Any]
+#: Rows in a chunk of a column of small values.
+COLUMN_CHUNK = 2048
+
+
+def create_field(group: h5py.Group, field: Field, shape: tuple[int, ...]) -> h5py.Dataset:
+    """Create an empty, growing dataset of a field whose rows have a shape.
+
+    Unit, frame and meaning become attributes. Images get a chunk per sample, because
+    loaders read them one by one in random order.
+    """
+    text = field.dtype == "str"
+    dataset = group.create_dataset(
+        field.name,
+        shape=(0, *shape),
+        maxshape=(None, *shape),
+        dtype=h5py.string_dtype() if text else np.dtype(field.dtype),
+        chunks=(1 if field.sample else COLUMN_CHUNK, *shape),
+        compression="gzip",
+        compression_opts=1,
+        shuffle=not text,
+    )
+    dataset.attrs.update({"unit": field.unit, "frame": field.frame, "meaning": field.meaning})
+    return dataset
+
+
+def write_field(group: h5py.Group, field: Field, values: AnyArray) -> h5py.Dataset:
+    """Write all rows of one field, see `create_field`."""
+    dataset = create_field(group, field, values.shape[1:])
+    dataset.resize(len(values), axis=0)
+    if len(values):
+        dataset[...] = values
+    return dataset

@@ -1,0 +1,54 @@
+"""Where a dataset's files are, and which belong to one."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import h5py
+
+from drakegrasp.dataset import lock as build_lock
+from drakegrasp.dataset import log as build_log
+from drakegrasp.dataset.schema import CAMERAS
+from drakegrasp.errors import DataError
+from drakegrasp.runtime.files import refuse_broken_seal
+
+TRIALS_FILE = "trials.hdf5"
+DATA_FILES = {camera: f"grasping_{camera}.hdf5" for camera in CAMERAS}
+FILE_NAME = "manifest.json"
+#: Where the built-in objects' meshes are put when they are asked for.
+BUILTIN_FOLDER = "builtin"
+#: Folders that a build makes; alone they do not make a directory somebody else's.
+OWN_FOLDERS = (BUILTIN_FOLDER, "objects", "shards")
+#: Files that a build writes besides the manifest; likewise.
+OWN_FILES = (build_lock.FILE_NAME, build_log.FILE_NAME)
+
+
+def model_path(out: Path, name: str) -> Path:
+    """Return where a dataset keeps an object's meshes and mass properties."""
+    return out / "objects" / f"{name}.npz"
+
+
+def plan_path(out: Path, name: str) -> Path:
+    """Return where a dataset keeps an object's resting pose and palm poses."""
+    return out / "objects" / f"{name}.plan.h5"
+
+
+def model_file_sha256(out: Path, name: str) -> str:
+    """Return the hash of the file that keeps an object's meshes, hexadecimal."""
+    return hashlib.sha256(model_path(out, name).read_bytes()).hexdigest()
+
+
+def refuse_changed_object(out: Path, name: str) -> None:
+    """Refuse an object of which either file is missing or not as it was written.
+
+    Raises:
+        DataError: If so. The plan is sealed, and vouches for the other file.
+    """
+    path, model = plan_path(out, name), model_path(out, name)
+    refuse_broken_seal(path, "plan of an object")
+    with h5py.File(path, "r") as file:
+        expected = str(file.attrs["model_sha256"])
+    if not model.is_file() or model_file_sha256(out, name) != expected:
+        got = "other content" if model.is_file() else "none"
+        raise DataError(f"{model}: must be the file that was written with its plan, got {got}")

@@ -1,0 +1,118 @@
+"""Objects at rest with their palm poses, and where they are kept.
+
+In: an object as `build.prepare` makes it. Out: `objects/<name>.npz` with the object and
+`objects/<name>.plan.h5` with its resting pose and its palm poses, in the dataset's directory. Work
+units, `check` and `replay` start from these two files and need the mesh file no more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from drakegrasp.config import Config
+from drakegrasp.dataset.paths import model_file_sha256, model_path, plan_path, refuse_changed_object
+from drakegrasp.errors import DataError
+from drakegrasp.frames import Array
+from drakegrasp.objects.model import ObjectModel, load_object, save_object
+from drakegrasp.runtime.files import atomic_hdf5
+from drakegrasp.simulation.candidates import Candidates
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PreparedObject:
+    """An object that rests on the table, with the palm poses to try.
+
+    Attributes:
+        model: Meshes and mass properties.
+        X_TO: Resting pose (4, 4).
+        candidates: Palm poses and their rays.
+        table_force: Upward force of the table at rest [N].
+        stopped: Whether it would have rolled on and was stopped, see `settle.settle`.
+    """
+
+    model: ObjectModel
+    X_TO: Array
+    candidates: Candidates
+    table_force: float
+    stopped: bool
+
+    def summary(self) -> dict[str, Any]:
+        """Return what the manifest says of the object, as JSON types."""
+        return {
+            "name": self.model.name,
+            "class": self.model.class_name,
+            "mesh_sha256": self.model.mesh_sha256,
+            "mass": self.model.mass,
+            "X_TO": self.X_TO[:3].ravel().tolist(),
+            "rolled": self.stopped,
+            "candidates": len(self.candidates),
+            "combinations": self.candidates.combinations,
+            "valid": self.candidates.valid,
+            "distinct": self.candidates.distinct,
+            "notes": list(self.model.notes),
+        }
+
+
+def save_prepared(prepared: PreparedObject, out: Path, config: Config) -> None:
+    """Write both files of an object; the plan comes last, so it vouches for the other."""
+    folder = out / "objects"
+    folder.mkdir(parents=True, exist_ok=True)
+    model, candidates = prepared.model, prepared.candidates
+    save_object(model, model_path(out, model.name))
+    with atomic_hdf5(plan_path(out, model.name), sealed=True) as file:
+        file.attrs["model_sha256"] = model_file_sha256(out, model.name)
+        file.attrs["config_hash"] = config.simulation_hash()
+        file.attrs["mesh_sha256"] = model.mesh_sha256
+        file.attrs["table_force"] = prepared.table_force
+        file.attrs["stopped"] = prepared.stopped
+        for name in ("combinations", "valid", "distinct"):
+            file.attrs[name] = getattr(candidates, name)
+        for name, values in (
+            ("X_TO", prepared.X_TO),
+            ("X_OG", candidates.X_OG),
+            ("distance", candidates.distance),
+        ):
+            file.create_dataset(name, data=values, dtype=np.float64)
+
+
+def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
+    """Return an object as `save_prepared` wrote it.
+
+    Raises:
+        DataError: If its files are missing, damaged or of another configuration.
+        MeshError: If the object's file is damaged.
+    """
+    path = plan_path(out, name)
+    refuse_changed_object(out, name)
+    try:
+        with h5py.File(path, "r") as file:
+            attributes = dict(file.attrs)
+            arrays = {key: file[key][:] for key in ("X_TO", "X_OG", "distance")}
+    except (OSError, KeyError) as error:
+        raise DataError(f"{path}: must be the plan of an object, got none ({error})") from None
+    if attributes["config_hash"] != config.simulation_hash():
+        raise DataError(
+            f"{path}: must be of configuration {config.simulation_hash()}, "
+            f"got {attributes['config_hash']}"
+        )
+    model = load_object(model_path(out, name))
+    if model.mesh_sha256 != attributes["mesh_sha256"]:
+        raise DataError(f"{path}: must be of the same mesh as {name}.npz, got another")
+    return PreparedObject(
+        model=model,
+        X_TO=arrays["X_TO"],
+        candidates=Candidates(
+            X_OG=arrays["X_OG"],
+            distance=arrays["distance"],
+            combinations=int(attributes["combinations"]),
+            valid=int(attributes["valid"]),
+            distinct=int(attributes["distinct"]),
+        ),
+        table_force=float(attributes["table_force"]),
+        stopped=bool(attributes["stopped"]),
+    )

@@ -1,0 +1,133 @@
+"""Reading a dataset: h5py and NumPy only, no Drake, no trimesh, no Dask.
+
+>>> data = GraspDataset("OUT/grasping_oto.hdf5", split="train")   # doctest: +SKIP
+>>> data[0].image.shape, data[0].grasp.shape                      # doctest: +SKIP
+((4, 128, 128), (18,))
+"""
+
+from __future__ import annotations
+
+import operator
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.dataset.schema import DATA_FIELDS, SCHEMA_VERSION, SPLITS
+from drakegrasp.errors import DataError
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sample:
+    """One grasp with what its camera saw.
+
+    Attributes:
+        image: (4, S, S) float32: R, G, B in 0..1 and depth [m].
+        mask: (S, S) uint8, 1 where the object is.
+        grasp: (6k,) float32, contact points [m] and outward unit normals, in the camera frame.
+        trial_id: Row of trials.hdf5.
+        props: The fields of `object_props` by name: names, mass properties, frames.
+    """
+
+    image: npt.NDArray[np.float32]
+    mask: npt.NDArray[np.uint8]
+    grasp: npt.NDArray[np.float32]
+    trial_id: int
+    props: dict[str, Any]
+
+
+class GraspDataset:
+    """One split of a data file as a sequence of samples.
+
+    It works under torch's DataLoader with any number of workers: the file is opened when a
+    process first reads from it, never before a fork, and is left out when pickled.
+
+    Args:
+        path: `grasping_oto.hdf5` or `grasping_otm.hdf5`.
+        split: `train`, `valid` or `test`.
+
+    Attributes:
+        camera: Whose images and frame the file has, `oto` or `otm`.
+        K: (3, 3), camera matrix [px].
+
+    Raises:
+        DataError: If the file is missing, of another kind or schema, or the split unknown.
+    """
+
+    def __init__(self, path: str | Path, *, split: str = "train") -> None:
+        if split not in SPLITS:
+            raise DataError(f"split must be one of {', '.join(SPLITS)}, got {split!r}")
+        self.path, self.split = Path(path), split
+        self._file: h5py.File | None = None
+        self._process = -1
+        try:
+            with h5py.File(self.path, "r") as file:
+                version = int(file.attrs["schema_version"])
+                self._length = len(file[split]["grasps"])
+                self.K = np.array(file.attrs["K"])
+                self.camera = str(file.attrs["camera"])
+        except (OSError, KeyError) as error:
+            raise DataError(
+                f"{self.path}: must be a data file of drakegrasp, got none ({error})"
+            ) from None
+        if version != SCHEMA_VERSION:
+            raise DataError(f"{self.path}: schema must be {SCHEMA_VERSION}, got {version}")
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __getitem__(self, index: int) -> Sample:
+        index = operator.index(index)
+        if not -self._length <= index < self._length:
+            raise IndexError(f"index must be below {self._length}, got {index}")
+        group = self._open()[self.split]
+        row = index % self._length
+        values = {f.name: _value(group[f.name], row, f.dtype) for f in DATA_FIELDS}
+        prefix = "object_props/"
+        return Sample(
+            image=values["images"],
+            mask=values["masks"],
+            grasp=values["grasps"],
+            trial_id=int(values["trial_id"]),
+            props={k.removeprefix(prefix): v for k, v in values.items() if k.startswith(prefix)},
+        )
+
+    def __iter__(self) -> Iterator[Sample]:
+        return (self[i] for i in range(len(self)))
+
+    def column(self, name: str) -> npt.NDArray[Any]:
+        """Return all rows of a field at once, e.g. `grasps` or `object_props/work2com`.
+
+        Raises:
+            DataError: If there is no such field.
+        """
+        names = {f.name: f for f in DATA_FIELDS}
+        if name not in names:
+            raise DataError(f"field must be one of {', '.join(names)}, got {name!r}")
+        dataset = self._open()[self.split][name]
+        if names[name].dtype == "str":
+            return np.asarray(dataset.asstr()[:])
+        return np.asarray(dataset[:])
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_file": None, "_process": -1}
+
+    def __repr__(self) -> str:
+        return f"GraspDataset({str(self.path)!r}, split={self.split!r}): {len(self)} grasps"
+
+    def _open(self) -> h5py.File:
+        # An open HDF5 file must not cross a fork: each process opens its own.
+        if self._file is None or self._process != os.getpid():
+            self._file = h5py.File(self.path, "r")
+            self._process = os.getpid()
+        return self._file
+
+
+def _value(dataset: h5py.Dataset, row: int, dtype: str) -> Any:
+    value = dataset[row]
+    return value.decode() if dtype == "str" else value

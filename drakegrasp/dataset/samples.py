@@ -1,0 +1,147 @@
+"""Writing samples: from the looks of a shard to their places in both data files.
+
+In: a part of the dataset and, by split, the ids of the trials that are samples. Out: rows
+of `grasping_oto.hdf5` and `grasping_otm.hdf5`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.arithmetic import multiply
+from drakegrasp.dataset.hdf5 import create_field
+from drakegrasp.dataset.manifest import Manifest
+from drakegrasp.dataset.paths import model_path
+from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS, SPLITS, sizes
+from drakegrasp.dataset.shards import Shard, ShardHeader, read_shard, trial_columns
+from drakegrasp.frames import X_WT, invert_pose, pack_pose, transform_points, unpack_pose
+from drakegrasp.grasp import pack_grasp, transform_grasp
+from drakegrasp.objects.model import ObjectModel, load_object
+from drakegrasp.outcomes import Outcome
+
+
+def create_splits(
+    file: h5py.File,
+    ids: Mapping[str, npt.NDArray[np.int64]],
+    shapes: Mapping[str, tuple[int, ...]],
+) -> None:
+    """Make the splits of a data file with room for their samples.
+
+    Args:
+        file: The data file.
+        ids: Ids of the trials that are samples, by split.
+        shapes: Of a row's columns, see `Part`.
+    """
+    letters = sizes(
+        fingers=shapes["closed_touching"][0],
+        joints=shapes["closed_q"][0],
+        image=shapes["image"][0],
+    )
+    for split, rows in ids.items():
+        group = file.create_group(split)
+        for field in DATA_FIELDS:
+            dataset = create_field(group, field, field.row_shape(letters))
+            dataset.resize(len(rows), axis=0)
+
+
+def write_samples(
+    files: Mapping[str, h5py.File],
+    out: Path,
+    part: Part,
+    ids: Mapping[str, npt.NDArray[np.int64]],
+) -> None:
+    """Write the samples that come from one shard into their places in both files."""
+    bounds = {s: np.searchsorted(ids[s], [part.first, part.first + part.rows]) for s in SPLITS}
+    if all(start == stop for start, stop in bounds.values()):
+        return
+    shard = read_shard(part.header.path(out), part.header)
+    model = load_object(model_path(out, part.header.object_name))
+    look_of = {int(row): k for k, row in enumerate(shard.looks["row"])}
+    for split, (start, stop) in bounds.items():
+        for place in range(start, stop):
+            trial_id = int(ids[split][place])
+            row = trial_id - part.first
+            for camera, file in files.items():
+                sample = _sample(model, shard, row, look_of[row], camera)
+                sample["trial_id"] = trial_id
+                for field in DATA_FIELDS:
+                    file[split][field.name][place] = sample[field.name]
+
+
+def _sample(model: ObjectModel, shard: Shard, row: int, k: int, camera: str) -> dict[str, Any]:
+    """Return a sample by the names of DATA_FIELDS, without its trial's id."""
+    trials, looks = shard.trials, shard.looks
+    X_TO = unpack_pose(trials["X_TO"][row])
+    X_TC = {c: unpack_pose(looks[f"X_TC_{c}"][k]) for c in CAMERAS}
+    grasp_O = pack_grasp(trials["closed_p_OQ"][row], trials["closed_nhat_Q_O"][row])
+    R_TO = X_TO[:3, :3]
+    properties = {
+        "object_name": model.name,
+        "class_name": model.class_name,
+        "work2com": transform_points(X_TO, model.p_OOcm[None])[0],
+        "work2inertia": multiply(multiply(R_TO, model.I_OOcm_O), R_TO.T).ravel(),
+        "work2mass": [model.mass],
+        "frame_cam2img_otm": looks["X_CI_otm"][k],
+        "frame_cam2work_otm": pack_pose(invert_pose(X_TC["otm"])),
+        "frame_cam2work_oto": pack_pose(invert_pose(X_TC["oto"])),
+        "frame_work2cam_otm": pack_pose(X_TC["otm"]),
+        "frame_work2cam_oto": pack_pose(X_TC["oto"]),
+        "frame_world2obj": pack_pose(multiply(X_WT, X_TO)),
+        "frame_world2work": pack_pose(X_WT),
+    }
+    return {
+        "images": looks[f"image_{camera}"][k],
+        "masks": looks[f"mask_{camera}"][k],
+        "grasps": transform_grasp(multiply(invert_pose(X_TC[camera]), X_TO), grasp_O),
+        **{f"object_props/{name}": value for name, value in properties.items()},
+    }
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Part:
+    """A shard's place in the dataset: its first row, how many rows are taken, their shapes."""
+
+    header: ShardHeader
+    object: int
+    first: int
+    rows: int
+    shapes: Mapping[str, tuple[int, ...]]
+
+
+def walk_parts(out: Path, manifest: Manifest) -> Iterator[tuple[Part, Shard]]:
+    """Yield the shards in the order of their rows, each object's up to its last wanted grasp."""
+    index = {entry["name"]: i for i, entry in enumerate(manifest.objects)}
+    wanted: dict[str, int | None] = dict.fromkeys(index, manifest.config.max_grasps)
+    first = 0
+    for header in manifest.headers():
+        name = header.object_name
+        if wanted[name] == 0:
+            continue
+        shard = read_shard(header.path(out), header)
+        rows, wanted[name] = rows_within(shard, wanted[name])
+        shapes = {f.name: shard.trials[f.name].shape[1:] for f in trial_columns()}
+        shapes["image"] = shard.looks["mask_oto"].shape[1:]
+        yield (
+            Part(header=header, object=index[name], first=first, rows=rows, shapes=shapes),
+            shard,
+        )
+        first += rows
+
+
+def rows_within(shard: Shard, wanted: int | None) -> tuple[int, int | None]:
+    """Return how many rows of a shard an object needs, and how many grasps it then wants.
+
+    The rows end with the last wanted grasp, so what is in a dataset does not depend on how
+    far work had gone when enough was found.
+    """
+    hits = np.flatnonzero(shard.trials["outcome"] == Outcome.SUCCESS)
+    if wanted is None or len(hits) < wanted:
+        return len(shard.trials["outcome"]), None if wanted is None else wanted - len(hits)
+    return int(hits[wanted - 1]) + 1, 0

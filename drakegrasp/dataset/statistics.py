@@ -1,0 +1,159 @@
+"""Counting what a dataset holds: the funnel by object and the paper's Table III.
+
+While a build runs, or after one that was stopped, the funnel is counted from the shards.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.dataset.assemble import is_assembled
+from drakegrasp.dataset.filters import Removal
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.paths import DATA_FILES, FILE_NAME, TRIALS_FILE
+from drakegrasp.dataset.schema import SPLITS
+from drakegrasp.dataset.shards import read_outcomes
+from drakegrasp.errors import DataError
+from drakegrasp.outcomes import Outcome
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Funnel:
+    """What became of the candidates, by object.
+
+    Attributes:
+        names, classes: (m,), of the objects.
+        candidates: (m,) palm poses that were tried, drawn from `distinct` different ones of
+            `valid` combinations.
+        distinct, valid: (m,).
+        outcomes: (m, number of outcomes), attempts by object and outcome.
+        removals: (m, number of removals), successes by object and reason of removal.
+    """
+
+    names: tuple[str, ...]
+    classes: tuple[str, ...]
+    candidates: npt.NDArray[np.int64]
+    distinct: npt.NDArray[np.int64]
+    valid: npt.NDArray[np.int64]
+    outcomes: npt.NDArray[np.int64]
+    removals: npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplitCount:
+    """A row of the paper's Table III."""
+
+    split: str
+    samples: int
+    objects: int
+    classes: int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Unfinished:
+    """What a build that runs, or was stopped, has done.
+
+    Attributes:
+        funnel: Of the work units that are done; no success is a sample yet.
+        done, total: Number of work units; `max_grasps` may leave some out.
+    """
+
+    funnel: Funnel
+    done: int
+    total: int
+
+
+def count_unfinished(out: Path) -> Unfinished | None:
+    """Return what a build has done so far, or None if its files are complete.
+
+    Shards are counted as they are, without a look at their seals; what is being written is
+    not there yet.
+
+    Raises:
+        DataError: If the directory holds no dataset.
+    """
+    if not (out / FILE_NAME).exists() or is_assembled(out):
+        return None
+    manifest = read_manifest(out)
+    names = [entry["name"] for entry in manifest.objects]
+    rows = {name: i for i, name in enumerate(names)}
+    outcomes, done = np.zeros((len(names), 1 + max(Outcome)), dtype=np.int64), 0
+    for header in manifest.headers():
+        try:
+            found = read_outcomes(header.path(out), header, trust=True)
+        except DataError:
+            continue
+        outcomes[rows[header.object_name]] += np.bincount(found, minlength=1 + max(Outcome))
+        done += 1
+    funnel = Funnel(
+        names=tuple(names),
+        classes=tuple(entry["class"] for entry in manifest.objects),
+        candidates=np.array([entry["candidates"] for entry in manifest.objects], dtype=np.int64),
+        distinct=np.array([entry["distinct"] for entry in manifest.objects], dtype=np.int64),
+        valid=np.array([entry["valid"] for entry in manifest.objects], dtype=np.int64),
+        outcomes=outcomes,
+        removals=np.zeros((len(names), 1 + max(Removal)), dtype=np.int64),
+    )
+    return Unfinished(funnel=funnel, done=done, total=manifest.units)
+
+
+def count_funnel(out: Path) -> Funnel:
+    """Return the funnel of a dataset.
+
+    Raises:
+        DataError: If trials.hdf5 is missing or damaged.
+    """
+    try:
+        with h5py.File(out / TRIALS_FILE, "r") as file:
+            objects = {name: values[:] for name, values in file["objects"].items()}
+            index = file["trials/object"][:]
+            outcome = file["trials/outcome"][:]
+            success = file["successes/trial_id"][:]
+            removal = file["successes/removal"][:]
+    except (OSError, KeyError) as error:
+        raise DataError(f"{out}: must hold {TRIALS_FILE}, got none ({error})") from None
+    count = len(objects["name"])
+    return Funnel(
+        names=tuple(name.decode() for name in objects["name"]),
+        classes=tuple(name.decode() for name in objects["class_name"]),
+        candidates=objects["candidates"],
+        distinct=objects["distinct"],
+        valid=objects["valid"],
+        outcomes=_count_pairs(index, outcome, count, 1 + max(Outcome)),
+        removals=_count_pairs(index[success], removal, count, 1 + max(Removal)),
+    )
+
+
+def count_splits(out: Path) -> list[SplitCount]:
+    """Return samples, objects and classes of each split.
+
+    Raises:
+        DataError: If the data files are missing or damaged.
+    """
+    path = out / DATA_FILES["oto"]
+    try:
+        with h5py.File(path, "r") as file:
+            return [
+                SplitCount(
+                    split=split,
+                    samples=len(file[split]["grasps"]),
+                    objects=len(set(file[split]["object_props/object_name"][:])),
+                    classes=len(set(file[split]["object_props/class_name"][:])),
+                )
+                for split in SPLITS
+            ]
+    except (OSError, KeyError) as error:
+        raise DataError(f"{path}: must be a data file, got none ({error})") from None
+
+
+def _count_pairs(
+    rows: npt.NDArray[np.int32], columns: npt.NDArray[np.uint8], height: int, width: int
+) -> npt.NDArray[np.int64]:
+    counts = np.zeros((height, width), dtype=np.int64)
+    np.add.at(counts, (rows, columns), 1)
+    return counts

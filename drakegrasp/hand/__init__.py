@@ -1,0 +1,1 @@
+"""Hands: their files, links, kinematics and collision shapes."""

@@ -1,0 +1,360 @@
+"""The hand: what an SDFormat file and a YAML file say of it.
+
+In: a YAML file and the SDFormat file that it names. Out: a `Hand`. Nothing here knows a
+particular hand or a number of fingers. `load_hand` reads the YAML, has Drake parse the
+SDFormat file once, checks one against the other, and keeps each finger's joints as
+constants; `kinematics` needs no more than those.
+
+The coordinates of a hand with k fingers are c = (spread, closing of finger 1..k) [rad];
+each joint is driven by exactly one of them: its angle is `gain @ c`. Frames: B palm link,
+G palm, Fi distal (fingertip) link of finger i, P a point on it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, with_config
+from pydrake.math import RollPitchYaw
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex, RevoluteJoint, RigidBody, WeldJoint
+
+from drakegrasp.arithmetic import multiply
+from drakegrasp.errors import HandError
+from drakegrasp.frames import Array, invert_pose, make_pose
+from drakegrasp.hand.files import hand_file
+from drakegrasp.runtime.environment import allow_network
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Name = Annotated[str, Field(min_length=1)]
+Vector = tuple[Finite, Finite, Finite]
+_STRICT = ConfigDict(frozen=True, extra="forbid")
+
+
+@with_config(_STRICT)
+@dataclass(frozen=True, kw_only=True)
+class Coupling:
+    """A joint that follows a finger's closing joint."""
+
+    joint: Name
+    ratio: Finite  # of its angle to the closing joint's; not zero
+
+    def __post_init__(self) -> None:
+        if self.ratio == 0.0:
+            raise ValueError("ratio must not be zero, got 0.0")
+
+
+@with_config(_STRICT)
+@dataclass(frozen=True, kw_only=True)
+class Finger:
+    """A finger as the YAML describes it; its kinematics is the hand's `Chain`."""
+
+    name: Name
+    fingertip: Name  # link, frame Fi
+    closing_joint: Name  # the driven joint; a positive angle closes
+    torque_limit: Positive  # at the closing joint [N m]
+    rotor_inertia: NonNegative = 0.0  # of the motor [kg m^2]
+    gear_ratio: Positive = 1.0  # motor angle / closing angle
+    coupled: tuple[Coupling, ...] = ()
+    pad_point: Vector  # where contacts usually are, in Fi [m]
+
+    @property
+    def p_FiP(self) -> Array:
+        """Usual contact point (3,) in the fingertip link's frame [m]."""
+        return np.array(self.pad_point)
+
+
+@with_config(_STRICT)
+@dataclass(frozen=True, kw_only=True)
+class Spread:
+    """The joints that all stand at the spread angle during an attempt; a hand may have none."""
+
+    joints: tuple[Name, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Chain:
+    """The m revolute joints from the palm to one link, as constants.
+
+    With angles q = gain @ c the pose of the link in the palm frame is
+    X_GFi = X_PJ[0] R(axis[0], q[0]) X_PJ[1] R(axis[1], q[1]) ... X_JFi.
+    """
+
+    X_PJ: Array  # (m, 4, 4), of each joint in the turning frame before it; the first in G
+    axis: Array  # (m, 3), unit, in the joint's frame J
+    gain: Array  # (m, 1 + k), angles per coordinate
+    X_JFi: Array  # (4, 4), the link in the last joint's turning frame
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Hand:
+    """A hand with k fingers; made by `load_hand`."""
+
+    name: str
+    sdf_path: Path
+    palm_link: str  # frame B
+    X_BG: Array  # (4, 4), palm frame, +Gz out of the palm
+    fingers: tuple[Finger, ...]  # in grasp order
+    spread: Spread
+    closing_speed: float  # of the closing joints [rad/s]
+    fingertip_force_limit: float  # [N]
+    joint_names: tuple[str, ...]  # the n revolute joints
+    joint_gain: Array  # (n, 1 + k), angles per coordinate; one non-zero in each row
+    joint_limits: Array  # (n, 2), lower and upper [rad]
+    chains: tuple[Chain, ...]  # one per finger, to its fingertip
+    link_chains: dict[str, Chain]  # one per link that the palm carries, itself included
+
+    @property
+    def num_fingers(self) -> int:
+        """Number of fingers, k."""
+        return len(self.fingers)
+
+    @property
+    def fingertip_links(self) -> tuple[str, ...]:
+        """Names of the fingertip links in grasp order."""
+        return tuple(finger.fingertip for finger in self.fingers)
+
+
+class _Palm(BaseModel):
+    model_config = _STRICT
+    link: Name
+    p_BG: Vector  # [m]
+    rpy_deg: Vector = (0.0, 0.0, 0.0)
+
+
+class _Description(BaseModel):
+    """The YAML file."""
+
+    model_config = _STRICT
+    model: Name  # the SDFormat file, relative to the YAML file
+    palm: _Palm
+    fingers: Annotated[tuple[Finger, ...], Field(min_length=1)]
+    spread: Spread = Spread()
+    closing_speed_deg: Positive  # [deg/s]
+    fingertip_force_limit: Positive  # [N]
+
+
+def make_parser(plant: MultibodyPlant) -> Parser:
+    """Return a parser for a plant that works where Drake is told to stay off the network.
+
+    A Drake parser registers a remote package that our models do not use; under the ban that
+    alone raises. Nothing is downloaded.
+    """
+    with allow_network("package_map"):
+        return Parser(plant)
+
+
+def load_hand(name_or_yaml: str | Path = "barrett") -> Hand:
+    """Return a hand that comes with the package, or the one of a YAML file.
+
+    Args:
+        name_or_yaml: One of `files.hand_names()`, or the path of a YAML file with the keys of
+            `models/barrett_hand.yaml`, whose `model` is found relative to it.
+
+    Raises:
+        HandError: If there is no such hand, a key or value of the YAML cannot be used, or
+            the SDFormat model lacks a link or joint that the YAML names.
+    """
+    path = hand_file(name_or_yaml)
+    known = _loaded.get(path)
+    if known is not None and known[1] == _stamp(path, known[0].sdf_path):
+        return known[0]
+    description = _read_description(path)
+    sdf_path = path.parent.resolve() / description.model
+    try:
+        hand = _build_hand(path.stem.removesuffix("_hand"), description, sdf_path)
+    except HandError as error:
+        raise HandError(f"{path}: {error}") from None
+    _loaded[path] = hand, _stamp(path, sdf_path)
+    return hand
+
+
+#: Hands that were loaded, with what their two files were like then: parsing takes 40 ms.
+_loaded: dict[Path, tuple[Hand, tuple[int, ...]]] = {}
+
+
+def _stamp(*paths: Path) -> tuple[int, ...]:
+    """Return sizes and times of change of files; a file that is gone has neither."""
+    found = [path.stat() for path in paths if path.exists()]
+    return tuple(number for s in found for number in (s.st_size, s.st_mtime_ns))
+
+
+def _read_description(path: Path) -> _Description:
+    try:
+        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        first = str(error).splitlines()[0]
+        raise HandError(f"{path}: must be YAML, got text that is not ({first})") from None
+    try:
+        return _Description.model_validate(tree)
+    except ValidationError as error:
+        lines = "; ".join(_describe(e) for e in error.errors())
+        raise HandError(f"{path}: {lines}") from None
+
+
+def _describe(error: Any) -> str:
+    """Return one pydantic error as `path: must ..., got ...`."""
+    where = ".".join(str(part) for part in error["loc"]) or "hand"
+    kind, got = error["type"], error["input"]
+    if kind in ("extra_forbidden", "unexpected_keyword_argument"):
+        return f"{where}: must be a key of a hand file, got an unknown one"
+    if kind == "missing":
+        return f"{where}: must be given, got nothing"
+    message = str(error["msg"]).removeprefix("Value error, ")
+    if kind == "value_error":
+        return f"{where}: {message}"
+    return f"{where}: must be {message.removeprefix('Input should be ')}, got {got!r}"
+
+
+def _build_hand(name: str, description: _Description, sdf_path: Path) -> Hand:
+    plant, instance = _parse(sdf_path)
+    palm = description.palm
+    R_BG = RollPitchYaw(np.deg2rad(palm.rpy_deg)).ToRotationMatrix()
+    X_BG = make_pose(R_BG.matrix(), palm.p_BG)
+    joints = _joints(plant, instance)
+    revolute = {j.name(): j for j in joints if isinstance(j, RevoluteJoint)}
+    gains = _gains(description, list(revolute))
+    bodies = {body.name(): body for body in map(plant.get_body, plant.GetBodyIndices(instance))}
+    base = _body(bodies, palm.link, "palm.link")
+    chains = []
+    for i, finger in enumerate(description.fingers):
+        tip = _body(bodies, finger.fingertip, f"fingers.{i}.fingertip")
+        chain = _chain(joints, tip, base, gains, invert_pose(X_BG))
+        if not chain.gain[:, 1 + i].any():
+            raise HandError(
+                f"fingers.{i}.closing_joint: must lie between the palm link and the fingertip, "
+                f"got {finger.closing_joint!r}"
+            )
+        chains.append(chain)
+    return Hand(
+        name=name,
+        sdf_path=sdf_path,
+        palm_link=palm.link,
+        X_BG=X_BG,
+        fingers=description.fingers,
+        spread=description.spread,
+        closing_speed=float(np.deg2rad(description.closing_speed_deg)),
+        fingertip_force_limit=description.fingertip_force_limit,
+        joint_names=tuple(revolute),
+        joint_gain=np.array([gains[joint] for joint in revolute]),
+        joint_limits=np.array(
+            [(j.position_lower_limit(), j.position_upper_limit()) for j in revolute.values()]
+        ),
+        chains=tuple(chains),
+        link_chains={
+            name: _chain(joints, body, base, gains, invert_pose(X_BG))
+            for name, body in bodies.items()
+            if _is_carried(joints, body, base)
+        },
+    )
+
+
+def _parse(sdf_path: Path) -> tuple[MultibodyPlant, ModelInstanceIndex]:
+    """Return the model alone in a plant, without its geometry and not finalized.
+
+    Finalizing would add a floating joint for the palm to the model's own joints.
+    """
+    if not sdf_path.is_file():
+        raise HandError(f"model: must be an SDFormat file, got {str(sdf_path)!r}")
+    plant = MultibodyPlant(0.0)
+    try:
+        (instance,) = make_parser(plant).AddModels(sdf_path)
+    except (RuntimeError, ValueError) as error:
+        first = str(error).splitlines()[0]
+        raise HandError(f"model: must be a file of one model, got {first}") from None
+    return plant, instance
+
+
+def _joints(plant: MultibodyPlant, instance: ModelInstanceIndex) -> list[Any]:
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
+    for joint in joints:
+        if not isinstance(joint, RevoluteJoint | WeldJoint):
+            raise HandError(
+                f"model: joint {joint.name()!r} must be revolute or fixed, "
+                f"got {type(joint).__name__}"
+            )
+    return joints
+
+
+def _body(bodies: dict[str, RigidBody], name: str, key: str) -> RigidBody:
+    if name not in bodies:
+        raise HandError(f"{key}: must be a link of the model ({', '.join(bodies)}), got {name!r}")
+    return bodies[name]
+
+
+def _gains(description: _Description, joints: list[str]) -> dict[str, Array]:
+    """Return each revolute joint's angle per coordinate, (1 + k,)."""
+    drives = [(f"spread.joints.{n}", j, 0, 1.0) for n, j in enumerate(description.spread.joints)]
+    for i, finger in enumerate(description.fingers):
+        drives.append((f"fingers.{i}.closing_joint", finger.closing_joint, 1 + i, 1.0))
+        for n, coupling in enumerate(finger.coupled):
+            drives.append((f"fingers.{i}.coupled.{n}.joint", coupling.joint, 1 + i, coupling.ratio))
+    gains: dict[str, Array] = {}
+    for key, joint, column, ratio in drives:
+        if joint not in joints:
+            raise HandError(
+                f"{key}: must be a revolute joint of the model ({', '.join(joints)}), got {joint!r}"
+            )
+        if joint in gains:
+            raise HandError(f"{key}: must be a joint that nothing else drives, got {joint!r}")
+        gains[joint] = ratio * np.eye(1 + len(description.fingers))[column]
+    if idle := [joint for joint in joints if joint not in gains]:
+        raise HandError(
+            f"model: every revolute joint must be driven by a finger or the spread, "
+            f"got {', '.join(idle)} driven by nothing"
+        )
+    return gains
+
+
+def _is_carried(joints: list[Any], body: RigidBody, base: RigidBody) -> bool:
+    """Return whether a link is the palm link or hangs on it."""
+    parents = {joint.child_body().index(): joint.parent_body().index() for joint in joints}
+    index = body.index()
+    while index != base.index() and index in parents:
+        index = parents.pop(index)
+    return bool(index == base.index())
+
+
+def _chain(
+    joints: list[Any], tip: RigidBody, base: RigidBody, gains: dict[str, Array], X_GB: Array
+) -> Chain:
+    by_child = {joint.child_body().index(): joint for joint in joints}
+    path: list[Any] = []
+    body = tip
+    while body.index() != base.index():
+        # Taken out, so that a closed loop of links ends here as well.
+        joint = by_child.pop(body.index(), None)
+        if joint is None:
+            raise HandError(
+                f"model: link {tip.name()!r} must be joined to the palm link {base.name()!r}, "
+                f"got a chain that ends at {body.name()!r}"
+            )
+        path.insert(0, joint)
+        body = joint.parent_body()
+    X, X_PJ, axes = X_GB, [], []
+    for joint in path:
+        X = multiply(X, joint.frame_on_parent().GetFixedPoseInBodyFrame().GetAsMatrix4())
+        if isinstance(joint, RevoluteJoint):
+            X_PJ.append(X)
+            axes.append(joint.revolute_axis())
+            X = np.eye(4)
+        else:
+            X = multiply(X, joint.X_FM().GetAsMatrix4())
+        X = multiply(
+            X, invert_pose(joint.frame_on_child().GetFixedPoseInBodyFrame().GetAsMatrix4())
+        )
+    gain = [gains[joint.name()] for joint in path if isinstance(joint, RevoluteJoint)]
+    k = len(next(iter(gains.values())))
+    return Chain(
+        X_PJ=np.reshape(X_PJ, (-1, 4, 4)),
+        axis=np.reshape(axes, (-1, 3)),
+        gain=np.reshape(gain, (-1, k)),
+        X_JFi=X,
+    )

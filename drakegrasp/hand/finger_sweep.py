@@ -1,0 +1,198 @@
+"""Where points of a hand's surface are while its fingers close, for one angle of the spread.
+
+In: a `Hand` and a spread. Out: `HandPaths`, in the palm frame: points of the links that
+closing does not move, and for each finger those of the links that it does, at closing angles
+from the open hand to the limit, half a degree apart. Only geometry is looked at here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache, lru_cache
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import ConvexHull
+
+from drakegrasp.arithmetic import dot, multiply, norm
+from drakegrasp.frames import Array, invert_pose
+from drakegrasp.hand.description import Hand
+from drakegrasp.hand.kinematics import coordinate_limits, link_poses
+from drakegrasp.hand.shapes import link_shapes
+from drakegrasp.mesh.distance_field import DistanceField, make_distance_field
+
+Points = npt.NDArray[np.float32]
+
+#: Between two closing angles of a path [rad]; a fingertip of a hand moves by about 1 mm.
+ANGLE_STEP = np.deg2rad(0.5)
+#: Points of a fingertip link, and of another link, are about so far apart [m].
+TIP_SPACING, LINK_SPACING = 0.003, 0.005
+#: A point that moves by less than this from one angle to the next is on the joint [m].
+STILL = 5e-5
+#: Angles of a path from one look at the gap between fingertips to the next.
+GAP_STRIDE = 5
+#: Postures of hands whose paths a process keeps.
+KEPT = 16
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FingerPath:
+    """The links that one finger's closing moves, at m closing angles.
+
+    Attributes:
+        angles: (m,), closing angles from 0 to the limit [rad].
+        points: (m, n, 3), points of the links in {G} [m]; those of the fingertip come first.
+        tip: Number of points of the fingertip.
+        travel: (n,), largest distance that each moves from one angle to the next [m].
+    """
+
+    angles: Array
+    points: Points
+    tip: int
+    travel: Points
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HandPaths:
+    """A hand of k fingers at one spread.
+
+    Attributes:
+        still: (s, 3), points of the links that closing does not move, in {G} [m].
+        fingers: One path per finger.
+        gaps: For each pair of fingers (a, b) the distance between their fingertips at each
+            `GAP_STRIDE`-th angle of a, and of b [m].
+    """
+
+    still: Points
+    fingers: tuple[FingerPath, ...]
+    gaps: dict[tuple[int, int], npt.NDArray[np.float32]]
+
+
+@lru_cache(maxsize=KEPT)
+def hand_paths(hand: Hand, spread: float) -> HandPaths | None:
+    """Return the paths of a hand's fingers at a spread [rad].
+
+    None is for a hand in which a link is moved by several fingers or the fingers' closing
+    is not limited: its attempts are all simulated.
+    """
+    closing_gain = {link: chain.gain[:, 1:] for link, chain in hand.link_chains.items()}
+    movers = {link: np.flatnonzero(gain.any(axis=0)) for link, gain in closing_gain.items()}
+    limits = coordinate_limits(hand)[1:, 1]
+    if max(map(len, movers.values())) > 1 or not np.all((limits > 0.0) & np.isfinite(limits)):
+        return None
+    surfaces = link_points(hand)
+    opened = np.zeros(hand.num_fingers)
+    still = [
+        _place(link_poses(hand, link, spread=spread, closing=opened), surfaces[link])
+        for link, moved_by in movers.items()
+        if not len(moved_by)
+    ]
+    fingers = []
+    for i, finger in enumerate(hand.fingers):
+        rest = [link for link, by in movers.items() if i in by and link != finger.fingertip]
+        fingers.append(_finger_path(hand, i, rest, spread, float(limits[i]), surfaces))
+    return HandPaths(
+        still=np.concatenate(still),
+        fingers=tuple(fingers),
+        gaps=_gaps(hand, fingers, spread),
+    )
+
+
+def _finger_path(
+    hand: Hand, i: int, rest: list[str], spread: float, limit: float, surfaces: dict[str, Array]
+) -> FingerPath:
+    angles = np.linspace(0.0, limit, int(np.ceil(limit / ANGLE_STEP)) + 1)
+    closing = np.zeros((len(angles), hand.num_fingers))
+    closing[:, i] = angles
+
+    def placed(link: str) -> Points:
+        X_GL = link_poses(hand, link, spread=spread, closing=closing)
+        return _place(X_GL, surfaces[link])
+
+    tip = placed(hand.fingers[i].fingertip)
+    points = np.concatenate([tip, *map(placed, rest)], axis=1)
+    travel = norm(np.diff(points, axis=0)).astype(np.float32).max(axis=0)
+    moving = travel > STILL
+    return FingerPath(
+        angles=angles,
+        points=np.ascontiguousarray(points[:, moving]),
+        tip=int(np.count_nonzero(moving[: tip.shape[1]])),
+        travel=travel[moving],
+    )
+
+
+def _place(X_GL: Array, p_LQ: Array) -> Points:
+    """Return points (..., n, 3) in {G} of points (n, 3) of links with poses (..., 4, 4)."""
+    moved = multiply(p_LQ, np.swapaxes(X_GL[..., :3, :3], -1, -2))
+    return np.asarray(moved + X_GL[..., None, :3, 3], dtype=np.float32)
+
+
+def _gaps(
+    hand: Hand, fingers: list[FingerPath], spread: float
+) -> dict[tuple[int, int], npt.NDArray[np.float32]]:
+    fields, gaps = _tip_fields(hand), {}
+    for b, other in enumerate(fingers):
+        closing = np.zeros((len(other.angles[::GAP_STRIDE]), hand.num_fingers))
+        closing[:, b] = other.angles[::GAP_STRIDE]
+        tip = hand.fingers[b].fingertip
+        X_FbG = invert_pose(link_poses(hand, tip, spread=spread, closing=closing))
+        for a in range(b):
+            points = fingers[a].points[::GAP_STRIDE, : fingers[a].tip]
+            gaps[a, b] = np.column_stack([_gap(fields[b], X, points) for X in X_FbG])
+    return gaps
+
+
+def _gap(field: DistanceField, X_FbG: Array, p_GQ: Points) -> npt.NDArray[np.float32]:
+    """Return the least distance (m,) of points (m, n, 3) from a fingertip, given its pose."""
+    X = X_FbG.astype(np.float32)
+    x, y, z = (dot(p_GQ, X[axis, :3]).astype(np.float32) + X[axis, 3] for axis in range(3))
+    return np.asarray(field.nearest(x, y, z).min(axis=1))
+
+
+@cache
+def _tip_fields(hand: Hand) -> tuple[DistanceField, ...]:
+    """Return the distance field of each fingertip in its own frame."""
+    shapes, fields = link_shapes(hand), []
+    for finger in hand.fingers:
+        triangles = np.concatenate([_triangles(c) for c in shapes[finger.fingertip]])
+        faces = np.arange(3 * len(triangles), dtype=np.int32).reshape(-1, 3)
+        fields.append(make_distance_field(triangles.reshape(-1, 3), faces))
+    return tuple(fields)
+
+
+@cache
+def link_points(hand: Hand) -> dict[str, Array]:
+    """Return points on the surface of each link (n, 3) in its own frame [m]."""
+    points = {}
+    for link, shapes in link_shapes(hand).items():
+        spacing = TIP_SPACING if link in hand.fingertip_links else LINK_SPACING
+        found = [_surface_points(corners, spacing) for corners in shapes]
+        points[link] = np.concatenate([np.zeros((0, 3)), *found])
+    return points
+
+
+def _triangles(corners: Array) -> Array:
+    """Return the faces (m, 3, 3) of a convex hull, counter-clockwise seen from outside."""
+    hull = ConvexHull(corners)
+    triangles = corners[hull.simplices]
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    inward = dot(normals, hull.equations[:, :3]) < 0.0
+    triangles[inward] = triangles[inward][:, ::-1]
+    return triangles
+
+
+def _surface_points(corners: Array, spacing: float) -> Array:
+    """Return the corners of a convex shape and evenly spread points of its surface."""
+    triangles, fine = _triangles(corners), spacing / 2.0
+    edges = norm(triangles - np.roll(triangles, 1, axis=1)).max(axis=1)
+    parts = np.ceil(edges / fine).astype(int)
+    points = [corners]
+    for triangle, n in zip(triangles, parts, strict=True):
+        i, j = (a.ravel() for a in np.indices((n + 1, n + 1)))
+        inside = i + j <= n
+        points.append(multiply(np.column_stack([i, j, n - i - j])[inside] / n, triangle))
+    dense = np.concatenate(points)
+    # The corners come first, so they are the ones that stay in their cells.
+    cells = np.floor(dense / spacing).astype(np.int64)
+    _, first = np.unique(cells, axis=0, return_index=True)
+    return dense[np.union1d(np.arange(len(corners)), first)]

@@ -1,0 +1,102 @@
+"""Forward kinematics of a hand: where its joints and fingertips are.
+
+In: a `Hand` and its coordinates, the spread and the closing of each finger. Out: joint
+angles, poses of the fingertip links, limits of the coordinates. NumPy only.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.arithmetic import Array, multiply
+from drakegrasp.frames import rotation_about
+from drakegrasp.hand.description import Chain, Hand
+
+
+def coordinate_limits(hand: Hand) -> Array:
+    """Return the least and greatest value of each coordinate, (1 + k, 2) [rad].
+
+    Row 0 is the spread, row 1 + i the closing of finger i. A coordinate's limits are those
+    of all joints that it drives, couplings included. A hand without spread has 0, 0 there.
+    """
+    limits = np.tile([-np.inf, np.inf], (1 + hand.num_fingers, 1))
+    for gain, joint_limits in zip(hand.joint_gain, hand.joint_limits, strict=True):
+        (column,) = np.flatnonzero(gain)
+        lower, upper = np.sort(joint_limits / gain[column])
+        limits[column] = max(limits[column, 0], lower), min(limits[column, 1], upper)
+    if not hand.spread.joints:
+        limits[0] = 0.0
+    return limits
+
+
+def joint_positions(hand: Hand, spread: float, closing: npt.ArrayLike) -> dict[str, float]:
+    """Return each revolute joint's angle [rad] at a spread and closing angles (k,) [rad].
+
+    Raises:
+        ValueError: If `closing` is not one angle per finger.
+    """
+    q = multiply(hand.joint_gain, _coordinates(hand, spread, closing))
+    return dict(zip(hand.joint_names, q.tolist(), strict=True))
+
+
+def fingertip_poses(hand: Hand, *, spread: npt.ArrayLike, closing: npt.ArrayLike) -> Array:
+    """Return the poses X_GFi (k, 4, 4) of the fingertip links in the palm frame.
+
+    Limits are not looked at.
+
+    Args:
+        hand: The hand.
+        spread: Angle of the spread joints [rad]; any shape (...,).
+        closing: Angle of each finger's closing joint (k,) [rad]; for many postures
+            (..., k), and the result is (..., k, 4, 4).
+
+    Raises:
+        ValueError: If `closing` is not one angle per finger.
+    """
+    c = _coordinates(hand, spread, closing)
+    return np.stack([_chain_pose(chain, c) for chain in hand.chains], axis=-3)
+
+
+def link_poses(hand: Hand, link: str, *, spread: npt.ArrayLike, closing: npt.ArrayLike) -> Array:
+    """Return the poses X_GL (..., 4, 4) of a link that the palm carries, in the palm frame.
+
+    Args:
+        hand: The hand.
+        link: Name of the link, a key of `hand.link_chains`.
+        spread: See `fingertip_poses`.
+        closing: See `fingertip_poses`.
+
+    Raises:
+        ValueError: If `closing` is not one angle per finger.
+    """
+    return _chain_pose(hand.link_chains[link], _coordinates(hand, spread, closing))
+
+
+def _coordinates(hand: Hand, spread: npt.ArrayLike, closing: npt.ArrayLike) -> Array:
+    """Return (..., 1 + k) of a spread (...,) and closing angles (..., k)."""
+    angles = np.asarray(closing, dtype=float)
+    k = hand.num_fingers
+    if angles.shape[-1:] != (k,):
+        raise ValueError(f"closing must have shape (..., {k}), got {angles.shape}")
+    first = np.asarray(spread, dtype=float)
+    shape = np.broadcast_shapes(first.shape, angles.shape[:-1])
+    return np.concatenate(
+        [np.broadcast_to(first, shape)[..., None], np.broadcast_to(angles, (*shape, k))], axis=-1
+    )
+
+
+def _chain_pose(chain: Chain, c: Array) -> Array:
+    q = multiply(c[..., None, :], chain.gain.T)[..., 0, :]
+    X = np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))
+    for j, (X_PJ, axis) in enumerate(zip(chain.X_PJ, chain.axis, strict=True)):
+        X = multiply(multiply(X, X_PJ), _turn(axis, q[..., j]))
+    return multiply(X, chain.X_JFi)
+
+
+def _turn(axis: Array, angle: Array) -> Array:
+    """Return the poses (..., 4, 4) that turn by angles (...,) about an axis."""
+    X = np.zeros((*np.shape(angle), 4, 4))
+    X[..., :3, :3] = rotation_about(axis, angle)
+    X[..., 3, 3] = 1.0
+    return X

@@ -1,0 +1,102 @@
+"""The shapes of a hand's links as convex sets of points, without a simulation.
+
+In: a `Hand`. Out: for each link the corners of its collision shapes, in the link's frame.
+Every shape of a hand is convex (`models/README.md`), so its corners are all of it.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from pydrake.geometry import (
+    Box,
+    Capsule,
+    Cylinder,
+    GeometryId,
+    Mesh,
+    SceneGraph,
+    SceneGraphInspector,
+    Sphere,
+)
+from pydrake.multibody.plant import MultibodyPlant
+
+from drakegrasp.arithmetic import sin_cos
+from drakegrasp.errors import HandError
+from drakegrasp.frames import Array, transform_points
+from drakegrasp.hand.description import Hand, make_parser
+
+#: Corners of the polygon that stands for a circle; it lies outside of it.
+CIRCLE = 16
+
+
+def link_shapes(hand: Hand) -> dict[str, tuple[Array, ...]]:
+    """Return the corners (n, 3) [m] of each collision shape of each link, in the link's frame.
+
+    Raises:
+        HandError: If a shape is not a box, cylinder, capsule, sphere or convex mesh.
+    """
+    return _link_shapes(hand.sdf_path)
+
+
+@cache
+def _link_shapes(sdf_path: Path) -> dict[str, tuple[Array, ...]]:
+    plant, scene_graph = MultibodyPlant(0.0), SceneGraph()
+    plant.RegisterAsSourceForSceneGraph(scene_graph)
+    (instance,) = make_parser(plant).AddModels(sdf_path)
+    inspector = scene_graph.model_inspector()
+    shapes = {}
+    for index in plant.GetBodyIndices(instance):
+        body = plant.get_body(index)
+        found = plant.GetCollisionGeometriesForBody(body)
+        shapes[body.name()] = tuple(_corners(inspector, geometry) for geometry in found)
+    return shapes
+
+
+def _corners(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
+    """Return the corners of a shape in its body's frame."""
+    shape = inspector.GetShape(geometry)
+    if isinstance(shape, Mesh) or inspector.GetConvexHull(geometry) is not None:
+        hull = inspector.GetConvexHull(geometry)
+        corners = np.array([hull.vertex(i) for i in range(hull.num_vertices())])
+    elif isinstance(shape, Box):
+        corners = _box(shape.size() / 2.0)
+    elif isinstance(shape, Cylinder):
+        corners = _prism(shape.radius(), shape.length() / 2.0)
+    elif isinstance(shape, Capsule):
+        ball = _ball(shape.radius())
+        ends = np.array([[0.0, 0.0, shape.length() / 2.0]])
+        corners = np.concatenate([ball + ends, ball - ends])
+    elif isinstance(shape, Sphere):
+        corners = _ball(shape.radius())
+    else:
+        raise HandError(
+            f"{inspector.GetName(geometry)}: must be a box, cylinder, capsule, sphere or convex "
+            f"mesh, got {type(shape).__name__}"
+        )
+    X_BS = inspector.GetPoseInFrame(geometry).GetAsMatrix4()
+    return transform_points(X_BS, corners)
+
+
+def _box(half: Array) -> Array:
+    signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    return np.asarray(signs * half)
+
+
+def _prism(radius: float, half_length: float) -> Array:
+    angles = 2.0 * np.pi * np.arange(CIRCLE) / CIRCLE
+    sine, cosine = sin_cos(angles)
+    ring = radius / sin_cos(np.pi / CIRCLE)[1] * np.column_stack([cosine, sine])
+    ends = [np.column_stack([ring, np.full(CIRCLE, z)]) for z in (-half_length, half_length)]
+    return np.concatenate(ends)
+
+
+def _ball(radius: float) -> Array:
+    """Return the corners of a polyhedron about the origin whose corners are on a sphere."""
+    # Fibonacci's lattice: even spacing without poles.
+    i = np.arange(CIRCLE**2) + 0.5
+    z, turn = 1.0 - 2.0 * i / CIRCLE**2, np.pi * (1.0 + np.sqrt(5.0)) * i
+    across = np.sqrt(1.0 - z**2)
+    sine, cosine = sin_cos(turn)
+    return radius * np.column_stack([across * cosine, across * sine, z])

@@ -1,0 +1,1 @@
+"""Triangle meshes: reading, repair, decimation, distance fields."""

@@ -1,0 +1,171 @@
+"""Bodies: the triangles of a file come in, its connected pieces of surface go out.
+
+A body's faces agree on which side is which, and it shares no vertex with another body.
+Half-edge 3f + i leaves corner i of face f; its twin is the half-edge of the neighbouring
+face, or -1 at a rim.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from drakegrasp.errors import MeshError
+from drakegrasp.frames import Array
+from drakegrasp.mesh.surfaces import Faces, compact, face_areas, half_edges, signed_volume
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Body:
+    """One connected piece of surface; `twins[h]` is the half-edge opposite to h, or -1."""
+
+    vertices: Array
+    faces: Faces
+    twins: Faces
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether every edge has two faces."""
+        return bool((self.twins >= 0).all())
+
+
+def find_bodies(vertices: Array, faces: Faces, notes: list[str]) -> list[Body]:
+    """Return the connected bodies, each with agreeing faces and vertices of its own."""
+    twins = pair_half_edges(vertices, faces, radial=True)
+
+    # Corners that meet across a paired edge share a vertex; all others are parted, also
+    # where the file makes two bodies touch in a single point.
+    halves = np.flatnonzero(twins >= 0)
+    ends = half_edges(faces)
+    start, end = halves, halves - halves % 3 + (halves + 1) % 3
+    other = twins[halves]
+    other_end = other - other % 3 + (other + 1) % 3
+    same = ends[halves, 0] == ends[other, 0]
+    rows = np.concatenate((start, end))
+    columns = np.concatenate((np.where(same, other, other_end), np.where(same, other_end, other)))
+    graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(len(ends), len(ends)))
+    _, corner_vertex = connected_components(graph, directed=False)
+    _, first = np.unique(corner_vertex, return_index=True)
+    vertices = vertices[faces.ravel()[first]]
+    faces = corner_vertex.reshape(-1, 3).astype(np.int64)
+
+    flip, flipped = _orient(vertices, faces, twins)
+    if flipped:
+        notes.append(
+            f"{flipped} of {len(faces)} faces ran against their neighbours and were turned"
+        )
+    count, piece = face_components(twins, len(faces))
+    faces = np.where(flip[:, None], faces[:, ::-1], faces)
+    bodies = []
+    for index in range(count):
+        own = np.flatnonzero(piece == index)
+        part_vertices, part_faces = compact(vertices, faces[own])
+        part_twins = pair_half_edges(part_vertices, part_faces, radial=False)
+        bodies.append(Body(vertices=part_vertices, faces=part_faces, twins=part_twins))
+    return bodies
+
+
+def _orient(vertices: Array, faces: Faces, twins: Faces) -> tuple[Faces, int]:
+    """Return for every face (m,) whether to flip it, so that neighbours agree.
+
+    A face and its flipped copy are two nodes of a graph: components of the graph are
+    consistent choices. The choice that keeps more of the file's surface wins.
+    """
+    m = len(faces)
+    halves = np.flatnonzero(twins >= 0)
+    ends = half_edges(faces)
+    clash = (ends[halves, 0] == ends[twins[halves], 0]).astype(np.int64)
+    f, g = halves // 3, twins[halves] // 3
+    rows, columns = np.concatenate((f, f + m)), np.concatenate((g + m * clash, g + m * (1 - clash)))
+    graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(2 * m, 2 * m))
+    _, labels = connected_components(graph, directed=False)
+    if (labels[:m] == labels[m:]).any():
+        raise MeshError("the surface must have two sides, got one like a Möbius strip")
+    count, piece = face_components(twins, m)
+    _, first = np.unique(piece, return_index=True)
+    flip = labels[:m] != labels[first[piece]]
+    areas = face_areas(vertices, faces)
+    flipped = np.bincount(piece, areas * flip, count) > 0.5 * np.bincount(piece, areas, count)
+    flip = flip ^ flipped[piece]
+    return flip, int(flip.sum())
+
+
+def count_parts(vertices: Array, faces: Faces) -> int:
+    """Return the number of pieces of a solid that do not touch; cavities do not count."""
+    count, piece = face_components(pair_half_edges(vertices, faces, radial=False), len(faces))
+    if count == 1:
+        return 1
+    return sum(signed_volume(vertices, faces[piece == index]) > 0.0 for index in range(count))
+
+
+# Half-edges
+
+
+def edge_ids(faces: Faces) -> tuple[Faces, Faces]:
+    """Return the edge of every half-edge (3m,) and the number of faces of every edge."""
+    halves = np.sort(half_edges(faces), axis=1)
+    key = halves[:, 0] * (int(faces.max(initial=0)) + 1) + halves[:, 1]
+    _, ids, counts = np.unique(key, return_inverse=True, return_counts=True)
+    return ids.reshape(-1), counts
+
+
+def pair_half_edges(vertices: Array, faces: Faces, *, radial: bool) -> Faces:
+    """Return the opposite of every half-edge (3m,), -1 where there is none.
+
+    At an edge with four or more faces, `radial` pairs those that bound the same wedge
+    of solid, so that bodies that touch along an edge come apart.
+    """
+    ids, counts = edge_ids(faces)
+    order = np.argsort(ids, kind="stable")
+    starts = np.concatenate(([0], np.cumsum(counts)[:-1]))
+    twins = np.full(3 * len(faces), -1, dtype=np.int64)
+    pairs = starts[counts == 2]
+    twins[order[pairs]], twins[order[pairs + 1]] = order[pairs + 1], order[pairs]
+    if radial:
+        for edge in np.flatnonzero((counts > 2) & (counts % 2 == 0)):
+            _pair_radially(
+                vertices, faces, order[starts[edge] : starts[edge] + counts[edge]], twins
+            )
+    return twins
+
+
+def _pair_radially(vertices: Array, faces: Faces, halves: Faces, twins: Faces) -> None:
+    """Pair the half-edges of one edge by their angles; leave them if they do not add up."""
+    face, corner = halves // 3, halves % 3
+    start, end = faces[face, corner], faces[face, (corner + 1) % 3]
+    leaves = start < end
+    if 2 * int(leaves.sum()) != len(halves):
+        return
+    low, high = int(start.min()), int(end.max())
+    axis = vertices[high] - vertices[low]
+    axis = axis / np.linalg.norm(axis)
+    arms = vertices[faces[face, (corner + 2) % 3]] - vertices[low]
+    first = np.cross(axis, arms[0])
+    second = np.cross(axis, first)
+    angles = np.round(np.arctan2(arms @ second, arms @ first) % (2.0 * np.pi), 6)
+    angles[angles >= 6.283185] = 0.0
+    # Around the axis, a face that runs along it is where the solid ends. At equal
+    # angles it comes first: bodies that share a wall are two, not one.
+    turn = np.lexsort((~leaves, angles))
+    depth = np.cumsum(np.where(leaves[turn], -1, 1))
+    turn = np.roll(turn, -(int(np.argmin(depth)) + 1))
+    entered: list[int] = []
+    for half in turn:
+        if leaves[half]:
+            other = entered.pop()
+            twins[halves[half]], twins[halves[other]] = halves[other], halves[half]
+        else:
+            entered.append(int(half))
+
+
+def face_components(twins: Faces, face_count: int) -> tuple[int, Faces]:
+    """Return how many pieces the paired half-edges join, and the piece of every face (m,)."""
+    halves = np.flatnonzero(twins >= 0)
+    graph = coo_matrix(
+        (np.ones(len(halves)), (halves // 3, twins[halves] // 3)), shape=(face_count, face_count)
+    )
+    count, labels = connected_components(graph, directed=False)
+    return int(count), labels

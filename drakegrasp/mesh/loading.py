@@ -1,0 +1,113 @@
+"""Mesh files: a path comes in, triangles go out."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from drakegrasp.errors import MeshError
+from drakegrasp.frames import Array
+from drakegrasp.mesh.repair import weld
+from drakegrasp.mesh.surfaces import Faces
+
+#: Mesh files that are read; everything else in the directory is ignored.
+SUFFIXES = (".obj", ".stl", ".ply", ".glb")
+
+
+def load_mesh(path: str | Path) -> trimesh.Trimesh:
+    """Return the triangles of a mesh file, in the file's units and axes.
+
+    All geometries of a scene are put together with their transforms. Equal vertices
+    are merged and duplicate and degenerate faces dropped; materials are not read.
+
+    Raises:
+        MeshError: If the file cannot be read or holds no finite triangles.
+    """
+    path = Path(path)
+    return _parse(path, read_bytes(path))
+
+
+def read_bytes(path: Path) -> bytes:
+    """Return a mesh file's content.
+
+    Raises:
+        MeshError: If it cannot be read.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise MeshError(
+            f"{path.name}: must be a readable file, got: {error.strerror or error}"
+        ) from error
+
+
+def _parse(path: Path, data: bytes) -> trimesh.Trimesh:
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise MeshError(f"{path.name}: must be one of {', '.join(SUFFIXES)}, got {suffix!r}")
+    if not data:
+        raise MeshError(f"{path.name}: must hold a mesh, got an empty file")
+    # Parsers fail on foreign bytes in countless ways, none of them of use to a caller.
+    try:
+        with np.errstate(all="ignore"):
+            scene = trimesh.load_scene(
+                io.BytesIO(data), file_type=suffix[1:], process=False, skip_materials=True
+            )
+            parts = []
+            for node in scene.graph.nodes_geometry:
+                X_SN, key = scene.graph[node]
+                part = scene.geometry[key]
+                if isinstance(part, trimesh.Trimesh) and len(part.faces):
+                    part = trimesh.Trimesh(part.vertices, part.faces, process=False)
+                    parts.append(part.apply_transform(X_SN))
+            vertices, faces = _concatenate(parts)
+    except Exception as error:
+        raise MeshError(
+            f"{path.name}: must be a valid {suffix} mesh, got: {one_line(error)}"
+        ) from error
+    return clean_triangles(vertices, faces, path.name)
+
+
+def clean_triangles(vertices: Array, faces: Faces, name: str) -> trimesh.Trimesh:
+    """Return triangles with equal vertices merged and degenerate faces dropped.
+
+    Args:
+        vertices: (n, 3).
+        faces: (m, 3).
+        name: What to call them in an error.
+
+    Raises:
+        MeshError: If they are no finite triangles.
+    """
+    if not len(faces):
+        raise MeshError(f"{name}: must hold triangles, got no faces")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise MeshError(
+            f"{name}: faces must use vertices 0..{len(vertices) - 1}, "
+            f"got {faces.min()}..{faces.max()}"
+        )
+    used = vertices[faces.ravel()]
+    if not np.isfinite(used).all():
+        bad = int((~np.isfinite(used)).any(axis=1).sum())
+        raise MeshError(f"{name}: vertices must be finite, got NaN or inf at {bad} corners")
+    vertices, faces = weld(vertices, faces)
+    if not len(faces):
+        raise MeshError(f"{name}: must hold triangles, got only degenerate faces")
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def _concatenate(parts: list[trimesh.Trimesh]) -> tuple[Array, Faces]:
+    if not parts:
+        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+    offsets = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
+    faces = [part.faces + offset for part, offset in zip(parts, offsets, strict=True)]
+    vertices = np.vstack([part.vertices for part in parts])
+    return np.array(vertices, dtype=np.float64), np.vstack(faces).astype(np.int64)
+
+
+def one_line(error: Exception) -> str:
+    """Return what another library says is wrong, fit to stand in a message of ours."""
+    return " ".join(str(error).split())[:200] or type(error).__name__

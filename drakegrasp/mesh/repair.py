@@ -1,0 +1,222 @@
+"""Geometric repair: from a soup of triangles to one watertight solid.
+
+`mend_solid` takes welded triangles in metres and returns the surface of one solid:
+closed, every edge shared by exactly two faces that run along it in opposite
+directions, normals outward. What it had to change it says in sentences. What it
+cannot change honestly raises `MeshError` with the reason and without a file name,
+which `drakegrasp.objects.model` adds. A mesh that is a clean solid keeps its own vertices.
+
+The order matters: gaps are stitched and inner walls dropped while the neighbours are
+still known, then the surface falls apart into `components`, whose holes (`hole_filling`) are closed
+and whose insides are told from their outsides; last come the `union` and a check of the result by
+generalised winding numbers, which knows nothing of the steps before it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from drakegrasp.errors import MeshError
+from drakegrasp.frames import Array
+from drakegrasp.mesh.components import edge_ids, face_components, find_bodies, pair_half_edges
+from drakegrasp.mesh.hole_filling import close_rims
+from drakegrasp.mesh.surfaces import (
+    Faces,
+    Solid,
+    compact,
+    diagonal,
+    face_areas,
+    half_edges,
+    is_solid_surface,
+    signed_volume,
+    winding_numbers,
+)
+from drakegrasp.mesh.union import separate, unite
+
+#: Vertices closer than this part of the diagonal are one: above the rounding of files
+#: with eight digits, far below the detail of any scan.
+WELD = 1e-8
+#: Rims closer than this part of the diagonal are the two sides of one seam.
+STITCH = 1e-4
+#: A body whose mean thickness is below this part of its diagonal encloses nothing.
+FLAT = 1e-4
+#: Filled holes may make up this part of the surface: an open box just passes (1/6),
+#: a hemispherical bowl made of a single sheet (1/3) is not taken for a solid one.
+MAX_FILLED = 0.25
+#: Fragments outside the solid that may be dropped, as a part of the surface.
+MAX_DROPPED = 0.01
+#: Inner walls are found by trying all subsets of patches; 2^12 take milliseconds.
+MAX_PATCHES = 12
+
+
+def weld(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
+    """Return a mesh with equal vertices merged and worthless faces dropped.
+
+    Faces that use a vertex twice, and faces that occur twice, go. Collinear faces
+    with three different vertices stay, because dropping them would open the surface.
+    """
+    grid = np.round(vertices / (WELD * max(diagonal(vertices[faces.ravel()]), 1e-300)))
+    _, first, inverse = np.unique(grid, axis=0, return_index=True, return_inverse=True)
+    faces = first[inverse.reshape(-1)][faces].astype(np.int64)
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+
+    # A face that occurs twice is a copy, or the wall between two touching solids. The
+    # reading that leaves fewer edges with an odd number of faces is the right one.
+    _, index, inverse, counts = np.unique(
+        np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True, return_counts=True
+    )
+    if (counts > 1).any():
+        once = faces[np.sort(index)]
+        without = faces[counts[inverse.reshape(-1)] != 2]
+        faces = min((once, without), key=_odd_edges) if len(without) else once
+    return compact(vertices, faces)
+
+
+def mend_solid(vertices: Array, faces: Faces) -> Solid:
+    """Return the surface of one solid from welded triangles.
+
+    Args:
+        vertices: (n, 3) [m].
+        faces: (m, 3), as `weld` returns them.
+
+    Raises:
+        MeshError: If the surface cannot become a solid without inventing shape.
+    """
+    notes: list[str] = []
+    size = diagonal(vertices)
+    vertices, faces = _stitch(vertices, faces, notes)
+    faces, walls = _drop_inner_walls(vertices, faces)
+    total = float(face_areas(vertices, faces).sum())
+    fragments = [(vertices[walls], "it ends at edges with three faces")] if len(walls) else []
+
+    closed: list[tuple[Array, Faces]] = []
+    holes, filled = 0, 0.0
+    for body in find_bodies(vertices, faces, notes):
+        new_faces, new_holes, new_area = body.faces, 0, 0.0
+        if not body.is_closed:
+            try:
+                lids, new_holes = close_rims(body, size)
+            except MeshError as error:
+                fragments.append((body.vertices[body.faces], str(error)))
+                continue
+            new_area = sum(float(face_areas(body.vertices, lid).sum()) for lid in lids)
+            new_faces = np.vstack((body.faces, *lids))
+        area = float(face_areas(body.vertices, new_faces).sum())
+        thickness = 2.0 * abs(signed_volume(body.vertices, new_faces)) / max(area, 1e-300)
+        if thickness < FLAT * diagonal(body.vertices):
+            fragments.append(
+                (body.vertices[body.faces], "it must enclose a volume, got a flat sheet")
+            )
+            continue
+        closed.append((body.vertices, new_faces))
+        holes += new_holes
+        filled += new_area
+    if not closed:
+        raise MeshError(max(fragments, key=lambda fragment: _triangle_area(fragment[0]))[1])
+    share = filled / (filled + total)
+    if share > MAX_FILLED:
+        raise MeshError(
+            f"holes must make up at most {MAX_FILLED:.0%} of the surface, got {share:.0%} "
+            f"({holes} open rims): the surface is too open to be a solid"
+        )
+    if holes:
+        notes.append(f"{holes} open rims were closed, {share:.1%} of the surface: solid there now")
+
+    vertices, faces = separate(*unite(closed, size, notes), notes)
+    if not len(faces) or not is_solid_surface(faces) or signed_volume(vertices, faces) <= 0.0:
+        raise MeshError("the mended surface must be watertight with outward normals, got gaps")
+    _drop_fragments(fragments, vertices, faces, total, notes)
+    return Solid(vertices=vertices, faces=faces, notes=tuple(notes))
+
+
+def _stitch(vertices: Array, faces: Faces, notes: list[str]) -> tuple[Array, Faces]:
+    """Merge vertices on rims that nearly touch, if that closes edges."""
+    ids, counts = edge_ids(faces)
+    rim = np.unique(half_edges(faces)[counts[ids] == 1])
+    if not len(rim):
+        return vertices, faces
+    pairs = cKDTree(vertices[rim]).query_pairs(STITCH * diagonal(vertices), output_type="ndarray")
+    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(rim), len(rim)))
+    _, labels = connected_components(graph, directed=False)
+    _, first = np.unique(labels, return_index=True)
+    merged = np.arange(len(vertices))
+    merged[rim] = rim[first[labels]]
+    stitched = merged[faces]
+    stitched = stitched[(stitched != np.roll(stitched, 1, axis=1)).all(axis=1)]
+    before, after = int((counts == 1).sum()), int((edge_ids(stitched)[1] == 1).sum())
+    if not len(stitched) or _odd_edges(stitched) >= _odd_edges(faces):
+        return vertices, faces
+    notes.append(f"{before - after} open edges were stitched together")
+    return compact(vertices, stitched)
+
+
+def _drop_inner_walls(vertices: Array, faces: Faces) -> tuple[Faces, Faces]:
+    """Split faces into those that bound the solid and patches that end inside it.
+
+    Where three faces meet at an edge, one of them is a wall inside the solid or a fin.
+    Among all choices of patches, the best leaves the fewest edges with an odd number
+    of faces, and then keeps the most surface.
+    """
+    ids, counts = edge_ids(faces)
+    if not ((counts > 2) & (counts % 2 == 1)).any():
+        return faces, faces[:0]
+    twins = pair_half_edges(vertices, faces, radial=False)
+    patch_count, patch = face_components(twins, len(faces))
+    bad = counts != 2
+    order = np.cumsum(bad) - 1
+    table = np.zeros((int(bad.sum()), patch_count), dtype=np.int64)
+    owners = np.repeat(patch, 3)[bad[ids]]
+    np.add.at(table, (order[ids[bad[ids]]], owners), 1)
+    doubtful = np.flatnonzero(table.any(axis=0))
+    if len(doubtful) > MAX_PATCHES:
+        raise MeshError(
+            f"edges with three or more faces must part at most {MAX_PATCHES} pieces of surface "
+            f"from each other, got {len(doubtful)}"
+        )
+    bits = (np.arange(2 ** len(doubtful))[:, None] >> np.arange(len(doubtful))) & 1
+    odd = ((bits @ table[:, doubtful].T) % 2).sum(axis=1)
+    areas = np.bincount(patch, face_areas(vertices, faces), patch_count)[doubtful]
+    best = bits[np.lexsort((-(bits @ areas), odd))[0]]
+    dropped = np.isin(patch, doubtful[best == 0])
+    return faces[~dropped], faces[dropped]
+
+
+def _odd_edges(faces: Faces) -> int:
+    return int((edge_ids(faces)[1] % 2).sum())
+
+
+def _drop_fragments(
+    fragments: list[tuple[Array, str]],
+    vertices: Array,
+    faces: Faces,
+    total: float,
+    notes: list[str],
+) -> None:
+    """Note the pieces that are no part of the solid; refuse to lose visible ones."""
+    lost, worst, reason = 0.0, 0.0, ""
+    for triangles, why in fragments:
+        # A quarter, not a half: a wall that lies in the surface itself is not visible.
+        hidden = winding_numbers(triangles.mean(axis=1), vertices, faces) > 0.25
+        visible = _triangle_area(triangles[~hidden])
+        lost += visible
+        if visible > worst:
+            worst, reason = visible, why
+    if lost > MAX_DROPPED * total:
+        raise MeshError(
+            f"pieces that enclose nothing must be at most {MAX_DROPPED:.0%} of the surface, got "
+            f"{lost / total:.1%}; the largest: {reason}"
+        )
+    if fragments:
+        notes.append(
+            f"{len(fragments)} pieces that enclose nothing were dropped "
+            f"({lost / total:.2%} of the surface, the rest inside the solid)"
+        )
+
+
+def _triangle_area(triangles: Array) -> float:
+    return float(
+        face_areas(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3)).sum()
+    )

@@ -1,0 +1,1 @@
+"""Objects to grasp: mesh sources, their solid models, what is wrong with them."""

@@ -1,0 +1,302 @@
+"""Tools for solids: curves in metres come in, watertight meshes go out.
+
+Why not `trimesh.creation` alone: its `revolve` puts the same number of vertices on every
+ring, so that a stem gets slivers where a rim gets good triangles, and its `extrude_polygon`
+needs Shapely. Here each ring has as many vertices as its circumference asks for.
+Booleans are Manifold's, by trimesh. No function draws random numbers.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+from scipy.interpolate import PchipInterpolator
+
+from drakegrasp.frames import Array
+from drakegrasp.mesh.surfaces import Faces
+from drakegrasp.objects.builtin.profiles import EDGE, arc_length, ring_angles, ring_size
+
+#: Vertices are rounded to this many decimals [m], which also removes what rounding errors
+#: could make differ between machines. Files keep the same number.
+DECIMALS = 7
+
+#: Triangles lower than this [m] are mended after a boolean: contact normals mean little there.
+SLIVER = 0.0005
+
+#: Bound on those mends; a seam needs some dozens.
+MAX_REPAIRS = 1000
+
+#: A point nearer to the axis than this lies on it, and no edge is shorter [m].
+ON_AXIS = 1e-9
+
+
+def solid(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> trimesh.Trimesh:
+    """Return a mesh with outward winding, rounded vertices and a canonical order of both.
+
+    The order depends on the shape alone, not on how a library numbered it.
+    """
+    mesh = trimesh.Trimesh(
+        np.round(np.asarray(vertices, dtype=float), DECIMALS) + 0.0, faces, process=False
+    )
+    mesh.merge_vertices(digits_vertex=DECIMALS)
+    mesh.update_faces(mesh.nondegenerate_faces(height=0.0))
+    mesh.remove_unreferenced_vertices()
+    if mesh.volume < 0.0:
+        mesh.invert()
+
+    # Sort the vertices, start each face at its lowest one, then sort the faces.
+    order = np.lexsort(mesh.vertices.T[::-1])
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    ranked = rank[mesh.faces]
+    first = ranked.argmin(axis=1)
+    ranked = np.take_along_axis(ranked, (first[:, None] + np.arange(3)) % 3, axis=1)
+    ranked = ranked[np.lexsort(ranked.T[::-1])]
+    return trimesh.Trimesh(mesh.vertices[order], ranked, process=False)
+
+
+# From curves.
+
+
+def revolve(
+    profile: npt.ArrayLike, *, edge: float | npt.ArrayLike = EDGE, closed: bool = False
+) -> trimesh.Trimesh:
+    """Return the solid of a profile (n, 2) of points (r, z) [m] turned about z.
+
+    Args:
+        profile: Outline from one point of the axis to another, or, if `closed`, a loop
+            off the axis. Its points become rings: see `resample` and `smooth`.
+        edge: Wanted edge length along a ring [m], one for all or one per point.
+        closed: Whether the last ring joins the first.
+    """
+    points = np.asarray(profile, dtype=float)
+    edges = np.broadcast_to(np.asarray(edge, dtype=float), len(points))
+    rings: list[Array] = []
+    for (r, z), length in zip(points, edges, strict=True):
+        if r < ON_AXIS:
+            rings.append(np.array([[0.0, 0.0, z]]))
+            continue
+        angles = ring_angles(ring_size(float(r), float(length)))
+        rings.append(
+            np.column_stack([r * np.cos(angles), r * np.sin(angles), np.full(len(angles), z)])
+        )
+    return skin(rings, closed=closed)
+
+
+def sweep(
+    path: npt.ArrayLike, section: npt.ArrayLike, *, normal: npt.ArrayLike, scale: npt.ArrayLike
+) -> trimesh.Trimesh:
+    """Return the solid of a section moved along a plane path, with flat ends.
+
+    Args:
+        path: Points (k, 3) [m] in a plane.
+        section: Closed outline (n, 2) [m] round its origin: first coordinate in the plane
+            of the path, across it, second along `normal`.
+        normal: Unit normal (3,) of the plane of the path.
+        scale: Factor on the section, (), (k,) or, one per coordinate of it, (k, 2).
+            Zero makes an end a point.
+    """
+    points, outline = np.asarray(path, dtype=float), np.asarray(section, dtype=float)
+    factors = np.asarray(scale, dtype=float)
+    if factors.ndim < 2:
+        factors = np.repeat(np.broadcast_to(factors, len(points))[:, None], 2, axis=1)
+    binormal = np.asarray(normal, dtype=float)
+    tangent = np.gradient(points, arc_length(points), axis=0)
+    across = np.cross(binormal, tangent)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+
+    rings = []
+    for point, side, (a, b) in zip(points, across, factors, strict=True):
+        ring = point + np.outer(a * outline[:, 0], side) + np.outer(b * outline[:, 1], binormal)
+        rings.append(ring if a > 0.0 else point[None])
+    # A flat end is a fan round its centre.
+    if len(rings[0]) > 1:
+        rings.insert(0, points[:1])
+    if len(rings[-1]) > 1:
+        rings.append(points[-1:])
+    return skin(rings, closed=False)
+
+
+def bar(
+    start: npt.ArrayLike,
+    end: npt.ArrayLike,
+    section: npt.ArrayLike,
+    *,
+    normal: npt.ArrayLike,
+    scale: npt.ArrayLike = ((0.0, 1.0), (1.0, 1.0)),
+    edge: float = EDGE,
+) -> trimesh.Trimesh:
+    """Return a straight bar with rounded ends.
+
+    Args:
+        start: Point (3,) [m] in the middle of one end.
+        end: Point (3,) [m] in the middle of the other.
+        section: As for `sweep`.
+        normal: As for `sweep`.
+        scale: Thickness along the bar: pairs (fraction of the length, factor).
+        edge: Edge length along the bar [m].
+    """
+    p, q = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
+    length = float(np.linalg.norm(q - p))
+    along = np.linspace(0.0, 1.0, max(4, round(length / edge)) + 1)
+    knots = np.asarray(scale, dtype=float)
+    factor = PchipInterpolator(knots[:, 0], knots[:, 1])(along)
+    # The end rings are smaller: a bevel instead of a sharp edge.
+    factor[[0, -1]] *= 0.8
+    return sweep(p + along[:, None] * (q - p), section, normal=normal, scale=factor)
+
+
+def extrude(section: npt.ArrayLike, profile: npt.ArrayLike) -> trimesh.Trimesh:
+    """Return a section (n, 2) [m] raised along z by a profile (k, 2) of points (scale, z [m])."""
+    outline = np.asarray(section, dtype=float)
+    rings = []
+    for scale, z in np.asarray(profile, dtype=float):
+        ring = np.column_stack([scale * outline, np.full(len(outline), z)])
+        rings.append(ring if scale > 0.0 else np.array([[0.0, 0.0, z]]))
+    return skin(rings, closed=False)
+
+
+def grid_box(extents: npt.ArrayLike, *, centre: npt.ArrayLike, edge: float) -> trimesh.Trimesh:
+    """Return a box of `extents` (3,) [m] round `centre` (3,) [m] whose faces are grids."""
+    size = np.asarray(extents, dtype=float)
+    counts = np.maximum(1, np.round(size / edge).astype(int))
+    vertices: list[Array] = []
+    faces: list[Faces] = []
+    total = 0
+    for axis in range(3):
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        i, j = np.meshgrid(np.arange(counts[u] + 1), np.arange(counts[v] + 1), indexing="ij")
+        number = np.arange(i.size).reshape(i.shape)
+        a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+        quads = np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
+        for side in (0.0, 1.0):
+            points = np.empty((i.size, 3))
+            points[:, axis] = side
+            points[:, u], points[:, v] = i.ravel() / counts[u], j.ravel() / counts[v]
+            vertices.append((points - 0.5) * size + np.asarray(centre, dtype=float))
+            faces.append((quads if side else quads[:, ::-1]) + total)
+            total += i.size
+    return solid(np.concatenate(vertices), np.concatenate(faces))
+
+
+def skin(rings: list[Array], *, closed: bool) -> trimesh.Trimesh:
+    """Return the surface through rings (n_i, 3) that start alike; one point is a tip."""
+    starts = np.cumsum([0, *(len(ring) for ring in rings)])
+    faces: list[tuple[int, int, int]] = []
+    pairs = [(k, k + 1) for k in range(len(rings) - 1)]
+    if closed:
+        pairs.append((len(rings) - 1, 0))
+    for lower, upper in pairs:
+        faces += _zip_rings(
+            int(starts[lower]), len(rings[lower]), int(starts[upper]), len(rings[upper])
+        )
+    return solid(np.concatenate(rings), np.array(faces))
+
+
+def _zip_rings(a0: int, a_size: int, b0: int, b_size: int) -> list[tuple[int, int, int]]:
+    """Return the triangles between two rings of vertex numbers, stepping on the one behind."""
+    a_steps, b_steps = (size if size > 1 else 0 for size in (a_size, b_size))
+    faces = []
+    i = j = 0
+    while i < a_steps or j < b_steps:
+        a, b = a0 + i % a_size, b0 + j % b_size
+        if j == b_steps or (i < a_steps and (2 * i + 1) * b_size <= (2 * j + 1) * a_size):
+            faces.append((a, a0 + (i + 1) % a_size, b))
+            i += 1
+        else:
+            faces.append((a, b0 + (j + 1) % b_size, b))
+            j += 1
+    return faces
+
+
+# From other solids.
+
+
+def fuse(*parts: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return the union of overlapping solids."""
+    return _from_boolean(trimesh.boolean.union(list(parts), engine="manifold"))
+
+
+def cut(body: trimesh.Trimesh, *tools: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return a solid without the space of the tools."""
+    return _from_boolean(trimesh.boolean.difference([body, *tools], engine="manifold"))
+
+
+def stand(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return the mesh moved along z until its lowest point is at z = 0."""
+    return solid(mesh.vertices - [0.0, 0.0, mesh.bounds[0, 2]], mesh.faces)
+
+
+def _from_boolean(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return the result of a boolean without the slivers along its seams."""
+    # Another order first: the mending below depends on it.
+    tidy = solid(mesh.vertices, mesh.faces)
+    points, faces = tidy.vertices.copy(), tidy.faces.copy()
+    refused: set[tuple[int, ...]] = set()
+    for _ in range(MAX_REPAIRS):
+        lengths, heights = _edge_lengths(points, faces), _heights(points, faces)
+        slivers = [
+            k for k in np.flatnonzero(heights < SLIVER) if tuple(faces[k].tolist()) not in refused
+        ]
+        if not slivers:
+            break
+        k = min(slivers, key=lambda face: float(heights[face]))
+        sliver = tuple(faces[k].tolist())
+        if lengths[k].min() < 2.0 * SLIVER:
+            short = int(lengths[k].argmin())
+            a, b = sliver[short], sliver[(short + 1) % 3]
+            mended = _collapse(faces, a, b)
+            if mended is not None:
+                points[a] = (points[a] + points[b]) / 2.0
+        else:
+            long = int(lengths[k].argmax())
+            mended = _flip(points, faces, sliver[long], sliver[(long + 1) % 3])
+        if mended is None:
+            refused.add(sliver)
+        else:
+            faces = mended
+    return solid(points, faces)
+
+
+def _edge_lengths(points: Array, faces: Faces) -> Array:
+    """Return the lengths (n, 3) [m] of the edges that start at each corner of each face."""
+    corners = points[faces]
+    return np.asarray(np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2))
+
+
+def _heights(points: Array, faces: Faces) -> Array:
+    """Return the height (n,) [m] of each face above its longest edge."""
+    p, q, r = np.moveaxis(points[faces], 1, 0)
+    doubled = np.linalg.norm(np.cross(q - p, r - p), axis=1)
+    return np.asarray(doubled / np.maximum(_edge_lengths(points, faces).max(axis=1), ON_AXIS))
+
+
+def _collapse(faces: Faces, a: int, b: int) -> Faces | None:
+    """Return the faces with vertex `b` made one with `a`, None if that would pinch the surface."""
+    around_a = set(faces[(faces == a).any(axis=1)].ravel().tolist())
+    around_b = set(faces[(faces == b).any(axis=1)].ravel().tolist())
+    if len((around_a & around_b) - {a, b}) != 2:
+        return None
+    joined = np.where(faces == b, a, faces)
+    return joined[(joined != np.roll(joined, 1, axis=1)).all(axis=1)]
+
+
+def _flip(points: Array, faces: Faces, a: int, b: int) -> Faces | None:
+    """Return the faces with the edge from `a` to `b` turned, None if that mends nothing."""
+    pair = np.flatnonzero((faces == a).any(axis=1) & (faces == b).any(axis=1))
+    left, right = (
+        next(
+            int(face[(i + 2) % 3])
+            for face in faces[pair]
+            for i in range(3)
+            if face[i] == start and face[(i + 1) % 3] == end
+        )
+        for start, end in ((a, b), (b, a))
+    )
+    if ((faces == left).any(axis=1) & (faces == right).any(axis=1)).any():
+        return None
+    turned = faces.copy()
+    turned[pair] = [(a, right, left), (right, b, left)]
+    before, after = (_heights(points, either[pair]).min() for either in (faces, turned))
+    return turned if after > before else None

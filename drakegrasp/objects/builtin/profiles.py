@@ -1,0 +1,130 @@
+"""Curves in the plane: corners and sizes in metres come in, points of even spacing go out.
+
+A curve is a polyline. It is a profile (r, z) that `drakegrasp.objects.builtin.modelling` turns
+about z, or an outline (x, y) that it moves along a path.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import PchipInterpolator
+
+from drakegrasp.frames import Array
+
+#: Usual edge length where fingers touch [m]: below the width of a fingertip.
+EDGE = 0.006
+
+#: Edges inside a cavity or below a foot are this much longer: no finger goes there.
+COARSE = 1.7
+
+#: Sizes of a ring. A short ladder, so that neighbouring rings mostly agree and zip up evenly.
+RING_SIZES = np.array([8, 12, 16, 24, 32, 48, 64])
+
+#: How far from its ends an inset profile starts to follow the given one [m].
+OVERLAP = 0.001
+
+
+def resample(points: npt.ArrayLike, step: float) -> Array:
+    """Return a polyline (n, d) with its corners kept and no piece longer than `step` [m]."""
+    corners = np.asarray(points, dtype=float)
+    pieces = [corners[:1]]
+    for start, end in pairwise(corners):
+        count = max(1, int(np.ceil(np.linalg.norm(end - start) / step - 1e-6)))
+        fractions = np.linspace(0.0, 1.0, count + 1)[1:, None]
+        pieces.append(start + fractions * (end - start))
+    return np.concatenate(pieces)
+
+
+def smooth(points: npt.ArrayLike, step: float) -> Array:
+    """Return points (n, d) about `step` [m] apart on a curve through `points` (k, d).
+
+    The curve is a monotone cubic in the chord length: it does not overshoot.
+    """
+    knots = np.asarray(points, dtype=float)
+    fine = PchipInterpolator(arc_length(knots), knots)(np.linspace(0.0, arc_length(knots)[-1], 400))
+    return spread_evenly(fine, step)
+
+
+def inset(side: npt.ArrayLike, distance: float, *, floor: float) -> Array:
+    """Return the profile `side` (n, 2) moved inwards by `distance` [m] and cut at z = `floor` [m].
+
+    `side` is a profile (r, z) of rising z. The result ends at the same height.
+    """
+    fine = resample(side, 0.0005)
+    height = fine[-1, 1]
+    tangent = np.gradient(fine, arc_length(fine), axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    moved = fine + distance * np.column_stack([-tangent[:, 1], tangent[:, 0]])
+    moved = moved[np.argsort(moved[:, 1], kind="stable")]
+    inside = moved[(moved[:, 1] > floor + OVERLAP) & (moved[:, 1] < height - OVERLAP)]
+    ends = [(np.interp(z, moved[:, 1], moved[:, 0]), z) for z in (floor, height)]
+    return np.vstack([ends[0], inside, ends[1]])
+
+
+def bevelled(radius: float, height: float, bevel: float) -> list[tuple[float, float]]:
+    """Return corners (r, z) of an upright wall with a bevelled foot and head, off the axis."""
+    return [
+        (radius - bevel, 0.0),
+        (radius, bevel),
+        (radius, height - bevel),
+        (radius - bevel, height),
+    ]
+
+
+def ellipse(a: float, b: float, *, edge: float) -> Array:
+    """Return an ellipse (n, 2) of half-axes `a` and `b` [m], anticlockwise."""
+    angles = ring_angles(ring_size((a + b) / 2.0, edge))
+    return np.column_stack([a * np.cos(angles), b * np.sin(angles)])
+
+
+def rounded_polygon(corners: npt.ArrayLike, radius: float, *, edge: float) -> Array:
+    """Return a convex polygon (n, 2), anticlockwise, with its corners rounded by `radius` [m]."""
+    points = np.asarray(corners, dtype=float)
+    outline = []
+    for before, corner, after in zip(
+        np.roll(points, 1, axis=0), points, np.roll(points, -1, axis=0), strict=True
+    ):
+        u = (before - corner) / np.linalg.norm(before - corner)
+        v = (after - corner) / np.linalg.norm(after - corner)
+        half = np.arccos(np.clip(u @ v, -1.0, 1.0)) / 2.0
+        centre = corner + radius / np.sin(half) * (u + v) / np.linalg.norm(u + v)
+        touch = corner + u * radius / np.tan(half) - centre
+        start = np.arctan2(touch[1], touch[0])
+        turn = np.pi - 2.0 * half
+        count = max(2, int(np.ceil(radius * turn / edge)))
+        angles = start + np.linspace(0.0, turn, count + 1)
+        outline.append(centre + radius * np.column_stack([np.cos(angles), np.sin(angles)]))
+    ring = np.concatenate(outline)
+    return resample(np.vstack([ring, ring[:1]]), edge)[:-1]
+
+
+def rounded_rectangle(width: float, depth: float, radius: float, *, edge: float) -> Array:
+    """Return a centred rectangle (n, 2) of `width` x `depth` [m] with rounded corners."""
+    x, y = width / 2.0, depth / 2.0
+    return rounded_polygon([(x, -y), (x, y), (-x, y), (-x, -y)], radius, edge=edge)
+
+
+def ring_size(radius: float, edge: float) -> int:
+    """Return how many points a ring of `radius` [m] needs for edges of about `edge` [m]."""
+    wanted = 2.0 * np.pi * radius / edge
+    return int(RING_SIZES[np.argmin(np.abs(np.log(RING_SIZES / wanted)))])
+
+
+def ring_angles(count: int) -> Array:
+    """Return the angles (count,) [rad] of a ring, from 0."""
+    return 2.0 * np.pi * np.arange(count) / count
+
+
+def arc_length(points: Array) -> Array:
+    """Return the length along a polyline (n, d) at each of its points, (n,) [m]."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+
+
+def spread_evenly(points: Array, step: float) -> Array:
+    """Return points (m, d) spread evenly along a polyline (n, d), about `step` [m] apart."""
+    s = arc_length(points)
+    even = np.linspace(0.0, s[-1], max(1, round(s[-1] / step)) + 1)
+    return np.column_stack([np.interp(even, s, column) for column in points.T])

@@ -1,0 +1,282 @@
+"""The object that Drake simulates: a mesh file comes in, an `ObjectModel` goes out.
+
+That is a watertight solid in metres with its origin {O} at the centre of the bounding box,
+mass properties of uniform density, and a collision mesh that is not too fine for
+hydroelastic contact. Drake itself accepts open, inverted and flat meshes without a word and
+simulates nonsense, so everything it needs is checked here; what is wrong is mended
+(`drakegrasp.mesh.repair`) and noted, or refused as `MeshError`.
+"""
+
+from __future__ import annotations
+
+import colorsys
+import io
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+
+from drakegrasp.config import ObjectConfig
+from drakegrasp.errors import MeshError
+from drakegrasp.frames import Array
+from drakegrasp.mesh.components import count_parts
+from drakegrasp.mesh.decimation import decimate
+from drakegrasp.mesh.distance_field import DistanceField, make_distance_field
+from drakegrasp.mesh.loading import load_mesh, one_line
+from drakegrasp.mesh.repair import mend_solid
+from drakegrasp.mesh.surfaces import Solid, diagonal, signed_volume
+from drakegrasp.objects.sources import MANIFEST_NAME, UNITS, MeshSource, source_sha256
+from drakegrasp.runtime.files import sync_and_rename, temporary_name
+from drakegrasp.seeding import object_key
+
+#: Below these an object is a sheet or a speck, which no hydroelastic contact resolves.
+MIN_EXTENT = 0.5e-3  # [m]
+MIN_VOLUME = 1e-9  # [m^3]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ObjectModel:
+    """A rigid object, ready to be simulated. Lengths in [m], all arrays read-only.
+
+    Attributes:
+        name: Unique name.
+        class_name: Class.
+        mesh_sha256: Digest of the source file's bytes and its scale, hexadecimal.
+        visual_vertices: (n, 3) float64, in {O}, full resolution.
+        visual_faces: (m, 3) int32, counter-clockwise seen from outside.
+        collision_vertices: (k, 3) float64, in {O}.
+        collision_faces: (l, 3) int32.
+        mass: [kg]
+        p_OOcm: (3,) centre of mass.
+        I_OOcm_O: (3, 3) rotational inertia about the centre of mass, in axes of {O} [kg m^2].
+        collision_error: Largest distance between visual and collision surface.
+        notes: What was mended, in sentences.
+    """
+
+    name: str
+    class_name: str
+    mesh_sha256: str
+    visual_vertices: Array
+    visual_faces: npt.NDArray[np.int32]
+    collision_vertices: Array
+    collision_faces: npt.NDArray[np.int32]
+    mass: float
+    p_OOcm: Array
+    I_OOcm_O: Array
+    collision_error: float
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        shapes = {
+            "visual_vertices": (np.float64, (None, 3)),
+            "visual_faces": (np.int32, (None, 3)),
+            "collision_vertices": (np.float64, (None, 3)),
+            "collision_faces": (np.int32, (None, 3)),
+            "p_OOcm": (np.float64, (3,)),
+            "I_OOcm_O": (np.float64, (3, 3)),
+        }
+        for key, (dtype, shape) in shapes.items():
+            array = np.array(getattr(self, key), dtype=dtype, order="C")
+            if len(array.shape) != len(shape) or array.shape[-1] != 3 or not array.size:
+                raise MeshError(f"{self.name}: {key} must have shape {shape}, got {array.shape}")
+            array.setflags(write=False)
+            object.__setattr__(self, key, array)
+
+    @property
+    def half_extents(self) -> Array:
+        """Half of the bounding box's edges (3,) [m]; its centre is the origin of {O}."""
+        return np.asarray(np.ptp(self.visual_vertices, axis=0) / 2.0)
+
+    @property
+    def volume(self) -> float:
+        """Volume of the solid [m^3]."""
+        return signed_volume(self.visual_vertices, self.visual_faces.astype(np.int64))
+
+    @cached_property
+    def visual(self) -> trimesh.Trimesh:
+        """The visual surface in {O}."""
+        return trimesh.Trimesh(self.visual_vertices, self.visual_faces, process=False)
+
+    @cached_property
+    def collision(self) -> trimesh.Trimesh:
+        """The collision surface in {O}."""
+        return trimesh.Trimesh(self.collision_vertices, self.collision_faces, process=False)
+
+    @cached_property
+    def field(self) -> DistanceField:
+        """Distances from the collision surface."""
+        return make_distance_field(self.collision_vertices, self.collision_faces)
+
+
+# Preparing
+
+
+def prepare_object(source: MeshSource, config: ObjectConfig | None = None) -> ObjectModel:
+    """Return the simulated object of a mesh file, mended where that is honest.
+
+    Args:
+        source: Where the mesh is and what unit it is in.
+        config: Mass, and limits of size and faces; the defaults if None.
+
+    Raises:
+        MeshError: If the file is no mesh, has an implausible size, or no solid can be
+            made of it; the message gives the reason.
+    """
+    mesh = load_mesh(source.path)
+    vertices, faces = np.asarray(mesh.vertices) * source.scale, np.asarray(mesh.faces)
+    try:
+        return make_object(
+            vertices,
+            faces,
+            config or ObjectConfig(),
+            name=source.name,
+            class_name=source.class_name,
+            mesh_sha256=source_sha256(source),
+            unit=f" with 1 unit = {source.scale:g} m",
+        )
+    except MeshError as reason:
+        raise MeshError(f"{source.path.name}: {reason}") from reason
+
+
+def make_object(
+    vertices: npt.ArrayLike,
+    faces: npt.ArrayLike,
+    config: ObjectConfig,
+    *,
+    name: str,
+    class_name: str,
+    mesh_sha256: str,
+    unit: str = "",
+) -> ObjectModel:
+    """Return the simulated object of a surface, see `prepare_object`.
+
+    Args:
+        vertices: (n, 3) [m].
+        faces: (m, 3).
+        config: Mass, and limits of size and faces.
+        name: Of the object.
+        class_name: Of the object.
+        mesh_sha256: Digest of where it comes from.
+        unit: What to say of the unit of length where the size is refused.
+
+    Raises:
+        MeshError: If the size is implausible, or no solid can be made of it.
+    """
+    vertices, faces = np.asarray(vertices, dtype=float), np.asarray(faces)
+    size = diagonal(vertices)
+    if not config.min_diagonal <= size <= config.max_diagonal:
+        raise MeshError(
+            f"the diagonal of the bounding box must be {config.min_diagonal:g} m to "
+            f"{config.max_diagonal:g} m, got {size:.4g} m{unit}: give the "
+            f"file's unit with --units ({', '.join(UNITS)}) or for this mesh in {MANIFEST_NAME}"
+        )
+    solid = mend_solid(vertices, faces)
+    _refuse_slight(solid)
+    centre = (solid.vertices.min(axis=0) + solid.vertices.max(axis=0)) / 2.0
+    visual = Solid(vertices=solid.vertices - centre, faces=solid.faces)
+    p_OOcm, I_OOcm_O = _mass_properties(visual, config.mass)
+    collision, error = decimate(visual, config.max_collision_faces)
+    notes = solid.notes
+    parts = count_parts(solid.vertices, solid.faces)
+    if parts > 1:
+        notes = (*notes, f"{parts} parts do not touch and will move as one")
+    return ObjectModel(
+        name=name,
+        class_name=class_name,
+        mesh_sha256=mesh_sha256,
+        visual_vertices=visual.vertices,
+        visual_faces=visual.faces.astype(np.int32),
+        collision_vertices=collision.vertices,
+        collision_faces=collision.faces.astype(np.int32),
+        mass=config.mass,
+        p_OOcm=p_OOcm,
+        I_OOcm_O=I_OOcm_O,
+        collision_error=error,
+        notes=notes,
+    )
+
+
+def _refuse_slight(solid: Solid) -> None:
+    """Refuse sheets, specks, and a volume that the convex hull contradicts."""
+    extents = np.ptp(solid.vertices, axis=0)
+    if extents.min() < MIN_EXTENT:
+        raise MeshError(
+            f"the object must be at least {MIN_EXTENT * 1e3:g} mm thick, "
+            f"got {extents.min() * 1e3:.3g} mm"
+        )
+    volume = signed_volume(solid.vertices, solid.faces)
+    if volume < MIN_VOLUME:
+        raise MeshError(f"the volume must be at least {MIN_VOLUME:g} m^3, got {volume:.3g} m^3")
+    hull = trimesh.Trimesh(solid.vertices, solid.faces, process=False).convex_hull.volume
+    if volume > hull * (1.0 + 1e-6):
+        raise MeshError(
+            f"the volume must be within the convex hull's, {hull:.4g} m^3, got {volume:.4g} m^3"
+        )
+
+
+def _mass_properties(solid: Solid, mass: float) -> tuple[Array, Array]:
+    """Return p_OOcm (3,) and I_OOcm_O (3, 3) of a solid of uniform density."""
+    triangles = solid.vertices[solid.faces]
+    volume = signed_volume(solid.vertices, solid.faces)
+    properties = trimesh.triangles.mass_properties(triangles, density=mass / volume)
+    p_OOcm = np.asarray(properties["center_mass"])
+    inertia = np.asarray(properties["inertia"])
+    I_OOcm_O = (inertia + inertia.T) / 2.0
+    moments = np.linalg.eigvalsh(I_OOcm_O)
+    if not (moments[0] > 0.0 and moments[0] + moments[1] >= moments[2] * (1.0 - 1e-9)):
+        raise MeshError(f"the moments of inertia must obey the triangle inequality, got {moments}")
+    # A centre of mass outside the hull is impossible for a solid, and trimesh's search
+    # for resting poses never returns from it.
+    hull = trimesh.Trimesh(solid.vertices, solid.faces, process=False).convex_hull
+    outside = np.einsum("ij,ij->i", p_OOcm - hull.triangles[:, 0], hull.face_normals).max()
+    if outside > 1e-9:
+        raise MeshError(f"the centre of mass must be inside the convex hull, got {p_OOcm}")
+    return p_OOcm, I_OOcm_O
+
+
+# Keeping
+
+
+def save_object(model: ObjectModel, path: str | Path) -> None:
+    """Write an object to a .npz file, atomically; equal objects give equal bytes."""
+    path = Path(path)
+    content: dict[str, Any] = {f.name: np.asarray(getattr(model, f.name)) for f in fields(model)}
+    content["notes"] = np.array(model.notes, dtype=np.str_)
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **content)
+    temporary = temporary_name(path)
+    try:
+        temporary.write_bytes(buffer.getvalue())
+        sync_and_rename(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def load_object(path: str | Path) -> ObjectModel:
+    """Return an object that `save_object` wrote.
+
+    Raises:
+        MeshError: If the file is missing, damaged or something else.
+    """
+    path = Path(path)
+    try:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as content:
+            values: dict[str, Any] = {f.name: content[f.name] for f in fields(ObjectModel)}
+    except Exception as error:
+        raise MeshError(
+            f"{path.name}: must be an object file of drakegrasp, got: {one_line(error)}"
+        ) from error
+    for key in ("name", "class_name", "mesh_sha256", "mass", "collision_error"):
+        values[key] = values[key].item()
+    values["notes"] = tuple(values["notes"].tolist())
+    return ObjectModel(**values)
+
+
+def object_colour(name: str) -> tuple[float, float, float]:
+    """Return the RGB colour that an object's name gives it, well apart from the table's."""
+    hue = (object_key(name) % 997) / 997.0
+    return colorsys.hsv_to_rgb(hue, 0.65, 0.85)

@@ -1,0 +1,228 @@
+"""Mesh files: a directory comes in, their names, classes and units go out.
+
+`find_meshes` lists the files of a directory, `drakegrasp.mesh.loading` reads one; the object
+that Drake simulates is made of it in `drakegrasp.objects.model`.
+
+File names and `objects.yaml`: a mesh called `<number>_<class>_<rest>.ext` belongs to
+`<class>`, which may itself contain underscores: the number goes, and so does the last
+part if at least two parts remain (24_mug_final and 1_mug are mugs, 30_fruit_juicer_final
+is a fruit_juicer). A name without a number is its own class. A file `objects.yaml`
+beside the meshes overrides that, per set or per mesh, and tells lengths:
+
+    units: cm
+    objects:
+      95_boots_final: {units: m, class: boots, name: boots}
+"""
+
+from __future__ import annotations
+
+import hashlib
+import unicodedata
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pydantic
+import yaml
+
+from drakegrasp.errors import MeshError
+from drakegrasp.mesh.loading import SUFFIXES, one_line, read_bytes
+
+#: Metres per unit of length of a file.
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+MANIFEST_NAME = "objects.yaml"
+#: Longest name of an object [bytes]; file systems allow 255 with what is added to it.
+MAX_NAME = 200
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshSource:
+    """A mesh file and what is known about it before it is opened.
+
+    Attributes:
+        name: Unique name of the object; the file's stem unless the manifest says otherwise.
+        class_name: Class of the object.
+        path: The mesh file.
+        scale: Metres per unit of length of the file.
+    """
+
+    name: str
+    class_name: str
+    path: Path
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        for what, text in (("name", self.name), ("class", self.class_name)):
+            # Names become names of folders and files.
+            bad = any(c in "/\\" or not c.isprintable() for c in text) or text.startswith(".")
+            if not text.strip() or bad or len(text.encode()) > MAX_NAME:
+                raise MeshError(
+                    f"{self.path.name}: the {what} must be printable, not empty, without slashes, "
+                    f"not begin with a dot, and have at most {MAX_NAME} bytes, got {text!r}"
+                )
+        if not (np.isfinite(self.scale) and self.scale > 0.0):
+            raise MeshError(f"{self.path.name}: scale must be positive, got {self.scale}")
+
+
+# Finding meshes
+
+
+class _Entry(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="forbid", coerce_numbers_to_str=True)
+
+    units: Literal["m", "cm", "mm"] | None = None
+    class_name: str | None = pydantic.Field(default=None, alias="class")
+    name: str | None = None
+
+
+class _Manifest(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="forbid", coerce_numbers_to_str=True)
+
+    units: Literal["m", "cm", "mm"] | None = None
+    objects: dict[str, _Entry] = pydantic.Field(default_factory=dict)
+
+    @pydantic.field_validator("objects", mode="before")
+    @classmethod
+    def _empty_section(cls, value: object) -> object:
+        # A section whose keys are all commented out is read as None.
+        return {} if value is None else value
+
+
+def _read_manifest(path: Path) -> _Manifest:
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise MeshError(f"{path}: must be a readable YAML file, got: {one_line(error)}") from error
+    try:
+        return _Manifest.model_validate({} if content is None else content)
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"]) or "the file"
+        legal = "; legal keys: " + (
+            "units, class, name" if first["loc"][:1] == ("objects",) else "units, objects"
+        )
+        must = {
+            "extra_forbidden": "a known key",
+            "model_type": "a mapping of keys to values",
+            "dict_type": "a mapping of names to their values",
+        }.get(first["type"], first["msg"].removeprefix("Input should be "))
+        raise MeshError(
+            f"{path}: {place}: must be {must}, got {first['input']!r}"
+            + (legal if first["type"] == "extra_forbidden" else "")
+        ) from error
+
+
+def _class_of(stem: str) -> str:
+    number, *parts = stem.split("_")
+    if not (number.isdigit() and parts):
+        return stem
+    return "_".join(parts[:-1] if len(parts) > 1 else parts) or stem
+
+
+def find_meshes(
+    directory: str | Path, *, units: str = "m", manifest: str | Path | None = None
+) -> list[MeshSource]:
+    """Return the meshes of a directory, sorted by name; subdirectories are not searched.
+
+    Args:
+        directory: Holds .obj, .stl, .ply and .glb files.
+        units: Unit of the files' lengths: m, cm or mm. The manifest's unit for the set
+            overrides it, and the manifest's unit for a mesh overrides both.
+        manifest: A YAML file as the module describes; without it `objects.yaml` in
+            `directory`, if there is one.
+
+    Raises:
+        MeshError: If there is no mesh, two have the same name, or the manifest is wrong.
+    """
+    directory = Path(directory)
+    _refuse_units(units)
+    try:
+        paths = [
+            path
+            for path in directory.iterdir()
+            if path.suffix.lower() in SUFFIXES and path.name[0] != "." and path.is_file()
+        ]
+    except OSError as error:
+        raise MeshError(
+            f"{directory}: must be a directory of meshes, got: {error.strerror or error}"
+        ) from error
+    if not paths:
+        raise MeshError(
+            f"{directory}: must hold at least one mesh ({', '.join(SUFFIXES)}), got none"
+        )
+
+    # Some file systems store é as two characters; the manifest's author typed one.
+    stems = {path: unicodedata.normalize("NFC", path.stem) for path in sorted(paths)}
+    _refuse_twins(directory, stems)
+    if manifest is None and (directory / MANIFEST_NAME).is_file():
+        manifest = directory / MANIFEST_NAME
+    table = _Manifest() if manifest is None else _read_manifest(Path(manifest))
+    entries = _entries(table)
+    unknown = sorted(set(entries) - set(stems.values()))
+    if unknown:
+        raise MeshError(
+            f"{manifest}: objects must be names of meshes in {directory}: "
+            f"{', '.join(sorted(stems.values()))}; got {', '.join(unknown)}"
+        )
+
+    sources = [_source(path, stem, table, units) for path, stem in stems.items()]
+    _refuse_twins(directory, {source.path: source.name for source in sources})
+    return sorted(sources, key=lambda source: source.name)
+
+
+def find_mesh(path: str | Path, *, units: str = "m") -> MeshSource:
+    """Return one mesh file as `find_meshes` does, whatever else is in its directory.
+
+    Raises:
+        MeshError: If it is no mesh file, or the manifest beside it is wrong.
+    """
+    path = Path(path)
+    _refuse_units(units)
+    if path.suffix.lower() not in SUFFIXES or not path.is_file():
+        got = repr(path.suffix) if path.is_file() else "none"
+        raise MeshError(f"{path}: must be a mesh file ({', '.join(SUFFIXES)}), got {got}")
+    manifest = path.with_name(MANIFEST_NAME)
+    table = _read_manifest(manifest) if manifest.is_file() else _Manifest()
+    return _source(path, unicodedata.normalize("NFC", path.stem), table, units)
+
+
+def _entries(table: _Manifest) -> dict[str, _Entry]:
+    return {unicodedata.normalize("NFC", key): entry for key, entry in table.objects.items()}
+
+
+def _source(path: Path, stem: str, table: _Manifest, units: str) -> MeshSource:
+    entry = _entries(table).get(stem, _Entry())
+    return MeshSource(
+        name=stem if entry.name is None else entry.name,
+        class_name=_class_of(stem) if entry.class_name is None else entry.class_name,
+        path=path,
+        scale=UNITS[entry.units or table.units or units],
+    )
+
+
+def _refuse_units(units: str) -> None:
+    if units not in UNITS:
+        raise MeshError(f"--units must be one of {', '.join(UNITS)}, got {units!r}")
+
+
+def _refuse_twins(directory: Path, names: dict[Path, str]) -> None:
+    for name, count in Counter(names.values()).items():
+        if count > 1:
+            twins = ", ".join(path.name for path, other in names.items() if other == name)
+            raise MeshError(f"{directory}: names must be unique, got {name!r} for {twins}")
+
+
+# Reading one
+
+
+def source_sha256(source: MeshSource) -> str:
+    """Return the hash of a mesh file's bytes and its scale, hexadecimal.
+
+    Raises:
+        MeshError: If the file cannot be read.
+    """
+    return hashlib.sha256(
+        read_bytes(source.path) + f"\nscale {source.scale!r}".encode()
+    ).hexdigest()

@@ -1,0 +1,1 @@
+"""One grasp attempt in Drake: scene, candidates, screen, trial, lift."""

@@ -1,0 +1,332 @@
+"""Stage "sample": palm poses about an object, and the attempts that follow from them.
+
+In: the object's box and mesh, and how it rests on the table. Out: up to
+`candidates.max` distinct palm poses X_OG and, for each, where its palm ray meets the
+object. The paper's method (`rotations`) multiplies a first palm pose with global and
+local rotations; `normals` is the baseline of its Figure 2.
+
+Nothing here needs Drake. Poses are the same bits on every machine: sums, products and square
+roots in a stated order (`arithmetic`), decisions that take in what lies on the edge by more than
+rounding, poses compared as rounded integers, draws from `seeding`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+
+from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos_deg
+from drakegrasp.config import CandidateConfig
+from drakegrasp.mesh.surfaces import on_faces
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.seeding import Stream, object_key
+
+#: The first palm's axes in {O}: +Gz looks down onto the object, Gx = Ox.
+R_OG0 = np.diag([1.0, -1.0, -1.0])
+#: Poses that agree to this in every rotation entry, and in position relative to the
+#: object's size, are one pose: Euler products repeat themselves up to rounding.
+SAME_POSE = 1e-6
+#: A palm this far below the table, or a palm ray this far beside the bounding box, is still in [m]:
+#: far above rounding, far below what matters.
+EDGE = 1e-6
+#: A palm ray this far beside a triangle still meets it, as a part of the triangle: no ray slips
+#: through an edge between two.
+RAY_EDGE = 1e-9
+#: Combinations whose poses are computed at a time; bounds the memory.
+CHUNK = 131_072
+#: Pairs of a ray and a triangle that are looked at together; few enough for a cache.
+PAIRS = 65_536
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Candidates:
+    """Palm poses of one object.
+
+    Attributes:
+        X_OG: (n, 4, 4), the drawn poses, in drawing order.
+        distance: (n,), from the palm's origin along +Gz to the object's surface [m]; NaN
+            where the palm ray misses the object.
+        combinations: Number of combinations of rotations (or surface samples).
+        valid: Those above the table whose palm ray meets the bounding box.
+        distinct: Different poses among them.
+    """
+
+    X_OG: Array
+    distance: Array
+    combinations: int
+    valid: int
+    distinct: int
+
+    def __len__(self) -> int:
+        return len(self.X_OG)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Attempt:
+    """One candidate at one stand-off: what a trial starts from.
+
+    Attributes:
+        candidate: Index of the candidate of its object.
+        standoff_index: Index into `candidates.standoffs`.
+        standoff: Distance of the palm from the surface point along -Gz [m].
+        spread: Angle of the spread joints [rad].
+        X_OG: Pose of the palm (4, 4); the candidate's own where its ray misses.
+        ray_hits: Whether the palm ray meets the object.
+        seed: What `spread` was drawn from.
+        closing: Angles of the closing joints (k,) [rad] from which the fingers close; None is
+            the open hand.
+    """
+
+    candidate: int
+    standoff_index: int
+    standoff: float
+    spread: float
+    X_OG: Array
+    ray_hits: bool
+    seed: int
+    closing: Array | None = None
+
+
+def sample_candidates(
+    model: ObjectModel, X_TO: npt.ArrayLike, config: CandidateConfig, seed: int
+) -> Candidates:
+    """Return the palm poses of an object, drawn with the seed, with their palm rays.
+
+    Args:
+        model: The object.
+        X_TO: Its resting pose in the table-top frame, (4, 4).
+        config: Method, rotations and number.
+        seed: Of the dataset.
+    """
+    stream = Stream(seed, object_key(model.name))
+    X_TO = np.asarray(X_TO, dtype=float)
+    if config.method == "rotations":
+        poses, combinations, valid = rotation_candidates(model.half_extents, X_TO, config, stream)
+        distinct = len(poses)
+        poses = poses[stream.permutation(distinct)[: config.max]]
+    else:
+        poses = normal_candidates(model, config.max, stream)
+        combinations = len(poses)
+        poses = poses[above_table(poses[:, :3, 3], X_TO)]
+        valid = distinct = len(poses)
+    return Candidates(
+        X_OG=poses,
+        distance=palm_ray_distance(model.collision, poses),
+        combinations=combinations,
+        valid=valid,
+        distinct=distinct,
+    )
+
+
+def rotation_candidates(
+    half_extents: npt.ArrayLike,
+    X_TO: Array,
+    config: CandidateConfig,
+    stream: Stream,
+) -> tuple[Array, int, int]:
+    """Return the distinct valid poses of the paper's method, and two counts.
+
+    X_OG = R_global X_OG0 R_local with R = Rx Ry Rz each, and X_OG0 on +Oz at the distance
+    of the box's corner from its centre, looking at it (Veres et al., equation 1). Valid:
+    the palm's origin is above the table and the ray along +Gz meets the box; what lies on the
+    edge is valid.
+
+    Args:
+        half_extents: (3,), of the box about the origin of {O} [m].
+        X_TO: Resting pose (4, 4).
+        config: The rotations; with `jitter_deg` each angle gets a random addition.
+        stream: Draws the jitter.
+
+    Returns:
+        Poses (n, 4, 4), sorted by their rotation's entries, row by row, and then by position,
+        as rounded integers; the number of combinations; of valid ones.
+    """
+    half = np.asarray(half_extents, dtype=float)
+    radius = float(norm(half))
+    rotations, positions, combinations = [], [], 0
+    for R_global, R_local in _rotation_chunks(config, stream):
+        combinations += len(R_global)
+        p_OG = radius * R_global[:, :, 2]
+        keep = above_table(p_OG, X_TO)
+        R_OG = multiply(R_global[keep] * np.diag(R_OG0), R_local[keep])
+        p_OG = p_OG[keep]
+        hits = ray_meets_box(p_OG, R_OG[:, :, 2], half)
+        rotations.append(R_OG[hits])
+        positions.append(p_OG[hits])
+    R, p = np.concatenate(rotations), np.concatenate(positions)
+    key = np.rint(np.hstack([R.reshape(-1, 9), p / radius]) / SAME_POSE).astype(np.int64)
+
+    # Equal poses are neighbours in this order, the one that came first in front.
+    order = np.lexsort(key.T[::-1])
+    new = np.ones(len(order), dtype=np.bool_)
+    new[1:] = (key[order[1:]] != key[order[:-1]]).any(axis=1)
+    first = order[new]
+    return _poses(R[first], p[first]), combinations, len(R)
+
+
+def normal_candidates(model: ObjectModel, count: int, stream: Stream) -> Array:
+    """Return poses (n, 4, 4) that look at random surface points against their normals.
+
+    The points are spread evenly over the area, the roll about the normal is uniform, and
+    the palm starts two of the box's half diagonals away, outside of the object.
+    """
+    vertices, faces = model.visual_vertices, model.visual_faces.astype(np.int64)
+    points, picked = on_faces(vertices, faces, stream.uniform(3 * count).reshape(count, 3))
+    a, b, c = np.moveaxis(vertices[faces[picked]], 1, 0)
+    outward = np.cross(b - a, c - a)
+    z = -outward / norm(outward)[:, None]
+
+    # Any direction that is not parallel to z serves to start the roll from.
+    helper = np.where(np.abs(z[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    x = np.cross(helper, z)
+    x /= norm(x)[:, None]
+    sine, cosine = sin_cos_deg(360.0 * stream.uniform(count)[:, None])
+    x = cosine * x + sine * np.cross(z, x)
+    R = np.stack([x, np.cross(z, x), z], axis=2)
+    return _poses(R, points - 2.0 * z * norm(model.half_extents))
+
+
+def _poses(R: Array, p: Array) -> Array:
+    """Return poses (n, 4, 4) of rotations (n, 3, 3) and positions (n, 3)."""
+    poses = np.tile(np.eye(4), (len(R), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = R, p
+    return poses
+
+
+def above_table(p_OG: Array, X_TO: Array) -> npt.NDArray[np.bool_]:
+    """Return for points (n, 3) in {O} whether they lie above the table, or in it."""
+    return dot(p_OG, X_TO[2, :3]) + X_TO[2, 3] > -EDGE
+
+
+def ray_meets_box(p_OG: Array, z_O: Array, half: Array) -> npt.NDArray[np.bool_]:
+    """Return for rays from (n, 3) along (n, 3) whether they meet the box of half extents (3,)."""
+    # A component that should be zero may be 1e-17: as an exact zero it divides to infinity,
+    # which is what the slab test wants.
+    direction = np.where(np.abs(z_O) < 1e-12, 0.0, z_O)
+    wide = half + EDGE
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t1, t2 = (-wide - p_OG) / direction, (wide - p_OG) / direction
+    # 0/0, a ray within a slab's face, constrains nothing: fmax and fmin skip the NaN.
+    entry = np.fmax.reduce(np.minimum(t1, t2), axis=1)
+    leave = np.fmin.reduce(np.maximum(t1, t2), axis=1)
+    return leave >= np.maximum(entry, 0.0)
+
+
+def palm_ray_distance(mesh: trimesh.Trimesh, X_OG: Array) -> Array:
+    """Return the distance (n,) [m] along +Gz to the mesh's surface; NaN where it is missed.
+
+    Our own rays, because embree casts single-precision ones, with kernels chosen by the CPU
+    (Möller and Trumbore 1997). A ray through an edge meets it.
+    """
+    a, b, c = np.moveaxis(np.asarray(mesh.triangles, dtype=float), 1, 0)
+    centre = (a + b + c) / 3.0
+    reach = np.sqrt(np.max([dot(q - centre, q - centre) for q in (a, b, c)], axis=0, initial=0.0))
+    distance = np.full(len(X_OG), np.inf)
+    step = max(1, PAIRS // max(1, len(a)))
+    for start in range(0, len(X_OG), step):
+        rays = X_OG[start : start + step]
+        near = _near_triangles(rays, centre, reach * (1.0 + RAY_EDGE) + EDGE)
+        ray, triangle = np.nonzero(near)
+        found = _ray_triangle(
+            rays[ray, :3, 3], rays[ray, :3, 2], a[triangle], b[triangle], c[triangle]
+        )
+        np.minimum.at(distance, start + ray, found)
+    return np.where(np.isfinite(distance), distance, np.nan)
+
+
+def _near_triangles(X_OG: Array, centre: Array, reach: Array) -> npt.NDArray[np.bool_]:
+    """Return (n, m), which rays pass spheres (m, 3) of radius (m,) within it, ahead of them."""
+    along, squared = np.zeros((len(X_OG), len(centre))), np.zeros((len(X_OG), len(centre)))
+    for axis in range(3):
+        apart = centre[:, axis] - X_OG[:, None, axis, 3]
+        along += apart * X_OG[:, None, axis, 2]
+        squared += apart * apart
+    # The difference of two squares rounds; EDGE in the reach is far above that.
+    return (squared - along * along <= reach * reach) & (along >= -reach)
+
+
+def _ray_triangle(p: Array, z: Array, a: Array, b: Array, c: Array) -> Array:
+    """Return the distance (n,) at which each ray meets its triangle; inf where it does not."""
+    ab, ac, ap = b - a, c - a, p - a
+    across, up = np.cross(z, ac), np.cross(ap, ab)
+    volume = dot(ab, across)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v, t = dot(ap, across) / volume, dot(z, up) / volume, dot(ac, up) / volume
+        meets = (u >= -RAY_EDGE) & (v >= -RAY_EDGE) & (u + v <= 1.0 + RAY_EDGE) & (t >= 0.0)
+    # Seen from its edge a triangle has no area: its neighbours are met.
+    flat = np.abs(volume) <= RAY_EDGE * norm(ab) * norm(ac)
+    return np.where(meets & ~flat, t, np.inf)
+
+
+def make_attempts(
+    candidates: Candidates,
+    indices: range,
+    config: CandidateConfig,
+    *,
+    name: str,
+    seed: int,
+) -> Iterator[Attempt]:
+    """Yield the attempts of a range of an object's candidates, a row of the dataset each.
+
+    Args:
+        candidates: Of the object.
+        indices: Which of them.
+        config: Stand-offs and spreads.
+        name: The object's name.
+        seed: Of the dataset; with name and candidate it decides the spreads.
+    """
+    spreads = np.deg2rad(config.spreads_deg)
+    for i in indices:
+        stream = Stream(seed, object_key(name), i)
+        drawn = stream.integers(len(spreads), len(config.standoffs))
+        distance = candidates.distance[i]
+        for j, standoff in enumerate(config.standoffs):
+            X_OG = candidates.X_OG[i].copy()
+            if np.isfinite(distance):
+                X_OG[:3, 3] += (distance - standoff) * X_OG[:3, 2]
+            yield Attempt(
+                candidate=i,
+                standoff_index=j,
+                standoff=standoff,
+                spread=float(spreads[drawn[j]]),
+                X_OG=X_OG,
+                ray_hits=bool(np.isfinite(distance)),
+                seed=stream.key,
+            )
+
+
+def _rotation_chunks(config: CandidateConfig, stream: Stream) -> Iterator[tuple[Array, Array]]:
+    """Yield R_global and R_local, (m, 3, 3) each, of all combinations, in chunks."""
+    grid_global = _angle_grid(config.global_x_deg, config.global_y_deg, config.global_z_deg)
+    grid_local = _angle_grid(config.local_x_deg, config.local_y_deg, config.local_z_deg)
+    per_chunk = max(1, CHUNK // len(grid_local))
+    for start in range(0, len(grid_global), per_chunk):
+        block = grid_global[start : start + per_chunk]
+        angles_global = np.repeat(block, len(grid_local), axis=0)
+        angles_local = np.tile(grid_local, (len(block), 1))
+        if config.jitter_deg:
+            drawn = np.floor(config.jitter_deg * stream.uniform(6 * len(angles_global)))
+            jitter_global, jitter_local = drawn.reshape(2, -1, 3)
+            angles_global, angles_local = angles_global + jitter_global, angles_local + jitter_local
+        yield _rotation_xyz(angles_global), _rotation_xyz(angles_local)
+
+
+def _angle_grid(*axes_deg: tuple[float, ...]) -> Array:
+    """Return all combinations (n, 3) of angles [degree]; 360 and 0 count once."""
+    unique = [np.unique(np.mod(np.asarray(axis, dtype=float), 360.0)) for axis in axes_deg]
+    return np.stack(np.meshgrid(*unique, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _rotation_xyz(angles_deg: Array) -> Array:
+    """Return Rx Ry Rz, (n, 3, 3), of angles (n, 3) [degree]."""
+    (sx, sy, sz), (cx, cy, cz) = (np.moveaxis(f, -1, 0) for f in sin_cos_deg(angles_deg))
+    rows = [
+        [cy * cz, -cy * sz, sy],
+        [cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy],
+        [sx * sz - cx * sy * cz, sx * cz + cx * sy * sz, cx * cy],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)

@@ -1,0 +1,357 @@
+"""Building a scene: object, table and hand as one Drake diagram.
+
+In: an object, the physics configuration and, if wanted, a hand. Out: a `scene.Scene`.
+
+How the hand is held: world, three prismatic joints, then a frame whose rotation is set
+in the context and which is welded to the palm. The orientation is thus exact and
+constant, and the plant needs no rotational wrist joints (our own construction).
+
+Traps of Drake 1.51.1 that shape this module: geometry on the world body crashes as soon
+as a joint is locked, so the table is a body of its own; `AddMultibodyPlantSceneGraph`
+leaks the plant; sampled output ports report the contacts of the step before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache, partial
+
+import numpy as np
+from pydrake.common import MemoryFile
+from pydrake.geometry import (
+    AddCompliantHydroelasticProperties,
+    AddContactMaterial,
+    AddRigidHydroelasticProperties,
+    CollisionFilterDeclaration,
+    GeometryId,
+    GeometrySet,
+    InMemoryMesh,
+    Mesh,
+    Meshcat,
+    MeshcatVisualizer,
+    MeshcatVisualizerParams,
+    ProximityProperties,
+    RoleAssign,
+    SceneGraph,
+)
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import (
+    AddMultibodyPlant,
+    CoulombFriction,
+    MultibodyPlant,
+    MultibodyPlantConfig,
+)
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    ModelInstanceIndex,
+    PdControllerGains,
+    PrismaticJoint,
+    RigidBody,
+    RotationalInertia,
+    SpatialInertia,
+)
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import TrajectorySource
+from pydrake.trajectories import PiecewisePolynomial
+
+from drakegrasp.config import PhysicsConfig
+from drakegrasp.frames import X_WT, Array
+from drakegrasp.hand.description import Hand, make_parser
+from drakegrasp.hand.files import MODELS
+from drakegrasp.mesh.wavefront import obj_text
+from drakegrasp.objects.model import ObjectModel, object_colour
+from drakegrasp.simulation.scene import HandHandles, Scene
+
+#: Mass of each of the three bodies that carry the wrist [kg]; light beside the hand.
+WRIST_BODY_MASS = 0.02
+#: Wrist gains [N/m], [N s/m]: 2 kg sag by 0.02 mm.
+WRIST_STIFFNESS, WRIST_DAMPING = 1e6, 1e4
+#: Damping of the velocity-controlled fingers [N m s/rad]: the torque limit is reached at a
+#: tenth of a radian per second of lag.
+FINGER_DAMPING = 20.0
+#: Drake demands a positive stiffness; this one adds less than a millionth of the torque.
+FINGER_STIFFNESS = 1e-6
+#: Resolution of the few hand parts that are cylinders [m]; boxes and meshes have none.
+RESOLUTION_HINT = 0.005
+#: Pictures per simulated second where a scene is shown in Meshcat. Times of a power of two are
+#: exact, so none of them is rounded into the place of another.
+MESHCAT_RATE = 32.0
+
+
+def build_scene(
+    model: ObjectModel,
+    physics: PhysicsConfig,
+    hand: Hand | None = None,
+    *,
+    meshcat: Meshcat | None = None,
+) -> Scene:
+    """Return the scene of an object and the table, with the hand if one is given.
+
+    With a hand, the scene for the calm part of a lift is built when it is first asked for.
+
+    The object is a rigid hydroelastic surface of its exact collision mesh; the table and
+    every part of the hand are compliant, so that each contact with the object is a
+    hydroelastic one.
+
+    Args:
+        model: The object.
+        physics: Materials, solver and time step.
+        hand: The hand.
+        meshcat: Where to show the scene while it is simulated; that changes no bit of it.
+    """
+    scene = _build(model, physics, hand, meshcat)
+    if hand is None or physics.calm_steps == 1:
+        return scene
+    longer = {"time_step": physics.calm_steps * physics.time_step}
+    make_calm = cache(partial(_build, model, physics.model_copy(update=longer), hand, meshcat))
+    return replace(scene, make_calm=make_calm)
+
+
+def _build(
+    model: ObjectModel, physics: PhysicsConfig, hand: Hand | None, meshcat: Meshcat | None
+) -> Scene:
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlant(_plant_config(physics), builder)
+    object_body = _add_object(plant, model, physics)
+    table = _add_table(plant, scene_graph, physics)
+    if meshcat is not None:
+        _add_visual(plant, object_body, model)
+        rate = MeshcatVisualizerParams(publish_period=1.0 / MESHCAT_RATE)
+        MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, rate)
+    handles = None
+    if hand is not None:
+        trajectory = builder.AddSystem(
+            TrajectorySource(PiecewisePolynomial(np.zeros((3, 1))), output_derivative_order=1)
+        )
+        handles = _add_hand(plant, scene_graph, hand, trajectory)
+        _make_compliant_hand(plant, scene_graph, handles, physics)
+    plant.Finalize()
+    if handles is not None:
+        _filter_within_hand(plant, scene_graph, handles)
+        builder.Connect(
+            handles.wrist_trajectory.get_output_port(),
+            plant.get_desired_state_input_port(handles.wrist_instance),
+        )
+    simulator = Simulator(builder.Build())
+    scene = Scene(
+        model=model,
+        simulator=simulator,
+        plant=plant,
+        scene_graph=scene_graph,
+        object=object_body,
+        table=table,
+        handles=handles,
+        physics=physics,
+    )
+    if handles is not None:
+        plant.get_desired_state_input_port(handles.instance).FixValue(
+            scene.context, _closing_command(handles.hand)
+        )
+    return scene
+
+
+def _plant_config(physics: PhysicsConfig) -> MultibodyPlantConfig:
+    return MultibodyPlantConfig(
+        time_step=physics.time_step,
+        contact_model="hydroelastic_with_fallback",
+        discrete_contact_approximation=physics.solver,
+        # Sampled ports would report the contacts of the step before.
+        use_sampled_output_ports=False,
+    )
+
+
+def _add_object(plant: MultibodyPlant, model: ObjectModel, physics: PhysicsConfig) -> RigidBody:
+    # Inertia.ReExpress and shifting are Drake's; the model gives it about Ocm, in O.
+    I = model.I_OOcm_O  # noqa: E741
+    inertia = SpatialInertia.MakeFromCentralInertia(
+        model.mass,
+        model.p_OOcm,
+        RotationalInertia(I[0, 0], I[1, 1], I[2, 2], I[0, 1], I[0, 2], I[1, 2]),
+    )
+    instance = plant.AddModelInstance("object")
+    body = plant.AddRigidBody("object", instance, inertia)
+    text = obj_text(model.collision_vertices, model.collision_faces, normals=False)
+    properties = ProximityProperties()
+    AddRigidHydroelasticProperties(properties)
+    _add_material(properties, object_friction(physics), physics)
+    plant.RegisterCollisionGeometry(
+        body,
+        RigidTransform(),
+        Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", model.name))),
+        "surface",
+        properties,
+    )
+    return body
+
+
+def _add_visual(plant: MultibodyPlant, body: RigidBody, model: ObjectModel) -> None:
+    # The surface that is simulated: its number of faces is bounded, that of the file is not.
+    text = obj_text(model.collision_vertices, model.collision_faces, normals=True)
+    mesh = Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", model.name)))
+    colour = np.array([*object_colour(model.name), 1.0])
+    plant.RegisterVisualGeometry(body, RigidTransform(), mesh, "visual", colour)
+
+
+def _add_table(plant: MultibodyPlant, scene_graph: SceneGraph, physics: PhysicsConfig) -> RigidBody:
+    (instance,) = make_parser(plant).AddModels(MODELS / "table.sdf")
+    body = plant.GetBodyByName("table", instance)
+    plant.WeldFrames(plant.world_frame(), body.body_frame(), RigidTransform(X_WT))
+    properties = ProximityProperties()
+    AddCompliantHydroelasticProperties(RESOLUTION_HINT, physics.table_modulus, properties)
+    _add_material(properties, partner_friction(physics.friction_table, physics), physics)
+    _assign_proximity(plant, scene_graph, body, properties)
+    return body
+
+
+def object_friction(physics: PhysicsConfig) -> float:
+    """Return the object's own friction coefficient.
+
+    Drake combines two coefficients to 2 a b / (a + b). With the object at the larger of the
+    two effective values, both can be met by a positive coefficient of the partner.
+    """
+    return max(physics.friction_hand, physics.friction_table)
+
+
+def partner_friction(effective: float, physics: PhysicsConfig) -> float:
+    """Return the coefficient of hand or table that gives the effective one with the object."""
+    mu = object_friction(physics)
+    return effective * mu / (2.0 * mu - effective)
+
+
+def _add_material(properties: ProximityProperties, mu: float, physics: PhysicsConfig) -> None:
+    AddContactMaterial(
+        dissipation=physics.dissipation,
+        friction=CoulombFriction(mu, mu),
+        properties=properties,
+    )
+    properties.AddProperty("material", "relaxation_time", physics.relaxation_time)
+
+
+def _assign_proximity(
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    body: RigidBody,
+    properties: ProximityProperties,
+) -> None:
+    for geometry in plant.GetCollisionGeometriesForBody(body):
+        scene_graph.AssignRole(plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
+
+
+def _add_hand(
+    plant: MultibodyPlant, scene_graph: SceneGraph, hand: Hand, trajectory: TrajectorySource
+) -> HandHandles:
+    wrist_instance = plant.AddModelInstance("wrist")
+    joints = _add_wrist(plant, wrist_instance)
+    (instance,) = make_parser(plant).AddModels(hand.sdf_path)
+    base = plant.GetBodyByName(hand.palm_link, instance)
+    palm = plant.AddFrame(
+        FixedOffsetFrame("palm", base.body_frame(), RigidTransform(hand.X_BG), instance)
+    )
+    wrist = plant.AddFrame(
+        FixedOffsetFrame("wrist", joints[-1].child_body().body_frame(), RigidTransform())
+    )
+    plant.WeldFrames(wrist, palm, RigidTransform())
+    _add_actuation(plant, hand, instance)
+    # Gravity on the hand is carried by the arm that is not simulated.
+    for weightless in (instance, wrist_instance):
+        plant.set_gravity_enabled(weightless, False)
+    return HandHandles(
+        hand=hand,
+        instance=instance,
+        wrist_instance=wrist_instance,
+        wrist_joints=joints,
+        wrist_frame=wrist,
+        wrist_trajectory=trajectory,
+        fingertips=tuple(plant.GetBodyByName(f.fingertip, instance) for f in hand.fingers),
+        closing_joints=tuple(plant.GetJointByName(f.closing_joint, instance) for f in hand.fingers),
+        parts=_points_inside(plant, scene_graph, instance),
+    )
+
+
+def _points_inside(
+    plant: MultibodyPlant, scene_graph: SceneGraph, instance: ModelInstanceIndex
+) -> tuple[tuple[GeometryId, Array], ...]:
+    """Return each collision shape of a model with a point inside it, (3,) in its own frame [m]."""
+    inspector, found = scene_graph.model_inspector(), []
+    for index in plant.GetBodyIndices(instance):
+        for geometry in plant.GetCollisionGeometriesForBody(plant.get_body(index)):
+            hull = inspector.GetConvexHull(geometry)
+            # A primitive has no hull, and its frame's origin is its centre.
+            vertices = (
+                [np.zeros(3)] if hull is None else map(hull.vertex, range(hull.num_vertices()))
+            )
+            found.append((geometry, np.mean(list(vertices), axis=0)))
+    return tuple(found)
+
+
+def _add_wrist(plant: MultibodyPlant, instance: ModelInstanceIndex) -> tuple[PrismaticJoint, ...]:
+    parent = plant.world_body()
+    joints = []
+    for name, axis in zip("xyz", np.eye(3), strict=True):
+        inertia = SpatialInertia.SolidSphereWithMass(WRIST_BODY_MASS, 0.02)
+        body = plant.AddRigidBody(f"wrist_{name}", instance, inertia)
+        joint = plant.AddJoint(
+            PrismaticJoint(f"wrist_{name}", parent.body_frame(), body.body_frame(), axis)
+        )
+        actuator = plant.AddJointActuator(f"wrist_{name}", joint)
+        actuator.set_controller_gains(PdControllerGains(p=WRIST_STIFFNESS, d=WRIST_DAMPING))
+        joints.append(joint)
+        parent = body
+    return tuple(joints)
+
+
+def _add_actuation(plant: MultibodyPlant, hand: Hand, instance: ModelInstanceIndex) -> None:
+    for finger in hand.fingers:
+        joint = plant.GetJointByName(finger.closing_joint, instance)
+        actuator = plant.AddJointActuator(finger.name, joint, finger.torque_limit)
+        actuator.set_default_rotor_inertia(finger.rotor_inertia)
+        actuator.set_default_gear_ratio(finger.gear_ratio)
+        actuator.set_controller_gains(PdControllerGains(p=FINGER_STIFFNESS, d=FINGER_DAMPING))
+        for coupling in finger.coupled:
+            plant.AddCouplerConstraint(
+                plant.GetJointByName(coupling.joint, instance), joint, coupling.ratio
+            )
+
+
+def _closing_command(hand: Hand) -> Array:
+    """Return the constant [q_d; v_d] that closes all fingers at the hand's speed."""
+    return np.concatenate(
+        [np.zeros(hand.num_fingers), np.full(hand.num_fingers, hand.closing_speed)]
+    )
+
+
+def _make_compliant_hand(
+    plant: MultibodyPlant, scene_graph: SceneGraph, handles: HandHandles, physics: PhysicsConfig
+) -> None:
+    tips = {body.index() for body in handles.fingertips}
+    mu = partner_friction(physics.friction_hand, physics)
+    for index in plant.GetBodyIndices(handles.instance):
+        modulus = physics.fingertip_modulus if index in tips else physics.link_modulus
+        properties = ProximityProperties()
+        AddCompliantHydroelasticProperties(RESOLUTION_HINT, modulus, properties)
+        _add_material(properties, mu, physics)
+        _assign_proximity(plant, scene_graph, plant.get_body(index), properties)
+
+
+def _filter_within_hand(
+    plant: MultibodyPlant, scene_graph: SceneGraph, handles: HandHandles
+) -> None:
+    """Let only fingertips of different fingers collide within the hand.
+
+    The other links' shapes overlap at their joints by design, and they cannot reach each
+    other before the fingertips do.
+    """
+
+    def geometries(body: RigidBody) -> list[GeometryId]:
+        return list(plant.GetCollisionGeometriesForBody(body))
+
+    bodies = [plant.get_body(i) for i in plant.GetBodyIndices(handles.instance)]
+    tips = {body.index() for body in handles.fingertips}
+    others = GeometrySet([g for b in bodies if b.index() not in tips for g in geometries(b)])
+    every_tip = GeometrySet([g for b in handles.fingertips for g in geometries(b)])
+    manager = scene_graph.collision_filter_manager()
+    manager.Apply(CollisionFilterDeclaration().ExcludeWithin(others))
+    manager.Apply(CollisionFilterDeclaration().ExcludeBetween(others, every_tip))
+    for tip in handles.fingertips:
+        manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(geometries(tip))))

@@ -1,0 +1,231 @@
+"""Reading Drake's contact results as facts about a grasp, in the object's frame.
+
+The contact of a fingertip is the union of all hydroelastic patches between its link and
+the object. Its point is the pressure-weighted centre of the patches, its normal the
+pressure-weighted mean of the face normals, pointing out of the object; both lie on the
+rigid object's surface because a rigid-compliant patch is a piece of the rigid surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.geometry import ContactSurface, HydroelasticContactRepresentation
+from pydrake.multibody.plant import HydroelasticContactInfo
+from pydrake.multibody.tree import BodyIndex
+
+from drakegrasp.arithmetic import norm
+from drakegrasp.frames import Array, invert_pose, rotate_vectors, transform_points
+from drakegrasp.mesh.surfaces import winding_numbers
+from drakegrasp.simulation.scene import Scene
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Contacts:
+    """What touches what at one instant, for a hand of k fingers.
+
+    Attributes:
+        touching: (k,) bool, whether fingertip i touches the object with enough force.
+        p_OQ: (k, 3), contact point of each fingertip in {O} [m]; NaN where not touching.
+        nhat_Q_O: (k, 3), unit normal out of the object in {O}; NaN where not touching.
+        f_Q_O: (k, 3), force of the fingertip on the object in {O} [N]; 0 where not touching.
+        area: (k,), area of the patches [m^2].
+        penetration: (k,), largest depth of the object's surface in the fingertip [m].
+        other_links: Number of other links of the hand that touch the object.
+        hand_on_table, object_on_table: Whether they touch.
+        table_force: (3,), force of the table on the object in {W} [N].
+        point_contacts: Number of point contacts (not hydroelastic) that involve the object.
+    """
+
+    touching: np.ndarray
+    p_OQ: Array
+    nhat_Q_O: Array
+    f_Q_O: Array
+    area: Array
+    penetration: Array
+    other_links: int
+    hand_on_table: bool
+    object_on_table: bool
+    table_force: Array
+    point_contacts: int
+
+
+def read_contacts(scene: Scene) -> Contacts:
+    """Return the contacts of the scene now; contacts weaker than the limit do not count."""
+    results = scene.plant.get_contact_results_output_port().Eval(scene.context)
+    reader = _Reader(scene)
+    for i in range(results.num_hydroelastic_contacts()):
+        reader.add_patch(results.hydroelastic_contact_info(i))
+    for i in range(results.num_point_pair_contacts()):
+        pair = results.point_pair_contact_info(i)
+        reader.add_point_pair({pair.bodyA_index(), pair.bodyB_index()})
+    return reader.contacts()
+
+
+def bodies_on_object(scene: Scene) -> set[BodyIndex]:
+    """Return what touches the object now, of hand and table, as `read_contacts` would see it."""
+    results = scene.plant.get_contact_results_output_port().Eval(scene.context)
+    ob = scene.object.index()
+    forces: dict[BodyIndex, Array] = {}
+    for i in range(results.num_hydroelastic_contacts()):
+        info = results.hydroelastic_contact_info(i)
+        surface = info.contact_surface()
+        M, N = _body_of(scene, surface.id_M()), _body_of(scene, surface.id_N())
+        if ob in (M, N):
+            other = N if ob == M else M
+            forces[other] = forces.get(other, np.zeros(3)) + info.F_Ac_W().translational()
+    limit = scene.physics.contact_force
+    return {body for body, force in forces.items() if float(norm(force)) > limit}
+
+
+def open_hand_collides(scene: Scene) -> bool:
+    """Return whether any part of the hand meets or is inside the object, or meets the table.
+
+    This is geometry only, nothing is solved. Surfaces that cross give contact surfaces; a
+    part that is wholly inside the object gives none, so a point inside each part is tested
+    against the object's volume as well.
+    """
+    handles = scene.handles
+    if handles is None:
+        return False
+    query = scene.plant.get_geometry_query_input_port().Eval(scene.context)
+    hand = hand_bodies(scene)
+    surfaces, pairs = query.ComputeContactSurfacesWithFallback(
+        HydroelasticContactRepresentation.kPolygon
+    )
+    meetings = [{_body_of(scene, s.id_M()), _body_of(scene, s.id_N())} for s in surfaces]
+    meetings += [{_body_of(scene, p.id_A), _body_of(scene, p.id_B)} for p in pairs]
+    if any(bodies & hand and not bodies <= hand for bodies in meetings):
+        return True
+    points = [query.GetPoseInWorld(geometry) @ p for geometry, p in handles.parts]
+    return is_inside(scene, np.array(points))
+
+
+def is_inside(scene: Scene, p_WP: Array) -> bool:
+    """Return whether any of the points (n, 3) [m] is inside the object's volume.
+
+    Drake's own point distance refuses meshes with very sharp edges; a winding number does not.
+    """
+    model = scene.model
+    p_OP = transform_points(invert_pose(scene.pose(scene.object)), p_WP)
+    near = p_OP[np.all(np.abs(p_OP) <= model.half_extents, axis=1)]
+    if not len(near):
+        return False
+    winding = winding_numbers(
+        near, model.collision_vertices, model.collision_faces.astype(np.int64)
+    )
+    return bool(np.any(winding > 0.5))
+
+
+class _Reader:
+    """Sums the patches of each pair of bodies while the results are walked once."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._X_OW = invert_pose(scene.pose(scene.object))
+        handles = scene.handles
+        self._tips = [] if handles is None else [b.index() for b in handles.fingertips]
+        self._hand = hand_bodies(scene)
+        k = len(self._tips)
+        self._force_W, self._area = np.zeros((k, 3)), np.zeros(k)
+        self._weight, self._penetration = np.zeros(k), np.zeros(k)
+        self._moment_p, self._moment_n = np.zeros((k, 3)), np.zeros((k, 3))
+        self._other_force: dict[BodyIndex, float] = {}
+        self._table_force, self._hand_table_force = np.zeros(3), 0.0
+        self._point_contacts, self._hand_on_table = 0, False
+
+    def add_patch(self, info: HydroelasticContactInfo) -> None:
+        scene, surface = self._scene, info.contact_surface()
+        M, N = _body_of(scene, surface.id_M()), _body_of(scene, surface.id_N())
+        force_on_M = np.array(info.F_Ac_W().translational())
+        ob, table = scene.object.index(), scene.table.index()
+        if ob not in (M, N):
+            if table in (M, N) and self._hand & {M, N}:
+                self._hand_table_force += float(norm(force_on_M))
+            return
+        other = N if ob == M else M
+        force_on_object = force_on_M if ob == M else -force_on_M
+        if other == table:
+            self._table_force += force_on_object
+        elif other in self._tips:
+            self._add_tip_patch(self._tips.index(other), surface, force_on_object, ob == M)
+        else:
+            magnitude = float(norm(force_on_object))
+            self._other_force[other] = self._other_force.get(other, 0.0) + magnitude
+
+    def _add_tip_patch(
+        self, i: int, surface: ContactSurface, force_W: Array, object_is_M: bool
+    ) -> None:
+        self._force_W[i] += force_W
+        # Face normals point out of N into M.
+        outward = -1.0 if object_is_M else 1.0
+        for area, centre, normal, pressure, depth in _faces(surface, object_is_M):
+            weight = area * pressure
+            self._area[i] += area
+            self._weight[i] += weight
+            self._moment_p[i] += weight * centre
+            self._moment_n[i] += weight * outward * normal
+            self._penetration[i] = max(self._penetration[i], depth)
+
+    def add_point_pair(self, bodies: set[BodyIndex]) -> None:
+        scene = self._scene
+        if scene.object.index() in bodies:
+            self._point_contacts += 1
+        if scene.table.index() in bodies and self._hand & bodies:
+            self._hand_on_table = True
+
+    def contacts(self) -> Contacts:
+        limit = self._scene.physics.contact_force
+        touching = (norm(self._force_W) > limit) & (self._weight > 0.0)
+        weight = np.where(touching, self._weight, np.nan)[:, None]
+        length = norm(self._moment_n)[:, None]
+        normal_W = self._moment_n / np.where(touching[:, None] & (length > 0), length, np.nan)
+        return Contacts(
+            touching=touching,
+            p_OQ=transform_points(self._X_OW, self._moment_p / weight),
+            nhat_Q_O=rotate_vectors(self._X_OW, normal_W),
+            f_Q_O=rotate_vectors(self._X_OW, np.where(touching[:, None], self._force_W, 0.0)),
+            area=np.where(touching, self._area, 0.0),
+            penetration=np.where(touching, self._penetration, 0.0),
+            other_links=sum(force > limit for force in self._other_force.values()),
+            hand_on_table=self._hand_on_table or self._hand_table_force > limit,
+            object_on_table=bool(norm(self._table_force) > limit),
+            table_force=self._table_force,
+            point_contacts=self._point_contacts,
+        )
+
+
+def hand_bodies(scene: Scene) -> set[BodyIndex]:
+    """Return the links of the scene's hand, if it has one."""
+    handles = scene.handles
+    return set() if handles is None else set(scene.plant.GetBodyIndices(handles.instance))
+
+
+def _faces(
+    surface: ContactSurface, object_is_M: bool
+) -> Iterator[tuple[float, Array, Array, float, float]]:
+    """Yield area [m^2], centre W [m], normal W, pressure [Pa] and depth [m] of each face."""
+    field = surface.poly_e_MN()
+    # The fingertip's pressure falls to zero at its surface, so pressure over gradient is
+    # the depth of the face below it.
+    compliant_is_M = not object_is_M
+    has_gradient = surface.HasGradE_M() if compliant_is_M else surface.HasGradE_N()
+    gradient = surface.EvaluateGradE_M_W if compliant_is_M else surface.EvaluateGradE_N_W
+    for face in range(surface.num_faces()):
+        centre = np.array(surface.centroid(face))
+        pressure = float(field.EvaluateCartesian(face, centre))
+        slope = float(norm(gradient(face))) if has_gradient else np.inf
+        yield (
+            float(surface.area(face)),
+            centre,
+            np.array(surface.face_normal(face)),
+            pressure,
+            pressure / slope,
+        )
+
+
+def _body_of(scene: Scene, geometry_id: object) -> BodyIndex:
+    inspector = scene.scene_graph.model_inspector()
+    return scene.plant.GetBodyFromFrameId(inspector.GetFrameId(geometry_id)).index()

@@ -1,0 +1,190 @@
+"""An object where it rests on the table: what a grasp is verified against.
+
+In: a mesh file, a trimesh or an object that was prepared before. Out: the object and its
+resting pose. What stays the same however the object is turned or moved on the table is
+computed at one pose, `rest_pose`, so a verdict cannot depend on it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+
+from drakegrasp.config import Config, load_config
+from drakegrasp.errors import ConfigError, GraspError, MeshError
+from drakegrasp.frames import Array, make_pose, read_pose, transform_points
+from drakegrasp.mesh.loading import clean_triangles
+from drakegrasp.objects.model import ObjectModel, make_object, prepare_object
+from drakegrasp.objects.sources import UNITS, find_mesh
+from drakegrasp.runtime.blas import one_thread
+from drakegrasp.simulation.settle import settle
+
+#: A given pose may leave this much between the object's lowest point and the table [m].
+MAX_GAP = 0.005
+
+
+@runtime_checkable
+class Placed(Protocol):
+    """Anything with a model and its pose: a `PlacedObject`, or a dataset's prepared object."""
+
+    @property
+    def model(self) -> ObjectModel:
+        """The object."""
+
+    @property
+    def X_TO(self) -> Array:
+        """Its pose in the table-top frame, (4, 4)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlacedObject:
+    """An object on the table.
+
+    Attributes:
+        model: Meshes and mass properties.
+        X_TO: Pose in the table-top frame, (4, 4).
+        config: With which it was prepared and dropped; the preset `paper` if None.
+    """
+
+    model: ObjectModel
+    X_TO: Array
+    config: Config = field(default_factory=load_config)
+
+    def __repr__(self) -> str:
+        model, z = self.model, self.X_TO[2, 3]
+        size = " x ".join(f"{2e3 * half:.0f}" for half in model.half_extents)
+        return f"PlacedObject({model.name!r}): {size} mm, {model.mass:g} kg, p_TO at z = {z:.4f} m"
+
+
+@one_thread
+def place_object(
+    mesh: str | Path | trimesh.Trimesh | Placed,
+    *,
+    units: str | None = None,
+    X_TO: npt.ArrayLike | None = None,
+    config: Config | None = None,
+) -> PlacedObject:
+    """Return an object on the table, ready for many calls of `verify_grasp`.
+
+    Args:
+        mesh: Path of a mesh file, a mesh, or an object that was placed before. The origin
+            of {O} is the centre of its bounding box, not that of the file.
+        units: Unit of the mesh's lengths: m, cm or mm; metres if None. An `objects.yaml` beside
+            a file wins.
+        X_TO: Pose of the object on the table; dropped as in a build if None.
+        config: Mass, friction and how it settles; that of an object that was placed before, else
+            the preset `paper`, if None.
+
+    Raises:
+        MeshError: If the mesh cannot be simulated or does not come to rest.
+        GraspError: If X_TO is no pose or does not stand on the table.
+        ConfigError: If config is none, or an object was placed before with other values.
+    """
+    config = config_of(mesh) if config is None else config
+    refuse_no_config(config)
+    if units is not None and units not in UNITS:
+        raise MeshError(f"units must be one of {', '.join(UNITS)}, got {units!r}")
+    if isinstance(mesh, Placed):
+        if units is not None:
+            raise MeshError(f"units must be None for an object that is prepared, got {units!r}")
+        if isinstance(mesh, PlacedObject):
+            refuse_other_objects(config, mesh.config, "as the object was placed with")
+        model, known = mesh.model, np.asarray(mesh.X_TO)
+    elif isinstance(mesh, trimesh.Trimesh):
+        model, known = _model_of(mesh, units or "m", config), None
+    elif isinstance(mesh, str | Path):
+        model, known = _read(Path(mesh), units or "m", config), None
+    else:
+        raise MeshError(
+            "mesh must be a mesh file, a trimesh.Trimesh or a placed object, "
+            f"got {type(mesh).__name__}"
+        )
+    if X_TO is not None:
+        known = _standing(model, read_pose(X_TO, "X_TO"))
+    X_TO = settle(model, config).X_TO if known is None else known
+    return PlacedObject(model=model, X_TO=X_TO, config=config)
+
+
+def config_of(mesh: object) -> Config:
+    """Return the configuration that goes with a mesh: a placed object's own, else `paper`."""
+    return mesh.config if isinstance(mesh, PlacedObject) else load_config()
+
+
+def refuse_no_config(config: object) -> None:
+    """Refuse what is not a configuration, such as a preset's name.
+
+    Raises:
+        ConfigError: If so.
+    """
+    if not isinstance(config, Config):
+        raise ConfigError(
+            f"config must be a Config, see load_config, got a {type(config).__name__}"
+        )
+
+
+def refuse_other_objects(config: Config, known: Config, must_be: str) -> None:
+    """Refuse a configuration that an object was not prepared and dropped with.
+
+    Raises:
+        ConfigError: If it differs in that.
+    """
+    for name in ("objects", "settle"):
+        if getattr(config, name) != getattr(known, name):
+            raise ConfigError(f"{name} must be {must_be}, got other values; give the mesh instead")
+
+
+def rest_pose(X_TO: Array) -> Array:
+    """Return the pose (4, 4) over the table's centre that lies as X_TO does, without its yaw.
+
+    Of all rotations that agree with X_TO on which way is up in {O} it is the smallest one.
+    """
+    up = X_TO[2, :3]
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    x, y, z = axis
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    # Rodrigues' formula with sin = |axis|, cos = up_z and K K / (1 + cos), which is here without
+    # cancellation where cos is nearly -1; upside down it is half a turn about x.
+    upright = 1.0 + up[2] if up[2] > 0.0 else axis @ axis / (1.0 - up[2])
+    R = np.eye(3) + K + K @ K / upright if upright > 1e-20 else np.diag([1.0, -1.0, -1.0])
+    return make_pose(R, [0.0, 0.0, X_TO[2, 3]])
+
+
+def _read(path: Path, units: str, config: Config) -> ObjectModel:
+    return prepare_object(find_mesh(path, units=units), config.objects)
+
+
+def _model_of(mesh: trimesh.Trimesh, units: str, config: Config) -> ObjectModel:
+    given = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=np.int64)
+    clean = clean_triangles(*given, "mesh")
+    vertices = clean.vertices * UNITS[units]
+    digest = hashlib.sha256(vertices.tobytes() + clean.faces.tobytes()).hexdigest()
+    try:
+        return make_object(
+            vertices,
+            clean.faces,
+            config.objects,
+            name="mesh",
+            class_name="mesh",
+            mesh_sha256=digest,
+            unit=f" with 1 unit = {UNITS[units]:g} m",
+        )
+    except MeshError as reason:
+        raise MeshError(f"mesh: {reason}") from reason
+
+
+def _standing(model: ObjectModel, X_TO: Array) -> Array:
+    if X_TO.shape != (4, 4):
+        raise GraspError(f"X_TO must be one pose, got an array of shape {X_TO.shape}")
+    lowest = float(transform_points(X_TO, model.collision_vertices)[:, 2].min())
+    if abs(lowest) > MAX_GAP:
+        raise GraspError(
+            f"X_TO must put the object on the table, its lowest point within {1e3 * MAX_GAP:g} mm, "
+            f"got one at {1e3 * lowest:.3g} mm"
+        )
+    return X_TO

@@ -1,0 +1,282 @@
+"""The Drake diagram of one object, the table and, if given, one hand: its state.
+
+A scene is built once per object (`construction.build_scene`) and reset for each attempt:
+building costs more than simulating, and a reset context gives the same bits as a new one.
+It takes no decisions; `settle` and `trial` drive it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from pydrake.geometry import CollisionFilterDeclaration, GeometryId, GeometrySet, SceneGraph
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    ModelInstanceIndex,
+    PrismaticJoint,
+    RevoluteJoint,
+    RigidBody,
+)
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context
+from pydrake.systems.primitives import TrajectorySource
+from pydrake.trajectories import BezierCurve, PiecewisePolynomial
+
+from drakegrasp.arithmetic import multiply
+from drakegrasp.config import PhysicsConfig
+from drakegrasp.frames import Array
+from drakegrasp.hand.description import Hand
+from drakegrasp.hand.kinematics import joint_positions
+from drakegrasp.objects.model import ObjectModel
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HandHandles:
+    """Where the hand is in a scene's plant."""
+
+    hand: Hand
+    instance: ModelInstanceIndex
+    wrist_instance: ModelInstanceIndex
+    wrist_joints: tuple[PrismaticJoint, ...]
+    wrist_frame: FixedOffsetFrame
+    wrist_trajectory: TrajectorySource
+    fingertips: tuple[RigidBody, ...]
+    closing_joints: tuple[RevoluteJoint, ...]
+    parts: tuple[tuple[GeometryId, Array], ...]  # each shape of the hand with a point inside it
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scene:
+    """A built diagram with its one context.
+
+    Attributes:
+        model: The object.
+        simulator: Owns the diagram's context.
+        plant, scene_graph: The two systems of the diagram.
+        object, table: The bodies.
+        handles: The hand's part, or None in a scene without a hand.
+        physics: The configuration that it was built with.
+        make_calm: Returns the same scene with `calm_steps` steps in one, always the same; None
+            where there is none.
+    """
+
+    model: ObjectModel
+    simulator: Simulator
+    plant: MultibodyPlant
+    scene_graph: SceneGraph
+    object: RigidBody
+    table: RigidBody
+    handles: HandHandles | None
+    physics: PhysicsConfig
+    make_calm: Callable[[], Scene] | None = None
+
+    @property
+    def context(self) -> Context:
+        """The plant's context."""
+        return self.plant.GetMyMutableContextFromRoot(self.simulator.get_mutable_context())
+
+    @property
+    def time(self) -> float:
+        """Simulated time since the last reset [s]."""
+        return float(self.simulator.get_context().get_time())
+
+    def pose(self, body: RigidBody) -> Array:
+        """Return the pose X_WB (4, 4) of a body now."""
+        return self.plant.EvalBodyPoseInWorld(self.context, body).GetAsMatrix4()
+
+
+def reset_object(scene: Scene, X_WO: npt.ArrayLike) -> None:
+    """Put the clock to zero and the object, free and at rest, at X_WO (4, 4)."""
+    scene.simulator.get_mutable_context().SetTime(0.0)
+    scene.object.Unlock(scene.context)
+    scene.plant.SetFreeBodyPose(scene.context, scene.object, RigidTransform(np.asarray(X_WO)))
+    scene.plant.SetVelocities(scene.context, np.zeros(scene.plant.num_velocities()))
+    _let_object_meet_table(scene, True)
+
+
+def reset_attempt(
+    scene: Scene,
+    X_WO: npt.ArrayLike,
+    X_WG: npt.ArrayLike,
+    *,
+    spread: float,
+    closing: npt.ArrayLike | None = None,
+) -> None:
+    """Put hand and object at the start of an attempt; wrist and object static.
+
+    Args:
+        scene: A scene with a hand.
+        X_WO: Pose of the object (4, 4).
+        X_WG: Pose of the palm (4, 4).
+        spread: Angle of the spread joints [rad].
+        closing: Angle of each finger's closing joint (k,) [rad]; None is the open hand.
+    """
+    handles = _handles(scene)
+    context, plant = scene.context, scene.plant
+    for joint in handles.wrist_joints:
+        joint.Unlock(context)
+    reset_object(scene, X_WO)
+    X = np.asarray(X_WG, dtype=float)
+    R_WG = RotationMatrix(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]))
+    handles.wrist_frame.SetPoseInParentFrame(context, RigidTransform(R_WG, np.zeros(3)))
+    opened = np.zeros(handles.hand.num_fingers) if closing is None else closing
+    for name, angle in joint_positions(handles.hand, spread, opened).items():
+        plant.GetJointByName(name, handles.instance).set_angle(context, angle)
+    for joint, p in zip(handles.wrist_joints, X[:3, 3], strict=True):
+        joint.set_translation(context, float(p))
+        joint.Lock(context)
+    # The spread stays where it is put: one motor drives it, and the released code locks it too.
+    for name in handles.hand.spread.joints:
+        plant.GetJointByName(name, handles.instance).Lock(context)
+    scene.object.Lock(context)
+    _let_object_meet_table(scene, False)
+    handles.wrist_trajectory.UpdateTrajectory(PiecewisePolynomial(X[:3, 3:4]))
+    scene.simulator.Initialize()
+
+
+def release(scene: Scene) -> None:
+    """Free the object and the wrist for the lift."""
+    for joint in _handles(scene).wrist_joints:
+        joint.Unlock(scene.context)
+    scene.object.Unlock(scene.context)
+    _let_object_meet_table(scene, True)
+
+
+def _let_object_meet_table(scene: Scene, meet: bool) -> None:
+    """Look for contacts between object and table, or do not.
+
+    While both are static such a contact changes nothing, and finding it at each step costs
+    more than anything else that happens before a finger touches.
+    """
+    manager = scene.scene_graph.collision_filter_manager(
+        scene.scene_graph.GetMyMutableContextFromRoot(scene.simulator.get_mutable_context())
+    )
+    declare = CollisionFilterDeclaration()
+    sides = [
+        GeometrySet(scene.plant.GetCollisionGeometriesForBody(body))
+        for body in (scene.object, scene.table)
+    ]
+    manager.Apply(declare.AllowBetween(*sides) if meet else declare.ExcludeBetween(*sides))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WristMotion:
+    """A straight minimum-jerk motion of the palm's origin; it stays at the end.
+
+    Attributes:
+        p_start, p_end: Where it begins and ends in {W}, (3,) [m].
+        begin: When it begins [s].
+        duration: Of the motion [s].
+    """
+
+    p_start: Array
+    p_end: Array
+    begin: float
+    duration: float
+
+
+def move_wrist(scene: Scene, p_WG_target: npt.ArrayLike, duration: float) -> WristMotion:
+    """Command a straight minimum-jerk motion of the wrist from where it is, starting now.
+
+    Args:
+        scene: A scene with a hand.
+        p_WG_target: Where the palm's origin goes, (3,) [m]; it stays there afterwards.
+        duration: Of the motion [s].
+
+    Raises:
+        ValueError: If the scene has no hand.
+    """
+    joints = _handles(scene).wrist_joints
+    motion = WristMotion(
+        p_start=np.array([joint.get_translation(scene.context) for joint in joints]),
+        p_end=np.asarray(p_WG_target, dtype=float),
+        begin=scene.time,
+        duration=duration,
+    )
+    _follow(scene, motion)
+    return motion
+
+
+def _follow(scene: Scene, motion: WristMotion) -> None:
+    # A quintic Bezier curve with threefold ends starts and stops with zero speed and
+    # acceleration: the minimum-jerk motion (Flash and Hogan, 1985).
+    points = np.column_stack([motion.p_start] * 3 + [motion.p_end] * 3)
+    # What is commanded at the begin of a step is where its end comes to be: said a step ahead,
+    # the wrist lags behind in no scene, whatever its step.
+    begin = motion.begin - scene.physics.time_step
+    curve = BezierCurve(begin, begin + motion.duration, points)
+    _handles(scene).wrist_trajectory.UpdateTrajectory(curve)
+
+
+def go_on_in(scene: Scene, before: Scene, time: float, motion: WristMotion) -> None:
+    """Give a scene the state that another one of the same systems has reached in its lift.
+
+    Args:
+        scene: The scene that goes on.
+        before: The scene whose state, orientation and wrist's motion it takes over.
+        time: Of the state [s], at which a step of both begins.
+        motion: Of the wrist.
+
+    Raises:
+        ValueError: If one of them has no hand.
+    """
+    theirs, ours = _handles(before), _handles(scene)
+    step = scene.physics.time_step
+    # Drake begins steps at whole multiples: one a rounding before `time` would be left out.
+    scene.simulator.get_mutable_context().SetTime(round(time / step) * step)
+    # Not the context as a whole: that of a plant knows the shapes of its own diagram.
+    X = theirs.wrist_frame.GetPoseInParentFrame(before.context)
+    ours.wrist_frame.SetPoseInParentFrame(scene.context, X)
+    state = before.plant.GetPositionsAndVelocities(before.context)
+    scene.plant.SetPositionsAndVelocities(scene.context, state)
+    for name in ours.hand.spread.joints:
+        scene.plant.GetJointByName(name, ours.instance).Lock(scene.context)
+    _follow(scene, motion)
+    scene.simulator.Initialize()
+
+
+def advance(scene: Scene, duration: float) -> None:
+    """Simulate for a duration [s]."""
+    scene.simulator.AdvanceTo(scene.time + duration, interruptible=False)
+
+
+def finger_speed(scene: Scene) -> float:
+    """Return the largest speed of a closing joint [rad/s]."""
+    rates = (joint.get_angular_rate(scene.context) for joint in _handles(scene).closing_joints)
+    return max(abs(float(rate)) for rate in rates)
+
+
+def closing_angles(scene: Scene) -> Array:
+    """Return the angle of each finger's closing joint (k,) [rad]."""
+    return np.array([joint.get_angle(scene.context) for joint in _handles(scene).closing_joints])
+
+
+def hand_positions(scene: Scene) -> Array:
+    """Return the positions of all joints of the hand in the plant's order [rad]."""
+    return scene.plant.GetPositions(scene.context, _handles(scene).instance)
+
+
+def hand_joint_names(scene: Scene) -> list[str]:
+    """Return the joints' names in the order of `hand_positions`."""
+    names = scene.plant.GetPositionNames(
+        _handles(scene).instance, add_model_instance_prefix=False, always_add_suffix=False
+    )
+    return list(names)
+
+
+def palm_pose(scene: Scene) -> Array:
+    """Return the pose X_WG (4, 4) of the palm now."""
+    handles = _handles(scene)
+    base = scene.plant.GetBodyByName(handles.hand.palm_link, handles.instance)
+    return multiply(scene.pose(base), handles.hand.X_BG)
+
+
+def _handles(scene: Scene) -> HandHandles:
+    if scene.handles is None:
+        raise ValueError("the scene must have a hand, got one without")
+    return scene.handles

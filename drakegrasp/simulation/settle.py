@@ -1,0 +1,130 @@
+"""Stage "settle": drop the object on the table and wait until it rests.
+
+In: a prepared object. Out: its resting pose X_TO, moved in x and y only so that
+p_TO = (0, 0, z) (Veres et al., "Initial Object and hand configurations").
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.math import RotationMatrix
+
+from drakegrasp.arithmetic import multiply, norm
+from drakegrasp.config import Config
+from drakegrasp.errors import MeshError
+from drakegrasp.frames import X_WT, Array, invert_pose, make_pose
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.contacts import read_contacts
+from drakegrasp.simulation.scene import Scene, advance, reset_object
+
+#: Simulated time between two looks at the object's speed [s].
+LOOK_PERIOD = 0.05
+#: Drake's gravity [m/s^2], and by how much the table's force at rest may miss the weight.
+GRAVITY, MAX_FORCE_ERROR = 9.81, 0.01
+#: A resting pose is snapped to multiples of this, in p_TO [m] and in the quaternion of R_TO: about
+#: a micrometre and a microradian. Drake's last bits depend on the CPU, and the palm poses on it.
+POSE_GRID = 2.0**-20
+#: When a rolling object is stopped by hand, as a share of the longest time; see `settle`.
+STOP_FRACTION = 0.6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Resting:
+    """How an object lies on the table.
+
+    Attributes:
+        X_TO: Pose in the table-top frame, (4, 4); p_TO = (0, 0, z).
+        seconds: Simulated time until it rested [s].
+        table_force: Upward force of the table at rest [N].
+        stopped: Whether it had to be stopped because it would have rolled on.
+    """
+
+    X_TO: Array
+    seconds: float
+    table_force: float
+    stopped: bool
+
+
+def settle(model: ObjectModel, config: Config) -> Resting:
+    """Return the resting pose of an object dropped with {O} aligned to {W}.
+
+    Hydroelastic contact has no rolling resistance, so a round object may roll for very
+    long. After `STOP_FRACTION` of `settle.max_time` its velocity is therefore set to zero
+    once at every look, as the released code froze whatever still moved.
+
+    Raises:
+        MeshError: If the object leaves the table, never comes to rest, or Drake cannot
+            simulate it.
+    """
+    try:
+        return _settle(model, config)
+    # A failed assertion within Drake arrives as SystemExit.
+    except (RuntimeError, SystemExit) as error:
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        raise MeshError(f"{model.name}: Drake must be able to drop it, got: {lines[0]}") from None
+
+
+def _settle(model: ObjectModel, config: Config) -> Resting:
+    rules = config.settle
+    scene = build_scene(model, config.physics.model_copy(update={"time_step": rules.time_step}))
+    lowest = float(model.collision_vertices[:, 2].min())
+    X_WO = multiply(X_WT, make_pose(np.eye(3), [0.0, 0.0, rules.drop_height - lowest]))
+    reset_object(scene, X_WO)
+    scene.simulator.Initialize()
+    resting_for, stopped, linear, angular = 0.0, False, 0.0, 0.0
+    while resting_for < rules.rest_time:
+        if scene.time >= rules.max_time:
+            raise MeshError(
+                f"{model.name}: must come to rest on the table within {rules.max_time:g} s of "
+                f"simulation, got {linear:.3g} m/s and {angular:.3g} rad/s"
+            )
+        advance(scene, LOOK_PERIOD)
+        linear, angular = _speeds(scene)
+        if not np.isfinite(linear) or linear > config.physics.max_speed:
+            raise MeshError(f"{model.name}: must fall calmly, got a speed of {linear:.3g} m/s")
+        slow = linear < rules.max_linear_speed and angular < rules.max_angular_speed
+        resting_for = resting_for + LOOK_PERIOD if slow else 0.0
+        if not slow and scene.time > STOP_FRACTION * rules.max_time:
+            scene.plant.SetVelocities(scene.context, np.zeros(scene.plant.num_velocities()))
+            stopped = True
+    X_TO = multiply(invert_pose(X_WT), scene.pose(scene.object))
+    if X_TO[2, 3] < 0.0:
+        raise MeshError(f"{model.name}: must come to rest on the table, got an object that left it")
+    X_TO = snapped(X_TO)
+    force = float(read_contacts(scene).table_force[2])
+    weight = model.mass * GRAVITY
+    if abs(force - weight) > MAX_FORCE_ERROR * weight:
+        raise MeshError(
+            f"{model.name}: the table must carry its {weight:.3g} N at rest, got {force:.3g} N"
+        )
+    return Resting(X_TO=X_TO, seconds=scene.time, table_force=force, stopped=stopped)
+
+
+def snapped(X_TO: Array) -> Array:
+    """Return a resting pose (4, 4) moved to p_TO = (0, 0, z) and to the next point of a fine grid.
+
+    The same pose but for rounding gives the same bits, unless it lies between two points of the
+    grid: of a rounding error e that is one pose in POSE_GRID / e.
+    """
+    wxyz = RotationMatrix(X_TO[:3, :3]).ToQuaternion().wxyz()
+    # A quaternion and its negative are one rotation: the largest entry is positive.
+    wxyz = np.rint(wxyz * np.sign(wxyz[np.argmax(np.abs(wxyz))]) / POSE_GRID)
+    w, x, y, z = wxyz / norm(wxyz)
+    R_TO = np.array(
+        [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+        ]
+    )
+    return make_pose(R_TO, [0.0, 0.0, np.rint(X_TO[2, 3] / POSE_GRID) * POSE_GRID])
+
+
+def _speeds(scene: Scene) -> tuple[float, float]:
+    """Return the object's linear [m/s] and angular [rad/s] speed."""
+    velocity = scene.plant.EvalBodySpatialVelocityInWorld(scene.context, scene.object)
+    linear = float(norm(velocity.translational()))
+    return linear, float(norm(velocity.rotational()))

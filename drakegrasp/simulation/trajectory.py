@@ -1,0 +1,99 @@
+"""The path along which forces lift an object, and the wrenches that it takes.
+
+In: a resting pose. Out: a `LiftPath` of the object's origin, a straight minimum-jerk motion
+(Flash and Hogan, 1985) with the orientation kept, within the limits of the palm's lift.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.config import Config
+from drakegrasp.frames import X_WT, Array, make_pose
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.simulation.settle import GRAVITY
+
+#: Peak speed of a minimum-jerk motion over its mean speed (Flash and Hogan, 1985).
+PEAK_SPEED = 15.0 / 8.0
+#: Peak acceleration of a minimum-jerk motion times duration squared over distance.
+PEAK_ACCELERATION = 10.0 / np.sqrt(3.0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LiftPath:
+    """A straight motion of an object that keeps its orientation.
+
+    Attributes:
+        X_WO: Pose at the start, (4, 4).
+        p_WO_end: Position of {O} at the end, (3,) [m].
+        duration: Of the motion [s], positive; the object stays there afterwards.
+    """
+
+    X_WO: Array
+    p_WO_end: Array
+    duration: float
+
+    @property
+    def R_WO(self) -> Array:
+        """Orientation, (3, 3)."""
+        return self.X_WO[:3, :3]
+
+    def at(self, time: float) -> tuple[Array, Array, Array]:
+        """Return position [m], velocity [m/s] and acceleration [m/s^2] of {O} at a time [s]."""
+        s = min(time / self.duration, 1.0)
+        start = self.X_WO[:3, 3]
+        way = self.p_WO_end - start
+        return (
+            start + way * s**3 * (10.0 - 15.0 * s + 6.0 * s**2),
+            way * 30.0 * s**2 * (1.0 - s) ** 2 / self.duration,
+            way * 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s) / self.duration**2,
+        )
+
+    def wrenches(self, model: ObjectModel) -> Array:
+        """Return the wrenches (2, 6) at the two peaks of acceleration, about Ocm in {O}.
+
+        Each is [torque; force] on the object [N m, N]. The orientation is kept, so there is
+        no torque, and every wrench of the motion lies between these two.
+        """
+        way = self.p_WO_end - self.X_WO[:3, 3]
+        peak = PEAK_ACCELERATION * way / self.duration**2
+        forces_W = [carrying_force(model, peak), carrying_force(model, -peak)]
+        return np.hstack([np.zeros((2, 3)), forces_W @ self.R_WO])
+
+
+def carrying_force(model: ObjectModel, acceleration: npt.ArrayLike) -> Array:
+    """Return the force (3,) in {W} [N] that accelerates an object (3,) [m/s^2] in the air."""
+    against_gravity = np.array([0.0, 0.0, GRAVITY])
+    return model.mass * (np.asarray(acceleration, dtype=float) + against_gravity)
+
+
+def lift_path(X_TO: npt.ArrayLike, config: Config) -> LiftPath:
+    """Return the path from a resting pose (4, 4) to p_TO = `lift.p_TG`.
+
+    The target of the palm is that of the object's origin here: there is no palm.
+    """
+    X_WO = X_WT @ np.asarray(X_TO, dtype=float)
+    p_WO_end = X_WT[:3, 3] + config.lift.p_TG
+    duration = lift_duration(float(np.linalg.norm(p_WO_end - X_WO[:3, 3])), config)
+    # The object may start at its target.
+    duration = max(duration, config.physics.time_step)
+    return LiftPath(X_WO=X_WO, p_WO_end=p_WO_end, duration=duration)
+
+
+def lifted_palm(X_TG: Array, time: float, config: Config) -> Array:
+    """Return X_WG (4, 4) at a time [s] of the lift of a trial whose palm begins at X_TG (4, 4).
+
+    A lift whose end is known ends early. The palm's motion is that of an object lifted by
+    forces: to the same place, in the same way.
+    """
+    return make_pose(X_TG[:3, :3], lift_path(X_TG, config).at(time)[0])
+
+
+def lift_duration(distance: float, config: Config) -> float:
+    """Return how long a minimum-jerk motion over a distance [m] takes within the limits [s]."""
+    at_speed_limit = PEAK_SPEED * distance / config.lift.max_speed
+    at_acceleration_limit = np.sqrt(PEAK_ACCELERATION * distance / config.lift.max_acceleration)
+    return float(max(at_speed_limit, at_acceleration_limit))

@@ -1,0 +1,1 @@
+"""Verification of predicted grasps in the simulator."""

@@ -1,0 +1,1 @@
+"""Lifting by forces at the contacts alone, and measures of grasp quality."""

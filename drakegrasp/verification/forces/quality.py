@@ -1,0 +1,176 @@
+"""What forces at a grasp's contact points can do to the object, by linear algebra alone.
+
+In: contact points, outward normals, a friction coefficient. Out: the epsilon of Ferrari and
+Canny, and the least friction that holds the object. Contacts are points with Coulomb friction: a
+finger pushes along the inward normal and along the surface, it neither pulls nor twists.
+
+A wrench here is [torque about Ocm; force], (6,), in axes of {O} [N m, N], in the order of
+Drake's spatial forces.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import ConvexHull, QhullError
+
+from drakegrasp.config import Config
+from drakegrasp.hand.description import load_hand
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.simulation.trajectory import lift_path
+from drakegrasp.verification.forces.contact_forces import (
+    ForceProgram,
+    contact_axes,
+    grasp_map,
+    largest_normal_force,
+)
+
+#: Edges of the pyramid that stands in for a friction cone, inscribed in it. With 16, epsilon
+#: is about 2 % too small and changes by as much with the frame, and the hull takes 15 ms.
+FRICTION_EDGES = 16
+#: An epsilon below this is the rounding of an origin on the hull's surface.
+ROUNDING = 1e-9
+
+
+#: Friction coefficients above this are not looked for, and to what the smallest is found.
+MAX_FRICTION, FRICTION_TOLERANCE = 10.0, 1e-4
+
+
+def characteristic_length(vertices: npt.ArrayLike, p_OOcm: npt.ArrayLike) -> float:
+    """Return the largest distance of a vertex (n, 3) in {O} from the centre of mass [m].
+
+    No contact on the surface has a longer arm, so torques divided by it are comparable with
+    the forces that cause them.
+    """
+    arms = np.asarray(vertices, dtype=float) - np.asarray(p_OOcm, dtype=float)
+    return float(np.linalg.norm(arms, axis=1).max())
+
+
+def ferrari_canny(
+    p_OQ: npt.ArrayLike,
+    nhat_Q_O: npt.ArrayLike,
+    p_OOcm: npt.ArrayLike,
+    *,
+    friction: float,
+    length: float,
+) -> float:
+    """Return the epsilon of a grasp: the smallest wrench that can break it.
+
+    The L1 version of C. Ferrari and J. Canny, "Planning optimal grasps", ICRA 1992: the
+    distance of the origin from the surface of the convex hull of all contacts' friction
+    cones with a unit normal force, that is, for normal forces that sum to one. Each cone is
+    linearised with `FRICTION_EDGES` edges.
+
+    Args:
+        p_OQ: (k, 3), contact points in {O} [m].
+        nhat_Q_O: (k, 3), normals out of the object in {O}.
+        p_OOcm: (3,), the centre of mass in {O} [m].
+        friction: Coulomb coefficient.
+        length: What torques are divided by [m], see `characteristic_length`.
+
+    Returns:
+        Epsilon, without unit; 0 where the origin is not inside of the hull, or the hull is
+        flat, or a number is not finite.
+    """
+    angles = 2.0 * np.pi * np.arange(FRICTION_EDGES) / FRICTION_EDGES
+    pyramid = np.stack(
+        [np.ones(FRICTION_EDGES), friction * np.cos(angles), friction * np.sin(angles)]
+    )
+    edges = contact_axes(nhat_Q_O) @ pyramid  # (k, 3, edges)
+    blocks = grasp_map(p_OQ, p_OOcm).reshape(6, -1, 3)
+    wrenches = np.einsum("wki,kie->kew", blocks, edges).reshape(-1, 6)
+    wrenches[:, :3] /= length
+    if not np.isfinite(wrenches).all():
+        return 0.0
+    try:
+        hull = ConvexHull(wrenches)
+    except QhullError:
+        return 0.0  # flat or too few points: some wrench cannot be resisted at all
+    # Rows are unit outward normal and offset, negative where the origin is inside.
+    epsilon = -float(hull.equations[:, -1].max())
+    return epsilon if epsilon > ROUNDING else 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForceMargin:
+    """How far a grasp is from not holding.
+
+    Attributes:
+        smallest_friction: Coefficient at which the forces of the lift would just be within
+            the limit of the hand's fingertips; inf if none is enough.
+        epsilon: Of Ferrari and Canny at the friction of the configuration, torques divided
+            by the largest distance of the object's surface from its centre of mass; 0
+            without force closure.
+    """
+
+    smallest_friction: float
+    epsilon: float
+
+
+def force_margin(
+    model: ObjectModel,
+    X_TO: npt.ArrayLike,
+    p_OQ: npt.ArrayLike,
+    nhat_Q_O: npt.ArrayLike,
+    config: Config,
+) -> ForceMargin:
+    """Return the margin of a grasp for the lift that `force_lift` simulates.
+
+    Args:
+        model: The object.
+        X_TO: Its resting pose, (4, 4).
+        p_OQ: (k, 3), contact points in {O} [m].
+        nhat_Q_O: (k, 3), normals out of the object in {O}.
+        config: Hand, friction and lift.
+    """
+    return ForceMargin(
+        smallest_friction=smallest_friction(
+            p_OQ,
+            nhat_Q_O,
+            model.p_OOcm,
+            lift_path(X_TO, config).wrenches(model),
+            load_hand(config.hand).fingertip_force_limit,
+        ),
+        epsilon=ferrari_canny(
+            p_OQ,
+            nhat_Q_O,
+            model.p_OOcm,
+            friction=config.physics.friction_hand,
+            length=characteristic_length(model.visual_vertices, model.p_OOcm),
+        ),
+    )
+
+
+def smallest_friction(
+    p_OQ: npt.ArrayLike,
+    nhat_Q_O: npt.ArrayLike,
+    p_OOcm: npt.ArrayLike,
+    wrenches_O: npt.ArrayLike,
+    force_limit: float,
+) -> float:
+    """Return the smallest friction coefficient at which all wrenches (n, 6) can be given.
+
+    More friction never needs more force, so it is found by bisection, rounded up by at most
+    `FRICTION_TOLERANCE`. It is inf where `MAX_FRICTION` is not enough.
+
+    Args:
+        p_OQ: (k, 3), contact points in {O} [m].
+        nhat_Q_O: (k, 3), normals out of the object in {O}.
+        p_OOcm: (3,), centre of mass in {O} [m].
+        wrenches_O: (n, 6), each torque about Ocm and force on the object in {O} [N m, N].
+        force_limit: Of each normal force [N].
+    """
+
+    def holds(friction: float) -> bool:
+        program = ForceProgram(p_OQ, nhat_Q_O, p_OOcm, friction)
+        return largest_normal_force(program, wrenches_O) <= force_limit
+
+    low, high = 0.0, MAX_FRICTION
+    if not holds(high):
+        return float("inf")
+    while high - low > FRICTION_TOLERANCE:
+        middle = (low + high) / 2.0
+        low, high = (low, middle) if holds(middle) else (middle, high)
+    return high

@@ -1,0 +1,171 @@
+"""The result of verifying one grasp: a verdict, how it came about, and by what margin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drakegrasp.config import Config
+from drakegrasp.frames import Array
+from drakegrasp.outcomes import Outcome
+from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.contacts import Contacts
+from drakegrasp.simulation.placement import PlacedObject
+from drakegrasp.simulation.trial import TrialRecord
+from drakegrasp.verification.forces.lift import ForceLift
+from drakegrasp.verification.wrist.solver import WristFit
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Verification:
+    """What became of a grasp of k contacts. What a method or stage did not reach is None or NaN.
+
+    Attributes:
+        method: "hand" or "forces".
+        outcome: The verdict; as in a dataset, or `unreachable` or `off_surface`.
+        reason: One sentence that says why.
+        placed: The object and its pose on the table.
+        config: The rules that it was verified by.
+        p_OQ, nhat_Q_O: (k, 3), the predicted contact points [m] and unit normals in {O}.
+        surface_distance: (k,), of the points from the object's surface [m].
+        fit: The wrist pose and joints that were tried last or held, with SLSQP's status.
+        tries: Number of wrist poses that were simulated.
+        attempt: What the trial began from.
+        trial: What happened in the simulator.
+        contact_error: (k,), distance of each contact after closing from its prediction [m].
+        lift: What happened to the object under forces alone.
+        epsilon: Ferrari-Canny measure of the predicted contacts, 0 without force closure.
+        smallest_friction: Least friction coefficient at which forces at the predicted
+            contacts within the hand's limit hold the object; infinite if none does.
+        seconds: Wall clock by stage [s].
+    """
+
+    method: str
+    outcome: Outcome
+    reason: str
+    placed: PlacedObject
+    config: Config
+    p_OQ: Array
+    nhat_Q_O: Array
+    surface_distance: Array
+    fit: WristFit | None = None
+    tries: int = 0
+    attempt: Attempt | None = None
+    trial: TrialRecord | None = None
+    contact_error: Array | None = None
+    lift: ForceLift | None = None
+    epsilon: float = np.nan
+    smallest_friction: float = np.nan
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def success(self) -> bool:
+        """Whether the grasp holds."""
+        return self.outcome is Outcome.SUCCESS
+
+    @property
+    def X_OG(self) -> Array | None:
+        """Palm pose (4, 4) in {O}."""
+        return None if self.fit is None else self.fit.X_OG
+
+    @property
+    def spread(self) -> float:
+        """Angle of the spread joints [rad]."""
+        return np.nan if self.fit is None else self.fit.spread
+
+    @property
+    def closing(self) -> Array | None:
+        """Closing angles (k,) at which the fingertips meet the predicted points [rad]."""
+        return None if self.fit is None else self.fit.closing
+
+    @property
+    def residual(self) -> Array | None:
+        """Distance (k,) of the predicted points from the fingertips before closing [m]."""
+        return None if self.fit is None else self.fit.residual
+
+    @property
+    def normal_error_deg(self) -> Array | None:
+        """Angle (k,) between the pads' and the predicted normals before closing [degree]."""
+        return None if self.fit is None else np.rad2deg(self.fit.normal_error)
+
+    @property
+    def closed(self) -> Contacts | None:
+        """Contacts after closing."""
+        return None if self.trial is None else self.trial.closed
+
+    @property
+    def lifted(self) -> Contacts | None:
+        """Contacts after the lift."""
+        return None if self.trial is None else self.trial.lifted
+
+    @property
+    def q_closed(self) -> Array | None:
+        """Positions of the hand's joints after closing [rad], in the plant's order."""
+        return None if self.trial is None else self.trial.q_closed
+
+    @property
+    def q_lifted(self) -> Array | None:
+        """Positions of the hand's joints after the lift [rad], in the plant's order."""
+        return None if self.trial is None else self.trial.q_lifted
+
+    def save_html(self, path: str | Path) -> None:
+        """Write what was simulated as a recording to turn about in a browser, in one file.
+
+        It is simulated again, which gives the same bits.
+
+        Raises:
+            OSError: If the file cannot be written.
+        """
+        from drakegrasp.verification.recording import record_verification
+
+        record_verification(self, Path(path))
+
+    def figure(self) -> Figure:
+        """Return a figure of predicted and reached contacts on the mesh; it has `savefig`."""
+        from drakegrasp.verification.figure import verification_figure
+
+        return verification_figure(self)
+
+    def explain(self) -> str:
+        """Return the verdict in two or three sentences for a person."""
+        verdict = "holds" if self.success else f"fails ({self.outcome.label})"
+        sentences = [f"The grasp of {self.placed.model.name} {verdict}: {self.reason}."]
+        if self.fit is not None:
+            sentences.append(
+                f"Before closing the fingertips are within {_mm(self.fit.residual)} of the "
+                f"predicted points and {np.rad2deg(self.fit.normal_error).max():.0f}° of their "
+                "normals"
+                + (
+                    f"; they touch within {_mm(self.contact_error)} of them."
+                    if self.contact_error is not None
+                    else "."
+                )
+            )
+        if not np.isnan(self.smallest_friction):
+            sentences.append(self._explain_margin())
+        return " ".join(sentences)
+
+    def _explain_margin(self) -> str:
+        simulated = self.config.physics.friction_hand
+        if np.isfinite(self.smallest_friction):
+            needed = f"need a friction of {self.smallest_friction:.2f}"
+        else:
+            needed = "are not enough at any friction"
+        text = f"Forces at these points alone {needed}; {simulated:.2f} is simulated"
+        if self.success and self.method == "hand" and self.smallest_friction > simulated:
+            # A point has no area and does not resist twisting.
+            text += ", and the hand also holds by the areas of contact and by its other parts"
+        return f"{text} (epsilon {self.epsilon:.3f})."
+
+    def __repr__(self) -> str:
+        return f"Verification({self.method}, {self.outcome.label}: {self.reason})"
+
+
+def _mm(values: Array) -> str:
+    return f"{1e3 * float(np.nanmax(values)):.1f} mm"

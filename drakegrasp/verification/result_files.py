@@ -1,0 +1,268 @@
+"""Results of verification in files: lines of JSON, and HDF5.
+
+In: `Verification`s in the order of the caller's grasps. Out: an object of strict JSON per
+line, or an HDF5 file whose fields are `schema.VERIFICATION_FIELDS`. Equal results give an
+equal HDF5 file: the seconds of the wall clock are in the JSON only.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+
+from drakegrasp.config import Config
+from drakegrasp.dataset.hdf5 import AnyArray, write_field
+from drakegrasp.dataset.manifest import installed_versions, write_origin
+from drakegrasp.dataset.schema import VERIFICATION_FIELDS, Field, sizes
+from drakegrasp.errors import DataError
+from drakegrasp.frames import Array, pack_pose
+from drakegrasp.hand.description import load_hand
+from drakegrasp.runtime.files import atomic_hdf5, sync_and_rename, temporary_name
+from drakegrasp.simulation.contacts import Contacts
+from drakegrasp.simulation.placement import rest_pose
+from drakegrasp.verification.result import Verification
+
+#: Group of the HDF5 file that holds the fields.
+GROUP = "grasps"
+#: Suffixes of the two files, and what else may stand for them in the name that a caller gives.
+JSON_SUFFIX, HDF5_SUFFIX = ".jsonl", ".h5"
+_KNOWN_SUFFIXES = (JSON_SUFFIX, HDF5_SUFFIX, ".hdf5", ".json")
+#: Digits of the numbers in JSON: a micrometre in a metre.
+DIGITS = 6
+
+
+def result_paths(out: Path) -> tuple[Path, Path]:
+    """Return the paths of the JSON lines and of the HDF5 file that a name stands for."""
+    stem = out.with_suffix("") if out.suffix.lower() in _KNOWN_SUFFIXES else out
+    return stem.with_name(stem.name + JSON_SUFFIX), stem.with_name(stem.name + HDF5_SUFFIX)
+
+
+def refuse_unwritable(out: Path) -> None:
+    """Refuse a name under which nothing can be written, without writing anything.
+
+    Raises:
+        DataError: If its folder, or the first above it that exists, cannot be written.
+    """
+    if out.is_dir():
+        raise DataError(f"{out}: must be a name for files, got a folder; choose another --out")
+    for path in (*result_paths(out), part_path(out)):
+        if path.is_dir():
+            raise DataError(f"{path}: must be a file, got a folder; choose another --out")
+    folder = out.absolute().parent
+    while not os.path.lexists(folder):
+        folder = folder.parent
+    if not (folder.is_dir() and _is_writable(folder)):
+        raise DataError(
+            f"{out}: must be in a folder that can be written, got {folder}; choose another --out"
+        )
+
+
+def _is_writable(folder: Path) -> bool:
+    probe = temporary_name(folder / "probe")
+    try:
+        probe.touch()
+        probe.unlink()
+    except OSError:
+        return False
+    return True
+
+
+# JSON
+
+
+@contextmanager
+def json_lines(out: Path) -> Iterator[Callable[[int, Verification], None]]:
+    """Give the block a function that writes the next JSON line of a name.
+
+    The lines are whole at the end of the block. Until then they are in NAME.part.jsonl, and
+    stay there if something stops the block; nothing is made before the first.
+
+    Args:
+        out: The name, see `result_paths`.
+
+    Raises:
+        OSError: If the disk is full or the folder cannot be written.
+    """
+    lines, _ = result_paths(out)
+    part, stream = part_path(out), None
+    with ExitStack() as stack:
+
+        def write(index: int, result: Verification) -> None:
+            nonlocal stream
+            if stream is None:
+                part.parent.mkdir(parents=True, exist_ok=True)
+                stream = stack.enter_context(part.open("w", encoding="utf-8"))
+            write_json_line(index, result, stream)
+
+        yield write
+    if stream is not None:
+        sync_and_rename(part, lines)
+
+
+def part_path(out: Path) -> Path:
+    """Return the path of the JSON lines of a name that are not all there yet."""
+    lines, _ = result_paths(out)
+    return lines.with_suffix(f".part{JSON_SUFFIX}")
+
+
+def write_json_line(index: int, result: Verification, stream: TextIO) -> None:
+    """Write a line of strict JSON for a result, at once; what is NaN or infinite is null."""
+    text = json.dumps(_plain(as_dict(index, result)), ensure_ascii=False, allow_nan=False)
+    stream.write(text + "\n")
+    stream.flush()
+
+
+def as_dict(index: int, result: Verification) -> dict[str, Any]:
+    """Return what a line says of one result; keys that are fields mean what those mean."""
+    trial, fit, lift = result.trial, result.fit, result.lift
+    return {
+        "index": index,
+        "object": result.placed.model.name,
+        "method": result.method,
+        "success": result.success,
+        "outcome": result.outcome.label,
+        "reason": result.reason,
+        "explain": result.explain(),
+        "X_TO": result.placed.X_TO,
+        "p_OQ": result.p_OQ,
+        "nhat_Q_O": result.nhat_Q_O,
+        "surface_distance": result.surface_distance,
+        "X_OG": result.X_OG,
+        "spread": result.spread,
+        "closing": result.closing,
+        "residual": result.residual,
+        "normal_error_deg": result.normal_error_deg,
+        "contact_error": result.contact_error,
+        "tries": result.tries,
+        "solver": None
+        if fit is None
+        else {"status": fit.status, "message": fit.message, "iterations": fit.iterations},
+        "closed": _contacts_as_dict(result.closed, result.q_closed),
+        "lifted": _contacts_as_dict(result.lifted, result.q_lifted),
+        "slip": None if trial is None else trial.slip,
+        "epsilon": result.epsilon,
+        "smallest_friction": result.smallest_friction,
+        # Null above may be infinity, or that it was not asked.
+        "friction_can_hold": None
+        if math.isnan(result.smallest_friction)
+        else math.isfinite(result.smallest_friction),
+        "forces": None
+        if lift is None
+        else {
+            "end": lift.end.value,
+            "planned_force": lift.planned_force,
+            "applied_force": lift.applied_force,
+            "position_error": lift.position_error,
+            "angle_error_deg": math.degrees(lift.angle_error),
+        },
+        "seconds": result.seconds,
+    }
+
+
+def _contacts_as_dict(contacts: Contacts | None, q: Array | None) -> dict[str, Any] | None:
+    if contacts is None:
+        return None
+    names = ("touching", "p_OQ", "nhat_Q_O", "f_Q_O", "other_links", "hand_on_table")
+    return {name: getattr(contacts, name) for name in (*names, "object_on_table")} | {"q": q}
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as types of strict JSON."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float):
+        # Adding zero turns -0.0 into 0.0.
+        return float(f"{value:.{DIGITS}g}") + 0.0 if math.isfinite(value) else None
+    return value
+
+
+# HDF5
+
+
+def write_results(results: Sequence[Verification], path: Path, config: Config) -> None:
+    """Write results to an HDF5 file that appears whole or not at all.
+
+    Args:
+        results: In the order of the grasps.
+        path: Of the file.
+        config: With which they were verified.
+
+    Raises:
+        OSError: If the disk is full or the folder cannot be written.
+    """
+    hand = load_hand(config.hand)
+    shape = sizes(fingers=hand.num_fingers, joints=len(hand.joint_names), image=0)
+    rows = [_row(result) for result in results]
+    with atomic_hdf5(path) as file:
+        write_origin(file, config, installed_versions(config))
+        group = file.create_group(GROUP)
+        for field in VERIFICATION_FIELDS:
+            write_field(group, field, _column(field, rows, shape))
+
+
+def _column(field: Field, rows: Sequence[dict[str, Any]], shape: dict[str, int]) -> AnyArray:
+    if field.dtype == "str":
+        return np.array([row[field.name] for row in rows], dtype=object)
+    column = field.empty(len(rows), shape)
+    for i, row in enumerate(rows):
+        if row.get(field.name) is not None:
+            column[i] = row[field.name]
+    return column
+
+
+def _row(result: Verification) -> dict[str, Any]:
+    """Return the values of one result by field; what was not reached is left out, or None."""
+    fit, attempt, trial, lift = result.fit, result.attempt, result.trial, result.lift
+    row: dict[str, Any] = {
+        "object": result.placed.model.name,
+        "method": result.method,
+        "outcome": result.outcome,
+        "reason": result.reason,
+        "X_TO": pack_pose(result.placed.X_TO),
+        "X_TO_simulated": pack_pose(rest_pose(result.placed.X_TO)),
+        "p_OQ": result.p_OQ,
+        "nhat_Q_O": result.nhat_Q_O,
+        "surface_distance": result.surface_distance,
+        "epsilon": result.epsilon,
+        "smallest_friction": result.smallest_friction,
+        "solver_status": -1,
+        "tries": result.tries,
+        "contact_error": result.contact_error,
+    }
+    if fit is not None:
+        row |= {name: getattr(fit, name) for name in ("spread", "closing", "residual")}
+        row |= {"X_OG": pack_pose(fit.X_OG), "normal_error": fit.normal_error}
+        row |= {"solver_status": fit.status, "solver_iterations": fit.iterations}
+    if attempt is not None:
+        row["closing_start"] = attempt.closing
+    if trial is not None and trial.closed is not None:
+        row |= {"time_close": trial.time_close, "closed_q": trial.q_closed}
+        row |= _contact_values("closed", trial.closed)
+    if trial is not None and trial.lifted is not None:
+        row |= {"time_lift": trial.time_lift, "lifted_q": trial.q_lifted}
+        row |= _contact_values("lifted", trial.lifted)
+        row |= {"slip": trial.slip, "slip_angle": trial.slip_angle}
+    if lift is not None:
+        names = ("planned_force", "applied_force", "position_error", "angle_error")
+        row |= {name: getattr(lift, name) for name in names}
+    for reached in (trial, lift):
+        if reached is not None and reached.X_TO_lifted is not None:
+            row["X_TO_lifted"] = pack_pose(reached.X_TO_lifted)
+    return row
+
+
+def _contact_values(prefix: str, contacts: Contacts) -> dict[str, Any]:
+    names = [f.name for f in VERIFICATION_FIELDS if f.name.startswith(f"{prefix}_")]
+    known = {name: name.removeprefix(f"{prefix}_") for name in names if name != f"{prefix}_q"}
+    return {name: getattr(contacts, attribute) for name, attribute in known.items()}

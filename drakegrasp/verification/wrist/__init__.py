@@ -1,0 +1,1 @@
+"""The palm pose that brings the fingertips to predicted contacts."""

@@ -1,0 +1,195 @@
+"""Solving the wrist problem: SciPy's SLSQP from several starts.
+
+In: a hand and k contacts in {O}. Out: palm poses with joints, the best first. Contacts
+leave a family of poses open, so the solutions from different starts are different ways to
+make the same grasp.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import minimize
+
+from drakegrasp.frames import Array
+from drakegrasp.hand.description import Hand
+from drakegrasp.verification.wrist.initial_guesses import find_starts, make_postures
+from drakegrasp.verification.wrist.pads import nearest_on_pads
+from drakegrasp.verification.wrist.problem import (
+    POSE,
+    Evaluation,
+    WristProblem,
+    evaluate,
+    hand_constants,
+)
+
+#: Starts, and so solutions.
+STARTS = 5
+#: Unit of the objective [m^2]: misfits of a few millimetres are of order one.
+UNIT = 0.005**2
+#: Unit of the clearance over the table [m].
+CLEARANCE_UNIT = 0.01
+#: Share of the identity in the scaling matrix; it keeps steps short where contacts say little.
+DAMPING = 3e-4
+#: SLSQP stops after so many iterations, or when the objective changes by less than this.
+MAX_ITERATIONS, TOLERANCE = 50, 1e-3
+#: Steps of Newton's method that bring each pad onto its point.
+REFINEMENTS = 3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WristFit:
+    """A solution of the wrist problem for k fingers.
+
+    Attributes:
+        X_OG: (4, 4), palm pose.
+        spread: [rad]
+        closing: (k,), closing angles at which the pads meet the points [rad].
+        objective: Sum of squared weighted misfits where SLSQP ended, before each finger was
+            brought onto its point [m^2].
+        residual: (k,), distance of each predicted point from its fingertip's surface [m].
+        normal_error: (k,), angle between each pad's inward and the predicted normal [rad].
+        status, message: SLSQP's exit mode, 0 for success, and its text.
+        iterations, evaluations: Of SLSQP.
+    """
+
+    X_OG: Array
+    spread: float
+    closing: Array
+    objective: float
+    residual: Array
+    normal_error: Array
+    status: int
+    message: str
+    iterations: int
+    evaluations: int
+
+
+def fit_wrist(
+    hand: Hand, p_OQ: Array, nhat_Q_O: Array, *, up_O: Array, height: float
+) -> list[WristFit]:
+    """Return the solutions from all starts, the one with the smallest objective first.
+
+    Args:
+        hand: Of k fingers.
+        p_OQ: (k, 3), contact points [m].
+        nhat_Q_O: (k, 3), outward unit normals.
+        up_O: (3,), the table's upward normal in {O}.
+        height: Of the origin of {O} above the table [m].
+    """
+    constants, fits = hand_constants(hand), []
+    for start in find_starts(make_postures(hand), p_OQ, nhat_Q_O, STARTS):
+        problem = WristProblem(
+            constants=constants,
+            p_OQ=p_OQ,
+            nhat_Q_O=nhat_Q_O,
+            up_O=up_O,
+            height=height,
+            X_OS=start.X_OG,
+            posture=start.coordinates,
+        )
+        fits.append(solve(problem))
+    return sorted(fits, key=lambda fit: fit.objective)
+
+
+def solve(problem: WristProblem) -> WristFit:
+    """Return what SLSQP finds from the problem's start, with each finger refined."""
+    scaled = _Scaled(problem)
+    result = minimize(
+        scaled.objective,
+        np.zeros(POSE + len(problem.posture)),
+        jac=True,
+        method="SLSQP",
+        constraints=[{"type": "ineq", "fun": scaled.slack, "jac": scaled.slack_slope}],
+        options={"maxiter": MAX_ITERATIONS, "ftol": TOLERANCE},
+    )
+    found = scaled.at(result.x)
+    evaluations = scaled.evaluations
+    problem = replace(problem, X_OS=found.X_OG)
+    refined, c = _refine(problem, scaled.x(result.x)[POSE:])
+    p_FiQ = refined.p_FiQ
+    facing = -np.sum(refined.pad_normals_O * problem.nhat_Q_O, axis=1)
+    return WristFit(
+        X_OG=found.X_OG,
+        spread=float(c[0]),
+        closing=c[1:],
+        objective=float(found.residuals @ found.residuals),
+        residual=np.linalg.norm(nearest_on_pads(problem.constants.pads, p_FiQ) - p_FiQ, axis=1),
+        normal_error=np.arccos(np.clip(facing, -1.0, 1.0)),
+        status=int(result.status),
+        message=str(result.message),
+        iterations=int(result.nit),
+        evaluations=evaluations,
+    )
+
+
+def _refine(problem: WristProblem, coordinates: Array) -> tuple[Evaluation, Array]:
+    """Close or open each finger until its pad meets its point, with the palm where it is.
+
+    Newton's method on each finger's own distance by its own closing angle.
+    """
+    lower, upper = problem.constants.limits.T
+    pose, own = np.zeros(POSE), np.arange(len(problem.p_OQ))
+    c = np.clip(coordinates, lower, upper)
+    best = evaluate(problem, np.concatenate([pose, c]))
+    for _ in range(REFINEMENTS):
+        distance = best.contact.distance
+        slope = best.jacobian[own, POSE + 1 + own]
+        # A pad that slides along its point cannot be brought nearer by closing.
+        moves = np.abs(slope) > 0.01
+        step = np.where(moves, distance / np.where(moves, slope, 1.0), 0.0)
+        trial = np.clip(c - np.concatenate([[0.0], step]), lower, upper)
+        after = evaluate(problem, np.concatenate([pose, trial]))
+        if not np.abs(after.contact.distance).sum() < np.abs(distance).sum():
+            break
+        best, c = after, trial
+    return best, c
+
+
+class _Scaled:
+    """The problem in scaled unknowns y with x = S y, as SLSQP asks for it.
+
+    S is the inverse square root of the Gauss-Newton matrix at the start, so that SLSQP's
+    first step, which it takes with an identity Hessian, is the Gauss-Newton step. The last
+    evaluation is kept: objective and constraints are asked for at the same point.
+    """
+
+    def __init__(self, problem: WristProblem) -> None:
+        self._problem = problem
+        self._start = np.concatenate([np.zeros(POSE), problem.posture])
+        self._last = evaluate(problem, self._start)
+        self.evaluations = 1
+        J = self._last.jacobian
+        H = 2.0 * J.T @ J / UNIT
+        H += DAMPING * np.trace(H) / len(H) * np.eye(len(H))
+        self._S = np.linalg.inv(np.linalg.cholesky(H)).T
+        self._y = np.zeros(len(H))
+
+    def x(self, y: Array) -> Array:
+        """Return the unknowns of the problem."""
+        return self._start + self._S @ y
+
+    def at(self, y: Array) -> Evaluation:
+        """Return the problem at y."""
+        if not np.array_equal(y, self._y):
+            self._y, self._last = y.copy(), evaluate(self._problem, self.x(y))
+            self.evaluations += 1
+        return self._last
+
+    def objective(self, y: Array) -> tuple[float, Array]:
+        """Return the sum of squares in units and its slope."""
+        e = self.at(y)
+        slope = 2.0 * (e.residuals @ e.jacobian) @ self._S / UNIT
+        return float(e.residuals @ e.residuals) / UNIT, slope
+
+    def slack(self, y: Array) -> Array:
+        """Return what must not be negative: room to the joints' limits and over the table."""
+        c, (lower, upper) = self.x(y)[POSE:], self._problem.constants.limits.T
+        return np.concatenate([c - lower, upper - c, self.at(y).clearance / CLEARANCE_UNIT])
+
+    def slack_slope(self, y: Array) -> Array:
+        """Return the derivative of `slack`."""
+        joints = self._S[POSE:]
+        over_table = self.at(y).clearance_jacobian @ self._S / CLEARANCE_UNIT
+        return np.concatenate([joints, -joints, over_table])

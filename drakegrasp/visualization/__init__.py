@@ -1,0 +1,1 @@
+"""Contact sheets, third-person pictures, recordings."""

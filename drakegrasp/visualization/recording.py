@@ -1,0 +1,180 @@
+"""Recordings: an attempt as one HTML file that any browser plays.
+
+In: what is to be run. Out: the file, which needs nothing else, no network either, and the
+result of the run: the same bits as without a recording, because the same code runs. Where
+there was nothing to run, the file shows how things would have stood.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from pydrake.geometry import Cylinder, Meshcat, MeshcatCone, MeshcatParams, Rgba, Sphere
+from pydrake.math import RigidTransform, RotationMatrix
+
+from drakegrasp.config import Config
+from drakegrasp.frames import X_WT, Array
+from drakegrasp.hand.description import load_hand
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.runtime.environment import allow_network
+from drakegrasp.runtime.files import sync_and_rename, temporary_name
+from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.construction import MESHCAT_RATE, build_scene
+from drakegrasp.simulation.scene import Scene, reset_attempt, reset_object
+from drakegrasp.simulation.trial import TrialRecord, run_attempt
+from drakegrasp.visualization.style import PREDICTED
+
+Result = TypeVar("Result")
+
+#: Where Meshcat has the object; what is put below moves with it.
+OBJECT_PATH = "visualizer/object/object"
+#: Radius of a contact's dot, length and radius of the arrow along its normal [m].
+DOT, ARROW, SHAFT = 0.004, 0.03, 0.0012
+#: Length and radius of an arrow's head [m].
+HEAD, HEAD_RADIUS = 0.009, 0.0035
+#: The camera looks from this far around the palm's side, about the vertical, and from above [rad].
+AZIMUTH, ELEVATION = np.deg2rad(50.0), np.deg2rad(20.0)
+#: Its distance in radii of a ball about all that happens, and what the hand adds to that [m].
+DISTANCE, HAND_RADIUS = 1.15, 0.1
+
+
+def record_attempt(
+    model: ObjectModel,
+    X_TO: npt.ArrayLike,
+    attempt: Attempt,
+    config: Config,
+    path: Path,
+    *,
+    p_OQ: Array | None = None,
+    nhat_Q_O: Array | None = None,
+) -> TrialRecord:
+    """Run an attempt as `trial.run_attempt` does, and write what is seen of it.
+
+    Args:
+        model: The object.
+        X_TO: Its resting pose in the table-top frame, (4, 4).
+        attempt: What to try.
+        config: Hand and rules.
+        path: The HTML file.
+        p_OQ: (k, 3), predicted contacts in {O}, drawn on the object [m].
+        nhat_Q_O: (k, 3), their outward unit normals.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+
+    def run(meshcat: Meshcat) -> TrialRecord:
+        scene = build_scene(model, config.physics, load_hand(config.hand), meshcat=meshcat)
+        # An attempt that fails before it is simulated is seen where it would have begun.
+        show_start(meshcat, scene, X_TO, config, attempt.X_OG, attempt.spread, attempt.closing)
+        record = run_attempt(scene, X_TO, attempt, config)
+        draw_predicted(meshcat, p_OQ, nhat_Q_O)
+        return record
+
+    return record_html(run, path)
+
+
+def show_start(
+    meshcat: Meshcat,
+    scene: Scene,
+    X_TO: npt.ArrayLike,
+    config: Config,
+    X_OG: Array | None = None,
+    spread: float = 0.0,
+    closing: Array | None = None,
+) -> None:
+    """Show the object, and the hand if a pose of it is given, before anything moves."""
+    X_WO = X_WT @ np.asarray(X_TO, dtype=float)
+    if X_OG is None:
+        reset_object(scene, X_WO)
+        scene.simulator.Initialize()
+        side_W = np.array([1.0, 0.0, 0.0])
+    else:
+        reset_attempt(scene, X_WO, X_WO @ X_OG, spread=spread, closing=closing)
+        side_W = X_WO[:3, :3] @ X_OG[:3, 3]
+    way = X_WT[:3, 3] + config.lift.p_TG - X_WO[:3, 3]
+    radius = np.linalg.norm(way) / 2.0 + np.linalg.norm(scene.model.half_extents) + HAND_RADIUS
+    azimuth = np.arctan2(side_W[1], side_W[0]) + AZIMUTH
+    towards = np.array([np.cos(azimuth), np.sin(azimuth), np.tan(ELEVATION)])
+    middle = X_WO[:3, 3] + way / 2.0
+    meshcat.SetCameraPose(middle + DISTANCE * radius * towards, middle)
+
+
+def record_html(run: Callable[[Meshcat], Result], path: Path) -> Result:
+    """Return what `run` does, and write what is seen of it when it ends well."""
+    meshcat = _make_meshcat()
+    try:
+        for part in ("/Grid", "/Axes"):
+            meshcat.SetProperty(part, "visible", False)
+        meshcat.StartRecording(frames_per_second=MESHCAT_RATE)
+        result = run(meshcat)
+        meshcat.StopRecording()
+        meshcat.PublishRecording()
+        _write(path, meshcat.StaticHtml())
+    finally:
+        # Diagrams sit in reference cycles; when the one of `run` is gone, the port is closed.
+        del meshcat
+        gc.collect()
+    return result
+
+
+def _make_meshcat() -> Meshcat:
+    """Return a Meshcat that only this machine can reach.
+
+    Meshcat is a server from the moment it is made, and there is no other way to its HTML.
+    Under `DRAKE_ALLOW_NETWORK=none`, as our workers run, making one raises, so the ban is
+    eased meanwhile; nothing leaves the machine. Nobody is to open the address that Drake
+    announces, so that is not said.
+    """
+    logger = logging.getLogger("drake")
+    level = logger.level
+    logger.setLevel(logging.WARNING)
+    try:
+        with allow_network("meshcat"):
+            # Port 0 is any that is free, so any number of recordings can be made at once.
+            return Meshcat(MeshcatParams(host="localhost", port=0, show_stats_plot=False))
+    finally:
+        logger.setLevel(level)
+
+
+def _write(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = temporary_name(path)
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        sync_and_rename(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def draw_predicted(meshcat: Meshcat, p_OQ: Array | None, nhat_Q_O: Array | None) -> None:
+    """Draw a dot per contact on the object, with an arrow along its normal."""
+    if p_OQ is None or nhat_Q_O is None:
+        return
+    colour = rgba(PREDICTED)
+    for i, (p, n) in enumerate(zip(p_OQ, nhat_Q_O, strict=True)):
+        path = f"{OBJECT_PATH}/predicted/{i + 1}"
+        meshcat.SetTransform(path, pose_along(p, n))
+        meshcat.SetObject(f"{path}/dot", Sphere(DOT), colour)
+        meshcat.SetObject(f"{path}/shaft", Cylinder(SHAFT, ARROW - HEAD), colour)
+        meshcat.SetTransform(f"{path}/shaft", RigidTransform([0.0, 0.0, (ARROW - HEAD) / 2.0]))
+        # A cone opens along its +z from its apex, here the arrow's tip.
+        meshcat.SetObject(f"{path}/head", MeshcatCone(HEAD, HEAD_RADIUS, HEAD_RADIUS), colour)
+        tip = RigidTransform(RotationMatrix.MakeXRotation(np.pi), [0.0, 0.0, ARROW])
+        meshcat.SetTransform(f"{path}/head", tip)
+
+
+def pose_along(p_OQ: Array, v_O: Array) -> RigidTransform:
+    """Return the pose in {O} of a frame at a point whose z axis is along a vector."""
+    return RigidTransform(RotationMatrix.MakeFromOneVector(v_O, 2), p_OQ)
+
+
+def rgba(colour: str) -> Rgba:
+    """Return a colour #rrggbb as Drake's."""
+    return Rgba(*(int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5)))

@@ -1,0 +1,138 @@
+"""What figures have in common: colours, axes, and how a sample is drawn.
+
+Contacts are drawn where the camera matrix projects them: a dot per finger with a short arrow
+along the outward normal; a dot is hollow where the object hides it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import cycle, islice
+from pathlib import Path
+
+import h5py
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import Colormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
+
+from drakegrasp.dataset.reader import Sample
+from drakegrasp.frames import Array
+from drakegrasp.grasp import unpack_grasp
+from drakegrasp.vision.camera import project
+
+#: Colours of what was predicted and of what was reached, told apart by the colour-blind too.
+PREDICTED, REACHED = "#0072B2", "#D55E00"
+#: Colours of the fingers in grasp order, told apart by the colour-blind too (Okabe and Ito).
+FINGER_COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00")
+#: Length of the arrows along the normals [m].
+ARROW = 0.03
+#: A contact this much behind what the depth image shows is hidden [m]; fingertips give way
+#: by less.
+HIDDEN = 0.006
+INK = "#333333"
+
+
+def draw_sample(
+    axes: Sequence[Axes], sample: Sample, K: Array, *, near: float, far: float, scale: float = 1.0
+) -> None:
+    """Draw colour, depth and mask of a sample into three axes, contacts and all."""
+    colour, depth, mask = axes
+    colour.imshow(np.moveaxis(sample.image[:3], 0, 2), interpolation="nearest")
+    shown = np.ma.masked_greater_equal(sample.image[3], far)
+    depth.imshow(shown, cmap=_depth_colours(), vmin=near, vmax=far, interpolation="nearest")
+    mask.imshow(sample.mask, cmap="gray", vmin=-0.25, vmax=1.1, interpolation="nearest")
+    for one in axes:
+        draw_contacts(one, sample, K, scale=scale)
+        hide_ticks(one)
+
+
+def draw_contacts(axes: Axes, sample: Sample, K: Array, *, scale: float = 1.0) -> None:
+    """Draw the contacts of a sample into its image: one dot, with an arrow, per finger."""
+    p_CQ, nhat_Q_C = unpack_grasp(sample.grasp)
+    dots = project(K, p_CQ)
+    ends = project(K, p_CQ + ARROW * nhat_Q_C)
+    size = np.array(sample.mask.shape[::-1])
+    for i, (dot, end) in enumerate(zip(dots, ends, strict=True)):
+        colour = FINGER_COLOURS[i % len(FINGER_COLOURS)]
+        column, row = np.clip(np.rint(dot), 0, size - 1).astype(int)
+        hidden = p_CQ[i, 2] > sample.image[3, row, column] + HIDDEN
+        white = [withStroke(linewidth=3.0 * scale, foreground="white")]
+        axes.plot(
+            *np.column_stack([dot, end]), color=colour, linewidth=1.6 * scale,
+            solid_capstyle="round", path_effects=white, zorder=3,
+        )  # fmt: skip
+        axes.plot(
+            *dot, marker="o", markersize=5.2 * scale, markeredgewidth=1.0 * scale,
+            markerfacecolor="white" if hidden else colour,
+            markeredgecolor=colour if hidden else "white",
+            linestyle="none", zorder=4, gid=f"contact {i}",
+            path_effects=[withStroke(linewidth=1.6 * scale, foreground="white")] if hidden else [],
+        )  # fmt: skip
+    axes.set_xlim(-0.5, size[0] - 0.5)
+    axes.set_ylim(size[1] - 0.5, -0.5)
+
+
+def read_far(path: Path) -> float:
+    """Return the far plane [m] of a data file."""
+    with h5py.File(path, "r") as file:
+        return float(file.attrs["far"])
+
+
+def _depth_colours() -> Colormap:
+    # What is beyond the far plane has no depth.
+    return mpl.colormaps["viridis_r"].with_extremes(bad="#E3E6EA")
+
+
+def draw_colour_bar(figure: Figure, axes: Axes, near: float, far: float, *, size: float) -> None:
+    """Draw the bar of the depths, with text of a size [points]."""
+    scale = mpl.cm.ScalarMappable(mpl.colors.Normalize(near, far), _depth_colours())
+    bar = figure.colorbar(scale, cax=axes, orientation="horizontal")
+    bar.outline.set_visible(False)
+    axes.tick_params(labelsize=size, length=2.0, pad=1.5, color=INK, labelcolor=INK)
+    axes.set_ylabel("depth [m]", rotation=0, ha="right", va="center", fontsize=size, color=INK)
+
+
+def draw_finger_legend(
+    figure: Figure, fingers: int, corner: tuple[float, float], size: float
+) -> None:
+    """Write which colour is which finger, right of a corner (0..1), text of a size [points]."""
+
+    def mark(colour: str, inside: str, edge: str, label: str) -> Line2D:
+        return Line2D([], [], marker="o", linestyle="none", markersize=0.75 * size, color=colour,
+                      markerfacecolor=inside, markeredgecolor=edge, label=label)  # fmt: skip
+
+    marks = [
+        mark(c, c, "white", f"finger {i + 1}")
+        for i, c in enumerate(islice(cycle(FINGER_COLOURS), fingers))
+    ]
+    marks.append(mark(INK, "white", INK, "hidden by the object"))
+    figure.legend(
+        handles=marks, loc="upper left", bbox_to_anchor=corner, ncols=len(marks), fontsize=size,
+        frameon=False, handletextpad=0.1, columnspacing=1.2, borderaxespad=0.0, borderpad=0.0,
+        labelcolor=INK,
+    )  # fmt: skip
+
+
+def add_axes(figure: Figure, left: float, top: float, wide: float, high: float) -> Axes:
+    """Add axes, measured in inches from the upper left corner of the figure."""
+    width, height = figure.get_size_inches()
+    box = (left / width, 1.0 - (top + high) / height, wide / width, high / height)
+    return figure.add_axes(box)
+
+
+def hide_ticks(axes: Axes) -> None:
+    """Take away the ticks and the frame of axes."""
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+
+
+def save_figure(figure: Figure, png: Path, *, dpi: int) -> None:
+    """Write a figure as PNG."""
+    # No version in the file: the same figure gives the same bytes.
+    figure.savefig(png, dpi=dpi, metadata={"Software": None})

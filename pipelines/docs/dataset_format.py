@@ -1,0 +1,180 @@
+"""Write docs/dataset-format.md from the schema table, or check that it is up to date.
+
+Usage: python pipelines/docs/dataset_format.py [--check] FILE
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from drakegrasp.dataset.schema import (
+    CONVENTIONS,
+    DATA_FIELDS,
+    LOOK_FIELDS,
+    OBJECT_FIELDS,
+    SCHEMA_VERSION,
+    SUCCESS_FIELDS,
+    TRIAL_FIELDS,
+    VERIFICATION_FIELDS,
+    Field,
+)
+
+_HEAD = f"""<!-- Made by `make docs` from drakegrasp/schema.py: change that, not this. -->
+
+# The dataset's format
+
+Schema version {SCHEMA_VERSION}. In the shapes `N` is the number of rows, `k` of fingers, `j` of
+the hand's joints, `6k` the length of a grasp (18 for three fingers) and `S` the size of the images.
+Frames are explained in [frames-and-units.md](frames-and-units.md). Every dataset of a file carries
+its `unit`, `frame` and `meaning` as attributes.
+
+```
+OUT/
+  manifest.json            configuration, its hash, seed, versions, objects, refused meshes
+  objects/NAME.npz         an object: meshes, mass, centre of mass, inertia
+  objects/NAME.plan.h5     its resting pose and palm poses
+  shards/NAME/RANGE.h5     what one work unit found; immutable
+  trials.hdf5              a row per attempt, whatever its outcome
+  grasping_oto.hdf5        samples, camera rolled with the palm
+  grasping_otm.hdf5        the same samples, image up is world up
+  log.jsonl                what happened while it was built, and when: a line of JSON per event
+  build.lock               while a build runs: by which process
+```
+
+Only the data files, `grasping_*.hdf5`, are needed to train. With `objects/` and `manifest.json`,
+every trial can be replayed.
+"""
+
+_CONTRACT = """## What makes two files equal
+
+The same command gives the same arrays, whatever the number of workers, in which order they work
+and how often the build was interrupted: nothing in these files depends on the clock or the
+machine's name. `time_close` and `time_lift` are simulated seconds. This holds on one machine with
+one set of library versions (`manifest.json` names them); another CPU or another version of Drake
+may round differently. The exceptions are the outcomes `timeout` and `crashed`: an attempt that
+takes longer than `attempt_seconds` (60 s, where a usual one takes about one), or ends its process
+again and again, says more about the machine than about the grasp, and may end otherwise elsewhere.
+`screened` is an attempt that geometry has decided: it was not simulated, and would have been a
+`missing_fingertip`, see `performance.md`.
+
+Shards and the files in `objects/` are sealed: a changed bit in one of them is found when it is
+used, and by `drakegrasp check`. The three main files have no seal: `check` finds what breaks an
+invariant, not every changed bit of an image. `drakegrasp assemble` makes them again from the
+shards; a list of rejected trials (`--reject`) holds until then.
+
+## Missing values
+
+The two data files hold no NaN. In `trials.hdf5` a value that does not exist for a row is NaN
+(floats), 0 or false: the column "from" above says with which stage a value begins. Contact points
+and normals are also NaN for a finger that does not touch. The stage of a row follows from its
+outcome: `success`, `slipped` and `dropped` were lifted; `missing_fingertip` and `hand_contact` were
+closed; `table_contact` was closed, and lifted if `time_lift` is a number (then it is the object
+that still touches the table); all others were only placed. `solver_error`, `timeout` and `crashed`
+say that the simulator failed: never count them as failed grasps.
+"""
+
+
+_ATTRIBUTES = """
+Further attributes: `schema_version`, `camera`, camera matrix `K` [px], `near` and `far` [m],
+`config` and `versions` (JSON), `config_hash`, `seed`, `signature` (of what the file was assembled
+from).
+"""
+
+_DATA = """## grasping_oto.hdf5 and grasping_otm.hdf5
+
+Groups `/train`, `/valid` and `/test` have the same fields; images and masks are stored in one
+chunk per sample, gzip 1 with shuffle. Successes only, after the filters.
+"""
+
+_VERIFICATION = """
+## The results of `drakegrasp verify`
+
+`drakegrasp verify ... --out NAME` writes two files, with a row or a line per grasp in the order of
+the input. `NAME.h5` has the attributes `convention_*`, `schema_version`, `config`, `config_hash`,
+`seed` and `versions`, and a group `/grasps`. What a method or a stage did not reach is NaN, 0,
+false or empty; "from" says with which stage a value begins. Equal input gives equal bytes.
+"""
+
+_LINES = """
+`NAME.jsonl`, or standard output without `--out`, has a JSON object per line; NaN and inf are
+`null`. `index` is the grasp's place in the input, `success` whether it holds, `outcome` the label
+of the verdict, `explain` the verdict in sentences, `X_OG` a 4 x 4 matrix. `solver` (SLSQP's
+`status`, `message`, `iterations`), `closed` and `lifted` (contacts then) and `forces` (method
+`forces`) are objects, or `null` if they were not reached; `seconds` is the wall clock by stage.
+Angles that end in `_deg` are in degrees; all else is as in the table, in its units.
+"""
+
+_SHARDS = """
+## Shards
+
+`/trials` as above without `trial_id` and `object`, and `/looks` with a row per success:
+"""
+
+
+def format_page() -> str:
+    """Return the page."""
+    return "\n".join(
+        [
+            _HEAD,
+            "## Conventions\n\nThey are in every file as attributes `convention_*`.\n",
+            _table(("attribute", "text"), CONVENTIONS.items()),
+            _ATTRIBUTES,
+            _DATA,
+            _fields(DATA_FIELDS),
+            "\n## trials.hdf5\n\n### /trials\n",
+            _fields(TRIAL_FIELDS, stages=True),
+            "\n### /objects\n",
+            _fields(OBJECT_FIELDS),
+            "\n### /successes\n",
+            _fields(SUCCESS_FIELDS),
+            _SHARDS,
+            _fields(LOOK_FIELDS),
+            _VERIFICATION,
+            _fields(VERIFICATION_FIELDS, stages=True),
+            _LINES,
+            "\n" + _CONTRACT,
+        ]
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Write the page, or with --check return 1 if it is out of date."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    check = "--check" in arguments
+    (target,) = (Path(a) for a in arguments if a != "--check")
+    page = format_page()
+    if not check:
+        target.write_text(page, encoding="utf-8")
+        return 0
+    if target.exists() and target.read_text(encoding="utf-8") == page:
+        return 0
+    sys.stderr.write(f"{target}: must be what `make docs` writes, got another text\n")
+    return 1
+
+
+def _fields(fields: Sequence[Field], *, stages: bool = False) -> str:
+    heads: tuple[str, ...] = ("field", "shape", "type", "unit", "frame", "meaning")
+    rows = []
+    for field in fields:
+        shape = (
+            "(" + ", ".join(["N", *map(str, field.shape)]) + ("," if not field.shape else "") + ")"
+        )
+        cells = [f"`{field.name}`", shape, field.dtype, field.unit, field.frame, field.meaning]
+        if stages:
+            cells.insert(5, field.stage.name.lower())
+        rows.append(cells)
+    if stages:
+        heads = (*heads[:5], "from", heads[5])
+    return _table(heads, rows)
+
+
+def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
+    lines += ["| " + " | ".join(row) + " |" for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,68 @@
+"""Draw the pictures of the README and the docs from a dataset of built-in objects.
+
+Writes trial.png (one grasp, start to lift, with what the cameras saw), frames.png (the
+frames) and candidates.png (palm poses by surface normals and by rotations, on a mug).
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from doc_figures import candidates_figure, frames_figure, hero_figure
+from trial_pictures import frames_panels, trial_snapshots
+
+from drakegrasp.build.prepare import prepare
+from drakegrasp.config import load_config
+from drakegrasp.dataset.paths import DATA_FILES
+from drakegrasp.dataset.prepared_objects import PreparedObject
+from drakegrasp.frames import Array
+from drakegrasp.objects.builtin.catalog import export_builtin
+from drakegrasp.objects.sources import find_meshes
+from drakegrasp.simulation.candidates import sample_candidates
+
+#: Titles of the two methods in the figure of the candidates.
+METHODS = {"normals": "along surface normals", "rotations": "global and local rotations"}
+MUG = "1_mug_small"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the script; return its exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("dataset", type=Path, help="directory of a finished dataset")
+    parser.add_argument("--trial", type=int, required=True, help="a success that is a sample")
+    parser.add_argument("--images", type=Path, default=Path("docs/images"), help="where to write")
+    parser.add_argument("--rays", type=int, default=220, help="palm poses drawn per method")
+    arguments = parser.parse_args(argv)
+    out, images = arguments.dataset, arguments.images
+    images.mkdir(parents=True, exist_ok=True)
+    pictures = trial_snapshots(out, arguments.trial)
+    oto, otm = out / DATA_FILES["oto"], out / DATA_FILES["otm"]
+    hero_figure(oto, otm, arguments.trial, pictures, images / "trial.png")
+    frames_figure(frames_panels(out, arguments.trial), images / "frames.png")
+    with tempfile.TemporaryDirectory() as folder:
+        export_builtin(folder, [MUG])
+        mug = prepare(find_meshes(Path(folder))[0], load_config(None, ["candidates.max=1"]))
+    rays = {title: palm_rays(mug, method, arguments.rays) for method, title in METHODS.items()}
+    model = mug.model
+    candidates_figure(model.visual_vertices, model.visual_faces, rays, images / "candidates.png")
+    return 0
+
+
+def palm_rays(prepared: PreparedObject, method: str, count: int) -> Array:
+    """Return (count, 2, 3), from the palm at its largest stand-off to the surface, in {O}."""
+    config = load_config(None, [f"candidates.method={method}", f"candidates.max={10 * count}"])
+    found = sample_candidates(prepared.model, prepared.X_TO, config.candidates, config.seed)
+    hits = np.flatnonzero(np.isfinite(found.distance))[:count]
+    z_O = found.X_OG[hits, :3, 2]
+    p_OS = found.X_OG[hits, :3, 3] + found.distance[hits, None] * z_O
+    return np.stack([p_OS - max(config.candidates.standoffs) * z_O, p_OS], axis=1)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

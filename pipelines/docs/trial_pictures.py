@@ -1,0 +1,206 @@
+"""Third-person pictures of a trial, hand and all, for the README and the docs.
+
+In: a dataset's directory and the number of a trial. Out: pictures of its moments, drawn
+from the poses and joint positions in trials.hdf5, and the panels of the figure of all
+frames; nothing is simulated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+from doc_figures import Panel, Triad, find_sample
+
+from drakegrasp.config import Config
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
+from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.errors import DataError
+from drakegrasp.frames import X_WT, Array, make_pose, rotate_vectors, transform_points, unpack_pose
+from drakegrasp.hand.description import load_hand
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.outcomes import Outcome, Stage
+from drakegrasp.simulation.trajectory import lifted_palm
+from drakegrasp.vision.camera import Picture, unproject
+from drakegrasp.visualization.style import ARROW
+from drakegrasp.visualization.third_person import (
+    TABLE_SIZE,
+    Moment,
+    Theatre,
+    build_theatre,
+    choose_view,
+    outline,
+    show,
+    take,
+    view,
+)
+
+#: Edge of the table where the world's origin below it must be seen [m].
+SMALL_TABLE = 0.36
+#: From where a camera's line of sight is looked at, about the vertical [rad].
+SIDE_VIEW = np.deg2rad(62.0)
+#: The camera follows the lift by this part of the way, and from this much further off.
+FOLLOW, BACK = 0.85, 0.3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StagedTrial:
+    """The three moments of a trial, and the theatre to show them in.
+
+    Attributes:
+        theatre: Of the trial's object and hand.
+        place, close, lift: At the start, after closing, after the lift.
+        p_OQ, nhat_Q_O: Contacts after closing (k, 3), in {O}.
+        model: The object.
+        config: Of the dataset.
+    """
+
+    theatre: Theatre
+    place: Moment
+    close: Moment
+    lift: Moment
+    p_OQ: Array
+    nhat_Q_O: Array
+    model: ObjectModel
+    config: Config
+
+
+def stage_trial(out: Path, trial_id: int, *, table_size: float = TABLE_SIZE) -> StagedTrial:
+    """Return a trial that came as far as the lift, ready to be shown.
+
+    Raises:
+        DataError: If the trial is not there, or ended before the lift.
+    """
+    config = read_manifest(out).config
+    path = out / TRIALS_FILE
+    try:
+        with h5py.File(path, "r") as file:
+            trials = file["trials"]
+            if not 0 <= trial_id < len(trials["outcome"]):
+                raise DataError(
+                    f"{path}: trial must be 0 to {len(trials['outcome']) - 1}, got {trial_id}"
+                )
+            row = {name: np.asarray(values[trial_id]) for name, values in trials.items()}
+            name = file["objects/name"][int(row["object"])].decode()
+    except (OSError, KeyError) as error:
+        raise DataError(f"{path}: must be the trials of a dataset, got none ({error})") from None
+    outcome = Outcome(int(row["outcome"]))
+    if outcome.stage is not Stage.LIFTED:
+        raise DataError(f"{path}: trial {trial_id} must have been lifted, got {outcome.label}")
+    X_WO = X_WT @ unpack_pose(row["X_TO"])
+    X_WG = X_WO @ unpack_pose(row["X_OG"])
+    X_TG = unpack_pose(row["X_TO"]) @ unpack_pose(row["X_OG"])
+    X_WG_lifted = lifted_palm(X_TG, float(row["time_lift"]), config)
+    X_WO_lifted = X_WT @ unpack_pose(row["X_TO_lifted"])
+    hand = load_hand(config.hand)
+    model = load_prepared(out, name, config).model
+    theatre = build_theatre(model, hand, table_size=table_size)
+    open_q = np.array(
+        [row["spread"] if joint in hand.spread.joints else 0.0 for joint in theatre.joint_names]
+    )
+    return StagedTrial(
+        theatre=theatre,
+        place=Moment(X_WG=X_WG, X_WO=X_WO, q=open_q),
+        close=Moment(X_WG=X_WG, X_WO=X_WO, q=row["closed_q"]),
+        lift=Moment(X_WG=X_WG_lifted, X_WO=X_WO_lifted, q=row["lifted_q"]),
+        p_OQ=row["closed_p_OQ"],
+        nhat_Q_O=row["closed_nhat_Q_O"],
+        model=model,
+        config=config,
+    )
+
+
+def trial_snapshots(
+    out: Path, trial_id: int, *, size: tuple[int, int] = (480, 480)
+) -> list[Picture]:
+    """Return pictures of a trial as it is placed, closed and lifted, from one side.
+
+    Raises:
+        DataError: If the trial is not there, or ended before the lift.
+    """
+    trial = stage_trial(out, trial_id)
+    theatre, half = trial.theatre, trial.model.half_extents
+    around = np.vstack([outline(theatre, m, half) for m in (trial.place, trial.close)])
+    X_WC = choose_view(theatre, around)
+    pictures = []
+    for moment in (trial.place, trial.close):
+        show(theatre, moment)
+        pictures.append(take(theatre, X_WC, size))
+    # So the table stays in view, and one sees that there is air below the object.
+    rise = trial.lift.X_WG[:3, 3] - trial.close.X_WG[:3, 3]
+    distance = float(np.linalg.norm(X_WC[:3, 3] - trial.close.X_WO[:3, 3]))
+    back = make_pose(np.eye(3), [0.0, 0.0, -BACK * distance])
+    show(theatre, trial.lift)
+    pictures.append(take(theatre, make_pose(np.eye(3), FOLLOW * rise) @ X_WC @ back, size))
+    return pictures
+
+
+def frames_panels(out: Path, trial_id: int) -> list[Panel]:
+    """Return the panels of the figure of all frames: from afar, from near, through the camera.
+
+    Raises:
+        DataError: If the trial is no sample.
+    """
+    sample, K = find_sample(out / DATA_FILES["otm"], trial_id)
+    X_WC = X_WT @ unpack_pose(sample.props["frame_work2cam_otm"])
+    X_WI = X_WC @ unpack_pose(sample.props["frame_cam2img_otm"])
+    trial = stage_trial(out, trial_id)
+    X_WO, X_WG = trial.close.X_WO, trial.close.X_WG
+    p_WQ = transform_points(X_WO, trial.p_OQ)
+    normals = rotate_vectors(X_WO, trial.nhat_Q_O)
+    tips = zip(p_WQ, p_WQ + ARROW * normals, strict=True)
+    contacts = {f"Q{i + 1}": ends for i, ends in enumerate(tips)}
+    half = trial.model.half_extents
+
+    small = build_theatre(trial.model, trial.theatre.hand, table_size=SMALL_TABLE)
+    around = np.vstack([np.zeros((1, 3)), outline(small, trial.close, half), X_WC[None, :3, 3]])
+    # Almost from the side of the camera's line of sight, so that its length is seen.
+    azimuth = float(np.arctan2(X_WC[1, 2], X_WC[0, 2])) + SIDE_VIEW
+    lines = [np.vstack([np.zeros(3), X_WT[:3, 3]]), np.vstack([X_WG[:3, 3], X_WC[:3, 3]])]
+    afar = Panel(
+        title="world, table, palm, camera",
+        picture=take(small, view(around, azimuth, np.deg2rad(12.0)), (520, 900)),
+        triads=[
+            Triad(label="W", X_WA=np.eye(4), length=0.15),
+            Triad(label="T", X_WA=X_WT, length=0.1),
+            Triad(label="C", X_WA=X_WC, length=0.09),
+            Triad(label="G", X_WA=X_WG, length=0.09),
+        ],
+        lines=[*lines, *_frustum(X_WC, K, sample.mask.shape[0], depth=0.12)],
+    )
+    body = outline(trial.theatre, trial.close, half)
+    near = Panel(
+        title="object, hand, contacts",
+        picture=take(trial.theatre, choose_view(trial.theatre, body), (900, 900)),
+        triads=[
+            Triad(label="O", X_WA=X_WO, length=0.04),
+            Triad(label="T", X_WA=X_WT, length=0.04),
+            Triad(label="G", X_WA=X_WG, length=0.04),
+            *(
+                Triad(label=f"F{i + 1}", X_WA=trial.theatre.pose(link), length=0.022)
+                for i, link in enumerate(trial.theatre.hand.fingertip_links)
+            ),
+        ],
+        points={"Ocm": transform_points(X_WO, trial.model.p_OOcm[None])[0]},
+        arrows=contacts,
+    )
+    rgb = np.rint(255.0 * np.moveaxis(sample.image[:3], 0, 2)).astype(np.uint8)
+    seen = Panel(
+        title="image (otm): pixels, image frame",
+        picture=Picture(image=rgb, K=K, X_WC=X_WC),
+        triads=[Triad(label="I", X_WA=X_WI, length=0.04)],
+        arrows=contacts,
+    )
+    return [afar, near, seen]
+
+
+def _frustum(X_WC: Array, K: Array, size: int, depth: float) -> list[Array]:
+    """Return polylines (n, 3) of what a camera sees, up to a depth [m]."""
+    edge = size - 0.5
+    pixels = np.array([[-0.5, -0.5], [edge, -0.5], [edge, edge], [-0.5, edge]])
+    corners = transform_points(X_WC, unproject(K, pixels, np.full(4, depth)))
+    rays = [np.vstack([X_WC[:3, 3], corner]) for corner in corners]
+    return [np.vstack([corners, corners[:1]]), *rays]

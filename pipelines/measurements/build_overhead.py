@@ -1,0 +1,145 @@
+"""What a build spends on anything but its work, and what a second worker is worth.
+
+    python pipelines/measurements/build_overhead.py [--objects MESH_DIR] [--candidates N]
+        [--set KEY=VALUE]
+
+Builds the same dataset with one worker and with two, and reads the logs. With one worker,
+all that is not scene, attempts or images is overhead: scheduling, shards, the log, and
+waiting for any of it; so is the check of every shard when the build is asked for again.
+Two busy cores of one machine are slower than one: how much, two plain loops without Dask
+say. Prints JSON. It needs two cores that have nothing else to do.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor
+from datetime import datetime
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import click
+
+from drakegrasp.api import build_dataset
+from drakegrasp.build.pipeline import build
+from drakegrasp.cli.options import set_option, units_option
+from drakegrasp.config import Config, load_config, override_config
+from drakegrasp.dataset.log import read_log
+from drakegrasp.objects.builtin.catalog import export_builtin
+from drakegrasp.objects.sources import find_meshes
+from drakegrasp.runtime.executor import run_here
+
+#: Stages of a unit that a plain loop without files would have, too.
+WORK = ("build", "try", "look")
+
+
+#: Built-in objects, if no others are given.
+OBJECTS = (
+    "2_mug_large",
+    "4_bottle_stout",
+    "8_wineglass_flute",
+    "10_box_tall",
+    "31_spray_bottle_small",
+    "40_apple_large",
+)
+
+
+#: The plain loops try one in so many palm poses.
+LESS = 4
+
+
+def plain_loop(objects: str | Path, units: str, config: Config) -> float:
+    """Return the seconds that a build in this process works, without any Dask."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "out"
+        build(find_meshes(objects, units=units), out, config, run_here, show=False)
+        return work_seconds(read_log(out))
+
+
+def work_seconds(events: Iterable[dict[str, Any]]) -> float:
+    """Return the seconds of work in a log."""
+    done = (event for event in events if event["event"] == "unit done")
+    return float(sum(event["seconds"][stage] for event in done for stage in WORK))
+
+
+def slow_down(objects: str | Path, units: str, config: Config) -> float:
+    """Return how much longer a plain loop takes when another runs beside it."""
+    few = override_config(config, [f"candidates.max={max(1, config.candidates.max // LESS)}"])
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        alone = pool.submit(plain_loop, objects, units, few).result()
+        both = [pool.submit(plain_loop, objects, units, few) for _ in range(2)]
+        return sum(one.result() for one in both) / (2.0 * alone)
+
+
+def measure(objects: str | Path, units: str, config: Config, workers: int) -> dict[str, float]:
+    """Return what a build took, in seconds of the wall clock."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "out"
+        build_dataset(objects, out, config=config, units=units, workers=workers, show=False)
+        begin = time.monotonic()
+        report = build_dataset(
+            objects, out, config=config, units=units, workers=workers, show=False
+        )
+        again = time.monotonic() - begin
+        events = list(read_log(out))
+    assert report.simulated == 0
+    first = events[: 1 + next(i for i, e in enumerate(events) if e["event"] == "finished")]
+    done = [event for event in first if event["event"] == "unit done"]
+    started, prepared, simulated, finished = (
+        datetime.fromisoformat(event["time"]).timestamp()
+        for event in (
+            next(e for e in first if e["event"] == "started"),
+            [e for e in first if e["event"].startswith("mesh ")][-1],
+            done[-1],
+            first[-1],
+        )
+    )
+    return {
+        "units": len(done),
+        "attempts": sum(sum(event["outcomes"].values()) for event in done),
+        "prepare": prepared - started,
+        "simulate": simulated - prepared,
+        "assemble": finished - simulated,
+        "work": work_seconds(first),
+        "write": sum(event["seconds"]["write"] for event in done),
+        "again": again,
+    }
+
+
+@click.command(help=__doc__)
+@click.option(
+    "--objects",
+    type=click.Path(path_type=Path, exists=True),
+    metavar="MESH_DIR",
+    help="[six built-in objects]",
+)
+@units_option
+@set_option
+@click.option("--candidates", default=100, show_default=True, help="Per object.")
+def main(objects: Path | None, units: str, overrides: tuple[str, ...], candidates: int) -> None:
+    """Measure it."""
+    config = load_config(overrides=[f"candidates.max={candidates}", *overrides])
+    with tempfile.TemporaryDirectory() as folder:
+        if objects is None:
+            export_builtin(folder, OBJECTS)
+        one, two = (measure(objects or folder, units, config, workers) for workers in (1, 2))
+        slower = slow_down(objects or folder, units, config)
+    ratio = one["simulate"] / two["simulate"]
+    figures: dict[str, Any] = {
+        "seconds with one worker": {k: round(v, 3) for k, v in one.items()},
+        "seconds with two workers": {k: round(v, 3) for k, v in two.items()},
+        "overhead, one worker": round(one["simulate"] / one["work"] - 1.0, 4),
+        "of which shards": round(one["write"] / one["work"], 4),
+        "two workers over one": round(ratio, 3),
+        "two plain loops over one": round(2.0 / slower, 3),
+        "share of what the cores can": round(ratio * slower / 2.0, 3),
+    }
+    click.echo(json.dumps(figures, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,88 @@
+"""How fast work units that do nothing go through, and what they leave in the client's memory.
+
+    python pipelines/measurements/empty_units.py [--units N] [--workers W]
+
+The units are those of a real build, but for their work: what remains is the scheduler, the
+client and the wire. Prints JSON with seconds and megabytes.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+
+from drakegrasp.build.work_unit import UnitSummary, WorkUnit
+from drakegrasp.cluster.connect import connect
+from drakegrasp.cluster.executor import DaskExecutor
+from drakegrasp.config import Config
+from drakegrasp.dataset.manifest import Manifest
+from drakegrasp.outcomes import Outcome
+
+#: Units until the memory that Dask needs once is taken.
+WARM_UP = 1000
+STAGES = ("build", "try", "look", "write")
+
+
+def run_nothing(unit: WorkUnit) -> UnitSummary:
+    """Return what a unit would, without doing it."""
+    outcomes = {Outcome.MISSING_FINGERTIP: 149, Outcome.SUCCESS: 1}
+    seconds = dict.fromkeys(STAGES, 0.0)
+    return UnitSummary(header=unit.header, outcomes=outcomes, seconds=seconds, errors={})
+
+
+def units(count: int) -> Iterator[WorkUnit]:
+    """Yield the work units of a dataset of objects with 10,000 palm poses each."""
+    config = Config()
+    per_object = config.candidates.max // config.unit_candidates
+    objects = tuple(
+        {"name": f"{i}_object", "mesh_sha256": "0" * 64, "candidates": config.candidates.max}
+        for i in range(-(-count // per_object))
+    )
+    manifest = Manifest(config=config, objects=objects, versions={})
+    values = config.to_dict()
+    for _, header in zip(range(count), manifest.headers(), strict=False):
+        yield WorkUnit(out="/nowhere", header=header, config=values, expendable=True)
+
+
+def memory() -> float:
+    """Return the memory that this process holds, with the scheduler in it [MB]."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * 4096 / 1e6
+
+
+@click.command(help=__doc__)
+@click.option("--units", "count", default=100_000, show_default=True)
+@click.option("--workers", default=2, show_default=True)
+def main(count: int, workers: int) -> None:
+    """Measure it."""
+    with connect(workers) as client:
+        execute = DaskExecutor(client)
+        done = sum(1 for _ in execute(run_nothing, units(WARM_UP)))
+        before, peak = memory(), 0.0
+        start, start_cpu = time.monotonic(), time.process_time()
+        for done, _ in enumerate(execute(run_nothing, units(count)), start=1):
+            if done % 1000 == 0:
+                peak = max(peak, memory())
+        seconds, cpu = time.monotonic() - start, time.process_time() - start_cpu
+    print(  # noqa: T201
+        json.dumps(
+            {
+                "units": done,
+                "workers": workers,
+                "seconds": round(seconds, 1),
+                "CPU seconds of client and scheduler": round(cpu, 1),
+                "milliseconds per unit": round(1e3 * seconds / done, 3),
+                "memory before [MB]": round(before, 1),
+                "growth at most [MB]": round(max(peak, memory()) - before, 1),
+            },
+            indent=1,
+        )
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,126 @@
+"""How much memory one worker holds while it tries attempts on many objects.
+
+    python pipelines/measurements/worker_memory.py MESH_DIR [--only NAME ...]
+        [--trials N] [--set KEY=VALUE]
+
+Builds a dataset with one worker process and looks at its memory after every work unit, until
+so many trials (attempts whose palm ray meets the object) are done. Units of the objects are
+mixed, so that scenes are built and given up all the time. Prints JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+from distributed import Client
+
+from drakegrasp.build.pipeline import build
+from drakegrasp.build.work_unit import UnitSummary, WorkUnit
+from drakegrasp.cli.options import manifest_option, set_option, units_option
+from drakegrasp.cluster.connect import connect
+from drakegrasp.cluster.executor import DaskExecutor
+from drakegrasp.config import load_config
+from drakegrasp.objects.sources import find_meshes
+from drakegrasp.outcomes import Outcome
+
+T = TypeVar("T")
+R = TypeVar("R")
+NO_TRIAL = (Outcome.RAY_MISS, Outcome.BELOW_TABLE)
+#: Units of one object that follow one another before the next object's.
+RUN = 2
+
+
+class EnoughError(Exception):
+    """As many trials were done as were asked for."""
+
+
+class Scale:
+    """An executor that weighs the one worker after every unit."""
+
+    def __init__(self, client: Client, trials: int) -> None:
+        """Work through a client until so many trials are done."""
+        self._execute, self._client, self._trials = DaskExecutor(client), client, trials
+        self.weights: list[tuple[int, float]] = []
+
+    def __call__(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+        """Yield results; units are mixed."""
+        done = 0
+        for result in self._execute(function, mixed(items)):
+            if isinstance(result, UnitSummary):
+                done += sum(n for o, n in result.outcomes.items() if o not in NO_TRIAL)
+                self.weights.append((done, self.weigh()))
+            yield result
+            if done >= self._trials:
+                raise EnoughError
+
+    def weigh(self) -> float:
+        """Return the memory of the worker [MB]."""
+        (worker,) = self._client.scheduler_info(n_workers=-1)["workers"].values()
+        return float(worker["metrics"]["memory"]) / 1e6
+
+
+def mixed(items: Iterable[T]) -> Iterator[T]:
+    """Yield work units of all objects in turn, and other items as they come."""
+    by_object: dict[str, list[Any]] = {}
+    for item in items:
+        if isinstance(item, WorkUnit):
+            by_object.setdefault(item.header.object_name, []).append(item)
+        else:
+            yield item
+    runs = ([u[k : k + RUN] for k in range(0, len(u), RUN)] for u in by_object.values())
+    for round_ in zip_longest(*runs, fillvalue=[]):
+        for run in round_:
+            yield from run
+
+
+@click.command(help=__doc__)
+@click.argument("meshes", type=click.Path(path_type=Path, exists=True))
+@click.option("--only", multiple=True, metavar="NAME", help="Those whose names begin so.")
+@click.option("--trials", default=5000, show_default=True)
+@click.option("--candidates", default=2000, show_default=True, help="Per object.")
+@set_option
+@units_option
+@manifest_option
+def main(
+    meshes: Path,
+    only: tuple[str, ...],
+    trials: int,
+    candidates: int,
+    overrides: tuple[str, ...],
+    units: str,
+    manifest: Path | None,
+) -> None:
+    """Print what the worker weighed."""
+    config = load_config(overrides=[f"candidates.max={candidates}", *overrides])
+    every = find_meshes(meshes, units=units, manifest=manifest)
+    sources = [s for s in every if not only or s.name.startswith(only)]
+    with tempfile.TemporaryDirectory() as folder, connect(1) as client:
+        scale = Scale(client, trials)
+        with suppress(EnoughError):
+            build(sources, Path(folder) / "out", config, scale, show=False)
+    done, weights = zip(*scale.weights, strict=True)
+    half = next(weight for n, weight in scale.weights if n >= done[-1] / 2)
+    late = [weight for n, weight in scale.weights if n >= done[-1] / 2]
+    quarter = len(late) // 2
+    means = [sum(part) / len(part) for part in (late[:quarter], late[quarter:])]
+    figures = {
+        "objects": len(sources),
+        "trials": done[-1],
+        "units": len(done),
+        "largest [MB]": round(max(weights), 1),
+        "at half, at the end [MB]": [round(half, 1), round(weights[-1], 1)],
+        "third and last quarter, means [MB]": [round(mean, 1) for mean in means],
+        "growth over the last half, by these": round(means[1] / means[0] - 1.0, 4),
+    }
+    click.echo(json.dumps(figures, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,108 @@
+"""The benchmark counts what it ran, and compares labels of the same attempts."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import trimesh
+from click.testing import CliRunner
+
+from drakegrasp.bench import measure
+from drakegrasp.cli.main import main
+from drakegrasp.config import load_config
+from drakegrasp.errors import DataError
+from drakegrasp.mesh.surfaces import signed_volume
+from drakegrasp.objects.model import prepare_object
+from drakegrasp.objects.sources import find_meshes
+from drakegrasp.outcomes import Outcome
+
+pytestmark = pytest.mark.sim
+
+
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("meshes")
+    trimesh.creation.box([0.05, 0.07, 0.15]).subdivide().export(folder / "1_box_tall.obj")
+    return folder
+
+
+def test_report_says_what_attempts_cost(meshes, tmp_path):
+    path, other = tmp_path / "first.json", tmp_path / "second.json"
+    arguments = ["bench", "--objects", str(meshes), "--candidates", "4", "--quiet"]
+    first = CliRunner().invoke(main, [*arguments, "--fidelity", "2", "--peer", "--out", str(path)])
+    assert first.exit_code == 0, first.output
+    report = json.loads(path.read_text())
+    (found,) = report["objects"]
+    assert found["attempts"] == report["all"]["attempts"] == 12
+    assert sum(found["outcomes"].values()) == sum(found["peer"]["outcomes"].values()) == 12
+    assert {"prepare", "scene", "field", "screen", "try", "look"} == set(found["seconds"])
+    assert found["resolved_per_core_second"] > 0.0
+    assert report["peak_memory"] > 50e6
+    assert report["versions"]["drake"]
+    assert set(report["all"]["fidelity"]) == set(measure.VARIANTS)
+    assert all(counts["attempts"] == 2 for counts in report["all"]["fidelity"].values())
+    assert "MuJoCo" in first.stdout
+    assert "peak memory" in first.stdout
+    for outcome, count in report["all"]["outcomes"].items():
+        assert f"{count} {outcome}" in first.stdout
+    assert "double resolution" in first.stdout
+    again = CliRunner().invoke(main, [*arguments, "--out", str(other), "--compare", str(path)])
+    ratio = json.loads(other.read_text())["ratio"]["resolved_per_core_second"]
+    assert f"{ratio:.2f} times that of {path}" in again.stdout.replace("\n", "")
+
+
+def test_finer_surface_is_the_same_surface(meshes):
+    (source,) = find_meshes(meshes)
+    model = prepare_object(source, load_config().objects)
+    finer = measure._finer(model)
+    assert len(finer.collision_faces) == 4 * len(model.collision_faces)
+    volumes = [signed_volume(m.collision_vertices, m.collision_faces) for m in (model, finer)]
+    assert volumes[1] == pytest.approx(volumes[0])
+
+
+def test_report_of_something_else_is_wrong_usage(meshes, tmp_path):
+    path = tmp_path / "report.json"
+    path.write_text("[]")
+    arguments = ["bench", "--objects", str(meshes), "--compare", str(path)]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 2
+    assert "--compare must be a report" in result.output
+
+
+def test_name_that_no_mesh_has_is_wrong_usage(meshes):
+    result = CliRunner().invoke(main, ["bench", "--objects", str(meshes), "--only", "9_cup"])
+    assert result.exit_code == 2
+    assert "--only must name objects" in result.output
+
+
+def test_screened_attempt_that_would_miss_a_fingertip_is_no_flip():
+    pairs = [
+        (Outcome.SCREENED, Outcome.MISSING_FINGERTIP),
+        (Outcome.START_COLLISION, Outcome.START_COLLISION),
+        (Outcome.SUCCESS, Outcome.SLIPPED),
+        (Outcome.SCREENED, Outcome.SUCCESS),
+    ]
+    counts = measure._count(pairs, [True, False, False, True])
+    assert counts["flips"] == 2
+    assert counts["successes_lost_by_screen"] == 1
+    assert (counts["decided"], counts["simulated"]) == (2, 1)
+
+
+def test_only_the_same_attempts_are_compared():
+    def report(name, attempts, grasps):
+        rates = {"resolved_per_core_second": 10.0, "grasps_per_core_hour": grasps}
+        return {"objects": [{"name": name, "attempts": attempts}], "all": rates}
+
+    same = measure.compare(report("a", 12, 3.0), report("a", 12, 0.0))
+    assert same == {"resolved_per_core_second": 1.0, "grasps_per_core_hour": None}
+    for other in (report("b", 12, 3.0), report("a", 15, 3.0)):
+        with pytest.raises(DataError, match="must be of the same attempts"):
+            measure.compare(report("a", 12, 3.0), other)
+
+
+def test_report_that_cannot_be_written_is_refused_before_measuring(meshes, tmp_path):
+    arguments = ["bench", "--objects", str(meshes), "--out", str(tmp_path / "no" / "x.json")]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 2
+    assert "--out must be a file that can be written" in result.output

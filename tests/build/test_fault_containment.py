@@ -1,0 +1,586 @@
+"""Whatever dies on the way, the data are those of an undisturbed build."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+from distributed import Client, LocalCluster, get_worker
+from helpers.assertions import assert_same_dataset
+
+from drakegrasp.build import columns
+from drakegrasp.build.pipeline import build
+from drakegrasp.cluster import executor as crew
+from drakegrasp.cluster.connect import connect
+from drakegrasp.cluster.executor import DaskExecutor
+from drakegrasp.config import Config, load_config
+from drakegrasp.dataset.prepared_objects import PreparedObject
+from drakegrasp.dataset.statistics import count_funnel
+from drakegrasp.errors import BlankImageError, DiskFullError, MachineError
+from drakegrasp.objects.sources import MeshSource, find_meshes
+from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.executor import run_here
+from drakegrasp.runtime.fault_injection import VARIABLE
+from drakegrasp.runtime.processes import host_label
+from drakegrasp.vision import rendering
+
+#: Units of half a second, so that none goes with another and a build can be stopped in time; of ten
+#: attempts one succeeds.
+FAST = [
+    "screen.mode=off",
+    "candidates.max=18",
+    "candidates.global_x_deg=[0]",
+    "candidates.global_y_deg=[0]",
+    "candidates.global_z_deg=[0,45,90]",
+    "candidates.local_z_deg=[0,90]",
+    "unit_candidates=1",
+    "settle.drop_height=0.01",
+    "settle.max_linear_speed=0.1",
+    "settle.max_angular_speed=1",
+    "physics.time_step=0.002",
+    "lift.max_speed=2",
+    "lift.max_acceleration=20",
+    "lift.hold_time=0.1",
+    "camera.size=32",
+    "filters.outlier_sigma=0",
+]
+UNITS = 36
+KILLS = 20
+
+
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("boxes")
+    trimesh.creation.box([0.06, 0.05, 0.12]).export(folder / "1_box_a.obj")
+    trimesh.creation.box([0.07, 0.05, 0.14]).export(folder / "2_box_b.obj")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return load_config(overrides=FAST)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(meshes: Path, config: Config, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset, built in this process. Read only: copy it to harm it."""
+    out = tmp_path_factory.mktemp("undisturbed") / "out"
+    build(find_meshes(meshes), out, config, run_here, show=False)
+    assert count_funnel(out).outcomes[:, Outcome.SUCCESS].sum() > 0
+    return out
+
+
+def start_build(
+    meshes: Path,
+    out: Path,
+    workers: int,
+    *arguments: str,
+    fault: str = "",
+    largest_file: int = resource.RLIM_INFINITY,
+) -> subprocess.Popen[str]:
+    """Start the command of a build in a process of its own, which can write files up to a size."""
+
+    def prepare() -> None:
+        # A test that was started in the background of a shell ignores Ctrl-C, and so would this.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
+
+    command = [
+        sys.executable,
+        "-c",
+        "from drakegrasp.cli.main import main; main()",
+        "build",
+        "--quiet",
+    ]
+    command += ["--objects", str(meshes), "--out", str(out), "--workers", str(workers)]
+    for value in FAST:
+        command += ["--set", value]
+    command += arguments
+    environment = {**os.environ, VARIABLE: fault} if fault else None
+    return subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        preexec_fn=prepare,
+    )
+
+
+def finish(process: subprocess.Popen[str]) -> tuple[str, str]:
+    """Return what a build that must succeed says."""
+    said, errors = process.communicate(timeout=240)
+    assert process.returncode == 0, errors
+    return said, errors
+
+
+def wait_for_shards(out: Path, count: int, patience: float | None = None) -> None:
+    """Wait until there are some shards: as long as it takes, or for some seconds at most."""
+    end = time.monotonic() + (120.0 if patience is None else patience)
+    while len(list(out.glob("shards/*/*.h5"))) < count:
+        if time.monotonic() > end:
+            assert patience is not None, "the build must go on"
+            return
+        time.sleep(0.05)
+
+
+def workers_of(client: int) -> list[int]:
+    """Return the worker processes that a build on this machine started."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+            spawned = b"spawn_main" in (folder / "cmdline").read_bytes()
+        except (OSError, IndexError):
+            continue
+        if parent == client and spawned:
+            found.append(int(folder.name))
+    return found
+
+
+def events(out: Path, name: str) -> list[dict[str, Any]]:
+    lines = (out / "log.jsonl").read_text(encoding="utf-8").splitlines()
+    return [line for line in map(json.loads, lines) if line["event"] == name]
+
+
+def assert_clean(out: Path, *patterns: str) -> None:
+    """Nothing is left of what was on the way."""
+    for pattern in patterns or (".*.tmp", "*.journal", "build.lock"):
+        assert list(out.rglob(pattern)) == []
+
+
+@pytest.mark.cluster
+@pytest.mark.sim
+@pytest.mark.slow
+def test_random_kills_change_nothing(meshes: Path, undisturbed: Path, tmp_path: Path) -> None:
+    """All of four workers are killed while objects are prepared, and twenty times one of them.
+
+    However quick they are: at the latest with the next shard.
+    """
+    out, rng, killed = tmp_path / "out", random.Random(0), 0
+    process = start_build(meshes, out, workers=4)
+    while not list(out.glob("objects/*.journal")):
+        assert process.poll() is None
+        time.sleep(0.05)
+    for worker in workers_of(process.pid):
+        os.kill(worker, signal.SIGKILL)
+    wait_for_shards(out, 1)
+    while process.poll() is None and killed < KILLS:
+        wait_for_shards(out, 2 + killed, patience=0.8)
+        workers = workers_of(process.pid)
+        if workers:
+            os.kill(rng.choice(workers), signal.SIGKILL)
+            killed += 1
+    finish(process)
+    assert killed == KILLS
+    assert_same_dataset(undisturbed, out)
+    assert_clean(out)
+    done = [(e["object"], e["start"]) for e in events(out, "unit done")]
+    assert len(done) == len(set(done)) == UNITS
+
+
+@pytest.mark.cluster
+@pytest.mark.sim
+@pytest.mark.slow
+def test_four_workers_change_nothing(meshes: Path, undisturbed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    said, errors = finish(start_build(meshes, out, workers=4))
+    assert f"{UNITS} work units simulated\n" in said
+    assert errors == ""
+    assert_same_dataset(undisturbed, out)
+    assert_clean(out)
+
+
+@pytest.mark.cluster
+@pytest.mark.sim
+@pytest.mark.slow
+def test_client_that_is_killed_or_stopped_goes_on(
+    meshes: Path, undisturbed: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    process = start_build(meshes, out, workers=2)
+    wait_for_shards(out, 2)
+    process.kill()
+    process.communicate()
+    for number, code in ((signal.SIGINT, 130), (signal.SIGTERM, 143)):
+        # Workers that outlive their client write shards, too: only the log tells of this one.
+        before = len(events(out, "unit done"))
+        process = start_build(meshes, out, workers=2)
+        while len(events(out, "unit done")) == before:
+            assert process.poll() is None
+            time.sleep(0.05)
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=60)
+        assert process.returncode == code
+        assert errors.splitlines()[-1] == "stopped; the same command goes on from here"
+        assert "Traceback" not in errors
+        assert not (out / "build.lock").exists()
+    said, _ = finish(start_build(meshes, out, workers=2))
+    assert "had been done before" in said
+    assert_same_dataset(undisturbed, out)
+    assert_clean(out)
+    assert len(events(out, "started")) == 4
+    assert len(events(out, "finished")) == 1
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_objects_are_prepared_once_whatever_died(
+    meshes: Path, undisturbed: Path, config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The manifest names them when all are; a client that dies before loses none of them."""
+
+    def prepare(source: MeshSource, config: Config) -> PreparedObject:
+        raise AssertionError(f"{source.name} is prepared again")
+
+    out = tmp_path / "out"
+    for name in ("objects", "shards"):
+        shutil.copytree(undisturbed / name, out / name)
+    monkeypatch.setattr("drakegrasp.build.prepare.prepare", prepare)
+    build(find_meshes(meshes), out, config, run_here, show=False)
+    assert (out / "manifest.json").read_bytes() == (undisturbed / "manifest.json").read_bytes()
+    assert_same_dataset(undisturbed, out)
+
+
+@pytest.mark.cluster
+@pytest.mark.sim
+@pytest.mark.slow
+def test_fault_costs_what_is_guilty_and_nothing_else(
+    meshes: Path, undisturbed: Path, tmp_path: Path
+) -> None:
+    """One attempt crashes, one hangs, one hangs with the interpreter's lock, a mesh crashes."""
+    more = Path(shutil.copytree(meshes, tmp_path / "meshes"))
+    trimesh.creation.box([0.05, 0.05, 0.1]).export(more / "3_box_c.obj")
+    faults = "crash:1_box_a:3:1 hang:1_box_a:5:0 freeze:2_box_b:4:2 crash:3_box_c"
+    out = tmp_path / "out"
+    # Long enough for the innocent on a busy machine.
+    limit = ("--set", "attempt_seconds=8")
+    said, errors = finish(start_build(more, out, 2, *limit, fault=faults))
+    assert "refused: 3_box_c: 3_box_c: must be fit to prepare, got one that crashed" in said
+    assert errors == ""
+    guilty = {
+        (0, 3, 1): Outcome.CRASHED,
+        (0, 5, 0): Outcome.TIMEOUT,
+        (1, 4, 2): Outcome.TIMEOUT,
+    }
+    with h5py.File(undisturbed / "trials.hdf5") as a, h5py.File(out / "trials.hdf5") as b:
+        names = ("object", "candidate", "standoff_index")
+        places = list(zip(*(a["trials"][n][:].tolist() for n in names), strict=True))
+        innocent = np.array([place not in guilty for place in places])
+        assert innocent.sum() == len(places) - 3
+        for name in a["trials"]:
+            one, two = a["trials"][name][:], b["trials"][name][:]
+            assert one[innocent].tobytes() == two[innocent].tobytes(), name
+        for place, outcome in guilty.items():
+            assert b["trials/outcome"][places.index(place)] == outcome
+            assert np.isnan(b["trials/closed_q"][places.index(place)]).all()
+    assert_clean(out)
+
+
+# Faults found on start
+
+
+def _cut(shard: Path) -> None:
+    shard.write_bytes(shard.read_bytes()[:-100])
+
+
+def _flip(shard: Path) -> None:
+    content = bytearray(shard.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    shard.write_bytes(bytes(content))
+
+
+def _exchange(shard: Path) -> None:
+    """Put another object's shard in its place."""
+    other = next(p for p in shard.parent.parent.glob(f"*/{shard.name}") if p != shard)
+    shutil.copyfile(other, shard)
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_what_is_harmed_is_named_and_run_again(
+    meshes: Path, undisturbed: Path, config: Config, tmp_path: Path
+) -> None:
+    out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
+    shards = sorted(out.glob("shards/*/*.h5"))
+    for harm, shard in zip((_cut, _flip, _exchange), shards, strict=False):
+        harm(shard)
+    dead = subprocess.Popen(["true"])
+    dead.wait()
+    stale = out / "shards" / "1_box_a" / f".x.h5.{host_label()}~{dead.pid}~0123456789ab.tmp"
+    alive = stale.with_name(stale.name.replace(f"~{dead.pid}~", f"~{os.getpid()}~"))
+    foreign = stale.with_name(f".y.h5.elsewhere~1~{'0' * 12}.tmp")
+    old = stale.with_name(f".z.h5.elsewhere~1~{'0' * 12}.tmp")
+    for path in (stale, alive, foreign, old):
+        path.write_bytes(b"half")
+    os.utime(old, (0, 0))
+    lock = {"process": {"host": "h", "pid": 5, "began": 1, "boot": ""}, "since": "s", "command": []}
+    (out / "build.lock").write_text(json.dumps(lock))
+    report = build(find_meshes(meshes), out, config, run_here, show=False)
+    assert (report.simulated, report.reused) == (3, UNITS - 3)
+    taken, swept, damaged = report.notices
+    assert taken == "the lock of a dead build was taken over: process 5 on h, since s"
+    assert swept.startswith("2 temporary files (shards/1_box_a/.")
+    names = ", ".join(str(s.relative_to(out)) for s in shards[:3])
+    assert damaged == f"3 shards ({names}): damaged, and simulated again"
+    assert (stale.exists(), alive.exists(), foreign.exists(), old.exists()) == (0, 1, 1, 0)
+    assert len(events(out, "damaged shard")) == 3
+    assert_same_dataset(undisturbed, out)
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_full_disk_stops_and_goes_on(meshes: Path, undisturbed: Path, tmp_path: Path) -> None:
+    """A limit on the size of files is what a full disk is to a shard with images."""
+    out = tmp_path / "out"
+    shutil.copytree(undisturbed / "objects", out / "objects")
+    size = max(path.stat().st_size for path in undisturbed.glob("shards/*/*.h5")) - 1
+    process = start_build(meshes, out, workers=1, largest_file=size)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert "must have room for what is written" in errors.splitlines()[-1]
+    assert "Traceback" not in errors, errors
+    # A unit that was begun meanwhile, and dropped, keeps its journal for its next run.
+    assert_clean(out, ".*.tmp", "build.lock")
+    finish(start_build(meshes, out, workers=1))
+    assert_same_dataset(undisturbed, out)
+
+
+@pytest.mark.sim
+def test_full_disk_of_the_client_is_one_error(
+    meshes: Path, config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("drakegrasp.dataset.manifest.sync_and_rename", full)
+    with pytest.raises(DiskFullError, match=r"must have room .* goes on from here"):
+        build(find_meshes(meshes), tmp_path / "out", config, run_here, show=False)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_blank_image_never_becomes_data(
+    meshes: Path, undisturbed: Path, config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def blank(*_: object) -> rendering.Look:
+        raise BlankImageError(rendering.BLANK)
+
+    out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
+    with h5py.File(undisturbed / "trials.hdf5") as file:
+        row = int(np.flatnonzero(file["trials/outcome"][:] == Outcome.SUCCESS)[0])
+        name = ("1_box_a", "2_box_b")[file["trials/object"][row]]
+        start = int(file["trials/candidate"][row])
+    shard = out / "shards" / name / f"{start:07d}-{start + 1:07d}.h5"
+    shard.unlink()
+    with monkeypatch.context() as patch:
+        patch.setattr(columns, "look", blank)
+        with pytest.raises(BlankImageError, match="must not be blank"):
+            build(find_meshes(meshes), out, config, run_here, show=False)
+    assert not shard.exists()
+    build(find_meshes(meshes), out, config, run_here, show=False)
+    assert_same_dataset(undisturbed, out)
+
+
+@pytest.mark.cluster
+@pytest.mark.sim
+@pytest.mark.slow
+def test_second_build_is_refused_before_it_starts(
+    meshes: Path, undisturbed: Path, tmp_path: Path
+) -> None:
+    out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
+    shutil.rmtree(out / "shards" / "1_box_a")
+    first = start_build(meshes, out, workers=1)
+    while not (out / "build.lock").exists():
+        time.sleep(0.05)
+    _, errors = start_build(meshes, out, workers=1).communicate(timeout=60)
+    assert f"must be built by one process at a time, got process {first.pid} on" in errors
+    assert len(errors.splitlines()) == 1
+    finish(first)
+    assert_same_dataset(undisturbed, out)
+
+
+# The executor
+
+
+@pytest.mark.cluster
+def test_worker_that_takes_its_time_to_end_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def late(cluster: LocalCluster, timeout: float | None = None) -> None:
+        close(cluster, timeout)
+        raise TimeoutError
+
+    close = LocalCluster.close
+    monkeypatch.setattr(LocalCluster, "close", late)
+    with connect(workers=1) as client:
+        assert client.submit(abs, -1).result() == 1
+    with pytest.raises(KeyboardInterrupt), connect(workers=1):
+        raise KeyboardInterrupt
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[Client]:
+    with (
+        LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client
+
+
+def _blank_at_first(path: str) -> str:
+    """Fail as often as the name says, and say so in a file."""
+    done = Path(path).read_text() if Path(path).exists() else ""
+    if len(done) < int(path[-1]):
+        Path(path).write_text(done + "x")
+        raise BlankImageError(rendering.BLANK)
+    return path
+
+
+@pytest.mark.cluster
+def test_blank_image_is_tried_again_but_not_for_ever(client: Client, tmp_path: Path) -> None:
+    execute, names = DaskExecutor(client), [str(tmp_path / f"f{i}") for i in range(3)]
+    assert sorted(execute(_blank_at_first, names)) == names
+    with pytest.raises(BlankImageError):
+        list(execute(_blank_at_first, [str(tmp_path / "f3")]))
+
+
+@pytest.mark.cluster
+def test_items_are_taken_as_there_is_room(client: Client) -> None:
+    taken = 0
+
+    def items() -> Iterator[int]:
+        nonlocal taken
+        while taken < 1000:
+            taken += 1
+            yield taken
+
+    results = DaskExecutor(client)(abs, items())
+    for done, _ in enumerate(results):
+        assert taken <= done + 1 + 2 * 2 * crew.LARGEST
+    assert taken == 1000
+
+
+def _task_of(seconds: float) -> str:
+    """Return which task an item is in, after a while."""
+    time.sleep(seconds)
+    return str(get_worker().get_current_task())
+
+
+@pytest.mark.cluster
+def test_quick_items_go_together_and_slow_ones_alone(client: Client) -> None:
+    execute = DaskExecutor(client)
+    together = list(execute(_task_of, [0.0] * 400))
+    assert len(together) == 400
+    assert len(set(together)) < 2 * 400 / crew.LARGEST
+    assert max(Counter(together).values()) <= crew.LARGEST
+    alone = list(execute(_task_of, [1.5 * crew.TASK_SECONDS] * 40))
+    assert len(set(alone)) == 40
+
+
+def test_error_costs_no_results_of_the_items_before_it() -> None:
+    def invert(value: float) -> float:
+        return 1.0 / value
+
+    assert crew._run_items(invert, [1.0, 2.0, 0.0, 4.0]).results == [1.0, 0.5]
+    with pytest.raises(ZeroDivisionError):
+        crew._run_items(invert, [0.0, 4.0])
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(crew, "COUNT_SECONDS", 0.1)
+    monkeypatch.setattr(crew, "SAY_SECONDS", 0.2)
+    monkeypatch.setattr(crew, "LOST_SECONDS", 0.5)
+
+
+@pytest.fixture
+def cluster() -> Iterator[LocalCluster]:
+    """A cluster of one worker, in this process."""
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
+    ) as cluster:
+        yield cluster
+
+
+@pytest.mark.cluster
+@pytest.mark.usefixtures("impatient")
+def test_where_no_worker_comes_back_it_says_so(cluster: LocalCluster) -> None:
+    with Client(cluster) as client:
+        execute = DaskExecutor(client)
+        changes: list[tuple[int, int]] = []
+        execute.crew.on_change = lambda joined, left: changes.append((len(joined), len(left)))
+        results = execute(time.sleep, [0.0, 5.0])
+        assert next(results) is None
+        cluster.scale(0)
+        with pytest.raises(MachineError, match=r"must be a worker, got none for 0\.5 s; the same"):
+            next(results)
+        assert changes == [(1, 0), (0, 1)]
+
+
+@pytest.mark.cluster
+@pytest.mark.usefixtures("impatient")
+def test_where_workers_may_come_the_work_waits(cluster: LocalCluster) -> None:
+    """As under SLURM, where all jobs reached their walltime and the next ones queue."""
+    with Client(cluster.scheduler_address) as client:
+        execute, said = DaskExecutor(client), 0
+
+        def say() -> None:
+            nonlocal said
+            said += 1
+
+        execute.crew.on_none = say
+        results = execute(str, [1, 2, 3, 4])
+        found = [next(results)]
+        cluster.scale(0)
+        threading.Timer(2.0, lambda: cluster.scale(1)).start()
+        client.run_on_scheduler(lambda dask_scheduler: None)
+        while client.nthreads():
+            time.sleep(0.05)
+        found += list(results)
+        assert sorted(found) == ["1", "2", "3", "4"]
+
+
+@pytest.mark.cluster
+def test_lost_scheduler_is_one_error(tmp_path: Path) -> None:
+    command, file = [sys.executable, "-m"], tmp_path / "scheduler.json"
+    options = ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
+    scheduler = subprocess.Popen(
+        [*command, "distributed.cli.dask_scheduler", *options, "--scheduler-file", str(file)],
+        stderr=subprocess.DEVNULL,
+    )
+    worker = subprocess.Popen(
+        [*command, "distributed.cli.dask_worker", "--scheduler-file", str(file), "--no-nanny"],
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        while not file.exists():
+            time.sleep(0.1)
+        with connect(scheduler_file=file) as client:
+            client.wait_for_workers(1, timeout=60)
+            results = DaskExecutor(client)(time.sleep, [0.0, 0.0, 600.0, 600.0])
+            assert [next(results), next(results)] == [None, None]
+            scheduler.kill()
+            with pytest.raises(MachineError, match=r"the scheduler must stay, got: .*; the same"):
+                next(results)
+    finally:
+        for process in (worker, scheduler):
+            process.kill()
+            process.wait(60)

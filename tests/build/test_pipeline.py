@@ -1,0 +1,346 @@
+"""The main job, end to end: meshes in, files out; again, elsewhere, and after damage."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+from helpers.assertions import assert_same_dataset
+
+from drakegrasp.api import build_dataset
+from drakegrasp.build.pipeline import build
+from drakegrasp.build.replay import replay_trial
+from drakegrasp.config import Config, load_config, override_config
+from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.filters import Removal
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.statistics import count_funnel, count_splits
+from drakegrasp.errors import ConfigError, DataError, MachineError, MeshError
+from drakegrasp.objects.sources import find_meshes
+from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.executor import run_here
+
+pytestmark = [pytest.mark.sim, pytest.mark.slow]
+
+
+def test_every_attempt_has_a_row_and_every_success_a_look(small_dataset: Path) -> None:
+    funnel = count_funnel(small_dataset)
+    assert np.all(funnel.candidates == 40)
+    assert np.all(funnel.outcomes.sum(axis=1) == 3 * 40)
+    assert funnel.outcomes[:, Outcome.SUCCESS].sum() == funnel.removals.sum() > 0
+    assert (
+        sum(c.samples for c in count_splits(small_dataset))
+        == funnel.removals[:, Removal.KEPT].sum()
+    )
+
+
+def test_dataset_keeps_every_invariant(small_dataset: Path) -> None:
+    assert [str(v) for v in check_dataset(small_dataset)] == []
+
+
+def test_samples_are_read_as_written(small_dataset: Path) -> None:
+    counts = {c.split: c.samples for c in count_splits(small_dataset)}
+    for split, count in counts.items():
+        data = GraspDataset(small_dataset / "grasping_oto.hdf5", split=split)
+        assert len(data) == count
+        for sample in data:
+            assert sample.image.shape == (4, 128, 128)
+            assert sample.grasp.shape == (18,)
+            assert sample.props["class_name"] in ("wineglass", "box")
+
+
+@pytest.mark.cluster
+@pytest.mark.parametrize("workers", [1, 2])
+def test_number_of_workers_changes_nothing(
+    small_meshes: Path, small_dataset: Path, small_config: Config, tmp_path: Path, workers: int
+) -> None:
+    report = build_dataset(
+        small_meshes, tmp_path / "out", config=small_config, workers=workers, show=False
+    )
+    assert report.simulated == 12
+    assert_same_dataset(small_dataset, tmp_path / "out")
+
+
+def test_order_of_work_changes_nothing(
+    small_meshes: Path, small_dataset: Path, small_config: Config, tmp_path: Path
+) -> None:
+    def backwards(function: Callable, items: Iterable) -> Iterator:
+        return (function(item) for item in reversed(list(items)))
+
+    build(find_meshes(small_meshes), tmp_path / "out", small_config, backwards, show=False)
+    assert_same_dataset(small_dataset, tmp_path / "out")
+
+
+def _copy(dataset: Path, folder: Path) -> Path:
+    return Path(shutil.copytree(dataset, folder / "copy"))
+
+
+def _nothing_runs(function: Callable, items: Iterable) -> Iterator:
+    pending = list(items)
+    assert not pending, "nothing may be done again"
+    return iter(())
+
+
+def test_second_build_simulates_nothing(
+    small_meshes: Path, small_dataset: Path, small_config: Config, tmp_path: Path
+) -> None:
+    out = _copy(small_dataset, tmp_path)
+    before = {p: p.stat().st_mtime_ns for p in out.glob("*.hdf5")}
+    report = build(find_meshes(small_meshes), out, small_config, _nothing_runs, show=False)
+    assert (report.simulated, report.reused) == (0, 12)
+    assert {p: p.stat().st_mtime_ns for p in out.glob("*.hdf5")} == before
+
+
+def _truncate(shard: Path) -> None:
+    shard.write_bytes(shard.read_bytes()[:-100])
+
+
+def _flip_byte(shard: Path) -> None:
+    content = bytearray(shard.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    shard.write_bytes(bytes(content))
+
+
+@pytest.mark.parametrize("damage", [_truncate, _flip_byte, Path.unlink])
+def test_damaged_shard_is_run_again(
+    small_meshes: Path,
+    small_dataset: Path,
+    small_config: Config,
+    tmp_path: Path,
+    damage: Callable[[Path], None],
+) -> None:
+    out = _copy(small_dataset, tmp_path)
+    damage(next((out / "shards").rglob("*20-*.h5")))
+    report = build(find_meshes(small_meshes), out, small_config, run_here, show=False)
+    assert (report.simulated, report.reused) == (1, 11)
+    assert_same_dataset(small_dataset, out)
+
+
+def test_changed_filter_needs_no_simulation(
+    small_meshes: Path, small_dataset: Path, tmp_path: Path
+) -> None:
+    out = _copy(small_dataset, tmp_path)
+    config = load_config(
+        overrides=["candidates.max=40", "unit_candidates=10", "filters.min_depth_variance=1"]
+    )
+    report = build(find_meshes(small_meshes), out, config, _nothing_runs, show=False)
+    assert report.assembly.removed.get(Removal.KEPT, 0) == 0
+    assert report.assembly.grasps > 0
+
+
+def test_changed_mesh_is_done_again_and_the_others_are_not(
+    small_meshes: Path, small_dataset: Path, small_config: Config, tmp_path: Path
+) -> None:
+    meshes = Path(shutil.copytree(small_meshes, tmp_path / "meshes"))
+    out = _copy(small_dataset, tmp_path)
+    trimesh.creation.box([0.06, 0.06, 0.12]).export(meshes / "10_box_tall.obj")
+    report = build(find_meshes(meshes), out, small_config, run_here, show=False)
+    assert (report.simulated, report.reused) == (4, 8)
+    assert [str(v) for v in check_dataset(out)] == []
+
+
+def test_max_grasps_cuts_after_the_last_wanted_one(
+    small_meshes: Path, small_dataset: Path, tmp_path: Path
+) -> None:
+    """The rows are those of the full dataset up to each object's first success."""
+    config = load_config(
+        overrides=["candidates.max=40", "unit_candidates=10", "filters.outlier_sigma=0"],
+        max_grasps=1,
+    )
+    build(find_meshes(small_meshes), tmp_path / "out", config, run_here, show=False)
+    few, full = count_funnel(tmp_path / "out"), count_funnel(small_dataset)
+    found = full.outcomes[:, Outcome.SUCCESS] > 0
+    assert np.array_equal(few.outcomes[:, Outcome.SUCCESS], found.astype(int))
+    with h5py.File(tmp_path / "out" / "trials.hdf5") as file:
+        outcome, index = file["trials/outcome"][:], file["trials/object"][:]
+    for i in np.flatnonzero(found):
+        assert outcome[index == i][-1] == Outcome.SUCCESS
+    assert [str(v) for v in check_dataset(tmp_path / "out")] == []
+
+
+def test_damage_beyond_the_last_wanted_grasp_is_nobodys(
+    small_meshes: Path, small_config: Config, small_dataset: Path, tmp_path: Path
+) -> None:
+    out = _copy(small_dataset, tmp_path)
+    with h5py.File(out / "trials.hdf5") as file:
+        success = file["trials/outcome"][:] == Outcome.SUCCESS
+        early = success & (file["trials/candidate"][:] < small_config.candidates.max // 2)
+        index = int(file["trials/object"][:][early][0])
+        name = file["objects/name"].asstr()[index]
+    _flip_byte(max((out / "shards" / name).glob("*.h5")))
+    config = small_config.model_copy(update={"max_grasps": 1})
+    report = build(find_meshes(small_meshes), out, config, _nothing_runs, show=False)
+    assert report.notices == ()
+    full = build(find_meshes(small_meshes), out, small_config, run_here, show=False)
+    assert "damaged, and simulated again" in full.notices[0]
+    assert_same_dataset(small_dataset, out)
+
+
+def test_other_configuration_is_refused_and_nothing_changes(
+    small_meshes: Path, small_dataset: Path, tmp_path: Path
+) -> None:
+    out = _copy(small_dataset, tmp_path)
+    before = sorted((p, p.stat().st_mtime_ns) for p in out.rglob("*") if p.is_file())
+    with pytest.raises(DataError, match=r"differs in seed \(0 there, 1 here\); choose another"):
+        config = load_config(overrides=["candidates.max=40", "unit_candidates=10"], seed=1)
+        build(find_meshes(small_meshes), out, config, _nothing_runs, show=False)
+    assert sorted((p, p.stat().st_mtime_ns) for p in out.rglob("*") if p.is_file()) == before
+
+
+def test_refused_meshes_are_listed_and_the_others_go_on(tmp_path: Path) -> None:
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    trimesh.creation.box([0.06, 0.06, 0.09]).export(meshes / "1_box_a.obj")
+    trimesh.creation.box([5.0, 5.0, 5.0]).export(meshes / "2_house_a.obj")
+    (meshes / "3_text_a.obj").write_text("no mesh at all\n")
+    out = tmp_path / "out"
+    config = load_config(overrides=["candidates.max=2"])
+    report = build(find_meshes(meshes), out, config, run_here, show=False)
+    assert report.objects == 1
+    assert [entry["name"] for entry in report.refused] == ["2_house_a", "3_text_a"]
+    assert "--units" in report.refused[0]["reason"]
+    again = build(find_meshes(meshes), out, config, _nothing_runs, show=False)
+    assert again.refused == report.refused
+
+
+def test_names_with_spaces_and_other_alphabets_work(tmp_path: Path) -> None:
+    meshes = tmp_path / "Möbel und Töpfe"
+    meshes.mkdir()
+    for name in ("1_чашка большая_a", "2_crème brûlée_b"):
+        trimesh.creation.box([0.06, 0.06, 0.12]).export(meshes / f"{name}.obj")
+    out = tmp_path / "Daten ü"
+    config = load_config(overrides=["candidates.max=6"])
+    build(find_meshes(meshes), out, config, run_here, show=False)
+    assert count_funnel(out).names == ("1_чашка большая_a", "2_crème brûlée_b")
+    assert count_funnel(out).classes == ("чашка большая", "crème brûlée")
+    assert [str(v) for v in check_dataset(out)] == []
+
+
+def test_directory_with_bad_meshes_only_leaves_nothing_behind(tmp_path: Path) -> None:
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    (meshes / "1_text_a.obj").write_text("no mesh at all\n")
+    with pytest.raises(DataError, match="at least one mesh must be fit to simulate"):
+        build(find_meshes(meshes), tmp_path / "out", load_config(), run_here, show=False)
+    assert not (tmp_path / "out").exists()
+
+
+def test_somebody_elses_directory_is_refused(tmp_path: Path, small_meshes: Path) -> None:
+    (tmp_path / "letter.txt").write_text("dear Ada")
+    with pytest.raises(DataError, match="must be empty or hold a dataset"):
+        build(find_meshes(small_meshes), tmp_path, load_config(), run_here, show=False)
+    assert [p.name for p in tmp_path.iterdir()] == ["letter.txt"]
+
+
+def test_directory_that_cannot_be_made_is_refused(tmp_path: Path, small_meshes: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match="must be a directory that can be written"):
+        build(
+            find_meshes(small_meshes),
+            tmp_path / "file" / "out",
+            load_config(),
+            run_here,
+            show=False,
+        )
+
+
+def test_other_version_of_drake_does_not_continue_a_dataset(
+    small_meshes: Path, small_dataset: Path, small_config: Config, tmp_path: Path
+) -> None:
+    out = _copy(small_dataset, tmp_path)
+    text = (out / "manifest.json").read_text()
+    drake = read_manifest(out).versions["drake"]
+    (out / "manifest.json").write_text(text.replace(f'"drake": "{drake}"', '"drake": "1.0.0"'))
+    with pytest.raises(DataError, match=r"must be continued with drake 1\.0\.0"):
+        build(find_meshes(small_meshes), out, small_config, _nothing_runs, show=False)
+
+
+@pytest.mark.parametrize("stage", ["success", "start_collision", "missing_fingertip"])
+def test_replay_gives_the_same_bits(small_dataset: Path, stage: str) -> None:
+    with h5py.File(small_dataset / "trials.hdf5") as file:
+        outcome = file["trials/outcome"][:]
+    (rows,) = np.nonzero(outcome == Outcome[stage.upper()])
+    again = replay_trial(small_dataset, int(rows[-1]))
+    assert again.same, again.differences
+    assert again.found is Outcome[stage.upper()]
+
+
+def test_replay_says_what_differs(small_dataset: Path, tmp_path: Path) -> None:
+    out = _copy(small_dataset, tmp_path)
+    with h5py.File(out / "trials.hdf5", "r+") as file:
+        file["trials/spread"][0] += 0.25
+    again = replay_trial(out, 0)
+    assert not again.same
+    assert again.differences == {"spread": pytest.approx(0.25)}
+    with pytest.raises(DataError, match="trial must be 0 to 359, got 360"):
+        replay_trial(out, 360)
+
+
+def test_reject_list_takes_samples_out(small_dataset: Path, tmp_path: Path) -> None:
+    out = _copy(small_dataset, tmp_path)
+    data = GraspDataset(out / "grasping_oto.hdf5", split="test")
+    victim = data[0].trial_id
+    before = sum(c.samples for c in count_splits(out))
+    report = assemble(out, rejected=[victim])
+    assert report.removed[Removal.REJECTED] == 1
+    assert sum(report.samples.values()) == before - 1
+    assert [str(v) for v in check_dataset(out)] == []
+
+
+def test_missing_shard_stops_assembly_and_keeps_the_old_files(
+    small_dataset: Path, tmp_path: Path
+) -> None:
+    out = _copy(small_dataset, tmp_path)
+    next((out / "shards").rglob("*.h5")).unlink()
+    before = {p: p.read_bytes() for p in out.glob("*.hdf5")}
+    with pytest.raises(DataError, match="must be a complete shard"):
+        assemble(out)
+    assert {p: p.read_bytes() for p in out.glob("*.hdf5")} == before
+    assert not list(out.glob(".*tmp"))
+
+
+def test_wrong_use_of_workers_is_refused(tmp_path: Path, small_meshes: Path) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(ConfigError, match="workers must be at least 1, got 0"):
+        build_dataset(small_meshes, out, workers=0)
+    with pytest.raises(ConfigError, match="must not be given with a scheduler"):
+        build_dataset(small_meshes, out, workers=1, scheduler="tcp://127.0.0.1:1")
+    with pytest.raises(MeshError, match="mesh"):
+        build_dataset(tmp_path / "nowhere", out)
+    assert not out.exists()
+
+
+@pytest.mark.cluster
+def test_scheduler_that_is_not_there_is_named(tmp_path: Path, small_meshes: Path) -> None:
+    with pytest.raises(MachineError, match="must be a running Dask scheduler"):
+        build_dataset(small_meshes, tmp_path / "out", scheduler="tcp://127.0.0.1:9")
+    with pytest.raises(MachineError, match=r"none\.json: must be the file of a running Dask"):
+        build_dataset(small_meshes, tmp_path / "out", scheduler_file=tmp_path / "none.json")
+
+
+def test_certificates_come_with_the_grasps_and_change_none(
+    small_meshes: Path, small_config: Config, small_dataset: Path, tmp_path: Path
+) -> None:
+    certified = ["certify.repeats=2", "certify.friction_steps=1"]
+    config = override_config(small_config, certified)
+    build(find_meshes(small_meshes), tmp_path / "out", config, run_here, show=False)
+    with (
+        h5py.File(tmp_path / "out" / "trials.hdf5", "r") as file,
+        h5py.File(small_dataset / "trials.hdf5", "r") as plain,
+    ):
+        share = file["successes/certified_share"][:]
+        friction = file["successes/certified_friction"][:]
+        assert np.array_equal(file["trials/outcome"][:], plain["trials/outcome"][:])
+        assert np.isnan(plain["successes/certified_share"][:]).all()
+    assert set(share.tolist()) <= {0.0, 0.5, 1.0}
+    mu = config.physics.friction_hand
+    assert set(friction.tolist()) <= {mu / 2.0, mu, np.inf}
+    assert (share == 1.0).any()
+    assert [str(v) for v in check_dataset(tmp_path / "out")] == []

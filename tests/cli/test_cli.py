@@ -1,0 +1,423 @@
+"""The command line as a user sees it: output, one-line errors, exit codes."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import h5py
+import numpy as np
+import pytest
+import trimesh
+from click.testing import CliRunner, Result
+from helpers.assertions import arrays_of
+
+from drakegrasp.cli.main import main
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.schema import SPLITS
+from drakegrasp.frames import make_pose
+from drakegrasp.verification.prediction import FRAMES
+from drakegrasp.verification.verify import METHODS
+
+
+def run(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+def error_line(result: Result) -> str:
+    lines = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
+    assert len(lines) == 1, result.stderr
+    return lines[0]
+
+
+def test_help_names_every_command() -> None:
+    result = run("--help")
+    assert result.exit_code == 0
+    for command in (
+        "doctor",
+        "objects",
+        "audit",
+        "build",
+        "assemble",
+        "check",
+        "stats",
+        "replay",
+        "verify",
+    ):
+        assert command in result.stdout
+
+
+def test_help_answers_without_loading_the_simulator() -> None:
+    code = (
+        "import sys; from drakegrasp.cli.main import main; "
+        "main(['--help'], standalone_mode=False); "
+        "heavy = {'pydrake', 'dask', 'distributed', 'matplotlib', 'trimesh', 'scipy', 'h5py'}; "
+        "assert not heavy & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+def test_wrong_usage_is_exit_code_two() -> None:
+    assert run("build").exit_code == 2
+    assert run("fly").exit_code == 2
+
+
+def test_objects_are_listed_and_exported(tmp_path: Path) -> None:
+    listed = run("objects", "list").stdout.splitlines()
+    assert len(listed) >= 24
+    assert len({line.split()[1] for line in listed}) >= 12
+    assert run("objects", "export", tmp_path / "meshes").exit_code == 0
+    assert len(list((tmp_path / "meshes").glob("*.obj"))) == len(listed)
+
+
+def _empty_directory(folder: Path) -> None:
+    pass
+
+
+def _text(folder: Path) -> None:
+    (folder / "1_text_a.obj").write_text("Dear mesh, where are your faces?\n")
+
+
+def _no_bytes(folder: Path) -> None:
+    (folder / "1_empty_a.obj").write_bytes(b"")
+
+
+def _flat(folder: Path) -> None:
+    (folder / "1_flat_a.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3\nf 1 3 4\n")
+
+
+def _nan(folder: Path) -> None:
+    (folder / "1_nan_a.obj").write_text(
+        "v 0 0 0\nv nan 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 2 3\nf 1 2 4\n"
+    )
+
+
+def _huge(folder: Path) -> None:
+    trimesh.creation.box([5.0, 5.0, 5.0]).export(folder / "1_huge_a.obj")
+
+
+@pytest.mark.sim
+@pytest.mark.cluster
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (_empty_directory, "mesh"),
+        (_text, "1_text_a"),
+        (_no_bytes, "1_empty_a"),
+        (_flat, "1_flat_a"),
+        (_nan, "1_nan_a"),
+        (_huge, "--units"),
+    ],
+)
+def test_bad_meshes_are_one_line_and_leave_nothing(tmp_path: Path, make, words: str) -> None:
+    meshes, out = tmp_path / "meshes", tmp_path / "out"
+    meshes.mkdir()
+    make(meshes)
+    result = run("build", "--objects", meshes, "--out", out, "--workers", "1", "--quiet")
+    assert result.exit_code in (1, 2)
+    assert words in error_line(result)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--set", "lift.speed=1"], "lift.speed: must be a known key"),
+        (["--set", "camera.near=2"], "near must be less than far"),
+        (["--set", "objects.mass=-1"], "objects.mass: must be greater than 0, got -1"),
+        (
+            ["--set", "candidates.standoffs=[]"],
+            "candidates.standoffs: must be a list of at least 1",
+        ),
+        (["--config", "nowhere.yaml"], "nowhere.yaml"),
+        (["--units", "inch"], "inch"),
+        (["--candidates", "0"], "candidates.max: must be greater than or equal to 1, got 0"),
+        (["--set", "hand=octopus"], "octopus"),
+    ],
+)
+def test_bad_options_are_one_line_and_leave_nothing(
+    tmp_path: Path, arguments: list[str], words: str
+) -> None:
+    trimesh.creation.box([0.05, 0.06, 0.07]).export(tmp_path / "1_box_a.obj")
+    out = tmp_path / "out"
+    result = run(
+        "build", "--objects", tmp_path, "--out", out, "--workers", "1", "--quiet", *arguments
+    )
+    assert result.exit_code == 2
+    assert words in error_line(result)
+    assert not out.exists()
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+@pytest.mark.cluster
+def test_build_reports_and_says_when_nothing_is_left_to_do(
+    small_meshes: Path, tmp_path: Path
+) -> None:
+    command = ["build", "--objects", small_meshes, "--out", tmp_path / "out", "--workers", "1"]
+    command += ["--candidates", "4", "--quiet"]
+    first = run(*command)
+    assert first.exit_code == 0, first.output
+    assert "3 work units simulated" in first.stdout
+    assert "grasping_oto.hdf5" in first.stdout
+    second = run(*command)
+    assert "all 3 work units had been done before: nothing was simulated" in second.stdout
+    refused = run(*command, "--seed", "1")
+    assert refused.exit_code == 1
+    assert "differs in seed" in error_line(refused)
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_check_stats_and_replay_speak_of_a_dataset(small_dataset: Path, tmp_path: Path) -> None:
+    assert "no broken invariants" in run("check", small_dataset).stdout
+    stats = run("stats", small_dataset).stdout
+    assert "8_wineglass_flute" in stats
+    assert "Samples by split" in stats
+    page = tmp_path / "trial.html"
+    again = run("replay", small_dataset, "--trial", "0", "--html", page)
+    assert again.exit_code == 0
+    assert page.read_text(encoding="utf-8").lstrip().startswith("<!DOCTYPE html>")
+    assert "trial 0 of 10_box_tall: was" in again.stdout
+    assert run("replay", small_dataset, "--trial", "100000").exit_code == 1
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_stats_of_a_build_that_runs_count_what_is_done(small_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(small_dataset, out)
+    for path in [*out.glob("*.hdf5"), *sorted(out.glob("shards/*/*.h5"))[:2]]:
+        path.unlink()
+    # What is on its way is not there yet.
+    (out / "shards" / "10_box_tall" / ".0000000-0000010.h5.h~1~0123456789ab.tmp").touch()
+    result = run("stats", out)
+    assert result.exit_code == 0, result.output
+    assert f"{out}: not finished: 10 of 12 work units are done" in result.stdout
+    lines = [line.split() for line in result.stdout.splitlines()]
+    assert [line[1:3] for line in lines if line[:1] == ["all"]] == [["120", "300"]]
+    shutil.rmtree(out / "shards")
+    assert "not finished: 0 of 12 work units are done" in run("stats", out).stdout
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_check_fails_on_a_broken_file(small_dataset: Path, tmp_path: Path) -> None:
+    path = tmp_path / "grasping_oto.hdf5"
+    path.write_bytes((small_dataset / path.name).read_bytes())
+    with h5py.File(path, "r+") as file:
+        file["test/grasps"][0, 9:12] *= np.float32(2.0)
+    result = run("check", path)
+    assert result.exit_code == 1
+    assert "/test row 0" in result.stdout
+
+
+def test_commands_refuse_what_is_no_dataset(tmp_path: Path) -> None:
+    for command in ("stats", "check", "assemble"):
+        result = run(command, tmp_path)
+        assert result.exit_code == 1
+        assert str(tmp_path) in error_line(result)
+
+
+def test_audit_lists_what_would_be_refused(tmp_path: Path) -> None:
+    trimesh.creation.box([0.05, 0.06, 0.07]).export(tmp_path / "1_box_a.obj")
+    _text(tmp_path)
+    result = run("audit", tmp_path)
+    assert result.exit_code == 0
+    assert "fit" in result.stdout
+    assert "refused" in result.stdout
+
+
+# Verify
+
+#: Edge of the cube that is verified [m].
+EDGE = 0.06
+
+
+@pytest.fixture(scope="module")
+def cube(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("mesh") / "1_cube_a.obj"
+    trimesh.creation.box([100.0 * EDGE] * 3).export(path)  # cm
+    return path
+
+
+def pinch(off: float = 0.0) -> np.ndarray:
+    """Return a grasp (18,) of two opposite faces, its first contact so far off the surface [m]."""
+    points = np.array([[EDGE / 2, 0, 0], [-EDGE / 2, 0.01, 0], [-EDGE / 2, -0.01, 0]])
+    normals = np.sign(points) * [1.0, 0.0, 0.0]
+    points[0, 0] += off
+    return np.concatenate([points.ravel(), normals.ravel()])
+
+
+def save(folder: Path, *grasps: np.ndarray) -> Path:
+    np.save(folder / "grasps.npy", np.array(grasps))
+    return folder / "grasps.npy"
+
+
+def test_choices_of_verify_are_those_of_the_code() -> None:
+    choices = {
+        option.name: option.type.choices
+        for option in main.commands["verify"].params
+        if isinstance(option.type, click.Choice)
+    }
+    assert {k: tuple(v) for k, v in choices.items()} == {
+        "split": SPLITS,
+        "frame": FRAMES,
+        "method": METHODS,
+    }
+
+
+@pytest.mark.sim
+def test_verdicts_are_lines_of_json_in_the_order_of_the_grasps(cube: Path, tmp_path: Path) -> None:
+    """Failed grasps are results: the exit code is zero."""
+    file = save(tmp_path, pinch(), pinch(off=0.02))
+    result = run("verify", file, "--object", cube, "--units", "cm", "--method", "forces")
+    assert result.exit_code == 0, result.stderr
+    held, off = (json.loads(line) for line in result.stdout.splitlines())
+    assert (held["index"], held["outcome"], held["object"]) == (0, "success", "1_cube_a")
+    assert (off["index"], off["outcome"]) == (1, "off_surface")
+    assert "contact 1 is 20.0 mm from the object's surface" in off["reason"]
+    table = [line.split() for line in result.stderr.splitlines()]
+    assert ["success", "1", "50.0%"] in table
+    assert ["off_surface", "1", "50.0%"] in table
+
+
+@pytest.mark.sim
+def test_hand_is_simulated_by_default(cube: Path, tmp_path: Path) -> None:
+    arguments = ["verify", save(tmp_path, pinch()), "--object", cube, "--units", "cm", "--quiet"]
+    result = run(*arguments, "--set", "verify.max_tries=1")
+    assert (result.exit_code, result.stderr) == (0, "")
+    (line,) = map(json.loads, result.stdout.splitlines())
+    assert line["method"] == "hand"
+    assert line["tries"] == 1 or line["outcome"] == "unreachable"
+
+
+@pytest.mark.sim
+def test_files_are_written_instead_of_lines(cube: Path, tmp_path: Path) -> None:
+    file = save(tmp_path, *[pinch(off=0.02)] * 3)
+    out = tmp_path / "new" / "run.1"
+    result = run("verify", file, "--object", cube, "--units", "cm", "--out", out)
+    assert result.stdout.splitlines() == [f"{out}.jsonl", f"{out}.h5"]
+    lines = Path(f"{out}.jsonl").read_text(encoding="utf-8").splitlines()
+    assert [json.loads(line)["outcome"] for line in lines] == ["off_surface"] * 3
+    assert arrays_of(Path(f"{out}.h5"))["grasps/outcome"].tolist() == [14] * 3
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+@pytest.mark.parametrize("camera", ["oto", "otm"])
+def test_grasps_of_a_dataset_are_verified_as_they_are(small_dataset: Path, camera: str) -> None:
+    """Object, pose, camera and configuration all come with the file."""
+    data = GraspDataset(small_dataset / f"grasping_{camera}.hdf5", split="test")
+    result = run("verify", data.path, "--workers", "1", "--method", "forces")
+    assert result.exit_code == 0, result.stderr
+    lines = [json.loads(line) for line in result.stdout.splitlines()]
+    assert [line["object"] for line in lines] == data.column("object_props/object_name").tolist()
+    # On the surface, so frames and poses were put together rightly.
+    assert max(d for line in lines for d in line["surface_distance"]) < 2e-3
+    assert any(line["success"] for line in lines)
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_predictions_for_some_rows_of_a_dataset(small_dataset: Path, tmp_path: Path) -> None:
+    data = GraspDataset(small_dataset / "grasping_oto.hdf5", split="test")
+    last = len(data) - 1
+    with h5py.File(tmp_path / "predicted.h5", "w") as file:
+        file["test/grasps"], file["test/rows"] = data.column("grasps")[[last, 0]], [last, 0]
+    result = run("verify", tmp_path / "predicted.h5", "--dataset", data.path)
+    assert result.exit_code == 0, result.stderr
+    lines = [json.loads(line) for line in result.stdout.splitlines()]
+    names = [data[row].props["object_name"] for row in (last, 0)]
+    assert [line["object"] for line in lines] == names
+    # They were taken from the simulator, so the hand gets there.
+    assert all(line["contact_error"] is not None for line in lines)
+
+
+@pytest.mark.sim
+def test_camera_ties_the_frame_to_the_table(cube: Path, tmp_path: Path) -> None:
+    """A camera at the cube's centre, aligned with the table, sees the grasp as the cube does."""
+    X_TC = make_pose(np.eye(3), [0.0, 0.0, EDGE / 2])
+    np.save(tmp_path / "camera.npy", X_TC)
+    file = save(tmp_path, pinch())
+    arguments = ["verify", file, "--object", cube, "--units", "cm", "--method", "forces"]
+    result = run(*arguments, "--frame", "camera", "--camera", tmp_path / "camera.npy")
+    assert result.exit_code == 0, result.stderr
+    assert max(json.loads(result.stdout)["surface_distance"]) < 1e-3
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize(
+    ("grasp", "arguments", "words"),
+    [
+        (pinch()[:17], [], "a grasp must be 18 numbers (3 points, then 3 outward normals)"),
+        (pinch() * np.nan, [], "number 1 must be finite, got nan"),
+        (pinch() * 2.0, [], "normal 1 must be of length 1 within 5%, got 2"),
+        (pinch(off=0.02), [], "must be on the object's surface, got: contact 1 is 20.0 mm"),
+        (pinch() * ([0.5] * 9 + [-1] * 9), [], "contact 1 is 15.0 mm"),
+        (pinch() * ([1] * 9 + [-1] * 9), [], "normal 1 points into the object"),
+        (pinch() * ([5.0] * 9 + [1.0] * 9), [], "got points all outside 3 times that"),
+        (pinch(), ["--units", "inch"], "units must be one of m, cm, mm"),
+        (pinch(), ["--frame", "camera"], "--camera FILE must be given with --object"),
+        (pinch(), ["--camera", "x.npy"], "--camera must be given with --object and --frame camera"),
+        (pinch(), ["--dataset", "x.hdf5"], "--object or --dataset must be given, got both"),
+        (pinch(), ["--hand", "octopus"], "octopus"),
+        (pinch(), ["--set", "lift.speed=1"], "lift.speed: must be a known key"),
+        (pinch(), ["--workers", "0"], "workers must be at least 1, got 0"),
+        (pinch(), ["--workers", "some"], "'some' is not a valid integer"),
+        (pinch(), ["--frame", "world"], "'world' is not one of 'object', 'camera', 'workspace'"),
+        (pinch(), ["--split", "test"], "--split must be given with --dataset or grasps in an HDF5"),
+        (pinch(), ["--set", "verify.max_tries=9"], "max_tries: must be less than or equal to 5"),
+        (pinch(), ["--workers", "2", "--scheduler", "x"], "must not be given with a scheduler"),
+    ],
+)
+def test_what_cannot_be_verified_is_one_line_and_leaves_nothing(
+    cube: Path, tmp_path: Path, grasp: np.ndarray, arguments: list[str], words: str
+) -> None:
+    out = tmp_path / "deep" / "run"
+    command = ["verify", save(tmp_path, grasp), "--object", cube, "--units", "cm", "--out", out]
+    result = run(*command, *arguments)
+    assert result.exit_code == 2
+    assert words in error_line(result)
+    assert result.stdout == ""
+    assert not out.parent.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["gone.npy", "--object", "cube.obj"], "gone.npy: must be a file of grasps, got none"),
+        (["a.npy", "--object", "gone.obj"], "gone.obj: must be a mesh file"),
+        (["a.npy"], "--object MESH or --dataset FILE must be given"),
+        (["a.npy", "--dataset", "a.npy"], "a.npy: must be a data file of drakegrasp"),
+        (["other.h5"], "other.h5: must be a data file of drakegrasp"),
+        (["other.h5", "--frame", "object"], "--frame must be camera for a dataset's own grasps"),
+        (["other.h5", "--units", "cm"], "--units must be given with --object only, got cm"),
+        (["a.npy", "--object", "o.obj", "--out", "."], "must be a name for files, got a folder"),
+        (["a.npy", "--object", "o.obj", "--out", "a.npy/x"], "must be in a folder that can be"),
+    ],
+)
+def test_wrong_files_are_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], words: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    np.save("a.npy", pinch())
+    with h5py.File("other.h5", "w") as file:
+        file["grasps"] = pinch()
+    result = run("verify", *arguments)
+    assert result.exit_code == 2
+    assert words in error_line(result)
+
+
+def test_module_runs_as_a_program() -> None:
+    """The console script of the package is there and starts."""
+    script = Path(sys.executable).with_name("drakegrasp")
+    result = subprocess.run(
+        [script, "--version"], capture_output=True, text=True, check=True, env=os.environ
+    )
+    assert result.stdout.startswith("drakegrasp, version ")

@@ -1,0 +1,242 @@
+"""Real clusters: SLURM and SSH, of this machine alone. Run by `make test-cluster`, as root."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from distributed import Client
+from helpers.assertions import assert_same_dataset
+from helpers.scripts import PIPELINES
+from server.processes import wait_until
+from server.slurm import PARTITION, queued_jobs, running_slurm
+from server.ssh import running_sshd
+
+from drakegrasp.build.pipeline import build
+from drakegrasp.cluster import launch
+from drakegrasp.cluster.admission import WORKER_ENVIRONMENT
+from drakegrasp.cluster.launch import start_cluster
+from drakegrasp.cluster.request import ClusterRequest
+from drakegrasp.config import load_config
+from drakegrasp.objects.builtin.catalog import export_builtin
+from drakegrasp.objects.sources import find_meshes
+from drakegrasp.runtime.executor import run_here
+
+pytestmark = [pytest.mark.server, pytest.mark.cluster, pytest.mark.sim, pytest.mark.slow]
+
+CANDIDATES, UNIT = 12, 4
+#: A build may take this long on a machine that has other work [s].
+PATIENCE = 600.0
+
+
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("meshes")
+    export_builtin(folder, ["10_box_tall"])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def built_here(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset, by a plain loop in this process."""
+    out = tmp_path_factory.mktemp("here") / "out"
+    config = load_config(overrides=[f"candidates.max={CANDIDATES}", f"unit_candidates={UNIT}"])
+    build(find_meshes(meshes), out, config, run_here, show=False)
+    return out
+
+
+@pytest.fixture(scope="module")
+def slurm() -> Iterator[dict[str, str]]:
+    """The environment of a SLURM whose user has a jobqueue.yaml; jobs inherit none of it."""
+    # Not pytest's folder: its name is too long for a socket.
+    with tempfile.TemporaryDirectory(prefix="slurm-") as name, running_slurm(Path(name)) as env:
+        folder = Path(name) / "dask"
+        folder.mkdir()
+        (folder / "jobqueue.yaml").write_text(
+            f"jobqueue:\n  slurm:\n    queue: {PARTITION}\n    interface: lo\n"
+            f"    log-directory: {name}/logs\n    memory: 1GB\n"
+            "    job-script-prologue: ['export FROM_YAML=1']\n"
+        )
+        yield {**env, "DASK_CONFIG": str(folder), "SBATCH_EXPORT": "NONE"}
+
+
+@pytest.fixture(scope="module")
+def ssh() -> Iterator[dict[str, str]]:
+    with tempfile.TemporaryDirectory(prefix="ssh-") as name, running_sshd(Path(name)) as env:
+        yield env
+
+
+def submit(env: dict[str, str], meshes: Path, out: Path, *arguments: str) -> None:
+    command = [sys.executable, PIPELINES / "submit_build.py", "--objects", meshes, "--out", out]
+    options = ["--candidates", str(CANDIDATES), "--set", f"unit_candidates={UNIT}", *arguments]
+    result = subprocess.run(
+        [*command, *options], env=env, cwd=out.parent, capture_output=True, text=True
+    )
+    assert result.returncode == 0, result.stderr
+    assert f"{CANDIDATES // UNIT} work units simulated" in result.stdout
+    assert not list(out.glob(".tls-*"))
+
+
+def settings(client: Client) -> dict[str, dict[str, Any]]:
+    """Return what matters of each worker, as it is there."""
+
+    # Workers cannot import this module, so what they run is defined here.
+    def look(dask_worker: Any) -> dict[str, Any]:
+        import os
+
+        import dask
+
+        get = dask.config.get
+        return {
+            "environment": {k: os.environ.get(k) for k in WORKER_ENVIRONMENT},
+            "start": get("distributed.worker.multiprocessing-method"),
+            "profile": get("distributed.worker.profile.enabled"),
+            "threads": dask_worker.state.nthreads,
+            "lifetime": dask_worker.lifetime,
+            "yaml": os.environ.get("FROM_YAML"),
+            "address": dask_worker.address,
+        }
+
+    return client.run(look)
+
+
+def check_settings(client: Client, count: int, scheme: str) -> None:
+    found = settings(client)
+    assert len(found) == count
+    for worker in found.values():
+        assert worker["environment"] == WORKER_ENVIRONMENT
+        assert (worker["start"], worker["profile"], worker["threads"]) == ("spawn", False, 1)
+        assert worker["address"].startswith(f"{scheme}://127.0.0.1:")
+
+    def saturation(dask_scheduler: Any) -> float:
+        return float(dask_scheduler.WORKER_SATURATION)
+
+    assert client.run_on_scheduler(saturation) == 1.0
+
+
+def remote_processes() -> list[psutil.Process]:
+    """Return the processes of Dask that sshd or slurmd started, and that are still there."""
+    found = []
+    for process in psutil.process_iter(["cmdline"]):
+        line = " ".join(process.info["cmdline"] or [])
+        if "distributed.cli.dask_spec" in line or "distributed.cli.dask_worker" in line:
+            found.append(process)
+    return found
+
+
+def test_slurm_builds_what_a_plain_loop_builds(
+    slurm: dict[str, str], meshes: Path, built_here: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    options = ["--workers", "2", "--walltime", "00:30:00", "--tls"]
+    submit(slurm, meshes, out, "--cluster", "slurm", *options)
+    assert_same_dataset(built_here, out)
+    wait_until(lambda: not queued_jobs(slurm), "the end of the jobs", out / "none")
+
+
+def test_slurm_workers_have_their_settings_and_are_replaced(
+    slurm: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import dask
+
+    for name in ("SLURM_CONF", "SBATCH_EXPORT"):
+        monkeypatch.setenv(name, slurm[name])
+    monkeypatch.setattr(launch, "REFILL_SECONDS", 2.0)
+    request = ClusterRequest(kind="slurm", workers=3, cores=1, walltime="00:20:00")
+    yaml = dask.config.collect(paths=[slurm["DASK_CONFIG"]], env={})
+    with dask.config.set(yaml), start_cluster(request, tmp_path) as client:
+        client.wait_for_workers(3, timeout=PATIENCE)
+        check_settings(client, 3, "tcp")
+        for worker in settings(client).values():
+            assert worker["yaml"] == "1"
+            assert 780.0 <= worker["lifetime"] <= 1020.0  # 20 min - 5 min +- 2 min
+        before = queued_jobs(slurm)
+        subprocess.run(["scancel", before[0]], env=slurm, check=True)
+        end = time.monotonic() + PATIENCE
+        while not (len(set(queued_jobs(slurm)) - set(before)) == 1 and workers(client) == 3):
+            assert time.monotonic() < end, queued_jobs(slurm)
+            time.sleep(0.5)
+    wait_until(lambda: not queued_jobs(slurm), "the end of the jobs", tmp_path / "none")
+
+
+def workers(client: Client) -> int:
+    return len(client.nthreads())
+
+
+def test_sbatch_file_builds_what_a_plain_loop_builds(
+    slurm: dict[str, str], meshes: Path, built_here: Path, tmp_path: Path
+) -> None:
+    """The recipe, with scheduler, workers and client in one allocation."""
+    out, log = tmp_path / "out", tmp_path / "log"
+    recipe = (PIPELINES / "recipes" / "build.sbatch").read_text()
+    asked = f"--quiet --candidates {CANDIDATES} --set unit_candidates={UNIT}"
+    script = tmp_path / "build.sbatch"
+    script.write_text(recipe.replace("--quiet", asked))
+    env = {k: v for k, v in slurm.items() if k != "SBATCH_EXPORT"} | {
+        "PATH": f"{Path(sys.executable).parent}:{slurm['PATH']}",
+        "MESHES": str(meshes),
+        "OUT": str(out),
+        "SCHEDULER_HOST": "127.0.0.1",
+    }
+    flags = ["--wait", "--ntasks=2", "--mem-per-cpu=1G", "--time=20", f"--output={log}"]
+    result = subprocess.run(["sbatch", *flags, script], env=env, cwd=PIPELINES.parent)
+    assert result.returncode == 0, log.read_text()
+    assert_same_dataset(built_here, out)
+    assert not list(out.glob(".job-*"))
+
+
+def test_slurm_refuses_a_job_in_one_line(
+    slurm: dict[str, str], meshes: Path, tmp_path: Path
+) -> None:
+    command = [sys.executable, PIPELINES / "submit_build.py", "--objects", meshes]
+    options = ["--out", tmp_path / "out", "--cluster", "slurm", "--workers", "1"]
+    too_much = ["--memory", "9000GB"]
+    result = subprocess.run(
+        [*command, *options, *too_much], env=slurm, capture_output=True, text=True
+    )
+    assert result.returncode == 1
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("error: SLURM must accept the job, got: ")
+    assert not (tmp_path / "out").exists()
+
+
+def test_ssh_builds_what_a_plain_loop_builds(
+    ssh: dict[str, str], meshes: Path, built_here: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    submit(ssh, meshes, out, "--cluster", "ssh", "127.0.0.1", "--workers", "2", "--tls")
+    assert_same_dataset(built_here, out)
+    wait_until(lambda: not remote_processes(), "the end of the workers", out / "none")
+
+
+def test_ssh_workers_have_their_settings(
+    ssh: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", ssh["HOME"])
+    for name in WORKER_ENVIRONMENT:
+        monkeypatch.delenv(name, raising=False)
+    request = ClusterRequest(kind="ssh", where=("127.0.0.1", "127.0.0.1"), workers=2, tls=True)
+    with start_cluster(request, tmp_path) as client:
+        client.wait_for_workers(2, timeout=PATIENCE)
+        check_settings(client, 2, "tls")
+    wait_until(lambda: not remote_processes(), "the end of the workers", tmp_path / "none")
+
+
+def test_ssh_host_that_is_not_there_is_one_line(
+    ssh: dict[str, str], meshes: Path, tmp_path: Path
+) -> None:
+    command = [sys.executable, PIPELINES / "submit_build.py", "--objects", meshes]
+    # Another loopback address: nothing in the user's ~/.ssh says anything of it.
+    options = ["--out", tmp_path / "out", "--cluster", "ssh", "127.0.0.2", "--cores", "1"]
+    result = subprocess.run([*command, *options], env=ssh, capture_output=True, text=True)
+    assert result.returncode == 1
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("error: the workers must start, got: ")
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,305 @@
+"""`pipelines/submit_build.py` and the clusters that it starts on this machine."""
+
+from __future__ import annotations
+
+import ast
+import gc
+import os
+import stat
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import dask
+import psutil
+import pytest
+from click.testing import CliRunner, Result
+from distributed import Client
+from helpers.assertions import assert_same_dataset
+from helpers.scripts import PIPELINES, load_script
+
+import drakegrasp
+from drakegrasp.build.pipeline import build
+from drakegrasp.cluster import connect as connecting
+from drakegrasp.cluster.admission import WORKER_ENVIRONMENT, admitted_workers
+from drakegrasp.cluster.certificates import make_certificates, private_directory
+from drakegrasp.cluster.connect import DASK_SETTINGS, connect
+from drakegrasp.cluster.launch import _exports, start_cluster
+from drakegrasp.cluster.request import ClusterRequest, walltime_seconds
+from drakegrasp.config import load_config
+from drakegrasp.errors import ConfigError, MachineError
+from drakegrasp.objects.builtin.catalog import export_builtin
+from drakegrasp.objects.sources import find_meshes
+from drakegrasp.runtime.executor import run_here
+
+#: A build of a few seconds.
+TINY = ["candidates.max=8", "unit_candidates=4"]
+TINY_OPTIONS = ["--candidates", "8", "--set", "unit_candidates=4"]
+
+
+@pytest.fixture(scope="session")
+def box(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("box")
+    export_builtin(folder, ["10_box_tall"])
+    return folder
+
+
+def run(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(load_script("submit_build").main, [str(a) for a in arguments])
+
+
+def plan_only(out: Path, *arguments: str | Path) -> Result:
+    return run("--objects", "builtin", "--out", out, *arguments, "--dry-run")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--workers", "3"], "workers on this machine"),
+        (["--cluster", "ssh", "127.0.0.1", "--cores", "3"], "3 workers over ssh on 127.0.0.1"),
+        (
+            ["--cluster", "ssh", "a", "b", "a", "--workers", "3", "--interface", "ib0"],
+            "3 workers over ssh on a b, scheduler on a",
+        ),
+    ],
+)
+def test_dry_run_says_what_would_run_and_makes_nothing(
+    tmp_path: Path, arguments: list[str], words: str
+) -> None:
+    out = tmp_path / "out"
+    result = plan_only(out, *arguments)
+    assert result.exit_code == 0, result.output
+    assert words in result.stdout
+    assert "1,260,000 attempts" in result.stdout
+    assert "on 3 workers" in result.stdout
+    assert "core-hours" in result.stdout
+    assert not out.exists()
+
+
+def test_open_port_is_warned_of(tmp_path: Path) -> None:
+    ssh = ["--cluster", "ssh", "a", "--cores", "1", "--host", "10.0.0.1"]
+    assert "can run programs as you" in plan_only(tmp_path / "out", *ssh).stdout
+    assert "warning" not in plan_only(tmp_path / "out", *ssh, "--tls").stdout
+    assert "warning" not in plan_only(tmp_path / "out", "--workers", "1").stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--workers", "0"], "workers must be at least 1, got 0"),
+        (["--cluster", "ssh"], "must be followed by the names of the hosts, got nothing"),
+        (["--cluster", "ssh", "a", "b"], "--workers or --cores must be given"),
+        (["--cluster", "ssh", "a", "b", "--workers", "3"], "must be a multiple of"),
+        (
+            ["--cluster", "ssh", "a", "b", "--cores", "4", "--workers", "9"],
+            "--workers must be --cores on each of 2 hosts, 8, or not be given, got 9",
+        ),
+        (["--cluster", "pbs"], "error: Invalid value for '--cluster': 'pbs' is not one of"),
+        (["--cluster", "ssh", "a", "--cores", "2"], "--interface NAME or --host ADDRESS must be"),
+        (["--cluster", "ssh", "me@a", "--cores", "2", "--host", "x"], "go into ~/.ssh/config"),
+        (["--cluster", "scheduler"], "must be followed by its address"),
+        (["--cluster", "scheduler", "tcp://a:1", "--workers", "2"], "--workers must not be given"),
+        (["--cluster", "local", "node1"], "must be followed by nothing, got node1"),
+        (["--cluster", "local", "--walltime", "1:00:00"], "--walltime must not be given"),
+        (["--cluster", "local", "--memory", "much"], "memory must be a size such as 2GB"),
+        (["--cluster", "slurm", "--walltime", "soon", "--workers", "1"], "must be a time of SLURM"),
+        (["--cluster", "slurm"], "--workers must be given"),
+        (["--tls-cert", __file__], "must be given together"),
+        (["--set", "lift.speed=1"], "lift.speed: must be a known key"),
+    ],
+)
+def test_bad_options_are_one_line_and_make_nothing(
+    tmp_path: Path, arguments: list[str], words: str
+) -> None:
+    out = tmp_path / "out"
+    result = plan_only(out, *arguments)
+    assert result.exit_code == 2, result.output
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("error: ")
+    assert words in line
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [
+        ("30", 1800.0),
+        ("30:15", 1815.0),
+        ("1:30:00", 5400.0),
+        ("2-0", 172800.0),
+        ("1-12:30", 131400.0),
+        ("1-00:00:01", 86401.0),
+    ],
+)
+def test_walltimes_are_those_of_slurm(text: str, seconds: float) -> None:
+    assert walltime_seconds(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "0", "1:2:3:4", "-5", "1d", "1.5"])
+def test_other_walltimes_are_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="walltime must be"):
+        walltime_seconds(text)
+
+
+def test_settings_survive_a_job_script() -> None:
+    """A shell that runs the lines of the script gives Dask the same settings."""
+    probe = f"import dask, json; print([dask.config.get(k) for k in {list(DASK_SETTINGS)!r}])"
+    script = "\n".join([*_exports(), f"exec '{sys.executable}' -c \"$0\""])
+    result = subprocess.run(
+        ["bash", "-c", script, probe], capture_output=True, text=True, env={}, check=True
+    )
+    found = ast.literal_eval(result.stdout)
+    for (key, wanted), got in zip(DASK_SETTINGS.items(), found, strict=True):
+        assert (got | wanted if isinstance(wanted, dict) else wanted) == got, key
+
+
+def test_keys_are_private_and_removed(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    dead = out / ".tls-dead"  # of a client that was killed
+    dead.mkdir(parents=True)
+    make_certificates(dead)
+    with private_directory(out) as folder:
+        assert list(out.iterdir()) == [folder]
+        files = make_certificates(folder)
+        assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+        assert {stat.S_IMODE(path.stat().st_mode) for path in files} == {0o600}
+    assert not out.exists()
+
+
+def test_nothing_that_is_read_can_run() -> None:
+    """No pickles from the disk, and YAML only by its safe loader."""
+    for path in Path(drakegrasp.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                names = {getattr(node, "module", None), *(alias.name for alias in node.names)}
+                assert not names & {"pickle", "cloudpickle", "joblib", "marshal"}, path
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+                name = f"{node.value.id}.{node.attr}"
+                assert name not in ("yaml.load", "yaml.full_load", "yaml.unsafe_load"), path
+            if isinstance(node, ast.keyword) and node.arg == "allow_pickle":
+                assert isinstance(node.value, ast.Constant) and node.value.value is False, path
+
+
+@pytest.mark.parametrize(("there", "words"), [(True, "http://127.0.0.1:1"), (False, "pip install")])
+def test_dashboard_is_linked_where_it_is_served(
+    monkeypatch: pytest.MonkeyPatch, there: bool, words: str
+) -> None:
+    monkeypatch.setattr(connecting, "has_dashboard", lambda: there)
+    line = connecting.dashboard_line(SimpleNamespace(dashboard_link="http://127.0.0.1:1/status"))
+    assert line.startswith("dashboard: ")
+    assert words in line
+
+
+@pytest.fixture
+def secure(tmp_path: Path) -> Iterator[Client]:
+    """A cluster of one worker with certificates made for it."""
+    with start_cluster(ClusterRequest(kind="local", workers=1, tls=True), tmp_path) as client:
+        yield client
+
+
+@pytest.mark.cluster
+@pytest.mark.slow
+def test_scheduler_with_tls_refuses_a_client_without_a_certificate(
+    secure: Client, box: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("drakegrasp.cluster.connect.CONNECT_SECONDS", 2)
+    address = secure.scheduler.address
+    assert address.startswith("tls://")
+    # The garbage collector must not be needed: it may run while another client starts.
+    gc.collect()
+    gc.disable()
+    try:
+        for other in (address, address.replace("tls://", "tcp://")):
+            with (
+                pytest.raises(MachineError, match="must be a running Dask scheduler"),
+                connect(scheduler=other),
+            ):
+                pass
+        clients = [o for o in gc.get_objects() if issubclass(type(o), Client)]
+    finally:
+        gc.enable()
+    assert [client for client in clients if client.status != "closed"] == [secure]
+    strange = make_certificates(tmp_path)
+    options = ["--tls-ca-file", strange[0], "--tls-cert", strange[1], "--tls-key", strange[2]]
+    for given in ([], options):
+        arguments = ["--objects", box, "--out", tmp_path / "out", "--cluster", "scheduler"]
+        result = run(*arguments, address, *given)
+        assert result.exit_code == 1
+        assert "must be a running Dask scheduler" in result.stderr.splitlines()[-1]
+    assert secure.submit(int, 7).result() == 7
+
+
+@pytest.mark.cluster
+@pytest.mark.slow
+def test_nothing_listens_beyond_this_machine(secure: Client) -> None:
+    listening = [
+        connection.laddr.ip
+        for process in (psutil.Process(), *psutil.Process().children(recursive=True))
+        for connection in process.net_connections("tcp")
+        if connection.status == psutil.CONN_LISTEN
+    ]
+    assert len(listening) >= 3
+    assert set(listening) == {"127.0.0.1"}
+
+
+@pytest.mark.cluster
+@pytest.mark.slow
+def test_running_scheduler_and_its_workers_are_set_up(tmp_path: Path) -> None:
+    """Whoever started them: saturation, environment; and a late worker of two threads goes."""
+
+    # Other processes cannot import this module, so what they run is defined here.
+    def saturation(dask_scheduler: Any) -> float:
+        return float(dask_scheduler.WORKER_SATURATION)
+
+    def environment() -> dict[str, str | None]:
+        return {name: os.environ.get(name) for name in WORKER_ENVIRONMENT}
+
+    command = [sys.executable, "-m"]
+    file = tmp_path / "scheduler.json"
+    plain = {k: v for k, v in os.environ.items() if k not in WORKER_ENVIRONMENT}
+    flags = ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
+    scheduler = subprocess.Popen(
+        [*command, "distributed.cli.dask_scheduler", *flags, "--scheduler-file", str(file)],
+        env=plain,
+        stderr=subprocess.DEVNULL,
+    )
+    join = [*command, "distributed.cli.dask_worker", "--scheduler-file", str(file)]
+    worker = subprocess.Popen([*join, "--nthreads", "1"], env=plain, stderr=subprocess.DEVNULL)
+    try:
+        request = ClusterRequest(kind="scheduler-file", where=(str(file),))
+        while not file.exists():
+            scheduler.poll()
+            assert scheduler.returncode is None
+        with start_cluster(request, tmp_path) as client:
+            client.wait_for_workers(1, timeout=60)
+            with admitted_workers(client, load_config()):
+                assert client.run_on_scheduler(saturation) == 1.0
+                ((address, found),) = client.run(environment).items()
+                assert found == WORKER_ENVIRONMENT
+                late = [*join, "--nthreads", "2"]
+                refused = subprocess.run(late, env=plain, stderr=subprocess.PIPE, timeout=120)
+                assert b"drakegrasp-unfit" in refused.stderr
+                assert list(client.nthreads()) == [address]
+    finally:
+        for process in (worker, scheduler):
+            process.terminate()
+            process.wait(60)
+
+
+@pytest.mark.cluster
+@pytest.mark.sim
+@pytest.mark.slow
+def test_script_builds_what_a_plain_loop_builds(box: Path, tmp_path: Path) -> None:
+    build(find_meshes(box), tmp_path / "here", load_config(overrides=TINY), run_here, show=False)
+    command = [sys.executable, PIPELINES / "submit_build.py", "--objects", box, *TINY_OPTIONS]
+    out = tmp_path / "out"
+    options = ["--out", out, "--workers", "2", "--memory", "2GB", "--tls"]
+    result = subprocess.run([*command, *options], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert "2 work units simulated" in result.stdout
+    assert "dashboard: " in result.stderr
+    assert_same_dataset(tmp_path / "here", out)
+    assert dask.config.get("distributed.worker.profile.enabled") is True  # and nothing is left set

@@ -1,0 +1,77 @@
+"""Rules of samples, splits, trials and objects together."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+from helpers.datasets import BOTH, MISSING, OTM, OTO, TRIALS, change, found, moved, must_find
+
+
+def test_a_sample_of_another_trial_is_found(out: Path) -> None:
+    with h5py.File(out / OTO, "r+") as file:
+        number = int(file["test/trial_id"][0])
+        file["test/trial_id"][0] = MISSING
+    assert number != MISSING
+    must_find(
+        out,
+        (OTO, "/test", 0, "a sample's trial must be a success"),
+        (OTO, "", None, "every success that /successes of trials.hdf5 keeps must be a sample"),
+        (OTO, "", None, "every sample must be a success that /successes"),
+    )
+
+
+def test_a_trial_id_out_of_range_is_found(out: Path) -> None:
+    for name in BOTH:
+        change(out, name, "test/trial_id", 0, lambda _: 10**9)
+    assert {h for h in found(out) if h[1]} == {
+        (name, "/test", 0, "trial_id must be a row of trials.hdf5") for name in BOTH
+    }
+
+
+def test_a_trial_in_two_splits_is_found(out: Path) -> None:
+    with h5py.File(out / OTO, "r+") as file:
+        file["valid/trial_id"][0] = file["train/trial_id"][0]
+    assert (OTO, "/valid", 0, "trial_id must be unique in all splits") in found(out / OTO)
+
+
+def test_an_object_in_two_splits_is_found(out: Path) -> None:
+    with h5py.File(out / OTO, "r+") as file:
+        file["train/object_props/object_name"][0] = file["test/object_props/object_name"][0]
+    must_find(
+        out,
+        (OTO, "/train", None, "an object of /test must be in no other split"),
+        (OTO, "/train", 0, "object_name must be that of its trial"),
+    )
+
+
+def test_classes_are_checked(out: Path) -> None:
+    for name in BOTH:
+        change(out, name, "test/object_props/class_name", 0, lambda _: "other")
+    what = "class_name of 1_box_a must be 'box'"
+    with h5py.File(out / OTO) as file:
+        if file["test/object_props/object_name"][0] != b"1_box_a":
+            what = "class_name of 2_box_b must be 'box'"
+    must_find(out, *((name, "/test", 0, what) for name in BOTH))
+    with h5py.File(out / OTO, "r+") as file:
+        file["train/object_props/class_name"][...] = "brick"
+        file["valid/object_props/class_name"][...] = "cup"
+    must_find(out / OTO, (OTO, "", None, "class cup must have one object in /test"))
+
+
+def test_both_data_files_must_agree(out: Path) -> None:
+    (out / TRIALS).unlink()
+    change(out, OTM, "train/trial_id", 1, lambda i: i + 1000)
+    change(out, OTM, "test/object_props/class_name", 0, lambda _: "box")
+    change(out, OTM, "test/object_props/frame_cam2img_otm", 1, moved(0, 0, 1e-4))
+    must_find(
+        out,
+        (TRIALS, "", None, "the file must be there and readable"),
+        (OTM, "/train", 1, "trial_id must be that of grasping_oto.hdf5"),
+        (OTO, "/test", 1, "object_props/frame_cam2img_otm must be equal to that of"),
+    )
+
+
+def test_objects_are_those_of_the_manifest(out: Path) -> None:
+    change(out, TRIALS, "objects/class_name", 1, lambda _: "ball")
+    must_find(out, (TRIALS, "/objects", 1, "class_name must be that of manifest.json, 'box'"))

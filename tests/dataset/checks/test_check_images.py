@@ -1,0 +1,123 @@
+"""Rules of cameras, contacts and images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from helpers.datasets import (
+    BOTH,
+    OTM,
+    OTO,
+    TRIALS,
+    Edit,
+    change,
+    found,
+    moved,
+    must_find,
+    set_at,
+    turned,
+)
+
+from drakegrasp.dataset.schema import CAMERAS
+from drakegrasp.frames import invert_pose, pack_pose, unpack_pose
+
+
+@pytest.mark.parametrize(
+    ("edit", "what"),
+    [
+        (moved(0.0, 0.0, 0.01), "both cameras must have the same place and view"),
+        (turned(0.3, [0, 0, 1]), "the otm camera must have world up"),
+        (turned(np.pi, [0, 0, 1]), "the otm camera must have world up"),
+    ],
+)
+def test_a_moved_or_rolled_camera_is_found(out: Path, edit: Edit, what: str) -> None:
+    with h5py.File(out / OTM, "r+") as file:
+        props = file["test/object_props"]
+        packed = edit(props["frame_work2cam_otm"][2])
+        props["frame_work2cam_otm"][2] = packed
+        props["frame_cam2work_otm"][2] = pack_pose(invert_pose(unpack_pose(packed)))
+    must_find(out, (OTM, "/test", 2, what))
+
+
+def nearer(by: float) -> Edit:
+    """Move the first contact along its line of sight."""
+
+    def edit(grasp: np.ndarray) -> np.ndarray:
+        grasp[:3] *= 1.0 - by / grasp[2]
+        return grasp
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    ("edit", "what"),
+    [
+        (set_at(0, to=0.1), "contact of finger 1 must project within 2 px of the mask"),
+        (nearer(0.15), "contact of finger 1 must not lie more than 0.005 m before the surface"),
+        (set_at(2, to=-0.1), "contact of finger 1 must be before the camera"),
+    ],
+)
+def test_a_contact_off_the_image_of_the_object_is_found(out: Path, edit: Edit, what: str) -> None:
+    change(out, OTO, "test/grasps", 3, edit)
+    must_find(out / OTO, (OTO, "/test", 3, what))
+
+
+def change_contact(out: Path, edit_p: Edit, edit_n: Edit) -> tuple[str, int]:
+    """Change the first contact of the first test sample, alike in all files; return its row."""
+    with h5py.File(out / TRIALS, "r+") as trials, h5py.File(out / OTO) as data:
+        number = int(data["test/trial_id"][0])
+        p = trials["trials/closed_p_OQ"][number]
+        n = trials["trials/closed_nhat_Q_O"][number]
+        f = trials["trials/closed_f_Q_O"][number]
+        p[0], turned_n = edit_p(p[0]), edit_n(n[0])
+        f[0] *= n[0] @ turned_n
+        n[0] = turned_n
+        trials["trials/closed_p_OQ"][number] = p
+        trials["trials/closed_nhat_Q_O"][number] = n
+        trials["trials/closed_f_Q_O"][number] = f
+        X_TO = unpack_pose(trials["trials/X_TO"][number])
+    for name, camera in zip(BOTH, CAMERAS, strict=True):
+        with h5py.File(out / name, "r+") as file:
+            X_CT = unpack_pose(file[f"test/object_props/frame_cam2work_{camera}"][0])
+            X_CO = X_CT @ X_TO
+            file["test/grasps"][0] = np.concatenate(
+                [(p @ X_CO[:3, :3].T + X_CO[:3, 3]).ravel(), (n @ X_CO[:3, :3].T).ravel()]
+            )
+    return "/test", 0
+
+
+def test_a_contact_inside_the_object_is_found(out: Path) -> None:
+    group, row = change_contact(out, lambda p: p - [0.004, 0.0, 0.0], lambda n: n)
+    what = "contact of finger 1 must be on the object's mesh within 0.002 m"
+    must_find(out, *((name, group, row, what) for name in BOTH))
+
+
+def test_a_normal_into_the_object_is_found(out: Path) -> None:
+    group, row = change_contact(out, lambda p: p, lambda n: -n)
+    what = "normal of finger 1 must point out of the object"
+    must_find(out, *((name, group, row, what) for name in BOTH))
+
+
+def test_object_pixels_are_checked_against_the_mesh(out: Path) -> None:
+    with h5py.File(out / OTO, "r+") as file:
+        for row, by in ((0, -0.1), (1, 0.01)):
+            v, u = np.nonzero(file["train/masks"][row])
+            middle = np.linspace(0, len(v) - 1, 16).astype(int)[8]
+            image = file["train/images"][row]
+            image[3, v[middle], u[middle]] += by
+            file["train/images"][row] = image
+    must_find(
+        out,
+        (OTO, "/train", 0, "points in the mask must be in the object's box within 0.0003 m"),
+        (OTO, "/train", 1, "points in the mask must be on the object's mesh within 0.0003 m"),
+    )
+
+
+@pytest.mark.parametrize("shift", [(0, 1), (1, 0)])
+def test_images_that_are_off_by_one_pixel_are_found(out: Path, shift: tuple[int, int]) -> None:
+    for place, axes in (("images", (1, 2)), ("masks", (0, 1))):
+        change(out, OTO, f"test/{place}", 1, lambda a, axes=axes: np.roll(a, shift, axes))
+    assert {h[:3] for h in found(out)} == {(OTO, "/test", 1)}

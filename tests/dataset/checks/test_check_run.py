@@ -1,0 +1,166 @@
+"""The check as a whole: what passes, what is missing or damaged, what is listed."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from helpers.datasets import (
+    OTM,
+    OTO,
+    TRIALS,
+    change,
+    edit_file,
+    found,
+    make_dataset,
+    must_find,
+    set_at,
+)
+
+from drakegrasp.config import load_config
+from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.manifest import read_manifest, write_manifest
+from drakegrasp.dataset.paths import model_path, plan_path
+from drakegrasp.dataset.shards import read_shard, write_shard
+from drakegrasp.errors import DataError
+from drakegrasp.objects.model import load_object, save_object
+
+
+def test_a_sound_dataset_passes(sound: Path) -> None:
+    assert check_dataset(sound) == []
+    with h5py.File(sound / OTO) as file:
+        assert {s: len(file[s]["grasps"]) for s in file} == {"train": 2, "valid": 1, "test": 6}
+
+
+@pytest.mark.parametrize("name", [OTO, OTM, TRIALS])
+def test_a_sound_file_passes_alone(sound: Path, tmp_path: Path, name: str) -> None:
+    shutil.copy(sound / name, tmp_path / "renamed.h5")
+    assert check_dataset(tmp_path / "renamed.h5") == []
+
+
+def test_shards_after_the_last_wanted_grasp_may_be_missing(tmp_path: Path) -> None:
+    (tmp_path / "meshes").mkdir()
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes", "max_grasps=1")
+    for path in out.glob("shards/*/0000002-*.h5"):
+        path.unlink()
+    assert check_dataset(out) == []
+
+
+def test_progress_ends_at_the_total(sound: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    check_dataset(sound, progress=lambda done, total, **_: seen.append((done, total)))
+    assert seen[-1][0] == seen[-1][1] == 36 + 2 * 9 + 6
+    assert [done for done, _ in seen] == sorted(done for done, _ in seen)
+
+
+def test_a_missing_shard_is_found(out: Path) -> None:
+    (out / "shards/2_box_b/0000002-0000004.h5").unlink()
+    must_find(out, ("shards/2_box_b/0000002-0000004.h5", "", None, "the shard must be there"))
+
+
+def test_a_damaged_shard_is_found(out: Path) -> None:
+    path = out / "shards/2_box_b/0000000-0000002.h5"
+    edit_file(path, lambda f: f["trials/slip"].__setitem__(0, 0.5))
+    (violation,) = check_dataset(out)
+    assert "damaged or cut off" in str(violation)
+
+
+def test_a_shard_of_another_unit_is_found(out: Path) -> None:
+    folder = out / "shards/2_box_b"
+    shard = read_shard(folder / "0000000-0000002.h5")
+    write_shard(out, replace(shard, header=replace(shard.header, mesh_sha256="0")))
+    must_find(out, ("shards/2_box_b/0000000-0000002.h5", "", None, "the shard must be there"))
+
+
+def test_a_flipped_bit_in_a_plan_is_found(out: Path) -> None:
+    path = plan_path(out, "2_box_b")
+    content = bytearray(path.read_bytes())
+    content[-100] ^= 1
+    path.write_bytes(content)
+    what = "an object's file must be as it was written"
+    must_find(out, ("objects/2_box_b.plan.h5", "", None, what))
+
+
+def test_objects_files_are_checked(out: Path) -> None:
+    model_path(out, "3_brick").unlink()
+    other = load_object(model_path(out, "1_box_a"))
+    save_object(replace(other, mesh_sha256="0"), model_path(out, "1_box_a"))
+    must_find(
+        out,
+        ("objects/3_brick.npz", "", None, "the object must be readable"),
+        ("objects/3_brick.npz", "", None, "an object's file must be as it was written"),
+        ("objects/1_box_a.npz", "", None, "an object's file must be as it was written"),
+        ("objects/1_box_a.npz", "", None, "mesh_sha256 must be that of manifest.json"),
+    )
+
+
+def test_files_are_of_the_manifests_configuration(out: Path) -> None:
+    manifest = read_manifest(out)
+    files = (OTO, OTM, TRIALS)
+    overrides = ["camera.size=32", "unit_candidates=2", "split.valid_fraction=0.34"]
+    write_manifest(replace(manifest, config=load_config(overrides=overrides)), out)
+    what = "filters, split and limits must be those of manifest.json"
+    must_find(out, *((name, "", None, what) for name in files))
+    write_manifest(replace(manifest, config=load_config(overrides=[*overrides, "seed=1"])), out)
+    hits = {h for h in found(out) if not h[0].startswith("shards")}
+    assert {h[0] for h in hits} == set(files)
+    assert all(h[3].startswith("configuration must be that of manifest.json") for h in hits)
+
+
+def test_a_truncated_file_is_found_and_the_others_are_still_checked(out: Path) -> None:
+    content = (out / OTM).read_bytes()
+    (out / OTM).write_bytes(content[: len(content) // 2])
+    change(out, OTO, "train/images", 0, set_at(0, 0, 0, to=2.0))
+    must_find(
+        out,
+        (OTM, "", None, "the file must be there and readable"),
+        (OTO, "/train", 0, "colours must be within 0..1"),
+    )
+    with pytest.raises(DataError, match="cannot be read"):
+        check_dataset(out / OTM)
+
+
+def test_rows_that_cannot_be_read_are_found(out: Path) -> None:
+    with h5py.File(out / OTO) as file:
+        offset = file["train/images"].id.get_chunk_info(0).byte_offset
+    with open(out / OTO, "r+b") as raw:
+        raw.seek(offset)
+        raw.write(b"\xff" * 64)
+    must_find(out, (OTO, "/train", None, "rows 0 to 1 must be readable"))
+
+
+def test_what_is_no_dataset_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"without manifest\.json"):
+        check_dataset(tmp_path)
+    with pytest.raises(DataError, match="must be the directory"):
+        check_dataset(tmp_path / "missing.hdf5")
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["x"] = [1, 2]
+    with pytest.raises(DataError, match="another HDF5 file"):
+        check_dataset(tmp_path / "other.h5")
+
+
+def test_a_broken_invariant_is_listed_for_twenty_rows_and_then_counted(out: Path) -> None:
+    with h5py.File(out / TRIALS, "r+") as file:
+        file["trials/spread"][...] = np.nan
+    violations = check_dataset(out / TRIALS)
+    assert len(violations) == 21
+    assert violations[0].row == 0
+    assert str(violations[0]).startswith("trials.hdf5 /trials row 0: spread must be finite from")
+    assert str(violations[-1]).endswith("got 16 more rows that break it")
+
+
+def test_check_needs_neither_drake_nor_dask() -> None:
+    code = (
+        "import sys, drakegrasp.dataset.checks.run\n"
+        "print([m for m in ('pydrake', 'dask', 'distributed') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout) == []

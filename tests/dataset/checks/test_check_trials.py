@@ -1,0 +1,106 @@
+"""Rules of trials."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.datasets import (
+    AFTER_LIFT,
+    BELOW,
+    BOTH,
+    MISSING,
+    SLIPPED,
+    SUCCESS,
+    TRIALS,
+    Edit,
+    change,
+    found,
+    mirrored,
+    moved,
+    must_find,
+    set_at,
+)
+
+from drakegrasp.outcomes import Outcome
+
+TRIAL_CASES: Mapping[str, tuple[str, int, Edit, str]] = {
+    "trial_id": ("trial_id", MISSING, lambda i: i + 1, "trial_id must be the row's number"),
+    "outcome": ("outcome", BELOW, lambda _: 99, "outcome must be 0..12"),
+    "object": ("object", BELOW, lambda _: 3, "object must be a row of /objects, 0..2"),
+    "candidate": ("candidate", BELOW, lambda _: 4, "candidate must be one of"),
+    "standoff": ("standoff_index", BELOW, lambda _: 3, "standoff_index must be below 3"),
+    "lost value": ("closed_q", SUCCESS, set_at(1, to=np.nan), "closed_q must be finite from"),
+    "infinite": ("spread", BELOW, lambda _: np.inf, "spread must be finite"),
+    "early value": ("slip", MISSING, lambda _: 0.0, "slip must be finite from the stage lifted"),
+    "early count": ("closed_other_links", BELOW, lambda _: 1, "closed_other_links must be 0"),
+    "late value": ("slip", AFTER_LIFT, lambda _: np.nan, "slip must be finite from"),
+    "no touch": ("closed_p_OQ", MISSING, set_at(2, to=0.0), "closed_p_OQ must be finite where"),
+    "touch": ("lifted_p_OQ", SUCCESS, set_at(2, 0, to=np.nan), "lifted_p_OQ must be finite where"),
+    "normal": (
+        "closed_nhat_Q_O",
+        SUCCESS,
+        set_at(2, to=[0, 0.9, 0]),
+        "closed_nhat_Q_O of finger 3 must have length 1",
+    ),
+    "pull": (
+        "lifted_f_Q_O",
+        SUCCESS,
+        set_at(1, to=[-10, 0, 0]),
+        "lifted_f_Q_O of finger 2 must push",
+    ),
+    "area": ("closed_area", SUCCESS, set_at(0, to=0), "closed_area of finger 1 must be positive"),
+    "depth": (
+        "closed_penetration",
+        SUCCESS,
+        set_at(1, to=-1e-3),
+        "closed_penetration of finger 2 must not be negative",
+    ),
+    "pose": ("X_OG", BELOW, lambda p: 1.1 * p, "X_OG must have an orthonormal rotation"),
+    "lifted pose": ("X_TO_lifted", SUCCESS, mirrored, "X_TO_lifted must have an orthonormal"),
+    "resting": ("X_TO", SUCCESS, moved(0.001, 0, 0), "X_TO must be the object's resting pose"),
+    "on table": ("lifted_object_on_table", SUCCESS, lambda _: True, "outcome must follow"),
+    "verdict": ("outcome", SLIPPED, lambda _: Outcome.DROPPED, "outcome must follow from the"),
+}
+
+
+@pytest.mark.parametrize("case", TRIAL_CASES)
+def test_a_wrong_value_of_a_trial_is_found(out: Path, case: str) -> None:
+    name, row, edit, what = TRIAL_CASES[case]
+    change(out, TRIALS, f"trials/{name}", row, edit)
+    must_find(out, (TRIALS, "/trials", row, what))
+
+
+def test_contact_that_slides_may_be_pressed_from_any_side(out: Path) -> None:
+    change(out, TRIALS, "trials/lifted_f_Q_O", SLIPPED, set_at(1, to=[-10, 0, 0]))
+    must_find(out)
+
+
+def test_successes_and_removals_are_checked(out: Path) -> None:
+    change(out, TRIALS, "successes/removal", 2, lambda _: 4)
+    what = "every sample must be a success that /successes"
+    must_find(out, *((name, "", None, what) for name in BOTH))
+    change(out, TRIALS, "successes/removal", 2, lambda _: 77)
+    must_find(
+        out / TRIALS,
+        (TRIALS, "/successes", 2, "removal must be 0..7"),
+    )
+    change(out, TRIALS, "successes/trial_id", 0, lambda i: i + 1)
+    assert (TRIALS, "/successes", None, "trial_id must list the successes of /trials") in found(
+        out / TRIALS
+    )
+
+
+def test_certificates_are_checked(out: Path) -> None:
+    change(out, TRIALS, "successes/certified_share", 1, lambda _: 1.0)
+    change(out, TRIALS, "successes/certified_friction", 1, lambda _: np.inf)
+    must_find(out)
+    change(out, TRIALS, "successes/certified_share", 1, lambda _: 1.5)
+    change(out, TRIALS, "successes/certified_friction", 1, lambda _: -0.1)
+    must_find(
+        out,
+        (TRIALS, "/successes", 1, "certified_share must be 0..1 or NaN"),
+        (TRIALS, "/successes", 1, "certified_friction must be 0..inf or NaN"),
+    )

@@ -1,0 +1,136 @@
+"""Filters and split on made-up successes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drakegrasp.config import FilterConfig, SplitConfig
+from drakegrasp.dataset.filters import (
+    Removal,
+    Successes,
+    is_outlier,
+    judge_successes,
+    split_samples,
+)
+
+
+def good(count: int) -> Successes:
+    """Successes that every filter keeps."""
+    rng = np.random.default_rng(0)
+    return Successes(
+        trial_id=np.arange(count, dtype=np.int64) * 3,
+        object=np.zeros(count, dtype=np.int32),
+        grasp_T=rng.normal(size=(count, 18)),
+        seen=np.ones(count, dtype=bool),
+        in_view=np.ones(count, dtype=bool),
+        camera_height=np.full(count, 0.3),
+        depth_variance=np.full(count, 0.01),
+        surface_distance=np.full(count, 1e-4),
+        certified_share=np.full(count, np.nan),
+        certified_friction=np.full(count, np.nan),
+    )
+
+
+def test_good_ones_are_kept() -> None:
+    assert np.all(judge_successes(good(10), FilterConfig()) == Removal.KEPT)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "reason"),
+    [
+        ("seen", False, Removal.NOT_SEEN),
+        ("in_view", False, Removal.OUT_OF_VIEW),
+        ("camera_height", 0.009, Removal.BISECTS_TABLE),
+        ("camera_height", -0.2, Removal.BISECTS_TABLE),
+        ("depth_variance", 0.99e-3, Removal.FLAT_DEPTH),
+        ("surface_distance", 2.1e-3, Removal.OFF_SURFACE),
+    ],
+)
+def test_each_filter_removes_its_own(field: str, value: float, reason: Removal) -> None:
+    successes = good(10)
+    values = getattr(successes, field).copy()
+    values[4] = value
+    removal = judge_successes(replace(successes, **{field: values}), FilterConfig())
+    assert removal[4] == reason
+    assert np.all(np.delete(removal, 4) == Removal.KEPT)
+
+
+def test_first_reason_counts() -> None:
+    bad = replace(good(3), seen=np.zeros(3, bool), depth_variance=np.zeros(3))
+    assert np.all(judge_successes(bad, FilterConfig(), rejected=[0, 3, 6]) == Removal.NOT_SEEN)
+
+
+def test_rejected_trials_are_found_by_id() -> None:
+    assert judge_successes(good(4), FilterConfig(), rejected=[6]).tolist() == [0, 0, 7, 0]
+
+
+def test_outlier_is_judged_by_its_own_objects_population() -> None:
+    """A value that is common for one object is far out for the other."""
+    successes = good(200)
+    grasps = successes.grasp_T.copy()
+    objects = np.repeat([0, 1], 100).astype(np.int32)
+    grasps[100:] += 50.0
+    grasps[5, 17] = 50.0
+    removal = judge_successes(replace(successes, object=objects, grasp_T=grasps), FilterConfig())
+    assert np.flatnonzero(removal == Removal.OUTLIER).tolist() == [5]
+
+
+@given(count=st.integers(1, 17), place=st.integers(0, 16))
+def test_few_grasps_have_no_outlier_at_four_sigma(count: int, place: int) -> None:
+    """No component of n values is beyond (n - 1) / sqrt(n) deviations."""
+    values = np.zeros((count, 1))
+    values[place % count] = 1e6
+    assert not is_outlier(values, 4.0).any()
+
+
+def test_seventeen_equal_values_and_one_far_off_make_an_outlier() -> None:
+    values = np.zeros((18, 2))
+    values[3, 1] = 1.0
+    assert np.flatnonzero(is_outlier(values, 4.0)).tolist() == [3]
+
+
+NAMES = ["a1", "a2", "a3", "b1", "c1", "c2"]
+CLASSES = ["a", "a", "a", "b", "c", "c"]
+OBJECTS = np.repeat(np.arange(6), 50).astype(np.int32)
+
+
+@given(seed=st.integers(0, 2**32))
+def test_split_is_a_partition_without_leaks(seed: int) -> None:
+    split = split_samples(OBJECTS, NAMES, CLASSES, SplitConfig(), seed)
+    together = np.sort(np.concatenate(list(split.values())))
+    assert np.array_equal(together, np.arange(len(OBJECTS)))
+    tested = set(OBJECTS[split["test"]])
+    assert not tested & set(OBJECTS[np.concatenate([split["train"], split["valid"]])])
+    by_class = {c: {i for i in tested if CLASSES[i] == c} for c in set(CLASSES)}
+    assert {c: len(found) for c, found in by_class.items()} == {"a": 1, "b": 1, "c": 1}
+    assert len(split["valid"]) == 10 + 5
+
+
+def test_split_depends_on_the_seed_and_on_nothing_else() -> None:
+    one = split_samples(OBJECTS, NAMES, CLASSES, SplitConfig(), 3)
+    two = split_samples(OBJECTS, NAMES, CLASSES, SplitConfig(), 3)
+    assert all(np.array_equal(one[k], two[k]) for k in one)
+    others = [split_samples(OBJECTS, NAMES, CLASSES, SplitConfig(), s)["test"] for s in range(20)]
+    assert any(not np.array_equal(one["test"], other) for other in others)
+
+
+def test_classes_that_do_not_train_are_tested_whole() -> None:
+    split = split_samples(OBJECTS, NAMES, CLASSES, SplitConfig(train_classes=("a",)), 0)
+    assert {CLASSES[i] for i in set(OBJECTS[split["train"]])} == {"a"}
+    assert {3, 4, 5} <= set(OBJECTS[split["test"]])
+
+
+def test_another_class_does_not_change_a_classs_draw() -> None:
+    whole = split_samples(OBJECTS, NAMES, CLASSES, SplitConfig(), 1)
+    part = split_samples(OBJECTS[:150], NAMES, CLASSES, SplitConfig(), 1)
+    assert np.array_equal(part["valid"], whole["valid"][whole["valid"] < 150])
+
+
+def test_no_samples_make_empty_splits() -> None:
+    split = split_samples(np.zeros(0, np.int32), [], [], SplitConfig(), 0)
+    assert {k: len(v) for k, v in split.items()} == {"train": 0, "valid": 0, "test": 0}

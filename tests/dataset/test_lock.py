@@ -1,0 +1,135 @@
+"""Two builds in one directory: the second is refused, a dead one is taken over."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from drakegrasp.dataset.lock import FILE_NAME, build_lock
+from drakegrasp.errors import DataError
+from drakegrasp.runtime.processes import this_process
+
+HOLD = """
+import sys
+from pathlib import Path
+from drakegrasp.dataset.lock import build_lock
+with build_lock(Path(sys.argv[1])):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+@contextmanager
+def holder(out: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Hold a directory in another process while the block runs."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLD, out], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == b"held\n"
+    try:
+        yield process
+    finally:
+        process.communicate()
+
+
+@pytest.fixture
+def no_flock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file system that knows no locks."""
+
+    def refuse(file: object, operation: int) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+
+
+def test_second_build_is_refused_and_names_the_first(tmp_path: Path) -> None:
+    with holder(tmp_path) as process:
+        message = rf"one process at a time, got process {process.pid} on \S+, since \d{{4}}-"
+        with pytest.raises(DataError, match=message), build_lock(tmp_path):
+            raise AssertionError
+    with build_lock(tmp_path) as dead:
+        assert dead is None
+
+
+def test_dead_build_is_taken_over_and_named(tmp_path: Path) -> None:
+    with holder(tmp_path) as process:
+        process.kill()
+        process.wait()
+        assert (tmp_path / FILE_NAME).exists()
+        with build_lock(tmp_path) as dead:
+            assert dead is not None
+            assert dead.process.pid == process.pid
+            assert str(process.pid) in str(dead)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_lock_file_without_content_is_nobodys(tmp_path: Path) -> None:
+    (tmp_path / FILE_NAME).write_text("")
+    with build_lock(tmp_path) as dead:
+        assert dead is None
+
+
+def test_steps_of_a_build_have_what_it_holds(tmp_path: Path) -> None:
+    with build_lock(tmp_path), build_lock(tmp_path / "." / "x" / ".."):
+        assert json.loads((tmp_path / FILE_NAME).read_text())["process"]["pid"] == os.getpid()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_directory_in_which_nothing_was_made_goes_again(tmp_path: Path) -> None:
+    with build_lock(tmp_path / "deep" / "out"):
+        assert (tmp_path / "deep" / "out").is_dir()
+    assert not (tmp_path / "deep" / "out").exists()
+
+
+def test_directory_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    message = "must be a directory that can be written"
+    with pytest.raises(DataError, match=message), build_lock(tmp_path / "file" / "out"):
+        raise AssertionError
+
+
+@pytest.mark.usefixtures("no_flock")
+def test_without_locks_a_living_process_is_believed(tmp_path: Path) -> None:
+    with holder(tmp_path) as process:
+        message = f"got process {process.pid} .*remove build.lock there if it is dead"
+        with pytest.raises(DataError, match=message), build_lock(tmp_path):
+            raise AssertionError
+
+
+@pytest.mark.usefixtures("no_flock")
+def test_without_locks_a_dead_process_is_taken_over(tmp_path: Path) -> None:
+    with holder(tmp_path) as process:
+        process.kill()
+        process.wait()
+        with build_lock(tmp_path) as dead:
+            assert dead is not None
+
+
+@pytest.mark.usefixtures("no_flock")
+@pytest.mark.parametrize(
+    ("change", "taken"),
+    [({"host": "elsewhere"}, False), ({"began": 1}, True), ({"boot": "before"}, True), ({}, False)],
+)
+def test_without_locks_a_number_alone_is_no_process(
+    tmp_path: Path, change: dict[str, object], taken: bool
+) -> None:
+    """The same number after a restart is another process; another machine's may be alive."""
+    process = {**vars(this_process()), **change}
+    content = {"process": process, "since": "2026-01-01T00:00:00", "command": []}
+    (tmp_path / FILE_NAME).write_text(json.dumps(content))
+    if taken:
+        with build_lock(tmp_path) as dead:
+            assert dead is not None
+    else:
+        with pytest.raises(DataError, match="one process at a time"), build_lock(tmp_path):
+            raise AssertionError

@@ -1,0 +1,185 @@
+"""Shards are whole or absent: what is written comes back, what is harmed is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from helpers.shards import HEADER, some_shard
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from drakegrasp.dataset.schema import LOOK_FIELDS, SCHEMA_VERSION, TRIAL_FIELDS
+from drakegrasp.dataset.shards import read_shard, trial_columns, write_shard
+from drakegrasp.errors import DataError
+from drakegrasp.runtime.files import seal
+
+
+def assert_same_bits(one: Mapping[str, Any], two: Mapping[str, Any]) -> None:
+    assert set(one) == set(two)
+    for name in one:
+        assert one[name].dtype == two[name].dtype, name
+        assert one[name].shape == two[name].shape, name
+        assert one[name].tobytes() == two[name].tobytes(), name
+
+
+@settings(
+    max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(st.integers(0, 40), st.integers(0, 3), st.integers(0, 2**32))
+def test_shard_comes_back_bit_by_bit(tmp_path: Path, trials: int, looks: int, seed: int) -> None:
+    shard = some_shard(trials=trials, looks=looks, seed=seed)
+    back = read_shard(write_shard(tmp_path, shard), HEADER)
+    assert back.header == HEADER
+    assert_same_bits(back.trials, shard.trials)
+    assert_same_bits(back.looks, shard.looks)
+
+
+def test_unit_without_a_success_has_no_looks(tmp_path: Path) -> None:
+    back = read_shard(write_shard(tmp_path, some_shard(looks=0)))
+    assert {len(values) for values in back.looks.values()} == {0}
+    assert back.looks["image_oto"].shape == (0, 4, 8, 8)
+    assert {len(values) for values in back.trials.values()} == {12}
+
+
+def test_path_tells_object_and_range(tmp_path: Path) -> None:
+    path = write_shard(tmp_path, some_shard())
+    assert path == tmp_path / "shards" / "24_mug_final" / "0000050-0000100.h5"
+
+
+def test_same_shard_gives_the_same_bytes(tmp_path: Path) -> None:
+    """No time, process or order of keys gets into a file."""
+    shard = some_shard()
+    turned = replace(shard, trials=dict(reversed(shard.trials.items())))
+    one, two = (write_shard(tmp_path / d, s) for d, s in (("a", shard), ("b", turned)))
+    assert one.read_bytes() == two.read_bytes()
+    one.write_bytes(b"")
+    assert write_shard(tmp_path / "a", shard).read_bytes() == two.read_bytes()
+
+
+def test_shard_has_every_column_but_those_of_the_whole_dataset() -> None:
+    names = [f.name for f in trial_columns()]
+    assert names == [f.name for f in TRIAL_FIELDS if f.name not in ("trial_id", "object")]
+
+
+def test_every_column_states_its_unit_frame_and_meaning(tmp_path: Path) -> None:
+    with h5py.File(write_shard(tmp_path, some_shard())) as file:
+        for group, fields in (("trials", trial_columns()), ("looks", LOOK_FIELDS)):
+            assert set(file[group]) == {f.name for f in fields}
+            for f in fields:
+                attributes = dict(file[group][f.name].attrs)
+                assert attributes == {"unit": f.unit, "frame": f.frame, "meaning": f.meaning}
+
+
+def test_images_lie_one_to_a_chunk(tmp_path: Path) -> None:
+    """A loader reads single samples: it must not unpack their neighbours."""
+    with h5py.File(write_shard(tmp_path, some_shard())) as file:
+        for name in ("image_oto", "mask_oto", "image_otm", "mask_otm"):
+            assert file["looks"][name].chunks == (1, *file["looks"][name].shape[1:])
+
+
+@pytest.mark.parametrize("part", [0.0, 0.001, 0.1, 0.5, 0.9, 0.999])
+def test_truncated_file_is_refused(tmp_path: Path, part: float) -> None:
+    path = write_shard(tmp_path, some_shard())
+    data = path.read_bytes()
+    path.write_bytes(data[: int(part * len(data))])
+    with pytest.raises(
+        DataError, match=r"0000050-0000100\.h5: must be a complete shard, got one that is dam"
+    ):
+        read_shard(path)
+
+
+def test_missing_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"none\.h5: must be a complete shard"):
+        read_shard(tmp_path / "none.h5")
+
+
+def test_hdf5_file_of_another_kind_is_refused(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["trials"] = np.arange(3)
+    with pytest.raises(DataError, match=r"other\.h5: must be a complete shard"):
+        read_shard(tmp_path / "other.h5")
+
+
+def test_missing_column_is_refused(tmp_path: Path) -> None:
+    path = write_shard(tmp_path, some_shard())
+    with h5py.File(path, "r+") as file:
+        del file["trials"]["outcome"]
+    seal(path)
+    with pytest.raises(DataError, match=r"\.h5: must be a complete shard.*outcome"):
+        read_shard(path)
+
+
+def test_any_flipped_bit_is_found(tmp_path: Path) -> None:
+    """Wherever it is: in data, in HDF5's own records, in unused space, or in the seal."""
+    path = write_shard(tmp_path, some_shard())
+    whole = path.read_bytes()
+    for flip in np.linspace(0, len(whole) - 1, 200).astype(int):
+        data = bytearray(whole)
+        data[flip] ^= 0x10
+        path.write_bytes(data)
+        with pytest.raises(DataError, match=r"0000050-0000100\.h5: must be a complete shard"):
+            read_shard(path)
+
+
+def test_absurd_number_of_rows_is_refused(tmp_path: Path) -> None:
+    """One flipped byte of the header claims rows that no memory holds."""
+    path = write_shard(tmp_path, some_shard())
+    with h5py.File(path, "r+") as file:
+        file["trials"]["slip"].resize(2**57, axis=0)
+    with pytest.raises(DataError, match=r"0000050-0000100\.h5: must be a complete shard"):
+        read_shard(path)
+
+
+@pytest.mark.parametrize("column", ["trials/slip", "trials/outcome", "looks/mask_otm"])
+def test_rewritten_value_is_refused(tmp_path: Path, column: str) -> None:
+    """HDF5 finds nothing wrong here: the seal does."""
+    path = write_shard(tmp_path, some_shard())
+    with h5py.File(path, "r+") as file:
+        first = np.atleast_1d(file[column][0])
+        first.flat[0] = 1 if first.flat[0] != 1 else 2
+        file[column][0] = first.reshape(file[column].shape[1:])
+    with pytest.raises(DataError, match=r"0000050-0000100\.h5: must be a complete shard"):
+        read_shard(path)
+
+
+def test_rewritten_header_is_refused(tmp_path: Path) -> None:
+    """A file that was copied to another object's name and told so is still not that object's."""
+    path = write_shard(tmp_path, some_shard())
+    with h5py.File(path, "r+") as file:
+        file.attrs["object_name"] = "other"
+    with pytest.raises(DataError, match="must be a complete shard"):
+        read_shard(path, replace(HEADER, object_name="other"))
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"config_hash": "0" * 16},
+        {"mesh_sha256": "0" * 64},
+        {"object_name": "mug"},
+        {"start": 0},
+        {"stop": 99},
+    ],
+)
+def test_shard_of_something_else_is_refused(tmp_path: Path, other: dict[str, Any]) -> None:
+    path = write_shard(tmp_path, some_shard())
+    wanted = replace(HEADER, **other)
+    with pytest.raises(DataError, match=r"0000050-0000100\.h5: must be a shard of .*, got one of"):
+        read_shard(path, wanted)
+    assert read_shard(path).header == HEADER
+
+
+def test_shard_of_another_schema_is_refused(tmp_path: Path) -> None:
+    path = write_shard(tmp_path, some_shard())
+    with h5py.File(path, "r+") as file:
+        file.attrs["schema_version"] = SCHEMA_VERSION + 1
+    seal(path)
+    message = rf"0000050-0000100\.h5: schema must be {SCHEMA_VERSION}, got {SCHEMA_VERSION + 1}"
+    with pytest.raises(DataError, match=message):
+        read_shard(path)

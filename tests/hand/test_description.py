@@ -1,0 +1,324 @@
+"""The Barrett Hand against its published figures, and any hand against its description."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from helpers.hands import PINCER, PINCER_SDF, changed_finger, write_pincer
+from pydrake.geometry import Box, Convex, Cylinder, Role, SceneGraph
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
+from pydrake.systems.framework import DiagramBuilder
+
+from drakegrasp.errors import HandError
+from drakegrasp.frames import Array
+from drakegrasp.hand.description import Coupling, Hand, load_hand, make_parser
+from drakegrasp.hand.files import MODELS, hand_digest, hand_names
+from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses, joint_positions
+
+#: Mass [kg] and bounding box of the CAD mesh [m] of each kind of link.
+LINKS = {
+    "base": (0.60858, (-0.0445, -0.0445, 0.0), (0.0445, 0.0650, 0.0904)),
+    "spread": (0.14109, (-0.0123, -0.0123, -0.0389), (0.0650, 0.0123, 0.0150)),
+    "proximal": (0.062139, (-0.0125, -0.0125, -0.0105), (0.0794, 0.0150, 0.0105)),
+    "distal": (0.04166, (-0.0095, -0.0095, -0.0115), (0.0590, 0.01105, 0.0115)),
+}
+
+
+@pytest.fixture(scope="module")
+def hand() -> Hand:
+    return load_hand()
+
+
+def link_kind(name: str) -> str:
+    return name.rpartition("_")[2]
+
+
+def parsed_plant(hand: Hand) -> MultibodyPlant:
+    plant = MultibodyPlant(0.0)
+    make_parser(plant).AddModels(str(hand.sdf_path))
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(hand.palm_link))
+    plant.Finalize()
+    return plant
+
+
+def drake_fingertip_poses(hand: Hand, spread: float, closing: Array) -> Array:
+    plant = parsed_plant(hand)
+    context = plant.CreateDefaultContext()
+    for name, angle in joint_positions(hand, spread, closing).items():
+        plant.GetJointByName(name).set_angle(context, angle)
+    X_GB = RigidTransform(hand.X_BG).inverse()
+    return np.array(
+        [
+            (X_GB @ plant.GetBodyByName(f).EvalPoseInWorld(context)).GetAsMatrix4()
+            for f in hand.fingertip_links
+        ]
+    )
+
+
+def test_barrett_is_the_only_hand_and_has_the_fields_of_its_file(hand: Hand) -> None:
+    assert hand_names() == ["barrett"]
+    assert hand.name == "barrett"
+    assert hand.num_fingers == 3
+    assert hand.fingertip_links == ("finger1_distal", "finger2_distal", "finger3_distal")
+    assert [finger.torque_limit for finger in hand.fingers] == [2.0, 2.0, 4.0]
+    assert hand.spread.joints == ("finger1_spread_joint", "finger2_spread_joint")
+    assert hand.closing_speed == pytest.approx(np.pi / 3)
+    np.testing.assert_allclose(hand.X_BG[:3, 3], [0.0, 0.0, 0.07795])
+
+
+def test_masses_are_the_published_ones_and_no_actuator_is_parsed(hand: Hand) -> None:
+    plant = parsed_plant(hand)
+    bodies = [plant.GetBodyByName(name) for name in body_names(plant)]
+    for body in bodies:
+        mass = LINKS[link_kind(body.name())][0]
+        assert body.default_mass() == mass
+        assert body.default_spatial_inertia().IsPhysicallyValid()
+    assert sum(body.default_mass() for body in bodies) == pytest.approx(1.2022, abs=1e-4)
+    assert plant.num_actuators() == 0
+
+
+def body_names(plant: MultibodyPlant) -> list[str]:
+    bodies = [
+        plant.get_body(i)
+        for i in plant.GetBodyIndices(plant.GetModelInstanceByName("barrett_hand"))
+    ]
+    return [body.name() for body in bodies]
+
+
+@pytest.mark.parametrize("path", sorted(MODELS.glob("barrett_*.obj")), ids=lambda p: p.stem)
+def test_parts_are_closed_convex_and_wound_outwards_with_normals(path: Path) -> None:
+    mesh = trimesh.load(path, process=False)
+    assert "vertex_normals" in mesh._cache  # read from the file, not computed
+    mesh.merge_vertices(merge_norm=True)
+    assert mesh.is_watertight
+    assert mesh.is_winding_consistent
+    assert mesh.is_convex
+    assert mesh.volume == pytest.approx(mesh.convex_hull.volume, rel=1e-6)
+
+
+def cad_sections() -> Array:
+    """Return points (58, 3) on the outline of six sections of the fingertip's CAD mesh [mm]."""
+    x = np.array([0.0, 17.0, 34.5, 41.0, 48.0, 53.0])
+    pad = np.array([9.5, 11.0, 11.0, 10.5, 9.6, 7.9])
+    back = np.array([-9.5, -7.8, -6.2, -5.6, -5.0, -4.5])
+    outline = [
+        *((pad - dy, np.full(6, z)) for dy, z in ((0.0, 5.0), (2.5, 10.1), (4.8, 11.5))),
+        *((back + dy, np.full(6, z)) for dy, z in ((2.2, 11.2), (0.0, 7.8))),
+    ]
+    ends = """-9.5 0 8.3  -6.7 6.7 10.5  -6.7 -6.7 10.5  55.6 5.7 4.6
+              55.6 -4.2 9.4  59 -2.8 4  59 -4 4.6"""
+    right = [np.column_stack((x, y, z)) for y, z in outline]
+    right.append(np.array(ends.split(), dtype=float).reshape(-1, 3))
+    half = np.concatenate(right)
+    return np.concatenate((half, half * [1.0, 1.0, -1.0]))
+
+
+def test_fingertip_deviates_from_its_sections_as_the_models_readme_says() -> None:
+    """The largest distance between convex bodies is that of their extents along a direction."""
+    corners = np.unique(1e3 * trimesh.load(MODELS / "barrett_distal.obj").vertices, axis=0)
+    assert len(corners) == 24
+    # Corners are up to 60 mm from the origin, so that half a degree matters.
+    directions = trimesh.creation.icosphere(subdivisions=7).vertices
+    extents = [(directions @ points.T).max(axis=1) for points in (corners, cad_sections())]
+    deviation = np.abs(extents[0] - extents[1])
+    pad = (directions[:, 1] > 0.2) & (directions[:, 0] > -0.25)
+    for side, most, usual in ((pad, 0.49, 0.32), (~pad, 0.61, 0.51)):
+        assert np.percentile(deviation[side], 95) == pytest.approx(usual, abs=0.01)
+        assert deviation[side].max() == pytest.approx(most, abs=0.01)
+
+
+def shape_points(shape: object) -> Array:
+    """Return points (n, 3) whose bounding box and hull are the shape's."""
+    if isinstance(shape, Box):
+        return trimesh.creation.box(shape.size()).vertices
+    if isinstance(shape, Cylinder):
+        return trimesh.creation.cylinder(shape.radius(), shape.length(), sections=64).vertices
+    assert isinstance(shape, Convex), f"collision shapes must be convex, got {shape}"
+    return trimesh.load(shape.source().path(), process=False).vertices
+
+
+def test_collision_shapes_are_convex_and_fill_the_cad_bounding_boxes(hand: Hand) -> None:
+    plant, scene_graph, _ = built_scene(hand)
+    inspector = scene_graph.model_inspector()
+    names = body_names(plant)
+    assert len(names) == 9
+    for name in names:
+        points = []
+        for geometry in plant.GetCollisionGeometriesForBody(plant.GetBodyByName(name)):
+            X_LG = inspector.GetPoseInFrame(geometry).GetAsMatrix4()
+            p = shape_points(inspector.GetShape(geometry))
+            points.append(p @ X_LG[:3, :3].T + X_LG[:3, 3])
+        p_L = np.concatenate(points)
+        _, lower, upper = LINKS[link_kind(name)]
+        np.testing.assert_allclose(p_L.min(axis=0), lower, atol=4e-3)
+        np.testing.assert_allclose(p_L.max(axis=0), upper, atol=4e-3)
+
+
+def test_the_shapes_are_drawn_as_they_collide_and_carry_no_contact_properties(hand: Hand) -> None:
+    plant, scene_graph, _ = built_scene(hand)
+    inspector = scene_graph.model_inspector()
+    for name in body_names(plant):
+        body = plant.GetBodyByName(name)
+        collisions = plant.GetCollisionGeometriesForBody(body)
+        assert len(collisions) == len(plant.GetVisualGeometriesForBody(body))
+        for geometry in collisions:
+            properties = inspector.GetProximityProperties(geometry)
+            assert not properties.HasGroup("hydroelastic")
+
+
+def built_scene(hand: Hand) -> tuple[MultibodyPlant, SceneGraph, object]:
+    builder = DiagramBuilder()
+    config = MultibodyPlantConfig(time_step=0.01)
+    plant, scene_graph = AddMultibodyPlant(config, builder)
+    make_parser(plant).AddModels(str(hand.sdf_path))
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(hand.palm_link))
+    plant.Finalize()
+    return plant, scene_graph, builder.Build()
+
+
+@pytest.mark.parametrize("spread_deg", [0.0, 11.25, 22.5, 90.0])
+def test_open_fingers_do_not_touch_each_other(hand: Hand, spread_deg: float) -> None:
+    plant, scene_graph, diagram = built_scene(hand)
+    context = diagram.CreateDefaultContext()
+    angles = joint_positions(hand, np.deg2rad(spread_deg), np.zeros(3))
+    for name, angle in angles.items():
+        plant.GetJointByName(name).set_angle(plant.GetMyContextFromRoot(context), angle)
+    query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
+    inspector = scene_graph.model_inspector()
+
+    def link(geometry: object) -> str:
+        return inspector.GetName(inspector.GetFrameId(geometry)).rpartition("::")[2]
+
+    pairs = {
+        tuple(sorted((link(p.id_A), link(p.id_B)))) for p in query.ComputePointPairPenetration()
+    }
+    fingers = {(a.partition("_")[0], b.partition("_")[0]) for a, b in pairs}
+    assert not {(a, b) for a, b in fingers if a != b and "base" not in (a, b)}
+    assert inspector.NumGeometriesWithRole(Role.kProximity) == 28
+
+
+def test_a_hand_of_two_fingers_without_spread_loads(tmp_path: Path) -> None:
+    pincer = load_hand(write_pincer(tmp_path))
+    assert (pincer.name, pincer.num_fingers) == ("pincer", 2)
+    assert pincer.spread.joints == ()
+    np.testing.assert_array_equal(coordinate_limits(pincer), [[0, 0], [-0.1, 1], [0, 1]])
+    # Each finger leans inwards by its own angle about its hinge, 10 mm above the palm frame.
+    X_GF = fingertip_poses(pincer, spread=0.0, closing=[0.2, 0.5])
+    for X, finger, y, angle in zip(X_GF, pincer.fingers, (-0.04, 0.04), (0.2, 0.5), strict=True):
+        inward, (s, c) = -np.sign(y), (np.sin(angle), np.cos(angle))
+        p_GP = X[:3, :3] @ finger.p_FiP + X[:3, 3]
+        expected = [0.0, y + inward * (0.09 * s + 0.01 * c), 0.01 + 0.09 * c - 0.01 * s]
+        np.testing.assert_allclose(p_GP, expected, atol=1e-12)
+    np.testing.assert_allclose(
+        X_GF, drake_fingertip_poses(pincer, 0.0, np.array([0.2, 0.5])), atol=1e-12
+    )
+
+
+def test_a_coupling_that_stops_first_limits_its_finger(tmp_path: Path) -> None:
+    coupled = [{"joint": "right_hinge", "ratio": -2.0}]
+    fingers = changed_finger(coupled=coupled)[:1]
+    pincer = load_hand(write_pincer(tmp_path, fingers=fingers))
+    assert pincer.fingers[0].coupled == (Coupling(joint="right_hinge", ratio=-2.0),)
+    # right_hinge, 0..1, turns by -2 times the closing angle, -0.1..1.
+    np.testing.assert_allclose(coordinate_limits(pincer)[1], [-0.1, 0.0])
+
+
+def test_an_unknown_hand_is_refused_with_the_hands_there_are() -> None:
+    with pytest.raises(
+        HandError, match=r"hand must be one of barrett or a YAML file, got 'shadow'"
+    ):
+        load_hand("shadow")
+
+
+REFUSALS = {
+    "unknown key": ({"colour": "red"}, r"colour: must be a key of a hand file"),
+    "unknown nested key": (
+        {"fingers": changed_finger(nail=1)},
+        r"fingers\.0\.nail: must be a key of a hand file",
+    ),
+    "missing key": ({"palm": {"link": "palm"}}, r"palm\.p_BG: must be given"),
+    "bad type": (
+        {"fingers": changed_finger(torque_limit="strong")},
+        r"fingers\.0\.torque_limit: must be a valid number.*got 'strong'",
+    ),
+    "not positive": ({"closing_speed_deg": 0}, r"closing_speed_deg: must be greater than 0, got 0"),
+    "no fingers": ({"fingers": []}, r"fingers: must .* at least 1 item"),
+    "zero ratio": (
+        {"fingers": changed_finger(coupled=[{"joint": "right_hinge", "ratio": 0}])},
+        r"fingers\.0\.coupled\.0: ratio must not be zero",
+    ),
+    "missing file": ({"model": "gone.sdf"}, r"model: must be an SDFormat file, got '.*gone\.sdf'"),
+    "not a model": ({"model": "pincer_hand.yaml"}, r"model: must be a file of one model"),
+    "missing palm": (
+        {"palm": {"link": "wrist", "p_BG": [0, 0, 0]}},
+        r"palm\.link: must be a link of the model \(palm, .*right\), got 'wrist'",
+    ),
+    "missing link": (
+        {"fingers": changed_finger(fingertip="thumb")},
+        r"fingers\.0\.fingertip: must be a link of the model \(palm, .*right\), got 'thumb'",
+    ),
+    "missing joint": (
+        {"fingers": changed_finger(closing_joint="knee")},
+        r"fingers\.0\.closing_joint: .* \(left_hinge, right_hinge\), got 'knee'",
+    ),
+    "joint driven twice": (
+        {"spread": {"joints": ["left_hinge"]}},
+        r"fingers\.0\.closing_joint: must be a joint that nothing else drives",
+    ),
+    "joint driven by nothing": (
+        {"fingers": changed_finger()[:1]},
+        r"every revolute joint must be driven .* got right_hinge driven by nothing",
+    ),
+    "closing joint elsewhere": (
+        {"fingers": [{**PINCER["fingers"][0], "fingertip": "right"}, PINCER["fingers"][1]]},
+        r"fingers\.0\.closing_joint: must lie between the palm link and the fingertip",
+    ),
+    "palm not inward": (
+        {"palm": {"link": "right", "p_BG": [0, 0, 0]}},
+        r"link 'left' must be joined to the palm link 'right', got a chain that ends at 'palm'",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSALS)
+def test_a_bad_description_is_refused_in_one_line(tmp_path: Path, case: str) -> None:
+    changes, message = REFUSALS[case]
+    with pytest.raises(HandError, match=message) as info:
+        load_hand(write_pincer(tmp_path, **changes))
+    assert "\n" not in str(info.value)
+    assert str(tmp_path / "pincer_hand.yaml") in str(info.value)
+
+
+@pytest.mark.parametrize("text", ["a: [", "- 1", ""])
+def test_text_that_is_no_mapping_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "odd.yaml"
+    path.write_text(text)
+    with pytest.raises(HandError, match=r"odd\.yaml: .*must be"):
+        load_hand(path)
+
+
+def test_a_sliding_joint_is_refused(tmp_path: Path) -> None:
+    path = write_pincer(tmp_path, PINCER_SDF.replace("revolute", "prismatic"))
+    with pytest.raises(HandError, match=r"'left_hinge' must be revolute or fixed, got Prismatic"):
+        load_hand(path)
+
+
+def test_digest_tells_changed_files_of_one_hand_apart(tmp_path: Path) -> None:
+    """YAML, SDFormat and every mesh in it count; a copy elsewhere is the same hand."""
+    for source in MODELS.glob("barrett_*"):
+        shutil.copy(source, tmp_path)
+    copy = tmp_path / "barrett_hand.yaml"
+    assert hand_digest(copy) == hand_digest("barrett")
+    digests = {hand_digest("barrett")}
+    for name in ("barrett_hand.yaml", "barrett_hand.sdf", "barrett_distal.obj"):
+        path = tmp_path / name
+        path.write_text(path.read_text() + ("\n" if name.endswith(".sdf") else "\n# changed\n"))
+        digests.add(hand_digest(copy))
+    assert len(digests) == 4
+    with pytest.raises(HandError, match="hand must be one of barrett"):
+        hand_digest("octopus")

@@ -1,0 +1,81 @@
+"""Paths of fingers: points on the links, moved as forward kinematics moves them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.hands import write_pincer
+
+from drakegrasp.frames import transform_points
+from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.finger_sweep import hand_paths
+from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses, link_poses
+from drakegrasp.hand.shapes import link_shapes
+
+
+@pytest.fixture(scope="module")
+def hand() -> Hand:
+    return load_hand()
+
+
+def test_paths_run_from_the_open_hand_to_the_limit_in_small_steps(hand):
+    paths = hand_paths(hand, 0.2)
+    limits = coordinate_limits(hand)[1:, 1]
+    for path, limit in zip(paths.fingers, limits, strict=True):
+        assert path.angles[0] == 0.0
+        assert path.angles[-1] == pytest.approx(limit)
+        assert path.travel.max() < 0.0015
+        steps = np.linalg.norm(np.diff(path.points, axis=0), axis=2)
+        assert np.all(steps <= path.travel + 1e-7)
+
+
+def test_points_of_a_fingertip_move_with_it(hand):
+    spread, k = 0.3, 120
+    paths = hand_paths(hand, spread)
+    for i, finger in enumerate(hand.fingers):
+        path = paths.fingers[i]
+        closing = np.zeros(hand.num_fingers)
+        closing[i] = path.angles[k]
+        X_GF = fingertip_poses(hand, spread=spread, closing=closing)[i]
+        corners = transform_points(X_GF, np.concatenate(link_shapes(hand)[finger.fingertip]))
+        tips = path.points[k, : path.tip]
+        distance = np.linalg.norm(corners[:, None] - tips, axis=2).min(axis=1)
+        assert distance.max() < 1e-6
+        assert np.all(tips > corners.min(axis=0) - 1e-6)
+        assert np.all(tips < corners.max(axis=0) + 1e-6)
+
+
+def test_link_poses_of_fingertips_are_the_fingertip_poses(hand):
+    closing = np.random.default_rng(0).uniform(0.0, 1.0, (5, hand.num_fingers))
+    spread = np.linspace(0.0, 1.0, 5)
+    tips = fingertip_poses(hand, spread=spread, closing=closing)
+    for i, link in enumerate(hand.fingertip_links):
+        assert np.array_equal(link_poses(hand, link, spread=spread, closing=closing), tips[:, i])
+    still = link_poses(hand, hand.palm_link, spread=spread, closing=closing)
+    assert np.allclose(still @ hand.X_BG, np.eye(4))
+
+
+def test_gap_is_large_for_open_fingers_and_gone_where_they_cross(hand):
+    paths = hand_paths(hand, float(np.deg2rad(22.5)))
+    assert set(paths.gaps) == {(0, 1), (0, 2), (1, 2)}
+    for gap in paths.gaps.values():
+        assert gap[0, 0] > 0.02
+    # Finger 3 closes against the two others when they are closed as far.
+    assert np.diag(paths.gaps[0, 2]).min() < 0.0
+
+
+def test_any_hand_has_paths(tmp_path):
+    """Nothing is made for one hand: a gripper without spread, with a mount that has no shape."""
+    pincer = load_hand(write_pincer(tmp_path))
+    paths = hand_paths(pincer, 0.0)
+    assert len(paths.fingers) == 2
+    assert len(paths.still) > 0
+    assert paths.gaps[0, 1][0, 0] == pytest.approx(0.06, abs=0.003)
+
+
+def test_hand_with_an_unlimited_finger_has_none(tmp_path):
+    from helpers.hands import PINCER_SDF
+
+    free = PINCER_SDF.replace("<limit><lower>0</lower><upper>1</upper></limit>", "")
+    assert free != PINCER_SDF
+    assert hand_paths(load_hand(write_pincer(tmp_path, sdf=free)), 0.0) is None

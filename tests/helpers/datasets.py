@@ -1,0 +1,256 @@
+"""A small dataset of boxes that is sound by construction, and ways to spoil it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import trimesh
+
+from drakegrasp.config import CameraConfig, load_config
+from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.manifest import Manifest, installed_versions, write_manifest
+from drakegrasp.dataset.prepared_objects import PreparedObject, save_prepared
+from drakegrasp.dataset.schema import CAMERAS, LOOK_FIELDS, sizes
+from drakegrasp.dataset.shards import Shard, ShardHeader, trial_columns, write_shard
+from drakegrasp.frames import Array, invert_pose, make_pose, pack_pose, unpack_pose
+from drakegrasp.objects.model import ObjectModel, prepare_object
+from drakegrasp.objects.sources import MeshSource
+from drakegrasp.outcomes import Outcome, Stage
+from drakegrasp.simulation.candidates import Candidates
+from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, image_frame, intrinsics
+
+OTO, OTM, TRIALS = "grasping_oto.hdf5", "grasping_otm.hdf5", "trials.hdf5"
+
+
+BOTH = (OTO, OTM)
+
+
+#: Edges of the objects' boxes [m] and their classes; the last class has one object.
+BOXES = {
+    "1_box_a": ((0.06, 0.05, 0.10), "box"),
+    "2_box_b": ((0.08, 0.04, 0.06), "box"),
+    "3_brick": ((0.05, 0.07, 0.08), "brick"),
+}
+
+
+#: Outcomes of an object's attempts, the same for all objects; three stand-offs a candidate.
+OUTCOMES = [
+    *(Outcome.SUCCESS, Outcome.MISSING_FINGERTIP, Outcome.BELOW_TABLE),
+    *(Outcome.SUCCESS, Outcome.SLIPPED, Outcome.DROPPED),
+    *(Outcome.HAND_CONTACT, Outcome.RAY_MISS, Outcome.START_COLLISION),
+    *(Outcome.TABLE_CONTACT, Outcome.TABLE_CONTACT, Outcome.SUCCESS),
+]
+
+
+#: Rows of /trials whose outcome is known, see OUTCOMES.
+SUCCESS, MISSING, BELOW, SLIPPED, AFTER_LIFT = 0, 1, 2, 4, 10
+
+
+SIZES = sizes(fingers=3, joints=4, image=32)
+
+
+def ray_box(origin: Array, rays: Array, half: Array) -> Array:
+    """Return how far along each ray the box begins, infinity where it is missed."""
+    with np.errstate(divide="ignore"):
+        a, b = (-half - origin) / rays, (half - origin) / rays
+    enter, leave = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
+    return np.where((enter <= leave) & (enter > 0.0), enter, np.inf)
+
+
+def see(
+    model: ObjectModel, X_TO: Array, X_TC: Array, camera: CameraConfig
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return image and mask of a box on the table, exactly at the pixels' centres."""
+    v, u = np.divmod(np.arange(camera.size**2), camera.size)
+    K = intrinsics(camera)
+    rays_C = np.column_stack([u - K[0, 2], v - K[1, 2], np.full(len(u), K[0, 0])]) / K[0, 0]
+    X_OC = invert_pose(X_TO) @ X_TC
+    box = ray_box(X_OC[:3, 3], rays_C @ X_OC[:3, :3].T, model.half_extents)
+    table = ray_box(
+        X_TC[:3, 3] - [0.0, 0.0, -0.05], rays_C @ X_TC[:3, :3].T, np.array([0.8, 0.8, 0.05])
+    )
+    shape = (camera.size, camera.size)
+    image = np.full((4, *shape), 0.5, dtype=np.float32)
+    image[3] = np.clip(np.minimum(box, table), camera.near, camera.far).reshape(shape)
+    mask = (box < np.minimum(table, camera.far)).astype(np.uint8).reshape(shape)
+    return image, mask
+
+
+def contacts(model: ObjectModel, touching: np.ndarray) -> dict[str, Any]:
+    """Return contacts of three fingertips in the middle of three sides."""
+    x, y, _ = model.half_extents
+    n = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0]])
+    gone = ~touching[:, None]
+    return {
+        "touching": touching,
+        "p_OQ": np.where(gone, np.nan, n * [[x], [x], [y]]),
+        "nhat_Q_O": np.where(gone, np.nan, n),
+        "f_Q_O": np.where(gone, 0.0, -10.0 * n),
+        "area": np.where(touching, 1e-5, 0.0),
+        "penetration": np.where(touching, 1e-4, 0.0),
+        "q": np.full(4, 0.5),
+    }
+
+
+def trial_row(model: ObjectModel, number: int, X_TO: Array) -> dict[str, Any]:
+    """Return what `/trials` says of an attempt, by its number among the object's."""
+    outcome = OUTCOMES[number]
+    # The palm is above the box, turned about the vertical and tilted.
+    yaw, tilt, height = 0.5 * number, 0.25, 0.10 + model.half_extents[2]
+    R_OG = (
+        trimesh.transformations.rotation_matrix(yaw, [0, 0, 1])
+        @ trimesh.transformations.rotation_matrix(np.pi + tilt, [1, 0, 0])
+    )[:3, :3]
+    row: dict[str, Any] = {
+        "candidate": number // 3,
+        "standoff_index": number % 3,
+        "spread": 0.1,
+        "seed": 7,
+        "outcome": outcome,
+        "X_TO": pack_pose(X_TO),
+        "X_OG": pack_pose(make_pose(R_OG, -height * R_OG[:, 2])),
+    }
+    after_lift = number == AFTER_LIFT
+    stage = Stage.LIFTED if after_lift else outcome.stage
+    touch = np.array([True, True, outcome is not Outcome.MISSING_FINGERTIP])
+    if stage >= Stage.CLOSED:
+        row |= {f"closed_{k}": v for k, v in contacts(model, touch).items()}
+        row |= {"time_close": 1.0, "closed_other_links": outcome is Outcome.HAND_CONTACT}
+        row["closed_hand_on_table"] = outcome is Outcome.TABLE_CONTACT and not after_lift
+        row["closed_object_on_table"] = True
+    if stage >= Stage.LIFTED:
+        touch = touch & (outcome is not Outcome.DROPPED)
+        touch[0] &= outcome is not Outcome.SLIPPED
+        row |= {f"lifted_{k}": v for k, v in contacts(model, touch).items()}
+        row |= {"time_lift": 1.0, "lifted_object_on_table": after_lift, "slip": 0.0}
+        row |= {"slip_angle": 0.0, "surface_distance": np.zeros(3), "X_TO_lifted": pack_pose(X_TO)}
+    return row
+
+
+def make_shard(model: ObjectModel, header: ShardHeader, X_TO: Array, camera: CameraConfig) -> Shard:
+    numbers = range(3 * header.start, 3 * header.stop)
+    rows = [trial_row(model, number, X_TO) for number in numbers]
+    trials = {f.name: f.empty(len(rows), SIZES) for f in trial_columns()}
+    for i, row in enumerate(rows):
+        for name, value in row.items():
+            trials[name][i] = value
+    hits = [i for i, row in enumerate(rows) if row["outcome"] is Outcome.SUCCESS]
+    looks = {f.name: f.empty(len(hits), SIZES) for f in LOOK_FIELDS}
+    for k, i in enumerate(hits):
+        looks["row"][k] = i
+        X_TG = X_TO @ unpack_pose(trials["X_OG"][i])
+        for name, pose in zip(CAMERAS, (camera_pose_oto, camera_pose_otm), strict=True):
+            X_TC = pose(X_TG, camera)
+            image, mask = see(model, X_TO, X_TC, camera)
+            looks[f"image_{name}"][k], looks[f"mask_{name}"][k] = image, mask
+            looks[f"X_TC_{name}"][k] = pack_pose(X_TC)
+        looks["X_CI_otm"][k] = pack_pose(image_frame(intrinsics(camera), mask, image[3]))
+    return Shard(header=header, trials=trials, looks=looks)
+
+
+def resting(model: ObjectModel, X_TO: Array) -> PreparedObject:
+    """An object on the table, with four palm poses that nobody looks at."""
+    candidates = Candidates(
+        X_OG=np.tile(np.eye(4), (4, 1, 1)),
+        distance=np.full(4, np.nan),
+        combinations=4,
+        valid=4,
+        distinct=4,
+    )
+    return PreparedObject(
+        model=model, X_TO=X_TO, candidates=candidates, table_force=9.81, stopped=False
+    )
+
+
+def make_dataset(out: Path, meshes: Path, *overrides: str) -> Path:
+    config = load_config(
+        overrides=[
+            "camera.size=32",
+            "unit_candidates=2",
+            "filters.min_depth_variance=0",
+            "split.valid_fraction=0.34",
+            *overrides,
+        ]
+    )
+    models, entries = [], []
+    (out / "objects").mkdir(parents=True)
+    for name, (extents, class_name) in BOXES.items():
+        path = meshes / f"{name}.stl"
+        trimesh.creation.box(extents).export(path)
+        model = prepare_object(MeshSource(name=name, class_name=class_name, path=path))
+        X_TO = make_pose(np.eye(3), [0.0, 0.0, model.half_extents[2]])
+        save_prepared(resting(model, X_TO), out, config)
+        numbers = {"candidates": 4, "combinations": 4, "valid": 4, "distinct": 4}
+        entry = {"name": name, "class": class_name, "mesh_sha256": model.mesh_sha256}
+        entries.append({**entry, **numbers, "X_TO": pack_pose(X_TO).tolist()})
+        models.append((model, X_TO))
+    manifest = Manifest(config=config, objects=tuple(entries), versions=installed_versions(config))
+    write_manifest(manifest, out)
+    by_name = {model.name: (model, X_TO) for model, X_TO in models}
+    for header in manifest.headers():
+        model, X_TO = by_name[header.object_name]
+        write_shard(out, make_shard(model, header, X_TO, config.camera))
+    assemble(out)
+    return out
+
+
+Edit = Callable[[np.ndarray], Any]
+
+
+def change(out: Path, name: str, place: str, row: int, edit: Edit) -> None:
+    """Replace a row of a dataset by what `edit` makes of it; no edit in place."""
+    with h5py.File(out / name, "r+") as file:
+        values = file[place][row]
+        file[place][row] = edit(np.array(values) if not isinstance(values, bytes) else values)
+
+
+def set_at(*index: int | slice, to: Any) -> Edit:
+    def edit(values: np.ndarray) -> np.ndarray:
+        values[index] = to
+        return values
+
+    return edit
+
+
+def moved(*by: float) -> Edit:
+    """Move a packed pose by a vector."""
+
+    def edit(values: np.ndarray) -> np.ndarray:
+        values[[3, 7, 11]] += by
+        return values
+
+    return edit
+
+
+def turned(angle: float, axis: list[float]) -> Edit:
+    """Turn a packed pose about an axis of its own."""
+    turn = trimesh.transformations.rotation_matrix(angle, axis)
+    return lambda values: pack_pose(unpack_pose(values) @ turn)
+
+
+def mirrored(values: np.ndarray) -> np.ndarray:
+    return pack_pose(unpack_pose(values) @ np.diag([1.0, 1.0, -1.0, 1.0]))
+
+
+def found(path: Path) -> set[tuple[str, str, int | None, str]]:
+    return {(v.file, v.group, v.row, v.what) for v in check_dataset(path)}
+
+
+def must_find(path: Path, *expected: tuple[str, str, int | None, str]) -> None:
+    """Require exactly these violations: file, group, row, and how the text begins."""
+    hits = found(path)
+    missing = [
+        e for e in expected if not any(h[:3] == e[:3] and h[3].startswith(e[3]) for h in hits)
+    ]
+    extra = [h for h in hits if not any(h[:3] == e[:3] and h[3].startswith(e[3]) for e in expected)]
+    assert not missing and not extra, f"missing {missing}, extra {extra}"
+
+
+def edit_file(path: Path, edit: Callable[[h5py.File], Any]) -> None:
+    with h5py.File(path, "r+") as file:
+        edit(file)

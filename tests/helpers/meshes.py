@@ -1,0 +1,67 @@
+"""Meshes as files, and boxes with faults."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from drakegrasp.config import ObjectConfig
+from drakegrasp.objects.model import ObjectModel, prepare_object
+from drakegrasp.objects.sources import MeshSource
+
+G3DB = Path(__file__).resolve().parents[3] / "shared/meshes/g3db"
+
+
+needs_g3db = pytest.mark.skipif(not G3DB.is_dir(), reason="the G3DB meshes are not here")
+
+
+BOX = (0.06, 0.10, 0.04)
+
+
+def write(path: Path, *meshes: trimesh.Trimesh) -> Path:
+    """Write meshes as one Wavefront file, exactly and without repair."""
+    lines, offset = [], 1
+    for mesh in meshes:
+        lines += ["v {!r} {!r} {!r}".format(*row) for row in mesh.vertices.tolist()]
+        lines += ["f {} {} {}".format(*row) for row in (mesh.faces + offset).tolist()]
+        offset += len(mesh.vertices)
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def prepare(path: Path, scale: float = 1.0, **options: float) -> ObjectModel:
+    source = MeshSource(name=path.stem, class_name="thing", path=path, scale=scale)
+    return prepare_object(source, ObjectConfig(**options))
+
+
+def box(extents=BOX, at=(0.0, 0.0, 0.0)) -> trimesh.Trimesh:
+    mesh = trimesh.creation.box(extents)
+    return trimesh.Trimesh(mesh.vertices + np.asarray(at), mesh.faces, process=False)
+
+
+def without_faces(mesh: trimesh.Trimesh, keep: np.ndarray) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices, mesh.faces[keep], process=False)
+
+
+def flipped(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1], process=False)
+
+
+def open_box() -> trimesh.Trimesh:
+    mesh = box()
+    return without_faces(mesh, mesh.face_normals[:, 2] < 0.5)
+
+
+def box_inertia(m: float, x: float, y: float, z: float) -> np.ndarray:
+    return np.diag([y * y + z * z, x * x + z * z, x * x + y * y]) * m / 12.0
+
+
+def assert_sound(model: ObjectModel) -> None:
+    for mesh in (model.visual, model.collision):
+        assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0.0
+    low, high = model.visual_vertices.min(axis=0), model.visual_vertices.max(axis=0)
+    np.testing.assert_allclose(low + high, 0.0, atol=1e-12)
+    np.testing.assert_allclose(model.half_extents, high, atol=1e-12)

@@ -1,0 +1,48 @@
+"""Simple objects and attempts that several test modules simulate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+
+from drakegrasp.frames import make_pose
+from drakegrasp.objects.model import ObjectModel, prepare_object
+from drakegrasp.objects.sources import MeshSource
+from drakegrasp.simulation.candidates import R_OG0, Attempt
+
+#: Edge of the cube that the hand can grasp from above [m].
+CUBE = 0.07
+
+
+def model_of(mesh: trimesh.Trimesh, folder: Path, name: str = "1_thing_a") -> ObjectModel:
+    """Return a mesh [m] as a prepared object of 1 kg."""
+    path = folder / f"{name}.obj"
+    mesh.export(path)
+    return prepare_object(MeshSource(name=name, class_name="thing", path=path))
+
+
+def box_model(folder: Path, extents: npt.ArrayLike, name: str = "1_box_a") -> ObjectModel:
+    """Return a box with edges of a few millimetres less than a fingertip."""
+    mesh = trimesh.creation.box(extents)
+    return model_of(mesh.subdivide().subdivide(), folder, name)
+
+
+def standing(model: ObjectModel) -> npt.NDArray[np.float64]:
+    """Return X_TO of an object that stands on the table as its mesh file has it."""
+    return make_pose(np.eye(3), [0.0, 0.0, float(model.half_extents[2])])
+
+
+def from_above(model: ObjectModel, standoff: float, *, spread: float = 0.0) -> Attempt:
+    """Return an attempt with the palm over the object's top, looking down on its middle."""
+    return Attempt(
+        candidate=0,
+        standoff_index=0,
+        standoff=standoff,
+        spread=spread,
+        X_OG=make_pose(R_OG0, [0.0, 0.0, float(model.half_extents[2]) + standoff]),
+        ray_hits=True,
+        seed=0,
+    )

@@ -1,0 +1,39 @@
+"""A shard of random values."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.dataset.schema import LOOK_FIELDS, Field, sizes
+from drakegrasp.dataset.shards import Shard, ShardHeader, trial_columns
+
+SIZES = sizes(fingers=3, joints=8, image=8)
+
+
+HEADER = ShardHeader(
+    config_hash="0123456789abcdef",
+    mesh_sha256="f" * 64,
+    object_name="24_mug_final",
+    start=50,
+    stop=100,
+)
+
+
+def column(field: Field, count: int, rng: np.random.Generator) -> npt.NDArray[Any]:
+    """Return rows of random bytes of a field's type: every NaN, infinity and denormal, too."""
+    shape, dtype = (count, *field.row_shape(SIZES)), np.dtype(field.dtype)
+    if dtype.kind == "b":
+        return rng.integers(0, 2, shape).astype(bool)
+    return np.frombuffer(rng.bytes(dtype.itemsize * int(np.prod(shape))), dtype).reshape(shape)
+
+
+def some_shard(*, trials: int = 12, looks: int = 3, seed: int = 0) -> Shard:
+    rng = np.random.default_rng(seed)
+    return Shard(
+        header=HEADER,
+        trials={f.name: column(f, trials, rng) for f in trial_columns()},
+        looks={f.name: column(f, looks, rng) for f in LOOK_FIELDS},
+    )

@@ -1,0 +1,35 @@
+"""Decimation keeps the solid."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from helpers.meshes import assert_sound, prepare, write
+
+from drakegrasp.errors import MeshError
+from drakegrasp.mesh.decimation import decimate
+from drakegrasp.mesh.surfaces import Solid, is_solid_surface
+
+
+def test_decimation_keeps_the_solid(tmp_path):
+    ring = trimesh.creation.torus(0.05, 0.02, major_sections=100, minor_sections=50)
+    model = prepare(write(tmp_path / "ring.obj", ring), max_collision_faces=2000)
+    assert_sound(model)
+    assert len(model.visual_faces) == 10_000 and len(model.collision_faces) <= 2000
+    assert 0.0 < model.collision_error < 5e-4
+    assert model.collision.euler_number == 0
+    assert model.collision.volume == pytest.approx(model.volume, rel=0.01)
+    again = prepare(tmp_path / "ring.obj", max_collision_faces=2000)
+    np.testing.assert_array_equal(again.collision_vertices, model.collision_vertices)
+
+
+def test_decimation_falls_back(tmp_path, monkeypatch):
+    ball = trimesh.creation.icosphere(4, radius=0.05)
+    solid = Solid(vertices=np.array(ball.vertices), faces=np.array(ball.faces, dtype=np.int64))
+    monkeypatch.setattr("drakegrasp.mesh.decimation._decimate_quadric", lambda *_: None)
+    reduced, error = decimate(solid, 1000)
+    assert is_solid_surface(reduced.faces) and len(reduced.faces) <= 1000 and 0.0 < error < 1e-3
+    monkeypatch.setattr("drakegrasp.mesh.decimation._simplify_manifold", lambda *_: None)
+    with pytest.raises(MeshError, match="at most 1000 faces"):
+        decimate(solid, 1000)

@@ -1,0 +1,91 @@
+"""Models of objects: closed forms of their mass properties, and what is saved of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from helpers.meshes import BOX, assert_sound, box, box_inertia, open_box, prepare, write
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drakegrasp.errors import MeshError
+from drakegrasp.objects.model import load_object, save_object
+
+
+def test_box_has_the_closed_form(tmp_path):
+    model = prepare(write(tmp_path / "a.obj", box(at=(1.0, 2.0, 3.0))), mass=0.7)
+    assert_sound(model)
+    assert model.mass == 0.7 and model.notes == () and model.collision_error == 0.0
+    assert model.volume == pytest.approx(np.prod(BOX), rel=1e-9)
+    np.testing.assert_allclose(model.p_OOcm, 0.0, atol=1e-12)
+    np.testing.assert_allclose(model.I_OOcm_O, box_inertia(0.7, *BOX), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(model.half_extents, np.array(BOX) / 2.0, rtol=1e-9)
+
+
+def test_sphere_and_cylinder_approach_the_closed_form(tmp_path):
+    ball = prepare(write(tmp_path / "b.obj", trimesh.creation.icosphere(4, radius=0.04)))
+    np.testing.assert_allclose(ball.I_OOcm_O, np.eye(3) * 0.4 * 0.04**2, rtol=5e-3, atol=1e-10)
+    tin = trimesh.creation.cylinder(radius=0.03, height=0.12, sections=256)
+    tin = prepare(write(tmp_path / "c.obj", tin))
+    side = (3 * 0.03**2 + 0.12**2) / 12.0
+    expected = np.diag([side, side, 0.03**2 / 2.0])
+    np.testing.assert_allclose(tin.I_OOcm_O, expected, rtol=1e-3, atol=1e-9)
+
+
+def test_centre_of_mass_of_a_cone_is_a_quarter_up(tmp_path):
+    cone = trimesh.creation.cone(radius=0.03, height=0.1, sections=128)
+    model = prepare(write(tmp_path / "cone.obj", cone))
+    np.testing.assert_allclose(model.p_OOcm, [0.0, 0.0, -0.025], atol=1e-6)
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    sides=st.tuples(*[st.floats(0.01, 0.3)] * 3),
+    shift=st.tuples(*[st.floats(-5.0, 5.0)] * 3),
+    unit=st.sampled_from([1.0, 0.01, 0.001]),
+)
+def test_place_and_unit_of_the_file_do_not_matter(tmp_path_factory, sides, shift, unit):
+    folder = tmp_path_factory.mktemp("any")
+    wedge = trimesh.convex.convex_hull(np.vstack((np.zeros(3), np.diag(sides), sides)))
+    moved = trimesh.Trimesh((wedge.vertices + shift) / unit, wedge.faces, process=False)
+    plain, other = (
+        prepare(write(folder / "plain.obj", wedge)),
+        prepare(write(folder / "moved.obj", moved), unit),
+    )
+    assert_sound(other)
+    np.testing.assert_allclose(other.p_OOcm, plain.p_OOcm, atol=1e-9)
+    np.testing.assert_allclose(other.I_OOcm_O, plain.I_OOcm_O, rtol=1e-6, atol=1e-10)
+    np.testing.assert_allclose(other.half_extents, np.array(sides) / 2.0, rtol=1e-6)
+    moments = np.linalg.eigvalsh(other.I_OOcm_O)
+    assert moments[0] > 0.0 and moments[0] + moments[1] >= moments[2]
+
+
+def test_save_and_load_keep_every_bit(tmp_path):
+    model = prepare(write(tmp_path / "é b.obj", open_box()))
+    first, second = tmp_path / "x.object", tmp_path / "y.npz"
+    save_object(model, first)
+    save_object(model, second)
+    assert first.read_bytes() == second.read_bytes()
+    loaded = load_object(first)
+    for key, value in vars(model).items():
+        assert type(getattr(loaded, key)) is type(value)
+        np.testing.assert_array_equal(getattr(loaded, key), value)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["x.object", "y.npz", "é b.obj"]
+    first.write_bytes(first.read_bytes()[:200])
+    with pytest.raises(MeshError, match=r"x\.object: must be an object file"):
+        load_object(first)
+    with pytest.raises(MeshError, match=r"gone: must be an object file"):
+        load_object(tmp_path / "gone")
+
+
+def test_model_is_read_only_and_knows_its_source(tmp_path):
+    path = write(tmp_path / "a.obj", box())
+    model = prepare(path)
+    for array in (model.visual_vertices, model.collision_faces, model.p_OOcm, model.I_OOcm_O):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0
+    assert model.visual_faces.dtype == np.int32 and model.visual_vertices.dtype == np.float64
+    assert model.visual is model.visual
+    digests = {model.mesh_sha256, prepare(path, 0.5).mesh_sha256, prepare(path).mesh_sha256}
+    assert len(digests) == 2

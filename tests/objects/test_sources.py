@@ -1,0 +1,128 @@
+"""Directories of meshes: names, classes, units, `objects.yaml`."""
+
+from __future__ import annotations
+
+import pytest
+from helpers.meshes import G3DB, assert_sound, box, needs_g3db, write
+
+from drakegrasp.errors import MeshError
+from drakegrasp.objects.model import prepare_object
+from drakegrasp.objects.sources import find_mesh, find_meshes
+
+
+@pytest.mark.parametrize(
+    ("stem", "class_name"),
+    [
+        ("24_mug_final", "mug"),
+        ("1_mug_small", "mug"),
+        ("1_mug", "mug"),
+        ("30_fruit_juicer_final", "fruit_juicer"),
+        ("41_jar_and_lid_final", "jar_and_lid"),
+        ("1_Coffeecup_final", "Coffeecup"),
+        ("mug", "mug"),
+        ("mug_final", "mug_final"),
+        ("24", "24"),
+        ("24_", "24_"),
+        ("2 große Tasse", "2 große Tasse"),
+        ("7_тарелка_a", "тарелка"),
+    ],
+)
+def test_class_comes_from_the_name(tmp_path, stem, class_name):
+    write(tmp_path / f"{stem}.obj", box())
+    (source,) = find_meshes(tmp_path)
+    assert (source.name, source.class_name, source.scale) == (stem, class_name, 1.0)
+    assert prepare_object(source).name == stem
+
+
+def test_sources_are_sorted_and_shallow(tmp_path):
+    for name in ("b.OBJ", "a.stl", "c.Ply", ".hidden.obj", "notes.txt"):
+        (tmp_path / name).write_text("x")
+    (tmp_path / "deep.obj").mkdir()
+    write(tmp_path / "deep.obj" / "d.obj", box())
+    assert [source.name for source in find_meshes(tmp_path)] == ["a", "b", "c"]
+
+
+def test_units_and_manifest_precedence(tmp_path):
+    for name in ("1_mug_x", "2_cup_x", "é"):
+        write(tmp_path / f"{name}.obj", box())
+    assert {s.scale for s in find_meshes(tmp_path, units="mm")} == {0.001}
+    (tmp_path / "objects.yaml").write_text(
+        "units: cm\nobjects:\n  1_mug_x: {units: m, class: pot}\n"
+    )
+    found = {s.name: s for s in find_meshes(tmp_path, units="mm")}
+    assert found["1_mug_x"].scale == 1.0 and found["1_mug_x"].class_name == "pot"
+    assert found["2_cup_x"].scale == 0.01 and found["2_cup_x"].class_name == "cup"
+    other = tmp_path / "other.yml"
+    # The e with its accent as two characters, as some file systems spell it.
+    other.write_text("objects: {é: {name: zebra}, 2_cup_x: {units: cm}}\n", encoding="utf-8")
+    found = {s.name: s for s in find_meshes(tmp_path, units="mm", manifest=other)}
+    assert set(found) == {"1_mug_x", "2_cup_x", "zebra"}
+    assert found["zebra"].scale == 0.001 and found["2_cup_x"].scale == 0.01
+    other.write_text("")
+    assert len(find_meshes(tmp_path, manifest=other)) == 3
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("units: inch", r"units: .*'m', 'cm' or 'mm'.*got 'inch'"),
+        ("unit: cm", r"unit: .*legal keys: units, objects"),
+        ("objects: {a: {unit: cm}}", r"objects\.a\.unit: .*legal keys: units, class, name"),
+        ("objects: {b: {units: cm}}", r"must be names of meshes in .*: a; got b"),
+        ("objects: {a: {name: ''}}", "name must be printable"),
+        ("objects: {a: {name: x/y}}", "without slashes"),
+        ("- a", "the file: "),
+        ("units: [", "readable YAML"),
+    ],
+)
+def test_wrong_manifest_is_refused(tmp_path, text, message):
+    write(tmp_path / "a.obj", box())
+    (tmp_path / "objects.yaml").write_text(text)
+    with pytest.raises(MeshError, match=message) as caught:
+        find_meshes(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_wrong_directories_are_refused(tmp_path):
+    with pytest.raises(MeshError, match=r"at least one mesh \(\.obj"):
+        find_meshes(tmp_path)
+    with pytest.raises(MeshError, match="must be a directory of meshes"):
+        find_meshes(tmp_path / "gone")
+    for name in ("mug.obj", "mug.stl", "b.obj"):
+        write(tmp_path / name, box())
+    with pytest.raises(MeshError, match=r"unique, got 'mug' for mug\.obj, mug\.stl"):
+        find_meshes(tmp_path)
+    with pytest.raises(MeshError, match="--units must be one of m, cm, mm, got 'inch'"):
+        find_meshes(tmp_path, units="inch")
+    (tmp_path / "mug.stl").unlink()
+    (tmp_path / "objects.yaml").write_text("objects: {mug: {name: b}}")
+    with pytest.raises(MeshError, match=r"unique, got 'b' for b\.obj, mug\.obj"):
+        find_meshes(tmp_path)
+    with pytest.raises(MeshError, match=r"gone\.yaml: must be a readable YAML"):
+        find_meshes(tmp_path, manifest=tmp_path / "gone.yaml")
+
+
+def test_one_mesh_is_found_whatever_lies_beside_it(tmp_path):
+    for name in ("1_mug_a.obj", "1_mug_a.stl", "b.obj"):
+        write(tmp_path / name, box())
+    (tmp_path / "objects.yaml").write_text("objects: {1_mug_a: {units: cm}, gone: {units: m}}")
+    source = find_mesh(tmp_path / "1_mug_a.obj", units="mm")
+    assert (source.name, source.class_name, source.scale) == ("1_mug_a", "mug", 0.01)
+    assert find_mesh(tmp_path / "b.obj", units="mm").scale == 0.001
+    (tmp_path / "a.txt").write_text("")
+    for name, got in (("a.txt", "'.txt'"), ("gone.obj", "none")):
+        with pytest.raises(MeshError, match=rf"{name}: must be a mesh file .*, got {got}"):
+            find_mesh(tmp_path / name)
+    with pytest.raises(MeshError, match="--units must be one of m, cm, mm, got 'inch'"):
+        find_mesh(tmp_path / "b.obj", units="inch")
+
+
+@needs_g3db
+def test_boots_are_in_metres(tmp_path):
+    (source,) = (s for s in find_meshes(G3DB, units="cm") if "boots" in s.name)
+    with pytest.raises(MeshError, match=r"95_boots_final\.obj: .*--units .*objects\.yaml"):
+        prepare_object(source)
+    manifest = tmp_path / "objects.yaml"
+    manifest.write_text("units: cm\nobjects: {95_boots_final: {units: m}}\n")
+    (source,) = (s for s in find_meshes(G3DB, manifest=manifest) if "boots" in s.name)
+    assert_sound(prepare_object(source))

@@ -1,0 +1,188 @@
+"""A death has a name: what ends a process is found, and nothing innocent is."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drakegrasp.runtime.journal import (
+    GIVE_UP_DEATHS,
+    NATIVE_DEATHS,
+    NO_JOURNAL,
+    SILENT_DEATHS,
+    Verdict,
+    _History,
+    open_journal,
+)
+
+UNIT = {"name": "mug", "start": 0, "stop": 10}
+#: A unit of ten steps, as its own process; every argument is a fault, KIND:STEP.
+RUN = """
+import sys, time
+from pathlib import Path
+from drakegrasp.runtime.fault_injection import _do
+from drakegrasp.runtime.journal import open_journal
+
+faults = dict(reversed(argument.split(":")) for argument in sys.argv[2:])
+with open_journal(Path(sys.argv[1]), {"name": "mug", "start": 0, "stop": 10}) as journal:
+    steps = [f"try {i}" for i in range(10)]
+    for step in sorted(steps, key=lambda step: step not in journal.suspects):
+        verdict = journal.verdict(step)
+        if verdict is not None:
+            print(step, verdict.name, flush=True)
+            continue
+        with journal.step(step, 0.5):
+            print(step, "runs", flush=True)
+            if step in faults:
+                _do(faults[step])
+"""
+
+
+def run(journal: Path, *faults: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", RUN, journal, *faults], capture_output=True, text=True, timeout=60
+    )
+
+
+def deaths_until_done(journal: Path, *faults: str) -> tuple[int, list[str]]:
+    """Run a unit until it comes to its end; return how often it died, and its last lines."""
+    for deaths in range(30):
+        result = run(journal, *faults)
+        if result.returncode == 0:
+            return deaths, result.stdout.splitlines()
+    raise AssertionError("the unit must come to its end")
+
+
+@pytest.mark.parametrize(
+    ("kind", "deaths", "verdict"),
+    [
+        ("crash", NATIVE_DEATHS, Verdict.CRASHED),
+        ("abort", NATIVE_DEATHS, Verdict.CRASHED),
+        ("exit", SILENT_DEATHS, Verdict.VANISHED),
+        ("memory", SILENT_DEATHS, Verdict.VANISHED),
+        ("hang", 1, Verdict.HUNG),
+        ("freeze", 1, Verdict.HUNG),
+    ],
+)
+def test_guilty_step_is_found_and_the_others_run(
+    tmp_path: Path, kind: str, deaths: int, verdict: Verdict
+) -> None:
+    found, lines = deaths_until_done(tmp_path / "journal", f"{kind}:try 4")
+    assert found == deaths
+    assert [line for line in lines if not line.endswith("runs")] == [f"try 4 {verdict.name}"]
+    assert sorted(line.split()[1] for line in lines) == [str(i) for i in range(10)]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_several_guilty_steps_are_found_one_by_one(tmp_path: Path) -> None:
+    found, lines = deaths_until_done(
+        tmp_path / "journal", "crash:try 0", "hang:try 3", "crash:try 9"
+    )
+    assert found == 2 * NATIVE_DEATHS + 1
+    guilty = [line for line in lines if not line.endswith("runs")]
+    assert guilty == ["try 0 CRASHED", "try 3 HUNG", "try 9 CRASHED"]
+
+
+def test_suspect_runs_first_and_is_cleared_by_passing(tmp_path: Path) -> None:
+    journal = tmp_path / "journal"
+    run(journal, "crash:try 4")
+    result = run(journal, "crash:try 7")
+    assert result.stdout.splitlines()[0] == "try 4 runs"
+    # One more crash there is again the first of its kind.
+    run(journal, "crash:try 4")
+    assert "try 4 runs" in run(journal).stdout
+
+
+def test_hang_costs_its_limit(tmp_path: Path) -> None:
+    start = time.monotonic()
+    run(tmp_path / "journal", "freeze:try 4")
+    assert 0.5 < time.monotonic() - start < 10.0
+
+
+def test_journal_says_where_it_died(tmp_path: Path) -> None:
+    run(tmp_path / "journal", "crash:try 4")
+    head, record, *trace = (tmp_path / "journal").read_text().splitlines()
+    assert json.loads(head)["unit"] == UNIT
+    assert record.split(maxsplit=1)[1].strip() == "try 4"
+    assert trace[0] == "Fatal Python error: Segmentation fault"
+
+
+@pytest.mark.parametrize(
+    "content", ["", "no journal", '{"unit": 3}\n', '{"deaths": {}}\nhello', "\x00" * 600]
+)
+def test_what_is_no_journal_is_ignored(tmp_path: Path, content: str) -> None:
+    (tmp_path / "journal").write_text(content)
+    assert deaths_until_done(tmp_path / "journal")[0] == 0
+
+
+def test_journal_of_another_unit_is_ignored(tmp_path: Path) -> None:
+    path = tmp_path / "journal"
+    for _ in range(NATIVE_DEATHS):
+        run(path, "crash:try 4")
+    with open_journal(path, {**UNIT, "name": "cup"}) as journal:
+        assert journal.verdict("try 4") is None
+        assert journal.suspects == []
+
+
+def test_unit_that_another_process_is_at_is_not_a_dead_one(tmp_path: Path) -> None:
+    with open_journal(tmp_path / "journal", UNIT) as first:
+        assert first is not NO_JOURNAL
+        with open_journal(tmp_path / "journal", UNIT) as second:
+            assert second is NO_JOURNAL
+        assert (tmp_path / "journal").exists()
+
+
+def test_error_of_a_unit_leaves_no_journal(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="wrong"), open_journal(tmp_path / "journal", UNIT):
+        raise ValueError("wrong")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_kill_leaves_a_journal_without_a_mark(tmp_path: Path) -> None:
+    path = tmp_path / "journal"
+    process = subprocess.Popen(
+        [sys.executable, "-c", RUN.replace("0.5", "60"), path, "hang:try 4"], stdout=subprocess.PIPE
+    )
+    assert process.stdout is not None
+    while b"try 4" not in process.stdout.readline():
+        pass
+    process.kill()
+    process.communicate()
+    with open_journal(path, UNIT) as journal:
+        assert journal.suspects == ["try 4"]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_random_kills_convict_nobody(seed: int) -> None:
+    """Two hundred kills at random moments, and every attempt still has its turn."""
+    rng = np.random.default_rng(seed)
+    lengths = rng.gamma(0.5, 1.0, 30)  # a few long attempts have most of the time
+    history = _History()
+    for _ in range(200):
+        order = sorted(range(30), key=lambda i: f"try {i}" not in history.suspects())
+        ends = np.cumsum(lengths[order])
+        moment = rng.exponential(2.0 * lengths.sum())
+        if moment > ends[-1]:
+            history = _History()  # the unit was done; the next begins
+            continue
+        at = int(np.searchsorted(ends, moment))
+        suspects = history.suspects()
+        done = {f"try {i}" for i in order[:at]}
+        passed = sum(1 << k for k, step in enumerate(suspects) if step in done)
+        history.add(f"try {order[at]}", passed, b"")
+        assert not any(history.verdict(step) for step in history.deaths)
+
+
+def test_unit_that_dies_for_nothing_is_given_up(tmp_path: Path) -> None:
+    """As when there is not even the memory to build its scene: no attempt is guilty."""
+    history = _History()
+    for _ in range(GIVE_UP_DEATHS):
+        history.add("build", 0, b"")
+        assert history.verdict("build") is None
+    assert history.futile == GIVE_UP_DEATHS

@@ -1,0 +1,520 @@
+"""Palm poses: the paper's counts, proved by other means, and draws that repeat themselves."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.spatial import cKDTree
+
+from drakegrasp.config import CandidateConfig, load_config
+from drakegrasp.frames import Array, make_pose
+from drakegrasp.objects.model import ObjectModel, prepare_object
+from drakegrasp.objects.sources import MeshSource
+from drakegrasp.seeding import Stream, object_key
+from drakegrasp.simulation.candidates import (
+    Attempt,
+    Candidates,
+    make_attempts,
+    normal_candidates,
+    palm_ray_distance,
+    ray_meets_box,
+    rotation_candidates,
+    sample_candidates,
+)
+
+#: Full extents of three of the paper's meshes [m]; their files are in centimetres. Counts
+#: of valid and of distinct poses, and the distinct ones of an earlier reference that took
+#: two signs of a half turn's quaternion for two poses.
+BOXES = {
+    "24_mug": ((0.09347607, 0.09348067, 0.14255742), 122_272, 29_992, 30_144),
+    "104_toaster": ((0.1324396, 0.2934922, 0.17027119), 98_688, 25_432, 25_538),
+    "39_beerbottle": ((0.05897712, 0.05885956, 0.23366707), 75_776, 16_296, 16_465),
+}
+
+#: A few hundred poses instead of ten thousand.
+COARSE = CandidateConfig(
+    global_x_deg=(0, 60, 120),
+    global_y_deg=(0, 90, 180, 270),
+    global_z_deg=(0, 45),
+    local_x_deg=(0, 20, 160, 180),
+    local_y_deg=(0, 20, 180, 340),
+    local_z_deg=(0, 45, 180),
+)
+
+
+class Reference(NamedTuple):
+    """Our poses of a box beside all valid ones, found by brute force."""
+
+    name: str
+    half: Array
+    poses: Array
+    combinations: int
+    valid: int
+    every_valid: Array
+
+
+def stream() -> Stream:
+    return Stream(0)
+
+
+def standing(half: Array) -> Array:
+    """Return X_TO of a box that stands on the table unturned."""
+    return make_pose(np.eye(3), [0.0, 0.0, half[2]])
+
+
+def euler(angles_deg: list[tuple[int, ...]]) -> Array:
+    """Return Rx Ry Rz (n, 3, 3) from sines and cosines, apart from the implementation's SciPy."""
+    (cx, cy, cz), (sx, sy, sz) = (f(np.deg2rad(angles_deg)).T for f in (np.cos, np.sin))
+    rows = [
+        [cy * cz, -cy * sz, sy],
+        [cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy],
+        [sx * sz - cx * sy * cz, sx * cz + cx * sy * sz, cx * cy],
+    ]
+    return np.moveaxis(np.array(rows), 2, 0)
+
+
+def line_meets_box(p: Array, z: Array, half: Array) -> Array:
+    """Return whether lines pass a box, by the separating axes of a line and a box.
+
+    The axes are z x e_i: there is no division and no slab.
+    """
+    moment, z = np.abs(np.cross(p, z)), np.abs(z)
+    reach = np.stack(
+        [
+            half[1] * z[:, 2] + half[2] * z[:, 1],
+            half[0] * z[:, 2] + half[2] * z[:, 0],
+            half[0] * z[:, 1] + half[1] * z[:, 0],
+        ],
+        axis=1,
+    )
+    # A line along e_i has no such axis: 0 <= 0, but for rounding.
+    return np.all(moment <= reach + 1e-15, axis=1)
+
+
+def every_valid_pose(half: Array, scale: float = 1.0) -> tuple[Array, Array]:
+    """Return rotations (n, 3, 3) and positions (n, 3) of all valid combinations, repeats too.
+
+    The box that the rays must meet is `scale` times the one that the palms stand around.
+    """
+    eighths = range(0, 360, 45)
+    R_global = euler(list(itertools.product(range(0, 181, 30), range(0, 360, 30), eighths)))
+    R_local = euler(list(itertools.product(range(0, 181, 20), range(0, 360, 20), eighths)))
+    radius = np.sqrt(half @ half)
+    rotations, positions = [], []
+    for R in R_global:
+        p = radius * R[:, 2]
+        if p[2] + half[2] <= 0.0:
+            continue
+        z = R_local[:, :, 2] @ (R @ np.diag([1.0, -1.0, -1.0])).T
+        # The palm is outside of the box: a line that meets it does so ahead if z looks inward.
+        hits = line_meets_box(np.broadcast_to(p, z.shape), z, scale * half) & (z @ p < 0.0)
+        rotations.append(R @ np.diag([1.0, -1.0, -1.0]) @ R_local[hits])
+        positions.append(np.broadcast_to(p, (hits.sum(), 3)))
+    return np.concatenate(rotations), np.concatenate(positions)
+
+
+def coordinates(R: Array, p: Array, half: Array) -> Array:
+    """Return poses as points (n, 12) whose distance tells poses apart."""
+    return np.hstack([R.reshape(-1, 9), p / np.linalg.norm(half)])
+
+
+@pytest.fixture(scope="module", params=BOXES)
+def reference(request: pytest.FixtureRequest) -> Reference:
+    half = np.array(BOXES[request.param][0]) / 2.0
+    poses, combinations, valid = rotation_candidates(
+        half, standing(half), CandidateConfig(), Stream(0)
+    )
+    every = coordinates(*every_valid_pose(half), half)
+    return Reference(request.param, half, poses, combinations, valid, every)
+
+
+@pytest.fixture(scope="module")
+def make_object(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., ObjectModel]:
+    def make(mesh: trimesh.Trimesh, name: str = "thing") -> ObjectModel:
+        path = tmp_path_factory.mktemp("mesh") / f"{name}.stl"
+        mesh.export(path)
+        return prepare_object(MeshSource(name=name, class_name=name, path=path))
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def box(make_object: Callable[..., ObjectModel]) -> ObjectModel:
+    return make_object(trimesh.creation.box((0.06, 0.08, 0.10)), "box")
+
+
+BOX_X_TO = make_pose(np.eye(3), [0.0, 0.0, 0.05])
+
+
+def test_paper_has_672_times_1440_combinations(reference: Reference) -> None:
+    """X closed at 180, Y and Z without 360, which is 0 again."""
+    assert reference.combinations == (7 * 12 * 8) * (10 * 18 * 8) == 967_680
+
+
+def test_full_turn_counts_once() -> None:
+    closed = COARSE.model_copy(update={"global_z_deg": (0, 45, 360), "local_x_deg": (0, 20, 160)})
+    opened = closed.model_copy(update={"global_z_deg": (0, 45)})
+    results = [
+        rotation_candidates([0.1, 0.1, 0.1], standing(np.full(3, 0.1)), c, Stream(0))
+        for c in (closed, opened)
+    ]
+    np.testing.assert_array_equal(results[0][0], results[1][0])
+    assert results[0][1:] == results[1][1:]
+
+
+def test_valid_poses_are_as_many_as_a_brute_force_finds(reference: Reference) -> None:
+    """And no ray grazes the box, so that the count does not hang on rounding."""
+    assert reference.valid == len(reference.every_valid) == BOXES[reference.name][1]
+    for scale in (1.0 - 1e-7, 1.0 + 1e-7):
+        assert len(every_valid_pose(reference.half, scale)[0]) == reference.valid
+
+
+def test_distinct_poses_are_counted_right(reference: Reference) -> None:
+    """No two of ours are one pose, and none is missing: so there are exactly this many.
+
+    The earlier reference's larger count is refuted by the same: with more representatives
+    than ours, two of them would be the same pose.
+    """
+    ours = coordinates(reference.poses[:, :3, :3], reference.poses[:, :3, 3], reference.half)
+    tree = cKDTree(ours)
+    assert not tree.query_pairs(1e-6)
+    nearest, index = tree.query(reference.every_valid)
+    assert nearest.max() < 1e-9
+    assert len(np.unique(index)) == len(ours) == BOXES[reference.name][2]
+
+
+def test_earlier_count_is_that_of_unstable_quaternion_signs(reference: Reference) -> None:
+    """A half turn has w = 0, and w = +-1e-17 chooses between q and -q: it was counted twice.
+
+    The excess depends on rounding; but away from half turns there is none to explain.
+    """
+    half_turn = np.abs(np.trace(reference.poses[:, :3, :3], axis1=1, axis2=2) + 1.0) < 1e-9
+    excess = BOXES[reference.name][3] - BOXES[reference.name][2]
+    assert 0 < excess <= half_turn.sum()
+
+
+def test_palms_are_above_the_table_on_the_corners_sphere(reference: Reference) -> None:
+    p_OG = reference.poses[:, :3, 3]
+    assert (p_OG[:, 2] > -reference.half[2]).all()
+    radius = np.sqrt(np.sum(reference.half**2))
+    np.testing.assert_allclose(np.linalg.norm(p_OG, axis=1), radius, rtol=1e-12)
+
+
+def test_palms_look_at_the_box(reference: Reference) -> None:
+    origins, directions = reference.poses[:, :3, 3], reference.poses[:, :3, 2]
+    # A hair larger for embree's single precision.
+    mesh = trimesh.creation.box(2.0 * reference.half * (1.0 + 1e-5))
+    assert mesh.ray.intersects_any(origins, directions).all()
+
+
+def test_palms_rotations_are_proper(reference: Reference) -> None:
+    R = reference.poses[:, :3, :3]
+    products = R @ np.swapaxes(R, 1, 2)
+    np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), R.shape), atol=1e-14)
+    np.testing.assert_allclose(np.linalg.det(R), 1.0, atol=1e-14)
+    np.testing.assert_array_equal(reference.poses[:, 3], np.broadcast_to([0, 0, 0, 1], (len(R), 4)))
+
+
+def test_first_pose_looks_down_from_above() -> None:
+    """With all angles zero: d on +Oz, Gz = -Oz, Gx = Ox (equation 1 of the paper)."""
+    zero = {f"{w}_{a}_deg": (0,) for w in ("global", "local") for a in "xyz"}
+    poses, combinations, valid = rotation_candidates(
+        [0.02, 0.03, 0.06],
+        standing(np.array([0.02, 0.03, 0.06])),
+        CandidateConfig(**zero),
+        stream(),
+    )
+    assert (combinations, valid) == (1, 1)
+    np.testing.assert_allclose(poses, [make_pose(np.diag([1, -1, -1]), [0, 0, 0.07])], atol=1e-16)
+
+
+def test_table_cuts_what_lies_below_it_in_world_axes() -> None:
+    """An object turned upside down keeps the poses that an upright one loses."""
+    half = np.array([0.05, 0.05, 0.05])
+    flipped = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.05])
+    up, down = (
+        rotation_candidates(half, X, COARSE, stream())[0] for X in (standing(half), flipped)
+    )
+    assert up[:, 2, 3].min() > -0.05 < 0.05 < up[:, 2, 3].max()
+    assert down[:, 2, 3].max() < 0.05
+    assert down[:, 2, 3].min() < -0.05
+
+
+@settings(max_examples=300)
+@given(
+    arrays(np.float64, 3, elements=st.floats(-2.0, 2.0)),
+    arrays(np.float64, 3, elements=st.floats(-1.0, 1.0)).filter(lambda z: z @ z > 1e-4),
+    arrays(np.float64, 3, elements=st.floats(0.05, 0.5)),
+)
+def test_slab_test_agrees_with_the_nearest_approach(p: Array, z: Array, half: Array) -> None:
+    """Ray and box meet if the convex function max_i(|p_i + t z_i| - h_i) has a minimum <= 0."""
+    z = z / np.linalg.norm(z)
+    low, high = 0.0, 10.0
+    for _ in range(120):
+        a, b = low + (high - low) / 3.0, high - (high - low) / 3.0
+        outside = [np.max(np.abs(p + t * z) - half) for t in (a, b)]
+        low, high = (low, b) if outside[0] <= outside[1] else (a, high)
+    gap = np.max(np.abs(p + low * z) - half)
+    if abs(gap) > 1e-9:  # a grazing ray may fall to either side
+        assert ray_meets_box(p[None], z[None], half)[0] == (gap < 0.0)
+
+
+@pytest.mark.parametrize(
+    ("p", "z", "meets"),
+    [
+        ((0, 0, 2), (0, 0, -1), True),
+        ((0, 0, 2), (0, 0, 1), False),  # behind
+        ((1.001, 0, 2), (0, 0, -1), False),
+        ((0.999, -0.999, 2), (0, 0, -1), True),
+        ((0, 0, 0), (1, 0, 0), True),  # from inside
+        ((0, 0, 2), (1e-17, -1e-17, -1), True),  # a zero with noise
+        ((2, 0, 2), (-1, 0, -1), True),
+    ],
+)
+def test_ray_and_unit_box_in_the_cases_that_divide_by_zero(
+    p: tuple[float, ...], z: tuple[float, ...], meets: bool
+) -> None:
+    direction = np.array([z], dtype=float)
+    assert ray_meets_box(np.array([p], dtype=float), direction, np.ones(3)).tolist() == [meets]
+
+
+@pytest.mark.parametrize("p", [(1, 0, 2), (-1, 0, 2), (1, 1, 2), (0, -1, 2)])
+def test_ray_within_a_face_touches_the_box(p: tuple[float, ...]) -> None:
+    """0/0 in a slab constrains nothing, as the code's comment says."""
+    direction = np.array([[0.0, 0.0, -1.0]])
+    assert ray_meets_box(np.array([p], dtype=float), direction, np.ones(3)).all()
+
+
+def test_jitter_keeps_the_number_of_combinations() -> None:
+    """The released code: 8^6 combinations, every angle moved by 0 to 44 degrees."""
+    half = np.array(BOXES["24_mug"][0]) / 2.0
+    config = load_config("released").candidates
+    poses, combinations, valid = rotation_candidates(half, standing(half), config, stream())
+    assert combinations == 8**6 == 262_144
+    # Jittered poses hardly ever repeat, in contrast to the grid's.
+    assert 0.9 * valid < len(poses) <= valid < combinations
+    assert (poses[:, 2, 3] > -half[2]).all()
+
+
+def test_jitter_moves_every_angle_by_whole_degrees_below_its_bound() -> None:
+    """At the zero pose the palm leans by no more than four tilts of three degrees each."""
+    axes = {f"{w}_{a}_deg": (0,) for w in ("global", "local") for a in "xyz"}
+    still = CandidateConfig(**{**axes, "local_z_deg": tuple(range(360))}, jitter_deg=1)
+    moved = still.model_copy(update={"jitter_deg": 4.0})
+    half = np.full(3, 0.05)
+    # Whole degrees below one are zero.
+    poses, *_ = rotation_candidates(half, standing(half), still, stream())
+    np.testing.assert_allclose(poses[:, 2, 2], -1.0, atol=1e-15)
+    assert len(poses) == 360
+    poses, *_ = rotation_candidates(half, standing(half), moved, stream())
+    lean = np.rad2deg(np.arccos(np.clip(-poses[:, 2, 2], -1.0, 1.0)))
+    assert 4.0 < lean.max() < 12.0
+    # Global X and Y alone move the palm; of their 4 x 4 pairs of degrees all come up.
+    assert len(np.unique(np.round(poses[:, :3, 3], 9), axis=0)) == 16
+
+
+def test_same_seed_draws_the_same(box: ObjectModel) -> None:
+    for method in ("rotations", "normals"):
+        config = COARSE.model_copy(update={"method": method, "max": 200})
+        one, two = (sample_candidates(box, BOX_X_TO, config, 3) for _ in range(2))
+        np.testing.assert_array_equal(one.X_OG, two.X_OG)
+        np.testing.assert_array_equal(one.distance, two.distance)
+
+
+@pytest.mark.parametrize("method", ["rotations", "normals"])
+def test_other_seed_or_other_name_draws_others(
+    box: ObjectModel, make_object: Callable[..., ObjectModel], method: str
+) -> None:
+    config = COARSE.model_copy(update={"method": method, "max": 50})
+    namesake = make_object(trimesh.creation.box((0.06, 0.08, 0.10)), "another_box")
+    first = sample_candidates(box, BOX_X_TO, config, 0)
+    for other in (
+        sample_candidates(box, BOX_X_TO, config, 1),
+        sample_candidates(namesake, BOX_X_TO, config, 0),
+    ):
+        shared = {tuple(X.ravel()) for X in first.X_OG} & {tuple(X.ravel()) for X in other.X_OG}
+        assert len(shared) < 0.5 * len(first)
+
+
+def test_smaller_number_is_a_prefix(box: ObjectModel) -> None:
+    """So more candidates can be tried later without losing the shards of the first."""
+    many, few = (
+        sample_candidates(box, BOX_X_TO, COARSE.model_copy(update={"max": n}), 0) for n in (150, 40)
+    )
+    assert (len(many), len(few)) == (150, 40)
+    np.testing.assert_array_equal(many.X_OG[:40], few.X_OG)
+    np.testing.assert_array_equal(many.distance[:40], few.distance)
+    assert (many.combinations, many.valid, many.distinct) == (
+        few.combinations,
+        few.valid,
+        few.distinct,
+    )
+
+
+def test_enough_room_keeps_every_distinct_pose(box: ObjectModel) -> None:
+    drawn = sample_candidates(box, BOX_X_TO, COARSE, 0)
+    poses, combinations, valid = rotation_candidates(box.half_extents, BOX_X_TO, COARSE, stream())
+    assert (drawn.combinations, drawn.valid, drawn.distinct) == (combinations, valid, len(poses))
+    assert 0 < len(drawn) == drawn.distinct < drawn.valid < drawn.combinations
+    assert {X.tobytes() for X in drawn.X_OG} == {X.tobytes() for X in poses}
+
+
+def test_object_key_is_frozen_and_of_the_name_alone() -> None:
+    """It decides which grasps an object gets: a change would make every dataset another.
+
+    The number is the first four bytes that `printf 24_mug_final | sha256sum` prints.
+    """
+    assert object_key("24_mug_final") == 0x2B63C3F3
+    assert object_key("24_mug_final") != object_key("24_mug_final ")
+    assert 0 <= object_key("é") < 2**32
+
+
+@given(arrays(np.float64, 3, elements=st.floats(-1.0, 1.0)).filter(lambda v: v @ v > 1e-2))
+@settings(max_examples=50)
+def test_palm_ray_meets_a_sphere_at_its_radius(v: Array) -> None:
+    """From 0.5 m to the centre of a sphere of 0.1 m: 0.4 m, and a facet's sagitta at most."""
+    z = -v / np.linalg.norm(v)
+    x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
+    x /= np.linalg.norm(x)
+    X_OG = make_pose(np.column_stack([x, np.cross(z, x), z]), -0.5 * z)
+    (distance,) = palm_ray_distance(SPHERE, X_OG[None])
+    assert 0.4 - 1e-6 <= distance <= 0.4 + 0.001
+
+
+SPHERE = trimesh.creation.icosphere(subdivisions=4, radius=0.1)
+
+
+def test_palm_ray_to_a_box_in_closed_form(box: ObjectModel) -> None:
+    """Down from 0.3 m onto the lid at 0.05; a slanted one by similar triangles; and a miss."""
+    slanted = np.array([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]])
+    looks_down = np.diag([1.0, -1.0, -1.0])
+    X_OG = np.stack(
+        [
+            make_pose(looks_down, [0.01, -0.02, 0.3]),
+            make_pose(slanted, [-0.1, 0.0, -0.1]),
+            make_pose(looks_down, [0.04, 0.0, 0.3]),
+            make_pose(np.eye(3), [0.0, 0.0, 0.3]),
+        ]
+    )
+    distance = palm_ray_distance(box.collision, X_OG)
+    # From (-0.1, 0, -0.1) along (0.6, 0, 0.8): x reaches -0.03 at t = 0.1166.., z is then -0.0067.
+    np.testing.assert_allclose(distance, [0.25, 0.07 / 0.6, np.nan, np.nan], atol=1e-7)
+    assert palm_ray_distance(box.collision, X_OG[:0]).shape == (0,)
+
+
+def test_normals_approach_the_faces_of_a_box_squarely(box: ObjectModel) -> None:
+    """Gz is minus a face's normal, and the palm ray ends on that face."""
+    config = CandidateConfig(method="normals", max=400)
+    drawn = sample_candidates(box, BOX_X_TO, config, 0)
+    z = drawn.X_OG[:, :3, 2]
+    np.testing.assert_allclose(np.abs(z).max(axis=1), 1.0, atol=1e-12)
+    surface = drawn.X_OG[:, :3, 3] + drawn.distance[:, None] * z
+    axis = np.abs(z).argmax(axis=1)
+    rows = np.arange(len(z))
+    np.testing.assert_allclose(
+        surface[rows, axis], -z[rows, axis] * box.half_extents[axis], atol=1e-7
+    )
+    assert (np.abs(surface) <= box.half_extents + 1e-7).all()
+    radius = np.linalg.norm(box.half_extents)
+    # Far enough away to be outside of any object with this box.
+    assert drawn.distance.min() > radius - 1e-7
+    assert np.ptp(drawn.distance) < 1e-7
+
+
+def test_normals_spread_over_the_area_and_roll_freely(box: ObjectModel) -> None:
+    """Each pair of faces gets its share of the area; rolls fill the circle."""
+    poses = normal_candidates(box, 4000, stream())
+    share = np.bincount(np.abs(poses[:, :3, 2]).argmax(axis=1), minlength=3) / len(poses)
+    areas = np.array([0.08 * 0.10, 0.06 * 0.10, 0.06 * 0.08])
+    # Four standard deviations of a binomial.
+    np.testing.assert_allclose(share, areas / areas.sum(), atol=4 * np.sqrt(0.25 / 4000))
+    lid = poses[poses[:, 2, 2] < -0.5]
+    roll = np.arctan2(lid[:, 1, 0], lid[:, 0, 0])
+    assert (np.histogram(roll, bins=8, range=(-np.pi, np.pi))[0] > 0.05 * len(lid)).all()
+    np.testing.assert_allclose(np.linalg.det(poses[:, :3, :3]), 1.0, atol=1e-12)
+
+
+def test_normals_that_start_under_the_table_are_dropped(box: ObjectModel) -> None:
+    drawn = sample_candidates(box, BOX_X_TO, CandidateConfig(method="normals", max=400), 0)
+    assert drawn.combinations == 400
+    # The bottom's share of the area is 0.0048 / 0.0376.
+    assert 400 * 0.75 < len(drawn) == drawn.valid == drawn.distinct < 400
+    assert (drawn.X_OG[:, 2, 3] > -0.05).all()
+    assert not (drawn.X_OG[:, 2, 2] > 0.5).any()
+
+
+def test_normals_start_outside_of_a_hollow_object(make_object: Callable[..., ObjectModel]) -> None:
+    """Backing off from a tube's inner wall must not end within the wall across."""
+    tube = make_object(trimesh.creation.annulus(r_min=0.08, r_max=0.13, height=0.06), "tube")
+    poses = normal_candidates(tube, 300, stream())
+    assert not tube.visual.contains(poses[:, :3, 3]).any()
+
+
+def some_candidates(n: int = 30) -> Candidates:
+    X_OG = np.tile(make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.3]), (n, 1, 1))
+    distance = np.linspace(0.2, 0.25, n)
+    distance[1] = np.nan
+    return Candidates(X_OG=X_OG, distance=distance, combinations=n, valid=n, distinct=n)
+
+
+def attempts(indices: range, *, name: str = "thing", seed: int = 0) -> list[Attempt]:
+    config = CandidateConfig()
+    return list(make_attempts(some_candidates(), indices, config, name=name, seed=seed))
+
+
+def test_every_candidate_is_tried_at_every_standoff() -> None:
+    found = [(a.candidate, a.standoff_index, a.standoff) for a in attempts(range(2, 5))]
+    assert found == [(i, j, s) for i in (2, 3, 4) for j, s in enumerate((0.06, 0.09, 0.12))]
+
+
+def test_palm_starts_at_the_standoff_from_the_surface() -> None:
+    """From 0.3 m down by distance - standoff, the orientation kept."""
+    poses, distance = some_candidates().X_OG, some_candidates().distance
+    for attempt in attempts(range(2, 30)):
+        expected = poses[attempt.candidate].copy()
+        expected[2, 3] = 0.3 - (distance[attempt.candidate] - attempt.standoff)
+        np.testing.assert_allclose(attempt.X_OG, expected, atol=1e-15)
+        assert attempt.ray_hits
+
+
+def test_candidate_whose_ray_misses_keeps_its_pose_at_every_standoff() -> None:
+    for attempt in attempts(range(1, 2)):
+        assert attempt.ray_hits is False
+        np.testing.assert_array_equal(attempt.X_OG, some_candidates().X_OG[1])
+
+
+def test_spreads_come_from_the_list_and_all_come() -> None:
+    spreads = {round(np.rad2deg(a.spread), 6) for a in attempts(range(30))}
+    assert spreads == {0.0, 11.25, 22.5}
+
+
+@pytest.mark.parametrize("cut", [1, 7, 29])
+def test_attempts_do_not_depend_on_how_the_work_is_cut(cut: int) -> None:
+    whole = attempts(range(30))
+    parts = attempts(range(cut)) + attempts(range(cut, 30))
+    for one, two in zip(whole, parts, strict=True):
+        assert (one.candidate, one.spread, one.seed) == (two.candidate, two.spread, two.seed)
+        np.testing.assert_array_equal(one.X_OG, two.X_OG)
+
+
+@pytest.mark.parametrize("other", [{"seed": 1}, {"name": "other"}])
+def test_other_seed_or_name_gives_other_spreads(other: dict[str, object]) -> None:
+    first, second = attempts(range(30)), attempts(range(30), **other)  # type: ignore[arg-type]
+    assert [a.spread for a in first] != [a.spread for a in second]
+    assert not {a.seed for a in first} & {a.seed for a in second}
+
+
+def test_seed_belongs_to_the_candidate() -> None:
+    """Three attempts share it, no two candidates do: it fits the files' uint64."""
+    seeds = [a.seed for a in attempts(range(30))]
+    assert len(set(seeds)) == 30
+    assert seeds[0::3] == seeds[1::3] == seeds[2::3]
+    assert 0 <= min(seeds) <= max(seeds) < 2**64

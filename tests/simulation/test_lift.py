@@ -1,0 +1,159 @@
+"""Lifts end as they would with short steps throughout, and no later than their end is known."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from helpers.objects import CUBE, box_model, from_above, standing
+
+from drakegrasp.config import Config, load_config, override_config
+from drakegrasp.frames import X_WT
+from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.outcomes import Outcome
+from drakegrasp.simulation import lift as lifting
+from drakegrasp.simulation import stepping
+from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.contacts import read_contacts
+from drakegrasp.simulation.lift import lift
+from drakegrasp.simulation.scene import (
+    Scene,
+    advance,
+    go_on_in,
+    hand_positions,
+    move_wrist,
+    palm_pose,
+    release,
+    reset_attempt,
+)
+from drakegrasp.simulation.stepping import start_clock
+from drakegrasp.simulation.trajectory import lift_duration
+from drakegrasp.simulation.trial import run_attempt
+
+pytestmark = pytest.mark.sim
+
+STANDOFF = 0.06
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return load_config()
+
+
+@pytest.fixture(scope="module")
+def hand() -> Hand:
+    return load_hand()
+
+
+@pytest.fixture(scope="module")
+def cube(tmp_path_factory) -> ObjectModel:
+    return box_model(tmp_path_factory.mktemp("cube"), [CUBE] * 3)
+
+
+@pytest.fixture(scope="module")
+def scene(cube, config, hand) -> Scene:
+    return build_scene(cube, config.physics, hand)
+
+
+def close(scene: Scene, cube: ObjectModel) -> None:
+    X_WO = X_WT @ standing(cube)
+    reset_attempt(scene, X_WO, X_WO @ from_above(cube, STANDOFF).X_OG, spread=0.0)
+    advance(scene, 2.4)
+
+
+def test_calm_lift_ends_as_one_of_short_steps_does(scene, cube, config, hand, monkeypatch):
+    # A cube that is pinched creeps a little all the time: here that counts as calm.
+    config = override_config(config, ["close.stop_speed=0.1"])
+    monkeypatch.setattr(lifting, "CALM", 2e-3)
+    monkeypatch.setattr(lifting, "CALM_ANGLE", np.deg2rad(2.0))
+    simulated = Counter()
+    simulate = stepping.advance
+
+    def count(stage: Scene, duration: float) -> None:
+        simulated[stage.physics.time_step] += duration
+        simulate(stage, duration)
+
+    monkeypatch.setattr(stepping, "advance", count)
+    attempt = from_above(cube, STANDOFF)
+    by_calm = run_attempt(scene, standing(cube), attempt, config)
+    long = config.physics.calm_steps * config.physics.time_step
+    assert simulated[long] > 0.4 * by_calm.time_lift
+    short = override_config(config, ["physics.calm_steps=1"])
+    throughout = build_scene(cube, short.physics, hand)
+    assert throughout.make_calm is None
+    by_short = run_attempt(throughout, standing(cube), attempt, short)
+    assert by_calm.outcome is by_short.outcome is Outcome.SUCCESS
+    assert by_calm.time_lift == pytest.approx(by_short.time_lift, abs=1e-9)
+    assert np.allclose(by_calm.X_TO_lifted[:3, 3], by_short.X_TO_lifted[:3, 3], atol=1e-3)
+    assert np.allclose(by_calm.X_TO_lifted[:3, :3], by_short.X_TO_lifted[:3, :3], atol=0.02)
+    assert np.allclose(by_calm.lifted.f_Q_O, by_short.lifted.f_Q_O, atol=1.0)
+
+
+@pytest.mark.parametrize("back", [False, True])
+def test_another_diagram_goes_on_where_one_stopped(scene, cube, config, back):
+    """The wrist follows its curve across the change, with the steps of the new diagram."""
+    close(scene, cube)
+    release(scene)
+    target = X_WT[:3, 3] + config.lift.p_TG
+    motion = move_wrist(scene, target, 1.0)
+    calm = scene.make_calm()
+    long = calm.physics.time_step
+    when = 125 * long
+    advance(scene, when - 1e-6 - scene.time)
+    before, after = scene, calm
+    go_on_in(after, before, when, motion)
+    if back:
+        advance(calm, 2 * long - 1e-6)
+        before, after, when = calm, scene, when + 2 * long
+        go_on_in(after, before, when, motion)
+    assert after.time == pytest.approx(when, abs=1e-12)
+    assert np.array_equal(palm_pose(after), palm_pose(before))
+    assert np.array_equal(after.pose(after.object), before.pose(before.object))
+    assert np.array_equal(hand_positions(after), hand_positions(before))
+    hand = scene.handles.hand
+    spread = [after.plant.GetJointByName(n, after.handles.instance) for n in hand.spread.joints]
+    assert spread
+    assert all(joint.is_locked(after.context) for joint in spread)
+    step = after.physics.time_step
+    for k in range(1, 6):
+        advance(after, when + k * step - 1e-6 - after.time)
+        s = (after.time - motion.begin) / motion.duration
+        risen = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+        meant = motion.p_start + risen * (motion.p_end - motion.p_start)
+        assert np.allclose(palm_pose(after)[:3, 3], meant, atol=5e-4)
+    # The object goes with the hand: what holds it carries its weight and speeds it up.
+    way = motion.p_end - motion.p_start
+    acceleration = way[2] * 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s) / motion.duration**2
+    contacts = read_contacts(after)
+    force = contacts.f_Q_O.sum(axis=0) @ after.pose(after.object)[2, :3]
+    assert contacts.touching.all()
+    assert force == pytest.approx(cube.mass * (9.81 + acceleration), rel=0.1)
+
+
+@pytest.mark.parametrize("where", ["off", "near", "on table"])
+def test_lift_ends_where_a_fingertip_stays_off(scene, cube, config, monkeypatch, where):
+    """Not if it may yet creep there, or the object stands on the table, which decides nothing."""
+    tips = [body.index() for body in scene.handles.fingertips]
+    seen = {*tips[1:], *([scene.table.index()] if where == "on table" else [])}
+    monkeypatch.setattr(lifting, "bodies_on_object", lambda _: seen)
+    if where != "near":
+        monkeypatch.setattr(lifting, "LOST", -1.0)
+    close(scene, cube)
+    distance = np.linalg.norm(X_WT[:3, 3] + config.lift.p_TG - palm_pose(scene)[:3, 3])
+    whole = lift_duration(float(distance), config) + config.lift.hold_time
+    found = lift(scene, start_clock(config), config)
+    if where == "off":
+        assert found.duration < 0.9 * whole
+    else:
+        assert found.duration == pytest.approx(whole, abs=1e-6)
+
+
+def test_lift_ends_when_the_object_is_lost(cube, config, hand):
+    slippery = override_config(config, ["physics.friction_hand=0.05"])
+    scene = build_scene(cube, slippery.physics, hand)
+    record = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), slippery)
+    assert record.outcome is Outcome.DROPPED
+    whole = lift_duration(0.60 - CUBE - STANDOFF, slippery) + slippery.lift.hold_time
+    assert record.time_lift < 0.7 * whole

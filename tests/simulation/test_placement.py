@@ -1,0 +1,299 @@
+"""An object on the table: from a file, a mesh or itself, and its pose without yaw."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import trimesh
+from helpers.objects import box_model, standing
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from drakegrasp.config import load_config
+from drakegrasp.errors import GraspError, MeshError
+from drakegrasp.frames import Array, make_pose, pack_pose
+from drakegrasp.simulation.placement import MAX_GAP, Placed, PlacedObject, place_object, rest_pose
+from drakegrasp.simulation.settle import settle
+
+EXTENTS = np.array([0.06, 0.08, 0.1])
+#: Stands the box of these extents on the table.
+X_TO = make_pose(np.eye(3), [0.1, -0.2, 0.05])
+
+
+def box(scale: float = 1.0, at: float = 0.0) -> trimesh.Trimesh:
+    mesh = trimesh.creation.box(scale * EXTENTS)
+    mesh.apply_translation([at, at, at])
+    return mesh
+
+
+def write(path: Path, mesh: trimesh.Trimesh) -> Path:
+    mesh.export(path)
+    return path
+
+
+# From a file
+
+
+@pytest.mark.parametrize(("units", "scale"), [("m", 1.0), ("cm", 100.0), ("mm", 1000.0)])
+def test_file_is_read_in_its_units_about_the_boxs_centre(
+    tmp_path: Path, units: str, scale: float
+) -> None:
+    path = write(tmp_path / "3_mug_red.obj", box(scale, at=0.3 * scale))
+    for given_as in (path, str(path)):
+        placed = place_object(given_as, units=units, X_TO=X_TO)
+        np.testing.assert_allclose(placed.model.half_extents, EXTENTS / 2.0, atol=1e-9)
+        np.testing.assert_allclose(placed.model.visual_vertices.mean(axis=0), 0.0, atol=1e-9)
+        np.testing.assert_array_equal(placed.X_TO, X_TO)
+        assert (placed.model.name, placed.model.class_name) == ("3_mug_red", "mug")
+
+
+def test_manifest_beside_the_file_wins_over_units(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.stl", box(1000.0))
+    write(tmp_path / "b.stl", box(100.0))
+    (tmp_path / "objects.yaml").write_text(
+        "units: cm\nobjects: {a: {units: mm, class: brick, name: wall}}\n"
+    )
+    for units in ("m", "mm"):
+        placed = place_object(path, units=units, X_TO=X_TO)
+        np.testing.assert_allclose(placed.model.half_extents, EXTENTS / 2.0, atol=1e-7)
+        assert (placed.model.name, placed.model.class_name) == ("wall", "brick")
+        other = place_object(tmp_path / "b.stl", units=units, X_TO=X_TO)
+        np.testing.assert_allclose(other.model.half_extents, EXTENTS / 2.0, atol=1e-7)
+
+
+def test_the_same_mesh_in_two_formats_in_one_folder_is_no_matter(tmp_path: Path) -> None:
+    """A folder of a build must not have two of a name; a file that is named is one."""
+    for suffix in (".obj", ".stl", ".ply"):
+        write(tmp_path / f"mug{suffix}", box())
+    placed = place_object(tmp_path / "mug.ply", X_TO=X_TO)
+    assert placed.model.name == "mug"
+
+
+def test_mass_is_the_configurations(tmp_path: Path) -> None:
+    config = load_config(overrides=["objects.mass=0.25"])
+    for mesh in (box(), write(tmp_path / "a.obj", box())):
+        assert place_object(mesh, X_TO=X_TO, config=config).model.mass == 0.25
+        assert place_object(mesh, X_TO=X_TO).model.mass == 1.0
+
+
+def text_file(folder: Path) -> Path:
+    (folder / "a.txt").write_text("no mesh")
+    return folder / "a.txt"
+
+
+def broken_file(folder: Path) -> Path:
+    (folder / "a.obj").write_text("no mesh")
+    return folder / "a.obj"
+
+
+def not_finite(_: Path) -> trimesh.Trimesh:
+    mesh = box()
+    vertices = np.array(mesh.vertices)
+    vertices[3, 1] = np.nan
+    return trimesh.Trimesh(vertices, mesh.faces, process=False)
+
+
+MISTAKES: dict[str, tuple[Any, str, str]] = {
+    "gone": (lambda f: f / "gone.obj", "m", "gone.obj"),
+    "folder": (lambda f: f, "m", "must be a mesh file"),
+    "other file": (text_file, "m", "got '.txt'"),
+    "broken file": (broken_file, "m", "a.obj: must"),
+    "units of a file": (lambda f: write(f / "a.obj", box()), "inch", "units must be one of m, cm"),
+    "units of a mesh": (lambda _: box(), "inch", "units must be one of m, cm, mm, got 'inch'"),
+    "nothing": (lambda _: None, "m", "a trimesh.Trimesh or a placed object, got NoneType"),
+    "number": (lambda _: 3, "m", "a trimesh.Trimesh or a placed object, got int"),
+    "scene": (lambda _: box().scene(), "m", "a trimesh.Trimesh or a placed object, got Scene"),
+    "empty": (lambda _: trimesh.Trimesh(), "m", "mesh: must hold triangles, got no faces"),
+    "nan": (not_finite, "m", "mesh: vertices must be finite, got NaN or inf"),
+    "too large": (lambda _: box(1000.0), "m", "mesh: the diagonal of the bounding box must be"),
+    "too small": (lambda _: box(), "mm", "got 0.0001414 m with 1 unit = 0.001 m"),
+    "sheet": (
+        lambda _: trimesh.Trimesh(np.eye(3) * 0.1, [[0, 1, 2]], process=False),
+        "m",
+        "mesh: ",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", MISTAKES)
+def test_what_is_no_object_is_refused_in_one_line(tmp_path: Path, case: str) -> None:
+    make, units, message = MISTAKES[case]
+    with pytest.raises(MeshError) as caught:
+        place_object(make(tmp_path), units=units, X_TO=X_TO)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+# From a mesh
+
+
+@pytest.mark.parametrize(("units", "scale"), [("m", 1.0), ("cm", 100.0), ("mm", 1000.0)])
+def test_mesh_is_taken_in_its_units(units: str, scale: float) -> None:
+    mesh = box(scale, at=0.2 * scale)
+    before = np.array(mesh.vertices)
+    placed = place_object(mesh, units=units, X_TO=X_TO)
+    np.testing.assert_allclose(placed.model.half_extents, EXTENTS / 2.0, atol=1e-9)
+    assert placed.model.collision.is_watertight
+    np.testing.assert_array_equal(mesh.vertices, before)
+
+
+def test_mesh_is_known_by_its_surface() -> None:
+    digest = place_object(box(), X_TO=X_TO).model.mesh_sha256
+    assert place_object(box(), X_TO=X_TO).model.mesh_sha256 == digest
+    turned = box().apply_transform(
+        make_pose(Rotation.from_euler("z", 90, True).as_matrix(), [0] * 3)
+    )
+    assert place_object(turned, X_TO=X_TO).model.mesh_sha256 != digest
+
+
+# From an object
+
+
+def test_placed_object_stays_as_it_is() -> None:
+    first = place_object(box(), X_TO=X_TO)
+    again = place_object(first)
+    assert again.model is first.model
+    np.testing.assert_array_equal(again.X_TO, first.X_TO)
+    moved = make_pose(np.eye(3), [0.0, 0.3, 0.05])
+    np.testing.assert_array_equal(place_object(first, X_TO=moved).X_TO, moved)
+    np.testing.assert_array_equal(first.X_TO, X_TO)
+
+
+def test_anything_with_a_model_and_a_pose_is_an_object(tmp_path: Path) -> None:
+    """As a dataset's prepared object is."""
+
+    class Prepared:
+        model = box_model(tmp_path, EXTENTS)
+        X_TO = standing(model)
+        candidates = None
+
+    assert isinstance(Prepared(), Placed)
+    assert not isinstance(box(), Placed)
+    placed = place_object(Prepared())
+    assert type(placed) is PlacedObject
+    assert placed.model is Prepared.model
+    np.testing.assert_array_equal(placed.X_TO, Prepared.X_TO)
+
+
+# Poses
+
+
+@pytest.mark.parametrize("written", [X_TO, X_TO[:3], pack_pose(X_TO), X_TO.tolist()])
+def test_pose_may_be_given_as_files_hold_it(written: npt.ArrayLike) -> None:
+    placed = place_object(box(), X_TO=np.asarray(written, dtype=np.float32))
+    np.testing.assert_allclose(placed.X_TO, X_TO, atol=1e-7)
+
+
+def lifted(height: float) -> Array:
+    return make_pose(np.eye(3), [0.0, 0.0, 0.05 + height])
+
+
+def test_pose_may_be_off_the_table_by_a_little() -> None:
+    for height in (0.9 * MAX_GAP, -0.9 * MAX_GAP):
+        place_object(box(), X_TO=lifted(height))
+    # On its side the lowest point is nearer to the origin.
+    on_its_side = make_pose(Rotation.from_euler("x", 90, True).as_matrix(), [0.0, 0.0, 0.04])
+    place_object(box(), X_TO=on_its_side)
+
+
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [
+        (lifted(0.02), "its lowest point within 5 mm, got one at 20 mm"),
+        (lifted(-0.02), "its lowest point within 5 mm, got one at -20 mm"),
+        (
+            make_pose(Rotation.from_euler("x", 90, True).as_matrix(), [0.0, 0.0, 0.05]),
+            "got one at 10 mm",
+        ),
+        (np.diag([1.0, 1.0, -1.0, 1.0]), "X_TO must hold a rotation"),
+        (np.full((4, 4), np.nan), "X_TO must be finite"),
+        (np.eye(3), "X_TO must be a pose, 4 x 4 numbers, got an array of shape (3, 3)"),
+        (np.tile(X_TO, (2, 1, 1)), "X_TO must be one pose, got an array of shape (2, 4, 4)"),
+        ("upright", "X_TO must be a pose, 4 x 4 numbers, got text"),
+        (X_TO.T, "X_TO must have 0 0 0 1 as its last row"),
+    ],
+)
+def test_pose_that_does_not_stand_on_the_table_is_refused(pose: Any, message: str) -> None:
+    with pytest.raises(GraspError) as caught:
+        place_object(box(), X_TO=pose)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.sim
+def test_without_a_pose_the_object_is_dropped_as_in_a_build(tmp_path: Path) -> None:
+    config = load_config(overrides=["settle.drop_height=0.01"])
+    path = write(tmp_path / "a.obj", box())
+    placed = place_object(path, config=config)
+    resting = settle(placed.model, config)
+    np.testing.assert_array_equal(placed.X_TO, resting.X_TO)
+    # It stays as it was dropped, about as high as it is.
+    np.testing.assert_allclose(placed.X_TO, lifted(0.0), atol=1e-3)
+    # The same from memory.
+    np.testing.assert_allclose(place_object(box(), config=config).X_TO, placed.X_TO, atol=1e-6)
+
+
+# The pose without yaw
+
+angles = st.floats(-np.pi, np.pi)
+
+
+def pose_of(yaw: float, tilt: float, about: float, x: float = 0.0, y: float = 0.0) -> Array:
+    """Return a pose that is tilted about an axis of the object, then turned about the vertical."""
+    axis = np.array([np.cos(about), np.sin(about), 0.0])
+    R = Rotation.from_euler("z", yaw) * Rotation.from_rotvec(tilt * axis)
+    return make_pose(R.as_matrix(), [x, y, 0.04])
+
+
+@given(angles, st.floats(0.0, np.pi), angles, st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
+def test_rest_pose_keeps_up_and_height_and_forgets_the_rest(
+    yaw: float, tilt: float, about: float, x: float, y: float
+) -> None:
+    X = pose_of(yaw, tilt, about, x, y)
+    rest = rest_pose(X)
+    np.testing.assert_allclose(rest[2], X[2], atol=1e-9)
+    np.testing.assert_array_equal(rest[:2, 3], 0.0)
+    np.testing.assert_array_equal(rest[3], [0.0, 0.0, 0.0, 1.0])
+    R = rest[:3, :3]
+    np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R) == pytest.approx(1.0)
+
+
+# Nearly upside down every small tilt has its own direction, so rounding decides.
+@given(angles, st.floats(0.0, np.pi - 1e-3), angles, angles, st.floats(-1.0, 1.0))
+def test_rest_pose_does_not_depend_on_yaw_or_place(
+    yaw: float, tilt: float, about: float, other: float, x: float
+) -> None:
+    rest = rest_pose(pose_of(yaw, tilt, about))
+    np.testing.assert_allclose(rest_pose(pose_of(other, tilt, about, x, -x)), rest, atol=1e-9)
+    # Of all yaws it has the one that turns the least: by the tilt alone.
+    np.testing.assert_allclose(rest, pose_of(0.0, tilt, about), atol=1e-9)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.5, 3.0])
+@pytest.mark.parametrize("slant", [0.0, 1e-12, 1e-9, 1e-7, 1e-5, 1e-4])
+def test_rest_pose_works_upside_down(yaw: float, slant: float) -> None:
+    X = pose_of(yaw, np.pi - slant, 0.7)
+    rest = rest_pose(X)
+    np.testing.assert_allclose(rest[2], X[2], atol=1e-9)
+    R = rest[:3, :3]
+    np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R) == pytest.approx(1.0)
+
+
+def test_rest_pose_of_an_upright_object_is_the_identity() -> None:
+    np.testing.assert_array_equal(rest_pose(X_TO), make_pose(np.eye(3), [0.0, 0.0, 0.05]))
+    again = rest_pose(pose_of(1.0, 0.3, 0.2))
+    np.testing.assert_allclose(rest_pose(again), again, atol=1e-12)
+
+
+def test_placed_object_says_what_it_is_in_a_line(tmp_path: Path) -> None:
+    mesh = trimesh.creation.box([0.05, 0.04, 0.1])
+    placed = place_object(mesh, X_TO=make_pose(np.eye(3), [0.0, 0.0, 0.05]))
+    assert repr(placed).endswith("50 x 40 x 100 mm, 1 kg, p_TO at z = 0.0500 m")
+    assert "\n" not in repr(placed)

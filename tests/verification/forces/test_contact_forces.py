@@ -1,0 +1,242 @@
+"""The smallest forces: closed forms, cones and balance, refusals as values."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+from scipy.spatial.transform import Rotation
+
+from drakegrasp.verification.forces.contact_forces import (
+    ContactForces,
+    ForceProgram,
+    contact_axes,
+    grasp_map,
+    largest_normal_force,
+    smallest_forces,
+)
+from drakegrasp.verification.forces.quality import (
+    FRICTION_TOLERANCE,
+    MAX_FRICTION,
+    smallest_friction,
+)
+
+WEIGHT = 9.81  # of 1 kg [N]
+#: The wrench that carries 1 kg at rest, +Oz up.
+CARRY = np.array([0.0, 0.0, 0.0, 0.0, 0.0, WEIGHT])
+MU = 0.71
+ORIGIN = np.zeros(3)
+
+
+def ring(k: int, radius: float = 0.04) -> tuple[np.ndarray, np.ndarray]:
+    """Return k contacts around an upright cylinder at the height of its centre."""
+    angles = 2.0 * np.pi * np.arange(k) / k
+    normals = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(k)])
+    return radius * normals, normals
+
+
+#: Two contacts on one face of a box, one in the middle of the opposite face.
+PINCH = (
+    np.array([[0.02, 0.03, 0.0], [-0.02, 0.03, 0.0], [0.0, -0.03, 0.0]]),
+    np.array([[0.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]]),
+)
+
+
+def some_grasp(seed: int, k: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a ring of contacts that are moved and tilted at random, and a centre of mass."""
+    rng = np.random.default_rng(seed)
+    p, n = ring(k)
+    n = n + rng.uniform(-0.2, 0.2, n.shape)
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    return p + rng.uniform(-0.005, 0.005, p.shape), n, rng.uniform(-0.005, 0.005, 3)
+
+
+def assert_in_cones(forces: ContactForces, n: np.ndarray, friction: float) -> None:
+    push = -np.einsum("ij,ij->i", forces.f_Q_O, n)
+    tangential = np.linalg.norm(forces.f_Q_O + push[:, None] * n, axis=1)
+    assert np.all(push >= -1e-6)
+    assert np.all(tangential <= friction * push + 1e-6)
+    assert forces.largest_normal == pytest.approx(push.max(), abs=1e-6)
+
+
+@pytest.mark.parametrize("k", [2, 3, 4, 7])
+def test_contacts_around_a_cylinder_share_its_weight_by_friction(k):
+    p, n = ring(k)
+    forces = smallest_forces(p, n, ORIGIN, CARRY, MU)
+    assert forces.feasible
+    assert forces.largest_normal == pytest.approx(WEIGHT / (k * MU), rel=1e-6)
+    assert np.allclose(forces.f_Q_O[:, 2], WEIGHT / k, atol=1e-5)
+
+
+def test_finger_that_opposes_two_presses_as_hard_as_both():
+    """Its friction carries half of the weight: N = m g / (2 mu)."""
+    forces = smallest_forces(*PINCH, ORIGIN, CARRY, MU)
+    assert forces.largest_normal == pytest.approx(WEIGHT / (2.0 * MU), rel=1e-6)
+    assert forces.f_Q_O[2, 1] == pytest.approx(WEIGHT / (2.0 * MU), rel=1e-5)
+
+
+def test_finger_below_the_centre_of_mass_carries_it_without_friction():
+    forces = smallest_forces([[0.0, 0.0, -0.03]], [[0.0, 0.0, -1.0]], ORIGIN, CARRY, 0.0)
+    assert forces.feasible
+    assert np.allclose(forces.f_Q_O, [[0.0, 0.0, WEIGHT]])
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("k", [3, 5])
+def test_forces_stay_in_their_cones_and_sum_to_the_wrench(seed, k):
+    p, n, p_OOcm = some_grasp(seed, k)
+    wrench = CARRY + np.random.default_rng(seed).uniform(-0.05, 0.05, 6) * [1, 1, 1, 20, 20, 20]
+    forces = smallest_forces(p, n, p_OOcm, wrench, MU)
+    assert forces.feasible
+    assert_in_cones(forces, n, MU)
+    assert np.allclose(grasp_map(p, p_OOcm) @ forces.f_Q_O.ravel(), wrench, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_linear_programme_with_pyramids_needs_hardly_more(seed):
+    """Pyramids of 64 edges lie within the cones and fill all but 0.12 % of their radius."""
+    p, n, p_OOcm = some_grasp(seed)
+    angles = 2.0 * np.pi * np.arange(64) / 64
+    pyramid = np.stack([np.ones(64), MU * np.cos(angles), MU * np.sin(angles)])
+    blocks = grasp_map(p, p_OOcm).reshape(6, 3, 3)
+    edges = np.einsum("wki,kie->wke", blocks, contact_axes(n) @ pyramid).reshape(6, -1)
+    found = linprog(
+        np.append(np.zeros(edges.shape[1]), 1.0),
+        A_ub=np.column_stack([np.kron(np.eye(3), np.ones(64)), -np.ones(3)]),
+        b_ub=np.zeros(3),
+        A_eq=np.column_stack([edges, np.zeros(6)]),
+        b_eq=CARRY,
+    )
+    smallest = smallest_forces(p, n, p_OOcm, CARRY, MU).largest_normal
+    assert smallest <= found.fun * (1.0 + 1e-6)
+    assert smallest == pytest.approx(found.fun, rel=0.01)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_forces_move_and_turn_with_the_frame(seed):
+    p, n, p_OOcm = some_grasp(seed)
+    R = Rotation.from_rotvec([1.0, -0.4, 0.7]).as_matrix()
+    shift = np.array([0.3, -0.2, 0.9])
+    turned = np.concatenate([R @ CARRY[:3], R @ CARRY[3:]])
+    here = smallest_forces(p, n, p_OOcm, CARRY, MU)
+    there = smallest_forces(p @ R.T + shift, n @ R.T, R @ p_OOcm + shift, turned, MU)
+    assert there.largest_normal == pytest.approx(here.largest_normal, rel=1e-6)
+    assert np.allclose(there.f_Q_O, here.f_Q_O @ R.T, atol=1e-3)  # they are not unique
+
+
+def test_one_programme_serves_all_wrenches_in_any_order():
+    p, n, p_OOcm = some_grasp(3)
+    program = ForceProgram(p, n, p_OOcm, MU)
+    heavy = program.smallest(2.0 * CARRY)
+    program.closest([1.0, 0.0, 0.0, 0.0, 0.0, 100.0], 20.0)
+    light = program.smallest(CARRY)
+    assert heavy.largest_normal == pytest.approx(2.0 * light.largest_normal, rel=1e-6)
+    alone = ForceProgram(p, n, p_OOcm, MU).smallest(CARRY)
+    assert np.array_equal(light.f_Q_O, alone.f_Q_O)
+
+
+def test_no_load_needs_no_force():
+    forces = smallest_forces(*PINCH, ORIGIN, np.zeros(6), MU)
+    assert forces.feasible
+    assert forces.largest_normal == 0.0
+    assert not forces.f_Q_O.any()
+
+
+@pytest.mark.parametrize(
+    ("p", "n"),
+    [
+        (
+            PINCH[0] * [1.0, 0.0, 1.0] + [0.0, 0.03, 0.0],
+            np.tile([0.0, 1.0, 0.0], (3, 1)),
+        ),  # one side
+        (PINCH[0], PINCH[1] * [[-1.0], [-1.0], [1.0]]),  # two of three reversed
+        (PINCH[0] + [0.0, 0.0, 0.0], PINCH[1] * 0.0),  # no direction
+        (PINCH[0] * np.nan, PINCH[1]),
+        (PINCH[0] + [np.inf, 0.0, 0.0], PINCH[1]),
+    ],
+)
+def test_grasp_that_cannot_carry_the_object_says_so(p, n):
+    forces = smallest_forces(p, n, ORIGIN, CARRY, MU)
+    assert not forces.feasible
+    assert forces.largest_normal == np.inf
+    assert np.isnan(forces.f_Q_O).all()
+    assert smallest_friction(p, n, ORIGIN, [CARRY], 20.0) == np.inf
+
+
+def test_wrench_that_is_not_finite_cannot_be_given():
+    program = ForceProgram(*PINCH, ORIGIN, MU)
+    assert not program.smallest(CARRY * np.nan).feasible
+    assert not program.closest(CARRY * np.nan, 20.0).feasible
+
+
+def test_pinch_without_friction_cannot_carry():
+    assert not smallest_forces(*PINCH, ORIGIN, CARRY, 0.0).feasible
+
+
+def test_closest_forces_give_a_wrench_that_is_within_the_limit():
+    p, n, p_OOcm = some_grasp(1)
+    forces = ForceProgram(p, n, p_OOcm, MU).closest(CARRY, 20.0)
+    assert_in_cones(forces, n, MU)
+    assert np.allclose(grasp_map(p, p_OOcm) @ forces.f_Q_O.ravel(), CARRY, atol=1e-3)
+
+
+def test_closest_forces_to_a_load_that_is_too_heavy_are_at_the_limit():
+    """Three contacts around a cylinder carry at most 3 mu times the limit."""
+    p, n = ring(3)
+    forces = ForceProgram(p, n, ORIGIN, MU).closest(100.0 * CARRY, 20.0)
+    assert not forces.feasible
+    assert_in_cones(forces, n, MU)
+    assert forces.largest_normal == pytest.approx(20.0, rel=1e-5)
+    assert np.allclose(forces.f_Q_O.sum(axis=0), [0.0, 0.0, 3.0 * MU * 20.0], atol=1e-3)
+
+
+def test_no_forces_within_friction_are_closer_than_the_closest():
+    p, n, p_OOcm = some_grasp(4)
+    wrench = np.array([0.8, -0.5, 1.0, 30.0, -10.0, 40.0])
+    forces = ForceProgram(p, n, p_OOcm, MU).closest(wrench, 20.0)
+    assert_in_cones(forces, n, MU)
+    arm = np.linalg.norm(p - p_OOcm, axis=1).max()
+    units = np.repeat([arm, 1.0], 3)
+
+    def error(f_Q_O: np.ndarray) -> float:
+        return float(np.linalg.norm((grasp_map(p, p_OOcm) @ f_Q_O.ravel() - wrench) / units))
+
+    rng = np.random.default_rng(0)
+    for _ in range(500):
+        push, angle, share = 20.0 * rng.random(3), 2.0 * np.pi * rng.random(3), rng.random(3)
+        local = push * np.stack(
+            [np.ones(3), MU * share * np.cos(angle), MU * share * np.sin(angle)]
+        )
+        other = np.einsum("kij,jk->ki", contact_axes(n), local)
+        # The set of forces is convex, so a step towards any of them is allowed.
+        for step in (1e-3, 0.1, 1.0):
+            assert error(forces.f_Q_O + step * (other - forces.f_Q_O)) >= error(forces.f_Q_O) - 1e-6
+
+
+@pytest.mark.parametrize("limit", [5.0, 20.0])
+def test_smallest_friction_of_a_ring_is_its_share_of_the_weight(limit):
+    p, n = ring(3)
+    friction = smallest_friction(p, n, ORIGIN, [CARRY, 0.5 * CARRY], limit)
+    exact = WEIGHT / (3.0 * limit)
+    assert exact <= friction <= exact + FRICTION_TOLERANCE * (1.0 + 1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_smallest_friction_is_where_the_force_limit_is_met(seed):
+    p, n, p_OOcm = some_grasp(seed)
+    loads = np.array([1.1 * CARRY, 0.9 * CARRY])
+    friction = smallest_friction(p, n, p_OOcm, loads, 20.0)
+    at = largest_normal_force(ForceProgram(p, n, p_OOcm, friction), loads)
+    below = largest_normal_force(ForceProgram(p, n, p_OOcm, friction - 2e-4), loads)
+    assert at <= 20.0 < below
+
+
+def test_smallest_friction_is_nothing_for_a_finger_below():
+    friction = smallest_friction([[0.0, 0.0, -0.03]], [[0.0, 0.0, -1.0]], ORIGIN, [CARRY], 20.0)
+    assert friction <= FRICTION_TOLERANCE
+
+
+def test_smallest_friction_is_infinite_where_the_limit_is_too_low():
+    p, n = ring(3)
+    limit = 0.99 * WEIGHT / (3.0 * MAX_FRICTION)
+    assert smallest_friction(p, n, ORIGIN, [CARRY], limit) == np.inf

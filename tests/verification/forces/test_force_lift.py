@@ -1,0 +1,218 @@
+"""Lifting by forces alone: closed forms, refusals, and a simulation that can say no."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.objects import CUBE, box_model, standing
+from scipy.spatial.transform import Rotation
+
+from drakegrasp.config import Config, load_config
+from drakegrasp.frames import X_WT, make_pose
+from drakegrasp.hand.description import load_hand
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.scene import Scene, advance, reset_object
+from drakegrasp.simulation.trajectory import PEAK_ACCELERATION, lift_duration
+from drakegrasp.verification.forces import lift as force_lift_module
+from drakegrasp.verification.forces.lift import ForceLift, LiftEnd, lift_by_forces
+from drakegrasp.verification.forces.quality import force_margin
+
+pytestmark = pytest.mark.sim
+
+GRAVITY, LIMIT = 9.81, 20.0
+HALF = CUBE / 2.0
+#: Two contacts on one face of the cube, one in the middle of the opposite face.
+P = np.array([[0.02, HALF, 0.0], [-0.02, HALF, 0.0], [0.0, -HALF, 0.0]])
+N = np.array([[0.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return load_config()
+
+
+@pytest.fixture(scope="module")
+def cube(tmp_path_factory) -> ObjectModel:
+    return box_model(tmp_path_factory.mktemp("cube"), [CUBE] * 3)
+
+
+@pytest.fixture(scope="module")
+def scene(cube, config) -> Scene:
+    return build_scene(cube, config.physics)
+
+
+@pytest.fixture(scope="module")
+def held(scene, cube, config) -> ForceLift:
+    return lift_by_forces(scene, standing(cube), P, N, force_limit=LIMIT, config=config)
+
+
+def heaviest(config: Config) -> float:
+    """Return the force that carries the cube [N] where it is accelerated upwards the most."""
+    distance = config.lift.p_TG[2] - HALF
+    return GRAVITY + PEAK_ACCELERATION * distance / lift_duration(distance, config) ** 2
+
+
+def test_cube_held_on_its_faces_arrives(held, config):
+    assert held.held
+    assert held.end is LiftEnd.HELD
+    assert held.position_error < 1e-4
+    assert held.angle_error < 1e-3
+    assert np.allclose(held.X_TO_lifted, make_pose(np.eye(3), config.lift.p_TG), atol=1e-3)
+    assert held.steps > 0
+    assert held.message == ""
+
+
+def test_forces_of_the_lift_are_the_closed_form(held, config):
+    """The finger that opposes two carries half of the load by friction."""
+    load = heaviest(config)
+    mu = config.physics.friction_hand
+    assert held.planned_force == pytest.approx(load / (2.0 * mu), rel=1e-6)
+    assert held.applied_force == pytest.approx(held.planned_force, rel=0.02)
+
+
+def test_more_friction_than_the_smallest_holds_and_less_does_not(scene, cube, config):
+    smallest = force_margin(cube, standing(cube), P, N, config).smallest_friction
+    for factor, outcome in ((1.001, LiftEnd.HELD), (0.999, LiftEnd.OVER_LIMIT)):
+        friction = factor * smallest
+        changed = load_config(overrides=[f"physics.friction_hand={friction}"])
+        found = lift_by_forces(scene, standing(cube), P, N, force_limit=LIMIT, config=changed)
+        assert found.end is outcome
+
+
+def test_slippery_cube_takes_more_than_a_fingertip_can_give(scene, cube):
+    slippery = load_config(overrides=["physics.friction_hand=0.05"])
+    found = lift_by_forces(scene, standing(cube), P, N, force_limit=LIMIT, config=slippery)
+    assert found.end is LiftEnd.OVER_LIMIT
+    assert not found.held
+    assert found.planned_force == pytest.approx(heaviest(slippery) / 0.1, rel=1e-6)
+    assert found.X_TO_lifted is None
+    assert np.isnan(found.position_error)
+    assert found.steps == 0
+
+
+@pytest.mark.parametrize(
+    ("p", "n"),
+    [
+        (np.abs(P), np.abs(N)),  # all on one side
+        (P, N * [[-1.0], [-1.0], [1.0]]),  # two normals reversed
+        (P, -N * [[1.0], [1.0], [-1.0]]),
+        (P * np.nan, N),
+    ],
+)
+def test_contacts_that_cannot_carry_the_cube_are_infeasible(scene, cube, config, p, n):
+    found = lift_by_forces(scene, standing(cube), p, n, force_limit=LIMIT, config=config)
+    assert found.end is LiftEnd.INFEASIBLE
+    assert found.planned_force == np.inf
+
+
+def test_turned_cube_is_held_as_well(scene, cube, config, held):
+    """Turned about the vertical, with the contacts of {O}; no figure may change."""
+    X_TO = standing(cube)
+    X_TO[:3, :3] = Rotation.from_rotvec([0.0, 0.0, 0.7]).as_matrix()
+    found = lift_by_forces(scene, X_TO, P, N, force_limit=LIMIT, config=config)
+    assert found.held
+    assert found.planned_force == pytest.approx(held.planned_force, rel=1e-6)
+    assert np.allclose(found.X_TO_lifted[:3, :3], X_TO[:3, :3], atol=1e-3)
+
+
+def test_lift_keeps_its_speed_and_its_straight_path(scene, cube, config, monkeypatch):
+    heights: list[float] = []
+    sideways: list[float] = []
+
+    def watch(scene: Scene, duration: float) -> None:
+        advance(scene, duration)
+        p = scene.pose(scene.object)[:3, 3]
+        heights.append(p[2])
+        sideways.append(float(np.abs(p[:2]).max()))
+
+    monkeypatch.setattr(force_lift_module, "advance", watch)
+    found = lift_by_forces(scene, standing(cube), P, N, force_limit=LIMIT, config=config)
+    assert found.held
+    assert len(heights) == found.steps
+    step = config.physics.time_step * force_lift_module.STEPS_PER_CONTROL
+    assert np.abs(np.diff(heights)).max() / step <= 1.02 * config.lift.max_speed
+    assert max(sideways) < 1e-3
+
+
+@pytest.mark.parametrize("limit", [LIMIT, 3.0])
+def test_object_that_is_heavier_than_believed_is_lost(scene, cube, config, limit):
+    """The forces are computed for a tenth of the mass, the simulation has all of it."""
+    deceived = replace(scene, model=replace(cube, mass=0.1, I_OOcm_O=0.1 * cube.I_OOcm_O))
+    found = lift_by_forces(deceived, standing(cube), P, N, force_limit=limit, config=config)
+    assert found.planned_force < limit
+    assert found.end is LiftEnd.STRAYED
+    assert found.position_error > config.verify.max_position_error
+    assert found.applied_force <= limit * (1.0 + 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("p", "n", "end"),
+    [
+        ([[0.0, 0.0, -HALF]], [[0.0, 0.0, -1.0]], LiftEnd.STRAYED),  # balanced on one finger
+        (P, N, LiftEnd.HELD),
+    ],
+)
+def test_nudged_cube_is_held_by_a_grasp_and_lost_by_a_balance(
+    scene, cube, config, monkeypatch, p, n, end
+):
+    """One finger below carries the cube, but nothing turns it back once it leans."""
+
+    def nudge(scene: Scene, duration: float) -> None:
+        advance(scene, duration)
+        if 1.0 < scene.time < 1.0 + 1.5 * duration:
+            velocity = np.zeros(6)
+            velocity[0] = 0.05  # about Wx [rad/s]
+            scene.plant.SetVelocities(scene.context, velocity)
+
+    monkeypatch.setattr(force_lift_module, "advance", nudge)
+    found = lift_by_forces(scene, standing(cube), p, n, force_limit=LIMIT, config=config)
+    assert found.planned_force < LIMIT
+    assert found.end is end
+
+
+def test_same_lift_gives_the_same_bits_whatever_ran_before(scene, cube, config, held):
+    deceived = replace(scene, model=replace(cube, mass=0.1))
+    lift_by_forces(deceived, standing(cube), P, N, force_limit=LIMIT, config=config)
+    again = lift_by_forces(scene, standing(cube), P, N, force_limit=LIMIT, config=config)
+    fresh = build_scene(cube, config.physics)
+    for other in (
+        again,
+        lift_by_forces(fresh, standing(cube), P, N, force_limit=LIMIT, config=config),
+    ):
+        assert np.array_equal(other.X_TO_lifted, held.X_TO_lifted)
+        assert other.applied_force == held.applied_force
+        assert other.planned_force == held.planned_force
+
+
+def test_no_force_is_left_behind(scene, cube, config, held):
+    """The cube falls from the air as in a scene that never knew a force."""
+    lift_by_forces(scene, standing(cube), P, N, force_limit=LIMIT, config=config)
+    heights = []
+    for used in (scene, build_scene(cube, config.physics)):
+        reset_object(used, X_WT @ make_pose(np.eye(3), [0.0, 0.0, 0.5]))
+        used.simulator.Initialize()
+        advance(used, 0.1)
+        heights.append(used.pose(used.object)[2, 3])
+    assert heights[0] == heights[1]
+    assert heights[0] < X_WT[2, 3] + 0.5 - 0.04
+
+
+@pytest.mark.parametrize("error", [RuntimeError("broken\nlong story"), SystemExit("abort")])
+def test_error_within_drake_is_an_outcome(scene, cube, config, monkeypatch, error):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(force_lift_module, "advance", fail)
+    found = lift_by_forces(scene, standing(cube), P, N, force_limit=LIMIT, config=config)
+    assert found.end is LiftEnd.ERROR
+    assert found.message == str(error).splitlines()[0]
+    assert not found.held
+
+
+def test_scene_with_a_hand_is_refused(cube, config):
+    with_hand = build_scene(cube, config.physics, load_hand())
+    with pytest.raises(ValueError, match="must have no hand"):
+        lift_by_forces(with_hand, standing(cube), P, N, force_limit=LIMIT, config=config)

@@ -1,0 +1,123 @@
+"""How far points are from an object's surface, and whether normals point out of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from helpers.objects import box_model, model_of
+
+from drakegrasp.frames import Array
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.verification.verify import WALL, face_distances, points_outward
+
+EXTENTS = np.array([0.06, 0.08, 0.1])
+#: Outer and inner half edge of the open box below [m]: walls of 2 mm.
+OUTER, INNER = 0.04, 0.038
+
+
+@pytest.fixture(scope="module")
+def box(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
+    return box_model(tmp_path_factory.mktemp("box"), EXTENTS)
+
+
+@pytest.fixture(scope="module")
+def pot(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
+    """A box, open at the top, with thin walls."""
+    outer = trimesh.creation.box(2.0 * OUTER * np.ones(3))
+    inner = trimesh.creation.box([2.0 * INNER, 2.0 * INNER, 2.0 * OUTER])
+    inner.apply_translation([0.0, 0.0, OUTER - INNER])
+    mesh = trimesh.boolean.difference([outer, inner], engine="manifold")
+    return model_of(mesh, tmp_path_factory.mktemp("pot"), "1_pot_a")
+
+
+def random_points(n: int, seed: int = 0) -> Array:
+    return np.random.default_rng(seed).uniform(-0.08, 0.08, (n, 3))
+
+
+@pytest.mark.parametrize("name", ["box", "pot"])
+def test_nearest_face_is_as_far_as_trimesh_says(name: str, request: pytest.FixtureRequest) -> None:
+    model: ObjectModel = request.getfixturevalue(name)
+    p = random_points(60)
+    distance = face_distances(model, p)
+    assert distance.shape == (60, len(model.collision_faces))
+    expected = trimesh.proximity.closest_point(model.collision, p)[1]
+    # Of faces that are almost equally near trimesh may return the second.
+    np.testing.assert_allclose(distance.min(axis=1), expected, atol=1e-6)
+    assert np.all(distance.min(axis=1) <= expected + 1e-9)
+
+
+def test_each_column_is_a_faces_own(pot: ObjectModel) -> None:
+    p = random_points(5, seed=1)
+    distance = face_distances(pot, p)
+    for face in range(0, len(pot.collision_faces), 7):
+        alone = trimesh.Trimesh(pot.collision.triangles[face], [[0, 1, 2]], process=False)
+        expected = trimesh.proximity.closest_point(alone, p)[1]
+        np.testing.assert_allclose(distance[:, face], expected, atol=1e-9)
+
+
+def test_no_points_have_no_distances(box: ObjectModel) -> None:
+    assert face_distances(box, np.zeros((0, 3))).shape == (0, len(box.collision_faces))
+
+
+def test_distances_from_a_box_are_those_of_the_formula(box: ObjectModel) -> None:
+    half = EXTENTS / 2.0
+    p = np.array(
+        [[0.0, 0.0, half[2] + 0.01], half + np.array([3e-3, 4e-3, 0]), [0.0, 0.0, 0.0], half]
+    )
+    nearest = face_distances(box, p).min(axis=1)
+    np.testing.assert_allclose(nearest, [0.01, 0.005, half.min(), 0.0], atol=1e-9)
+
+
+def outward(model: ObjectModel, p: Array, n: Array) -> list[bool]:
+    found = points_outward(model, face_distances(model, p), n)
+    assert found.shape == (len(p),)
+    assert found.dtype == bool
+    return [bool(each) for each in found]
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize("off", [-0.002, 0.0, 0.002])
+def test_a_boxs_normals_point_out(box: ObjectModel, axis: int, side: float, off: float) -> None:
+    """Also where the point is a little inside or outside, and the normal leans."""
+    out = side * np.eye(3)[axis]
+    p = np.tile(out * (EXTENTS / 2.0 + off), (4, 1))
+    lean = np.roll(out, 1)
+    n = np.array([out, -out, (out + lean) / np.sqrt(2.0), (lean - out) / np.sqrt(2.0)])
+    assert outward(box, p, n) == [True, False, True, False]
+
+
+def test_beside_an_edge_either_face_will_do(box: ObjectModel) -> None:
+    p = np.array([[EXTENTS[0] / 2.0, EXTENTS[1] / 2.0 - 0.001, 0.0]])
+    x, y = np.eye(3)[:2]
+    for normal, expected in ((x, True), (y, True), (-x, False), (-y, False)):
+        assert outward(box, p, normal[None]) == [expected]
+    # Farther from the edge than a wall is thick only the first is near.
+    assert outward(box, p - [[0.0, 2.0 * WALL, 0.0]], y[None]) == [False]
+
+
+def test_both_sides_of_a_thin_wall_are_asked(pot: ObjectModel) -> None:
+    """A point may be a few millimetres off, on the wrong side of the wall."""
+    x = np.eye(3)[:1]
+    for at in (OUTER, INNER, OUTER + 0.004, INNER - 0.004):
+        assert outward(pot, at * x, x) == outward(pot, at * x, -x) == [True]
+        # Along the wall it still does not point out of it.
+        assert outward(pot, at * x, np.eye(3)[1:2]) == [False]
+
+
+def test_sides_of_a_thick_plate_are_told_apart(tmp_path: Path) -> None:
+    """Also when the point is off the surface: the other side is no nearer for it."""
+    plate = box_model(tmp_path, [0.1, 0.1, 0.008])
+    z = np.eye(3)[2:]
+    for off in (-0.001, 0.0, 0.003, 0.009):
+        assert outward(plate, (0.004 + off) * z, z) == [True]
+        assert outward(plate, (0.004 + off) * z, -z) == [False]
+
+
+def test_normals_are_judged_one_by_one(box: ObjectModel) -> None:
+    half = EXTENTS / 2.0
+    p, n = np.diag(half), np.diag([1.0, -1.0, 1.0])
+    assert outward(box, p, n) == [True, False, True]

@@ -1,0 +1,170 @@
+"""The figure of a verification: contacts where they are, the hand where it was, the verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers.machine import needs_egl
+from helpers.objects import CUBE, box_model, from_above, standing
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+
+from drakegrasp.config import Config, load_config
+from drakegrasp.frames import make_pose
+from drakegrasp.hand.description import load_hand
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.outcomes import Outcome
+from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.scene import Scene, palm_pose
+from drakegrasp.simulation.trajectory import lifted_palm
+from drakegrasp.simulation.trial import TrialRecord, run_attempt
+from drakegrasp.verification.figure import verification_figure
+from drakegrasp.verification.forces.lift import ForceLift, LiftEnd
+from drakegrasp.visualization.style import save_figure
+
+pytestmark = pytest.mark.sim
+
+#: Contacts on the cube's front, back and underside.
+NHAT_Q_O = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
+P_OQ = CUBE / 2.0 * NHAT_Q_O
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return load_config()
+
+
+@pytest.fixture(scope="module")
+def cube(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
+    return box_model(tmp_path_factory.mktemp("cube"), [CUBE] * 3)
+
+
+@pytest.fixture(scope="module")
+def scene(cube: ObjectModel, config: Config) -> Scene:
+    return build_scene(cube, config.physics, load_hand(config.hand))
+
+
+@pytest.fixture(scope="module")
+def held(scene: Scene, cube: ObjectModel, config: Config) -> TrialRecord:
+    return run_attempt(scene, standing(cube), from_above(cube, 0.06), config)
+
+
+@pytest.fixture
+def verified(cube: ObjectModel) -> Callable[..., SimpleNamespace]:
+    """Return a function that makes a result, of a grasp that was not tried unless told."""
+
+    def make(**values: object) -> SimpleNamespace:
+        result: dict[str, object] = {
+            "outcome": Outcome.OFF_SURFACE, "reason": "so it is",
+            "placed": SimpleNamespace(model=cube, X_TO=standing(cube)),
+            "p_OQ": P_OQ, "nhat_Q_O": NHAT_Q_O,
+            "fit": None, "attempt": None, "trial": None, "lift": None,
+            "config": load_config(),
+        }  # fmt: skip
+        return SimpleNamespace(**result | values)
+
+    return make
+
+
+def dots_of(figure: Figure, panel: int) -> dict[str, bool]:
+    """Return the dots of a panel, and whether each is drawn as one that is seen."""
+    lines = {str(line.get_gid()): line for line in figure.axes[panel].lines}
+    return {name: line.get_markerfacecolor() != "white" for name, line in lines.items()}
+
+
+def texts_of(figure: Figure) -> list[str]:
+    return [text.get_text() for text in figure.texts]
+
+
+@needs_egl
+def test_contacts_on_opposite_sides_are_each_seen_once(
+    verified: Callable[..., SimpleNamespace], config: Config, tmp_path: Path
+) -> None:
+    figure = verification_figure(verified())
+    assert len(figure.axes) == 2
+    first, second = dots_of(figure, 0), dots_of(figure, 1)
+    assert list(first) == list(second) == ["predicted 0", "predicted 1", "predicted 2"]
+    assert sorted([first["predicted 0"], first["predicted 1"]]) == [False, True]
+    assert first["predicted 0"] == second["predicted 1"]
+    # What the object stands on is seen from nowhere.
+    assert not first["predicted 2"]
+    assert not second["predicted 2"]
+    assert texts_of(figure) == ["1_box_a  fails: off surface", "so it is"]
+    save_figure(figure, tmp_path / "figure.png", dpi=50)
+    assert imread(tmp_path / "figure.png").std() > 0.1
+
+
+@needs_egl
+def test_dots_are_on_the_object_and_its_hand_is_shown(
+    verified: Callable[..., SimpleNamespace], held: TrialRecord, config: Config
+) -> None:
+    assert held.outcome is Outcome.SUCCESS
+    assert held.closed is not None
+    result = verified(
+        outcome=Outcome.SUCCESS,
+        trial=held,
+        p_OQ=held.closed.p_OQ,
+        nhat_Q_O=held.closed.nhat_Q_O,
+    )
+    figure = verification_figure(result)
+    assert texts_of(figure)[0] == "1_box_a  holds"
+    assert [axes.get_title(loc="left") for axes in figure.axes][2] == "end of the lift"
+    # Predicted where they were reached: dots lie on each other.
+    for panel in (0, 1):
+        lines = {line.get_gid(): line.get_xydata()[0] for line in figure.axes[panel].lines}
+        for i in range(3):
+            np.testing.assert_allclose(lines[f"predicted {i}"], lines[f"reached {i}"], atol=1e-6)
+    assert set(dots_of(figure, 2)) == {"reached 0", "reached 1", "reached 2"}
+    alone, hand = (figure.axes[k].images[0].get_array() for k in (0, 2))
+    # The hand is grey and black, the table and the cube are not.
+    assert np.mean(np.ptp(hand, axis=2) < 8) > 0.05
+    assert np.mean(np.ptp(alone, axis=2) < 8) < 0.05
+    largest = max(
+        np.linalg.norm(contacts.f_Q_O, axis=1).max()
+        for contacts in (held.closed, held.lifted)
+        if contacts is not None
+    )
+    legend = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert any(f"{largest:.1f} N" in text for text in legend)
+
+
+@needs_egl
+def test_last_panel_shows_the_last_instant(
+    verified: Callable[..., SimpleNamespace], held: TrialRecord, cube: ObjectModel, config: Config
+) -> None:
+    closed = replace(held, lifted=None, q_lifted=None, X_TO_lifted=None)
+    fit = SimpleNamespace(X_OG=held.X_OG, spread=0.0, closing=np.full(3, 1.0))
+    X_TO_lifted = make_pose(np.eye(3), [0.0, 0.0, 0.6])
+    lift = ForceLift(end=LiftEnd.HELD, planned_force=1.0, X_TO_lifted=X_TO_lifted)
+    for values, title in (
+        ({"trial": closed, "fit": fit}, "after closing"),
+        ({"fit": fit}, "the hand where it comes closest"),
+        ({"lift": lift}, "end of the lift"),
+    ):
+        figure = verification_figure(verified(**values))
+        assert figure.axes[2].get_title(loc="left") == title
+    refused = ForceLift(end=LiftEnd.INFEASIBLE, planned_force=np.inf)
+    assert len(verification_figure(verified(lift=refused)).axes) == 2
+
+
+@pytest.mark.parametrize("friction", [0.71, 0.1])
+def test_palm_is_where_the_lift_ended(cube: ObjectModel, config: Config, friction: float) -> None:
+    """Without friction the cube is lost long before the palm has arrived."""
+    physics = config.physics.model_copy(update={"friction_hand": friction})
+    slick = config.model_copy(update={"physics": physics})
+    scene = build_scene(cube, physics, load_hand(config.hand))
+    record = run_attempt(scene, standing(cube), from_above(cube, 0.06), slick)
+    assert record.lifted is not None
+    assert record.lifted.touching.any() == (friction > 0.5)
+    # The calm part of a lift has a scene of its own.
+    assert scene.make_calm is not None
+    X_WG = palm_pose(max(scene, scene.make_calm(), key=lambda stage: stage.time))
+    X_TG = record.X_TO @ record.X_OG
+    np.testing.assert_allclose(lifted_palm(X_TG, record.time_lift, slick), X_WG, atol=2e-4)
+    if friction < 0.5:
+        assert X_WG[2, 3] < 0.65 + config.lift.p_TG[2] - 0.1

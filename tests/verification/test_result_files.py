@@ -1,0 +1,267 @@
+"""Results of verification as files: complete, strict, and the same for the same results."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+from helpers.objects import standing
+
+from drakegrasp.config import load_config
+from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, VERIFICATION_FIELDS, sizes
+from drakegrasp.errors import DataError
+from drakegrasp.frames import make_pose, pack_pose
+from drakegrasp.objects.model import make_object
+from drakegrasp.outcomes import Outcome
+from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.contacts import Contacts
+from drakegrasp.simulation.placement import PlacedObject
+from drakegrasp.simulation.trial import TrialRecord
+from drakegrasp.verification.forces.lift import ForceLift, LiftEnd
+from drakegrasp.verification.result import Verification
+from drakegrasp.verification.result_files import (
+    json_lines,
+    part_path,
+    refuse_unwritable,
+    result_paths,
+    write_json_line,
+    write_results,
+)
+from drakegrasp.verification.wrist.solver import WristFit
+
+CONFIG = load_config()
+RNG = np.random.default_rng(0)
+X_OG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.1])
+
+
+def contacts() -> Contacts:
+    """Two fingertips touch, the second does not."""
+    touching = np.array([True, False, True])
+    return Contacts(
+        touching=touching,
+        p_OQ=np.where(touching[:, None], RNG.normal(size=(3, 3)), np.nan),
+        nhat_Q_O=np.where(touching[:, None], [1.0, 0.0, 0.0], np.nan),
+        f_Q_O=RNG.normal(size=(3, 3)),
+        area=RNG.random(3),
+        penetration=RNG.random(3),
+        other_links=2,
+        hand_on_table=False,
+        object_on_table=True,
+        table_force=np.zeros(3),
+        point_contacts=1,
+    )
+
+
+def results() -> list[Verification]:
+    """One of each kind: held by the hand, held by forces, out of reach, off the surface."""
+    box = trimesh.creation.box([0.06, 0.05, 0.12])
+    model = make_object(
+        box.vertices, box.faces, CONFIG.objects, name="чашка", class_name="cup", mesh_sha256=""
+    )
+    placed = PlacedObject(model=model, X_TO=standing(model))
+    off = Verification(
+        method="hand",
+        outcome=Outcome.OFF_SURFACE,
+        reason="contact 1 is 20.0 mm from the object's surface",
+        placed=placed,
+        config=CONFIG,
+        p_OQ=RNG.normal(size=(3, 3)),
+        nhat_Q_O=np.tile([0.0, 0.0, 1.0], (3, 1)),
+        surface_distance=np.array([0.02, 0.0, 0.0]),
+        seconds={"surface": 0.001},
+    )
+    fit = WristFit(
+        X_OG=X_OG,
+        spread=0.25,
+        closing=np.array([0.5, 0.6, 0.7]),
+        objective=1e-6,
+        residual=np.array([0.0, 1e-3, 1 / 3]),
+        normal_error=np.deg2rad([1.0, 2.0, 60.0]),
+        status=0,
+        message="Optimization terminated successfully",
+        iterations=12,
+        evaluations=15,
+    )
+    attempt = Attempt(
+        candidate=0,
+        standoff_index=0,
+        standoff=0.0,
+        spread=0.25,
+        X_OG=X_OG,
+        ray_hits=True,
+        seed=0,
+        closing=np.array([0.1, 0.2, 0.3]),
+    )
+    trial = TrialRecord(
+        outcome=Outcome.SUCCESS,
+        X_TO=placed.X_TO,
+        X_OG=X_OG,
+        closed=contacts(),
+        lifted=contacts(),
+        q_closed=RNG.random(8),
+        q_lifted=RNG.random(8),
+        time_close=1.5,
+        time_lift=2.5,
+        X_TO_lifted=make_pose(np.eye(3), [0.0, 0.0, 0.5]),
+        slip=0.002,
+        slip_angle=0.01,
+    )
+    lift = ForceLift(
+        end=LiftEnd.HELD,
+        planned_force=5.0,
+        applied_force=6.0,
+        position_error=0.001,
+        angle_error=np.deg2rad(2.0),
+        X_TO_lifted=make_pose(np.eye(3), [0.0, 0.0, 0.6]),
+        steps=300,
+    )
+    judged = replace(off, epsilon=0.1, smallest_friction=0.5)
+    unreachable = replace(judged, outcome=Outcome.UNREACHABLE, smallest_friction=np.inf, fit=fit)
+    held = replace(
+        judged,
+        outcome=Outcome.SUCCESS,
+        reason="every fingertip holds it",
+        fit=fit,
+        tries=2,
+        attempt=attempt,
+        trial=trial,
+        contact_error=np.array([0.001, 0.002, 0.003]),
+    )
+    by_forces = replace(judged, method="forces", outcome=Outcome.SUCCESS, lift=lift)
+    return [held, by_forces, unreachable, off]
+
+
+@pytest.fixture(scope="module")
+def found() -> list[Verification]:
+    return results()
+
+
+def lines_of(found: list[Verification]) -> list[dict[str, Any]]:
+    stream = io.StringIO()
+    for index, result in enumerate(found):
+        write_json_line(index, result, stream)
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is not strict JSON")
+
+    return [json.loads(line, parse_constant=refuse) for line in stream.getvalue().splitlines()]
+
+
+def test_a_line_says_all_of_a_grasp_in_strict_json(found: list[Verification]) -> None:
+    held, by_forces, unreachable, off = lines_of(found)
+    assert [line["index"] for line in (held, by_forces, unreachable, off)] == [0, 1, 2, 3]
+    assert [line["outcome"] for line in (held, by_forces, unreachable, off)] == [
+        "success",
+        "success",
+        "unreachable",
+        "off_surface",
+    ]
+    assert held["object"] == "чашка"
+    assert held["success"] is True
+    assert held["X_OG"] == X_OG.tolist()
+    assert held["closed"]["touching"] == [True, False, True]
+    assert held["closed"]["p_OQ"][1] == [None, None, None]
+    assert held["closed"]["other_links"] == 2
+    assert len(held["lifted"]["q"]) == 8
+    assert by_forces["forces"]["end"] == "held"
+    assert held["solver"]["iterations"] == 12
+    assert held["slip"] == 0.002
+    assert held["forces"] is None
+    assert by_forces["forces"]["angle_error_deg"] == pytest.approx(2.0)
+    assert by_forces["closed"] is None
+    assert unreachable["normal_error_deg"] == pytest.approx([1.0, 2.0, 60.0])
+    assert unreachable["smallest_friction"] is None
+    can_hold = [line["friction_can_hold"] for line in (held, unreachable, off)]
+    assert can_hold == [True, False, None]
+    assert (off["X_OG"], off["spread"], off["epsilon"], off["slip"]) == (None, None, None, None)
+    assert off["seconds"] == {"surface": 0.001}
+
+
+def test_numbers_are_short(found: list[Verification]) -> None:
+    (held, *_) = lines_of(found)
+    assert held["residual"] == [0.0, 0.001, 0.333333]
+
+
+def test_every_field_is_written_and_reads_back(found: list[Verification], tmp_path: Path) -> None:
+    write_results(found, tmp_path / "r.h5", CONFIG)
+    shape = sizes(fingers=3, joints=8, image=0)
+    with h5py.File(tmp_path / "r.h5") as file:
+        group = file["grasps"]
+        assert set(group) == {f.name for f in VERIFICATION_FIELDS}
+        for field in VERIFICATION_FIELDS:
+            dataset = group[field.name]
+            assert dataset.shape == (4, *field.row_shape(shape))
+            assert field.dtype == "str" or dataset.dtype == np.dtype(field.dtype)
+            assert dataset.attrs["unit"] == field.unit
+        columns = {name: dataset[:] for name, dataset in group.items()}
+        assert group["object"].asstr()[0] == "чашка"
+        assert file.attrs["schema_version"] == SCHEMA_VERSION
+        assert {f"convention_{key}" for key in CONVENTIONS} <= set(file.attrs)
+        assert json.loads(file.attrs["config"]) == CONFIG.to_dict()
+        assert json.loads(file.attrs["versions"])["drake"]
+    held = found[0]
+    assert columns["outcome"].tolist() == [0, 0, 13, 14]
+    for name in ("p_OQ", "nhat_Q_O", "surface_distance", "epsilon", "smallest_friction", "tries"):
+        assert np.array_equal(columns[name], [getattr(v, name) for v in found], equal_nan=True)
+    assert np.array_equal(columns["X_OG"][0], pack_pose(X_OG))
+    assert np.array_equal(columns["closed_q"][0], held.q_closed)
+    assert held.closed is not None
+    assert np.array_equal(columns["closed_p_OQ"][0], held.closed.p_OQ, equal_nan=True)
+    assert np.array_equal(columns["closing_start"][0], [0.1, 0.2, 0.3])
+    assert columns["solver_status"].tolist() == [0, -1, 0, -1]
+    assert columns["X_TO_lifted"][:2, 11].tolist() == [0.5, 0.6]
+    assert np.isnan(columns["X_TO_lifted"][2:]).all()
+    assert np.isnan(columns["slip"][1:]).all()
+    assert math.isinf(columns["smallest_friction"][2])
+
+
+def test_equal_results_give_equal_bytes(found: list[Verification], tmp_path: Path) -> None:
+    """Whatever the clock said while they were found."""
+    slower = [replace(v, seconds={"surface": 1.0, "fit": 2.0}) for v in found]
+    write_results(found, tmp_path / "a.h5", CONFIG)
+    write_results(slower, tmp_path / "b.h5", CONFIG)
+    assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
+
+
+def test_lines_are_whole_in_the_end_and_not_lost_before(
+    found: list[Verification], tmp_path: Path
+) -> None:
+    out = tmp_path / "new folder" / "run.1"
+    with pytest.raises(KeyboardInterrupt), json_lines(out) as write:
+        write(0, found[0])
+        assert len(part_path(out).read_text(encoding="utf-8").splitlines()) == 1
+        raise KeyboardInterrupt
+    assert [p.name for p in out.parent.iterdir()] == ["run.1.part.jsonl"]
+    with json_lines(out) as write:
+        for index, result in enumerate(found):
+            write(index, result)
+    (whole,) = out.parent.iterdir()
+    assert whole.name == "run.1.jsonl"
+    assert len(whole.read_text(encoding="utf-8").splitlines()) == 4
+    with pytest.raises(ValueError, match="nothing"), json_lines(tmp_path / "deep" / "run"):
+        raise ValueError("nothing was verified")
+    assert [p.name for p in tmp_path.iterdir()] == ["new folder"]
+
+
+def test_a_name_stands_for_two_files(tmp_path: Path) -> None:
+    for name in ("run.h5", "run.jsonl", "run.hdf5", "run"):
+        assert [p.name for p in result_paths(tmp_path / name)] == ["run.jsonl", "run.h5"]
+
+
+def test_place_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder.h5").mkdir()
+    with pytest.raises(DataError, match="must be in a folder that can be written"):
+        refuse_unwritable(tmp_path / "file" / "deep" / "run")
+    with pytest.raises(DataError, match=r"folder\.h5: must be a file, got a folder"):
+        refuse_unwritable(tmp_path / "folder")
+    refuse_unwritable(tmp_path / "new" / "deep" / "run")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "folder.h5"]

@@ -1,0 +1,274 @@
+"""Verifying grasps end to end: what held once holds again, and what cannot hold does not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.objects import CUBE, box_model, standing
+from scipy.spatial.transform import Rotation
+from threadpoolctl import threadpool_limits
+
+import drakegrasp as dg
+from drakegrasp.config import load_config, override_config
+from drakegrasp.errors import GraspError, OffSurfaceError
+from drakegrasp.frames import X_WT, invert_pose, make_pose
+from drakegrasp.hand.description import load_hand
+from drakegrasp.outcomes import Outcome
+from drakegrasp.simulation.candidates import R_OG0, Attempt
+from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.placement import PlacedObject
+from drakegrasp.simulation.trial import TrialRecord, run_attempt
+from drakegrasp.verification.tasks import VerifyTask, plan_verification, run_task
+from drakegrasp.verification.verify import verify_contacts
+
+pytestmark = pytest.mark.sim
+
+CONFIG = load_config()
+
+
+@pytest.fixture(scope="module")
+def cube(tmp_path_factory: pytest.TempPathFactory) -> PlacedObject:
+    model = box_model(tmp_path_factory.mktemp("cube"), [CUBE] * 3, "1_cube_a")
+    return PlacedObject(model=model, X_TO=standing(model))
+
+
+@pytest.fixture(scope="module")
+def grasp(cube: PlacedObject) -> tuple[np.ndarray, np.ndarray]:
+    """Contacts of a simulated grasp that held, across two faces of the cube, from above."""
+    scene = build_scene(cube.model, CONFIG.physics, load_hand(CONFIG.hand))
+    attempt = Attempt(
+        candidate=0,
+        standoff_index=0,
+        standoff=0.06,
+        spread=0.0,
+        X_OG=make_pose(R_OG0, [0.0, 0.0, CUBE / 2.0 + 0.06]),
+        ray_hits=True,
+        seed=0,
+    )
+    record = run_attempt(scene, cube.X_TO, attempt, CONFIG)
+    assert record.outcome is Outcome.SUCCESS and record.closed is not None
+    return record.closed.p_OQ, record.closed.nhat_Q_O
+
+
+def verify(
+    placed: PlacedObject, p: np.ndarray, n: np.ndarray, method: str = "hand"
+) -> dg.Verification:
+    return verify_contacts(placed, p, n, method=method, config=CONFIG)
+
+
+@pytest.fixture(scope="module")
+def held(cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]) -> dg.Verification:
+    return verify(cube, *grasp)
+
+
+def test_a_grasp_that_held_is_found_again_and_holds(held: dg.Verification) -> None:
+    assert held.success and held.outcome is Outcome.SUCCESS
+    assert held.residual is not None and held.residual.max() < 0.003
+    assert held.normal_error_deg is not None and held.normal_error_deg.max() < 15.0
+    assert held.contact_error is not None and held.contact_error.max() < 0.005
+    assert held.closed is not None and held.closed.touching.all()
+    assert held.lifted is not None and held.lifted.touching.all()
+    assert held.fit is not None and held.fit.status == 0 and held.fit.iterations > 0
+    assert {"surface", "margin", "fit", "simulate"} <= set(held.seconds)
+    assert held.explain().startswith("The grasp of 1_cube_a holds")
+
+
+def test_forces_alone_hold_it_too(cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]) -> None:
+    found = verify(cube, *grasp, "forces")
+    assert found.success and found.fit is None and found.trial is None
+    assert found.lift is not None and found.lift.applied_force < 20.0
+    assert 0.0 < found.smallest_friction < CONFIG.physics.friction_hand
+    assert "carry it" in found.explain()
+
+
+def test_the_same_grasp_gives_the_same_bits(
+    held: dg.Verification, cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
+) -> None:
+    p, n = grasp
+    verify(cube, p + np.array([0.0, 0.0, 0.003]), n)  # something else in between
+    again = verify(cube, p, n)
+    assert again.trial is not None and held.trial is not None
+    assert again.closed is not None and held.closed is not None
+    np.testing.assert_array_equal(again.X_OG, held.X_OG)
+    np.testing.assert_array_equal(again.closed.p_OQ, held.closed.p_OQ)
+    np.testing.assert_array_equal(again.trial.X_TO_lifted, held.trial.X_TO_lifted)
+
+
+@pytest.mark.parametrize("yaw", [0.7, -2.9])
+def test_moving_object_and_grasp_together_changes_nothing(
+    held: dg.Verification, cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray], yaw: float
+) -> None:
+    Z = make_pose(Rotation.from_euler("z", yaw).as_matrix(), [0.2, -0.1, 0.0])
+    X_TO = Z @ cube.X_TO
+    moved = dg.transform_grasp(X_TO, dg.pack_grasp(*grasp))
+    found = dg.verify_grasp(moved, cube, frame="workspace", X_TO=X_TO)
+    assert found.outcome is held.outcome and found.tries == held.tries
+    assert found.X_OG is not None and found.closed is not None and held.closed is not None
+    np.testing.assert_allclose(found.X_OG, held.X_OG, atol=1e-9)
+    np.testing.assert_allclose(found.closed.p_OQ, held.closed.p_OQ, atol=1e-9)
+
+
+def test_the_camera_frame_is_the_one_of_its_pose(
+    held: dg.Verification, cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
+) -> None:
+    X_TC = make_pose(Rotation.from_euler("xyz", [2.0, 0.4, -1.0]).as_matrix(), [0.1, 0.3, 0.4])
+    X_CO = invert_pose(X_TC) @ cube.X_TO
+    seen = dg.transform_grasp(X_CO, dg.pack_grasp(*grasp))
+    found = dg.verify_grasp(seen, cube, frame="camera", X=X_TC)
+    assert found.outcome is held.outcome
+    np.testing.assert_allclose(found.p_OQ, held.p_OQ, atol=1e-12)
+
+
+@pytest.mark.parametrize("method", ["hand", "forces"])
+def test_contacts_off_the_surface_are_no_grasp(
+    cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray], method: str
+) -> None:
+    p, n = grasp
+    found = verify(cube, p + 0.03 * n, n, method)
+    assert found.outcome is Outcome.OFF_SURFACE and not found.success
+    assert "30.0 mm from the object's surface" in found.reason
+    with pytest.raises(OffSurfaceError, match=r"on the object's surface, got: contact . is 30\.0"):
+        dg.verify_grasp(dg.pack_grasp(p + 0.03 * n, n), cube, method=method)
+
+
+@pytest.mark.parametrize("method", ["hand", "forces"])
+def test_normals_that_point_inwards_are_no_grasp(
+    cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray], method: str
+) -> None:
+    p, n = grasp
+    found = verify(cube, p, n * [[-1.0], [-1.0], [1.0]], method)
+    assert found.outcome is Outcome.OFF_SURFACE
+    assert found.reason in ("normal 1 points into the object", "normal 2 points into the object")
+
+
+@pytest.mark.parametrize("method", ["hand", "forces"])
+def test_three_contacts_on_one_face_hold_nothing(cube: PlacedObject, method: str) -> None:
+    half = CUBE / 2.0
+    p = np.array([[half, -0.02, 0.0], [half, 0.02, 0.0], [half, 0.0, 0.02]])
+    found = verify(cube, p, np.tile([1.0, 0.0, 0.0], (3, 1)), method)
+    assert not found.success
+    assert found.smallest_friction == np.inf
+    assert "are not enough at any friction" in found.explain()
+
+
+def test_contacts_that_no_hand_spans_are_unreachable(tmp_path: Path) -> None:
+    model = box_model(tmp_path, [0.5, 0.1, 0.1], "1_beam_a")
+    p = np.array([[0.25, 0.0, 0.0], [0.0, 0.05, 0.0], [-0.25, 0.0, 0.0]])
+    n = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    found = verify(PlacedObject(model=model, X_TO=standing(model)), p, n)
+    assert found.outcome is Outcome.UNREACHABLE
+    assert "no pose of the palm" in found.reason and found.tries == 0
+
+
+def test_a_finger_that_touches_elsewhere_does_not_make_the_grasp(
+    held: dg.Verification, cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
+) -> None:
+    strict = override_config(CONFIG, ["verify.max_contact_error=1e-5"])
+    p, n = grasp
+    found = verify_contacts(cube, p, n, method="hand", config=strict)
+    assert found.outcome is Outcome.UNREACHABLE and held.success
+    assert "closing fingertip" in found.reason
+
+
+def test_at_little_friction_neither_method_holds(
+    cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
+) -> None:
+    slippery = override_config(CONFIG, ["physics.friction_hand=0.05"])
+    for method in ("hand", "forces"):
+        found = verify_contacts(cube, *grasp, method=method, config=slippery)
+        assert found.outcome in (Outcome.DROPPED, Outcome.SLIPPED)
+
+
+def test_a_drake_error_is_a_value_and_the_next_grasp_is_untouched(
+    held: dg.Verification,
+    cube: PlacedObject,
+    grasp: tuple[np.ndarray, np.ndarray],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    p, n = grasp
+    with monkeypatch.context() as patch:
+        patch.setattr("drakegrasp.simulation.trial.finger_speed", _fail)
+        found = verify(cube, p, n)
+    assert found.outcome is Outcome.SOLVER_ERROR and found.outcome.says_nothing
+    assert "says nothing about the grasp" in found.reason and "broken" in found.reason
+    again = verify(cube, p, n)
+    assert again.closed is not None and held.closed is not None
+    np.testing.assert_array_equal(again.closed.p_OQ, held.closed.p_OQ)
+
+
+def test_without_a_verdict_on_one_try_there_is_none(
+    cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A palm pose that timed out might have held."""
+    outcomes = iter([Outcome.SLIPPED, Outcome.TIMEOUT, *[Outcome.DROPPED] * 3])
+    monkeypatch.setattr(
+        "drakegrasp.verification.verify.run_attempt",
+        lambda scene, X_TO, attempt, config: TrialRecord(
+            outcome=next(outcomes), X_TO=X_TO, X_OG=attempt.X_OG
+        ),
+    )
+    found = verify(cube, *grasp)
+    assert found.tries > 1
+    assert found.outcome is Outcome.TIMEOUT
+    assert "says nothing about the grasp" in found.explain()
+
+
+def test_lift_by_forces_has_a_wall_clock_limit(
+    cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
+) -> None:
+    hasty = override_config(CONFIG, ["attempt_seconds=1e-3"])
+    found = verify_contacts(cube, *grasp, method="forces", config=hasty)
+    assert found.outcome is Outcome.TIMEOUT
+    assert "says nothing about the grasp" in found.reason
+
+
+def test_number_of_threads_changes_no_bit(
+    cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
+) -> None:
+    """Workers have one thread for linear algebra; a caller's own process has many."""
+    fits = []
+    for threads in (1, 4):
+        with threadpool_limits(threads):
+            (task,) = plan_of(cube, grasp)
+            _, (found,) = run_task(task)
+        assert found.fit is not None
+        fits.append(found.fit)
+    np.testing.assert_array_equal(fits[0].X_OG, fits[1].X_OG)
+    np.testing.assert_array_equal(fits[0].closing, fits[1].closing)
+
+
+def plan_of(cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]) -> list[VerifyTask]:
+    nothing = dict.fromkeys(("frame", "X", "X_TO", "units", "hand", "config", "dataset", "rows"))
+    return plan_verification(dg.pack_grasp(*grasp), cube, method="hand", **nothing)
+
+
+def _fail(scene: object) -> float:
+    raise RuntimeError("broken")
+
+
+def test_one_grasp_is_a_vector(cube: PlacedObject) -> None:
+    with pytest.raises(GraspError, match=r"verify_grasps takes many"):
+        dg.verify_grasp(np.zeros((2, 18)), cube)
+    with pytest.raises(GraspError, match=r"must be one of hand, forces, got 'fingers'"):
+        dg.verify_grasp(np.zeros(18), cube, method="fingers")
+    with pytest.raises(GraspError, match=r"a mesh or a dataset must be given"):
+        dg.verify_grasp(np.zeros(18))
+
+
+def test_another_hands_grasp_is_refused(cube: PlacedObject) -> None:
+    with pytest.raises(GraspError, match=r"must be 18 numbers .*got an array of shape \(24,\)"):
+        dg.verify_grasp(np.zeros(24), cube)
+
+
+def test_results_know_what_they_were_asked(held: dg.Verification, cube: PlacedObject) -> None:
+    assert held.placed is cube and held.method == "hand"
+    assert np.isnan(replace(held, fit=None).spread)
+    assert repr(held).startswith("Verification(hand, success")
+    assert held.attempt is not None and held.attempt.closing is not None
+    assert held.closing is not None
+    # The fingers were opened before they closed.
+    assert np.all(held.attempt.closing < held.closing)
+    assert (X_WT @ cube.X_TO @ held.attempt.X_OG)[2, 3] > 0.65

@@ -1,0 +1,264 @@
+"""Fingertips as smooth functions: against exact distances, finite differences and Drake."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from helpers.hands import PINCER_SDF, write_pincer
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
+from pydrake.systems.framework import DiagramBuilder
+from scipy.spatial import ConvexHull
+
+from drakegrasp.errors import HandError
+from drakegrasp.frames import Array
+from drakegrasp.hand.description import Hand, load_hand, make_parser
+from drakegrasp.hand.shapes import link_shapes
+from drakegrasp.verification.wrist.pads import ROUNDING, Pads, make_pads, nearest_on_pads, touch
+
+#: Half edges of the box among the bodies below [m].
+HALF = np.array([0.012, 0.01, 0.03])
+#: Rounding of plane offsets when planes are merged [m].
+MERGED = 2e-6
+
+
+def bodies() -> list[Array]:
+    """Return corners of a box, a tetrahedron and a Barrett fingertip: few planes and many."""
+    hand = load_hand()
+    tetrahedron = np.array([[0.0, 0.0, 0.0], [0.03, 0.0, 0.0], [0.0, 0.02, 0.0], [0.0, 0.0, 0.04]])
+    fingertip = np.concatenate(link_shapes(hand)[hand.fingertip_links[0]])
+    return [trimesh.creation.box(2.0 * HALF).vertices, tetrahedron, fingertip]
+
+
+@pytest.fixture(scope="module")
+def pads() -> Pads:
+    return make_pads(bodies())
+
+
+@pytest.fixture(scope="module")
+def hulls() -> list[trimesh.Trimesh]:
+    return [trimesh.convex.convex_hull(corners) for corners in bodies()]
+
+
+def points_about(hulls: list[trimesh.Trimesh], seed: int) -> Array:
+    """Return one point for each hull, within its box made larger by 10 mm."""
+    rng = np.random.default_rng(seed)
+    low, high = np.swapaxes([hull.bounds for hull in hulls], 0, 1)
+    return np.asarray(rng.uniform(low - 0.01, high + 0.01))
+
+
+def highest_plane(hull: trimesh.Trimesh, p: Array) -> float:
+    """Return the largest height of a point above a face's plane."""
+    return float(np.einsum("ij,ij->i", p - hull.triangles[:, 0], hull.face_normals).max())
+
+
+def signed_distance(hull: trimesh.Trimesh, p: Array) -> float:
+    """Return trimesh's distance outside of the hull, negative inside."""
+    return -float(trimesh.proximity.signed_distance(hull, p[None])[0])
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_smooth_distance_is_over_the_planes_by_its_rounding_at_most(
+    pads: Pads, hulls: list[trimesh.Trimesh], seed: int
+) -> None:
+    p = points_about(hulls, seed)
+    distance = touch(pads, p).distance
+    exact = np.array([highest_plane(hull, q) for hull, q in zip(hulls, p, strict=True)])
+    planes = np.isfinite(pads.offsets).sum(axis=1)
+    assert np.all(distance >= exact - MERGED)
+    assert np.all(distance <= exact + ROUNDING * np.log(planes) + MERGED)
+    # Where the planes are clear about a side, so is the smooth distance.
+    clear = np.abs(exact) > ROUNDING * np.log(planes) + MERGED
+    inside = [hull.contains(q[None])[0] for hull, q in zip(hulls, p, strict=True)]
+    np.testing.assert_array_equal((distance < 0.0)[clear], np.array(inside)[clear])
+
+
+def test_before_the_middle_of_a_face_the_distance_is_the_exact_one(
+    pads: Pads, hulls: list[trimesh.Trimesh]
+) -> None:
+    box = make_pads([trimesh.creation.box(2.0 * HALF).vertices])
+    for axis in range(3):
+        for height in (0.02, 0.003, 0.0, -0.001):
+            for side in (-1.0, 1.0):
+                p = np.zeros((1, 3))
+                p[0, axis] = side * (HALF[axis] + height)
+                contact = touch(box, p)
+                # Five other faces at least 1 cm - 1 mm farther away: e^-12 each.
+                assert contact.distance[0] == pytest.approx(height, abs=1e-8)
+                np.testing.assert_allclose(contact.normal[0], side * np.eye(3)[axis], atol=1e-4)
+    # The same with padding: body 0 of three has fewer planes than the others.
+    p = np.tile([0.0, HALF[1] + 0.004, 0.0], (3, 1))
+    assert touch(pads, p).distance[0] == pytest.approx(0.004, abs=1e-8)
+    assert not np.isfinite(pads.offsets[0]).all()
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_derivatives_are_those_of_finite_differences(
+    pads: Pads, hulls: list[trimesh.Trimesh], seed: int
+) -> None:
+    p, h = points_about(hulls, 100 + seed), 1e-6
+    contact = touch(pads, p)
+    for axis in np.eye(3):
+        after, before = touch(pads, p + h * axis), touch(pads, p - h * axis)
+        slope = (after.distance - before.distance) / (2.0 * h)
+        np.testing.assert_allclose(contact.gradient @ axis, slope, atol=1e-6)
+        turn = (after.normal - before.normal) / (2.0 * h)
+        # A pad turns by at most about a radian per rounding, 1/m.
+        np.testing.assert_allclose(contact.normal_slope @ axis, turn, atol=1e-5 / ROUNDING)
+
+
+def test_normals_are_unit_vectors_along_the_gradient_which_is_shorter_at_edges(pads: Pads) -> None:
+    p = np.array([HALF, [0.03, 0.02, 0.04], [0.1, 0.0, 0.0]])
+    contact = touch(pads, p)
+    np.testing.assert_allclose(np.linalg.norm(contact.normal, axis=1), 1.0, atol=1e-12)
+    length = np.linalg.norm(contact.gradient, axis=1)
+    np.testing.assert_allclose(contact.gradient, length[:, None] * contact.normal, atol=1e-12)
+    assert np.all(length <= 1.0 + 1e-6)
+    # At a box's corner three planes count alike.
+    np.testing.assert_allclose(contact.normal[0], np.full(3, 3.0**-0.5), atol=1e-5)
+    assert length[0] == pytest.approx(3.0**-0.5, abs=1e-5)
+
+
+def test_far_from_the_pad_nothing_overflows(pads: Pads) -> None:
+    for p in np.random.default_rng(0).normal(size=(5, 3, 3)):
+        contact = touch(pads, 1e3 * p)
+        for values in (contact.distance, contact.normal, contact.gradient, contact.normal_slope):
+            assert np.isfinite(values).all()
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_nearest_point_is_trimeshs_own(pads: Pads, hulls: list[trimesh.Trimesh], seed: int) -> None:
+    p = points_about(hulls, 200 + seed)
+    near = nearest_on_pads(pads, p)
+    for hull, q, found in zip(hulls, p, near, strict=True):
+        expected, distance, _ = trimesh.proximity.closest_point(hull, q[None])
+        assert np.linalg.norm(found - q) == pytest.approx(distance[0], abs=1e-9)
+        # Of inside a body two faces may be equally near; then only the distance is given.
+        if not hull.contains(q[None])[0]:
+            np.testing.assert_allclose(found, expected[0], atol=1e-9)
+        assert abs(signed_distance(hull, found)) < 1e-9
+
+
+def test_nearest_point_has_no_rounding() -> None:
+    box = make_pads([trimesh.creation.box(2.0 * HALF).vertices])
+    corner = nearest_on_pads(box, np.array([HALF + 0.01]))
+    np.testing.assert_allclose(corner[0], HALF, atol=1e-12)
+
+
+# The shapes of links
+
+
+@pytest.fixture(scope="module")
+def hand() -> Hand:
+    return load_hand()
+
+
+def test_every_link_of_the_barrett_hand_has_shapes_that_are_solids(hand: Hand) -> None:
+    shapes = link_shapes(hand)
+    assert len(shapes) == 9
+    assert {hand.palm_link, *hand.fingertip_links} <= set(shapes)
+    for parts in shapes.values():
+        assert parts
+        for corners in parts:
+            assert corners.shape[1] == 3
+            assert ConvexHull(corners).volume > 1e-8
+
+
+def test_barretts_pad_points_are_on_their_fingertips(hand: Hand) -> None:
+    """The median of contacts on a rounded pad is a little below its surface."""
+    corners = [np.concatenate(link_shapes(hand)[link]) for link in hand.fingertip_links]
+    p_FiP = np.array([finger.p_FiP for finger in hand.fingers])
+    off = np.linalg.norm(nearest_on_pads(make_pads(corners), p_FiP) - p_FiP, axis=1)
+    assert off.max() < 2.5e-3
+
+
+def with_shape(folder: Path, shape: str) -> Path:
+    """Write a gripper whose left finger is one shape."""
+    capsule = "<capsule><radius>0.01</radius><length>0.08</length></capsule>"
+    assert capsule in PINCER_SDF
+    return write_pincer(folder, PINCER_SDF.replace(capsule, shape))
+
+
+#: SDFormat, and volume [m^3]; the shapes of circles are a little off by design.
+SHAPES = {
+    "box": ("<box><size>0.02 0.03 0.08</size></box>", 0.02 * 0.03 * 0.08, 1e-9),
+    "cylinder": (
+        "<cylinder><radius>0.01</radius><length>0.08</length></cylinder>",
+        np.pi * 0.01**2 * 0.08,
+        0.02,
+    ),
+    "capsule": (
+        "<capsule><radius>0.01</radius><length>0.08</length></capsule>",
+        np.pi * 0.01**2 * (0.08 + 4.0 / 3.0 * 0.01),
+        0.05,
+    ),
+    "sphere": ("<sphere><radius>0.02</radius></sphere>", 4.0 / 3.0 * np.pi * 0.02**3, 0.05),
+}
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+def test_shapes_have_the_volume_and_place_of_their_formula(tmp_path: Path, kind: str) -> None:
+    sdf, volume, tolerance = SHAPES[kind]
+    shapes = link_shapes(load_hand(with_shape(tmp_path, sdf)))
+    assert shapes["mount"] == ()
+    (corners,) = shapes["left"]
+    assert ConvexHull(corners).volume == pytest.approx(volume, rel=tolerance)
+    # The collision's pose in the link.
+    middle = (corners.min(axis=0) + corners.max(axis=0)) / 2.0
+    np.testing.assert_allclose(middle, [0.0, 0.0, 0.055], atol=5e-4)
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+def test_shapes_reach_as_far_as_drakes(tmp_path: Path, kind: str) -> None:
+    hand = load_hand(with_shape(tmp_path, SHAPES[kind][0]))
+    # A polygon around a circle of 1 cm is 0.2 mm farther out, a ball's corners as much less.
+    assert_reaches_as_far_as_drakes(hand, atol=3e-4)
+
+
+def test_barretts_shapes_reach_as_far_as_drakes(hand: Hand) -> None:
+    # Its cylinders have a radius of up to 44.5 mm.
+    assert_reaches_as_far_as_drakes(hand, atol=1e-3)
+
+
+def assert_reaches_as_far_as_drakes(hand: Hand, *, atol: float) -> None:
+    """In any direction each link ends where Drake's distance from a far point says."""
+    far, rng = 1e3, np.random.default_rng(0)
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.01), builder)
+    make_parser(plant).AddModels(str(hand.sdf_path))
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(hand.palm_link))
+    plant.Finalize()
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
+    for link, parts in link_shapes(hand).items():
+        body = plant.GetBodyByName(link)
+        own = set(plant.GetCollisionGeometriesForBody(body))
+        assert len(own) == len(parts)
+        if not parts:
+            continue
+        X_WB = body.EvalPoseInWorld(plant.GetMyContextFromRoot(context)).GetAsMatrix4()
+        for direction in rng.normal(size=(12, 3)):
+            d_B = direction / np.linalg.norm(direction)
+            p_W = X_WB[:3, :3] @ (far * d_B) + X_WB[:3, 3]
+            found = query.ComputeSignedDistanceToPoint(p_W)
+            nearest = min(f.distance for f in found if f.id_G in own)
+            reach = max(float((corners @ d_B).max()) for corners in parts)
+            assert reach == pytest.approx(far - nearest, abs=atol), (link, d_B)
+
+
+@pytest.mark.parametrize(
+    ("shape", "got"),
+    [
+        ("<ellipsoid><radii>0.01 0.02 0.03</radii></ellipsoid>", "Ellipsoid"),
+        ("<plane><normal>0 0 1</normal><size>1 1</size></plane>", "HalfSpace"),
+    ],
+)
+def test_other_shapes_are_refused(tmp_path: Path, shape: str, got: str) -> None:
+    hand = load_hand(with_shape(tmp_path, shape))
+    message = rf"rod: must be a box, cylinder, capsule, sphere or convex mesh, got {got}"
+    with pytest.raises(HandError, match=message) as caught:
+        link_shapes(hand)
+    assert "\n" not in str(caught.value)

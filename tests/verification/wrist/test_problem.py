@@ -1,0 +1,248 @@
+"""The wrist problem: its kinematics, gradients and clearances, for two hands."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache, partial
+
+import numpy as np
+import pytest
+from helpers.hands import write_pincer
+from scipy.spatial.transform import Rotation
+
+from drakegrasp.frames import Array, invert_pose, make_pose, rotate_vectors, transform_points
+from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses
+from drakegrasp.hand.shapes import link_shapes
+from drakegrasp.verification.wrist.pads import touch
+from drakegrasp.verification.wrist.problem import (
+    CLEARANCE_ROUNDING,
+    CLOSING_WEIGHT,
+    NORMAL_WEIGHT,
+    POSE,
+    WristProblem,
+    evaluate,
+    hand_constants,
+)
+
+SEEDS = range(12)
+
+
+@cache
+def hand_of(name: str) -> Hand:
+    return load_hand(name)
+
+
+@pytest.fixture(scope="module", params=["barrett", "pincer"])
+def name(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The Barrett Hand, and one of two fingers, with one joint each and without spread."""
+    if request.param == "barrett":
+        return "barrett"
+    return str(write_pincer(tmp_path_factory.mktemp("pincer")))
+
+
+def unit(vectors: Array) -> Array:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def random_pose(rng: np.random.Generator) -> Array:
+    return make_pose(Rotation.random(random_state=rng).as_matrix(), rng.uniform(-0.3, 0.3, 3))
+
+
+def random_problem(name: str, seed: int) -> tuple[WristProblem, Array]:
+    """Return contacts some centimetres off a hand's fingertips, and an x away from the start."""
+    rng = np.random.default_rng(seed)
+    hand, X_OS = hand_of(name), random_pose(rng)
+    k, (lower, upper) = hand.num_fingers, coordinate_limits(hand).T
+    c = rng.uniform(lower, upper)
+    X_GF = fingertip_poses(hand, spread=c[0], closing=c[1:])
+    pads = np.array([finger.p_FiP for finger in hand.fingers])
+    p_GQ = np.einsum("kab,kb->ka", X_GF[:, :3, :3], pads) + X_GF[:, :3, 3]
+    problem = WristProblem(
+        constants=hand_constants(hand_of(name)),
+        p_OQ=transform_points(X_OS, p_GQ + rng.normal(scale=0.015, size=(k, 3))),
+        nhat_Q_O=unit(rng.normal(size=(k, 3))),
+        up_O=unit(rng.normal(size=3)),
+        height=0.2,
+        X_OS=X_OS,
+        posture=rng.uniform(lower, upper),
+    )
+    pose = np.concatenate([rng.uniform(-1.2, 1.2, 3), rng.normal(scale=0.03, size=3)])
+    return problem, np.concatenate([pose, c + rng.normal(scale=0.2, size=1 + k)])
+
+
+def differences(function: Callable[[Array], Array], x: Array, h: float = 1e-6) -> Array:
+    """Return the derivative of a function of x by central differences, x last."""
+    steps = h * np.eye(len(x))
+    return np.stack([(function(x + s) - function(x - s)) / (2.0 * h) for s in steps], axis=-1)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_palm_and_fingertips_are_where_kinematics_puts_them(name: str, seed: int) -> None:
+    problem, x = random_problem(name, seed)
+    at = evaluate(problem, x)
+    R_SG = Rotation.from_euler("XYZ", x[:3]).as_matrix()
+    X_OG = problem.X_OS @ make_pose(R_SG, x[3:POSE])
+    np.testing.assert_allclose(at.X_OG, X_OG, atol=1e-12)
+    X_GF = fingertip_poses(hand_of(name), spread=x[POSE], closing=x[POSE + 1 :])
+    X_FO = invert_pose(X_OG @ X_GF)
+    p_FQ = np.array(
+        [transform_points(X, p[None])[0] for X, p in zip(X_FO, problem.p_OQ, strict=True)]
+    )
+    np.testing.assert_allclose(at.p_FiQ, p_FQ, atol=1e-12)
+    contact = touch(problem.constants.pads, p_FQ)
+    np.testing.assert_allclose(at.contact.distance, contact.distance, atol=1e-12)
+    normals = np.einsum("kba,kb->ka", X_FO[:, :3, :3], contact.normal)
+    np.testing.assert_allclose(at.pad_normals_O, normals, atol=1e-9)
+
+
+def test_at_zero_the_palm_is_at_the_start(name: str) -> None:
+    problem, x = random_problem(name, 0)
+    x[:POSE] = 0.0
+    np.testing.assert_array_equal(evaluate(problem, x).X_OG, problem.X_OS)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_slope_of_the_objective_is_that_of_finite_differences(name: str, seed: int) -> None:
+    problem, x = random_problem(name, seed)
+
+    def objective(x: Array) -> Array:
+        residuals = evaluate(problem, x).residuals
+        return np.asarray(residuals @ residuals)
+
+    at = evaluate(problem, x)
+    slope = differences(objective, x)
+    np.testing.assert_allclose(
+        2.0 * at.residuals @ at.jacobian, slope, atol=1e-6 * np.abs(slope).max(), rtol=1e-5
+    )
+
+
+def terms(k: int) -> dict[str, slice]:
+    """Return which residuals of k fingers are of which term."""
+    ends = np.cumsum([0, k, 3 * k, 3 * k, 3 * k, 1 + k])
+    names = ("distance", "normal", "closing", "pad", "posture")
+    return {t: slice(a, b) for t, a, b in zip(names, ends[:-1], ends[1:], strict=True)}
+
+
+@pytest.mark.parametrize("term", terms(1))
+def test_slope_of_each_term_is_that_of_finite_differences(name: str, term: str) -> None:
+    """A term with a small weight could hide an error behind the others."""
+    problem, x = random_problem(name, 99)
+    at = evaluate(problem, x)
+    k = len(problem.p_OQ)
+    rows = terms(k)[term]
+    assert terms(k)["posture"].stop == len(at.residuals)
+
+    def share(x: Array) -> Array:
+        residuals = evaluate(problem, x).residuals[rows]
+        return np.asarray(residuals @ residuals)
+
+    slope = differences(share, x)
+    own = 2.0 * at.residuals[rows] @ at.jacobian[rows]
+    np.testing.assert_allclose(own, slope, atol=1e-6 * np.abs(slope).max(), rtol=1e-5)
+
+
+@pytest.mark.parametrize("seed", SEEDS[:4])
+def test_rows_of_scalars_are_plain_derivatives(name: str, seed: int) -> None:
+    problem, x = random_problem(name, seed)
+    k = len(problem.p_OQ)
+    for term in ("distance", "posture", "pad"):
+        rows = terms(k)[term]
+        slope = differences(lambda x, rows=rows: evaluate(problem, x).residuals[rows], x)  # type: ignore[misc]
+        at = evaluate(problem, x)
+        np.testing.assert_allclose(at.jacobian[rows], slope, atol=1e-7)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_closing_direction_is_how_the_fingertip_moves_at_the_point(name: str, seed: int) -> None:
+    problem, x = random_problem(name, seed)
+    at, hand, h = evaluate(problem, x), hand_of(name), 1e-6
+    k = hand.num_fingers
+    residual = at.residuals[terms(k)["closing"]].reshape(k, 3) / CLOSING_WEIGHT
+    direction = residual - problem.nhat_Q_O @ at.X_OG[:3, :3]
+
+    def material_points(closing: Array) -> Array:
+        X_GF = fingertip_poses(hand, spread=x[POSE], closing=closing)
+        return np.asarray(np.einsum("kab,kb->ka", X_GF[:, :3, :3], at.p_FiQ) + X_GF[:, :3, 3])
+
+    closing = x[POSE + 1 :]
+    moved = material_points(closing + h) - material_points(closing - h)
+    np.testing.assert_allclose(direction, unit(moved), atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_clearance_is_the_lowest_corners_height_within_the_rounding(name: str, seed: int) -> None:
+    problem, x = random_problem(name, seed)
+    at, hand = evaluate(problem, x), hand_of(name)
+    shapes = link_shapes(hand)
+    X_GF = fingertip_poses(hand, spread=x[POSE], closing=x[POSE + 1 :])
+    parts = [(invert_pose(hand.X_BG), hand.palm_link)]
+    parts += list(zip(X_GF, hand.fingertip_links, strict=True))
+    corners = [
+        transform_points(at.X_OG @ X_GB, np.concatenate(shapes[link])) for X_GB, link in parts
+    ]
+    exact = np.array([problem.height + (p @ problem.up_O).min() for p in corners])
+    most = np.array([len(corners[0])] + [max(map(len, corners[1:]))] * hand.num_fingers)
+    assert np.all(at.clearance <= exact + 1e-12)
+    assert np.all(at.clearance >= exact - CLEARANCE_ROUNDING * np.log(most) - 1e-12)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_slope_of_the_clearance_is_that_of_finite_differences(name: str, seed: int) -> None:
+    problem, x = random_problem(name, seed)
+    slope = differences(lambda x: evaluate(problem, x).clearance, x)
+    np.testing.assert_allclose(evaluate(problem, x).clearance_jacobian, slope, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_where_the_object_is_does_not_matter(name: str, seed: int) -> None:
+    """Contacts, table and start, moved together, make the same problem."""
+    problem, x = random_problem(name, seed)
+    X_AO = random_pose(np.random.default_rng(1000 + seed))
+    up_A = X_AO[:3, :3] @ problem.up_O
+    moved = replace(
+        problem,
+        p_OQ=transform_points(X_AO, problem.p_OQ),
+        nhat_Q_O=rotate_vectors(X_AO, problem.nhat_Q_O),
+        up_O=up_A,
+        height=problem.height - float(up_A @ X_AO[:3, 3]),
+        X_OS=X_AO @ problem.X_OS,
+    )
+    here, there = evaluate(problem, x), evaluate(moved, x)
+    np.testing.assert_allclose(there.X_OG, X_AO @ here.X_OG, atol=1e-12)
+    np.testing.assert_allclose(there.residuals, here.residuals, atol=1e-11)
+    np.testing.assert_allclose(there.jacobian, here.jacobian, atol=1e-9)
+    np.testing.assert_allclose(there.clearance, here.clearance, atol=1e-12)
+
+
+def test_a_finger_closed_against_its_contact_leaves_little(name: str) -> None:
+    """Contacts on the nominal points, normals against the pads: only rounding is left."""
+    hand, constants = hand_of(name), hand_constants(hand_of(name))
+    c = coordinate_limits(hand).mean(axis=1) * [0.2, *[0.8] * hand.num_fingers]
+    X_GF = fingertip_poses(hand, spread=c[0], closing=c[1:])
+    contact = touch(constants.pads, constants.pad_points)
+    on_pad = constants.pad_points - contact.distance[:, None] * contact.normal
+    turn = partial(np.einsum, "kab,kb->ka", X_GF[:, :3, :3])
+    problem = WristProblem(
+        constants=constants,
+        p_OQ=turn(on_pad) + X_GF[:, :3, 3],
+        nhat_Q_O=-turn(contact.normal),
+        up_O=np.array([0.0, 0.0, 1.0]),
+        height=1.0,
+        X_OS=np.eye(4),
+        posture=c,
+    )
+    x = np.concatenate([np.zeros(POSE), c])
+    at, rows = evaluate(problem, x), terms(hand.num_fingers)
+    assert np.abs(at.residuals[rows["distance"]]).max() < 1e-4
+    assert np.abs(at.residuals[rows["normal"]]).max() < 0.05 * NORMAL_WEIGHT
+    np.testing.assert_array_equal(at.residuals[rows["posture"]], 0.0)
+    # With the normals reversed each finger would open towards its contact.
+    reversed_ = evaluate(replace(problem, nhat_Q_O=-problem.nhat_Q_O), x)
+    right, wrong = (
+        np.linalg.norm(e.residuals[rows["closing"]].reshape(-1, 3), axis=1) / CLOSING_WEIGHT
+        for e in (at, reversed_)
+    )
+    assert np.all(right < 1.0)
+    assert np.all(wrong > 1.7)

@@ -1,0 +1,359 @@
+"""Solving the wrist problem: what a hand touched is found again, and what it cannot is not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from itertools import combinations, permutations
+
+import numpy as np
+import pytest
+from helpers.hands import write_pincer
+from scipy.spatial.transform import Rotation
+
+import drakegrasp.verification.wrist.initial_guesses
+from drakegrasp.frames import Array, invert_pose, make_pose, rotate_vectors, transform_points
+from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses
+from drakegrasp.hand.shapes import link_shapes
+from drakegrasp.verification.wrist.initial_guesses import (
+    DIFFERENT,
+    LEVER,
+    find_starts,
+    make_postures,
+)
+from drakegrasp.verification.wrist.pads import nearest_on_pads, touch
+from drakegrasp.verification.wrist.problem import hand_constants
+from drakegrasp.verification.wrist.solver import WristFit, fit_wrist
+
+SEEDS = range(25)
+#: Of the table's normal; above the table by so much that it never matters [m].
+UP, HIGH = np.array([0.0, 0.0, 1.0]), 5.0
+
+
+@cache
+def hand_of(name: str) -> Hand:
+    return load_hand(name)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Touch:
+    """What a hand in a posture touches: contacts that it can surely make."""
+
+    X_OG: Array
+    coordinates: Array
+    p_OQ: Array
+    nhat_Q_O: Array
+
+
+def touched(
+    name: str, seed: int, *, scatter: float = 0.005, closing_deg: tuple[float, float] = (20, 100)
+) -> Touch:
+    """Return contacts on the pads of a hand in any posture and pose.
+
+    Args:
+        name: Of the hand.
+        seed: Of the random numbers.
+        scatter: How far contacts are from the pad points, by component [m].
+        closing_deg: Range of the closing angles.
+    """
+    rng = np.random.default_rng(seed)
+    hand, constants = hand_of(name), hand_constants(hand_of(name))
+    k, (lower, upper) = hand.num_fingers, coordinate_limits(hand).T
+    first, last = np.deg2rad(closing_deg)
+    low = np.maximum(lower, [0.0, *[first] * k])
+    c = rng.uniform(low, np.minimum(upper, [np.deg2rad(40.0), *[last] * k]))
+    p_FQ = constants.pad_points + scatter * rng.uniform(-1.0, 1.0, (k, 3))
+    p_FQ = nearest_on_pads(constants.pads, p_FQ)
+    X_OG = make_pose(Rotation.random(random_state=rng).as_matrix(), rng.uniform(-0.2, 0.2, 3))
+    X_OF = X_OG @ fingertip_poses(hand, spread=c[0], closing=c[1:])
+    return Touch(
+        X_OG=X_OG,
+        coordinates=c,
+        p_OQ=np.einsum("kab,kb->ka", X_OF[:, :3, :3], p_FQ) + X_OF[:, :3, 3],
+        nhat_Q_O=-np.einsum("kab,kb->ka", X_OF[:, :3, :3], touch(constants.pads, p_FQ).normal),
+    )
+
+
+def fit(name: str, made: Touch, up_O: Array = UP, height: float = HIGH) -> list[WristFit]:
+    return fit_wrist(hand_of(name), made.p_OQ, made.nhat_Q_O, up_O=up_O, height=height)
+
+
+def coordinates(fit: WristFit) -> Array:
+    return np.concatenate([[fit.spread], fit.closing])
+
+
+def lowest(name: str, fit: WristFit, up_O: Array, height: float) -> float:
+    """Return how far over the table the lowest corner of palm and fingertips is [m]."""
+    hand = hand_of(name)
+    X_OF = fit.X_OG @ fingertip_poses(hand, spread=fit.spread, closing=fit.closing)
+    poses = [fit.X_OG @ invert_pose(hand.X_BG), *X_OF]
+    links = [hand.palm_link, *hand.fingertip_links]
+    corners = [
+        transform_points(X, np.concatenate(link_shapes(hand)[link]))
+        for X, link in zip(poses, links, strict=True)
+    ]
+    return float((np.concatenate(corners) @ up_O).min()) + height
+
+
+@pytest.fixture(scope="module")
+def pincer(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return str(write_pincer(tmp_path_factory.mktemp("pincer")))
+
+
+def test_contacts_that_the_hand_made_are_found_again() -> None:
+    """Always the points; the normals but for a pad's corner that another place may fit as well."""
+    turned = []
+    for seed in range(30):
+        fits = fit("barrett", touched("barrett", seed))
+        assert len(fits) > 1
+        objectives = [each.objective for each in fits]
+        assert objectives == sorted(objectives)
+        assert fits[0].residual.max() < 2e-3
+        turned.append(np.rad2deg(fits[0].normal_error.max()))
+    assert np.mean(np.array(turned) < 15.0) >= 0.95
+    assert max(turned) < 40.0
+
+
+@pytest.mark.parametrize("seed", SEEDS[:10])
+def test_contacts_on_the_pad_points_are_found_closely(seed: int) -> None:
+    """Only the posture of the start and the pads' rounding keep the fit from being exact."""
+    best = fit("barrett", touched("barrett", seed, scatter=0.0))[0]
+    assert best.residual.max() < 1.5e-3
+    assert np.rad2deg(best.normal_error.max()) < 6.0
+
+
+@pytest.mark.parametrize("seed", SEEDS[:10])
+def test_a_hand_of_two_fingers_finds_its_contacts_again(pincer: str, seed: int) -> None:
+    best = fit(pincer, touched(pincer, seed, scatter=0.002, closing_deg=(5, 45)))[0]
+    assert best.residual.max() < 2e-3
+    assert np.rad2deg(best.normal_error.max()) < 15.0
+    assert best.spread == 0.0
+    assert best.closing.shape == best.residual.shape == best.normal_error.shape == (2,)
+
+
+@pytest.mark.parametrize("seed", SEEDS[:8])
+def test_a_fit_is_as_good_as_it_says(seed: int) -> None:
+    """By the forward kinematics and the pads without rounding."""
+    made, hand, constants = (
+        touched("barrett", seed),
+        hand_of("barrett"),
+        hand_constants(hand_of("barrett")),
+    )
+    for found in fit("barrett", made):
+        X_OF = found.X_OG @ fingertip_poses(hand, spread=found.spread, closing=found.closing)
+        X_FO = invert_pose(X_OF)
+        p_FQ = np.einsum("kab,kb->ka", X_FO[:, :3, :3], made.p_OQ) + X_FO[:, :3, 3]
+        residual = np.linalg.norm(nearest_on_pads(constants.pads, p_FQ) - p_FQ, axis=1)
+        np.testing.assert_allclose(found.residual, residual, atol=1e-9)
+        inward = -np.einsum("kab,kb->ka", X_OF[:, :3, :3], touch(constants.pads, p_FQ).normal)
+        cosine = np.clip(np.sum(inward * made.nhat_Q_O, axis=1), -1.0, 1.0)
+        np.testing.assert_allclose(np.cos(found.normal_error), cosine, atol=1e-9)
+        R = found.X_OG[:3, :3]
+        np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-9)
+        assert np.linalg.det(R) > 0.0
+
+
+@pytest.mark.parametrize("seed", SEEDS[:10])
+def test_joints_stay_within_their_limits(pincer: str, seed: int) -> None:
+    for name, closing_deg in (("barrett", (0, 140)), (pincer, (-6, 57))):
+        lower, upper = coordinate_limits(hand_of(name)).T
+        for found in fit(name, touched(name, seed, closing_deg=closing_deg)):
+            c = coordinates(found)
+            assert np.all((lower <= c) & (c <= upper)), (lower, c, upper)
+
+
+@pytest.mark.parametrize("seed", SEEDS[:8])
+def test_where_the_object_is_does_not_matter(seed: int) -> None:
+    rng, made = np.random.default_rng(1000 + seed), touched("barrett", seed)
+    X_AO = make_pose(Rotation.random(random_state=rng).as_matrix(), rng.uniform(-1.0, 1.0, 3))
+    up_O = X_AO[:3, :3].T @ UP
+    here = fit("barrett", made, up_O, HIGH)
+    there = fit_wrist(
+        hand_of("barrett"),
+        transform_points(X_AO, made.p_OQ),
+        rotate_vectors(X_AO, made.nhat_Q_O),
+        up_O=UP,
+        height=HIGH - X_AO[2, 3],
+    )
+    assert len(there) == len(here)
+    assert there[0].objective == pytest.approx(here[0].objective, rel=1e-2)
+    np.testing.assert_allclose(coordinates(there[0]), coordinates(here[0]), atol=1e-3)
+    np.testing.assert_allclose(there[0].X_OG, X_AO @ here[0].X_OG, atol=1e-3)
+
+
+@pytest.mark.parametrize("seed", SEEDS[:8])
+def test_the_hands_mirror_image_is_the_hand_with_two_fingers_swapped(seed: int) -> None:
+    """Fingers 1 and 2 are mirror images in the palm's plane x = 0, finger 3 is its own."""
+    made, mirror, swapped = touched("barrett", seed), np.diag([-1.0, 1.0, 1.0]), [1, 0, 2]
+    best = fit("barrett", made)[0]
+    image = fit_wrist(
+        hand_of("barrett"),
+        made.p_OQ[swapped] @ mirror,
+        made.nhat_Q_O[swapped] @ mirror,
+        up_O=UP,
+        height=HIGH,
+    )[0]
+    assert image.objective == pytest.approx(best.objective, rel=1e-2)
+    np.testing.assert_allclose(image.closing, best.closing[swapped], atol=1e-3)
+    assert image.spread == pytest.approx(best.spread, abs=1e-3)
+
+
+@pytest.mark.parametrize("seed", SEEDS[:5])
+def test_contacts_given_to_other_fingers_fit_worse(seed: int) -> None:
+    """Often not by much: three points on three large pads leave a lot open."""
+    made = touched("barrett", seed, scatter=0.0, closing_deg=(40, 100))
+    own = fit("barrett", made)[0].objective
+    for order in list(permutations(range(3)))[1:]:
+        p, n = made.p_OQ[list(order)], made.nhat_Q_O[list(order)]
+        other = fit_wrist(hand_of("barrett"), p, n, up_O=UP, height=HIGH)[0]
+        assert other.objective > own
+
+
+def above(made: Touch, room: float) -> float:
+    """Return the height of {O} at which the lowest contact is so far above the table [m]."""
+    return room - float((made.p_OQ @ UP).min())
+
+
+@pytest.mark.parametrize("seed", SEEDS[:12])
+def test_palm_and_fingertips_stay_over_the_table(seed: int) -> None:
+    """At most a millimetre or two of the rounding and of the last closing step are below."""
+    made = touched("barrett", seed, scatter=0.0, closing_deg=(35, 100))
+    height = above(made, 0.02)
+    for found in fit("barrett", made, UP, height):
+        assert lowest("barrett", found, UP, height) > -2e-3
+
+
+def test_a_table_in_the_way_pushes_the_hand_up() -> None:
+    pushed = 0
+    for seed in SEEDS[:12]:
+        made = touched("barrett", seed, scatter=0.0, closing_deg=(35, 100))
+        height = above(made, 0.02)
+        free, over = fit("barrett", made)[0], fit("barrett", made, UP, height)[0]
+        below = lowest("barrett", free, UP, height)
+        if below > 2e-3:
+            # Where it is not in the way it changes nothing; another start may be better now.
+            assert over.objective == pytest.approx(free.objective, rel=0.05)
+        elif below < -0.01:
+            pushed += 1
+            assert lowest("barrett", over, UP, height) > -2e-3
+            assert over.objective > free.objective
+            assert np.degrees(over.normal_error.max()) > np.degrees(free.normal_error.max())
+    assert pushed >= 3
+
+
+def test_contacts_out_of_reach_leave_a_large_residual() -> None:
+    angle = 2.0 * np.pi * np.arange(3) / 3.0
+    outward = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(3)])
+    p_OQ = 0.5 / np.sqrt(3.0) * outward  # an equilateral triangle with edges of 0.5 m
+    found = fit_wrist(hand_of("barrett"), p_OQ, outward, up_O=UP, height=HIGH)
+    assert found
+    for each in found:
+        assert each.residual.max() > 0.05
+        assert np.isfinite(each.X_OG).all()
+
+
+def test_contacts_in_one_point_are_no_crash() -> None:
+    """Nonsense that a network may well predict."""
+    for normals in (np.tile(UP, (3, 1)), np.eye(3)):
+        for each in fit_wrist(hand_of("barrett"), np.zeros((3, 3)), normals, up_O=UP, height=HIGH):
+            assert np.isfinite(each.X_OG).all() and np.isfinite(each.objective)
+
+
+@pytest.mark.parametrize("seed", SEEDS[:3])
+def test_the_same_contacts_give_the_same_bits(seed: int) -> None:
+    made = touched("barrett", seed)
+    for a, b in zip(fit("barrett", made), fit("barrett", made), strict=True):
+        np.testing.assert_array_equal(a.X_OG, b.X_OG)
+        np.testing.assert_array_equal(coordinates(a), coordinates(b))
+        np.testing.assert_array_equal(a.residual, b.residual)
+        assert (a.objective, a.iterations) == (b.objective, b.iterations)
+
+
+# Where to start
+
+
+@pytest.mark.parametrize("row", [0, 1234, 9000, -1])
+def test_a_posture_of_the_table_is_its_own_first_start(row: int) -> None:
+    postures, rng = make_postures(hand_of("barrett")), np.random.default_rng(row + 1)
+    X_OG = make_pose(Rotation.random(random_state=rng).as_matrix(), rng.uniform(-1.0, 1.0, 3))
+    p_OQ = transform_points(X_OG, postures.p_GP[row])
+    first = find_starts(postures, p_OQ, -rotate_vectors(X_OG, postures.n_G[row]), 3)[0]
+    np.testing.assert_array_equal(first.coordinates, postures.coordinates[row])
+    np.testing.assert_allclose(first.X_OG, X_OG, atol=1e-9)
+
+
+def test_postures_are_within_the_limits_and_where_kinematics_puts_them(pincer: str) -> None:
+    for name in ("barrett", pincer):
+        hand, postures = hand_of(name), make_postures(hand_of(name))
+        lower, upper = coordinate_limits(hand).T
+        c = postures.coordinates
+        assert np.all((lower - 1e-8 <= c) & (c <= upper + 1e-8))
+        assert len(np.unique(c, axis=0)) == len(c)
+        X_GF = fingertip_poses(hand, spread=c[:, 0], closing=c[:, 1:])
+        p_FP = np.einsum("nkba,nkb->nka", X_GF[..., :3, :3], postures.p_GP - X_GF[..., :3, 3])
+        constants = hand_constants(hand_of(name))
+        for p in p_FP[:: len(p_FP) // 7]:
+            # On the pad but for its rounding.
+            assert np.abs(touch(constants.pads, p).distance).max() < 5e-4
+            np.testing.assert_allclose(p, p_FP[0], atol=1e-12)
+
+
+def misfit(name: str, X_OG: Array, c: Array, made: Touch) -> float:
+    """Return what is left between a posture's contacts, as arrows of length `LEVER`, and others."""
+    hand, constants = hand_of(name), hand_constants(hand_of(name))
+    X_OF = X_OG @ fingertip_poses(hand, spread=c[0], closing=c[1:])
+    contact = touch(constants.pads, constants.pad_points)
+    on_pad = constants.pad_points - contact.distance[:, None] * contact.normal
+    p = np.einsum("kab,kb->ka", X_OF[:, :3, :3], on_pad) + X_OF[:, :3, 3] - made.p_OQ
+    n = np.einsum("kab,kb->ka", X_OF[:, :3, :3], contact.normal) + made.nhat_Q_O
+    return float(np.sum(p**2) + np.sum((p + LEVER * n) ** 2))
+
+
+@pytest.mark.parametrize("seed", SEEDS[:8])
+def test_starts_differ_and_the_best_comes_first(pincer: str, seed: int) -> None:
+    for name in ("barrett", pincer):
+        made = touched(name, seed)
+        starts = find_starts(make_postures(hand_of(name)), made.p_OQ, made.nhat_Q_O, 5)
+        assert 1 < len(starts) <= 5
+        for a, b in combinations(starts, 2):
+            assert np.abs(a.coordinates - b.coordinates).max() > DIFFERENT
+        misfits = [misfit(name, s.X_OG, s.coordinates, made) for s in starts]
+        assert misfits == sorted(misfits)
+        # Each pose is the best for its posture: nudging it makes it worse.
+        for start, least in zip(starts, misfits, strict=True):
+            R = start.X_OG[:3, :3]
+            np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-9)
+            assert np.linalg.det(R) > 0.0
+            for axis in np.concatenate([np.eye(3), -np.eye(3)]):
+                turned = make_pose(Rotation.from_rotvec(1e-3 * axis).as_matrix(), np.zeros(3))
+                shifted = make_pose(np.eye(3), 1e-4 * axis)
+                for nudge in (turned, shifted):
+                    assert misfit(name, start.X_OG @ nudge, start.coordinates, made) > least
+
+
+def test_starts_tell_left_from_right(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Mirrored contacts have the same lengths and angles; their posture must be another."""
+    monkeypatch.setattr(drakegrasp.verification.wrist.initial_guesses, "NEAREST", 1)
+    postures, mirror = make_postures(hand_of("barrett")), np.diag([-1.0, 1.0, 1.0])
+    wanted = np.deg2rad([33.75, 32.0, 88.0, 56.0])
+    row = int(np.abs(postures.coordinates - wanted).max(axis=1).argmin())
+    p, n = postures.p_GP[row], postures.n_G[row]
+    (own,) = find_starts(postures, p, -n, 1)
+    (image,) = find_starts(postures, p @ mirror, -n @ mirror, 1)
+    np.testing.assert_allclose(own.coordinates, wanted, atol=1e-9)
+    assert np.abs(image.coordinates - wanted).max() > DIFFERENT
+
+
+@pytest.mark.parametrize("seed", SEEDS[:8])
+def test_search_by_shape_finds_what_laying_over_every_posture_finds(
+    monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    postures, made = make_postures(hand_of("barrett")), touched("barrett", seed)
+    (quick,) = find_starts(postures, made.p_OQ, made.nhat_Q_O, 1)
+    monkeypatch.setattr(
+        drakegrasp.verification.wrist.initial_guesses, "NEAREST", len(postures.coordinates)
+    )
+    (best,) = find_starts(postures, made.p_OQ, made.nhat_Q_O, 1)
+    least = misfit("barrett", best.X_OG, best.coordinates, made)
+    assert misfit("barrett", quick.X_OG, quick.coordinates, made) < 1.2 * least

@@ -1,0 +1,190 @@
+"""The two cameras and the image frame, against Drake and by closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from pydrake.systems.sensors import CameraInfo
+from scipy.spatial.transform import Rotation
+
+from drakegrasp.config import CameraConfig
+from drakegrasp.frames import Array, invert_pose, make_pose, transform_points
+from drakegrasp.vision.camera import (
+    camera_pose_otm,
+    camera_pose_oto,
+    image_frame,
+    intrinsics,
+    project,
+    unproject,
+)
+
+CONFIG = CameraConfig()
+K = intrinsics(CONFIG)
+
+vectors = arrays(np.float64, 3, elements=st.floats(-3.0, 3.0))
+palms = st.builds(lambda r, p: make_pose(Rotation.from_rotvec(r).as_matrix(), p), vectors, vectors)
+#: Palms that do not look within a degree of straight up or down.
+slanted_palms = palms.filter(lambda X_TG: abs(X_TG[2, 2]) < np.cos(np.deg2rad(1.0)))
+
+
+@pytest.mark.parametrize(("size", "fov_y_deg"), [(128, 50.0), (64, 40.0), (33, 90.0)])
+def test_camera_matrix_is_drakes(size: int, fov_y_deg: float) -> None:
+    drake = CameraInfo(width=size, height=size, fov_y=np.deg2rad(fov_y_deg))
+    ours = intrinsics(CameraConfig(size=size, fov_y_deg=fov_y_deg))
+    np.testing.assert_allclose(ours, drake.intrinsic_matrix(), rtol=1e-14)
+
+
+def test_field_of_view_ends_at_the_images_edge() -> None:
+    """A point 25 degrees above the axis lies half a pixel outside of row 0's centre."""
+    p_CQ = [[0.0, -np.tan(np.deg2rad(25.0)), 1.0]]
+    np.testing.assert_allclose(project(K, p_CQ), [[63.5, -0.5]], atol=1e-12)
+
+
+@given(palms)
+def test_oto_stands_behind_the_palm_and_rolls_with_it(X_TG: Array) -> None:
+    X_GC = invert_pose(X_TG) @ camera_pose_oto(X_TG, CONFIG)
+    np.testing.assert_allclose(X_GC, make_pose(np.eye(3), [0.0, 0.0, -0.25]), atol=1e-13)
+
+
+@given(palms)
+def test_otm_differs_from_oto_by_a_roll_only(X_TG: Array) -> None:
+    X_TC_otm, X_TC_oto = camera_pose_otm(X_TG, CONFIG), camera_pose_oto(X_TG, CONFIG)
+    np.testing.assert_array_equal(X_TC_otm[:, 2:], X_TC_oto[:, 2:])
+    np.testing.assert_allclose(X_TC_otm[:3, :3] @ X_TC_otm[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(X_TC_otm[:3, :3]) == pytest.approx(1.0)
+
+
+@given(slanted_palms)
+def test_world_up_is_up_in_the_otm_image(X_TG: Array) -> None:
+    """A point above another in the world is above it in the image, in the same column."""
+    X_CT = invert_pose(camera_pose_otm(X_TG, CONFIG))
+    ahead = X_TG[:3, 3] + 0.05 * X_TG[:3, 2]
+    (u0, v0), (u1, v1) = project(K, transform_points(X_CT, [ahead, ahead + np.array([0, 0, 1e-3])]))
+    assert u1 == pytest.approx(u0, abs=1e-6)
+    assert v1 < v0
+    # Up has no part along Cx: the horizon is level.
+    assert X_CT[0, 2] == pytest.approx(0.0, abs=1e-12)
+
+
+@given(slanted_palms, st.floats(-np.pi, np.pi))
+def test_otm_does_not_depend_on_the_palms_roll(X_TG: Array, roll: float) -> None:
+    rolled = X_TG @ make_pose(Rotation.from_rotvec([0.0, 0.0, roll]).as_matrix(), np.zeros(3))
+    np.testing.assert_allclose(
+        camera_pose_otm(rolled, CONFIG), camera_pose_otm(X_TG, CONFIG), atol=1e-9
+    )
+
+
+@given(st.sampled_from([1.0, -1.0]), st.floats(-np.pi, np.pi))
+def test_otm_that_looks_straight_up_or_down_has_ty_on_top(sign: float, roll: float) -> None:
+    """Looking down, Cx = Tx and Cy = -Ty, as on a map; looking up, Cx = -Tx."""
+    flip = np.diag([1.0, sign, sign])
+    R_TG = flip @ Rotation.from_rotvec([0.0, 0.0, roll]).as_matrix()
+    X_TC = camera_pose_otm(make_pose(R_TG, [0.1, 0.2, 0.3]), CONFIG)
+    expected = np.diag([-sign, -1.0, sign])
+    np.testing.assert_allclose(X_TC[:3, :3], expected, atol=1e-12)
+    np.testing.assert_allclose(X_TC[:3, 3], [0.1, 0.2, 0.3 - sign * 0.25], atol=1e-15)
+
+
+def test_palms_pose_is_not_changed() -> None:
+    X_TG = make_pose(np.eye(3), [0.1, 0.2, 0.3])
+    X_TG.setflags(write=False)
+    assert not np.shares_memory(camera_pose_otm(X_TG, CONFIG), X_TG)
+
+
+@given(
+    arrays(np.float64, (4, 2), elements=st.floats(-0.5, 127.5)),
+    arrays(np.float64, 4, elements=st.floats(0.01, 0.75)),
+)
+def test_unprojected_pixels_project_to_themselves(pixels: Array, depth: Array) -> None:
+    p_CQ = unproject(K, pixels, depth)
+    np.testing.assert_allclose(p_CQ[:, 2], depth, rtol=1e-12)
+    np.testing.assert_allclose(project(K, p_CQ), pixels, atol=1e-9)
+
+
+def test_projection_in_closed_form() -> None:
+    """The axis meets the middle; 0.1 m right and down at 0.5 m is a fifth of the focal length."""
+    focal = 64.0 / np.tan(np.deg2rad(25.0))
+    uv = project(K, [[0.0, 0.0, 0.5], [0.1, 0.1, 0.5]])
+    np.testing.assert_allclose(uv, [[63.5, 63.5], [63.5 + focal / 5, 63.5 + focal / 5]])
+    assert project(K, np.zeros((0, 3))).shape == (0, 2)
+
+
+def bar(angle_deg: float, *, half_length: float = 40.3, half_width: float = 6.3) -> Array:
+    """Return a mask (128, 128) of a bar about (63, 60), `angle_deg` clockwise from +u."""
+    v, u = np.mgrid[:128, :128]
+    c, s = np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))
+    along, across = c * (u - 63) + s * (v - 60), -s * (u - 63) + c * (v - 60)
+    return (np.abs(along) <= half_length) & (np.abs(across) <= half_width)
+
+
+DEPTH = np.full((128, 128), 0.3)
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 30.0, 89.0, 90.0, -89.0, -45.0, 135.0, 180.0])
+def test_image_frame_of_a_bar_lies_along_it(angle_deg: float) -> None:
+    """Iz to the image's right, or straight down; Ix away from the camera; Iy = Iz x Ix."""
+    X_CI = image_frame(K, bar(angle_deg), DEPTH)
+    angle = np.deg2rad((angle_deg + 90.0) % 180.0 - 90.0)
+    if angle_deg == 90.0:
+        angle = np.pi / 2.0
+    Iz = np.array([np.cos(angle), np.sin(angle), 0.0])
+    expected = np.column_stack([[0.0, 0.0, 1.0], np.cross(Iz, [0.0, 0.0, 1.0]), Iz])
+    # A bar of pixels has steps: its axis is true to a fifth of a degree.
+    np.testing.assert_allclose(X_CI[:3, :3], expected, atol=np.deg2rad(0.2))
+    assert np.linalg.det(X_CI[:3, :3]) == pytest.approx(1.0)
+    np.testing.assert_allclose(np.cross(X_CI[:3, 1], X_CI[:3, 2]), X_CI[:3, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 30.0, 90.0, -45.0])
+def test_image_frame_sits_at_the_unprojected_centroid(angle_deg: float) -> None:
+    """The bar is symmetric about the pixel (63, 60), 0.3 m away."""
+    focal = K[0, 0]
+    X_CI = image_frame(K, bar(angle_deg), DEPTH)
+    expected = [-0.5 / focal * 0.3, -3.5 / focal * 0.3, 0.3]
+    np.testing.assert_allclose(X_CI[:3, 3], expected, atol=1e-12)
+
+
+def test_image_frame_turns_with_the_mask() -> None:
+    """Half a turn of the image about its middle mirrors the origin and keeps the axes."""
+    mask = bar(20.0)
+    one, two = image_frame(K, mask, DEPTH), image_frame(K, mask[::-1, ::-1], DEPTH)
+    np.testing.assert_allclose(two[:3, :3], one[:3, :3], atol=1e-12)
+    np.testing.assert_allclose(two[:3, 3], one[:3, 3] * [-1, -1, 1], atol=1e-12)
+
+
+def test_depth_is_that_of_the_object_where_the_centroid_falls_beside_it() -> None:
+    """Two separate patches at different depths: the nearest object pixel counts, not the gap."""
+    mask, depth = np.zeros((128, 128)), np.full((128, 128), 0.75)
+    mask[60:63, 20:30] = mask[60:63, 80:84] = 1
+    depth[60:63, 20:30], depth[60:63, 80:84] = 0.2, 0.4
+    # Centroid at u = (10 * 24.5 + 4 * 81.5) / 14 = 40.8: the left patch ends nearer, at 29.
+    X_CI = image_frame(K, mask, depth)
+    assert X_CI[2, 3] == 0.2
+    (uv,) = project(K, X_CI[None, :3, 3])
+    np.testing.assert_allclose(uv, [(10 * 24.5 + 4 * 81.5) / 14, 61.0])
+
+
+def test_single_pixel_has_iz_to_the_right() -> None:
+    mask = np.zeros((128, 128))
+    mask[70, 40] = 1
+    X_CI = image_frame(K, mask, DEPTH)
+    np.testing.assert_array_equal(X_CI[:3, 2], [1.0, 0.0, 0.0])
+    np.testing.assert_allclose(project(K, X_CI[None, :3, 3]), [[40.0, 70.0]], atol=1e-9)
+
+
+@given(arrays(np.uint8, (8, 8), elements=st.integers(0, 1)).filter(np.any))
+def test_any_mask_gives_a_right_handed_frame_with_the_stated_signs(mask: Array) -> None:
+    X_CI = image_frame(intrinsics(CameraConfig(size=8)), mask, np.full((8, 8), 0.5))
+    np.testing.assert_allclose(X_CI[:3, :3] @ X_CI[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(X_CI[:3, :3]) == pytest.approx(1.0)
+    np.testing.assert_array_equal(X_CI[:3, 0], [0.0, 0.0, 1.0])
+    x, y = X_CI[:2, 2]
+    assert x > 1e-9 or (abs(x) <= 1e-9 and y > 0.0)
+
+
+def test_empty_mask_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least one object pixel, got none"):
+        image_frame(K, np.zeros((128, 128)), DEPTH)

@@ -1,0 +1,233 @@
+"""What the renderer sees of a box, by closed forms: depth, outline, and the same bits again."""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import trimesh
+
+from drakegrasp.config import CameraConfig
+from drakegrasp.frames import Array, invert_pose, make_pose, transform_points
+from drakegrasp.objects.model import ObjectModel, object_colour, prepare_object
+from drakegrasp.objects.sources import MeshSource
+from drakegrasp.vision.camera import intrinsics, project, unproject
+from drakegrasp.vision.rendering import Look, Renderer, build_renderer, look
+
+
+def has_egl() -> bool:
+    try:
+        ctypes.CDLL("libEGL.so.1")
+    except OSError:
+        return False
+    return True
+
+
+pytestmark = [
+    pytest.mark.sim,
+    pytest.mark.skipif(
+        sys.platform == "linux" and not has_egl(), reason="rendering needs libEGL.so.1"
+    ),
+]
+
+CONFIG = CameraConfig()
+K = intrinsics(CONFIG)
+#: Full extents of the box [m], standing on the table.
+EXTENTS = np.array([0.06, 0.08, 0.10])
+HALF = EXTENTS / 2.0
+X_TO = make_pose(np.eye(3), [0.0, 0.0, HALF[2]])
+#: Columns are the camera's axes in {T}: looking along -x, from +x, world up on top.
+R_FROM_X = np.column_stack([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
+#: Looking straight down, +Ty on top.
+R_FROM_ABOVE = np.diag([1.0, -1.0, -1.0])
+
+
+#: Drake's images are drawn as if its principal point were measured from the corner of pixel
+#: (0, 0), half a pixel from where the camera matrix says it is.
+
+
+@pytest.fixture(scope="module")
+def make_object(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., ObjectModel]:
+    def make(mesh: trimesh.Trimesh, name: str) -> ObjectModel:
+        path = tmp_path_factory.mktemp("mesh") / f"{name}.stl"
+        mesh.export(path)
+        return prepare_object(MeshSource(name=name, class_name=name, path=path))
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def box(make_object: Callable[..., ObjectModel]) -> ObjectModel:
+    return make_object(trimesh.creation.box(EXTENTS), "box")
+
+
+@pytest.fixture(scope="module")
+def renderer(box: ObjectModel) -> Renderer:
+    return build_renderer(box, CONFIG)
+
+
+def facing_x(distance: float) -> Array:
+    """Return X_TC of a camera `distance` in front of the box's +x face, level with its centre."""
+    return make_pose(R_FROM_X, [HALF[0] + distance, 0.0, HALF[2]])
+
+
+#: A camera above a corner that sees three faces and the table.
+def oblique() -> Array:
+    p_TC = np.array([0.18, 0.14, 0.25])
+    z = X_TO[:3, 3] - p_TC
+    z /= np.linalg.norm(z)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    return make_pose(np.column_stack([x, np.cross(z, x), z]), p_TC)
+
+
+def object_points(seen: Look, X_TC: Array) -> Array:
+    """Return p_OQ (n, 3) of the mask's pixels, unprojected with their depth."""
+    rows, columns = np.nonzero(seen.mask)
+    p_CQ = unproject(K, np.column_stack([columns, rows]), seen.image[3][rows, columns])
+    return transform_points(invert_pose(X_TO) @ X_TC, p_CQ)
+
+
+def box_distance(p: Array) -> Array:
+    """Return the signed distance (n,) of points from the box's surface [m]."""
+    q = np.abs(p) - HALF
+    return np.linalg.norm(np.maximum(q, 0.0), axis=1) + np.minimum(q.max(axis=1), 0.0)
+
+
+@pytest.mark.parametrize("distance", [0.1, 0.25, 0.6])
+def test_depth_of_a_face_is_its_distance_along_the_axis(
+    renderer: Renderer, distance: float
+) -> None:
+    """Depth is z, not range: it is the same all over a face that the camera sees squarely."""
+    seen = look(renderer, X_TO, facing_x(distance))
+    np.testing.assert_allclose(seen.image[3, 63:65, 63:65], distance, atol=1e-4)
+    rows, columns = np.nonzero(seen.mask)
+    np.testing.assert_allclose(seen.image[3][rows, columns], distance, atol=1e-4)
+
+
+def test_depth_from_above_is_that_of_the_lid_and_of_the_table(renderer: Renderer) -> None:
+    X_TC = make_pose(R_FROM_ABOVE, [0.0, 0.0, 0.5])
+    seen = look(renderer, X_TO, X_TC)
+    on_object = seen.mask.astype(bool)
+    # The camera sees the lid only: the sides are hidden behind its edge.
+    np.testing.assert_allclose(seen.image[3][on_object], 0.5 - EXTENTS[2], atol=1e-4)
+    np.testing.assert_allclose(seen.image[3][~on_object], 0.5, atol=1e-4)
+
+
+@pytest.mark.parametrize("distance", [0.15, 0.25, 0.5])
+def test_mask_of_a_face_covers_its_projection(renderer: Renderer, distance: float) -> None:
+    """Edges of f w / d pixels, to a pixel, centred: y to the right, z up."""
+    mask = look(renderer, X_TO, facing_x(distance)).mask
+    rows, columns = np.nonzero(mask)
+    for pixels, edge in ((columns, EXTENTS[1]), (rows, EXTENTS[2])):
+        assert abs((pixels.max() - pixels.min() + 1) - K[0, 0] * edge / distance) <= 1.0
+        assert abs((pixels.max() + pixels.min()) / 2.0 - 63.5) <= 1.0
+    # A face seen squarely fills its rectangle.
+    assert mask.sum() == (np.ptp(columns) + 1) * (np.ptp(rows) + 1)
+
+
+def test_mask_has_no_bias(renderer: Renderer) -> None:
+    """The middle of the mask is the face's projection, on average over parts of a pixel."""
+    errors = []
+    for k in range(20):
+        X_TC = facing_x(0.25)
+        X_TC[1:3, 3] += np.array([2e-4, 2.6e-4]) * k
+        rows, columns = np.nonzero(look(renderer, X_TO, X_TC).mask)
+        middle = [(columns.min() + columns.max()) / 2.0, (rows.min() + rows.max()) / 2.0]
+        errors.append(middle - project(K, [[-2e-4 * k, 2.6e-4 * k, 0.25]])[0])
+    np.testing.assert_allclose(np.mean(errors, axis=0), 0.0, atol=0.15)
+
+
+def test_image_axes_are_not_mirrored(renderer: Renderer) -> None:
+    """A camera moved to -y and up, seen from +x, has the box further right and down."""
+    X_TC = facing_x(0.25)
+    X_TC[1, 3] -= 0.03
+    X_TC[2, 3] += 0.02
+    seen = look(renderer, X_TO, X_TC)
+    rows, columns = np.nonzero(seen.mask)
+    ((u, v),) = project(K, [[0.03, 0.02, 0.25]])
+    middle = [(columns.min() + columns.max()) / 2.0, (rows.min() + rows.max()) / 2.0]
+    assert u > 63.5 < v
+    # The camera is lower than the lid, so the mask is the face alone.
+    np.testing.assert_allclose(middle, [u, v], atol=1.1)
+
+
+def test_pixels_beyond_the_table_hold_far(renderer: Renderer) -> None:
+    """Level with the table there is no table above the horizon: exactly `far`, in float32."""
+    seen = look(renderer, X_TO, facing_x(0.25))
+    background = seen.image[3][:20]
+    np.testing.assert_array_equal(background, np.float32(CONFIG.far))
+    assert not seen.mask[:20].any()
+    assert seen.image[3].max() == np.float32(CONFIG.far)
+
+
+def test_object_beyond_far_is_not_in_mask_or_depth(renderer: Renderer) -> None:
+    seen = look(renderer, X_TO, facing_x(0.8))
+    assert not seen.mask.any()
+    np.testing.assert_array_equal(seen.image[3, 63:65, 63:65], np.float32(CONFIG.far))
+
+
+def test_mask_and_depth_agree(renderer: Renderer) -> None:
+    """Pixels of the mask, unprojected, lie on the box; all others lie off it."""
+    X_TC = oblique()
+    seen = look(renderer, X_TO, X_TC)
+    assert 500 < seen.mask.sum() < 128 * 128 / 2
+    assert np.abs(box_distance(object_points(seen, X_TC))).max() < 1e-6
+    inverted = Look(image=seen.image, mask=1 - seen.mask)
+    # The table's pixels at the foot of the box come near to it.
+    assert np.median(box_distance(object_points(inverted, X_TC))) > 0.02
+    assert box_distance(object_points(inverted, X_TC)).min() > -1e-6
+
+
+def test_all_that_is_drawn_is_object_table_or_nothing(renderer: Renderer) -> None:
+    """The hand is never in an image, wherever the palm is: nothing else has a depth."""
+    X_TC = oblique()
+    seen = look(renderer, X_TO, X_TC)
+    rows, columns = np.nonzero((seen.mask == 0) & (seen.image[3] < np.float32(CONFIG.far)))
+    p_CQ = unproject(K, np.column_stack([columns, rows]), seen.image[3][rows, columns])
+    assert len(rows) > 1000
+    np.testing.assert_allclose(transform_points(X_TC, p_CQ)[:, 2], 0.0, atol=1e-6)
+
+
+def test_types_and_ranges_are_those_of_the_files(renderer: Renderer) -> None:
+    seen = look(renderer, X_TO, oblique())
+    assert (seen.image.shape, seen.image.dtype) == ((4, 128, 128), np.float32)
+    assert (seen.mask.shape, seen.mask.dtype) == ((128, 128), np.uint8)
+    assert set(np.unique(seen.mask)) == {0, 1}
+    assert 0.0 <= seen.image[:3].min() < seen.image[:3].max() <= 1.0
+    assert seen.image[3].min() >= np.float32(CONFIG.near)
+    assert seen.image[3].max() <= np.float32(CONFIG.far)
+
+
+def test_object_has_its_names_colour(renderer: Renderer) -> None:
+    """Shading scales a colour and keeps its hue: the channels keep their order."""
+    seen = look(renderer, X_TO, oblique())
+    colour: npt.NDArray[np.float32] = np.median(seen.image[:3][:, seen.mask == 1], axis=1)
+    np.testing.assert_array_equal(np.argsort(colour), np.argsort(object_colour("box")))
+
+
+def pixels(seen: Look) -> tuple[bytes, bytes]:
+    return seen.image.tobytes(), seen.mask.tobytes()
+
+
+def test_same_view_gives_the_same_bits(renderer: Renderer, box: ObjectModel) -> None:
+    """Whatever was looked at before, and in another renderer of the same process too."""
+    first = pixels(look(renderer, X_TO, oblique()))
+    look(renderer, X_TO, facing_x(0.1))
+    assert pixels(look(renderer, X_TO, oblique())) == first
+    assert pixels(look(build_renderer(box, CONFIG), X_TO, oblique())) == first
+
+
+def test_image_follows_the_object(renderer: Renderer) -> None:
+    """Moved by 3 cm to +y, a face at 0.25 m moves by f 0.03 / 0.25 pixels to the right."""
+    moved = X_TO.copy()
+    moved[1, 3] = 0.03
+    middles = []
+    for X in (X_TO, moved):
+        _, columns = np.nonzero(look(renderer, X, facing_x(0.25)).mask)
+        middles.append((columns.min() + columns.max()) / 2.0)
+    assert middles[1] - middles[0] == pytest.approx(K[0, 0] * 0.03 / 0.25, abs=1.0)

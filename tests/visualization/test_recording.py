@@ -1,0 +1,199 @@
+"""Recordings: the file holds what happened, and recording it changes nothing."""
+
+from __future__ import annotations
+
+import base64
+import os
+import re
+import socket
+from dataclasses import fields, replace
+from pathlib import Path
+from types import SimpleNamespace
+from urllib.parse import urlsplit
+
+import h5py
+import msgpack
+import numpy as np
+import pytest
+from helpers.objects import CUBE, box_model, from_above, standing
+
+from drakegrasp.build.replay import record_trial
+from drakegrasp.config import Config, load_config
+from drakegrasp.hand.description import load_hand
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.outcomes import Outcome
+from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.construction import MESHCAT_RATE, build_scene
+from drakegrasp.simulation.trial import run_attempt
+from drakegrasp.verification.forces.lift import LiftEnd, lift_by_forces
+from drakegrasp.verification.recording import record_lift, record_verification
+from drakegrasp.visualization import recording
+from drakegrasp.visualization.recording import record_attempt
+
+pytestmark = pytest.mark.sim
+
+#: Two contacts on opposite faces of the cube, a third beside the first, and their normals.
+P_OQ = CUBE / 2.0 * np.array([[0.3, 1.0, 0.0], [0.0, -1.0, 0.0], [-0.3, 1.0, 0.0]])
+NHAT_Q_O = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
+#: What Meshcat calls the object, the palm, and the command that sends a recording.
+OBJECT, HAND, ANIMATION = b"visualizer/object/object", b"palm_plate", b"set_animation"
+#: No file is larger [bytes]; three.js alone is some two million.
+LARGEST = 5_000_000
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return load_config()
+
+
+@pytest.fixture(scope="module")
+def cube(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
+    return box_model(tmp_path_factory.mktemp("cube"), [CUBE] * 3)
+
+
+@pytest.fixture(scope="module")
+def attempt(cube: ObjectModel) -> Attempt:
+    """One that holds the cube."""
+    return from_above(cube, 0.06)
+
+
+def commands_of(path: Path) -> list[bytes]:
+    """Return what the page tells Meshcat, decoded."""
+    text = path.read_text(encoding="utf-8")
+    assert len(text) < LARGEST
+    assert not re.search(r"<(script|link)[^>]+(src|href)=", text), "the page loads something"
+    return [base64.b64decode(b) for b in re.findall(r"octet-binary;base64,([\w+/=]+)", text)]
+
+
+def keys_of(path: Path) -> bytes:
+    """Return the one command that holds the recording."""
+    (animation,) = (c for c in commands_of(path) if ANIMATION in c)
+    return animation
+
+
+def test_recording_a_trial_changes_no_bit_of_it(
+    cube: ObjectModel, attempt: Attempt, config: Config, tmp_path: Path
+) -> None:
+    hand = load_hand(config.hand)
+    plain = run_attempt(build_scene(cube, config.physics, hand), standing(cube), attempt, config)
+    path = tmp_path / "new" / "trial.html"
+    recorded = record_attempt(
+        cube, standing(cube), attempt, config, path, p_OQ=P_OQ, nhat_Q_O=NHAT_Q_O
+    )
+    assert plain.outcome is recorded.outcome is Outcome.SUCCESS
+    for name in ("q_closed", "q_lifted", "X_TO_lifted", "slip", "slip_angle", "time_close"):
+        assert np.array_equal(getattr(plain, name), getattr(recorded, name)), name
+    for one, other in ((plain.closed, recorded.closed), (plain.lifted, recorded.lifted)):
+        assert one is not None
+        for field in fields(one):
+            assert np.array_equal(getattr(one, field.name), getattr(other, field.name)), field.name
+    everything = b"".join(commands_of(path))
+    assert all(part in everything for part in (OBJECT, HAND, b"predicted/3/shaft"))
+    # Object and fingers move; contacts go with the object.
+    keys = keys_of(path)
+    # Two diagrams take turns in a lift, and no picture is missing.
+    clips = {
+        part["path"]: part["clip"]
+        for part in msgpack.unpackb(keys, strict_map_key=False)["animations"]
+    }
+    times = [key["time"] for key in clips["/drake/visualizer/object/object"]["tracks"][0]["keys"]]
+    end = plain.time_close + plain.time_lift
+    assert times == list(range(len(times)))
+    assert len(times) / MESHCAT_RATE == pytest.approx(end, abs=2.0 / MESHCAT_RATE)
+    assert OBJECT in keys
+    assert b"finger" in keys
+    assert b"predicted" not in keys
+    assert not list(path.parent.glob("*tmp*"))
+
+
+def test_recording_a_lift_changes_no_bit_of_it(
+    cube: ObjectModel, config: Config, tmp_path: Path
+) -> None:
+    limit = load_hand(config.hand).fingertip_force_limit
+    scene = build_scene(cube, config.physics)
+    plain = lift_by_forces(scene, standing(cube), P_OQ, NHAT_Q_O, force_limit=limit, config=config)
+    path = tmp_path / "lift.html"
+    recorded = record_lift(cube, standing(cube), P_OQ, NHAT_Q_O, config, path)
+    assert plain.end is recorded.end is LiftEnd.HELD
+    assert np.array_equal(plain.X_TO_lifted, recorded.X_TO_lifted)
+    assert plain.applied_force == recorded.applied_force
+    keys = keys_of(path)
+    assert all(part in keys for part in (OBJECT, b"forces/1", b"forces/3", b"scale"))
+    assert HAND not in b"".join(commands_of(path))
+
+
+def test_attempt_that_is_not_simulated_is_shown_all_the_same(
+    cube: ObjectModel, attempt: Attempt, config: Config, tmp_path: Path
+) -> None:
+    path = tmp_path / "miss.html"
+    missed = replace(attempt, ray_hits=False)
+    assert record_attempt(cube, standing(cube), missed, config, path).outcome is Outcome.RAY_MISS
+    everything = b"".join(commands_of(path))
+    assert OBJECT in everything
+    assert HAND in everything
+    assert b"predicted" not in everything
+
+
+@pytest.mark.parametrize("fitted", [False, True])
+def test_verification_without_a_trial_shows_what_there_is(
+    cube: ObjectModel, config: Config, tmp_path: Path, fitted: bool
+) -> None:
+    X_OG = from_above(cube, 0.06).X_OG
+    fit = SimpleNamespace(X_OG=X_OG, spread=0.3, closing=np.full(3, 0.8)) if fitted else None
+    verified = SimpleNamespace(
+        placed=SimpleNamespace(model=cube, X_TO=standing(cube)),
+        p_OQ=P_OQ, nhat_Q_O=NHAT_Q_O, fit=fit, attempt=None, lift=None, config=config,
+    )  # fmt: skip
+    record_verification(verified, tmp_path / "still.html")
+    everything = b"".join(commands_of(tmp_path / "still.html"))
+    assert b"predicted/1" in everything
+    assert (HAND in everything) == fitted
+
+
+def test_only_this_machine_is_served_and_only_meanwhile(
+    cube: ObjectModel,
+    attempt: Attempt,
+    config: Config,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("DRAKE_ALLOW_NETWORK", "none")
+    urls = []
+    make = recording._make_meshcat
+
+    def spy() -> object:
+        meshcat = make()
+        urls.append(urlsplit(meshcat.web_url()))
+        return meshcat
+
+    monkeypatch.setattr(recording, "_make_meshcat", spy)
+    missed = replace(attempt, ray_hits=False)
+    record_attempt(cube, standing(cube), missed, config, tmp_path / "a.html")
+    record_lift(cube, standing(cube), P_OQ, NHAT_Q_O, config, tmp_path / "b.html")
+    assert os.environ["DRAKE_ALLOW_NETWORK"] == "none"
+    assert [url.hostname for url in urls] == ["localhost"] * 2
+    for url in urls:
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection(("127.0.0.1", url.port), timeout=5.0).close()
+    assert "listening" not in "".join(capfd.readouterr())
+
+
+def test_file_that_cannot_be_written_leaves_nothing_behind(
+    cube: ObjectModel, attempt: Attempt, config: Config, tmp_path: Path
+) -> None:
+    (tmp_path / "folder").mkdir()
+    missed = replace(attempt, ray_hits=False)
+    with pytest.raises(OSError, match="folder"):
+        record_attempt(cube, standing(cube), missed, config, tmp_path / "folder")
+    assert [p.name for p in tmp_path.iterdir()] == ["folder"]
+
+
+@pytest.mark.slow
+def test_trial_of_a_dataset_is_recorded(small_dataset: Path, tmp_path: Path) -> None:
+    with h5py.File(small_dataset / "trials.hdf5") as file:
+        outcomes = file["trials/outcome"][:]
+    row = int(np.flatnonzero(outcomes == Outcome.MISSING_FINGERTIP)[0])
+    path = tmp_path / "trial.html"
+    assert record_trial(small_dataset, row, path) is Outcome.MISSING_FINGERTIP
+    assert b"finger" in keys_of(path)
