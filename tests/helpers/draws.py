@@ -13,21 +13,22 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
-from drakegrasp.builtin import export_builtin
-from drakegrasp.candidates import make_attempts, normal_candidates
-from drakegrasp.certify import _noise_factor, _palm_noise
-from drakegrasp.filters import split_samples
-from drakegrasp.meshes import MeshSource, find_meshes
-from drakegrasp.prepared import prepare
-from drakegrasp.screen import predict
 from threadpoolctl import threadpool_info
 
+from drakegrasp.build.prepare import prepare
 from drakegrasp.config import SplitConfig, load_config
-from drakegrasp.hand import load_hand
+from drakegrasp.dataset.filters import split_samples
+from drakegrasp.hand.description import load_hand
+from drakegrasp.objects.builtin.catalog import export_builtin
+from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.seeding import Stream
+from drakegrasp.simulation.candidates import make_attempts, normal_candidates
+from drakegrasp.simulation.robustness import _noise_factor, _palm_noise
+from drakegrasp.simulation.screen import predict
 
 #: Of the real meshes: a thin one, one with many faces, one that lies on its side.
 REAL = ("24_mug_final", "42_wineglass_final", "110_bunny_final")
@@ -112,15 +113,20 @@ def main(meshes: Path | None) -> dict[str, object]:
         *(_palm_noise(stream, config) for _ in range(100)),
         np.array([_noise_factor(stream, 0.1) for _ in range(100)]),
     )
+    found["kernels"] = kernels()
+    return found
+
+
+def kernels() -> dict[str, object]:
+    """Return what this process computes with, so that a test sees that a setting took effect."""
     x = np.linspace(-3.0, 3.0, 10_001)
-    found["kernels"] = {
-        "blas": sorted(
-            {info["architecture"] for info in threadpool_info() if "architecture" in info}
-        ),
-        "numpy": digest(np.exp(x), np.arctan(x)),
+    simd: Any = np.show_config(mode="dicts")
+    blas = {str(info["architecture"]) for info in threadpool_info() if "architecture" in info}
+    return {
+        "blas": sorted(blas),
+        "simd": sorted(simd["SIMD Extensions"].get("found", [])),
         "libm": digest(np.array([[math.sin(v), math.exp(v)] for v in x.tolist()])),
     }
-    return found
 
 
 if __name__ == "__main__":

@@ -1,0 +1,82 @@
+"""What is drawn is the same on every machine: the same hashes, whatever kernels compute it."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from helpers import draws
+
+pytestmark = [pytest.mark.sim, pytest.mark.slow]
+
+HASHES = json.loads((Path(__file__).parent / "helpers" / "draws.json").read_text())
+#: What OpenBLAS calls the kernels that it is asked for.
+KERNELS = {
+    "Prescott": {"Katmai", "Prescott"},
+    "Haswell": {"Haswell"},
+    "Zen": {"Haswell", "Zen"},
+    "SkylakeX": {"SkylakeX"},
+}
+SIMD = draws.kernels()["simd"]
+assert isinstance(SIMD, list)
+
+
+def cpu_flags() -> set[str]:
+    """Return what this CPU says that it can do; nothing where Linux does not say it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return set()
+    return {flag for line in lines if line.startswith("flags") for flag in line.split()}
+
+
+def drawn_with(**settings: str) -> dict[str, object]:
+    """Return what a process with other settings in its environment draws, and its kernels."""
+    ours = ("OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES", "GLIBC_TUNABLES")
+    env = {k: v for k, v in os.environ.items() if k not in ours} | settings
+    meshes = Path(__file__).resolve().parents[2] / "shared" / "meshes" / "g3db"
+    command = [sys.executable, draws.__file__, *([str(meshes)] if meshes.is_dir() else [])]
+    result = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    found: dict[str, object] = json.loads(result.stdout)
+    return found
+
+
+def check(found: dict[str, object]) -> dict[str, list[str]]:
+    """Compare with the stated hashes; return the kernels."""
+    kernels = found.pop("kernels")
+    assert isinstance(kernels, dict)
+    assert len(found) > 15
+    assert found == {name: HASHES[name] for name in found}
+    return kernels
+
+
+@pytest.mark.parametrize("kernel", list(KERNELS))
+def test_blas_kernel_changes_no_draw(kernel: str) -> None:
+    needs = {"Prescott": set(), "SkylakeX": {"avx512f", "avx512vl"}}.get(kernel, {"avx2", "fma"})
+    if not needs <= cpu_flags():
+        pytest.skip(f"this CPU lacks {needs - cpu_flags()}")
+    assert set(check(drawn_with(OPENBLAS_CORETYPE=kernel))["blas"]) <= KERNELS[kernel]
+
+
+@pytest.mark.parametrize("wide_only", [True, False])
+def test_instructions_of_numpy_change_no_draw(wide_only: bool) -> None:
+    """Without the 512-bit ones, and without any beyond NumPy's least."""
+    off = [name for name in SIMD if not wide_only or "512" in name or name == "X86_V4"]
+    if not off:
+        pytest.skip("this CPU has none of them")
+    kernels = check(drawn_with(NPY_DISABLE_CPU_FEATURES=" ".join(off)))
+    assert not set(off) & set(kernels["simd"])
+
+
+def test_sines_of_the_c_library_change_no_draw() -> None:
+    if "fma" not in cpu_flags() or platform.libc_ver()[0] != "glibc":
+        pytest.skip("the C library has one kind of sine here")
+    plain = draws.kernels()["libm"]
+    kernels = check(drawn_with(GLIBC_TUNABLES="glibc.cpu.hwcaps=-FMA,-FMA4,-AVX2"))
+    assert kernels["libm"] != plain or "GLIBC_TUNABLES" in os.environ
