@@ -1,10 +1,9 @@
 """The figure of a verified grasp: predicted and reached contacts on the object.
 
-In: a verification. Out: a matplotlib figure: the object from two sides with its contacts, and
-the hand, or the object alone where forces lift it, at the last instant that was reached.
+In: a verification. Out: a matplotlib figure: the object from two sides with its contacts, then
+the last state that was reached, with the hand, or without it if forces lifted the object.
 
-The pictures are those of `visualization.third_person`: they need what rendering needs, and one
-thread.
+The pictures come from `visualization.third_person`, so they need OpenGL and a single thread.
 """
 
 from __future__ import annotations
@@ -41,30 +40,30 @@ from drakegrasp.visualization.style import (
 )
 from drakegrasp.visualization.third_person import (
     AZIMUTHS_DEG,
-    Moment,
-    build_theatre,
+    Snapshot,
+    build_render_scene,
+    camera_pose,
     choose_view,
-    outline,
-    show,
-    take,
-    view,
+    outline_points,
+    render_view,
+    set_snapshot,
 )
 
 if TYPE_CHECKING:
     from drakegrasp.verification.result import Verification
 
-#: Lamps beside the camera and above the table that cast no shadow: contacts are on all sides of
-#: an object, and none is to be in the dark.
+#: Lights beside the camera and above the table, without shadows: contacts are on all sides of an
+#: object, and none should be in the dark.
 LIGHTS = (
     LightParameter(type="point", frame="camera", position=[-0.25, -0.15, 0.0], intensity=0.85),
     LightParameter(type="point", frame="camera", position=[0.4, 0.0, 0.0], intensity=0.4),
     LightParameter(type="point", frame="world", position=[0.0, 0.0, 4.0], intensity=0.4),
 )
-#: Where the hand is when only the object is to be seen: beyond what the camera shows.
+#: Pose of the hand in pictures of the object alone: out of view.
 AWAY = make_pose(np.eye(3), [0.0, 0.0, -100.0])
-#: Height of the camera that looks at the object alone, above the horizontal [rad].
+#: Elevation of the camera in pictures of the object alone [rad].
 ELEVATION = np.deg2rad(24.0)
-#: A contact is looked at where the cosine between its normal and the line of sight is larger.
+#: A contact faces the camera if the cosine between its normal and the line of sight is above this.
 FACING = 0.1
 #: Length of the arrow of the largest force [m].
 LARGEST_FORCE = 0.05
@@ -78,16 +77,16 @@ HOLDS, FAILS = "#1B7F3B", "#B3261E"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Marks:
-    """Contacts to be drawn, of one kind.
+    """Contacts of one kind to draw: a dot and an arrow each.
 
     Attributes:
-        kind: What they are called in the figure's elements.
+        kind: Name of the kind in the ids of the figure's elements.
         colour: Of dots and arrows.
-        size: Diameter of the dots; the arrows go by it [points].
+        size: Diameter of the dots; the arrows scale with it [points].
         p_OQ: (n, 3), points in {O} [m].
-        nhat_Q_O: (n, 3), outward normals in {O}.
+        nhat_Q_O: (n, 3), outward unit normals in {O}.
         tail_O, tip_O: (n, 3), ends of the arrows in {O} [m].
-        names: Text at the end of each arrow.
+        names: Text at the tip of each arrow.
     """
 
     kind: str
@@ -102,7 +101,14 @@ class Marks:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class View:
-    """A picture of an object at X_WO (4, 4) and what is to be drawn over it."""
+    """A picture, and the contacts to draw over it.
+
+    Attributes:
+        title: Text above the picture.
+        picture: The picture.
+        X_WO: (4, 4), pose of the object.
+        marks: The contacts.
+    """
 
     title: str
     picture: Picture
@@ -119,73 +125,84 @@ def verification_figure(verified: Verification) -> Figure:
     Raises:
         MachineError: If a picture is blank, which means that OpenGL failed.
     """
-    stage = _Stage(verified.placed.model, load_hand(verified.config.hand))
+    # The contacts: predicted ones, and those after closing.
+    renderer = _Renderer(verified.placed.model, load_hand(verified.config.hand))
     X_WO = X_WT @ rest_pose(verified.placed.X_TO)
     closed = None if verified.trial is None else verified.trial.closed
     marks = [_predicted(verified), *_reached(closed, _force_scale(verified))]
-    first, second = _two_sides(stage.model, X_WO, marks)
+
+    # The object from two sides, then the last state that was reached.
+    first, second = _two_sides(renderer.model, X_WO, marks)
     views = [
-        stage.object("contacts", X_WO, marks, first),
-        stage.object("from another side", X_WO, marks, second),
-        *_last_view(stage, verified, marks, first),
+        renderer.object_view("contacts", X_WO, marks, first),
+        renderer.object_view("from another side", X_WO, marks, second),
+        *_last_view(renderer, verified, marks, first),
     ]
-    return _draw_figure(verified, stage.model, views)
+    return _draw_figure(verified, renderer.model, views)
 
 
 def _last_view(
-    stage: _Stage, verified: Verification, marks: Sequence[Marks], azimuth: float
+    renderer: _Renderer, verified: Verification, marks: Sequence[Marks], azimuth: float
 ) -> list[View]:
-    """Return the view of the last instant that was reached, if anything was tried at all."""
+    """Return the view of the last state that was reached; no view if nothing was tried.
+
+    The azimuth [rad] is that of the camera where the object is shown alone.
+    """
     X_WO = X_WT @ rest_pose(verified.placed.X_TO)
     trial, lift, fit = verified.trial, verified.lift, verified.fit
+
+    # After the lift, by forces or by the hand.
     if lift is not None and lift.X_TO_lifted is not None:
-        return [stage.object("end of the lift", X_WT @ lift.X_TO_lifted, marks, azimuth)]
+        return [renderer.object_view("end of the lift", X_WT @ lift.X_TO_lifted, marks, azimuth)]
     if trial is not None and trial.X_TO_lifted is not None and trial.q_lifted is not None:
         X_WG = lifted_palm(trial.X_TO @ trial.X_OG, trial.time_lift, verified.config)
         X_WO = X_WT @ trial.X_TO_lifted
-        moment = Moment(X_WG=X_WG, X_WO=X_WO, q=trial.q_lifted)
+        snapshot = Snapshot(X_WG=X_WG, X_WO=X_WO, q=trial.q_lifted)
         reached = _reached(trial.lifted, _force_scale(verified))
-        return [stage.hand("end of the lift", moment, reached)]
+        return [renderer.hand_view("end of the lift", snapshot, reached)]
+
+    # Before it: the closed hand, or the palm pose that comes closest.
     if trial is not None and trial.q_closed is not None:
-        moment = Moment(X_WG=X_WO @ trial.X_OG, X_WO=X_WO, q=trial.q_closed)
-        return [stage.hand("after closing", moment, marks)]
+        snapshot = Snapshot(X_WG=X_WO @ trial.X_OG, X_WO=X_WO, q=trial.q_closed)
+        return [renderer.hand_view("after closing", snapshot, marks)]
     if fit is not None:
-        q = stage.posture(fit.spread, fit.closing)
-        moment = Moment(X_WG=X_WO @ fit.X_OG, X_WO=X_WO, q=q)
-        return [stage.hand("the hand where it comes closest", moment, marks)]
+        q = renderer.positions(fit.spread, fit.closing)
+        snapshot = Snapshot(X_WG=X_WO @ fit.X_OG, X_WO=X_WO, q=q)
+        return [renderer.hand_view("the hand where it comes closest", snapshot, marks)]
     return []
 
 
-class _Stage:
-    """Takes the pictures."""
+class _Renderer:
+    """Renders the views of one object and one hand."""
 
     def __init__(self, model: ObjectModel, hand: Hand) -> None:
         self.model = model
-        self._theatre = build_theatre(model, hand, lights=LIGHTS)
+        self._scene = build_render_scene(model, hand, lights=LIGHTS)
 
-    def object(self, title: str, X_WO: Array, marks: Sequence[Marks], azimuth: float) -> View:
+    def object_view(self, title: str, X_WO: Array, marks: Sequence[Marks], azimuth: float) -> View:
         """Return a view of the object alone, at X_WO (4, 4), from an azimuth [rad]."""
-        q = self.posture(0.0, np.zeros(self._theatre.hand.num_fingers))
+        q = self.positions(0.0, np.zeros(self._scene.hand.num_fingers))
         X_WC = _camera(self.model, X_WO, marks, azimuth)
-        return self._view(title, Moment(X_WG=AWAY, X_WO=X_WO, q=q), X_WC, marks)
+        return self._view(title, Snapshot(X_WG=AWAY, X_WO=X_WO, q=q), X_WC, marks)
 
-    def hand(self, title: str, moment: Moment, marks: Sequence[Marks]) -> View:
-        """Return a view of the hand and the object, from where most of both is seen."""
-        around = outline(self._theatre, moment, self.model.half_extents)
-        return self._view(title, moment, choose_view(self._theatre, around), marks)
+    def hand_view(self, title: str, snapshot: Snapshot, marks: Sequence[Marks]) -> View:
+        """Return a view of hand and object, from where most of both is visible."""
+        around = outline_points(self._scene, snapshot, self.model.half_extents)
+        return self._view(title, snapshot, choose_view(self._scene, around), marks)
 
-    def posture(self, spread: float, closing: Array) -> Array:
-        """Return the positions of the hand's joints as a `Moment` has them [rad]."""
-        angles = joint_positions(self._theatre.hand, spread, closing)
-        return np.array([angles[name] for name in self._theatre.joint_names])
+    def positions(self, spread: float, closing: Array) -> Array:
+        """Return the positions of the hand's joints [rad], in the order of `Snapshot.q`."""
+        angles = joint_positions(self._scene.hand, spread, closing)
+        return np.array([angles[name] for name in self._scene.joint_names])
 
-    def _view(self, title: str, moment: Moment, X_WC: Array, marks: Sequence[Marks]) -> View:
-        show(self._theatre, moment)
-        picture = take(self._theatre, X_WC, (PIXELS, PIXELS))
-        return View(title=title, picture=picture, X_WO=moment.X_WO, marks=marks)
+    def _view(self, title: str, snapshot: Snapshot, X_WC: Array, marks: Sequence[Marks]) -> View:
+        set_snapshot(self._scene, snapshot)
+        picture = render_view(self._scene, X_WC, (PIXELS, PIXELS))
+        return View(title=title, picture=picture, X_WO=snapshot.X_WO, marks=marks)
 
 
 def _predicted(verified: Verification) -> Marks:
+    """Return the predicted contacts, with arrows along their normals."""
     p, n = verified.p_OQ, verified.nhat_Q_O
     names = [str(i + 1) for i in range(len(p))]
     tip = p + ARROW * n
@@ -202,7 +219,10 @@ def _predicted(verified: Verification) -> Marks:
 
 
 def _reached(contacts: Contacts | None, scale: float) -> list[Marks]:
-    """Return the contacts that are there, if any, with an arrow per force, `scale` [m/N]."""
+    """Return the contacts of touching fingertips, if any, with their forces as arrows.
+
+    The arrow of a force ends at its contact; its length per force is `scale` [m/N].
+    """
     if contacts is None or not contacts.touching.any():
         return []
     p, n, f = (
@@ -225,7 +245,7 @@ def _reached(contacts: Contacts | None, scale: float) -> list[Marks]:
 
 
 def _largest_force(verified: Verification) -> float:
-    """Return the largest force of a fingertip that is drawn [N], infinite if there is none."""
+    """Return the largest force on a fingertip that is drawn [N]; inf if there is none."""
     trial = verified.trial
     stages = [] if trial is None else [trial.closed, trial.lifted]
     forces = [float(np.linalg.norm(c.f_Q_O, axis=1).max()) for c in stages if c is not None]
@@ -233,24 +253,28 @@ def _largest_force(verified: Verification) -> float:
 
 
 def _force_scale(verified: Verification) -> float:
-    """Return the length of a force's arrow [m/N]."""
+    """Return the length of an arrow per force [m/N]."""
     return LARGEST_FORCE / _largest_force(verified)
 
 
 def _two_sides(model: ObjectModel, X_WO: Array, marks: Sequence[Marks]) -> tuple[float, float]:
-    """Return two azimuths [rad] from which the predicted contacts are seen, together all of them.
+    """Return two azimuths [rad] that together show as many predicted contacts as possible.
 
-    The first sees most; the second most of those that the first does not.
+    The first shows the most; the second shows the most of those that the first does not.
     """
+    # Which contacts each camera sees, and which of them face it.
     azimuths = np.deg2rad(AZIMUTHS_DEG)
     cameras = [_camera(model, X_WO, marks, azimuth)[:3, 3] for azimuth in azimuths]
     seen = np.array([_is_seen(model, X_WO, marks[0], p_WC) for p_WC in cameras])
     towards = np.array([_towards(marks[0], X_WO, p_WC) for p_WC in cameras])
     normals = np.broadcast_to(marks[0].nhat_Q_O, towards.shape)
     facing = np.sum(towards * normals, axis=2) > FACING
-    # An arrow that points at the camera says little.
+
+    # An arrow that points at the camera shows little, so one across the line of sight counts more.
     across = np.linalg.norm(np.cross(towards, normals), axis=2)
     worth = (seen & facing) * (1.0 + 0.5 * across)
+
+    # Among equal second views take the one opposite to the first.
     first = int(np.argmax(worth.sum(axis=1)))
     opposite = 1e-3 * np.cos(azimuths - azimuths[first])
     second = int(np.argmax((worth * (worth[first] == 0.0)).sum(axis=1) - opposite))
@@ -260,11 +284,11 @@ def _two_sides(model: ObjectModel, X_WO: Array, marks: Sequence[Marks]) -> tuple
 def _camera(
     model: ObjectModel, X_WO: Array, marks: Sequence[Marks], azimuth: float, fill: float = 1.3
 ) -> Array:
-    """Return X_WC of a camera that has the object and its marks in view."""
+    """Return the pose X_WC (4, 4) of a camera that has the object and its marks in view."""
     half = model.half_extents
     corners = half * np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T
     around = np.vstack([corners, *(m.tail_O for m in marks), *(m.tip_O for m in marks)])
-    return view(transform_points(X_WO, around), azimuth, ELEVATION, fill=fill)
+    return camera_pose(transform_points(X_WO, around), azimuth, ELEVATION, fill=fill)
 
 
 def _towards(marks: Marks, X_WO: Array, p_WC: Array) -> Array:
@@ -275,23 +299,29 @@ def _towards(marks: Marks, X_WO: Array, p_WC: Array) -> Array:
 
 
 def _is_seen(model: ObjectModel, X_WO: Array, marks: Marks, p_WC: Array) -> npt.NDArray[np.bool_]:
-    """Return for each contact whether the object leaves it in sight of a camera at p_WC (3,)."""
+    """Return (n,), whether a camera at p_WC (3,) sees each contact past the object."""
     start = marks.p_OQ + HIDDEN * marks.nhat_Q_O
     return ~model.visual.ray.intersects_any(start, _towards(marks, X_WO, p_WC))
 
 
 def _draw_figure(verified: Verification, model: ObjectModel, views: Sequence[View]) -> Figure:
+    """Draw the views side by side, with the verdict above and the legend below."""
+    # The page [inch].
     gap, margin, head, foot = 0.08, 0.12, 0.85, 0.4
     width = len(views) * (EDGE + gap) - gap + 2.0 * margin
     figure = Figure(figsize=(width, EDGE + head + foot), facecolor="white")
-    for k, one in enumerate(views):
+
+    # The views, with their contacts.
+    for k, view in enumerate(views):
         axes = add_axes(figure, margin + k * (EDGE + gap), head, EDGE, EDGE)
-        axes.imshow(one.picture.image, interpolation="antialiased")
+        axes.imshow(view.picture.image, interpolation="antialiased")
         axes.set(xlim=(-0.5, PIXELS - 0.5), ylim=(PIXELS - 0.5, -0.5))
-        axes.set_title(one.title, fontsize=9.5, color=INK, loc="left", pad=4)
+        axes.set_title(view.title, fontsize=9.5, color=INK, loc="left", pad=4)
         hide_ticks(axes)
-        for marks in one.marks:
-            _draw_marks(axes, one, model, marks)
+        for marks in view.marks:
+            _draw_marks(axes, view, model, marks)
+
+    # The verdict and its reason.
     holds = verified.outcome is Outcome.SUCCESS
     verdict = "holds" if holds else f"fails: {verified.outcome.label.replace('_', ' ')}"
     left, height = margin / width, EDGE + head + foot
@@ -299,17 +329,22 @@ def _draw_figure(verified: Verification, model: ObjectModel, views: Sequence[Vie
                 weight="bold", color=HOLDS if holds else FAILS)  # fmt: skip
     figure.text(left, 1.0 - 0.36 / height, verified.reason, fontsize=9.5, va="top", color=INK,
                 wrap=True)  # fmt: skip
+
     _draw_legend(figure, verified, (left, 0.3 / height))
     return figure
 
 
-def _draw_marks(axes: Axes, one: View, model: ObjectModel, marks: Marks) -> None:
+def _draw_marks(axes: Axes, view: View, model: ObjectModel, marks: Marks) -> None:
+    """Draw contacts of one kind; the dots of those that the object hides are hollow."""
+    # Project them into the picture, and ask which are visible.
     halo = [withStroke(linewidth=3.0, foreground="white")]
     pixels = [
-        one.picture.pixels(transform_points(one.X_WO, p))
+        view.picture.pixels(transform_points(view.X_WO, p))
         for p in (marks.p_OQ, marks.tail_O, marks.tip_O)
     ]
-    seen = _is_seen(model, one.X_WO, marks, one.picture.X_WC[:3, 3])
+    seen = _is_seen(model, view.X_WO, marks, view.picture.X_WC[:3, 3])
+
+    # An arrow, the dot, and the name beyond the arrow's tip.
     rows = zip(*pixels, marks.names, seen, strict=True)
     for i, (dot, tail, tip, name, is_seen) in enumerate(rows):
         arrow = {"arrowstyle": "-|>", "color": marks.colour, "linewidth": 0.36 * marks.size,
@@ -326,16 +361,18 @@ def _draw_marks(axes: Axes, one: View, model: ObjectModel, marks: Marks) -> None
 
 
 def _beyond(tail: Array, tip: Array) -> tuple[float, float]:
-    """Return how far from an arrow's tip its name is written [points], y up."""
+    """Return the offset (x, y up) of an arrow's name from its tip [points]."""
     along = (tip - tail) * [1.0, -1.0]
     length = float(np.linalg.norm(along))
-    # An arrow that points at the camera is a dot: its name goes above that.
+    # An arrow that points at the camera looks like a dot: its name goes above that.
     if length < NUMBER:
         return 0.0, 1.5 * NUMBER
     return float(NUMBER * along[0] / length), float(NUMBER * along[1] / length)
 
 
 def _draw_legend(figure: Figure, verified: Verification, corner: tuple[float, float]) -> None:
+    """Draw the legend below a corner, given as shares of the figure's width and height."""
+
     def dot(colour: str, inside: str, label: str) -> Line2D:
         return Line2D([], [], marker="o", linestyle="none", markersize=6.5, label=label,
                       markerfacecolor=inside, markeredgecolor=colour)  # fmt: skip
