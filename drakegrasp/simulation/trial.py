@@ -17,7 +17,7 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import Contacts, open_hand_collides, read_contacts
 from drakegrasp.simulation.lift import lift
 from drakegrasp.simulation.scene import (
@@ -70,7 +70,7 @@ class TrialRecord:
 def run_attempt(
     scene: Scene,
     X_TO: npt.ArrayLike,
-    attempt: Attempt,
+    attempt: Pregrasp,
     config: Config,
     prediction: Prediction | None = None,
 ) -> TrialRecord:
@@ -111,7 +111,7 @@ def run_attempt(
         return replace(failed, message=lines[0])
 
 
-def _predict(scene: Scene, X_TO: Array, attempt: Attempt, config: Config) -> Prediction | None:
+def _predict(scene: Scene, X_TO: Array, attempt: Pregrasp, config: Config) -> Prediction | None:
     if scene.handles is None:
         return None
     (found,) = predict(scene.model, scene.handles.hand, X_TO, [attempt], config.screen)
@@ -121,7 +121,7 @@ def _predict(scene: Scene, X_TO: Array, attempt: Attempt, config: Config) -> Pre
 def _simulate(
     scene: Scene,
     record: TrialRecord,
-    attempt: Attempt,
+    attempt: Pregrasp,
     config: Config,
     prediction: Prediction | None,
 ) -> TrialRecord:

@@ -74,7 +74,7 @@ def _of(rows: Array, row: int) -> str:
 
 
 def to_object_frame(
-    points: Array, normals: Array, *, frame: str, X: Array | None, X_TO: Array
+    points: Array, normals: Array, *, frame: str, X_TC: Array | None, X_TO: Array
 ) -> tuple[Array, Array]:
     """Return points and normals (n, k, 3), given in one of three frames, in {O}.
 
@@ -82,54 +82,71 @@ def to_object_frame(
         points: (n, k, 3) [m].
         normals: (n, k, 3).
         frame: "object" {O}, "camera" {C} or "workspace" {T}.
-        X: For the camera frame the pose of the camera in the table-top frame, X_TC (4, 4), or
-            one per grasp (n, 4, 4).
+        X_TC: With the frame "camera": pose of the camera, (4, 4), or one per grasp (n, 4, 4).
         X_TO: (4, 4), pose of the object.
 
     Raises:
-        GraspError: If the frame is unknown, or a camera's pose is missing or out of place.
+        GraspError: If the frame is unknown, a camera's pose is missing, or one is given for
+            another frame.
     """
     if frame not in FRAMES:
         raise GraspError(f"frame must be one of {', '.join(FRAMES)}, got {frame!r}")
-    if frame == "camera" and X is None:
+    if frame == "camera" and X_TC is None:
         raise GraspError(
-            "X must be the camera's pose in the table-top frame (X_TC, frame_work2cam in the "
-            "files) where frame is camera, got None"
+            "X_TC must be the camera's pose in the table-top frame (frame_work2cam in the files) "
+            "if frame is camera, got None"
         )
-    if frame != "camera" and X is not None:
-        raise GraspError(f"X must be None where frame is {frame}, got a pose")
+    if frame != "camera" and X_TC is not None:
+        raise GraspError(f"X_TC must be None if frame is {frame}, got a pose")
     if frame == "object":
         return points, normals
+
+    # Pose of the grasps' frame {A} in {O}, one per grasp.
     X_OT = invert_pose(X_TO)
-    X_OA = X_OT if X is None else X_OT @ X
+    X_OA = X_OT if X_TC is None else X_OT @ X_TC
     if X_OA.ndim == 2:
         X_OA = np.broadcast_to(X_OA, (len(points), 4, 4))
     if len(X_OA) != len(points):
-        raise GraspError(f"X must be one pose, or one per grasp ({len(points)}), got {len(X_OA)}")
+        raise GraspError(
+            f"X_TC must be one pose, or one per grasp ({len(points)}), got {len(X_OA)}"
+        )
+
+    # Without any grasp the shapes stay (0, k, 3).
     moved = [transform_points(A, p) for A, p in zip(X_OA, points, strict=True)]
     turned = [rotate_vectors(A, n) for A, n in zip(X_OA, normals, strict=True)]
-    # No grasps at all keep their shape, too.
     return np.reshape(moved, points.shape), np.reshape(turned, normals.shape)
 
 
 def boxes_away(p_OQ: Array, half_extents: Array) -> float:
-    """Return how many times the bounding box the nearest of points (n, k, 3) is out; 1 is on it."""
+    """Return how far out the nearest point is, as a multiple of the bounding box.
+
+    Args:
+        p_OQ: (..., 3), points in {O} [m].
+        half_extents: (3,), of the box [m].
+
+    Returns:
+        1 on the box, below 1 inside it, inf without points.
+    """
     return float(np.abs(p_OQ / half_extents).max(axis=-1).min(initial=np.inf))
 
 
 def refuse_other_units(p_OQ: Array, half_extents: Array) -> None:
-    """Refuse points (n, k, 3) that are all far outside of the object.
+    """Refuse points that are all far from the object: another unit of length, or another frame.
+
+    Args:
+        p_OQ: (..., 3), points in {O} [m].
+        half_extents: (3,), of the object's bounding box [m].
 
     Raises:
-        GraspError: If every point is beyond three times the bounding box.
+        GraspError: If every point is outside `UNIT_FACTOR` times the bounding box.
     """
     factor = boxes_away(p_OQ, half_extents)
     if p_OQ.size and factor > UNIT_FACTOR:
         size = " x ".join(f"{edge:.3g}" for edge in 2.0 * half_extents)
         raise GraspError(
             f"contact points must lie on the object, whose box is {size} m, got points all "
-            f"outside {UNIT_FACTOR:g} times that (the nearest at {factor:.3g} times): are grasp "
-            "and mesh in the same units (metres, see units) and is the frame the right one?"
+            f"outside {UNIT_FACTOR:g} times that (the nearest at {factor:.3g} times); check the "
+            "units (grasps are in metres, meshes in units) and the frame"
         )
 
 

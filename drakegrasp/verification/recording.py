@@ -99,8 +99,8 @@ def record_verification(verified: Verification, path: Path) -> None:
     model, X_TO = verified.placed.model, rest_pose(verified.placed.X_TO)
     config = verified.config
     p_OQ, nhat_Q_O = verified.p_OQ, verified.nhat_Q_O
-    if verified.attempt is not None:
-        record_attempt(model, X_TO, verified.attempt, config, path, p_OQ=p_OQ, nhat_Q_O=nhat_Q_O)
+    if verified.pregrasp is not None:
+        record_attempt(model, X_TO, verified.pregrasp, config, path, p_OQ=p_OQ, nhat_Q_O=nhat_Q_O)
     elif verified.lift is not None:
         record_lift(model, X_TO, p_OQ, nhat_Q_O, config, path)
     else:

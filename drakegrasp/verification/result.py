@@ -11,7 +11,7 @@ import numpy as np
 from drakegrasp.config import Config
 from drakegrasp.frames import Array
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.trial import TrialRecord
@@ -36,7 +36,7 @@ class Verification:
         surface_distance: (k,), of the points from the object's surface [m].
         fit: The wrist pose and joints that were tried last or held, with SLSQP's status.
         tries: Number of wrist poses that were simulated.
-        attempt: What the trial began from.
+        pregrasp: Palm and opened fingers that the trial started from.
         trial: What happened in the simulator.
         contact_error: (k,), distance of each contact after closing from its prediction [m].
         lift: What happened to the object under forces alone.
@@ -56,7 +56,7 @@ class Verification:
     surface_distance: Array
     fit: WristFit | None = None
     tries: int = 0
-    attempt: Attempt | None = None
+    pregrasp: Pregrasp | None = None
     trial: TrialRecord | None = None
     contact_error: Array | None = None
     lift: ForceLift | None = None

@@ -223,7 +223,7 @@ def _column(field: Field, rows: Sequence[dict[str, Any]], shape: dict[str, int])
 
 def _row(result: Verification) -> dict[str, Any]:
     """Return the values of one result by field; what was not reached is left out, or None."""
-    fit, attempt, trial, lift = result.fit, result.attempt, result.trial, result.lift
+    fit, trial, lift = result.fit, result.trial, result.lift
     row: dict[str, Any] = {
         "object": result.placed.model.name,
         "method": result.method,
@@ -244,8 +244,8 @@ def _row(result: Verification) -> dict[str, Any]:
         row |= {name: getattr(fit, name) for name in ("spread", "closing", "residual")}
         row |= {"X_OG": pack_pose(fit.X_OG), "normal_error": fit.normal_error}
         row |= {"solver_status": fit.status, "solver_iterations": fit.iterations}
-    if attempt is not None:
-        row["closing_start"] = attempt.closing
+    if result.pregrasp is not None:
+        row["closing_start"] = result.pregrasp.closing
     if trial is not None and trial.closed is not None:
         row |= {"time_close": trial.time_close, "closed_q": trial.q_closed}
         row |= _contact_values("closed", trial.closed)

@@ -24,7 +24,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.runtime.environment import allow_network
 from drakegrasp.runtime.files import sync_and_rename, temporary_name
-from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.construction import MESHCAT_RATE, build_scene
 from drakegrasp.simulation.scene import Scene, reset_attempt, reset_object
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
@@ -48,7 +48,7 @@ DISTANCE, HAND_RADIUS = 1.15, 0.1
 def record_attempt(
     model: ObjectModel,
     X_TO: npt.ArrayLike,
-    attempt: Attempt,
+    attempt: Pregrasp,
     config: Config,
     path: Path,
     *,
