@@ -61,8 +61,8 @@ def test_workers_change_nothing(test_split: GraspDataset, tmp_path: Path) -> Non
     here = verify_grasps(grasps, dataset=test_split, rows=rows)
     with connect(2) as client:
         there = verify_grasps(grasps, dataset=test_split, rows=rows, client=client)
-    for name, found in (("here.h5", here), ("there.h5", there)):
-        write_results(found, tmp_path / name, config)
+    for name, results in (("here.h5", here), ("there.h5", there)):
+        write_results(results, tmp_path / name, config)
     assert (tmp_path / "here.h5").read_bytes() == (tmp_path / "there.h5").read_bytes()
     names = test_split.column("object_props/object_name")[rows]
     assert [v.placed.model.name for v in here] == names.tolist()
@@ -72,11 +72,11 @@ def test_results_come_in_the_order_of_the_grasps(cube: PlacedObject) -> None:
     off = GRASP.copy()
     off[0, 0] += 0.02
     order = [off, GRASP, off, GRASP]
-    found = verify_grasps([g.ravel() for g in order], cube, method="forces")
-    assert [v.outcome for v in found] == [
+    results = verify_grasps([g.ravel() for g in order], cube, method="forces")
+    assert [v.outcome for v in results] == [
         Outcome.OFF_SURFACE if g is off else Outcome.SUCCESS for g in order
     ]
-    assert [v.p_OQ[0, 0] for v in found] == [g[0, 0] for g in order]
+    assert [v.p_OQ[0, 0] for v in results] == [g[0, 0] for g in order]
 
 
 def test_every_grasp_is_placed_once(cube: PlacedObject) -> None:

@@ -140,7 +140,9 @@ def as_dict(index: int, result: Verification) -> dict[str, Any]:
         index: Of the grasp.
         result: Its verdict.
     """
+    # In the order in which a person reads them: verdict, contacts, hand, lift, margin.
     trial, fit, lift = result.trial, result.fit, result.lift
+
     return {
         "index": index,
         "object": result.placed.model.name,

@@ -107,6 +107,7 @@ def read_far(path: Path) -> float:
 
 
 def _depth_colours() -> Colormap:
+    """Return the colours of depths; that of pixels without depth is a light grey."""
     # Pixels beyond the far plane are masked: they have no depth.
     return mpl.colormaps["viridis_r"].with_extremes(bad="#E3E6EA")
 

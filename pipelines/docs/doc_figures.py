@@ -318,6 +318,7 @@ def _draw_pixel_axes(axes: Axes) -> None:
 
 
 def _show_image(axes: Axes, image: npt.NDArray[np.uint8]) -> None:
+    """Show an image whose pixel centres have whole coordinates."""
     axes.imshow(image, interpolation="antialiased")
     axes.set_xlim(-0.5, image.shape[1] - 0.5)
     axes.set_ylim(image.shape[0] - 0.5, -0.5)

@@ -92,6 +92,7 @@ def hand_constants(hand: Hand) -> HandConstants:
 
 def _stack_chains(hand: Hand) -> dict[str, Array]:
     """Return the attributes of `HandConstants` that describe the joints, by name."""
+    # Pad all chains to the length of the longest.
     m = max(len(chain.axis) for chain in hand.chains)
     X_PJ, axis, gain = [], [], []
     for chain in hand.chains:
@@ -100,9 +101,12 @@ def _stack_chains(hand: Hand) -> dict[str, Array]:
         X_PJ.append(np.concatenate([chain.X_PJ, np.tile(np.eye(4), (missing, 1, 1))]))
         axis.append(np.concatenate([chain.axis, np.tile([0.0, 0.0, 1.0], (missing, 1))]))
         gain.append(np.pad(chain.gain, ((0, missing), (0, 0))))
+
+    # The matrices of the cross products by the axes, with room for a position.
     a, k = np.stack(axis, axis=1), len(hand.chains)
     cross = np.zeros((m, k, 4, 4))
     cross[..., :3, :3] = skew(a)
+
     return {
         "X_PJ": np.stack(X_PJ, axis=1),
         "axis": a,
