@@ -213,7 +213,7 @@ class VerifyConfig(_Section):
 
 
 #: What acts on assembled shards, or on nothing that a shard holds.
-LATE_KEYS = ("filters", "split", "max_grasps", "attempt_seconds", "verify")
+POSTPROCESSING_KEYS = ("filters", "split", "max_grasps", "attempt_seconds", "verify")
 
 
 class Config(_Section):
@@ -248,7 +248,7 @@ class Config(_Section):
         `max_grasps`, which only says where to stop, the wall-clock limit, and `verify`.
         """
         values = self.to_dict()
-        for key in LATE_KEYS:
+        for key in POSTPROCESSING_KEYS:
             del values[key]
         if not self.certify.repeats:
             del values["certify"]  # without repeats the noise is not asked for

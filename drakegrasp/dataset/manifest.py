@@ -17,7 +17,7 @@ from typing import Any
 
 import h5py
 
-from drakegrasp.config import LATE_KEYS, Config, override_config, parse_config
+from drakegrasp.config import POSTPROCESSING_KEYS, Config, override_config, parse_config
 from drakegrasp.dataset import log as build_log
 from drakegrasp.dataset.paths import FILE_NAME, OWN_FILES, OWN_FOLDERS
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION
@@ -219,5 +219,5 @@ def _differences(theirs: Config, ours: Config) -> str:
         return found
 
     a, b = flat(theirs.to_dict()), flat(ours.to_dict())
-    keys = [k for k in a if a[k] != b[k] and k.partition(".")[0] not in LATE_KEYS]
+    keys = [k for k in a if a[k] != b[k] and k.partition(".")[0] not in POSTPROCESSING_KEYS]
     return ", ".join(f"{k} ({a[k]} there, {b[k]} here)" for k in keys)

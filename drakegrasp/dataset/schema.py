@@ -277,7 +277,7 @@ TRIAL_FIELDS: tuple[Field, ...] = (
         unit="-",
         frame="-",
         meaning="verdict: "
-        + ", ".join(f"{o.value} {o.label}" for o in Outcome if not o.only_verified),
+        + ", ".join(f"{o.value} {o.label}" for o in Outcome if not o.verification_only),
     ),
     Field(
         name="X_TO",

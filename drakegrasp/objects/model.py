@@ -27,7 +27,7 @@ from drakegrasp.mesh.components import count_parts
 from drakegrasp.mesh.decimation import decimate
 from drakegrasp.mesh.distance_field import DistanceField, make_distance_field
 from drakegrasp.mesh.loading import load_mesh, one_line
-from drakegrasp.mesh.repair import mend_solid
+from drakegrasp.mesh.repair import repair_solid
 from drakegrasp.mesh.surfaces import Solid, diagonal, signed_volume
 from drakegrasp.objects.sources import MANIFEST_NAME, UNITS, MeshSource, source_sha256
 from drakegrasp.runtime.files import sync_and_rename, temporary_name
@@ -174,7 +174,7 @@ def make_object(
             f"{config.max_diagonal:g} m, got {size:.4g} m{unit}: give the "
             f"file's unit with --units ({', '.join(UNITS)}) or for this mesh in {MANIFEST_NAME}"
         )
-    solid = mend_solid(vertices, faces)
+    solid = repair_solid(vertices, faces)
     _refuse_slight(solid)
     centre = (solid.vertices.min(axis=0) + solid.vertices.max(axis=0)) / 2.0
     visual = Solid(vertices=solid.vertices - centre, faces=solid.faces)

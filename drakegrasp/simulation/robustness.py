@@ -145,4 +145,4 @@ def _holds(
     # A scene has its friction and its masses from when it was built.
     scene = build_scene(model, physics, load_hand(config.hand))
     outcome = run_attempt(scene, X_TO, attempt, config, prediction).outcome
-    return None if outcome.says_nothing else outcome is Outcome.SUCCESS
+    return None if outcome.inconclusive else outcome is Outcome.SUCCESS

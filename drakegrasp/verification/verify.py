@@ -156,7 +156,7 @@ def _by_hand(base: Verification, config: Config) -> Verification:
         if results[-1].success:
             return replace(results[-1], tries=tries)
     # As long as one of them has no verdict, the grasp has none.
-    unknown = [result for result in results if result.outcome.says_nothing]
+    unknown = [result for result in results if result.outcome.inconclusive]
     farthest = max(unknown or results, key=lambda result: _RANK.index(result.outcome))
     return replace(farthest, tries=len(near))
 
@@ -173,7 +173,7 @@ def _by_forces(base: Verification, config: Config) -> Verification:
             force_limit=limit,
             config=config,
         )
-    if _ENDS[lift.end].says_nothing:
+    if _ENDS[lift.end].inconclusive:
         forget_scenes()
     moved = f"{_mm(lift.position_error)} and {np.rad2deg(lift.angle_error):.1f}°"
     reasons = {
@@ -228,7 +228,7 @@ def _try(
         trial = run_attempt(scene, X_TO, attempt, config)
         if trial.outcome is not Outcome.START_COLLISION:
             break
-    if trial.outcome.says_nothing:
+    if trial.outcome.inconclusive:
         forget_scenes()
     return attempt, trial
 

@@ -42,7 +42,7 @@ def numbers(
     yield from batch.broken(
         "trial_id must be the row's number", batch["trial_id"] != batch.rows, batch["trial_id"]
     )
-    outcome, known = batch["outcome"], [o.value for o in Outcome if not o.only_verified]
+    outcome, known = batch["outcome"], [o.value for o in Outcome if not o.verification_only]
     yield from batch.broken(f"outcome must be 0..{max(known)}", ~np.isin(outcome, known), outcome)
     index, candidate = batch["object"], batch["candidate"]
     wild = (index < 0) | (index >= objects)
