@@ -6,7 +6,7 @@ from enum import IntEnum
 
 
 class Stage(IntEnum):
-    """How far an attempt got; this decides which columns of its row in `trials.hdf5` hold values."""
+    """How far an attempt got; it decides which columns of `trials.hdf5` hold values."""
 
     PLACED = 0  # geometry only: nothing was simulated
     CLOSED = 1  # the fingers were closed and judged

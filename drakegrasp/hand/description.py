@@ -25,7 +25,8 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RevoluteJoint, RigidBody, WeldJoint
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.errors import HandError
+from drakegrasp.config import describe_mistake
+from drakegrasp.errors import HandError, first_line, one_line
 from drakegrasp.frames import Array, invert_pose, make_pose
 from drakegrasp.hand.files import hand_file
 from drakegrasp.runtime.environment import allow_network
@@ -190,27 +191,15 @@ def _read_description(path: Path) -> _Description:
     try:
         tree = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        first = str(error).splitlines()[0]
-        raise HandError(f"{path}: must be YAML, got text that is not ({first})") from None
+        raise HandError(f"{path}: must be YAML, got text that is not ({one_line(error)})") from None
     try:
         return _Description.model_validate(tree)
     except ValidationError as error:
-        lines = "; ".join(_describe(e) for e in error.errors())
-        raise HandError(f"{path}: {lines}") from None
-
-
-def _describe(error: Any) -> str:
-    """Return one pydantic error as `path: must ..., got ...`."""
-    where = ".".join(str(part) for part in error["loc"]) or "hand"
-    kind, got = error["type"], error["input"]
-    if kind in ("extra_forbidden", "unexpected_keyword_argument"):
-        return f"{where}: must be a key of a hand file, got an unknown one"
-    if kind == "missing":
-        return f"{where}: must be given, got nothing"
-    message = str(error["msg"]).removeprefix("Value error, ")
-    if kind == "value_error":
-        return f"{where}: {message}"
-    return f"{where}: must be {message.removeprefix('Input should be ')}, got {got!r}"
+        lines = [
+            describe_mistake(mistake, whole="hand", legal="a key of a hand file")
+            for mistake in error.errors()
+        ]
+        raise HandError(f"{path}: {'; '.join(lines)}") from None
 
 
 def _build_hand(name: str, description: _Description, sdf_path: Path) -> Hand:
@@ -267,8 +256,7 @@ def _parse(sdf_path: Path) -> tuple[MultibodyPlant, ModelInstanceIndex]:
     try:
         (instance,) = make_parser(plant).AddModels(sdf_path)
     except (RuntimeError, ValueError) as error:
-        first = str(error).splitlines()[0]
-        raise HandError(f"model: must be a file of one model, got {first}") from None
+        raise HandError(f"model: must be a file of one model, got {first_line(error)}") from None
     return plant, instance
 
 

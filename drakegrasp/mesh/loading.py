@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from drakegrasp.errors import MeshError
+from drakegrasp.errors import MeshError, one_line
 from drakegrasp.frames import Array
 from drakegrasp.mesh.repair import weld
 from drakegrasp.mesh.surfaces import Faces
@@ -106,8 +106,3 @@ def _concatenate(parts: list[trimesh.Trimesh]) -> tuple[Array, Faces]:
     faces = [part.faces + offset for part, offset in zip(parts, offsets, strict=True)]
     vertices = np.vstack([part.vertices for part in parts])
     return np.array(vertices, dtype=np.float64), np.vstack(faces).astype(np.int64)
-
-
-def one_line(error: Exception) -> str:
-    """Return what another library says is wrong, fit to stand in a message of ours."""
-    return " ".join(str(error).split())[:200] or type(error).__name__

@@ -21,12 +21,12 @@ import numpy.typing as npt
 import trimesh
 
 from drakegrasp.config import ObjectConfig
-from drakegrasp.errors import MeshError
+from drakegrasp.errors import MeshError, one_line
 from drakegrasp.frames import Array
 from drakegrasp.mesh.components import count_parts
 from drakegrasp.mesh.decimation import decimate
 from drakegrasp.mesh.distance_field import DistanceField, make_distance_field
-from drakegrasp.mesh.loading import load_mesh, one_line
+from drakegrasp.mesh.loading import load_mesh
 from drakegrasp.mesh.repair import repair_solid
 from drakegrasp.mesh.surfaces import Solid, diagonal, signed_volume
 from drakegrasp.objects.sources import MANIFEST_NAME, UNITS, MeshSource, source_sha256

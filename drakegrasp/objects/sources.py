@@ -27,8 +27,9 @@ import numpy as np
 import pydantic
 import yaml
 
-from drakegrasp.errors import MeshError
-from drakegrasp.mesh.loading import SUFFIXES, one_line, read_bytes
+from drakegrasp.config import describe_mistake
+from drakegrasp.errors import MeshError, one_line
+from drakegrasp.mesh.loading import SUFFIXES, read_bytes
 
 #: Metres per unit of length of a file.
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -98,20 +99,10 @@ def _read_manifest(path: Path) -> _Manifest:
     try:
         return _Manifest.model_validate({} if content is None else content)
     except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"]) or "the file"
-        legal = "; legal keys: " + (
-            "units, class, name" if first["loc"][:1] == ("objects",) else "units, objects"
-        )
-        must = {
-            "extra_forbidden": "a known key",
-            "model_type": "a mapping of keys to values",
-            "dict_type": "a mapping of names to their values",
-        }.get(first["type"], first["msg"].removeprefix("Input should be "))
-        raise MeshError(
-            f"{path}: {place}: must be {must}, got {first['input']!r}"
-            + (legal if first["type"] == "extra_forbidden" else "")
-        ) from error
+        mistake = error.errors()[0]
+        keys = "units, class, name" if mistake["loc"][:1] == ("objects",) else "units, objects"
+        line = describe_mistake(mistake, whole="the file", legal=f"a known key ({keys})")
+        raise MeshError(f"{path}: {line}") from error
 
 
 def _class_of(stem: str) -> str:

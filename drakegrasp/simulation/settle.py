@@ -13,7 +13,7 @@ from pydrake.math import RotationMatrix
 
 from drakegrasp.arithmetic import multiply, norm
 from drakegrasp.config import Config
-from drakegrasp.errors import MeshError
+from drakegrasp.errors import MeshError, first_line
 from drakegrasp.frames import X_WT, Array, invert_pose, make_pose
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.construction import build_scene
@@ -63,8 +63,8 @@ def settle(model: ObjectModel, config: Config) -> Resting:
         return _settle(model, config)
     # A failed assertion within Drake arrives as SystemExit.
     except (RuntimeError, SystemExit) as error:
-        lines = str(error).strip().splitlines() or [type(error).__name__]
-        raise MeshError(f"{model.name}: Drake must be able to drop it, got: {lines[0]}") from None
+        reason = first_line(error)
+        raise MeshError(f"{model.name}: Drake must be able to drop it, got: {reason}") from None
 
 
 def _settle(model: ObjectModel, config: Config) -> Resting:

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
+from drakegrasp.errors import first_line
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Attempt
@@ -106,9 +107,8 @@ def run_attempt(
         raise  # the machine's, not the attempt's
     # A failed assertion within Drake arrives as SystemExit, everything else as RuntimeError.
     except (Exception, SystemExit) as error:
-        lines = str(error).strip().splitlines() or [type(error).__name__]
         failed = TrialRecord(outcome=Outcome.SOLVER_ERROR, X_TO=X_TO, X_OG=attempt.X_OG)
-        return replace(failed, message=lines[0])
+        return replace(failed, message=first_line(error))
 
 
 def _predict(scene: Scene, X_TO: Array, attempt: Attempt, config: Config) -> Prediction | None:

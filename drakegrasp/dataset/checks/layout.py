@@ -15,7 +15,7 @@ import numpy as np
 from drakegrasp.config import Config, parse_config
 from drakegrasp.dataset.checks.findings import Violation
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, SPLITS, Field, sizes
-from drakegrasp.errors import ConfigError
+from drakegrasp.errors import ConfigError, first_line
 from drakegrasp.vision.camera import intrinsics
 
 #: K, near and far are float64 copies of what the configuration gives.
@@ -35,7 +35,7 @@ def read_config(name: str, file: h5py.File) -> tuple[Config | None, list[Violati
     except KeyError:
         got = "none"
     except (json.JSONDecodeError, ConfigError) as error:
-        got = f"another ({str(error).splitlines()[0]})"
+        got = f"another ({first_line(error)})"
     what = "attribute config must be a configuration of drakegrasp as JSON"
     return None, [Violation(file=name, what=what, got=got)]
 

@@ -25,6 +25,7 @@ from drakegrasp.dataset.schema import (
     TRIAL_FIELDS,
     Field,
 )
+from drakegrasp.errors import first_line
 
 Rule = Callable[[Batch], Iterator[Violation]]
 
@@ -117,8 +118,3 @@ def open_file(name: str, file: h5py.File, camera: str, findings: Findings) -> Op
 def column(dataset: h5py.Dataset, field: Field) -> Any:
     """Return a dataset as it is indexed for values: text for a field of text."""
     return dataset.asstr() if field.dtype == "str" else dataset
-
-
-def first_line(error: Exception) -> str:
-    """Return what an exception says, in a line."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -24,7 +24,7 @@ from drakegrasp.dataset.checks import samples as sample_rules
 from drakegrasp.dataset.checks import trials as trial_rules
 from drakegrasp.dataset.checks.findings import Batch, Findings, Violation, of_file
 from drakegrasp.dataset.checks.images import Lens
-from drakegrasp.dataset.checks.open_file import OpenFile, Rule, first_line, open_file
+from drakegrasp.dataset.checks.open_file import OpenFile, Rule, open_file
 from drakegrasp.dataset.manifest import Manifest, read_manifest
 from drakegrasp.dataset.paths import (
     DATA_FILES,
@@ -35,7 +35,7 @@ from drakegrasp.dataset.paths import (
 )
 from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS, SPLITS
 from drakegrasp.dataset.shards import read_shard
-from drakegrasp.errors import DataError, MeshError
+from drakegrasp.errors import DataError, MeshError, first_line
 from drakegrasp.objects.model import ObjectModel, load_object
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.progress import Report, silent
