@@ -97,7 +97,7 @@ class SettleConfig(_Section):
     max_angular_speed: Positive = 1e-2  # [rad/s], slower than this is at rest
     rest_time: Positive = 0.2  # [s], at rest for this long
     time_step: Annotated[float, Field(gt=0.0, le=0.02)] = (
-        0.004  # [s]; longer steps turn the object as it lands
+        0.004  # [s]; longer ones tilt it in landing
     )
 
 
@@ -124,9 +124,7 @@ class ScreenConfig(_Section):
 
     mode: Literal["on", "off"] = "on"  # "off" simulates every attempt, from the open hand
     start_margin: Positive = 0.0025  # [m], deeper penetration at the start is a certain collision
-    reach_margin: Positive = (
-        0.0025  # [m], a fingertip that passes nearer than this may make contact
-    )
+    reach_margin: Positive = 0.0025  # [m], a fingertip that passes nearer than this may touch
     block_margin: Positive = 0.005  # [m], contact stops every finger before it penetrates this far
     clearance: Positive = 0.004  # [m], fingers start to close at this distance from what they meet
 

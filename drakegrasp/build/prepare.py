@@ -61,7 +61,7 @@ def prepare_one(task: PrepareTask) -> tuple[str, dict[str, Any]]:
         if entry is not None:  # its process, or the client, died before the manifest was written
             return source.name, entry
         if not task.expendable:
-            return source.name, _prepared_entry(task)
+            return source.name, _prepared_entry(task, digest)
         release_memory()  # of the mesh before
         identity = {
             "name": source.name,
@@ -70,7 +70,7 @@ def prepare_one(task: PrepareTask) -> tuple[str, dict[str, Any]]:
         }
         path = model_path(out, source.name).with_suffix(".journal")
         with open_journal(path, identity) as journal:
-            return source.name, _prepared_or_guilty(task, journal)
+            return source.name, _prepared_or_guilty(task, digest, journal)
 
 
 def _entry_there(
@@ -86,12 +86,12 @@ def _entry_there(
     return prepared.summary() if same else None
 
 
-def _prepared_or_guilty(task: PrepareTask, journal: Journal) -> dict[str, Any]:
+def _prepared_or_guilty(task: PrepareTask, digest: str, journal: Journal) -> dict[str, Any]:
     name = task.source.name
     verdict = journal.verdict("prepare")
     if verdict is not None:
         return _refused(
-            task.source, f"{name}: must be fit to prepare, got one that {verdict.value}"
+            task.source, digest, f"{name}: must be fit to prepare, got one that {verdict.value}"
         )
     if journal.is_futile:
         raise MachineError(
@@ -100,28 +100,28 @@ def _prepared_or_guilty(task: PrepareTask, journal: Journal) -> dict[str, Any]:
         )
     with journal.step("prepare", PREPARE_SECONDS):
         inject_fault(name)
-        return _prepared_entry(task)
+        return _prepared_entry(task, digest)
 
 
-def _prepared_entry(task: PrepareTask) -> dict[str, Any]:
+def _prepared_entry(task: PrepareTask, digest: str) -> dict[str, Any]:
     config = parse_config(task.config)
     try:
         prepared = prepare(task.source, config)
     except MeshError as error:
-        return _refused(task.source, str(error))
+        return _refused(task.source, digest, str(error))
     save_prepared(prepared, Path(task.out), config)
     return prepared.summary()
 
 
-def _refused(source: MeshSource, reason: str) -> dict[str, Any]:
-    return {"name": source.name, "mesh_sha256": source_sha256(source), "reason": reason}
+def _refused(source: MeshSource, digest: str, reason: str) -> dict[str, Any]:
+    return {"name": source.name, "mesh_sha256": digest, "reason": reason}
 
 
 def prepare(source: MeshSource, config: Config) -> PreparedObject:
     """Return a mesh as an object at rest with its palm poses.
 
     Raises:
-        MeshError: If the mesh cannot be mended, its size is implausible, or the object does
+        MeshError: If the mesh cannot be repaired, its size is implausible, or the object does
             not come to rest.
     """
     model = prepare_object(source, config.objects)

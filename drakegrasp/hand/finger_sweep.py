@@ -20,6 +20,7 @@ from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import coordinate_limits, link_poses
 from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.mesh.distance_field import DistanceField, make_distance_field
+from drakegrasp.mesh.surfaces import cover_triangles
 
 Points = npt.NDArray[np.float32]
 
@@ -166,7 +167,7 @@ def link_points(hand: Hand) -> dict[str, Array]:
     points = {}
     for link, shapes in link_shapes(hand).items():
         spacing = TIP_SPACING if link in hand.fingertip_links else LINK_SPACING
-        found = [_surface_points(corners, spacing) for corners in shapes]
+        found = [_thinned_points(corners, spacing) for corners in shapes]
         points[link] = np.concatenate([np.zeros((0, 3)), *found])
     return points
 
@@ -181,18 +182,12 @@ def _triangles(corners: Array) -> Array:
     return triangles
 
 
-def _surface_points(corners: Array, spacing: float) -> Array:
+def _thinned_points(corners: Array, spacing: float) -> Array:
     """Return the corners of a convex shape and evenly spread points of its surface."""
-    triangles, fine = _triangles(corners), spacing / 2.0
-    edges = norm(triangles - np.roll(triangles, 1, axis=1)).max(axis=1)
-    parts = np.ceil(edges / fine).astype(int)
-    points = [corners]
-    for triangle, n in zip(triangles, parts, strict=True):
-        i, j = (a.ravel() for a in np.indices((n + 1, n + 1)))
-        inside = i + j <= n
-        points.append(multiply(np.column_stack([i, j, n - i - j])[inside] / n, triangle))
-    dense = np.concatenate(points)
-    # The corners come first, so they are the ones that stay in their cells.
+    points, owner = cover_triangles(_triangles(corners), spacing / 2.0)
+    dense = np.concatenate([corners, points[np.argsort(owner, kind="stable")]])
+
+    # One point stays in each cell of a grid; corners come first, so they are the ones that stay.
     cells = np.floor(dense / spacing).astype(np.int64)
     _, first = np.unique(cells, axis=0, return_index=True)
     return dense[np.union1d(np.arange(len(corners)), first)]
