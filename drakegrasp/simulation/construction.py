@@ -101,11 +101,11 @@ def build_scene(
         meshcat: Where to show the scene while it is simulated; that changes no bit of it.
     """
     scene = _build(model, physics, hand, meshcat)
-    if hand is None or physics.calm_steps == 1:
+    if hand is None or physics.coarse_steps == 1:
         return scene
-    longer = {"time_step": physics.calm_steps * physics.time_step}
-    make_calm = cache(partial(_build, model, physics.model_copy(update=longer), hand, meshcat))
-    return replace(scene, make_calm=make_calm)
+    longer = {"time_step": physics.coarse_steps * physics.time_step}
+    coarse_scene = cache(partial(_build, model, physics.model_copy(update=longer), hand, meshcat))
+    return replace(scene, coarse_scene=coarse_scene)
 
 
 def _build(

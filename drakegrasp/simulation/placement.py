@@ -2,7 +2,7 @@
 
 In: a mesh file, a trimesh or an object that was prepared before. Out: the object and its
 resting pose. What stays the same however the object is turned or moved on the table is
-computed at one pose, `rest_pose`, so a verdict cannot depend on it.
+computed at one pose, `canonical_pose`, so a verdict cannot depend on it.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ def refuse_other_objects(config: Config, known: Config, must_be: str) -> None:
             raise ConfigError(f"{name} must be {must_be}, got other values; give the mesh instead")
 
 
-def rest_pose(X_TO: Array) -> Array:
+def canonical_pose(X_TO: Array) -> Array:
     """Return the pose (4, 4) over the table's centre that lies as X_TO does, without its yaw.
 
     Of all rotations that agree with X_TO on which way is up in {O} it is the smallest one.

@@ -138,7 +138,7 @@ def _holds(
     changed = {
         "friction_hand": friction,
         "time_step": STEP_RATIO * config.physics.time_step,
-        "calm_steps": 1,
+        "coarse_steps": 1,
     }
     physics = config.physics.model_copy(update=changed)
     config = config.model_copy(update={"physics": physics})

@@ -61,7 +61,7 @@ class Scene:
         object, table: The bodies.
         handles: The hand's part, or None in a scene without a hand.
         physics: The configuration that it was built with.
-        make_calm: Returns the same scene with `calm_steps` steps in one, always the same; None
+        coarse_scene: Returns the same scene with `coarse_steps` steps in one, always the same; None
             where there is none.
     """
 
@@ -73,7 +73,7 @@ class Scene:
     table: RigidBody
     handles: HandHandles | None
     physics: PhysicsConfig
-    make_calm: Callable[[], Scene] | None = None
+    coarse_scene: Callable[[], Scene] | None = None
 
     @property
     def context(self) -> Context:
@@ -213,7 +213,7 @@ def _follow(scene: Scene, motion: WristMotion) -> None:
     _handles(scene).wrist_trajectory.UpdateTrajectory(curve)
 
 
-def go_on_in(scene: Scene, before: Scene, time: float, motion: WristMotion) -> None:
+def transfer_state(scene: Scene, before: Scene, time: float, motion: WristMotion) -> None:
     """Give a scene the state that another one of the same systems has reached in its lift.
 
     Args:

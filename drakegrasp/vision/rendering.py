@@ -61,7 +61,7 @@ _ENGINE = "vtk"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Look:
+class RenderedView:
     """What one camera sees.
 
     Attributes:
@@ -116,7 +116,7 @@ def build_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
     )
 
 
-def look(renderer: Renderer, X_TO: npt.ArrayLike, X_TC: npt.ArrayLike) -> Look:
+def render(renderer: Renderer, X_TO: npt.ArrayLike, X_TC: npt.ArrayLike) -> RenderedView:
     """Return what a camera at X_TC (4, 4) sees of an object at X_TO (4, 4).
 
     Raises:
@@ -147,4 +147,4 @@ def look(renderer: Renderer, X_TO: npt.ArrayLike, X_TC: npt.ArrayLike) -> Look:
     image[:3] = np.moveaxis(rgb, 2, 0) / np.float32(255.0)
     # Drake gives 0 for too near and infinity for too far.
     image[3] = np.clip(depth, config.near, config.far)
-    return Look(image=image, mask=(labels == int(renderer.object.index())).astype(np.uint8))
+    return RenderedView(image=image, mask=(labels == int(renderer.object.index())).astype(np.uint8))

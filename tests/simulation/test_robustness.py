@@ -47,7 +47,7 @@ def test_least_friction_holds_and_less_does_not(cube, config):
         changed = [
             f"physics.friction_hand={friction}",
             f"physics.time_step={half}",
-            "physics.calm_steps=1",
+            "physics.coarse_steps=1",
         ]
         other = override_config(config, changed)
         scene = build_scene(cube, other.physics, load_hand(other.hand))
