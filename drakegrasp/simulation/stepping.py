@@ -45,7 +45,7 @@ class TrialLimits:
         if time.monotonic() > self.deadline:
             raise TrialTimeout
         if not np.isfinite(hand_positions(scene)).all():
-            raise StateError("the hand's joints must have finite positions, got others")
+            raise StateError("the positions of the hand's joints became infinite or NaN")
         velocity = scene.plant.EvalBodySpatialVelocityInWorld(scene.context, scene.object)
         speed = float(np.linalg.norm(velocity.translational()))
         if not speed <= self.max_speed:
