@@ -63,6 +63,7 @@ def hull_corners(inspector: SceneGraphInspector, geometry: GeometryId) -> Array 
 
 def _corners(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
     """Return the corners of a shape in its body's frame."""
+    # Corners in the shape's own frame.
     shape, hull = inspector.GetShape(geometry), hull_corners(inspector, geometry)
     if hull is not None:
         corners = hull
@@ -81,6 +82,7 @@ def _corners(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
             f"{inspector.GetName(geometry)}: must be a box, cylinder, capsule, sphere or convex "
             f"mesh, got {type(shape).__name__}"
         )
+
     X_BS = inspector.GetPoseInFrame(geometry).GetAsMatrix4()
     return transform_points(X_BS, corners)
 
