@@ -6,11 +6,10 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from helpers.objects import CUBE, box_model, from_above, standing
+from helpers.objects import CUBE, STANDOFF, from_above, standing
 
-from drakegrasp.config import Config, load_config, override_config
+from drakegrasp.config import override_config
 from drakegrasp.frames import X_WT
-from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation import lift as lifting
@@ -33,28 +32,6 @@ from drakegrasp.simulation.trajectory import lift_duration
 from drakegrasp.simulation.trial import run_attempt
 
 pytestmark = pytest.mark.sim
-
-STANDOFF = 0.06
-
-
-@pytest.fixture(scope="module")
-def config() -> Config:
-    return load_config()
-
-
-@pytest.fixture(scope="module")
-def hand() -> Hand:
-    return load_hand()
-
-
-@pytest.fixture(scope="module")
-def cube(tmp_path_factory) -> ObjectModel:
-    return box_model(tmp_path_factory.mktemp("cube"), [CUBE] * 3)
-
-
-@pytest.fixture(scope="module")
-def scene(cube, config, hand) -> Scene:
-    return build_scene(cube, config.physics, hand)
 
 
 def close(scene: Scene, cube: ObjectModel) -> None:
