@@ -60,8 +60,8 @@ class Variant:
 
 VARIANTS = {
     "screen_off": Variant(("screen.mode=off",)),
-    "half_step": Variant(("physics.time_step={half}", "physics.calm_steps=1")),
-    "calm_off": Variant(("physics.calm_steps=1",)),
+    "half_step": Variant(("physics.time_step={half}", "physics.coarse_steps=1")),
+    "coarse_steps_off": Variant(("physics.coarse_steps=1",)),
     "double_resolution": Variant(fine=True),
     "similar": Variant(("physics.solver=similar",)),
     "sap": Variant(("physics.solver=sap",)),

@@ -20,7 +20,7 @@ from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.scene import hand_joint_names
 from drakegrasp.simulation.trial import TrialRecord
 from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, image_frame, intrinsics
-from drakegrasp.vision.rendering import look
+from drakegrasp.vision.rendering import render
 
 
 def trial_rows(
@@ -42,7 +42,7 @@ def look_values(bench: Workbench, record: TrialRecord) -> dict[str, AnyArray]:
     poses = {"oto": camera_pose_oto, "otm": camera_pose_otm}
     for name in CAMERAS:
         X_TC = poses[name](multiply(record.X_TO, record.X_OG), camera)
-        seen = look(bench.renderer, record.X_TO, X_TC)
+        seen = render(bench.renderer, record.X_TO, X_TC)
         found[f"image_{name}"] = seen.image
         found[f"mask_{name}"] = seen.mask
         found[f"X_TC_{name}"] = pack_pose(X_TC)

@@ -239,7 +239,7 @@ def render_test_image() -> tuple[int, int]:
     from drakegrasp.frames import make_pose
     from drakegrasp.objects.model import ObjectModel
     from drakegrasp.vision.camera import intrinsics
-    from drakegrasp.vision.rendering import build_renderer, look
+    from drakegrasp.vision.rendering import build_renderer, render
 
     config = CameraConfig()
     box = trimesh.creation.box((BOX_EDGE,) * 3)
@@ -258,7 +258,7 @@ def render_test_image() -> tuple[int, int]:
     )
     X_TO = make_pose(np.eye(3), [0.0, 0.0, BOX_EDGE / 2.0])
     X_TC = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, BOX_EDGE + BOX_DISTANCE])
-    seen = look(build_renderer(model, config), X_TO, X_TC)
+    seen = render(build_renderer(model, config), X_TO, X_TC)
     edge = intrinsics(config)[0, 0] * BOX_EDGE / BOX_DISTANCE
     return int(seen.mask.sum()), round(edge**2)
 

@@ -26,7 +26,7 @@ from drakegrasp.frames import Array, pack_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.runtime.files import atomic_hdf5, sync_and_rename, temporary_name
 from drakegrasp.simulation.contacts import Contacts
-from drakegrasp.simulation.placement import rest_pose
+from drakegrasp.simulation.placement import canonical_pose
 from drakegrasp.verification.result import Verification
 
 #: Group of the HDF5 file that holds the fields.
@@ -230,7 +230,7 @@ def _row(result: Verification) -> dict[str, Any]:
         "outcome": result.outcome,
         "reason": result.reason,
         "X_TO": pack_pose(result.placed.X_TO),
-        "X_TO_simulated": pack_pose(rest_pose(result.placed.X_TO)),
+        "X_TO_simulated": pack_pose(canonical_pose(result.placed.X_TO)),
         "p_OQ": result.p_OQ,
         "nhat_Q_O": result.nhat_Q_O,
         "surface_distance": result.surface_distance,

@@ -22,6 +22,7 @@ from drakegrasp.dataset.checks.findings import (
 )
 from drakegrasp.dataset.schema import TRIAL_FIELDS
 from drakegrasp.outcomes import Outcome, Stage
+from drakegrasp.simulation.verdict import judge_closed, judge_lifted
 
 #: A patch's mean normal and its force are two averages: where a fingertip is just losing the
 #: object they may disagree by as much as the force from which on a contact counts [N].
@@ -86,27 +87,14 @@ def stages(batch: Batch) -> Iterator[Violation]:
 
 
 def verdicts(batch: Batch) -> Iterator[Violation]:
-    """The outcome is what follows from the contacts that were recorded (`trial.judge_*`)."""
-    lifted = batch["lifted_touching"]
-    expected = np.select(
-        [
-            ~batch["closed_touching"].all(axis=1),
-            batch["closed_other_links"] > 0,
-            batch["closed_hand_on_table"],
-            ~lifted.any(axis=1) & (batch["lifted_other_links"] == 0),
-            ~lifted.all(axis=1),
-            batch["lifted_object_on_table"],
-        ],
-        [
-            Outcome.MISSING_FINGERTIP.value,
-            Outcome.HAND_CONTACT.value,
-            Outcome.TABLE_CONTACT.value,
-            Outcome.DROPPED.value,
-            Outcome.SLIPPED.value,
-            Outcome.TABLE_CONTACT.value,
-        ],
-        Outcome.SUCCESS.value,
+    """The outcome is what follows from the recorded contacts (`simulation.verdict`)."""
+    closed = judge_closed(
+        batch["closed_touching"], batch["closed_other_links"], batch["closed_hand_on_table"]
     )
+    lifted = judge_lifted(
+        batch["lifted_touching"], batch["lifted_other_links"], batch["lifted_object_on_table"]
+    )
+    expected = np.where(closed != Outcome.SUCCESS, closed, lifted)
     judged = _stages(batch) >= Stage.CLOSED
     yield from batch.broken(
         "outcome must follow from the contacts",
