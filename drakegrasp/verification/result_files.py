@@ -20,7 +20,7 @@ import numpy as np
 from drakegrasp.config import Config
 from drakegrasp.dataset.hdf5 import AnyArray, write_field
 from drakegrasp.dataset.manifest import installed_versions, write_origin
-from drakegrasp.dataset.schema import VERIFICATION_FIELDS, Field, sizes
+from drakegrasp.dataset.schema import CONTACT_NAMES, VERIFICATION_FIELDS, Field, sizes
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, pack_pose
 from drakegrasp.hand.description import load_hand
@@ -263,6 +263,4 @@ def _row(result: Verification) -> dict[str, Any]:
 
 
 def _contact_values(prefix: str, contacts: Contacts) -> dict[str, Any]:
-    names = [f.name for f in VERIFICATION_FIELDS if f.name.startswith(f"{prefix}_")]
-    known = {name: name.removeprefix(f"{prefix}_") for name in names if name != f"{prefix}_q"}
-    return {name: getattr(contacts, attribute) for name, attribute in known.items()}
+    return {f"{prefix}_{name}": getattr(contacts, name) for name in CONTACT_NAMES}

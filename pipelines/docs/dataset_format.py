@@ -1,4 +1,4 @@
-"""Write docs/dataset-format.md from the schema table, or check that it is up to date.
+"""Write docs/reference/dataset-format.md from the schema table, or check that it is up to date.
 
 Usage: python pipelines/docs/dataset_format.py [--check] FILE
 """
@@ -21,7 +21,7 @@ from drakegrasp.dataset.schema import (
     Field,
 )
 
-_HEAD = f"""<!-- Made by `make docs` from drakegrasp/schema.py: change that, not this. -->
+_HEAD = f"""<!-- Made by `make docs` from drakegrasp/dataset/schema.py: change that, not this. -->
 
 # The dataset's format
 
@@ -57,7 +57,7 @@ may round differently. The exceptions are the outcomes `timeout` and `crashed`: 
 takes longer than `attempt_seconds` (60 s, where a usual one takes about one), or ends its process
 again and again, says more about the machine than about the grasp, and may end otherwise elsewhere.
 `screened` is an attempt that geometry has decided: it was not simulated, and would have been a
-`missing_fingertip`, see `performance.md`.
+`missing_fingertip`, see [screening](../explanation/screening.md).
 
 Shards and the files in `objects/` are sealed: a changed bit in one of them is found when it is
 used, and by `drakegrasp check`. The three main files have no seal: `check` finds what breaks an
@@ -159,7 +159,7 @@ def _fields(fields: Sequence[Field], *, stages: bool = False) -> str:
     rows = []
     for field in fields:
         shape = (
-            "(" + ", ".join(["N", *map(str, field.shape)]) + ("," if not field.shape else "") + ")"
+            "(" + ", ".join(["N", *map(str, field.axes)]) + ("," if not field.axes else "") + ")"
         )
         cells = [f"`{field.name}`", shape, field.dtype, field.unit, field.frame, field.meaning]
         if stages:
