@@ -30,7 +30,7 @@ from drakegrasp.mesh.loading import load_mesh, one_line
 from drakegrasp.mesh.repair import mend_solid
 from drakegrasp.mesh.surfaces import Solid, diagonal, signed_volume
 from drakegrasp.objects.sources import MANIFEST_NAME, UNITS, MeshSource, source_sha256
-from drakegrasp.runtime.files import sync_and_rename, temporary_name
+from drakegrasp.runtime.files import write_atomic
 from drakegrasp.seeding import object_key
 
 #: Below these an object is a sheet or a speck, which no hydroelastic contact resolves.
@@ -243,17 +243,11 @@ def _mass_properties(solid: Solid, mass: float) -> tuple[Array, Array]:
 
 def save_object(model: ObjectModel, path: str | Path) -> None:
     """Write an object to a .npz file, atomically; equal objects give equal bytes."""
-    path = Path(path)
     content: dict[str, Any] = {f.name: np.asarray(getattr(model, f.name)) for f in fields(model)}
     content["notes"] = np.array(model.notes, dtype=np.str_)
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **content)
-    temporary = temporary_name(path)
-    try:
-        temporary.write_bytes(buffer.getvalue())
-        sync_and_rename(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_atomic(Path(path), buffer.getvalue())
 
 
 def load_object(path: str | Path) -> ObjectModel:

@@ -24,7 +24,7 @@ from drakegrasp.dataset.schema import CONTACT_NAMES, VERIFICATION_FIELDS, Field,
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, pack_pose
 from drakegrasp.hand.description import load_hand
-from drakegrasp.runtime.files import atomic_hdf5, sync_and_rename, temporary_name
+from drakegrasp.runtime.files import atomic_hdf5, probe_folder, sync_and_rename
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.placement import rest_pose
 from drakegrasp.verification.result import Verification
@@ -65,10 +65,8 @@ def refuse_unwritable(out: Path) -> None:
 
 
 def _is_writable(folder: Path) -> bool:
-    probe = temporary_name(folder / "probe")
     try:
-        probe.touch()
-        probe.unlink()
+        probe_folder(folder)
     except OSError:
         return False
     return True
@@ -103,6 +101,7 @@ def json_lines(out: Path) -> Iterator[Callable[[int, Verification], None]]:
 
         yield write
     if stream is not None:
+        # Not `atomic_path`: the lines of a run that is stopped must stay.
         sync_and_rename(part, lines)
 
 
