@@ -187,9 +187,8 @@ def _write_attributes(file: h5py.File, manifest: Manifest) -> None:
 
 def _write_objects(file: h5py.File, manifest: Manifest) -> None:
     group = file.create_group("objects")
-    keys = {"class_name": "class"}
     for field in OBJECT_FIELDS:
-        values = [entry[keys.get(field.name, field.name)] for entry in manifest.objects]
+        values = [getattr(entry, field.name) for entry in manifest.objects]
         dtype = object if field.dtype == "str" else field.dtype
         write_field(group, field, np.array(values, dtype=dtype))
 
@@ -264,8 +263,8 @@ def _split_ids(
     kept = np.flatnonzero(removal == Removal.KEPT)
     split = split_samples(
         successes.object[kept],
-        [entry["name"] for entry in manifest.objects],
-        [entry["class"] for entry in manifest.objects],
+        [entry.name for entry in manifest.objects],
+        [entry.class_name for entry in manifest.objects],
         manifest.config.split,
         manifest.config.seed,
     )

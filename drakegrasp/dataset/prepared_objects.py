@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 
 from drakegrasp.config import Config
+from drakegrasp.dataset.manifest import ObjectEntry
 from drakegrasp.dataset.paths import model_file_sha256, model_path, plan_path, refuse_changed_object
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array
@@ -41,21 +41,21 @@ class PreparedObject:
     table_force: float
     stopped: bool
 
-    def summary(self) -> dict[str, Any]:
-        """Return what the manifest says of the object, as JSON types."""
-        return {
-            "name": self.model.name,
-            "class": self.model.class_name,
-            "mesh_sha256": self.model.mesh_sha256,
-            "mass": self.model.mass,
-            "X_TO": self.X_TO[:3].ravel().tolist(),
-            "rolled": self.stopped,
-            "candidates": len(self.candidates),
-            "combinations": self.candidates.combinations,
-            "valid": self.candidates.valid,
-            "distinct": self.candidates.distinct,
-            "notes": list(self.model.notes),
-        }
+    def entry(self) -> ObjectEntry:
+        """Return the object's entry in the manifest."""
+        return ObjectEntry(
+            name=self.model.name,
+            class_name=self.model.class_name,
+            mesh_sha256=self.model.mesh_sha256,
+            mass=self.model.mass,
+            X_TO=tuple(self.X_TO[:3].ravel().tolist()),
+            rolled=self.stopped,
+            candidates=len(self.candidates),
+            combinations=self.candidates.combinations,
+            valid=self.candidates.valid,
+            distinct=self.candidates.distinct,
+            notes=self.model.notes,
+        )
 
 
 def save_prepared(prepared: PreparedObject, out: Path, config: Config) -> None:

@@ -117,7 +117,7 @@ class Part:
 
 def walk_parts(out: Path, manifest: Manifest) -> Iterator[tuple[Part, Shard]]:
     """Yield the shards in the order of their rows, each object's up to its last wanted grasp."""
-    index = {entry["name"]: i for i, entry in enumerate(manifest.objects)}
+    index = {entry.name: i for i, entry in enumerate(manifest.objects)}
     wanted: dict[str, int | None] = dict.fromkeys(index, manifest.config.max_grasps)
     first = 0
     for header in manifest.headers():

@@ -80,7 +80,7 @@ def count_unfinished(out: Path) -> Unfinished | None:
     if not (out / FILE_NAME).exists() or is_assembled(out):
         return None
     manifest = read_manifest(out)
-    names = [entry["name"] for entry in manifest.objects]
+    names = [entry.name for entry in manifest.objects]
     rows = {name: i for i, name in enumerate(names)}
     outcomes, done = np.zeros((len(names), 1 + max(Outcome)), dtype=np.int64), 0
     for header in manifest.headers():
@@ -92,10 +92,10 @@ def count_unfinished(out: Path) -> Unfinished | None:
         done += 1
     funnel = Funnel(
         names=tuple(names),
-        classes=tuple(entry["class"] for entry in manifest.objects),
-        candidates=np.array([entry["candidates"] for entry in manifest.objects], dtype=np.int64),
-        distinct=np.array([entry["distinct"] for entry in manifest.objects], dtype=np.int64),
-        valid=np.array([entry["valid"] for entry in manifest.objects], dtype=np.int64),
+        classes=tuple(entry.class_name for entry in manifest.objects),
+        candidates=np.array([entry.candidates for entry in manifest.objects], dtype=np.int64),
+        distinct=np.array([entry.distinct for entry in manifest.objects], dtype=np.int64),
+        valid=np.array([entry.valid for entry in manifest.objects], dtype=np.int64),
         outcomes=outcomes,
         removals=np.zeros((len(names), 1 + max(Removal)), dtype=np.int64),
     )

@@ -107,10 +107,10 @@ def same_objects(trials: OpenFile, manifest: Manifest) -> Iterator[Violation]:
         return
     for f in OBJECT_FIELDS:
         values = column(trials.groups["objects"][f.name], f)[:].tolist()
-        key = {"class_name": "class"}.get(f.name, f.name)
         for row, (value, entry) in enumerate(zip(values, manifest.objects, strict=True)):
-            if value != entry[key]:
-                what = f"{f.name} must be that of {FILE_NAME}, {entry[key]!r}"
+            expected = getattr(entry, f.name)
+            if value != expected:
+                what = f"{f.name} must be that of {FILE_NAME}, {expected!r}"
                 yield Violation(
                     file=trials.name, group="/objects", row=row, what=what, got=repr(value)
                 )

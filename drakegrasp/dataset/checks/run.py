@@ -63,7 +63,7 @@ class _Dataset:
     @property
     def names(self) -> list[str]:
         """Names of the objects."""
-        return [entry["name"] for entry in self.manifest.objects]
+        return [entry.name for entry in self.manifest.objects]
 
 
 def check_dataset(path: str | Path, *, progress: Report | None = None) -> list[Violation]:
@@ -256,7 +256,7 @@ def _load_model(out: Path, manifest: Manifest, findings: Findings, name: str) ->
     except MeshError as error:
         findings.add([of_file(file, "the object must be readable", str(error))])
         return None
-    hashes = {entry["name"]: entry["mesh_sha256"] for entry in manifest.objects}
+    hashes = {entry.name: entry.mesh_sha256 for entry in manifest.objects}
     if hashes.get(name) != model.mesh_sha256:
         what = f"mesh_sha256 must be that of {FILE_NAME}"
         findings.add([of_file(file, what, model.mesh_sha256)])
@@ -289,7 +289,7 @@ def _check_trials(
         _add(findings, trials, dataset_rules.same_objects(trials, dataset.manifest))
     if not {"objects", "trials"} <= set(trials.groups):
         return  # found as a broken layout; trials mean nothing without their objects
-    candidates = [entry["candidates"] for entry in dataset.manifest.objects] if dataset else None
+    candidates = [entry.candidates for entry in dataset.manifest.objects] if dataset else None
     standoffs = len(trials.config.candidates.standoffs) if trials.config else None
     successes = []
     for whole in trials.batches("trials", TRIAL_ROWS, findings):
@@ -304,7 +304,7 @@ def _check_trials(
         batch = trials.judge(batch, findings, trial_rules.stages)
         checks: list[Rule] = [trial_rules.verdicts, trial_rules.contacts, trial_rules.poses]
         if dataset is not None and trials.count("objects") == len(dataset.manifest.objects):
-            poses = [entry["X_TO"] for entry in dataset.manifest.objects]
+            poses = [entry.X_TO for entry in dataset.manifest.objects]
             checks.append(partial(trial_rules.resting_poses, X_TO=poses))
         trials.judge(batch, findings, *checks)
         steps.add(len(whole))
