@@ -12,7 +12,7 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.build.attempts import Workbench
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.prepared_objects import PreparedObject
-from drakegrasp.dataset.schema import CAMERAS, sizes
+from drakegrasp.dataset.schema import CAMERAS, CONTACT_NAMES, sizes
 from drakegrasp.dataset.shards import trial_columns
 from drakegrasp.frames import pack_pose
 from drakegrasp.simulation.candidates import Attempt
@@ -77,19 +77,7 @@ def _row(prepared: PreparedObject, attempt: Attempt, record: TrialRecord) -> dic
 
 
 def _contact_values(prefix: str, contacts: Contacts) -> dict[str, Any]:
-    names = (
-        "touching",
-        "p_OQ",
-        "nhat_Q_O",
-        "f_Q_O",
-        "area",
-        "penetration",
-        "other_links",
-        "hand_on_table",
-        "object_on_table",
-        "point_contacts",
-    )
-    return {f"{prefix}_{name}": getattr(contacts, name) for name in names}
+    return {f"{prefix}_{name}": getattr(contacts, name) for name in CONTACT_NAMES}
 
 
 def array_sizes(bench: Workbench) -> dict[str, int]:

@@ -369,7 +369,7 @@ def test_full_disk_of_the_client_is_one_error(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("drakegrasp.dataset.manifest.sync_and_rename", full)
+    monkeypatch.setattr("drakegrasp.dataset.manifest.write_atomic", full)
     with pytest.raises(DiskFullError, match=r"must have room .* goes on from here"):
         build(find_meshes(meshes), tmp_path / "out", config, run_here, show=False)
     assert not (tmp_path / "out").exists()
