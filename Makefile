@@ -22,8 +22,8 @@ help:            ## what can be made
 
 install: $(STAMP)  ## the virtual environment with the package and what its tests need
 
-# Made anew for a Python that was asked for and is another, or for a newer one that was found;
-# an environment of a newer one than was found is kept.
+# An environment that was made here is made anew for another Python that was asked for, or for a
+# newer one that was found. One of a newer Python is kept, and so is one that was not made here.
 WHICH := import sys; print(*sys.version_info[:2], sys.base_prefix)
 NEWER := import sys; a, b = ([*map(int, text.split()[:2])] for text in sys.argv[1:]); sys.exit(a <= b)
 ASKED := $(filter command environment,$(origin PYTHON))
@@ -31,9 +31,12 @@ ASKED := $(filter command environment,$(origin PYTHON))
 $(VENV)/pyvenv.cfg: FORCE
 	@there=$$($(BIN)/python -c '$(WHICH)' 2>/dev/null); python='$(PYTHON)'; \
 	wanted=$$($$python -c '$(WHICH)') || exit 1; \
-	if test -z "$$there" || { test -n '$(ASKED)' && test "$$there" != "$$wanted"; } || \
-	    $$python -c '$(NEWER)' "$$wanted" "$$there"; then \
-	  echo "environment of Python $$wanted in $(VENV)"; \
+	if test -z "$$there"; then \
+	  $$python -m venv $(VENV); \
+	elif test ! -e $(STAMP) || test "$$there" = "$$wanted"; then \
+	  :; \
+	elif test -n '$(ASKED)' || $$python -c '$(NEWER)' "$$wanted" "$$there"; then \
+	  echo "$(VENV) was of Python $$there: made anew with $$wanted"; \
 	  $$python -m venv --clear $(VENV); \
 	fi
 

@@ -45,8 +45,9 @@ def fake(folder: Path, name: str, version: str) -> None:
         f"""case "$1 $2" in
   *base_prefix*) echo "{version} /usr" ;;
   *ensurepip*) exit 0 ;;
-  "-m venv") for last; do :; done; mkdir -p "$last/bin"; cp "$0" "$last/bin/python"
-             echo made >> "$last/pyvenv.cfg" ;;
+  "-m venv") for last; do :; done
+             test "$3" = --clear && rm -rf "$last"
+             mkdir -p "$last/bin"; cp "$0" "$last/bin/python"; echo "{version}" > "$last/pyvenv.cfg" ;;
   "-c "*) exec {sys.executable} "$@" ;;
 esac""",
     )
@@ -66,28 +67,52 @@ def make(path: Path, *words: str) -> str:
     return done.stdout
 
 
-def chosen(path: Path, *words: str) -> str:
-    """Return for which Python an environment is made, or nothing where it is kept."""
-    return make(path, f"{path.parent / 'venv'}/pyvenv.cfg", *words)
+def environment(path: Path, *words: str) -> str:
+    """Return of which Python the environment is, after one was asked for."""
+    config = path.parent / "venv" / "pyvenv.cfg"
+    make(path, str(config), *words)
+    return config.read_text().strip()
+
+
+def installed(path: Path) -> None:
+    """Say that the package was installed there."""
+    (path.parent / "venv" / ".installed").touch()
 
 
 def test_newest_that_starts_is_taken(path: Path) -> None:
     fake(path, "python3.11", "3 11")
-    assert "Python 3 11" in chosen(path)
-    assert chosen(path) == ""
+    assert environment(path) == "3 11"
+    installed(path)
     fake(path, "python3.12", "3 12")
-    assert "Python 3 12" in chosen(path)
-    assert chosen(path) == ""
+    assert environment(path) == "3 12"
+    assert not (path.parent / "venv" / ".installed").exists()  # so it is installed again
+    installed(path)
+    config = path.parent / "venv" / "pyvenv.cfg"
+    before = config.stat().st_mtime_ns
+    assert environment(path) == "3 12"
+    assert config.stat().st_mtime_ns == before
 
 
 def test_newer_environment_is_kept_but_for_who_asks(path: Path) -> None:
     fake(path, "python3.13", "3 13")
-    assert "Python 3 13" in chosen(path)
+    environment(path)
+    installed(path)
     program(path, "python3.13", SHIM)
     fake(path, "python3", "3 11")
-    assert chosen(path) == ""
-    assert "Python 3 11" in chosen(path, "PYTHON=python3")
-    assert chosen(path, "PYTHON=python3") == ""
+    assert environment(path) == "3 13"
+    assert environment(path, "PYTHON=python3") == "3 11"
+
+
+def test_what_was_not_made_here_is_not_cleared(path: Path) -> None:
+    kept = path.parent / "venv" / "kept"
+    kept.parent.mkdir()
+    kept.touch()
+    fake(path, "python3.11", "3 11")
+    assert environment(path) == "3 11"
+    fake(path, "python3.12", "3 12")
+    assert environment(path) == "3 11"
+    assert environment(path, "PYTHON=python3.12") == "3 11"
+    assert kept.exists()
 
 
 def test_help_starts_no_python(path: Path) -> None:

@@ -130,7 +130,8 @@ def test_without_the_library_nothing_starts_again(
 
 def test_program_that_started_again_has_jemalloc(jemalloc: dict[str, str]) -> None:
     code = (
-        "import sys; from drakegrasp.cli import main as cli; from drakegrasp.runtime.allocator import allocator; "
+        "import sys; from drakegrasp.cli import main as cli; "
+        "from drakegrasp.runtime.allocator import allocator; "
         "sys.argv = ['drakegrasp', 'bench']; cli.main = lambda: print(allocator()); cli.run()"
     )
     assert run_child(code, {}) == f"{LIBRARY}\n"
