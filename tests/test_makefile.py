@@ -47,7 +47,8 @@ def fake(folder: Path, name: str, version: str) -> None:
   *ensurepip*) exit 0 ;;
   "-m venv") for last; do :; done
              test "$3" = --clear && rm -rf "$last"
-             mkdir -p "$last/bin"; cp "$0" "$last/bin/python"; echo "{version}" > "$last/pyvenv.cfg" ;;
+             mkdir -p "$last/bin"; cp "$0" "$last/bin/python"
+             echo "{version}" > "$last/pyvenv.cfg" ;;
   "-c "*) exec {sys.executable} "$@" ;;
 esac""",
     )

@@ -42,8 +42,11 @@ class _Place(ctypes.Structure):
 
 def allocator() -> str:
     """Return the file name of the library from which this process has its memory."""
+    if sys.platform != "linux":
+        return "unknown"
     process, place = ctypes.CDLL(None), _Place()
-    if sys.platform != "linux" or not process.dladdr(process.malloc, ctypes.byref(place)):
+    # Not `malloc`, whose address is the program's own where it is not position-independent.
+    if not process.dladdr(process.malloc_usable_size, ctypes.byref(place)):
         return "unknown"
     return Path(os.fsdecode(place.file)).name
 

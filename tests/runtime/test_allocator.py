@@ -6,6 +6,7 @@ import ctypes
 import os
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -68,6 +69,16 @@ def run_child(code: str, environment: dict[str, str]) -> str:
 @pytest.mark.skipif(sys.platform != "linux", reason="named on Linux only")
 def test_allocator_is_named_by_its_library() -> None:
     assert allocator.allocator().startswith(("libc.", "libjemalloc", "libc-"))
+
+
+def test_allocator_of_a_program_at_a_fixed_address_is_named_too() -> None:
+    """Debian's Python is one: the address of its `malloc` is its own."""
+    python = "/usr/bin/python3"
+    if not Path(python).exists():
+        pytest.skip("the system has no Python")
+    code = f"import runpy; print(runpy.run_path({allocator.__file__!r})['allocator']())"
+    child = subprocess.run([python, "-c", code], capture_output=True, text=True, check=True)
+    assert child.stdout.startswith(("libc", "libjemalloc"))
 
 
 def test_a_library_that_does_not_load_is_not_used(
