@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array as Array
 from drakegrasp.arithmetic import multiply, sin_cos
-from drakegrasp.errors import GraspError
+from drakegrasp.errors import GraspError, first_line
 
 #: Position of the table-top centre T in the world [m] (Veres et al., "Coordinate frames").
 P_WT = np.array([0.0, 0.0, 0.65])
@@ -115,8 +115,9 @@ def as_numbers(value: npt.ArrayLike, must: str) -> Array:
     try:
         array = np.asarray(value)
     except (TypeError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise GraspError(f"{must}, got a {type(value).__name__} that is none ({reason})") from None
+        raise GraspError(
+            f"{must}, got a {type(value).__name__} that is none ({first_line(error)})"
+        ) from None
     # No grasps at all may come as an empty list, which NumPy takes for real numbers.
     if array.dtype.kind not in "fiu":
         got = _OTHER_KINDS.get(array.dtype.kind, f"a {type(value).__name__}")

@@ -127,14 +127,14 @@ def audit_table(rows: Sequence[AuditRow]) -> Table:
 def verdict_table(outcomes: Sequence[Outcome]) -> Table:
     """Return how many grasps had each outcome, and which share of those that were judged."""
     counts = Counter(outcomes)
-    judged = sum(n for outcome, n in counts.items() if not outcome.says_nothing)
+    judged = sum(n for outcome, n in counts.items() if not outcome.inconclusive)
     table = _table("Verdicts")
     table.add_column("outcome", no_wrap=True)
     for head in ("grasps", "share"):
         table.add_column(head, justify="right", no_wrap=True)
     others = sorted(counts.keys() - {Outcome.SUCCESS}, key=lambda o: (-counts[o], o))
     for outcome in (Outcome.SUCCESS, *others):
-        share = "-" if outcome.says_nothing or not judged else f"{counts[outcome] / judged:.1%}"
+        share = "-" if outcome.inconclusive or not judged else f"{counts[outcome] / judged:.1%}"
         table.add_row(outcome.label, f"{counts[outcome]:,}", share)
     table.add_section()
     table.add_row("all", f"{len(outcomes):,}", "")

@@ -32,7 +32,7 @@ class Body:
         return bool((self.twins >= 0).all())
 
 
-def find_bodies(vertices: Array, faces: Faces, notes: list[str]) -> list[Body]:
+def find_components(vertices: Array, faces: Faces, notes: list[str]) -> list[Body]:
     """Return the connected bodies, each with agreeing faces and vertices of its own."""
     twins = pair_half_edges(vertices, faces, radial=True)
 

@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 from drakegrasp.errors import MeshError
-from drakegrasp.mesh.components import find_bodies
+from drakegrasp.mesh.components import find_components
 from drakegrasp.mesh.surfaces import (
     MAX_OVERLAP,
     Solid,
@@ -98,7 +98,7 @@ def _decimate_quadric(solid: Solid, max_faces: int) -> Solid | None:
         if not 0 < len(faces) <= max_faces:
             continue
         # Walls that have come to touch share edges now; parting them closes both again.
-        bodies = find_bodies(
+        bodies = find_components(
             np.asarray(vertices, dtype=np.float64), np.asarray(faces, np.int64), []
         )
         return stack([(body.vertices, body.faces) for body in bodies])

@@ -1,6 +1,6 @@
 """Geometric repair: from a soup of triangles to one watertight solid.
 
-`mend_solid` takes welded triangles in metres and returns the surface of one solid:
+`repair_solid` takes welded triangles in metres and returns the surface of one solid:
 closed, every edge shared by exactly two faces that run along it in opposite
 directions, normals outward. What it had to change it says in sentences. What it
 cannot change honestly raises `MeshError` with the reason and without a file name,
@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
-from drakegrasp.mesh.components import edge_ids, face_components, find_bodies, pair_half_edges
+from drakegrasp.mesh.components import edge_ids, face_components, find_components, pair_half_edges
 from drakegrasp.mesh.hole_filling import close_rims
 from drakegrasp.mesh.surfaces import (
     Faces,
@@ -75,7 +75,7 @@ def weld(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
     return compact(vertices, faces)
 
 
-def mend_solid(vertices: Array, faces: Faces) -> Solid:
+def repair_solid(vertices: Array, faces: Faces) -> Solid:
     """Return the surface of one solid from welded triangles.
 
     Args:
@@ -94,7 +94,7 @@ def mend_solid(vertices: Array, faces: Faces) -> Solid:
 
     closed: list[tuple[Array, Faces]] = []
     holes, filled = 0, 0.0
-    for body in find_bodies(vertices, faces, notes):
+    for body in find_components(vertices, faces, notes):
         new_faces, new_holes, new_area = body.faces, 0, 0.0
         if not body.is_closed:
             try:

@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.errors import GraspError
+from drakegrasp.errors import GraspError, first_line
 from drakegrasp.frames import Array, as_numbers, invert_pose, rotate_vectors, transform_points
 
 Frame = Literal["object", "camera", "workspace"]
@@ -206,7 +206,7 @@ def read_numbers(path: Path) -> Array:
     # A damaged header may claim any size, hence the MemoryError.
     except (OSError, EOFError, ValueError, MemoryError) as error:
         raise GraspError(
-            f"{path}: must be a .npy file of numbers, got none ({_first_line(error)})"
+            f"{path}: must be a .npy file of numbers, got none ({first_line(error)})"
         ) from None
     return as_numbers(array, f"{path}: must hold real numbers")
 
@@ -218,7 +218,7 @@ def _read_csv(path: Path) -> Array:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise GraspError(
-            f"{path}: must be a text file of numbers, got none ({_first_line(error)})"
+            f"{path}: must be a text file of numbers, got none ({first_line(error)})"
         ) from None
     rows = [(n, line.split(",")) for n, line in enumerate(lines, start=1) if line.strip()]
 
@@ -258,7 +258,7 @@ def _read_hdf5(path: Path, split: str | None) -> Predictions:
             place = _place(group, ROWS)
     except (OSError, KeyError, RuntimeError) as error:
         raise GraspError(
-            f"{path}: must be an HDF5 file with grasps, got none ({_first_line(error)})"
+            f"{path}: must be an HDF5 file with grasps, got none ({first_line(error)})"
         ) from None
 
     # One row per grasp.
@@ -321,8 +321,3 @@ def _place(group: h5py.Group, name: str) -> str:
 def _listed(names: tuple[str, ...]) -> str:
     """Return names as in "a, b or c"."""
     return f"{', '.join(names[:-1])} or {names[-1]}"
-
-
-def _first_line(error: BaseException) -> str:
-    """Return the first line of an error's message, else its type."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]

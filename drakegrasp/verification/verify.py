@@ -24,8 +24,8 @@ from drakegrasp.hand.kinematics import coordinate_limits
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.blas import one_thread
 from drakegrasp.simulation.candidates import Pregrasp
-from drakegrasp.simulation.placement import PlacedObject, rest_pose
-from drakegrasp.simulation.scene_cache import forget_scenes, scene_of
+from drakegrasp.simulation.placement import PlacedObject, canonical_pose
+from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.verification.contact_surface import face_distances, points_outward
 from drakegrasp.verification.forces.lift import LiftEnd, lift_by_forces
@@ -127,7 +127,7 @@ def verify_contacts(
 
     # What forces at the contacts alone can do, whatever the method.
     with _timed(seconds, "margin"):
-        margin = force_margin(placed.model, rest_pose(placed.X_TO), p_OQ, nhat_Q_O, config)
+        margin = force_margin(placed.model, canonical_pose(placed.X_TO), p_OQ, nhat_Q_O, config)
     base = replace(base, epsilon=margin.epsilon, smallest_friction=margin.smallest_friction)
 
     # The trial.
@@ -147,7 +147,7 @@ def refuse_off_surface(result: Verification) -> None:
 def _lift_by_hand(base: Verification, config: Config) -> Verification:
     """Find palm poses for the contacts and try them until one holds the object."""
     # Palm poses that bring the fingertips to the contacts, the best first.
-    rules, X_TO = config.verify, rest_pose(base.placed.X_TO)
+    rules, X_TO = config.verify, canonical_pose(base.placed.X_TO)
     with _timed(base.seconds, "fit"):
         fits = fit_wrist(
             load_hand(config.hand),
@@ -171,7 +171,7 @@ def _lift_by_hand(base: Verification, config: Config) -> Verification:
             return replace(results[-1], tries=tries)
 
     # If one of them has no verdict, the grasp has none: that one might have held.
-    unknown = [result for result in results if result.outcome.says_nothing]
+    unknown = [result for result in results if result.outcome.inconclusive]
     farthest = max(unknown or results, key=lambda result: _RANK.index(result.outcome))
     return replace(farthest, tries=len(near))
 
@@ -180,16 +180,16 @@ def _lift_by_forces(base: Verification, config: Config) -> Verification:
     """Lift the object by forces at the contacts, without a hand."""
     limit = load_hand(config.hand).fingertip_force_limit
     with _timed(base.seconds, "simulate"):
-        scene = scene_of(base.placed.model, config.physics, None)
+        scene = cached_scene(base.placed.model, config.physics, None)
         lift = lift_by_forces(
             scene,
-            rest_pose(base.placed.X_TO),
+            canonical_pose(base.placed.X_TO),
             base.p_OQ,
             base.nhat_Q_O,
             force_limit=limit,
             config=config,
         )
-    if _ENDS[lift.end].says_nothing:
+    if _ENDS[lift.end].inconclusive:
         forget_scenes()
 
     # The verdict, and why.
@@ -233,7 +233,7 @@ def _try(
     Returns:
         What the trial started from, and what happened.
     """
-    scene = scene_of(placed.model, config.physics, config.hand)
+    scene = cached_scene(placed.model, config.physics, config.hand)
     least = coordinate_limits(load_hand(config.hand))[1:, 0]
     for share in MARGINS:
         margin = share * np.deg2rad(config.verify.open_margin_deg)
@@ -244,7 +244,7 @@ def _try(
             break
 
     # A scene in which Drake failed is never used again.
-    if trial.outcome.says_nothing:
+    if trial.outcome.inconclusive:
         forget_scenes()
     return pregrasp, trial
 

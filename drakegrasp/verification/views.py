@@ -21,7 +21,7 @@ from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.contacts import Contacts
-from drakegrasp.simulation.placement import rest_pose
+from drakegrasp.simulation.placement import canonical_pose
 from drakegrasp.simulation.trajectory import lifted_palm
 from drakegrasp.vision.camera import Picture
 from drakegrasp.visualization.style import ARROW, HIDDEN, PREDICTED, REACHED
@@ -110,7 +110,7 @@ def render_views(verified: Verification) -> list[View]:
     """
     # The contacts: predicted ones, and those after closing.
     renderer = _Renderer(verified.placed.model, load_hand(verified.config.hand))
-    X_WO = X_WT @ rest_pose(verified.placed.X_TO)
+    X_WO = X_WT @ canonical_pose(verified.placed.X_TO)
     closed = None if verified.trial is None else verified.trial.closed
     marks = [_predicted(verified), *_reached(closed, _force_scale(verified))]
 
@@ -130,7 +130,7 @@ def _last_view(
 
     The azimuth [rad] is that of the camera where the object is shown alone.
     """
-    X_WO = X_WT @ rest_pose(verified.placed.X_TO)
+    X_WO = X_WT @ canonical_pose(verified.placed.X_TO)
     trial, lift, fit = verified.trial, verified.lift, verified.fit
 
     # After the lift, by forces or by the hand.

@@ -14,33 +14,28 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from pydrake.common import MemoryFile
 from pydrake.geometry import (
     Box,
     ClippingRange,
     ColorRenderCamera,
     FrameId,
-    InMemoryMesh,
     LightParameter,
-    MakeRenderEngineVtk,
-    Mesh,
     QueryObject,
     RenderCameraCore,
     RenderEngineVtkParams,
 )
 from pydrake.math import RigidTransform
-from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import FixedOffsetFrame, ModelInstanceIndex, RigidBody, SpatialInertia
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import FixedOffsetFrame, ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
 from drakegrasp.errors import MachineError
 from drakegrasp.frames import X_WT, Array, make_pose, transform_points
 from drakegrasp.hand.description import Hand, make_parser
-from drakegrasp.mesh.wavefront import obj_text
-from drakegrasp.objects.model import ObjectModel, object_colour
+from drakegrasp.objects.model import ObjectModel
 from drakegrasp.vision.camera import Picture
-from drakegrasp.vision.rendering import BLANK
+from drakegrasp.vision.rendering import BLANK, ENGINE, add_drawn_object
 
 #: Vertical field of view [deg]: narrow, so that perspective distorts little.
 FOV_Y_DEG = 26.0
@@ -71,7 +66,6 @@ LIGHTS = (
         cone_angle=26.0,
     ),
 )
-_ENGINE = "vtk"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -141,23 +135,15 @@ def build_render_scene(
         table_size: Edge of the table [m].
         lights: What lights it.
     """
-    # The empty world with its renderer.
+    # The object, rendered by VTK.
     builder = DiagramBuilder()
-    plant, scene_graph = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.0), builder)
     parameters = RenderEngineVtkParams(
         default_clear_color=BACKGROUND,
         lights=list(lights),
         cast_shadows=True,
         shadow_map_size=SHADOW_MAP,
     )
-    scene_graph.AddRenderer(_ENGINE, MakeRenderEngineVtk(parameters))
-
-    # The object, as a free body with a visual shape only.
-    body = plant.AddRigidBody("object", SpatialInertia.SolidSphereWithMass(1.0, 1.0))
-    text = obj_text(model.visual_vertices, model.visual_faces, normals=True)
-    mesh = Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", model.name)))
-    colour = np.array([*object_colour(model.name), 1.0])
-    plant.RegisterVisualGeometry(body, RigidTransform(), mesh, "surface", colour)
+    plant, body = add_drawn_object(builder, model, parameters)
 
     # The table, with its top at {T}.
     X_WB = RigidTransform(X_WT @ make_pose(np.eye(3), [0.0, 0.0, -TABLE_THICKNESS / 2.0]))
@@ -316,7 +302,7 @@ def _camera(
     """Return the query object, a camera of a size (width, height) [px], and the world's frame."""
     plant = scene.plant
     core = RenderCameraCore(
-        _ENGINE,
+        ENGINE,
         CameraInfo(*size, np.deg2rad(FOV_Y_DEG)),
         ClippingRange(0.05, 20.0),
         RigidTransform(),

@@ -66,12 +66,16 @@ def test_units_and_manifest_precedence(tmp_path):
     ("text", "message"),
     [
         ("units: inch", r"units: .*'m', 'cm' or 'mm'.*got 'inch'"),
-        ("unit: cm", r"unit: .*legal keys: units, objects"),
-        ("objects: {a: {unit: cm}}", r"objects\.a\.unit: .*legal keys: units, class, name"),
+        ("unit: cm", r"unit: must be a known key \(units, objects\), got an unknown one"),
+        (
+            "objects: {a: {unit: cm}}",
+            r"objects\.a\.unit: must be a known key \(units, class, name\), got",
+        ),
         ("objects: {b: {units: cm}}", r"must be names of meshes in .*: a; got b"),
         ("objects: {a: {name: ''}}", "name must be printable"),
         ("objects: {a: {name: x/y}}", "without slashes"),
-        ("- a", "the file: "),
+        ("- a", "the file: must be a mapping of keys to values, got "),
+        ("objects: {a: 3}", r"objects\.a: must be a mapping of keys to values, got 3"),
         ("units: [", "readable YAML"),
     ],
 )

@@ -183,7 +183,7 @@ def test_a_drake_error_is_a_value_and_the_next_grasp_is_untouched(
     with monkeypatch.context() as patch:
         patch.setattr("drakegrasp.simulation.trial.finger_speed", _fail)
         found = verify(cube, p, n)
-    assert found.outcome is Outcome.SOLVER_ERROR and found.outcome.says_nothing
+    assert found.outcome is Outcome.SOLVER_ERROR and found.outcome.inconclusive
     assert "says nothing about the grasp" in found.reason and "broken" in found.reason
     again = verify(cube, p, n)
     assert again.closed is not None and held.closed is not None

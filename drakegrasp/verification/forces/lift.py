@@ -21,6 +21,7 @@ from pydrake.multibody.plant import ExternallyAppliedSpatialForce
 from scipy.spatial.transform import Rotation
 
 from drakegrasp.config import Config
+from drakegrasp.errors import first_line
 from drakegrasp.frames import X_WT, Array, invert_pose, rotation_angle
 from drakegrasp.simulation.scene import Scene, advance, reset_object
 from drakegrasp.simulation.trajectory import LiftPath, carrying_force, lift_path
@@ -131,8 +132,7 @@ def lift_by_forces(
         raise  # the machine failed, not the grasp
     # A failed assertion within Drake arrives as SystemExit.
     except (Exception, SystemExit) as error:
-        lines = str(error).strip().splitlines() or [type(error).__name__]
-        return ForceLift(end=LiftEnd.ERROR, planned_force=force, message=lines[0])
+        return ForceLift(end=LiftEnd.ERROR, planned_force=force, message=first_line(error))
     finally:
         fingers.release()
 
