@@ -194,7 +194,7 @@ def test_object_keeps_the_rules_that_it_was_placed_by() -> None:
     assert grasp.config == slick
     with pytest.raises(ConfigError, match="objects must be as the object was placed with"):
         place(GRASP.ravel(), placed, config=load_config())
-    with pytest.raises(MeshError, match="units must be None for an object that is prepared"):
+    with pytest.raises(MeshError, match="units must be None for a prepared object"):
         place(GRASP.ravel(), placed, units="cm")
 
 
