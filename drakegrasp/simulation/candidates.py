@@ -66,28 +66,37 @@ class Candidates:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Attempt:
-    """One candidate at one stand-off: the start of a trial.
+class Pregrasp:
+    """Palm pose and joint angles before the fingers close: the start of a trial.
+
+    Attributes:
+        X_OG: Pose of the palm (4, 4); the candidate's own where its ray misses.
+        spread: Angle of the spread joints [rad].
+        closing: Angles of the closing joints (k,) [rad] at the start; None is the open hand.
+        ray_hits: Whether the palm ray meets the object; true if no ray places the palm.
+    """
+
+    X_OG: Array
+    spread: float
+    closing: Array | None = None
+    ray_hits: bool = True
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Attempt(Pregrasp):
+    """One candidate at one stand-off, as a dataset counts it.
 
     Attributes:
         candidate: Index of the candidate of its object.
         standoff_index: Index into `candidates.standoffs`.
         standoff: Distance of the palm from the surface point along -Gz [m].
-        spread: Angle of the spread joints [rad].
-        X_OG: Pose of the palm (4, 4); the candidate's own where its ray misses.
-        ray_hits: Whether the palm ray meets the object.
         seed: Seed from which `spread` was drawn.
-        closing: Angles of the closing joints (k,) [rad] at the start; None is the open hand.
     """
 
     candidate: int
     standoff_index: int
     standoff: float
-    spread: float
-    X_OG: Array
-    ray_hits: bool
     seed: int
-    closing: Array | None = None
 
 
 def sample_candidates(
