@@ -58,15 +58,15 @@ class ObjectConfig(_Section):
         return self
 
 
-#: Longest step of a calm lift that is taken [s]; own choice, 24 ms are what was measured.
-MAX_CALM_STEP = 0.06
+#: Longest coarse step that is allowed [s]; own choice, 24 ms are what was measured.
+MAX_COARSE_STEP = 0.06
 
 
 class PhysicsConfig(_Section):
     """Contact and time stepping; reasons and sources in docs/physics.md."""
 
     time_step: Annotated[float, Field(gt=0.0, le=0.02)] = 0.008  # [s]
-    calm_steps: Annotated[int, Field(ge=1, le=8)] = 3  # time steps in one of a calm lift
+    coarse_steps: Annotated[int, Field(ge=1, le=8)] = 3  # time steps in one coarse step of a lift
     friction_hand: Positive = 0.71  # effective coefficient between hand and object
     friction_table: Positive = 0.71  # effective coefficient between table and object
     fingertip_modulus: Annotated[float, Field(gt=0.0, le=1e8)] = 1e7  # hydroelastic [Pa]
@@ -80,10 +80,10 @@ class PhysicsConfig(_Section):
 
     @model_validator(mode="after")
     def _short_enough(self) -> PhysicsConfig:
-        if not self.calm_steps * self.time_step <= MAX_CALM_STEP:
+        if not self.coarse_steps * self.time_step <= MAX_COARSE_STEP:
             raise ValueError(
-                f"calm_steps times time_step must be at most {MAX_CALM_STEP} s, "
-                f"got {self.calm_steps} times {self.time_step}"
+                f"coarse_steps times time_step must be at most {MAX_COARSE_STEP} s, "
+                f"got {self.coarse_steps} times {self.time_step}"
             )
         return self
 
@@ -154,7 +154,7 @@ class LiftConfig(_Section):
     max_speed: Positive = 0.5  # [m/s] of the wrist
     max_acceleration: Positive = 1.0  # [m/s^2] of the wrist
     hold_time: NonNegative = 0.3  # [s] at the target before the final verdict
-    check_period: Positive = 0.1  # [s] of simulation between two checks, and up to a calm step more
+    check_period: Positive = 0.1  # [s] simulated between two checks, and up to a coarse step more
 
 
 class CertifyConfig(_Section):

@@ -32,7 +32,7 @@ DOCS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 
 
 def test_format_page_is_what_the_schema_says(tmp_path: Path) -> None:
-    page = ROOT / "docs" / "dataset-format.md"
+    page = ROOT / "docs" / "reference" / "dataset-format.md"
     assert dataset_format.main(["--check", str(page)]) == 0
     stale = tmp_path / "page.md"
     stale.write_text(page.read_text(encoding="utf-8").replace("float64", "float16"))
@@ -42,7 +42,7 @@ def test_format_page_is_what_the_schema_says(tmp_path: Path) -> None:
 
 
 def test_every_field_is_on_the_format_page() -> None:
-    text = (ROOT / "docs" / "dataset-format.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "reference" / "dataset-format.md").read_text(encoding="utf-8")
     for field in (field for table in TABLES for field in table):
         assert f"`{field.name}`" in text
     for outcome in Outcome:

@@ -33,6 +33,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.outcomes import Outcome, Stage
+from drakegrasp.runtime.allocator import allocator
 from drakegrasp.runtime.blas import one_thread
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.seeding import Stream
@@ -60,8 +61,8 @@ class Variant:
 
 VARIANTS = {
     "screen_off": Variant(("screen.mode=off",)),
-    "half_step": Variant(("physics.time_step={half}", "physics.calm_steps=1")),
-    "calm_off": Variant(("physics.calm_steps=1",)),
+    "half_step": Variant(("physics.time_step={half}", "physics.coarse_steps=1")),
+    "coarse_steps_off": Variant(("physics.coarse_steps=1",)),
     "double_resolution": Variant(fine=True),
     "similar": Variant(("physics.solver=similar",)),
     "sap": Variant(("physics.solver=sap",)),
@@ -132,6 +133,7 @@ def summarize(objects: Sequence[dict[str, Any]], config: Config) -> dict[str, An
         "objects": list(objects),
         "peak_memory": _peak_memory(),
         "cpu": _cpu(),
+        "allocator": allocator(),
         "versions": installed_versions(config),
         "config": config.to_dict(),
     }

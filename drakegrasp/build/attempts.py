@@ -1,15 +1,15 @@
-"""The diagrams of one object in this process, and one attempt on them.
+"""One attempt on an object of a dataset.
 
-In: a prepared object of a dataset. Out: a `Workbench`, kept for the next work unit of the same
-object, on which attempts are tried and successes are looked at.
+In: a prepared object of a dataset. Out: a `Workbench`, on which attempts are tried and successes
+are rendered. Prepared objects are kept for the next work unit of the same object, and so are the
+diagrams (`simulation.scene_cache`).
 """
 
 from __future__ import annotations
 
-import atexit
-import ctypes
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 from drakegrasp.config import Config
@@ -20,13 +20,13 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import release_memory
 from drakegrasp.simulation.candidates import Attempt
-from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.scene import Scene
+from drakegrasp.simulation.scene_cache import cached_renderer, cached_scene, forget_scenes
 from drakegrasp.simulation.screen import Prediction, predict
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
-from drakegrasp.vision.rendering import Renderer, build_renderer
+from drakegrasp.vision.rendering import Renderer
 
-#: Objects whose diagrams a process keeps; a unit follows units of the same object.
+#: Prepared objects that a process keeps; a unit follows units of the same object.
 KEPT_OBJECTS = 2
 
 
@@ -43,11 +43,8 @@ class Workbench:
     def renderer(self) -> Renderer:
         """The object's renderer."""
         if self._renderer is None:
-            self._renderer = build_renderer(self.prepared.model, self.config.camera)
+            self._renderer = cached_renderer(self.prepared.model, self.config.camera)
         return self._renderer
-
-
-_workbenches: dict[tuple[Path, str, str, str], Workbench] = {}
 
 
 def workbench(out: Path, header: ShardHeader, config: Config) -> Workbench:
@@ -56,28 +53,18 @@ def workbench(out: Path, header: ShardHeader, config: Config) -> Workbench:
     Raises:
         DataError: If the object's files are damaged, or of another configuration or mesh.
     """
-    key = (out, header.config_hash, header.object_name, header.mesh_sha256)
-    if key not in _workbenches:
-        prepared = load_prepared(out, header.object_name, config)
-        if prepared.model.mesh_sha256 != header.mesh_sha256:
-            raise DataError(f"{out}: {header.object_name} must be of the unit's mesh, got another")
-        while len(_workbenches) >= KEPT_OBJECTS:
-            del _workbenches[next(iter(_workbenches))]
-        release_memory()  # what other objects left, also in preparing them
-        scene = build_scene(prepared.model, config.physics, load_hand(config.hand))
-        _workbenches[key] = Workbench(prepared=prepared, config=config, scene=scene)
-    return _workbenches[key]
+    prepared = _load(out, header.object_name, header.mesh_sha256, config)
+    scene = cached_scene(prepared.model, config.physics, config.hand)
+    return Workbench(prepared=prepared, config=config, scene=scene)
 
 
-@atexit.register
-def _leave_renderers_to_the_system() -> None:
-    """Keep the renderers from being destroyed when the process ends.
-
-    That would happen in another thread than the one that made them, which VTK answers with a
-    page of warnings. A reference that nobody gives back keeps them until the process is gone.
-    """
-    for bench in _workbenches.values():
-        ctypes.pythonapi.Py_IncRef(ctypes.py_object(bench))
+@lru_cache(maxsize=KEPT_OBJECTS)
+def _load(out: Path, name: str, mesh_sha256: str, config: Config) -> PreparedObject:
+    prepared = load_prepared(out, name, config)
+    if prepared.model.mesh_sha256 != mesh_sha256:
+        raise DataError(f"{out}: {name} must be of the unit's mesh, got another")
+    release_memory()  # what other objects left, also in preparing them
+    return prepared
 
 
 def predict_all(bench: Workbench, attempts: Sequence[Attempt]) -> list[Prediction | None]:
@@ -91,6 +78,6 @@ def try_on(bench: Workbench, attempt: Attempt, prediction: Prediction | None = N
     """Run one attempt; a scene in which Drake failed is replaced, never used again."""
     record = run_attempt(bench.scene, bench.prepared.X_TO, attempt, bench.config, prediction)
     if record.outcome is Outcome.SOLVER_ERROR:
-        hand = load_hand(bench.config.hand)
-        bench.scene = build_scene(bench.prepared.model, bench.config.physics, hand)
+        forget_scenes()
+        bench.scene = cached_scene(bench.prepared.model, bench.config.physics, bench.config.hand)
     return record

@@ -12,7 +12,7 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.build.attempts import Workbench
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.prepared_objects import PreparedObject
-from drakegrasp.dataset.schema import CAMERAS, sizes
+from drakegrasp.dataset.schema import CAMERAS, CONTACT_NAMES, sizes
 from drakegrasp.dataset.shards import trial_columns
 from drakegrasp.frames import pack_pose
 from drakegrasp.simulation.candidates import Attempt
@@ -20,7 +20,7 @@ from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.scene import hand_joint_names
 from drakegrasp.simulation.trial import TrialRecord
 from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, image_frame, intrinsics
-from drakegrasp.vision.rendering import look
+from drakegrasp.vision.rendering import render
 
 
 def trial_rows(
@@ -42,7 +42,7 @@ def look_values(bench: Workbench, record: TrialRecord) -> dict[str, AnyArray]:
     poses = {"oto": camera_pose_oto, "otm": camera_pose_otm}
     for name in CAMERAS:
         X_TC = poses[name](multiply(record.X_TO, record.X_OG), camera)
-        seen = look(bench.renderer, record.X_TO, X_TC)
+        seen = render(bench.renderer, record.X_TO, X_TC)
         found[f"image_{name}"] = seen.image
         found[f"mask_{name}"] = seen.mask
         found[f"X_TC_{name}"] = pack_pose(X_TC)
@@ -77,19 +77,7 @@ def _row(prepared: PreparedObject, attempt: Attempt, record: TrialRecord) -> dic
 
 
 def _contact_values(prefix: str, contacts: Contacts) -> dict[str, Any]:
-    names = (
-        "touching",
-        "p_OQ",
-        "nhat_Q_O",
-        "f_Q_O",
-        "area",
-        "penetration",
-        "other_links",
-        "hand_on_table",
-        "object_on_table",
-        "point_contacts",
-    )
-    return {f"{prefix}_{name}": getattr(contacts, name) for name in names}
+    return {f"{prefix}_{name}": getattr(contacts, name) for name in CONTACT_NAMES}
 
 
 def array_sizes(bench: Workbench) -> dict[str, int]:

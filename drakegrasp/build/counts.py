@@ -39,7 +39,7 @@ class Tally:
         self._crew, self._report = crew, report
         self._wanted, self._step = manifest.config.max_grasps, manifest.config.unit_candidates
         standoffs = len(manifest.config.candidates.standoffs)
-        self._total = standoffs * sum(entry["candidates"] for entry in manifest.objects)
+        self._total = standoffs * sum(entry.candidates for entry in manifest.objects)
         self._outcomes: Counter[Outcome] = Counter()
         self._found = 0
         self._grasps: Counter[str] = Counter()

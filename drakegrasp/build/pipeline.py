@@ -14,7 +14,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from drakegrasp.build.counts import NAMED, Tally
 from drakegrasp.build.prepare import PrepareTask, prepare_one
@@ -25,6 +24,8 @@ from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.log import BuildLog
 from drakegrasp.dataset.manifest import (
     Manifest,
+    ObjectEntry,
+    RefusedMesh,
     claim_directory,
     installed_versions,
     release_directory,
@@ -59,7 +60,7 @@ class BuildReport:
     simulated: int
     reused: int
     objects: int
-    refused: tuple[dict[str, str], ...]
+    refused: tuple[RefusedMesh, ...]
     errors: dict[str, int]
     notices: tuple[str, ...]
     assembly: Assembly
@@ -146,7 +147,7 @@ def _build(
     if not manifest.objects:
         if known is None:
             release_directory(out)
-        reasons = "; ".join(f"{entry['name']}: {entry['reason']}" for entry in manifest.refused)
+        reasons = "; ".join(f"{entry.name}: {entry.reason}" for entry in manifest.refused)
         raise DataError(f"at least one mesh must be fit to simulate, got none: {reasons}")
     write_manifest(manifest, out)
     with progress_bar("simulate", "attempts", show=job.show) as report:
@@ -213,7 +214,8 @@ def _count(names: Sequence[str], what: str, total: int | None = None) -> str:
 def _refuse_missing(known: Manifest, sources: Sequence[MeshSource], out: Path) -> None:
     """Refuse to go on with a dataset without a mesh that it was built from."""
     names = {source.name for source in sources}
-    missing = [e["name"] for e in (*known.objects, *known.refused) if e["name"] not in names]
+    built = [entry.name for entry in known.objects] + [mesh.name for mesh in known.refused]
+    missing = [name for name in built if name not in names]
     if missing:
         raise DataError(
             f"{out}: must be given every mesh that it was built from, got none named "
@@ -226,7 +228,8 @@ def _prepare_all(
 ) -> Manifest:
     """Return the manifest with every object prepared or refused, in the order of the sources."""
     out, config = job.out, manifest.config.to_dict()
-    found, pending = {}, []
+    found: dict[str, ObjectEntry | RefusedMesh] = {}
+    pending = []
     for source in sources:
         entry = _known_entry(source, out, manifest)
         if entry is None:
@@ -240,33 +243,35 @@ def _prepare_all(
     report(known, len(sources), found=known)
     for name, entry in job.execute(prepare_one, pending):
         found[name] = entry
-        if "reason" in entry:
-            job.log("mesh refused", name=name, reason=entry["reason"])
+        if isinstance(entry, RefusedMesh):
+            job.log("mesh refused", name=name, reason=entry.reason)
         else:
-            job.log("mesh prepared", name=name, candidates=entry["candidates"])
+            job.log("mesh prepared", name=name, candidates=entry.candidates)
         report(len(found), len(sources), found=known)
     entries = [found[source.name] for source in sources]
     return replace(
         manifest,
-        objects=tuple(entry for entry in entries if "reason" not in entry),
-        refused=tuple(entry for entry in entries if "reason" in entry),
+        objects=tuple(entry for entry in entries if isinstance(entry, ObjectEntry)),
+        refused=tuple(entry for entry in entries if isinstance(entry, RefusedMesh)),
     )
 
 
-def _known_entry(source: MeshSource, out: Path, manifest: Manifest) -> dict[str, Any] | None:
+def _known_entry(
+    source: MeshSource, out: Path, manifest: Manifest
+) -> ObjectEntry | RefusedMesh | None:
     """Return what the manifest says of a mesh, if that still holds."""
     digest = source_sha256(source)
-    for entry in manifest.refused:
-        if (entry["name"], entry["mesh_sha256"]) == (source.name, digest):
-            return dict(entry)
+    for refusal in manifest.refused:
+        if (refusal.name, refusal.mesh_sha256) == (source.name, digest):
+            return refusal
     for entry in manifest.objects:
-        known = (entry["name"], entry["class"], entry["mesh_sha256"])
+        known = (entry.name, entry.class_name, entry.mesh_sha256)
         if known == (source.name, source.class_name, digest):
             try:
                 load_prepared(out, source.name, manifest.config)
             except DrakegraspError:
                 return None
-            return dict(entry)
+            return entry
     return None
 
 

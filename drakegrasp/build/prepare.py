@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from drakegrasp.config import Config, parse_config
+from drakegrasp.dataset.manifest import ObjectEntry, RefusedMesh
 from drakegrasp.dataset.paths import model_path
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared, save_prepared
 from drakegrasp.errors import DrakegraspError, MachineError, MeshError
@@ -47,7 +48,7 @@ class PrepareTask:
 
 
 @one_thread
-def prepare_one(task: PrepareTask) -> tuple[str, dict[str, Any]]:
+def prepare_one(task: PrepareTask) -> tuple[str, ObjectEntry | RefusedMesh]:
     """Prepare one mesh; return its name and its entry in the manifest, a refusal among them.
 
     Raises:
@@ -73,9 +74,7 @@ def prepare_one(task: PrepareTask) -> tuple[str, dict[str, Any]]:
             return source.name, _prepared_or_guilty(task, digest, journal)
 
 
-def _entry_there(
-    source: MeshSource, digest: str, out: Path, config: Config
-) -> dict[str, Any] | None:
+def _entry_there(source: MeshSource, digest: str, out: Path, config: Config) -> ObjectEntry | None:
     """Return the entry of an object whose files are there and whole, or None."""
     try:
         prepared = load_prepared(out, source.name, config)
@@ -83,10 +82,12 @@ def _entry_there(
         return None
     model = prepared.model
     same = (model.class_name, model.mesh_sha256) == (source.class_name, digest)
-    return prepared.summary() if same else None
+    return prepared.entry() if same else None
 
 
-def _prepared_or_guilty(task: PrepareTask, digest: str, journal: Journal) -> dict[str, Any]:
+def _prepared_or_guilty(
+    task: PrepareTask, digest: str, journal: Journal
+) -> ObjectEntry | RefusedMesh:
     name = task.source.name
     verdict = journal.verdict("prepare")
     if verdict is not None:
@@ -103,18 +104,18 @@ def _prepared_or_guilty(task: PrepareTask, digest: str, journal: Journal) -> dic
         return _prepared_entry(task, digest)
 
 
-def _prepared_entry(task: PrepareTask, digest: str) -> dict[str, Any]:
+def _prepared_entry(task: PrepareTask, digest: str) -> ObjectEntry | RefusedMesh:
     config = parse_config(task.config)
     try:
         prepared = prepare(task.source, config)
     except MeshError as error:
         return _refused(task.source, digest, str(error))
     save_prepared(prepared, Path(task.out), config)
-    return prepared.summary()
+    return prepared.entry()
 
 
-def _refused(source: MeshSource, digest: str, reason: str) -> dict[str, Any]:
-    return {"name": source.name, "mesh_sha256": digest, "reason": reason}
+def _refused(source: MeshSource, digest: str, reason: str) -> RefusedMesh:
+    return RefusedMesh(name=source.name, mesh_sha256=digest, reason=reason)
 
 
 def prepare(source: MeshSource, config: Config) -> PreparedObject:

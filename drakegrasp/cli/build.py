@@ -145,6 +145,6 @@ def print_report(report: BuildReport) -> None:
     for notice in report.notices:
         click.echo(notice)
     for entry in report.refused:
-        click.echo(f"refused: {entry['name']}: {entry['reason']}")
+        click.echo(f"refused: {entry.name}: {entry.reason}")
     for name in ("grasping_oto.hdf5", "grasping_otm.hdf5", "trials.hdf5"):
         click.echo(str(report.out / name))

@@ -17,7 +17,7 @@ from typing import Any
 from distributed import Client, Scheduler, Worker, WorkerPlugin
 
 from drakegrasp.config import Config
-from drakegrasp.dataset.manifest import DECISIVE, installed_versions
+from drakegrasp.dataset.manifest import REQUIRED_VERSIONS, installed_versions
 from drakegrasp.errors import MachineError
 
 #: Environment of the workers. Software OpenGL would start threads of its own beside the
@@ -86,7 +86,7 @@ def unfitness(threads: int, theirs: dict[str, str], ours: dict[str, str]) -> str
             "must have one thread (dask worker --nthreads 1), because the first that renders "
             f"owns the images, got {threads}"
         )
-    for name in DECISIVE:
+    for name in REQUIRED_VERSIONS:
         if theirs[name] != ours[name]:
             return f"must have {name} {ours[name]} like the client, got {theirs[name]}"
     return None

@@ -16,9 +16,12 @@ from distributed.security import Security
 
 from drakegrasp.cluster.admission import SATURATION, WORKER_ENVIRONMENT
 from drakegrasp.errors import MachineError
+from drakegrasp.runtime.allocator import own_environment
 
 #: How long to wait for a scheduler to answer [s].
 CONNECT_SECONDS = 10
+#: Module that a nanny loads before it starts its worker: the worker's allocator is found there.
+NANNY_PRELOAD = "drakegrasp.runtime.allocator"
 #: Settings of Dask: a worker's process must not be a fork, because a fork after the first
 #: image hangs; its profiler costs time; a worker takes no task before it can start it.
 DASK_SETTINGS: dict[str, Any] = {
@@ -28,6 +31,7 @@ DASK_SETTINGS: dict[str, Any] = {
     "distributed.worker.profile.enabled": False,
     "distributed.scheduler.worker-saturation": SATURATION,
     "distributed.nanny.pre-spawn-environ": WORKER_ENVIRONMENT,
+    "distributed.nanny.preload": [NANNY_PRELOAD],
     # A busy machine takes its time to start a worker again; Dask would close its nanny.
     "distributed.deploy.lost-worker-timeout": "60 s",
     "distributed.worker.memory.target": False,
@@ -70,7 +74,7 @@ def connect(
     Raises:
         MachineError: If there is no scheduler at the address.
     """
-    with dask.config.set(DASK_SETTINGS):
+    with own_environment(), dask.config.set(DASK_SETTINGS):
         if scheduler or scheduler_file:
             file = None if scheduler_file is None else str(scheduler_file)
             # Dask waits for the file for ever.

@@ -31,7 +31,7 @@ from drakegrasp.cluster.certificates import (
     server_options,
     temporary_security,
 )
-from drakegrasp.cluster.connect import DASK_SETTINGS, closing_cluster, connect
+from drakegrasp.cluster.connect import DASK_SETTINGS, NANNY_PRELOAD, closing_cluster, connect
 from drakegrasp.cluster.request import (
     LOOPBACK,
     WORKER_MEMORY,
@@ -152,6 +152,8 @@ def _slurm(request: ClusterRequest, security: Security | None) -> SpecCluster:
             *(jobqueue("worker-extra-args") or ()),
             *_lifetime(request.walltime or jobqueue("walltime")),
             f"--dashboard-address={LOOPBACK}:0",
+            # The settings' preload is not read by the command that starts a worker.
+            f"--preload-nanny={NANNY_PRELOAD}",
             *([f"--host={LOOPBACK}"] if "host" in workers_listening(listening) else []),
         ],
         job_script_prologue=[*(jobqueue("job-script-prologue") or ()), *_exports()],

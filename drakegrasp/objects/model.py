@@ -29,7 +29,7 @@ from drakegrasp.mesh.distance_field import DistanceField, make_distance_field
 from drakegrasp.mesh.repair import repair_solid
 from drakegrasp.mesh.surfaces import Solid, diagonal, signed_volume
 from drakegrasp.objects.sources import MANIFEST_NAME, UNITS, MeshSource, load_source
-from drakegrasp.runtime.files import sync_and_rename, temporary_name
+from drakegrasp.runtime.files import write_atomic
 from drakegrasp.seeding import object_key
 
 #: Smaller objects are sheets or specks, which hydroelastic contact does not resolve.
@@ -249,19 +249,11 @@ def _mass_properties(solid: Solid, mass: float) -> tuple[Array, Array]:
 def save_object(model: ObjectModel, path: str | Path) -> None:
     """Write an object to a .npz file, atomically; equal objects give equal bytes."""
     # The same bytes for the same object: `np.savez` stores no time stamps.
-    path = Path(path)
     content: dict[str, Any] = {f.name: np.asarray(getattr(model, f.name)) for f in fields(model)}
     content["notes"] = np.array(model.notes, dtype=np.str_)
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **content)
-
-    # Written beside it and renamed, so that no reader meets half a file.
-    temporary = temporary_name(path)
-    try:
-        temporary.write_bytes(buffer.getvalue())
-        sync_and_rename(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_atomic(Path(path), buffer.getvalue())
 
 
 def load_object(path: str | Path) -> ObjectModel:

@@ -1,7 +1,7 @@
 """The process: memory that is given back, and Drake's ban of the network.
 
-Diagrams and meshes are megabytes in C++ and NumPy: Python does not count the one, and the C
-library keeps what is freed of both for later, in the arenas of each of a worker's threads.
+Diagrams and meshes are megabytes in C++ and NumPy: Python does not count the one, and the
+allocator keeps what is freed of both for later, in the arenas of each of a worker's threads.
 
 `DRAKE_ALLOW_NETWORK=none`, as our workers run, is a ban that Drake (1.51 to 1.58) applies
 already when some objects are made, whether or not they would use a network: it is eased for the
@@ -17,8 +17,13 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from drakegrasp.runtime.allocator import has_jemalloc
+
 #: Time between two returns of free memory [s]; one takes some 20 ms.
 TRIM_SECONDS = 5.0
+#: What jemalloc is told: forget what this thread keeps, and return the free pages of every arena
+#: (4096 is its MALLCTL_ARENAS_ALL).
+_PURGE = (b"thread.tcache.flush", b"arena.4096.purge")
 
 _trimmed = -TRIM_SECONDS
 
@@ -41,9 +46,12 @@ def trim_memory() -> None:
 def _trim() -> None:
     global _trimmed
     _trimmed = time.monotonic()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:  # other C libraries decide for themselves
-        trim(0)
+    process = ctypes.CDLL(None)
+    if has_jemalloc():
+        for order in _PURGE:
+            process.mallctl(order, None, None, None, ctypes.c_size_t(0))
+    elif hasattr(process, "malloc_trim"):  # other C libraries decide for themselves
+        process.malloc_trim(0)
 
 
 @contextmanager

@@ -38,13 +38,11 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @contextmanager
-def atomic_hdf5(path: Path, *, sealed: bool = False) -> Iterator[h5py.File]:
-    """Open a new HDF5 file that appears at `path` only when the block ends well.
+def atomic_path(path: Path) -> Iterator[Path]:
+    """Give the block a temporary path to write; it becomes `path` when the block ends well.
 
     Args:
-        path: Of the file.
-        sealed: Whether to leave room for a seal and set it, see `seal`. Such a file is built in
-            memory: a full disk is then the error of one write, and leaves HDF5 sound.
+        path: Of the file. Its folder is made if it is missing; an older file is replaced.
 
     Raises:
         OSError: If the disk is full or the folder cannot be written; nothing is left behind.
@@ -52,6 +50,31 @@ def atomic_hdf5(path: Path, *, sealed: bool = False) -> Iterator[h5py.File]:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = temporary_name(path)
     try:
+        yield temporary
+        sync_and_rename(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_atomic(path: Path, content: bytes) -> None:
+    """Write a file of these bytes, see `atomic_path`."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+
+
+@contextmanager
+def atomic_hdf5(path: Path, *, sealed: bool = False) -> Iterator[h5py.File]:
+    """Open a new HDF5 file that appears at `path` when the block ends well, see `atomic_path`.
+
+    Args:
+        path: Of the file.
+        sealed: Whether to leave room for a seal and set it, see `seal`. Such a file is built in
+            memory: a full disk is then the error of one write, and HDF5 stays usable.
+
+    Raises:
+        OSError: If the disk is full or the folder cannot be written; nothing is left behind.
+    """
+    with atomic_path(path) as temporary:
         if sealed:
             content = BytesIO()
             with h5py.File(content, "w", userblock_size=SEAL_SIZE) as file:
@@ -61,9 +84,6 @@ def atomic_hdf5(path: Path, *, sealed: bool = False) -> Iterator[h5py.File]:
         else:
             with h5py.File(temporary, "w") as file:
                 yield file
-        sync_and_rename(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def seal(path: Path) -> None:
@@ -97,7 +117,7 @@ def _seal_of(file: BufferedReader | BufferedRandom) -> bytes:
 
 
 def sync_and_rename(temporary: Path, path: Path) -> None:
-    """Make a finished temporary file durable and give it its name, in one step for readers."""
+    """Make a finished file durable and give it its name, in one step for readers."""
     _sync(temporary)
     temporary.replace(path)
     _sync(path.parent)
@@ -107,6 +127,17 @@ def temporary_name(path: Path) -> Path:
     """Return a name beside a file under which it may be written, unlike any other process's."""
     writer = f"{host_label()}~{os.getpid()}~{secrets.token_hex(6)}"
     return path.with_name(f".{path.name}.{writer}{TEMPORARY_SUFFIX}")
+
+
+def probe_folder(folder: Path) -> None:
+    """Create a file in a folder and remove it again.
+
+    Raises:
+        OSError: If the folder cannot be written.
+    """
+    probe = temporary_name(folder / "probe")
+    probe.touch()
+    probe.unlink()
 
 
 def sweep_temporary(out: Path) -> list[Path]:

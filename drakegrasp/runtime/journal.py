@@ -184,6 +184,7 @@ def open_journal(path: Path, identity: Mapping[str, Any]) -> Iterator[Journal]:
         ensure_ascii=False,
     ).encode()
     start = len(line) + 1
+    # Not `atomic_path`: the file gets its name while it is open and locked, and is not synced.
     temporary = temporary_name(path)
     try:
         temporary.write_bytes(line + b"\n" + _record("start", 0))

@@ -1,13 +1,13 @@
-"""Stage "sample": palm poses about an object, and the attempts that follow from them.
+"""Stage "sample": palm poses around an object, and the attempts that follow from them.
 
-In: the object's box and mesh, and how it rests on the table. Out: up to
-`candidates.max` distinct palm poses X_OG and, for each, where its palm ray meets the
-object. The paper's method (`rotations`) multiplies a first palm pose with global and
-local rotations; `normals` is the baseline of its Figure 2.
+In: the object's box and mesh, and its resting pose. Out: up to `candidates.max` distinct palm poses
+X_OG and, for each, the distance along its palm ray to the object. The paper's method (`rotations`)
+multiplies a first palm pose with global and local rotations; `normals` is the baseline of its
+Figure 2.
 
-Nothing here needs Drake. Poses are the same bits on every machine: sums, products and square
-roots in a stated order (`arithmetic`), decisions that take in what lies on the edge by more than
-rounding, poses compared as rounded integers, draws from `seeding`.
+Nothing here needs Drake. Poses are the same bits on every machine: sums, products and square roots
+have a stated order (`arithmetic`), limits are inclusive by more than rounding, poses are compared
+as rounded integers, and random numbers come from `seeding`.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from drakegrasp.seeding import Stream, object_key
 
 #: The first palm's axes in {O}: +Gz looks down onto the object, Gx = Ox.
 R_OG0 = np.diag([1.0, -1.0, -1.0])
-#: Poses that agree to this in every rotation entry, and in position relative to the
-#: object's size, are one pose: Euler products repeat themselves up to rounding.
+#: Poses that agree to this in every rotation entry, and in position relative to the object's size,
+#: are one pose: different Euler angles give equal rotations up to rounding.
 SAME_POSE = 1e-6
-#: A palm this far below the table, or a palm ray this far beside the bounding box, is still in [m]:
-#: far above rounding, far below what matters.
+#: A palm this far below the table, or a palm ray this far beside the bounding box, is still valid
+#: [m]: far above rounding, far below what matters.
 EDGE = 1e-6
-#: A palm ray this far beside a triangle still meets it, as a part of the triangle: no ray slips
-#: through an edge between two.
+#: A palm ray that misses a triangle by this share of it still meets it, so that no ray passes
+#: between two triangles.
 RAY_EDGE = 1e-9
-#: Combinations whose poses are computed at a time; bounds the memory.
+#: Combinations whose poses are computed together; bounds the memory.
 CHUNK = 131_072
-#: Pairs of a ray and a triangle that are looked at together; few enough for a cache.
+#: Pairs of a ray and a triangle that are computed together; they fit into a CPU's cache.
 PAIRS = 65_536
 
 
@@ -51,8 +51,8 @@ class Candidates:
         distance: (n,), from the palm's origin along +Gz to the object's surface [m]; NaN
             where the palm ray misses the object.
         combinations: Number of combinations of rotations (or surface samples).
-        valid: Those above the table whose palm ray meets the bounding box.
-        distinct: Different poses among them.
+        valid: Number of those above the table whose palm ray meets the bounding box.
+        distinct: Number of different poses among the valid ones.
     """
 
     X_OG: Array
@@ -67,7 +67,7 @@ class Candidates:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Attempt:
-    """One candidate at one stand-off: what a trial starts from.
+    """One candidate at one stand-off: the start of a trial.
 
     Attributes:
         candidate: Index of the candidate of its object.
@@ -76,9 +76,8 @@ class Attempt:
         spread: Angle of the spread joints [rad].
         X_OG: Pose of the palm (4, 4); the candidate's own where its ray misses.
         ray_hits: Whether the palm ray meets the object.
-        seed: What `spread` was drawn from.
-        closing: Angles of the closing joints (k,) [rad] from which the fingers close; None is
-            the open hand.
+        seed: Seed from which `spread` was drawn.
+        closing: Angles of the closing joints (k,) [rad] at the start; None is the open hand.
     """
 
     candidate: int
@@ -132,8 +131,7 @@ def rotation_candidates(
 
     X_OG = R_global X_OG0 R_local with R = Rx Ry Rz each, and X_OG0 on +Oz at the distance
     of the box's corner from its centre, looking at it (Veres et al., equation 1). Valid:
-    the palm's origin is above the table and the ray along +Gz meets the box; what lies on the
-    edge is valid.
+    the palm's origin is above the table and the ray along +Gz meets the box, edges included.
 
     Args:
         half_extents: (3,), of the box about the origin of {O} [m].
@@ -145,6 +143,7 @@ def rotation_candidates(
         Poses (n, 4, 4), sorted by their rotation's entries, row by row, and then by position,
         as rounded integers; the number of combinations; of valid ones.
     """
+    # Keep the valid combinations, chunk by chunk.
     half = np.asarray(half_extents, dtype=float)
     radius = float(norm(half))
     rotations, positions, combinations = [], [], 0
@@ -158,9 +157,9 @@ def rotation_candidates(
         rotations.append(R_OG[hits])
         positions.append(p_OG[hits])
     R, p = np.concatenate(rotations), np.concatenate(positions)
-    key = np.rint(np.hstack([R.reshape(-1, 9), p / radius]) / SAME_POSE).astype(np.int64)
 
-    # Equal poses are neighbours in this order, the one that came first in front.
+    # Sort by rounded integers: equal poses become neighbours, and the first of them is kept.
+    key = np.rint(np.hstack([R.reshape(-1, 9), p / radius]) / SAME_POSE).astype(np.int64)
     order = np.lexsort(key.T[::-1])
     new = np.ones(len(order), dtype=np.bool_)
     new[1:] = (key[order[1:]] != key[order[:-1]]).any(axis=1)
@@ -171,16 +170,17 @@ def rotation_candidates(
 def normal_candidates(model: ObjectModel, count: int, stream: Stream) -> Array:
     """Return poses (n, 4, 4) that look at random surface points against their normals.
 
-    The points are spread evenly over the area, the roll about the normal is uniform, and
-    the palm starts two of the box's half diagonals away, outside of the object.
+    The points are uniform over the area, the roll about the normal is uniform, and the palm is two
+    half diagonals of the box away, outside of the object.
     """
+    # Random points of the surface, with the outward normals of their faces.
     vertices, faces = model.visual_vertices, model.visual_faces.astype(np.int64)
     points, picked = on_faces(vertices, faces, stream.uniform(3 * count).reshape(count, 3))
     a, b, c = np.moveaxis(vertices[faces[picked]], 1, 0)
     outward = np.cross(b - a, c - a)
     z = -outward / norm(outward)[:, None]
 
-    # Any direction that is not parallel to z serves to start the roll from.
+    # Roll from any direction that is not parallel to z.
     helper = np.where(np.abs(z[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     x = np.cross(helper, z)
     x /= norm(x)[:, None]
@@ -198,18 +198,19 @@ def _poses(R: Array, p: Array) -> Array:
 
 
 def above_table(p_OG: Array, X_TO: Array) -> npt.NDArray[np.bool_]:
-    """Return for points (n, 3) in {O} whether they lie above the table, or in it."""
+    """Return for points (n, 3) in {O} whether they lie above the table or on it."""
     return dot(p_OG, X_TO[2, :3]) + X_TO[2, 3] > -EDGE
 
 
 def ray_meets_box(p_OG: Array, z_O: Array, half: Array) -> npt.NDArray[np.bool_]:
     """Return for rays from (n, 3) along (n, 3) whether they meet the box of half extents (3,)."""
-    # A component that should be zero may be 1e-17: as an exact zero it divides to infinity,
-    # which is what the slab test wants.
+    # The slab test (Kay and Kajiya 1986) needs exact zeros: they divide to infinity. Rounding may
+    # leave 1e-17 instead.
     direction = np.where(np.abs(z_O) < 1e-12, 0.0, z_O)
     wide = half + EDGE
     with np.errstate(divide="ignore", invalid="ignore"):
         t1, t2 = (-wide - p_OG) / direction, (wide - p_OG) / direction
+
     # 0/0, a ray within a slab's face, constrains nothing: fmax and fmin skip the NaN.
     entry = np.fmax.reduce(np.minimum(t1, t2), axis=1)
     leave = np.fmin.reduce(np.maximum(t1, t2), axis=1)
@@ -219,33 +220,36 @@ def ray_meets_box(p_OG: Array, z_O: Array, half: Array) -> npt.NDArray[np.bool_]
 def palm_ray_distance(mesh: trimesh.Trimesh, X_OG: Array) -> Array:
     """Return the distance (n,) [m] along +Gz to the mesh's surface; NaN where it is missed.
 
-    Our own rays, because embree casts single-precision ones, with kernels chosen by the CPU
-    (Möller and Trumbore 1997). A ray through an edge meets it.
+    Möller and Trumbore's test (1997); a ray through an edge meets it. Embree is no alternative: it
+    works in single precision, with kernels that depend on the CPU.
     """
+    # A sphere around each triangle, a little larger than rounding needs.
     a, b, c = np.moveaxis(np.asarray(mesh.triangles, dtype=float), 1, 0)
     centre = (a + b + c) / 3.0
     reach = np.sqrt(np.max([dot(q - centre, q - centre) for q in (a, b, c)], axis=0, initial=0.0))
+
+    # Test only triangles whose sphere is near the ray.
     distance = np.full(len(X_OG), np.inf)
     step = max(1, PAIRS // max(1, len(a)))
     for start in range(0, len(X_OG), step):
         rays = X_OG[start : start + step]
         near = _near_triangles(rays, centre, reach * (1.0 + RAY_EDGE) + EDGE)
         ray, triangle = np.nonzero(near)
-        found = _ray_triangle(
+        hits = _ray_triangle(
             rays[ray, :3, 3], rays[ray, :3, 2], a[triangle], b[triangle], c[triangle]
         )
-        np.minimum.at(distance, start + ray, found)
+        np.minimum.at(distance, start + ray, hits)
     return np.where(np.isfinite(distance), distance, np.nan)
 
 
 def _near_triangles(X_OG: Array, centre: Array, reach: Array) -> npt.NDArray[np.bool_]:
-    """Return (n, m), which rays pass spheres (m, 3) of radius (m,) within it, ahead of them."""
+    """Return (n, m) whether each ray meets each sphere of centre (m, 3) and radius (m,)."""
     along, squared = np.zeros((len(X_OG), len(centre))), np.zeros((len(X_OG), len(centre)))
     for axis in range(3):
         apart = centre[:, axis] - X_OG[:, None, axis, 3]
         along += apart * X_OG[:, None, axis, 2]
         squared += apart * apart
-    # The difference of two squares rounds; EDGE in the reach is far above that.
+    # The difference of two squares loses digits; EDGE in the reach is far above that error.
     return (squared - along * along <= reach * reach) & (along >= -reach)
 
 
@@ -257,7 +261,7 @@ def _ray_triangle(p: Array, z: Array, a: Array, b: Array, c: Array) -> Array:
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v, t = dot(ap, across) / volume, dot(z, up) / volume, dot(ac, up) / volume
         meets = (u >= -RAY_EDGE) & (v >= -RAY_EDGE) & (u + v <= 1.0 + RAY_EDGE) & (t >= 0.0)
-    # Seen from its edge a triangle has no area: its neighbours are met.
+    # A triangle that is seen edge-on is skipped: the ray meets its neighbours.
     flat = np.abs(volume) <= RAY_EDGE * norm(ab) * norm(ac)
     return np.where(meets & ~flat, t, np.inf)
 
@@ -270,19 +274,22 @@ def make_attempts(
     name: str,
     seed: int,
 ) -> Iterator[Attempt]:
-    """Yield the attempts of a range of an object's candidates, a row of the dataset each.
+    """Yield the attempts of a range of an object's candidates; each is a row of the dataset.
 
     Args:
         candidates: Of the object.
-        indices: Which of them.
+        indices: The range.
         config: Stand-offs and spreads.
         name: The object's name.
         seed: Of the dataset; with name and candidate it decides the spreads.
     """
     spreads = np.deg2rad(config.spreads_deg)
     for i in indices:
+        # Each candidate has its own stream, so ranges do not depend on each other.
         stream = Stream(seed, object_key(name), i)
         drawn = stream.integers(len(spreads), len(config.standoffs))
+
+        # Move the palm along its ray to each stand-off from the surface.
         distance = candidates.distance[i]
         for j, standoff in enumerate(config.standoffs):
             X_OG = candidates.X_OG[i].copy()

@@ -27,7 +27,7 @@ from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.contacts import Contacts
-from drakegrasp.simulation.placement import rest_pose
+from drakegrasp.simulation.placement import canonical_pose
 from drakegrasp.simulation.trajectory import lifted_palm
 from drakegrasp.vision.camera import Picture
 from drakegrasp.visualization.style import (
@@ -120,7 +120,7 @@ def verification_figure(verified: Verification) -> Figure:
         MachineError: If a picture is blank, which means that OpenGL failed.
     """
     stage = _Stage(verified.placed.model, load_hand(verified.config.hand))
-    X_WO = X_WT @ rest_pose(verified.placed.X_TO)
+    X_WO = X_WT @ canonical_pose(verified.placed.X_TO)
     closed = None if verified.trial is None else verified.trial.closed
     marks = [_predicted(verified), *_reached(closed, _force_scale(verified))]
     first, second = _two_sides(stage.model, X_WO, marks)
@@ -136,7 +136,7 @@ def _last_view(
     stage: _Stage, verified: Verification, marks: Sequence[Marks], azimuth: float
 ) -> list[View]:
     """Return the view of the last instant that was reached, if anything was tried at all."""
-    X_WO = X_WT @ rest_pose(verified.placed.X_TO)
+    X_WO = X_WT @ canonical_pose(verified.placed.X_TO)
     trial, lift, fit = verified.trial, verified.lift, verified.fit
     if lift is not None and lift.X_TO_lifted is not None:
         return [stage.object("end of the lift", X_WT @ lift.X_TO_lifted, marks, azimuth)]

@@ -16,7 +16,7 @@ from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.construction import build_scene
-from drakegrasp.simulation.placement import rest_pose
+from drakegrasp.simulation.placement import canonical_pose
 from drakegrasp.simulation.scene import Scene
 from drakegrasp.verification.forces.lift import ForceLift, lift_by_forces
 from drakegrasp.verification.wrist.solver import WristFit
@@ -96,7 +96,7 @@ def record_verification(verified: Verification, path: Path) -> None:
     Raises:
         OSError: If the file cannot be written.
     """
-    model, X_TO = verified.placed.model, rest_pose(verified.placed.X_TO)
+    model, X_TO = verified.placed.model, canonical_pose(verified.placed.X_TO)
     config = verified.config
     p_OQ, nhat_Q_O = verified.p_OQ, verified.nhat_Q_O
     if verified.attempt is not None:

@@ -20,13 +20,13 @@ import numpy as np
 from drakegrasp.config import Config
 from drakegrasp.dataset.hdf5 import AnyArray, write_field
 from drakegrasp.dataset.manifest import installed_versions, write_origin
-from drakegrasp.dataset.schema import VERIFICATION_FIELDS, Field, sizes
+from drakegrasp.dataset.schema import CONTACT_NAMES, VERIFICATION_FIELDS, Field, sizes
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, pack_pose
 from drakegrasp.hand.description import load_hand
-from drakegrasp.runtime.files import atomic_hdf5, sync_and_rename, temporary_name
+from drakegrasp.runtime.files import atomic_hdf5, probe_folder, sync_and_rename
 from drakegrasp.simulation.contacts import Contacts
-from drakegrasp.simulation.placement import rest_pose
+from drakegrasp.simulation.placement import canonical_pose
 from drakegrasp.verification.result import Verification
 
 #: Group of the HDF5 file that holds the fields.
@@ -65,10 +65,8 @@ def refuse_unwritable(out: Path) -> None:
 
 
 def _is_writable(folder: Path) -> bool:
-    probe = temporary_name(folder / "probe")
     try:
-        probe.touch()
-        probe.unlink()
+        probe_folder(folder)
     except OSError:
         return False
     return True
@@ -103,6 +101,7 @@ def json_lines(out: Path) -> Iterator[Callable[[int, Verification], None]]:
 
         yield write
     if stream is not None:
+        # Not `atomic_path`: the lines of a run that is stopped must stay.
         sync_and_rename(part, lines)
 
 
@@ -230,7 +229,7 @@ def _row(result: Verification) -> dict[str, Any]:
         "outcome": result.outcome,
         "reason": result.reason,
         "X_TO": pack_pose(result.placed.X_TO),
-        "X_TO_simulated": pack_pose(rest_pose(result.placed.X_TO)),
+        "X_TO_simulated": pack_pose(canonical_pose(result.placed.X_TO)),
         "p_OQ": result.p_OQ,
         "nhat_Q_O": result.nhat_Q_O,
         "surface_distance": result.surface_distance,
@@ -263,6 +262,4 @@ def _row(result: Verification) -> dict[str, Any]:
 
 
 def _contact_values(prefix: str, contacts: Contacts) -> dict[str, Any]:
-    names = [f.name for f in VERIFICATION_FIELDS if f.name.startswith(f"{prefix}_")]
-    known = {name: name.removeprefix(f"{prefix}_") for name in names if name != f"{prefix}_q"}
-    return {name: getattr(contacts, attribute) for name, attribute in known.items()}
+    return {f"{prefix}_{name}": getattr(contacts, name) for name in CONTACT_NAMES}

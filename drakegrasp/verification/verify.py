@@ -25,8 +25,8 @@ from drakegrasp.hand.kinematics import coordinate_limits
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Attempt
-from drakegrasp.simulation.placement import PlacedObject, rest_pose
-from drakegrasp.simulation.scene_cache import forget_scenes, scene_of
+from drakegrasp.simulation.placement import PlacedObject, canonical_pose
+from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.verification.forces.lift import LiftEnd, lift_by_forces
 from drakegrasp.verification.forces.quality import force_margin
@@ -128,14 +128,14 @@ def verify_contacts(
         finger = int(np.argmin(outward))
         return replace(base, reason=f"normal {finger + 1} points into the object")
     with _timed(seconds, "margin"):
-        margin = force_margin(placed.model, rest_pose(placed.X_TO), p_OQ, nhat_Q_O, config)
+        margin = force_margin(placed.model, canonical_pose(placed.X_TO), p_OQ, nhat_Q_O, config)
     base = replace(base, epsilon=margin.epsilon, smallest_friction=margin.smallest_friction)
     by = _by_hand if method == "hand" else _by_forces
     return by(base, config)
 
 
 def _by_hand(base: Verification, config: Config) -> Verification:
-    rules, X_TO = config.verify, rest_pose(base.placed.X_TO)
+    rules, X_TO = config.verify, canonical_pose(base.placed.X_TO)
     with _timed(base.seconds, "fit"):
         fits = fit_wrist(
             load_hand(config.hand),
@@ -164,10 +164,10 @@ def _by_hand(base: Verification, config: Config) -> Verification:
 def _by_forces(base: Verification, config: Config) -> Verification:
     limit = load_hand(config.hand).fingertip_force_limit
     with _timed(base.seconds, "simulate"):
-        scene = scene_of(base.placed.model, config.physics, None)
+        scene = cached_scene(base.placed.model, config.physics, None)
         lift = lift_by_forces(
             scene,
-            rest_pose(base.placed.X_TO),
+            canonical_pose(base.placed.X_TO),
             base.p_OQ,
             base.nhat_Q_O,
             force_limit=limit,
@@ -211,7 +211,7 @@ def _try(
     placed: PlacedObject, X_TO: Array, fit: WristFit, config: Config
 ) -> tuple[Attempt, TrialRecord]:
     """Open the fingers of a fit until the hand is clear, and run the trial from there."""
-    scene = scene_of(placed.model, config.physics, config.hand)
+    scene = cached_scene(placed.model, config.physics, config.hand)
     least = coordinate_limits(load_hand(config.hand))[1:, 0]
     for share in MARGINS:
         margin = share * np.deg2rad(config.verify.open_margin_deg)

@@ -23,7 +23,7 @@ from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.runtime.environment import allow_network
-from drakegrasp.runtime.files import sync_and_rename, temporary_name
+from drakegrasp.runtime.files import write_atomic
 from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.construction import MESHCAT_RATE, build_scene
 from drakegrasp.simulation.scene import Scene, reset_attempt, reset_object
@@ -116,7 +116,7 @@ def record_html(run: Callable[[Meshcat], Result], path: Path) -> Result:
         result = run(meshcat)
         meshcat.StopRecording()
         meshcat.PublishRecording()
-        _write(path, meshcat.StaticHtml())
+        write_atomic(path, meshcat.StaticHtml().encode())
     finally:
         # Diagrams sit in reference cycles; when the one of `run` is gone, the port is closed.
         del meshcat
@@ -141,16 +141,6 @@ def _make_meshcat() -> Meshcat:
             return Meshcat(MeshcatParams(host="localhost", port=0, show_stats_plot=False))
     finally:
         logger.setLevel(level)
-
-
-def _write(path: Path, text: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = temporary_name(path)
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        sync_and_rename(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def draw_predicted(meshcat: Meshcat, p_OQ: Array | None, nhat_Q_O: Array | None) -> None:

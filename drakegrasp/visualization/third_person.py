@@ -14,33 +14,28 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from pydrake.common import MemoryFile
 from pydrake.geometry import (
     Box,
     ClippingRange,
     ColorRenderCamera,
     FrameId,
-    InMemoryMesh,
     LightParameter,
-    MakeRenderEngineVtk,
-    Mesh,
     QueryObject,
     RenderCameraCore,
     RenderEngineVtkParams,
 )
 from pydrake.math import RigidTransform
-from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import FixedOffsetFrame, ModelInstanceIndex, RigidBody, SpatialInertia
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import FixedOffsetFrame, ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
 from drakegrasp.errors import MachineError
 from drakegrasp.frames import X_WT, Array, make_pose, transform_points
 from drakegrasp.hand.description import Hand, make_parser
-from drakegrasp.mesh.wavefront import obj_text
-from drakegrasp.objects.model import ObjectModel, object_colour
+from drakegrasp.objects.model import ObjectModel
 from drakegrasp.vision.camera import Picture
-from drakegrasp.vision.rendering import BLANK
+from drakegrasp.vision.rendering import BLANK, ENGINE, add_drawn_object
 
 #: Vertical field of view [deg]: narrow, so that nothing is distorted.
 FOV_Y_DEG = 26.0
@@ -71,7 +66,6 @@ LIGHTS = (
         cone_angle=26.0,
     ),
 )
-_ENGINE = "vtk"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -119,19 +113,13 @@ def build_theatre(
 ) -> Theatre:
     """Return a diagram of an object, a hand and a square table of an edge [m], lit by lights."""
     builder = DiagramBuilder()
-    plant, scene_graph = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.0), builder)
     parameters = RenderEngineVtkParams(
         default_clear_color=BACKGROUND,
         lights=list(lights),
         cast_shadows=True,
         shadow_map_size=SHADOW_MAP,
     )
-    scene_graph.AddRenderer(_ENGINE, MakeRenderEngineVtk(parameters))
-    body = plant.AddRigidBody("object", SpatialInertia.SolidSphereWithMass(1.0, 1.0))
-    text = obj_text(model.visual_vertices, model.visual_faces, normals=True)
-    mesh = Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", model.name)))
-    colour = np.array([*object_colour(model.name), 1.0])
-    plant.RegisterVisualGeometry(body, RigidTransform(), mesh, "surface", colour)
+    plant, body = add_drawn_object(builder, model, parameters)
     X_WB = RigidTransform(X_WT @ make_pose(np.eye(3), [0.0, 0.0, -TABLE_THICKNESS / 2.0]))
     slab = Box(table_size, table_size, TABLE_THICKNESS)
     plant.RegisterVisualGeometry(plant.world_body(), X_WB, slab, "table", TABLE_COLOUR)
@@ -248,7 +236,7 @@ def _camera(
 ) -> tuple[QueryObject, ColorRenderCamera, FrameId]:
     plant = theatre.plant
     core = RenderCameraCore(
-        _ENGINE,
+        ENGINE,
         CameraInfo(*size, np.deg2rad(FOV_Y_DEG)),
         ClippingRange(0.05, 20.0),
         RigidTransform(),

@@ -369,7 +369,7 @@ def test_full_disk_of_the_client_is_one_error(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("drakegrasp.dataset.manifest.sync_and_rename", full)
+    monkeypatch.setattr("drakegrasp.dataset.manifest.write_atomic", full)
     with pytest.raises(DiskFullError, match=r"must have room .* goes on from here"):
         build(find_meshes(meshes), tmp_path / "out", config, run_here, show=False)
     assert not (tmp_path / "out").exists()
@@ -380,7 +380,7 @@ def test_full_disk_of_the_client_is_one_error(
 def test_blank_image_never_becomes_data(
     meshes: Path, undisturbed: Path, config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def blank(*_: object) -> rendering.Look:
+    def blank(*_: object) -> rendering.RenderedView:
         raise BlankImageError(rendering.BLANK)
 
     out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
@@ -391,7 +391,7 @@ def test_blank_image_never_becomes_data(
     shard = out / "shards" / name / f"{start:07d}-{start + 1:07d}.h5"
     shard.unlink()
     with monkeypatch.context() as patch:
-        patch.setattr(columns, "look", blank)
+        patch.setattr(columns, "render", blank)
         with pytest.raises(BlankImageError, match="must not be blank"):
             build(find_meshes(meshes), out, config, run_here, show=False)
     assert not shard.exists()

@@ -204,8 +204,8 @@ def test_refused_meshes_are_listed_and_the_others_go_on(tmp_path: Path) -> None:
     config = load_config(overrides=["candidates.max=2"])
     report = build(find_meshes(meshes), out, config, run_here, show=False)
     assert report.objects == 1
-    assert [entry["name"] for entry in report.refused] == ["2_house_a", "3_text_a"]
-    assert "--units" in report.refused[0]["reason"]
+    assert [entry.name for entry in report.refused] == ["2_house_a", "3_text_a"]
+    assert "--units" in report.refused[0].reason
     again = build(find_meshes(meshes), out, config, _nothing_runs, show=False)
     assert again.refused == report.refused
 

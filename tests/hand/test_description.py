@@ -29,11 +29,6 @@ LINKS = {
 }
 
 
-@pytest.fixture(scope="module")
-def hand() -> Hand:
-    return load_hand()
-
-
 def link_kind(name: str) -> str:
     return name.rpartition("_")[2]
 

@@ -183,7 +183,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     prepared = prepare(find_meshes(folder / "meshes")[0], config)
     save_prepared(prepared, out, config)
     write_manifest(
-        Manifest(config=config, objects=(prepared.summary(),), versions=installed_versions(config)),
+        Manifest(config=config, objects=(prepared.entry(),), versions=installed_versions(config)),
         out,
     )
     palm = prepared.model.half_extents[2] + 0.08

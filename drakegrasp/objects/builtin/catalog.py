@@ -23,6 +23,7 @@ import trimesh
 from drakegrasp.errors import MeshError
 from drakegrasp.objects.builtin import hollow_shapes, revolved_shapes, solid_shapes
 from drakegrasp.objects.builtin.modelling import DECIMALS
+from drakegrasp.runtime.files import write_atomic
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -294,12 +295,7 @@ def export_builtin(
     paths = []
     for item in chosen:
         path = folder / f"{item.name}.obj"
-        temporary = folder / f".{item.name}.{os.getpid()}.tmp"
-        try:
-            temporary.write_bytes(_wavefront(item.build()))
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        write_atomic(path, _wavefront(item.build()))
         paths.append(path)
     return paths
 
