@@ -74,7 +74,7 @@ def export_objects(directory: Path) -> None:
 @units_option
 @manifest_option
 def audit(mesh_dir: Path, units: str, manifest: Path | None) -> None:
-    """Say mesh by mesh: fit to simulate, mended, or refused, and why.
+    """Say mesh by mesh: fit to simulate, repaired, or refused, and why.
 
     A build also drops each object on the table, and refuses one that does not come to rest.
     """

@@ -110,7 +110,7 @@ def audit_table(rows: Sequence[AuditRow]) -> Table:
     table.add_column("faces", justify="right")
     table.add_column(escape("size [mm]"), justify="right", no_wrap=True)
     table.add_column("notes", overflow="fold")
-    colours = {"fit": "green", "mended": "yellow", "refused": "red"}
+    colours = {"fit": "green", "repaired": "yellow", "refused": "red"}
     for row in rows:
         size = "-" if row.extents is None else "x".join(f"{1e3 * e:.0f}" for e in row.extents)
         table.add_row(

@@ -111,7 +111,7 @@ def run_attempt(
         if screened is Outcome.START_COLLISION or (screened is not None and not near):
             return replace(start, outcome=screened)
 
-        # Place: object and palm stand still, the fingers are open.
+        # Place: object and palm stand still, the fingers are where the attempt starts them.
         limits = start_limits(config)
         reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=attempt.closing)
         if open_hand_collides(scene):

@@ -264,7 +264,7 @@ def builtin_object(name: str) -> BuiltinObject:
     """Return the built-in object of this name.
 
     Raises:
-        MeshError: If there is none; the message lists the names there are.
+        MeshError: If there is none; the message lists the known names.
     """
     for item in BUILTIN_OBJECTS:
         if item.name == name:
@@ -287,9 +287,11 @@ def export_builtin(
     Raises:
         MeshError: If a name is unknown; nothing is written then.
     """
+    # Look up all names before anything is written.
     chosen = BUILTIN_OBJECTS if names is None else [builtin_object(name) for name in names]
     folder = Path(directory)
     folder.mkdir(parents=True, exist_ok=True)
+
     paths = []
     for item in chosen:
         path = folder / f"{item.name}.obj"
@@ -299,7 +301,7 @@ def export_builtin(
 
 
 def _wavefront(mesh: trimesh.Trimesh) -> bytes:
-    """Return a mesh as Wavefront text; we write it ourselves, so that a release changes nothing."""
+    """Return a mesh as Wavefront text; not trimesh's, which may change by release."""
     d = DECIMALS
     lines = [f"v {x:.{d}f} {y:.{d}f} {z:.{d}f}" for x, y, z in mesh.vertices.tolist()]
     lines += [f"f {a} {b} {c}" for a, b, c in (mesh.faces + 1).tolist()]

@@ -1,4 +1,4 @@
-"""Hollow things, one function per class: sizes in metres come in, watertight meshes go out.
+"""Hollow shapes, one function per class: sizes in metres come in, watertight meshes go out.
 
 Every mesh stands on the plane z = 0 as it would on a table, z up;
 `drakegrasp.objects.builtin.catalog` holds the table of sizes.
@@ -294,7 +294,7 @@ def loop_handle(
     """
     angles = np.linspace(0.0, np.pi, 200)
     middle, half = (top + bottom) / 2.0, (top - bottom) / 2.0
-    # A power below one squares the half ellipse, as a hand likes it.
+    # A power below one makes the half ellipse squarer, like a real handle.
     curve = np.column_stack(
         [
             x + reach * np.sin(angles) ** 0.7,
