@@ -27,7 +27,7 @@ from drakegrasp.hand.files import hand_digest
 from drakegrasp.runtime.files import probe_folder, write_atomic
 
 #: Packages whose versions may change a result.
-VERSIONED = ("drakegrasp", "drake", "numpy", "scipy", "trimesh", "manifold3d", "embreex", "h5py")
+VERSIONED = ("drakegrasp", "drake", "numpy", "scipy", "trimesh", "manifold3d", "h5py")
 #: Versions that must not change within a dataset, nor between a client and its workers.
 REQUIRED_VERSIONS = ("drakegrasp", "drake", "hand")
 

@@ -19,6 +19,7 @@ from pydrake.geometry import LightParameter
 from drakegrasp.frames import X_WT, Array, invert_pose, make_pose, transform_points
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import joint_positions
+from drakegrasp.mesh.rays import first_hits
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.placement import canonical_pose
@@ -283,4 +284,5 @@ def _towards(marks: Marks, X_WO: Array, p_WC: Array) -> Array:
 def is_seen(model: ObjectModel, X_WO: Array, marks: Marks, p_WC: Array) -> npt.NDArray[np.bool_]:
     """Return (n,), whether a camera at p_WC (3,) sees each contact past the object."""
     start = marks.p_OQ + HIDDEN * marks.nhat_Q_O
-    return ~model.visual.ray.intersects_any(start, _towards(marks, X_WO, p_WC))
+    hits = first_hits(np.asarray(model.visual.triangles), start, _towards(marks, X_WO, p_WC))
+    return ~np.isfinite(hits)
