@@ -8,9 +8,6 @@ Failures of prediction, solver and physics are values here.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import Literal, get_args
 
@@ -24,6 +21,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import coordinate_limits
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.timing import timed
 from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.placement import PlacedObject, rest_pose
 from drakegrasp.simulation.scene_cache import forget_scenes, scene_of
@@ -103,7 +101,7 @@ def verify_contacts(
     # Adding zero takes the sign of a negative zero away.
     p_OQ, nhat_Q_O = np.round(p_OQ, POINT_DIGITS) + 0.0, np.round(nhat_Q_O, NORMAL_DIGITS) + 0.0
     nhat_Q_O /= np.linalg.norm(nhat_Q_O, axis=1, keepdims=True)
-    with _timed(seconds, "surface"):
+    with timed(seconds, "surface"):
         distance = face_distances(placed.model, p_OQ)
         outward = points_outward(placed.model, distance, nhat_Q_O)
     base = Verification(
@@ -127,7 +125,7 @@ def verify_contacts(
     if not outward.all():
         finger = int(np.argmin(outward))
         return replace(base, reason=f"normal {finger + 1} points into the object")
-    with _timed(seconds, "margin"):
+    with timed(seconds, "margin"):
         margin = force_margin(placed.model, rest_pose(placed.X_TO), p_OQ, nhat_Q_O, config)
     base = replace(base, epsilon=margin.epsilon, smallest_friction=margin.smallest_friction)
     by = _by_hand if method == "hand" else _by_forces
@@ -136,7 +134,7 @@ def verify_contacts(
 
 def _by_hand(base: Verification, config: Config) -> Verification:
     rules, X_TO = config.verify, rest_pose(base.placed.X_TO)
-    with _timed(base.seconds, "fit"):
+    with timed(base.seconds, "fit"):
         fits = fit_wrist(
             load_hand(config.hand),
             base.p_OQ,
@@ -150,7 +148,7 @@ def _by_hand(base: Verification, config: Config) -> Verification:
         return replace(base, outcome=Outcome.UNREACHABLE, reason=reason, fit=fits[0])
     results: list[Verification] = []
     for tries, fit in enumerate(near, start=1):
-        with _timed(base.seconds, "simulate"):
+        with timed(base.seconds, "simulate"):
             attempt, trial = _try(base.placed, X_TO, fit, config)
         results.append(_judge(replace(base, fit=fit, attempt=attempt, trial=trial), config))
         if results[-1].success:
@@ -163,7 +161,7 @@ def _by_hand(base: Verification, config: Config) -> Verification:
 
 def _by_forces(base: Verification, config: Config) -> Verification:
     limit = load_hand(config.hand).fingertip_force_limit
-    with _timed(base.seconds, "simulate"):
+    with timed(base.seconds, "simulate"):
         scene = scene_of(base.placed.model, config.physics, None)
         lift = lift_by_forces(
             scene,
@@ -250,16 +248,6 @@ def _judge(result: Verification, config: Config) -> Verification:
                 f"its point, more than {_mm(config.verify.max_contact_error)}"
             )
     return replace(result, outcome=outcome, reason=reason, contact_error=error)
-
-
-@contextmanager
-def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    """Add the wall clock of the block to a stage's."""
-    start = time.perf_counter()
-    try:
-        yield
-    finally:
-        seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start
 
 
 def _mm(length: float) -> str:

@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, Array, invert_pose, rotation_angle
 from drakegrasp.simulation.scene import Scene, advance, reset_object
+from drakegrasp.simulation.stepping import StateError
 from drakegrasp.simulation.trajectory import LiftPath, carrying_force, lift_path
 from drakegrasp.verification.forces.contact_forces import ForceProgram, largest_normal_force
 
@@ -80,10 +81,6 @@ class ForceLift:
     def held(self) -> bool:
         """Whether the forces lifted the object to the target."""
         return self.end is LiftEnd.HELD
-
-
-class _StateError(Exception):
-    """The state or the solution left the range in which it means anything."""
 
 
 def lift_by_forces(
@@ -148,7 +145,7 @@ class _Fingers:
         if forces.largest_normal > self.force_limit:
             forces = self.program.closest(wrench_O, self.force_limit)
         if not np.isfinite(forces.largest_normal):
-            raise _StateError("contact forces must be found at every step, got none")
+            raise StateError("contact forces must be found at every step, got none")
         R_WO = self.scene.pose(self.scene.object)[:3, :3]
         self._apply(forces.f_Q_O @ R_WO.T)
         return forces.largest_normal
@@ -188,7 +185,7 @@ def _simulate(fingers: _Fingers, planned: float, path: LiftPath, config: Config)
         deviation = _deviation(scene, path)
         done += 1
     if not np.isfinite(deviation).all():
-        raise _StateError("the object's pose must stay finite, got one that is not")
+        raise StateError("the object's pose must stay finite, got one that is not")
     arrived = done == steps and _within(deviation, config, 1.0)
     return ForceLift(
         planned_force=planned,
