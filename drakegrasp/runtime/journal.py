@@ -12,7 +12,7 @@ the step that it names is judged:
 * an attempt in which the process vanished `SILENT_DEATHS` times in a row (the kernel's or
   the nanny's answer to too little memory) is not tried again.
 
-Steps under suspicion run first, so a guilty one costs a start of the process and not the
+Steps under suspicion run first, so a failing one costs a start of the process and not the
 unit, and an innocent one is cleared by passing. Silent deaths must hit the very same step
 eight times in a row: a machine that is switched off, or a random SIGKILL, does not.
 
@@ -73,7 +73,7 @@ class _History:
     """What earlier runs of a unit died of: by step, and their number since the last verdict."""
 
     deaths: dict[str, Deaths] = field(default_factory=dict)
-    futile: int = 0
+    crash_loop: int = 0
 
     def verdict(self, step: str) -> Verdict | None:
         found = self.deaths.get(step, Deaths())
@@ -85,12 +85,12 @@ class _History:
         vanished = found.silent >= SILENT_DEATHS and step.startswith(ATTEMPT)
         return Verdict.VANISHED if vanished else None
 
-    def suspects(self) -> list[str]:
+    def unresolved(self) -> list[str]:
         return [step for step in self.deaths if self.verdict(step) is None]
 
     def add(self, step: str, passed: int, marks: bytes) -> None:
         """Take in that a run died at a step; bit i of `passed` clears the i-th suspect."""
-        for i, suspect in enumerate(self.suspects()):
+        for i, suspect in enumerate(self.unresolved()):
             if passed >> i & 1:
                 del self.deaths[suspect]
         before = self.deaths.get(step, Deaths())
@@ -101,7 +101,7 @@ class _History:
         else:
             now = replace(before, silent=before.silent + 1)
         self.deaths[step] = now
-        self.futile = 0 if self.verdict(step) else self.futile + 1
+        self.crash_loop = 0 if self.verdict(step) else self.crash_loop + 1
 
 
 class Journal:
@@ -112,14 +112,14 @@ class Journal:
         self._passed = 0
 
     @property
-    def suspects(self) -> list[str]:
+    def unresolved(self) -> list[str]:
         """The steps to run first, in this order."""
-        return self._history.suspects()
+        return self._history.unresolved()
 
     @property
-    def is_futile(self) -> bool:
+    def in_crash_loop(self) -> bool:
         """Whether the unit died again and again and nothing was learned from it."""
-        return self._history.futile >= GIVE_UP_DEATHS
+        return self._history.crash_loop >= GIVE_UP_DEATHS
 
     def verdict(self, step: str) -> Verdict | None:
         """Return why a step must not be tried again, or None if it may."""
@@ -148,8 +148,8 @@ class Journal:
         finally:
             if seconds is not None:
                 faulthandler.cancel_dump_traceback_later()
-        if name in self.suspects:
-            self._passed |= 1 << self.suspects.index(name)
+        if name in self.unresolved:
+            self._passed |= 1 << self.unresolved.index(name)
 
 
 #: The journal of a run in a process that nobody would start again: it keeps none.
@@ -179,7 +179,7 @@ def open_journal(path: Path, identity: Mapping[str, Any]) -> Iterator[Journal]:
         {
             "unit": dict(identity),
             "deaths": {step: asdict(deaths) for step, deaths in history.deaths.items()},
-            "futile": history.futile,
+            "crash_loop": history.crash_loop,
         },
         ensure_ascii=False,
     ).encode()
@@ -216,7 +216,7 @@ def _read_history(path: Path, identity: Mapping[str, Any]) -> _History | None:
             return _History()
         for step, deaths in content["deaths"].items():
             history.deaths[step] = Deaths(**deaths)
-        history.futile = int(content["futile"])
+        history.crash_loop = int(content["crash_loop"])
         passed, step = rest[:_RECORD_SIZE].decode("ascii").split(maxsplit=1)
         history.add(step.strip(), int(passed, 16), rest[_RECORD_SIZE:])
     except FileNotFoundError:
