@@ -1,22 +1,23 @@
-"""Building and verifying as callers use them: on Dask workers, or in this process.
+"""The public calls: building datasets and verifying grasps, on Dask workers or in this process.
 
-Tasks are work units of many attempts; their data goes through shards, and only a summary
+A build's tasks are work units of many attempts. Their data are written as shards; only a summary
 comes back. A few tasks per worker are in flight at a time, whatever their number.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy.typing as npt
 
-from drakegrasp.build.pipeline import BuildReport, build
+from drakegrasp.build.pipeline import BuildReport, build_locked
 from drakegrasp.build.request import BUILTIN
 from drakegrasp.cluster.admission import admitted_workers
-from drakegrasp.cluster.connect import connect, cores, dashboard_line, has_dashboard
+from drakegrasp.cluster.connect import connect, dashboard_line, has_dashboard
 from drakegrasp.cluster.executor import RESUBMISSIONS, DaskExecutor
 from drakegrasp.config import Config, load_config, parse_config
 from drakegrasp.dataset.lock import build_lock
@@ -28,13 +29,14 @@ from drakegrasp.frames import as_numbers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.builtin.catalog import export_builtin
 from drakegrasp.objects.sources import MeshSource, find_meshes
+from drakegrasp.runtime.environment import available_cores
 from drakegrasp.runtime.executor import Executor, run_here
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.verification.result import Verification
 from drakegrasp.verification.tasks import (
     TASK_GRASPS,
-    Deliver,
     Mesh,
+    ResultCallback,
     VerifyTask,
     plan_verification,
     refuse_off_surface,
@@ -61,11 +63,11 @@ def build_dataset(
 ) -> BuildReport:
     """Build the dataset of a directory of meshes; the same as `drakegrasp build`.
 
-    What is complete in `out` already is kept, so the same call goes on where one stopped.
+    What is complete in `out` is kept: the same call goes on where an earlier one stopped.
 
     Args:
         objects: Directory of meshes, or "builtin" for the built-in objects.
-        out: Directory of the dataset; every worker must see it.
+        out: Directory of the dataset; it must be visible to every worker.
         config: All the rules; the preset `paper` if None.
         units: Unit of length of the meshes: m, cm or mm.
         manifest: YAML file with units and classes per mesh, if it is not beside the meshes.
@@ -77,20 +79,26 @@ def build_dataset(
     Raises:
         MeshError: If there is no mesh.
         ConfigError: If both workers and a scheduler are given.
-        DataError: If `out` cannot be used, another process builds there, or no mesh is fit to be
+        DataError: If `out` cannot be used, another process builds there, or no mesh can be
             simulated.
         MachineError: If there is no scheduler, the workers cannot do the work, or no room is
-            left; the same call goes on when that is mended.
+            left; the same call goes on when that is fixed.
     """
     _refuse_workers(workers, scheduler, scheduler_file)
     out, config = Path(out).absolute(), config or load_config()
     load_hand(config.hand)
     sources = find_sources(objects, units, manifest)
-    # Locked first: a second build is refused before it starts any worker.
-    with build_lock(out), connect(workers, scheduler, scheduler_file) as client:
+    cluster = _announced(connect(workers, scheduler, scheduler_file), show)
+    return build_on(cluster, sources, out, config, show=show)
+
+
+@contextmanager
+def _announced(cluster: AbstractContextManager[Client], show: bool) -> Iterator[Client]:
+    """Enter a cluster, and say where its dashboard is."""
+    with cluster as client:
         if show and has_dashboard():
             sys.stderr.write(f"{dashboard_line(client)}\n")
-        return build_on(client, sources, out, config, show=show)
+        yield client
 
 
 def find_sources(
@@ -107,33 +115,44 @@ def find_sources(
 
 
 def build_on(
-    client: Client,
+    cluster: AbstractContextManager[Client],
     sources: Sequence[MeshSource] | None,
     out: Path,
     config: Config,
     *,
     show: bool = True,
 ) -> BuildReport:
-    """Build a dataset on the workers of a client; see `build_dataset`.
+    """Build a dataset on the workers of a cluster; see `build_dataset`.
+
+    The directory is locked before the workers start: a second build is refused before that.
 
     Args:
-        client: Of a cluster whose workers all see `out`.
+        cluster: Starts workers that all see `out`, and yields their client, e.g. `connect(2)`. A
+            client of the caller's own goes in as `contextlib.nullcontext(client)`.
         sources: The meshes; None for the built-in objects.
         out: Directory of the dataset, absolute.
         config: All the rules.
         show: Whether to show progress on standard error.
 
     Raises:
-        DataError: If `out` cannot be used, or no mesh is fit to be simulated.
+        DataError: If `out` cannot be used, another process builds there, or no mesh can be
+            simulated.
         MachineError: If a worker would give other results than this machine.
     """
-    with admitted_workers(client, config), build_lock(out):
+    with (
+        build_lock(out) as dead,
+        cluster as client,
+        admitted_workers(client, config) as kernel,
+    ):
+        # The built-in objects become mesh files of the dataset.
         if sources is None:
             claim_directory(out, config)
             export_builtin(out / BUILTIN_FOLDER)
             sources = find_meshes(out / BUILTIN_FOLDER)
+
         execute = DaskExecutor(client, resubmissions=RESUBMISSIONS)
-        return build(sources, out, config, execute, crew=execute.crew, show=show)
+        execute.pool.kernel = kernel
+        return build_locked(sources, out, config, execute, dead=dead, pool=execute.pool, show=show)
 
 
 def verify_grasps(
@@ -200,20 +219,20 @@ def run_verification(
     workers: int | None = None,
     scheduler: str | None = None,
     scheduler_file: str | Path | None = None,
-    deliver: Deliver,
+    deliver: ResultCallback,
     show: bool = True,
 ) -> list[Verification]:
     """Return the verdicts of tasks in the order of their grasps; what `drakegrasp verify` does.
 
-    One worker, or few grasps, are a plain loop in this process: it would take longer to start
-    others.
+    One worker, or few grasps, run as a plain loop in this process: starting workers would take
+    longer.
 
     Args:
         tasks: From `tasks.plan_verification`.
         workers: Processes on this machine; one per core if None.
         scheduler: Address of a running Dask scheduler to use instead.
         scheduler_file: Its JSON file, instead of the address.
-        deliver: Is given each verdict, in that order, as soon as those before it are there.
+        deliver: Called with each verdict, in that order, as soon as those before it are there.
         show: Whether to show progress on standard error.
 
     Raises:
@@ -222,7 +241,7 @@ def run_verification(
     """
     _refuse_workers(workers, scheduler, scheduler_file)
     few = sum(len(task.indices) for task in tasks) <= TASK_GRASPS
-    if not (scheduler or scheduler_file) and (few or (workers or cores()) == 1):
+    if not (scheduler or scheduler_file) and (few or (workers or available_cores()) == 1):
         return _verify(tasks, None, show, deliver)
     with connect(workers, scheduler, scheduler_file) as client:
         return _verify(tasks, client, show, deliver)
@@ -232,10 +251,10 @@ def _verify(
     tasks: Sequence[VerifyTask],
     client: Client | None,
     show: bool,
-    deliver: Deliver = lambda index, result: None,
+    deliver: ResultCallback = lambda index, result: None,
 ) -> list[Verification]:
     if client is None:
-        # Here it costs nothing to report every grasp.
+        # In this process a task per grasp costs nothing, and progress is finer.
         parts = [part for task in tasks for part in split_task(task, 1)]
         return _verify_with(run_here, parts, show, deliver)
     if not tasks:
@@ -245,7 +264,7 @@ def _verify(
 
 
 def _verify_with(
-    execute: Executor, tasks: Sequence[VerifyTask], show: bool, deliver: Deliver
+    execute: Executor, tasks: Sequence[VerifyTask], show: bool, deliver: ResultCallback
 ) -> list[Verification]:
     with progress_bar("verify", "grasps", show=show) as report:
         return verify_tasks(tasks, execute, report, deliver)
@@ -254,10 +273,10 @@ def _verify_with(
 def _refuse_workers(
     workers: int | None, scheduler: str | None, scheduler_file: str | Path | None
 ) -> None:
-    """Refuse a number of workers that cannot be had.
+    """Refuse a number of workers below one, or one given together with a scheduler.
 
     Raises:
-        ConfigError: If it is below one, or given with a scheduler.
+        ConfigError: If so.
     """
     if workers is not None and (scheduler or scheduler_file):
         raise ConfigError("workers must not be given with a scheduler, which has its own")

@@ -51,7 +51,7 @@ Mesh: TypeAlias = str | Path | trimesh.Trimesh | Placed
 
 
 #: Who takes results as they come: called with a grasp's index and its result.
-Deliver: TypeAlias = Callable[[int, Verification], None]
+ResultCallback: TypeAlias = Callable[[int, Verification], None]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -241,7 +241,7 @@ def verify_tasks(
     tasks: Sequence[VerifyTask],
     execute: Executor,
     report: Report,
-    deliver: Deliver = lambda index, result: None,
+    deliver: ResultCallback = lambda index, result: None,
 ) -> list[Verification]:
     """Return the results of tasks in the order of the caller's grasps.
 
