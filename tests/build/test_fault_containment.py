@@ -354,7 +354,7 @@ def test_full_disk_stops_and_goes_on(meshes: Path, undisturbed: Path, tmp_path: 
     process = start_build(meshes, out, workers=1, largest_file=size)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 1
-    assert "must have room for what is written" in errors.splitlines()[-1]
+    assert "the disk or the quota is full" in errors.splitlines()[-1]
     assert "Traceback" not in errors, errors
     # A unit that was begun meanwhile, and dropped, keeps its journal for its next run.
     assert_clean(out, ".*.tmp", "build.lock")
@@ -370,7 +370,7 @@ def test_full_disk_of_the_client_is_one_error(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("drakegrasp.dataset.manifest.sync_and_rename", full)
-    with pytest.raises(DiskFullError, match=r"must have room .* goes on from here"):
+    with pytest.raises(DiskFullError, match=r"the disk or the quota is full .* goes on from here"):
         build(find_meshes(meshes), tmp_path / "out", config, run_here, show=False)
     assert not (tmp_path / "out").exists()
 

@@ -26,7 +26,7 @@ UNIT = {"name": "mug", "start": 0, "stop": 10}
 RUN = """
 import sys, time
 from pathlib import Path
-from drakegrasp.runtime.fault_injection import _do
+from drakegrasp.runtime.fault_injection import _cause
 from drakegrasp.runtime.journal import open_journal
 
 faults = dict(reversed(argument.split(":")) for argument in sys.argv[2:])
@@ -40,7 +40,7 @@ with open_journal(Path(sys.argv[1]), {"name": "mug", "start": 0, "stop": 10}) as
         with journal.step(step, 0.5):
             print(step, "runs", flush=True)
             if step in faults:
-                _do(faults[step])
+                _cause(faults[step])
 """
 
 
@@ -70,7 +70,7 @@ def deaths_until_done(journal: Path, *faults: str) -> tuple[int, list[str]]:
         ("freeze", 1, Verdict.HUNG),
     ],
 )
-def test_guilty_step_is_found_and_the_others_run(
+def test_failing_step_is_found_and_the_others_run(
     tmp_path: Path, kind: str, deaths: int, verdict: Verdict
 ) -> None:
     found, lines = deaths_until_done(tmp_path / "journal", f"{kind}:try 4")
@@ -180,7 +180,7 @@ def test_random_kills_convict_nobody(seed: int) -> None:
 
 
 def test_unit_that_dies_for_nothing_is_given_up(tmp_path: Path) -> None:
-    """As when there is not even the memory to build its scene: no attempt is failing."""
+    """As when there is not even the memory to build its scene: no attempt is at fault."""
     history = _History()
     for _ in range(GIVE_UP_DEATHS):
         history.add("build", 0, b"")
