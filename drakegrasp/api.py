@@ -6,16 +6,17 @@ These are the functions that `drakegrasp` exports and the command line calls.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy.typing as npt
 
-from drakegrasp.build.pipeline import BuildReport, build
+from drakegrasp.build.pipeline import BuildReport, build_locked
 from drakegrasp.build.request import BUILTIN
 from drakegrasp.cluster.admission import admitted_workers
-from drakegrasp.cluster.connect import connect, cores, dashboard_line, has_dashboard
+from drakegrasp.cluster.connect import connect, dashboard_line, has_dashboard
 from drakegrasp.cluster.executor import RESUBMISSIONS, DaskExecutor
 from drakegrasp.config import Config, load_config
 from drakegrasp.dataset.lock import build_lock
@@ -27,6 +28,7 @@ from drakegrasp.frames import as_numbers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.builtin.catalog import export_builtin
 from drakegrasp.objects.sources import MeshSource, find_meshes
+from drakegrasp.runtime.environment import available_cores
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.verification.batch import ResultCallback, ignore_result, verify_batch
@@ -61,11 +63,11 @@ def build_dataset(
 ) -> BuildReport:
     """Build the dataset of a directory of meshes; the same as `drakegrasp build`.
 
-    What is complete in `out` already is kept, so the same call goes on where one stopped.
+    What is complete in `out` is kept: the same call goes on where an earlier one stopped.
 
     Args:
         objects: Directory of meshes, or "builtin" for the built-in objects.
-        out: Directory of the dataset; every worker must see it.
+        out: Directory of the dataset; it must be visible to every worker.
         config: All the rules; the preset `paper` if None.
         units: Unit of length of the meshes: m, cm or mm.
         manifest: YAML file with units and classes per mesh, if it is not beside the meshes.
@@ -77,20 +79,26 @@ def build_dataset(
     Raises:
         MeshError: If there is no mesh.
         ConfigError: If both workers and a scheduler are given.
-        DataError: If `out` cannot be used, another process builds there, or no mesh is fit to be
+        DataError: If `out` cannot be used, another process builds there, or no mesh can be
             simulated.
         MachineError: If there is no scheduler, the workers cannot do the work, or no room is
-            left; the same call goes on when that is mended.
+            left; the same call goes on when that is fixed.
     """
     _refuse_workers(workers, scheduler, scheduler_file)
     out, config = Path(out).absolute(), config or load_config()
     load_hand(config.hand)
     sources = find_sources(objects, units, manifest)
-    # Locked first: a second build is refused before it starts any worker.
-    with build_lock(out), connect(workers, scheduler, scheduler_file) as client:
+    cluster = _announced(connect(workers, scheduler, scheduler_file), show)
+    return build_on(cluster, sources, out, config, show=show)
+
+
+@contextmanager
+def _announced(cluster: AbstractContextManager[Client], show: bool) -> Iterator[Client]:
+    """Enter a cluster, and say where its dashboard is."""
+    with cluster as client:
         if show and has_dashboard():
             sys.stderr.write(f"{dashboard_line(client)}\n")
-        return build_on(client, sources, out, config, show=show)
+        yield client
 
 
 def find_sources(
@@ -107,33 +115,44 @@ def find_sources(
 
 
 def build_on(
-    client: Client,
+    cluster: AbstractContextManager[Client],
     sources: Sequence[MeshSource] | None,
     out: Path,
     config: Config,
     *,
     show: bool = True,
 ) -> BuildReport:
-    """Build a dataset on the workers of a client; see `build_dataset`.
+    """Build a dataset on the workers of a cluster; see `build_dataset`.
+
+    The directory is locked before the workers start: a second build is refused before that.
 
     Args:
-        client: Of a cluster whose workers all see `out`.
+        cluster: Starts workers that all see `out`, and yields their client, e.g. `connect(2)`. A
+            client of the caller's own goes in as `contextlib.nullcontext(client)`.
         sources: The meshes; None for the built-in objects.
         out: Directory of the dataset, absolute.
         config: All the rules.
         show: Whether to show progress on standard error.
 
     Raises:
-        DataError: If `out` cannot be used, or no mesh is fit to be simulated.
+        DataError: If `out` cannot be used, another process builds there, or no mesh can be
+            simulated.
         MachineError: If a worker would give other results than this machine.
     """
-    with admitted_workers(client, config), build_lock(out):
+    with (
+        build_lock(out) as dead,
+        cluster as client,
+        admitted_workers(client, config) as kernel,
+    ):
+        # The built-in objects become mesh files of the dataset.
         if sources is None:
             claim_directory(out, config)
             export_builtin(out / BUILTIN_FOLDER)
             sources = find_meshes(out / BUILTIN_FOLDER)
+
         execute = DaskExecutor(client, resubmissions=RESUBMISSIONS)
-        return build(sources, out, config, execute, crew=execute.crew, show=show)
+        execute.pool.kernel = kernel
+        return build_locked(sources, out, config, execute, dead=dead, pool=execute.pool, show=show)
 
 
 def verify_grasp(
@@ -295,7 +314,7 @@ def run_verification(
         MachineError: If a worker would give other results than this machine.
     """
     _refuse_workers(workers, scheduler, scheduler_file)
-    alone = len(grasps) <= FEW_GRASPS or (workers or cores()) == 1
+    alone = len(grasps) <= FEW_GRASPS or (workers or available_cores()) == 1
     if alone and not (scheduler or scheduler_file):
         return _verify_on(None, grasps, on_result, show=show)
     with connect(workers, scheduler, scheduler_file) as client:

@@ -13,8 +13,8 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from drakegrasp.build.attempts import Workbench, predict_all, try_on
+from drakegrasp.build.attempts import TrialSetup, predict_attempts, try_attempt
 from drakegrasp.build.prepare import prepare
-from drakegrasp.build.work_unit import look_at_successes
+from drakegrasp.build.work_unit import render_successes
 from drakegrasp.config import Config, override_config
 from drakegrasp.dataset.manifest import installed_versions
 from drakegrasp.dataset.prepared_objects import PreparedObject
@@ -36,6 +36,7 @@ from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.runtime.allocator import allocator
 from drakegrasp.runtime.blas import one_thread
 from drakegrasp.runtime.progress import Report, silent
+from drakegrasp.runtime.timing import timed
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.candidates import Attempt, make_attempts
 from drakegrasp.simulation.construction import build_scene
@@ -44,6 +45,8 @@ from drakegrasp.simulation.trial import TrialRecord
 
 #: Attempts from one report of progress to the next.
 STRIDE = 50
+#: Other work on the machine disturbs CPU time less than the wall clock.
+_cpu_timed = partial(timed, clock=time.process_time)
 
 
 @dataclass(frozen=True)
@@ -160,25 +163,25 @@ def _measure_object(
     source: MeshSource, config: Config, sample: int, peer: bool, counter: _Counter
 ) -> dict[str, Any]:
     seconds: dict[str, float] = {}
-    with _timed(seconds, "prepare"):
+    with _cpu_timed(seconds, "prepare"):
         prepared = prepare(source, config)
     attempts = _attempts(prepared, config)
     hits = [row for row, attempt in enumerate(attempts) if attempt.ray_hits]
     counter.begin(len(attempts), len(hits))
-    with _timed(seconds, "scene"):
+    with _cpu_timed(seconds, "scene"):
         scene = build_scene(prepared.model, config.physics, load_hand(config.hand))
-        bench = Workbench(prepared=prepared, config=config, scene=scene)
-    with _timed(seconds, "field"):
+        bench = TrialSetup(prepared=prepared, config=config, scene=scene)
+    with _cpu_timed(seconds, "field"):
         _ = prepared.model.field
-    with _timed(seconds, "screen"):
-        predictions = predict_all(bench, attempts)
+    with _cpu_timed(seconds, "screen"):
+        predictions = predict_attempts(bench, attempts)
     records: list[TrialRecord] = []
     for attempt, prediction in zip(attempts, predictions, strict=True):
-        with _timed(seconds, "try"):
-            records.append(try_on(bench, attempt, prediction))
+        with _cpu_timed(seconds, "try"):
+            records.append(try_attempt(bench, attempt, prediction))
         counter.add(records[-1].outcome)
-    with _timed(seconds, "look"):
-        look_at_successes(bench, records)
+    with _cpu_timed(seconds, "look"):
+        render_successes(bench, records)
     found = {
         "name": source.name,
         "faces": len(prepared.model.collision_faces),
@@ -224,11 +227,11 @@ def _run_peer(
     from drakegrasp.bench.mujoco_baseline import Peer
 
     seconds: dict[str, float] = {}
-    with _timed(seconds, "prepare"):
+    with _cpu_timed(seconds, "prepare"):
         peer = Peer(prepared.model, prepared.X_TO, config)
     outcomes: Counter[str] = Counter()
     for attempt in attempts:
-        with _timed(seconds, "try"):
+        with _cpu_timed(seconds, "try"):
             outcome = peer.run(attempt)
         outcomes[outcome.label] += 1
         counter.add(outcome)
@@ -247,7 +250,7 @@ def _add_peer(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _compare_labels(
-    bench: Workbench,
+    bench: TrialSetup,
     attempts: Sequence[Attempt],
     records: Sequence[TrialRecord],
     predictions: Sequence[Prediction | None],
@@ -260,15 +263,15 @@ def _compare_labels(
     other = override_config(bench.config, [t.format(half=half) for t in variant.overrides])
     some = [attempts[row] for row in rows]
     # What geometry says is asked of the same surface, however fine its faces are.
-    seen = predict_all(replace(bench, config=other), some)
+    seen = predict_attempts(replace(bench, config=other), some)
     prepared = bench.prepared
     if variant.fine:
         prepared = replace(prepared, model=_finer(prepared.model))
     scene = build_scene(prepared.model, other.physics, load_hand(other.hand))
-    bench = Workbench(prepared=prepared, config=other, scene=scene)
+    bench = TrialSetup(prepared=prepared, config=other, scene=scene)
     pairs, decided = [], []
     for row, attempt, prediction in zip(rows, some, seen, strict=True):
-        outcome = try_on(bench, attempt, prediction).outcome
+        outcome = try_attempt(bench, attempt, prediction).outcome
         counter.add(outcome)
         pairs.append((records[row].outcome, outcome))
         said = predictions[row]
@@ -332,10 +335,3 @@ def _cpu() -> str:
         return next(line.partition(":")[2].strip() for line in lines if "model name" in line)
     except (OSError, StopIteration):
         return platform.processor() or platform.machine()
-
-
-@contextmanager
-def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    start = time.process_time()
-    yield
-    seconds[stage] = seconds.get(stage, 0.0) + time.process_time() - start

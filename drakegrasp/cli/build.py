@@ -125,7 +125,8 @@ def _print_stats(out: Path) -> None:
 
 def print_plan(request: BuildRequest, workers: int | None, times: Path | None) -> None:
     """Print what a build that was asked for is expected to take."""
-    from drakegrasp.build.estimate import logged_times, plan_lines, plan_request, read_times
+    from drakegrasp.build.estimate import plan_lines, plan_request
+    from drakegrasp.build.stage_times import logged_times, read_times
 
     logged = logged_times(request.out, request.config)
     measured = logged if times is None else read_times(times)

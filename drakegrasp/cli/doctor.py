@@ -20,6 +20,8 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
+from drakegrasp.runtime.environment import available_cores
+
 PYTHON = (3, 11)
 #: Drake's wheels are built for this C library (manylinux_2_34).
 GLIBC = (2, 34)
@@ -229,12 +231,12 @@ def check_disk(directory: Path) -> Finding:
 
 def check_cores() -> Finding:
     """Return how many cores this process may use; any number will do."""
-    return Finding(name="cores", ok=True, what=str(_cores()))
+    return Finding(name="cores", ok=True, what=str(available_cores()))
 
 
 def check_memory() -> Finding:
     """Return whether there is memory for a worker on every core."""
-    total, cores = _memory(), _cores()
+    total, cores = _memory(), available_cores()
     if total is None:
         return Finding(name="memory", ok=True, what="unknown")
     return _finding(
@@ -319,12 +321,6 @@ def _signal_name(number: int) -> str:
         return signal.Signals(number).name
     except ValueError:
         return f"signal {number}"
-
-
-def _cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _memory() -> int | None:

@@ -8,9 +8,6 @@ failed solver and a lost object are outcomes, not exceptions.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import Literal, get_args
 
@@ -23,6 +20,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import coordinate_limits
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.blas import one_thread
+from drakegrasp.runtime.timing import timed
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.placement import PlacedObject, canonical_pose
 from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
@@ -100,7 +98,7 @@ def verify_contacts(
     nhat_Q_O /= np.linalg.norm(nhat_Q_O, axis=1, keepdims=True)
 
     # Contacts off the surface, and normals that point inwards, are no grasp.
-    with _timed(seconds, "surface"):
+    with timed(seconds, "surface"):
         distance = face_distances(placed.model, p_OQ)
         outward = points_outward(placed.model, distance, nhat_Q_O)
     base = Verification(
@@ -126,7 +124,7 @@ def verify_contacts(
         return replace(base, reason=f"normal {finger + 1} points into the object")
 
     # What forces at the contacts alone can do, whatever the method.
-    with _timed(seconds, "margin"):
+    with timed(seconds, "margin"):
         margin = force_margin(placed.model, canonical_pose(placed.X_TO), p_OQ, nhat_Q_O, config)
     base = replace(base, epsilon=margin.epsilon, smallest_friction=margin.smallest_friction)
 
@@ -148,7 +146,7 @@ def _lift_by_hand(base: Verification, config: Config) -> Verification:
     """Find palm poses for the contacts and try them until one holds the object."""
     # Palm poses that bring the fingertips to the contacts, the best first.
     rules, X_TO = config.verify, canonical_pose(base.placed.X_TO)
-    with _timed(base.seconds, "fit"):
+    with timed(base.seconds, "fit"):
         fits = fit_wrist(
             load_hand(config.hand),
             base.p_OQ,
@@ -164,7 +162,7 @@ def _lift_by_hand(base: Verification, config: Config) -> Verification:
     # A trial from each, until one holds.
     results: list[Verification] = []
     for tries, fit in enumerate(near, start=1):
-        with _timed(base.seconds, "simulate"):
+        with timed(base.seconds, "simulate"):
             pregrasp, trial = _try(base.placed, X_TO, fit, config)
         results.append(_judge(replace(base, fit=fit, pregrasp=pregrasp, trial=trial), config))
         if results[-1].success:
@@ -179,7 +177,7 @@ def _lift_by_hand(base: Verification, config: Config) -> Verification:
 def _lift_by_forces(base: Verification, config: Config) -> Verification:
     """Lift the object by forces at the contacts, without a hand."""
     limit = load_hand(config.hand).fingertip_force_limit
-    with _timed(base.seconds, "simulate"):
+    with timed(base.seconds, "simulate"):
         scene = cached_scene(base.placed.model, config.physics, None)
         lift = lift_by_forces(
             scene,
@@ -269,16 +267,6 @@ def _judge(result: Verification, config: Config) -> Verification:
                 f"point, more than {_mm(config.verify.max_contact_error)}"
             )
     return replace(result, outcome=outcome, reason=reason, contact_error=error)
-
-
-@contextmanager
-def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    """Add the wall-clock time of the block to the seconds of a stage."""
-    start = time.perf_counter()
-    try:
-        yield
-    finally:
-        seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start
 
 
 def _mm(length: float) -> str:

@@ -57,7 +57,7 @@ def units(count: int) -> Iterator[WorkUnit]:
     manifest = Manifest(config=config, objects=objects, versions={})
     values = config.to_dict()
     for _, header in zip(range(count), manifest.headers(), strict=False):
-        yield WorkUnit(out="/nowhere", header=header, config=values, expendable=True)
+        yield WorkUnit(out="/nowhere", header=header, config=values, restartable=True)
 
 
 def memory() -> float:

@@ -210,7 +210,7 @@ def test_memory_is_the_machines_or_the_containers_whichever_is_less(
     limit.write_text("max\n")
     monkeypatch.setattr(doctor, "MEMINFO", meminfo)
     monkeypatch.setattr(doctor, "CGROUP_LIMITS", (limit, tmp_path / "none"))
-    monkeypatch.setattr(doctor, "_cores", lambda: 6)
+    monkeypatch.setattr(doctor, "available_cores", lambda: 6)
     assert doctor.check_memory() == Finding(name="memory", ok=True, what="8.2 GB for 6 cores")
     limit.write_text("3000000000\n")
     finding = doctor.check_memory()

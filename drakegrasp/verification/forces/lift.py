@@ -24,6 +24,7 @@ from drakegrasp.config import Config
 from drakegrasp.errors import first_line
 from drakegrasp.frames import X_WT, Array, invert_pose, rotation_angle
 from drakegrasp.simulation.scene import Scene, advance, reset_object
+from drakegrasp.simulation.stepping import StateError
 from drakegrasp.simulation.trajectory import LiftPath, carrying_force, lift_path
 from drakegrasp.verification.forces.contact_forces import ForceProgram, largest_normal_force
 
@@ -81,10 +82,6 @@ class ForceLift:
     def held(self) -> bool:
         """Whether the forces lifted the object to the target."""
         return self.end is LiftEnd.HELD
-
-
-class _StateError(Exception):
-    """The simulated state or the contact forces are no longer meaningful."""
 
 
 def lift_by_forces(
@@ -156,7 +153,7 @@ class _Fingers:
         if forces.largest_normal > self.force_limit:
             forces = self.program.closest(wrench_O, self.force_limit)
         if not np.isfinite(forces.largest_normal):
-            raise _StateError("the solver found no contact forces")
+            raise StateError("the solver found no contact forces")
         R_WO = self.scene.pose(self.scene.object)[:3, :3]
         self._apply(forces.f_Q_O @ R_WO.T)
         return forces.largest_normal
@@ -201,7 +198,7 @@ def _simulate(fingers: _Fingers, planned: float, path: LiftPath, config: Config)
         deviation = _deviation(scene, path)
         done += 1
     if not np.isfinite(deviation).all():
-        raise _StateError("the object's pose is not finite")
+        raise StateError("the object's pose is not finite")
 
     # Has it arrived?
     arrived = done == steps and _within(deviation, config, 1.0)
