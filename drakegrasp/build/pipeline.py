@@ -17,7 +17,7 @@ from drakegrasp.build.events import BuildEvents
 from drakegrasp.build.prepare import PrepareTask, prepare_one
 from drakegrasp.build.work_unit import WorkUnit, find_outcomes, run_unit
 from drakegrasp.config import Config
-from drakegrasp.dataset.assemble import Assembly, assemble, is_assembled, summarise
+from drakegrasp.dataset.assemble import Assembly, assemble_locked, is_assembled, summarise
 from drakegrasp.dataset.lock import Holder, build_lock
 from drakegrasp.dataset.manifest import (
     Manifest,
@@ -189,7 +189,7 @@ def _build(
     # Assemble the shards, unless the files are of these very shards already.
     if counts.simulated or not is_assembled(out):
         with progress_bar("assemble", "shards", show=job.show) as report:
-            assemble(out, progress=report)
+            assemble_locked(out, progress=report)
 
     # Report.
     if counts.damaged:
