@@ -45,14 +45,14 @@ lint: $(STAMP)   ## style, types, and docs that are made from code
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python pipelines/docs/dataset_format.py --check docs/dataset-format.md
+	$(BIN)/python pipelines/docs/dataset_format.py --check docs/reference/dataset-format.md
 
 format: $(STAMP) ## let ruff lay out the code
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
 docs: $(STAMP)   ## write the docs that are made from code
-	$(BIN)/python pipelines/docs/dataset_format.py docs/dataset-format.md
+	$(BIN)/python pipelines/docs/dataset_format.py docs/reference/dataset-format.md
 
 clean:           ## remove what was made here
 	rm -rf $(VENV) $(DEMO) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

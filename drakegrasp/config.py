@@ -63,7 +63,7 @@ MAX_CALM_STEP = 0.06
 
 
 class PhysicsConfig(_Section):
-    """Contact and time stepping; reasons and sources in docs/physics.md."""
+    """Contact and time stepping; reasons and sources in docs/explanation/physics.md."""
 
     time_step: Annotated[float, Field(gt=0.0, le=0.02)] = 0.008  # [s]
     calm_steps: Annotated[int, Field(ge=1, le=8)] = 3  # time steps in one of a calm lift
@@ -118,7 +118,7 @@ class CandidateConfig(_Section):
 
 
 class ScreenConfig(_Section):
-    """What geometry decides without a simulation; see docs/performance.md."""
+    """What geometry decides without a simulation; see docs/explanation/screening.md."""
 
     mode: Literal["on", "off"] = "on"  # off simulates every attempt, from the open hand
     start_margin: Positive = 0.0025  # [m], deeper in object or table is a collision for certain
@@ -156,7 +156,7 @@ class LiftConfig(_Section):
 
 
 class CertifyConfig(_Section):
-    """How robust each success is; see docs/performance.md."""
+    """How robust each success is; see docs/explanation/physics.md."""
 
     repeats: NonNegativeCount = 0  # of each success with noise; 0 certifies nothing
     palm_noise: NonNegative = 0.002  # [m], standard deviation along each axis of the palm
@@ -167,7 +167,7 @@ class CertifyConfig(_Section):
 
 
 class CameraConfig(_Section):
-    """The two cameras; see docs/frames-and-units.md."""
+    """The two cameras; see docs/reference/frames-and-units.md."""
 
     distance: Positive = 0.25  # [m] behind the palm along -Gz (paper)
     size: Annotated[int, Field(ge=8, le=2048)] = 128  # [px], square images
@@ -199,7 +199,7 @@ class SplitConfig(_Section):
 
 
 class VerifyConfig(_Section):
-    """What a predicted grasp is held to; see docs/verification.md."""
+    """What a predicted grasp is held to; see docs/how-to/verify-predictions.md."""
 
     max_surface_distance: Positive = 0.01  # [m], of a predicted point from the object's surface
     max_residual: Positive = 0.008  # [m], of a fingertip from its point before closing

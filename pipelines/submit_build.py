@@ -8,7 +8,7 @@
     python pipelines/submit_build.py --cluster scheduler-file scheduler.json ...
 
 What will run and what it is expected to take is printed first; --dry-run stops there. The
-same command goes on where one stopped, on any cluster. docs/clusters.md has the details,
+same command goes on where one stopped, on any cluster. docs/how-to/clusters.md has the details,
 pipelines/recipes/ an example of each.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 

@@ -76,7 +76,7 @@ def measure(
     peer: bool = False,
     progress: Report = silent,
 ) -> Iterator[dict[str, Any]]:
-    """Yield what was measured on each object, see `docs/performance.md`.
+    """Yield what was measured on each object, see `docs/benchmarks.md`.
 
     Args:
         sources: The meshes.

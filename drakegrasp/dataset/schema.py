@@ -1,6 +1,6 @@
 """The one table of everything that the files hold.
 
-Writer, reader, checker and docs/dataset-format.md are made from these rows; a field that
+Writer, reader, checker and docs/reference/dataset-format.md are made from these rows; a field that
 is not here is not in a file. Shapes are per row of the dataset; in them `k` is the number
 of fingers, `j` of the hand's joints, `6k` the length of a grasp (18 for three fingers)
 and `S` the size of the images.

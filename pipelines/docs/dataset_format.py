@@ -1,4 +1,4 @@
-"""Write docs/dataset-format.md from the schema table, or check that it is up to date.
+"""Write docs/reference/dataset-format.md from the schema table, or check that it is up to date.
 
 Usage: python pipelines/docs/dataset_format.py [--check] FILE
 """
