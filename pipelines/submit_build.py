@@ -30,7 +30,9 @@ from drakegrasp.dataset.lock import build_lock
 from drakegrasp.errors import ConfigError
 
 
-@click.command(cls=OneCommand, help=__doc__)
+@click.command(
+    cls=OneCommand, help=__doc__, context_settings={"help_option_names": ["-h", "--help"]}
+)
 @click.option(
     "--cluster",
     "kind",

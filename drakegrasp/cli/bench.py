@@ -14,16 +14,22 @@ from drakegrasp.cli.options import manifest_option, set_option, units_option
 
 @click.command()
 @click.option(
-    "--objects", default=BUILTIN, show_default=True, metavar="MESH_DIR|builtin", help="Meshes."
+    "--objects", default=BUILTIN, show_default=True, metavar="MESH_DIR|builtin", help="The meshes."
 )
-@click.option("--only", multiple=True, metavar="NAME", help="Those whose names begin so.")
-@click.option("--config", "preset", metavar="YAML|PRESET", help="[paper]")
+@click.option(
+    "--only",
+    multiple=True,
+    metavar="NAME",
+    help="Only objects whose names begin with NAME; may be given several times.",
+)
+@click.option("--config", "preset", metavar="YAML|PRESET", help="Configuration.  [default: paper]")
 @set_option
 @click.option(
     "--candidates",
     type=click.IntRange(min=1),
     default=100,
     show_default=True,
+    metavar="N",
     help="Palm poses per object.",
 )
 @click.option(
@@ -32,13 +38,14 @@ from drakegrasp.cli.options import manifest_option, set_option, units_option
     default=0,
     metavar="N",
     help="Compare the labels of N attempts per object.",
+    show_default=True,
 )
-@click.option("--peer", is_flag=True, help="Run the same attempts in MuJoCo.")
+@click.option("--peer", is_flag=True, help="Run the same attempts in MuJoCo as well.")
 @click.option(
     "--compare",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
     metavar="FILE",
-    help="An earlier report; print the ratios to it.",
+    help="Print the ratios to this earlier report.",
 )
 @click.option(
     "--out",
@@ -65,11 +72,13 @@ def bench(
     manifest: Path | None,
     quiet: bool,
 ) -> None:
-    """Measure what attempts cost on this machine, in one process.
+    """Measure how fast this machine simulates attempts.
 
-    With --fidelity, N random attempts of each object are simulated again without the screen, at
-    half the step, with four times the faces and by Drake's other solvers. With --peer (extra
-    [peer]), all are simulated plainly in MuJoCo as well.
+    The command runs in one process and writes a report as JSON.
+
+    With --fidelity, it simulates N random attempts of each object again without the screen, at
+    half the time step, with four times the faces and with Drake's other solvers. With --peer
+    (pip install 'drakegrasp[peer]'), it simulates all attempts in MuJoCo as well.
     """
     import json
     import tempfile
