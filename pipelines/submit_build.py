@@ -32,7 +32,9 @@ from drakegrasp.cluster.request import KINDS, ClusterRequest, describe, worker_c
 from drakegrasp.errors import ConfigError
 
 
-@click.command(cls=OneCommand, help=__doc__)
+@click.command(
+    cls=OneCommand, help=__doc__, context_settings={"help_option_names": ["-h", "--help"]}
+)
 @click.option(
     "--cluster",
     "kind",

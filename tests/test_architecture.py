@@ -17,8 +17,8 @@ import drakegrasp
 
 PACKAGE = Path(drakegrasp.__file__).parent
 
-#: The rooms; each may import only from those before it (docs/architecture.md). The first is
-#: the vocabulary: the modules at the top of the package, but for `api`.
+#: The rooms; each may import only from those before it, see docs/explanation/architecture.md.
+#: The first is the vocabulary: the modules at the top of the package, but for `api`.
 ORDER = (
     "(root)",
     "runtime",

@@ -85,7 +85,6 @@ def diagnose(directory: Path | None = None) -> list[Finding]:
         check_allocator(),
         check_egl(),
         check_image(),
-        check_embree(),
         check_writing(place),
         check_disk(place),
         check_cores(),
@@ -185,20 +184,6 @@ def check_image() -> Finding:
     if not 0.9 * expected <= seen <= 1.1 * expected:
         return _bad_image(what if seen else f"blank image: {what}")
     return Finding(name="test image", ok=True, what=what)
-
-
-def check_embree() -> Finding:
-    """Return whether trimesh casts its rays with embree, a hundred times faster than without."""
-    mend = "pip install embreex"
-    # A wheel for another machine fails in its own ways when it is loaded.
-    try:
-        from trimesh import ray
-
-        if ray.has_embree:
-            return Finding(name="embree", ok=True, what=f"embreex {_version('embreex')}")
-    except Exception as error:
-        return _finding("embree", False, f"{type(error).__name__}: {error}", "pip install trimesh")
-    return _finding("embree", False, "trimesh does not find it", mend)
 
 
 def check_writing(directory: Path) -> Finding:

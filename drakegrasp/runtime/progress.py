@@ -121,4 +121,5 @@ def progress_bar(title: str, unit: str, *, show: bool = True) -> Iterator[Report
     try:
         yield report
     finally:
-        bar.stop()
+        if bar.live.is_started:  # else rich would print an empty line
+            bar.stop()
