@@ -21,7 +21,7 @@ from drakegrasp.dataset.manifest import REQUIRED_VERSIONS, installed_versions
 from drakegrasp.errors import MachineError
 from drakegrasp.runtime import kernels
 from drakegrasp.runtime.blas import running_kernel
-from drakegrasp.runtime.kernels import common_kernel, supported_kernel
+from drakegrasp.runtime.kernels import KERNELS, agreed_kernel, common_kernel, supported_kernel
 
 #: Tasks that the scheduler gives to a worker, per thread: a task that waits behind another would
 #: be blamed, too, when that one kills the worker.
@@ -36,7 +36,7 @@ def worker_environment() -> dict[str, str]:
 
     Software OpenGL and BLAS would start threads beside the one process per core, and nothing that
     a worker does needs the network. The BLAS kernel is not among them: another machine's CPU may
-    not support this machine's (see `KernelSetting`).
+    not support this machine's (see `KernelSetting`), and workers here inherit it.
     """
     return {
         "LP_NUM_THREADS": "0",
@@ -45,12 +45,6 @@ def worker_environment() -> dict[str, str]:
         "MKL_NUM_THREADS": "1",
         "OPENBLAS_NUM_THREADS": "1",
     }
-
-
-def local_environment() -> dict[str, str]:
-    """Return the environment variables of workers on this machine: also its BLAS kernel."""
-    kernel = supported_kernel()
-    return worker_environment() | ({} if kernel is None else {kernels.VARIABLE: kernel})
 
 
 class KernelSetting(NannyPlugin):
@@ -67,12 +61,22 @@ class KernelSetting(NannyPlugin):
 
     def setup(self, nanny: Nanny) -> None:
         """Set the kernel in a nanny; a CPU that does not support it gets its own fastest."""
+        if self._kernel not in KERNELS:
+            return  # OpenBLAS chose it by itself; the worker tells if it has another
         kernel = common_kernel([self._kernel, supported_kernel()])
-        if kernel is None or nanny.env.get(kernels.VARIABLE) == kernel:
+        if kernel in (None, _kernel_of(nanny)):
             return
         # The worker is a new process that loads NumPy before it sees `env`.
         nanny.env[kernels.VARIABLE] = nanny.pre_spawn_env[kernels.VARIABLE] = kernel
         self.restart = True  # Dask reads this after the setup
+
+
+def _kernel_of(nanny: Nanny) -> str:
+    """Return the BLAS kernel with which a nanny starts its worker."""
+    for environment in (nanny.env, nanny.pre_spawn_env, os.environ):
+        if kernels.VARIABLE in environment:
+            return str(environment[kernels.VARIABLE])
+    return running_kernel()
 
 
 class Admission(WorkerPlugin):  # type: ignore[misc]
@@ -152,13 +156,15 @@ def unfitness(threads: int, theirs: Mapping[str, str], ours: Mapping[str, str]) 
 
 
 def _set_kernel(client: Client) -> str | None:
-    """Give all workers the fastest BLAS kernel that each supports; return it.
+    """Give all workers the BLAS kernel on which they agree; return it.
 
-    Workers without a nanny keep theirs: `Admission` says so.
+    Workers without a nanny keep theirs: `Admission` says so. Without a worker yet, it is the
+    client's.
     """
-    # Without a worker yet, those to come are taken to be like this machine.
-    supported = client.run(supported_kernel) or {"": supported_kernel()}
-    kernel = common_kernel(supported.values())
+    supported = client.run(supported_kernel)
+    kernel = agreed_kernel(
+        running_kernel(), client.run(running_kernel).values(), supported.values()
+    )
     if kernel is not None:
         client.register_plugin(KernelSetting(kernel))
         return kernel

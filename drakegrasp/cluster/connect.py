@@ -13,7 +13,7 @@ import dask
 from distributed import Client, LocalCluster, SpecCluster
 from distributed.security import Security
 
-from drakegrasp.cluster.admission import SATURATION, local_environment, worker_environment
+from drakegrasp.cluster.admission import SATURATION, worker_environment
 from drakegrasp.errors import MachineError
 from drakegrasp.runtime.allocator import own_environment
 from drakegrasp.runtime.environment import available_cores
@@ -110,17 +110,16 @@ def _connect_remote(
 def _start_local(
     workers: int | None, security: Security | None, memory: str | None
 ) -> Iterator[Client]:
-    with dask.config.set({"distributed.nanny.pre-spawn-environ": local_environment()}):
-        cluster = LocalCluster(
-            n_workers=workers or available_cores(),
-            threads_per_worker=1,
-            dashboard_address="127.0.0.1:0",
-            silence_logs=logging.CRITICAL,
-            security=security,
-            memory_limit=memory or "auto",
-        )
-        with closing_cluster(cluster), Client(cluster) as client:
-            yield client
+    cluster = LocalCluster(
+        n_workers=workers or available_cores(),
+        threads_per_worker=1,
+        dashboard_address="127.0.0.1:0",
+        silence_logs=logging.CRITICAL,
+        security=security,
+        memory_limit=memory or "auto",
+    )
+    with closing_cluster(cluster), Client(cluster) as client:
+        yield client
 
 
 class _RemoteClient(Client):

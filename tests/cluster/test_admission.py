@@ -13,12 +13,16 @@ import pytest
 from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.connect import connect
 from drakegrasp.config import load_config
-from drakegrasp.runtime.kernels import VARIABLE, chosen_kernel, supported_kernel
+from drakegrasp.runtime.blas import running_kernel
+from drakegrasp.runtime.kernels import KERNELS, VARIABLE, chosen_kernel
 
 pytestmark = [
     pytest.mark.cluster,
     pytest.mark.slow,
-    pytest.mark.skipif(supported_kernel() != "Haswell", reason="this CPU has one known kernel"),
+    pytest.mark.skipif(
+        running_kernel() not in KERNELS or running_kernel() == "Prescott",
+        reason="this process must run a known kernel other than Prescott",
+    ),
 ]
 
 
@@ -31,19 +35,18 @@ def test_workers_of_another_kernel_are_restarted_with_the_common_one(
         assert set(client.run(chosen_kernel).values()) == {"Prescott"}
         with admitted_workers(client, load_config()) as kernel:
             client.wait_for_workers(2, timeout=60)
-            assert kernel == "Haswell"
-            assert list(client.run(chosen_kernel).values()) == ["Haswell", "Haswell"]
+            assert kernel == running_kernel()
+            assert list(client.run(running_kernel).values()) == [kernel, kernel]
             assert not set(client.run(os.getpid).values()) & set(before.values())
     assert "last bits" not in capfd.readouterr().err
 
 
-def test_workers_of_the_common_kernel_are_not_restarted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(VARIABLE, raising=False)
+def test_workers_of_the_client_s_kernel_are_not_restarted() -> None:
     with connect(workers=1) as client:
         before = client.run(os.getpid)
         with admitted_workers(client, load_config()) as kernel:
             assert client.run(os.getpid) == before
-            assert list(client.run(chosen_kernel).values()) == [kernel]
+            assert list(client.run(running_kernel).values()) == [kernel]
 
 
 def test_workers_that_join_later_get_the_kernel_or_say_so(
@@ -68,18 +71,18 @@ def test_workers_that_join_later_get_the_kernel_or_say_so(
             connect(scheduler_file=file) as client,
             admitted_workers(client, load_config()) as kernel,
         ):
-            assert kernel == "Haswell"
+            assert kernel == running_kernel()
             for options in (["--nanny"], ["--no-nanny"]):
                 processes.append(
                     subprocess.Popen([*join, *options], env=plain, stderr=subprocess.DEVNULL)
                 )
                 client.wait_for_workers(len(processes) - 1, timeout=60)
-            assert sorted(map(str, client.run(chosen_kernel).values())) == ["Haswell", "Prescott"]
+            assert sorted(client.run(running_kernel).values()) == sorted([kernel, "Prescott"])
             error, end = "", time.monotonic() + 30.0
             while "last bits" not in error and time.monotonic() < end:
                 time.sleep(0.1)
                 error += capfd.readouterr().err
-            assert error.count("runs BLAS kernel Prescott, not Haswell like the others") == 1
+            assert error.count(f"runs BLAS kernel Prescott, not {kernel} like the others") == 1
     finally:
         for process in reversed(processes):
             process.terminate()

@@ -8,12 +8,18 @@ import pytest
 
 from drakegrasp.runtime import kernels
 from drakegrasp.runtime.blas import running_kernel
-from drakegrasp.runtime.kernels import KERNELS, common_kernel, supported_kernel
+from drakegrasp.runtime.kernels import (
+    KERNELS,
+    agreed_kernel,
+    common_kernel,
+    supported_kernel,
+)
 
 
 @pytest.mark.parametrize(
     ("flags", "kernel"),
     [
+        ("fpu avx fma avx2 avx512f avx512cd avx512bw avx512dq avx512vl", "SkylakeX"),
         ("fpu sse2 pni avx fma avx2 avx512f", "Haswell"),
         ("fpu sse2 pni avx avx2", "Prescott"),  # without fused multiply-add
         ("fpu sse2 pni avx fma", "Prescott"),
@@ -42,11 +48,29 @@ def test_other_machines_support_no_known_kernel(
 
 
 def test_common_kernel_is_the_slowest() -> None:
-    fast, slow = KERNELS
+    fast, *_, slow = KERNELS
     assert common_kernel([fast, fast]) == fast
     assert common_kernel([fast, slow, fast]) == slow
     assert common_kernel([fast, None]) is None
     assert common_kernel([]) is None
+
+
+@pytest.mark.parametrize(
+    ("ours", "running", "supported", "agreed"),
+    [
+        ("SkylakeX", ["SkylakeX"] * 2, ["SkylakeX"] * 2, "SkylakeX"),
+        ("Cooperlake", ["Cooperlake"], ["SkylakeX"], "Cooperlake"),  # nothing to set
+        ("Haswell", ["SkylakeX"], ["SkylakeX"], "Haswell"),  # the client's, though slower
+        ("SkylakeX", ["SkylakeX", "Haswell"], ["SkylakeX", "Haswell"], "Haswell"),
+        ("Cooperlake", ["SkylakeX", "Haswell"], ["SkylakeX", "Haswell"], "Haswell"),
+        ("Haswell", ["Haswell", "ThunderX"], ["Haswell", None], None),
+        ("Haswell", [], [], "Haswell"),
+    ],
+)
+def test_workers_agree_on_the_kernel_of_the_client_where_they_can(
+    ours: str, running: list[str], supported: list[str | None], agreed: str | None
+) -> None:
+    assert agreed_kernel(ours, running, supported) == agreed
 
 
 def test_running_kernel_has_a_name() -> None:
