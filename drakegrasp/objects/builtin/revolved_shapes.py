@@ -21,6 +21,8 @@ def bottle(*, radius: float, height: float, neck_radius: float) -> trimesh.Trime
     All lengths are in [m].
     """
     shoulder, neck, cap = 0.58 * height, 0.78 * height, 0.9 * height
+
+    # From the bottom up: body, shoulder, neck and cap.
     side = np.vstack(
         [
             resample([*bevelled(radius, height, 0.004)[:2], (radius, shoulder)], EDGE),
