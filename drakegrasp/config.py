@@ -63,7 +63,7 @@ MAX_COARSE_STEP = 0.06
 
 
 class PhysicsConfig(_Section):
-    """Contact and time stepping; reasons and sources in docs/physics.md."""
+    """Contact and time stepping; reasons and sources in docs/explanation/physics.md."""
 
     time_step: Annotated[float, Field(gt=0.0, le=0.02)] = 0.008  # [s]
     coarse_steps: Annotated[int, Field(ge=1, le=8)] = 3  # time steps in one coarse step of a lift
@@ -120,7 +120,7 @@ class CandidateConfig(_Section):
 
 
 class ScreenConfig(_Section):
-    """Attempts that geometry decides without a simulation; see docs/performance.md."""
+    """Attempts that geometry decides without a simulation; see docs/explanation/screening.md."""
 
     mode: Literal["on", "off"] = "on"  # "off" simulates every attempt, from the open hand
     start_margin: Positive = 0.0025  # [m], deeper penetration at the start is a certain collision
@@ -158,7 +158,7 @@ class LiftConfig(_Section):
 
 
 class CertifyConfig(_Section):
-    """How robust each success is; see docs/performance.md."""
+    """How robust each success is; see docs/explanation/physics.md."""
 
     repeats: NonNegativeCount = 0  # with noise, of each success; 0 switches certification off
     palm_noise: NonNegative = 0.002  # [m], standard deviation along each axis of the palm
@@ -169,7 +169,7 @@ class CertifyConfig(_Section):
 
 
 class CameraConfig(_Section):
-    """The two cameras; see docs/frames-and-units.md."""
+    """The two cameras; see docs/reference/frames-and-units.md."""
 
     distance: Positive = 0.25  # [m] behind the palm along -Gz (paper)
     size: Annotated[int, Field(ge=8, le=2048)] = 128  # [px], square images
@@ -201,7 +201,7 @@ class SplitConfig(_Section):
 
 
 class VerifyConfig(_Section):
-    """Limits for a predicted grasp; see docs/verification.md."""
+    """Limits for a predicted grasp; see docs/how-to/verify-predictions.md."""
 
     max_surface_distance: Positive = 0.01  # [m], of a predicted point from the object's surface
     max_residual: Positive = 0.008  # [m], of a fingertip from its point before closing

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import re
+import shlex
+from collections.abc import Iterator
 from pathlib import Path
 
+import click
 import dataset_format
 import pytest
+from helpers.scripts import load_script
 
 from drakegrasp.cli.main import main
+from drakegrasp.config import Config
 from drakegrasp.dataset.schema import (
     DATA_FIELDS,
     LOOK_FIELDS,
@@ -28,21 +33,47 @@ TABLES = (
     SUCCESS_FIELDS,
     VERIFICATION_FIELDS,
 )
-DOCS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+FORMAT_PAGE = ROOT / "docs" / "reference" / "dataset-format.md"
+COMMAND_PAGE = ROOT / "docs" / "reference" / "command-line.md"
+CONFIG_PAGE = ROOT / "docs" / "reference" / "configuration.md"
+DOCS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+#: Lines of the README, whose reader has a few minutes.
+README_LINES = 120
+SUBMIT = "pipelines/submit_build.py"
+
+
+def page_id(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
+
+
+def read(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """Return the code blocks of a page that are marked with a language; "" for plain ones."""
+    fences = re.findall(r"^```(\w*)\n(.*?)^```$", read(page), flags=re.DOTALL | re.MULTILINE)
+    return [block for name, block in fences if name == language]
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the anchors that GitHub gives a page's headings."""
+    prose = re.sub(r"^```.*?^```", "", read(page), flags=re.DOTALL | re.MULTILINE)
+    headings = re.findall(r"^#+ (.*)$", prose, flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", head.lower()).strip().replace(" ", "-") for head in headings}
 
 
 def test_format_page_is_what_the_schema_says(tmp_path: Path) -> None:
-    page = ROOT / "docs" / "reference" / "dataset-format.md"
-    assert dataset_format.main(["--check", str(page)]) == 0
+    assert dataset_format.main(["--check", str(FORMAT_PAGE)]) == 0
     stale = tmp_path / "page.md"
-    stale.write_text(page.read_text(encoding="utf-8").replace("float64", "float16"))
+    stale.write_text(read(FORMAT_PAGE).replace("float64", "float16"), encoding="utf-8")
     assert dataset_format.main(["--check", str(stale)]) == 1
     assert dataset_format.main([str(stale)]) == 0
-    assert stale.read_bytes() == page.read_bytes()
+    assert stale.read_bytes() == FORMAT_PAGE.read_bytes()
 
 
 def test_every_field_is_on_the_format_page() -> None:
-    text = (ROOT / "docs" / "reference" / "dataset-format.md").read_text(encoding="utf-8")
+    text = read(FORMAT_PAGE)
     for field in (field for table in TABLES for field in table):
         assert f"`{field.name}`" in text
     for outcome in Outcome:
@@ -57,41 +88,158 @@ def test_field_names_are_unique_in_their_table() -> None:
         assert len(names) == len(set(names))
 
 
-@pytest.mark.parametrize("page", DOCS, ids=lambda p: p.name)
+@pytest.mark.parametrize("page", DOCS, ids=page_id)
 def test_links_lead_somewhere(page: Path) -> None:
-    targets = re.findall(r"\]\((?!https?://)([^)#]+)", page.read_text(encoding="utf-8"))
-    missing = [t for t in targets if not (page.parent / t).exists()]
+    missing = []
+    for path, anchor in re.findall(r"\]\((?!https?://)([^)#]*)#?([^)]*)\)", read(page)):
+        target = page.parent / path if path else page
+        if not target.exists() or (anchor and anchor not in anchors(target)):
+            missing.append(f"{path}#{anchor}")
     assert not missing
 
 
-@pytest.mark.parametrize("page", DOCS, ids=lambda p: p.name)
-def test_commands_in_the_docs_exist(page: Path) -> None:
-    text = page.read_text(encoding="utf-8")
-    for command in re.findall(r"^drakegrasp ([a-z]+)", text, flags=re.MULTILINE):
-        assert command in main.commands
+def test_every_page_is_reached_from_the_index() -> None:
+    index = read(ROOT / "docs" / "index.md")
+    pages = {page.relative_to(ROOT / "docs").as_posix() for page in DOCS if page.parent != ROOT}
+    assert {page for page in pages if f"]({page})" not in index} == {"index.md"}
+
+
+def test_pages_that_the_code_names_exist() -> None:
+    files = [ROOT / "Makefile", ROOT / "CHANGELOG.md"]
+    for folder in ("drakegrasp", "pipelines", "tests"):
+        files += [p for p in (ROOT / folder).rglob("*") if p.suffix in (".py", ".sh", ".yaml")]
+    named = {
+        (path.name, page)
+        for path in files
+        for page in re.findall(r"docs/[\w/-]+\.md", path.read_text(encoding="utf-8"))
+    }
+    assert named
+    assert not {(name, page) for name, page in named if not (ROOT / page).is_file()}
+
+
+@pytest.mark.parametrize("page", DOCS, ids=page_id)
+def test_files_that_the_docs_name_exist(page: Path) -> None:
+    """A module is named by its path below the package, a test by its file's name alone."""
+    tests = {path.name for path in (ROOT / "tests").rglob("*.py")}
+    named = set(re.findall(r"`([\w/]+\.(?:py|sh|sbatch))`", read(page)))
+    missing = {
+        name
+        for name in named - tests
+        if not any((base / name).is_file() for base in _bases(page, name))
+    }
+    assert not missing
+
+
+def _bases(page: Path, name: str) -> list[Path]:
+    """Return the folders in which a file that the docs name may lie."""
+    package = ROOT / "drakegrasp"
+    # Pages on one room, and the recipes beside the scripts, name files by less.
+    rooms = [package / "verification"] if page.stem == "wrist-problem" else []
+    return [ROOT, package, ROOT / "pipelines" / "recipes", *rooms]
+
+
+def commands() -> dict[str, click.Command]:
+    """Return the commands that have a section on their page."""
+    return {**main.commands, SUBMIT: load_script("submit_build").main}
+
+
+def command_lines(page: Path) -> Iterator[tuple[click.Command, list[str]]]:
+    """Yield the commands of a page's plain code blocks with their arguments."""
+    text = "\n".join(blocks(page, "")).replace("\\\n", " ")
+    for name, rest in re.findall(r"^drakegrasp ([a-z]+)(.*)", text, re.M):
+        yield main.commands[name], shlex.split(rest, comments=True)
+    for script, rest in re.findall(r"^python pipelines/([\w/]+)\.py(.*)", text, re.M):
+        command = load_script(script).main
+        if isinstance(command, click.Command):  # the others read their options with argparse
+            yield command, shlex.split(rest, comments=True)
+
+
+def options_of(command: click.Command) -> set[str]:
+    options = {o for p in command.params for o in p.opts if isinstance(p, click.Option)}
+    return options | {"--help", "-h"}
+
+
+@pytest.mark.parametrize("page", DOCS, ids=page_id)
+def test_commands_and_options_in_the_docs_exist(page: Path) -> None:
+    for name in re.findall(r"`drakegrasp ([a-z]+)", read(page)):
+        assert name in main.commands
+    for command, words in command_lines(page):
+        unknown = {word for word in words if word.startswith("-")} - options_of(command)
+        assert not unknown, f"{command.name} {words}"
+
+
+def test_docs_name_commands() -> None:
+    """Else the test above would be of nothing."""
+    assert len([line for page in DOCS for line in command_lines(page)]) > 20
+
+
+def test_the_command_page_has_every_command_and_its_options() -> None:
+    sections = dict(re.findall(r"^## (\S+)\n(.*?)(?=^## |\Z)", read(COMMAND_PAGE), re.M | re.S))
+    assert list(sections) == list(commands())
+    shared = options_of(main.commands["build"])
+    for name, command in commands().items():
+        named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", sections[name]))
+        options = options_of(command) - {"--help", "-h"}
+        assert named <= options | shared, name
+        # The script takes the options of a build, which its section refers to.
+        assert options <= named | (shared if name == SUBMIT else set()), name
+
+
+def test_the_configuration_page_has_every_setting() -> None:
+    text = read(CONFIG_PAGE)
+    sections = dict(re.findall(r"^## ([\w*, ]+)\n(.*?)(?=^## |\Z)", text, re.M | re.S))
+    named = {
+        (heading.replace("*", ""), key)
+        for heading, table in sections.items()
+        for row in re.findall(r"^\| (`[^|]*)\|", table, re.M)
+        for key in re.findall(r"`([\w.]+)`", row)
+    }
+    on_page = set()
+    for heading, key in named:
+        if heading == "Top level":
+            on_page.add(key)
+        elif heading != "Presets":
+            on_page.add(key if "." in key else f"{heading.strip()}.{key}")
+    settings = set()
+    for name, value in Config().to_dict().items():
+        settings |= {f"{name}.{key}" for key in value} if isinstance(value, dict) else {name}
+    assert on_page == settings
+
+
+def test_the_readme_is_short() -> None:
+    assert len(read(ROOT / "README.md").splitlines()) <= README_LINES
 
 
 @pytest.mark.sim
 @pytest.mark.slow
-def test_session_of_the_readme_runs(
-    small_dataset: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("page", [page for page in DOCS if blocks(page, "python")], ids=page_id)
+def test_python_of_the_docs_runs(
+    page: Path,
+    small_dataset: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """All but the build itself, and then what is done with predictions, on the small dataset."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    session, predictions = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
-    lines = [line for line in session.splitlines() if not line.startswith("dg.build_dataset")]
-    assert len(session.splitlines()) == len(lines) + 1
-    monkeypatch.chdir(small_dataset.parent)
+    """All blocks of a page, one after the other as a reader would, on the small dataset.
+
+    Blocks marked `py` in place of `python` need a cluster, training, or a file of the reader.
+    """
+    (tmp_path / "demo").mkdir()
+    for name in ("OUT", "demo/dataset"):
+        (tmp_path / name).symlink_to(small_dataset, target_is_directory=True)
+    monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
-    code = "\n".join([*lines, predictions]).replace('"OUT', '"out')
-    try:
-        exec(compile(code, "README.md", "exec"), names)
-        assert Path("grasp.html").stat().st_size > 1_000_000
-        assert Path("grasp.png").read_bytes().startswith(b"\x89PNG")
-    finally:
-        for made in ("grasp.html", "grasp.png"):
-            Path(made).unlink(missing_ok=True)
-    replayed, verdict, explanation = capsys.readouterr().out.splitlines()[-3:]
-    assert replayed == "True"
-    assert verdict.split()[0] in ("True", "False")
-    assert explanation.startswith("The grasp of ")
+    for block in blocks(page, "python"):
+        # A build takes hours; its result is there.
+        lines = [line for line in block.splitlines() if not line.startswith("dg.build_dataset")]
+        exec(compile("\n".join(lines), page_id(page), "exec"), names)
+    for figure in tmp_path.glob("*.png"):
+        assert figure.read_bytes().startswith(b"\x89PNG")
+    for recording in tmp_path.glob("*.html"):
+        assert recording.stat().st_size > 1_000_000
+    if page.name == "README.md":
+        replayed, verdict, explanation = capsys.readouterr().out.splitlines()[-3:]
+        assert replayed == "True"
+        assert verdict.split()[0] in ("True", "False")
+        assert explanation.startswith("The grasp of ")
+        assert {path.name for path in tmp_path.iterdir()} >= {"grasp.html", "grasp.png"}

@@ -1,8 +1,8 @@
-"""Throughput of this machine: what attempts cost, stage by stage, in this process alone.
+"""Measures what attempts cost on this machine, stage by stage, in this process alone.
 
-In: meshes and a configuration. Out: plain data for a JSON file. Costs are seconds of a core
-(CPU time of this process), so that other work on the machine disturbs them as little as
-possible; preparing an object is told apart, because a dataset does it once.
+In: meshes and a configuration. Out: plain data for a JSON file. Costs are seconds of CPU time
+of this process, so that other work on the machine disturbs them as little as possible. The
+cost of preparing an object is counted apart, because a dataset pays it once.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from drakegrasp.build.attempts import Workbench, predict_all, try_on
+from drakegrasp.build.attempts import TrialSetup, predict_attempts, try_attempt
 from drakegrasp.build.prepare import prepare
-from drakegrasp.build.work_unit import look_at_successes
+from drakegrasp.build.work_unit import render_successes
 from drakegrasp.config import Config, override_config
 from drakegrasp.dataset.manifest import installed_versions
 from drakegrasp.dataset.prepared_objects import PreparedObject
@@ -36,23 +36,26 @@ from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.runtime.allocator import allocator
 from drakegrasp.runtime.blas import one_thread
 from drakegrasp.runtime.progress import Report, silent
+from drakegrasp.runtime.timing import timed
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.candidates import Attempt, make_attempts
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.screen import Prediction
 from drakegrasp.simulation.trial import TrialRecord
 
-#: Attempts from one report of progress to the next.
+#: Attempts between two reports of progress.
 STRIDE = 50
+#: Other work on the machine disturbs CPU time less than the wall clock.
+_cpu_timed = partial(timed, clock=time.process_time)
 
 
 @dataclass(frozen=True)
 class Variant:
-    """Another way to simulate an attempt, by which labels are judged.
+    """Another way to simulate the same attempts, with which their labels are compared.
 
     Attributes:
-        overrides: Of the configuration; `{half}` stands for half of its time step.
-        fine: Whether each face of the object is cut into four, so that edges are half as long.
+        overrides: Changes of the configuration; `{half}` stands for half of its time step.
+        fine: Whether to cut each face of the object into four, so that edges are half as long.
     """
 
     overrides: tuple[str, ...] = ()
@@ -74,29 +77,29 @@ def measure(
     config: Config,
     *,
     sample: int = 0,
-    peer: bool = False,
+    mujoco: bool = False,
     progress: Report = silent,
 ) -> Iterator[dict[str, Any]]:
-    """Yield what was measured on each object, see `docs/performance.md`.
+    """Yield the measurements of each object, see `docs/benchmarks.md`.
 
     Args:
         sources: The meshes.
         config: What to run; `candidates.max` says how much.
-        sample: Attempts per object that are run again in other ways for `fidelity`, drawn
-            with the seed from those whose palm ray meets the object.
-        peer: Whether to run all attempts in MuJoCo as well; needs the extra `[peer]`.
-        progress: Called with the attempts that are done, as far as objects are known.
+        sample: Attempts per object that are simulated again by each variant, drawn with the
+            seed from those whose palm ray meets the object.
+        mujoco: Whether to run all attempts in MuJoCo as well; needs the extra `[peer]`.
+        progress: Called with the number of attempts done and the estimated number in all.
 
     Raises:
         MeshError: If a mesh cannot be prepared.
     """
-    counter = _Counter(progress, len(sources), (2 if peer else 1), sample)
+    counter = _Counter(progress, len(sources), (2 if mujoco else 1), sample)
     for source in sources:
-        yield _measure_object(source, config, sample, peer, counter)
+        yield _measure_object(source, config, sample, mujoco, counter)
 
 
 class _Counter:
-    """Counts attempts for the progress; objects to come count as those before did."""
+    """Counts attempts for the progress bar; estimates the total from the objects so far."""
 
     def __init__(self, progress: Report, objects: int, runs: int, sample: int) -> None:
         self._progress, self._objects, self._runs, self._sample = progress, objects, runs, sample
@@ -118,16 +121,12 @@ class _Counter:
 
 def summarize(objects: Sequence[dict[str, Any]], config: Config) -> dict[str, Any]:
     """Return the whole report: machine, versions, each object and all together."""
-    outcomes: Counter[str] = Counter()
-    seconds: Counter[str] = Counter()
-    for found in objects:
-        outcomes.update(found["outcomes"])
-        seconds.update(found["seconds"])
-    total = {"objects": len(objects), **_rates(outcomes, seconds)}
-    if any("fidelity" in found for found in objects):
-        total["fidelity"] = _add_fidelity([found["fidelity"] for found in objects])
-    if any("peer" in found for found in objects):
-        total["peer"] = _add_peer([found["peer"] for found in objects])
+    total = {"objects": len(objects), **_sum_rates(objects)}
+    if any("fidelity" in report for report in objects):
+        total["fidelity"] = _sum_fidelity([report["fidelity"] for report in objects])
+    if any("peer" in report for report in objects):
+        total["peer"] = _sum_baseline([report["peer"] for report in objects])
+
     return {
         "all": total,
         "objects": list(objects),
@@ -143,13 +142,13 @@ def compare(now: dict[str, Any], then: dict[str, Any]) -> dict[str, float | None
     """Return the ratio of each rate to that of an earlier report; None where that was zero.
 
     Raises:
-        DataError: If the reports are not of as many attempts at the same objects.
+        DataError: If the reports differ in objects, or in the attempts of one.
     """
-    tried = [{o["name"]: o["attempts"] for o in report["objects"]} for report in (now, then)]
-    odd = sorted(name for name, _ in tried[0].items() ^ tried[1].items())
-    if odd:
+    attempts = [{o["name"]: o["attempts"] for o in report["objects"]} for report in (now, then)]
+    different = sorted(name for name, _ in attempts[0].items() ^ attempts[1].items())
+    if different:
         raise DataError(
-            f"reports must be of the same attempts to be compared, got other ones of {odd[0]}"
+            f"reports must be of the same attempts to be compared, got others of {different[0]}"
         )
     keys = ("resolved_per_core_second", "grasps_per_core_hour")
     return {key: now["all"][key] / old if (old := then["all"][key]) else None for key in keys}
@@ -157,46 +156,56 @@ def compare(now: dict[str, Any], then: dict[str, Any]) -> dict[str, float | None
 
 @one_thread
 def _measure_object(
-    source: MeshSource, config: Config, sample: int, peer: bool, counter: _Counter
+    source: MeshSource, config: Config, sample: int, mujoco: bool, counter: _Counter
 ) -> dict[str, Any]:
+    """Return the measurements of one object."""
+    # Prepare the object and list its attempts, as a build does.
     seconds: dict[str, float] = {}
-    with _timed(seconds, "prepare"):
+    with _cpu_timed(seconds, "prepare"):
         prepared = prepare(source, config)
     attempts = _attempts(prepared, config)
     hits = [row for row, attempt in enumerate(attempts) if attempt.ray_hits]
     counter.begin(len(attempts), len(hits))
-    with _timed(seconds, "scene"):
+
+    # Build what all attempts share, and screen them by geometry.
+    with _cpu_timed(seconds, "scene"):
         scene = build_scene(prepared.model, config.physics, load_hand(config.hand))
-        bench = Workbench(prepared=prepared, config=config, scene=scene)
-    with _timed(seconds, "field"):
+        bench = TrialSetup(prepared=prepared, config=config, scene=scene)
+    with _cpu_timed(seconds, "field"):
         _ = prepared.model.field
-    with _timed(seconds, "screen"):
-        predictions = predict_all(bench, attempts)
+    with _cpu_timed(seconds, "screen"):
+        predictions = predict_attempts(bench, attempts)
+
+    # Simulate what is left, and render the successes.
     records: list[TrialRecord] = []
     for attempt, prediction in zip(attempts, predictions, strict=True):
-        with _timed(seconds, "try"):
-            records.append(try_on(bench, attempt, prediction))
+        with _cpu_timed(seconds, "try"):
+            records.append(try_attempt(bench, attempt, prediction))
         counter.add(records[-1].outcome)
-    with _timed(seconds, "look"):
-        look_at_successes(bench, records)
-    found = {
+    with _cpu_timed(seconds, "look"):
+        render_successes(bench, records)
+
+    report = {
         "name": source.name,
         "faces": len(prepared.model.collision_faces),
         "candidates": len(prepared.candidates),
         **_rates(Counter(record.outcome.label for record in records), seconds),
         "peak_memory": _peak_memory(),
     }
-    if peer:
-        found["peer"] = _run_peer(prepared, attempts, config, counter)
-        ours, theirs = found["grasps_per_core_hour"], found["peer"]["grasps_per_core_hour"]
-        found["peer"]["ratio"] = ours / theirs if theirs else None
+
+    # Run the same attempts in MuJoCo, and some of them by the variants.
+    if mujoco:
+        baseline = _run_baseline(prepared, attempts, config, counter)
+        theirs = baseline["grasps_per_core_hour"]
+        ratio = report["grasps_per_core_hour"] / theirs if theirs else None
+        report["peer"] = {**baseline, "ratio": ratio}
     if sample:
         rows = [hits[k] for k in Stream(config.seed).permutation(len(hits))[:sample]]
-        found["fidelity"] = {
+        report["fidelity"] = {
             name: _compare_labels(bench, attempts, records, predictions, rows, variant, counter)
             for name, variant in VARIANTS.items()
         }
-    return found
+    return report
 
 
 def _attempts(prepared: PreparedObject, config: Config) -> list[Attempt]:
@@ -217,37 +226,44 @@ def _rates(outcomes: Counter[str], seconds: Mapping[str, float]) -> dict[str, An
     }
 
 
-def _run_peer(
-    prepared: PreparedObject, attempts: Sequence[Attempt], config: Config, counter: _Counter
-) -> dict[str, Any]:
-    """Return what MuJoCo makes of the same attempts; cutting the object into parts is prepared."""
-    from drakegrasp.bench.mujoco_baseline import Peer
-
-    seconds: dict[str, float] = {}
-    with _timed(seconds, "prepare"):
-        peer = Peer(prepared.model, prepared.X_TO, config)
-    outcomes: Counter[str] = Counter()
-    for attempt in attempts:
-        with _timed(seconds, "try"):
-            outcome = peer.run(attempt)
-        outcomes[outcome.label] += 1
-        counter.add(outcome)
-    return {"parts": peer.parts, **_rates(outcomes, seconds)}
-
-
-def _add_peer(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _sum_rates(reports: Sequence[dict[str, Any]]) -> dict[str, Any]:
     outcomes: Counter[str] = Counter()
     seconds: Counter[str] = Counter()
-    for each in found:
-        outcomes.update(each["outcomes"])
-        seconds.update(each["seconds"])
-    ratios = [each["ratio"] for each in found if each["ratio"] is not None]
+    for report in reports:
+        outcomes.update(report["outcomes"])
+        seconds.update(report["seconds"])
+    return _rates(outcomes, seconds)
+
+
+def _run_baseline(
+    prepared: PreparedObject, attempts: Sequence[Attempt], config: Config, counter: _Counter
+) -> dict[str, Any]:
+    """Return the outcomes and costs of the same attempts in MuJoCo.
+
+    Cutting the object into convex parts counts as preparing it.
+    """
+    from drakegrasp.bench.mujoco_baseline import MujocoBaseline
+
+    seconds: dict[str, float] = {}
+    with _cpu_timed(seconds, "prepare"):
+        baseline = MujocoBaseline(prepared.model, prepared.X_TO, config)
+    outcomes: Counter[str] = Counter()
+    for attempt in attempts:
+        with _cpu_timed(seconds, "try"):
+            outcome = baseline.run(attempt)
+        outcomes[outcome.label] += 1
+        counter.add(outcome)
+    return {"parts": baseline.parts, **_rates(outcomes, seconds)}
+
+
+def _sum_baseline(reports: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    ratios = [report["ratio"] for report in reports if report["ratio"] is not None]
     middle = median(ratios) if ratios else None
-    return {**_rates(outcomes, seconds), "median_ratio": middle, "ratios": len(ratios)}
+    return {**_sum_rates(reports), "median_ratio": middle, "ratios": len(ratios)}
 
 
 def _compare_labels(
-    bench: Workbench,
+    bench: TrialSetup,
     attempts: Sequence[Attempt],
     records: Sequence[TrialRecord],
     predictions: Sequence[Prediction | None],
@@ -256,23 +272,27 @@ def _compare_labels(
     counter: _Counter,
 ) -> dict[str, int]:
     """Return counts for one variant over some of an object's attempts."""
+    # The screen works on the original surface, also if the variant has finer faces.
     half = bench.config.physics.time_step / 2.0
     other = override_config(bench.config, [t.format(half=half) for t in variant.overrides])
-    some = [attempts[row] for row in rows]
-    # What geometry says is asked of the same surface, however fine its faces are.
-    seen = predict_all(replace(bench, config=other), some)
+    sample = [attempts[row] for row in rows]
+    other_predictions = predict_attempts(replace(bench, config=other), sample)
+
+    # The scene is the variant's.
     prepared = bench.prepared
     if variant.fine:
         prepared = replace(prepared, model=_finer(prepared.model))
     scene = build_scene(prepared.model, other.physics, load_hand(other.hand))
-    bench = Workbench(prepared=prepared, config=other, scene=scene)
+    bench = TrialSetup(prepared=prepared, config=other, scene=scene)
+
+    # Pairs of outcomes, the first as measured; whether geometry decided the first.
     pairs, decided = [], []
-    for row, attempt, prediction in zip(rows, some, seen, strict=True):
-        outcome = try_on(bench, attempt, prediction).outcome
+    for row, attempt, prediction in zip(rows, sample, other_predictions, strict=True):
+        outcome = try_attempt(bench, attempt, prediction).outcome
         counter.add(outcome)
         pairs.append((records[row].outcome, outcome))
-        said = predictions[row]
-        decided.append(said is not None and said.outcome is not None)
+        first = predictions[row]
+        decided.append(first is not None and first.outcome is not None)
     return _count(pairs, decided)
 
 
@@ -283,9 +303,14 @@ def _finer(model: ObjectModel) -> ObjectModel:
 
 
 def _count(pairs: Sequence[tuple[Outcome, Outcome]], decided: Sequence[bool]) -> dict[str, int]:
-    """Return counts of pairs of verdicts: as measured, where geometry decided, and otherwise."""
+    """Return how often labels differ, from pairs of outcomes: as measured, by the variant.
+
+    Args:
+        pairs: The outcomes.
+        decided: Whether geometry alone decided the first outcome of each pair.
+    """
     success = Outcome.SUCCESS
-    # What geometry said instead of the simulation is no other label.
+    # Screened attempts stand for missing fingertips, so the two are the same label.
     alike = {Outcome.SCREENED: Outcome.MISSING_FINGERTIP}
     flips = [(a, b) for a, b in pairs if alike.get(a, a) is not alike.get(b, b)]
     both = list(zip(pairs, decided, strict=True))
@@ -301,23 +326,25 @@ def _count(pairs: Sequence[tuple[Outcome, Outcome]], decided: Sequence[bool]) ->
     }
 
 
-def _add_fidelity(found: Sequence[dict[str, dict[str, int]]]) -> dict[str, dict[str, Any]]:
-    added: dict[str, dict[str, Any]] = {}
+def _sum_fidelity(reports: Sequence[dict[str, dict[str, int]]]) -> dict[str, dict[str, Any]]:
+    sums: dict[str, dict[str, Any]] = {}
     for name in VARIANTS:
         counts: Counter[str] = Counter()
-        for each in found:
-            counts.update(each[name])
+        for report in reports:
+            counts.update(report[name])
         flips = counts["flips"]
-        added[name] = {
+        sums[name] = {
             **counts,
             "flip_share": flips / max(1, counts["attempts"]),
             "flip_share_of_simulated": flips / max(1, counts["simulated"]),
         }
-    off = added["screen_off"]
+
+    # Without the screen, the successes show what the screen loses.
+    off = sums["screen_off"]
     lost, successes = off["successes_lost_by_screen"], off["successes_other"]
     off["recall"] = 1.0 - lost / successes if successes else None
     off["precision"] = 1.0 - lost / off["decided"] if off["decided"] else None
-    return added
+    return sums
 
 
 def _peak_memory() -> int:
@@ -332,10 +359,3 @@ def _cpu() -> str:
         return next(line.partition(":")[2].strip() for line in lines if "model name" in line)
     except (OSError, StopIteration):
         return platform.processor() or platform.machine()
-
-
-@contextmanager
-def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    start = time.process_time()
-    yield
-    seconds[stage] = seconds.get(stage, 0.0) + time.process_time() - start

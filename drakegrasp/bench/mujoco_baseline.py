@@ -1,9 +1,9 @@
-"""The same attempts in MuJoCo, plainly simulated: what Drake's speed is measured against.
+"""Simulates the same attempts in MuJoCo, as a baseline for Drake's speed.
 
-In: a prepared object and attempts. Out: their outcomes. MuJoCo knows only convex shapes, so the
-object is cut into convex parts (CoACD), and contacts are points. Nothing is screened and nothing
-is rendered; else the trial is that of `drakegrasp.simulation.trial`, with the same hand. Needs the
-extra `[peer]`.
+In: a prepared object and attempts. Out: their outcomes. MuJoCo collides convex shapes only, so
+the object is cut into convex parts (CoACD), and contacts are points. No attempt is screened and
+no image is rendered. Otherwise the trial is that of `drakegrasp.simulation.trial`, with the same
+hand. Needs the extra `[peer]`.
 """
 
 from __future__ import annotations
@@ -37,24 +37,26 @@ from drakegrasp.simulation.verdict import judge_closed, judge_lifted
 
 #: Time step [s].
 TIME_STEP = 0.002
-#: Largest concavity of a convex part, and the most corners that one may have.
+#: Largest concavity of a convex part, and the largest number of its corners.
 CONCAVITY, CORNERS = 0.05, 24
-#: Gains of the wrist [N/m], [N s/m], and of the fingers' speed [N m s/rad].
+#: Stiffness [N/m] and damping [N s/m] of the wrist, and gain of the fingers' speed [N m s/rad].
 WRIST_STIFFNESS, WRIST_DAMPING, FINGER_DAMPING = 2e4, 400.0, 5.0
-#: Of the bodies that carry the wrist [kg], [kg m^2], and of joints for their stability.
+#: Mass [kg] and inertia [kg m^2] of the bodies that carry the wrist, and a small inertia of the
+#: rotors [kg m^2] that keeps joints stable.
 CARRIER_MASS, CARRIER_INERTIA, ARMATURE = 0.01, 1e-5, 2e-4
-#: Steps between two looks while closing, and while lifting.
+#: Time steps between two checks while closing, and while lifting.
 CLOSING_STRIDE, LIFTING_STRIDE = 25, 50
-#: Fingers start from rest, so for so long [s] their standing still means nothing.
+#: Fingers start from rest, so slow fingers have stopped only after this time [s].
 STARTING = 0.3
 #: Mean speed of the lift [m/s], and its least duration [s].
 LIFT_SPEED, LIFT_TIME = 0.3, 1.0
-#: Friction against turning and rolling [m], MuJoCo's own defaults.
+#: Torsional and rolling friction [m], MuJoCo's defaults.
 TURNING, ROLLING = 0.005, 0.0001
-_HAND, _OBJECT, _TABLE = 1, 2, 4  # bits: what may touch what
+#: Bits of MuJoCo's collision masks.
+_HAND, _OBJECT, _TABLE = 1, 2, 4
 
 
-class Peer:
+class MujocoBaseline:
     """One object, the table and the hand in MuJoCo.
 
     Attributes:
@@ -67,21 +69,24 @@ class Peer:
         Args:
             model: The object.
             X_TO: Its resting pose, (4, 4).
-            config: The rules; friction, closing and the lift's target are taken from it.
+            config: The configuration; gives hand, friction, closing and the lift's target.
         """
         self._config, self._hand = config, load_hand(config.hand)
+        self._X_WO = X_WT @ X_TO
+
         parts = _convex_parts(model)
         self.parts = len(parts)
         spec = _spec()
         _add_table(spec, config)
         _add_object(spec, model, parts, config)
-        self._X_WO = X_WT @ X_TO
         self._joints = _add_hand(spec, self._hand, config)
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
+
         self._find_addresses()
 
     def _find_addresses(self) -> None:
+        """Look up where bodies and joints are in MuJoCo's arrays."""
         m, hand = self._model, self._hand
         self._object, self._palm = m.body("object").id, m.body(hand.palm_link).id
         self._tips = {m.body(finger.fingertip).id for finger in hand.fingers}
@@ -93,7 +98,8 @@ class Peer:
         self._X_GB = np.linalg.inv(hand.X_BG)
 
     def run(self, attempt: Attempt) -> Outcome:
-        """Return what happens when the hand tries one attempt."""
+        """Return the outcome of one attempt."""
+        # Palm pose and start, as in a trial.
         if not attempt.ray_hits:
             return Outcome.RAY_MISS
         X_WG = self._X_WO @ attempt.X_OG
@@ -104,37 +110,46 @@ class Peer:
         links, hand_on_table, _ = self._touching()
         if links or hand_on_table:
             return Outcome.START_COLLISION
+
+        # Close on the clamped object and judge the contacts.
         self._close(start)
         links, hand_on_table, _ = self._touching()
         verdict = judge_closed(*self._held_by(links), hand_on_table)
         if verdict != Outcome.SUCCESS:
             return Outcome(int(verdict))
+
+        # Lift: the wrist is commanded by B's origin, and the target is the palm's.
         X_BG = self._hand.X_BG
         target = X_WT[:3, 3] + self._config.lift.p_TG
         return self._lift(start, target - (X_WG[:3, :3] @ X_BG[:3, :3].T @ X_BG[:3, 3]))
 
     def _reset(self, X_WB: Array, spread: float) -> None:
+        """Put the open hand at its start and the object at rest."""
         m, d = self._model, self._data
         mujoco.mj_resetData(m, d)
+
+        # The wrist has no rotation and the spread is locked, so both turn bodies of the model.
         m.body_quat[self._palm] = _quaternion(X_WB[:3, :3])
         for body, axis, quat in self._joints:
             turn, total = np.zeros(4), np.zeros(4)
             mujoco.mju_axisAngle2Quat(turn, axis, spread)
             mujoco.mju_mulQuat(total, quat, turn)
             m.body_quat[m.body(body).id] = total
+
         d.qpos[self._wrist_q] = X_WB[:3, 3]
         d.qpos[self._object_q : self._object_q + 3] = self._X_WO[:3, 3]
         d.qpos[self._object_q + 3 : self._object_q + 7] = _quaternion(self._X_WO[:3, :3])
         mujoco.mj_forward(m, d)
 
     def _close(self, p_WB: Array) -> None:
+        """Close the fingers on the object, which is held in place, until they stop."""
         m, d = self._model, self._data
         d.ctrl[:3], d.ctrl[3:] = p_WB, self._hand.closing_speed
         q, v = self._object_q, self._object_v
-        held, step = d.qpos[q : q + 7].copy(), 0
+        resting, step = d.qpos[q : q + 7].copy(), 0
         while d.time < self._config.close.max_time:
             mujoco.mj_step(m, d)
-            d.qpos[q : q + 7] = held
+            d.qpos[q : q + 7] = resting
             d.qvel[v : v + 6] = 0.0
             step += 1
             if step % CLOSING_STRIDE == 0 and d.time > STARTING:
@@ -143,9 +158,12 @@ class Peer:
                     return
 
     def _lift(self, start: Array, target: Array) -> Outcome:
+        """Lift the wrist from start to target and return the outcome."""
         m, d = self._model, self._data
         duration = max(LIFT_TIME, float(np.linalg.norm(target - start)) / LIFT_SPEED)
         begin, step = d.time, 0
+
+        # A cubic path, at rest at both ends. A dropped object ends the lift.
         while d.time < begin + duration:
             x = min((d.time - begin) / duration, 1.0)
             d.ctrl[:3] = start + (target - start) * (3.0 * x * x - 2.0 * x**3)
@@ -153,6 +171,7 @@ class Peer:
             step += 1
             if step % LIFTING_STRIDE == 0 and not self._touching()[0]:
                 return Outcome.DROPPED
+
         links, _, object_on_table = self._touching()
         return Outcome(int(judge_lifted(*self._held_by(links), object_on_table)))
 
@@ -178,7 +197,7 @@ class Peer:
 
 
 def _convex_parts(model: ObjectModel) -> list[Array]:
-    """Return the corners (n, 3) in {O} [m] of convex parts that make up an object."""
+    """Return the corners of an object's convex parts, each (n, 3) in {O} [m]."""
     coacd.set_log_level("error")
     mesh = coacd.Mesh(model.visual_vertices, model.visual_faces)
     parts = coacd.run_coacd(mesh, threshold=CONCAVITY, seed=0, max_convex_hull=CORNERS)
@@ -186,6 +205,7 @@ def _convex_parts(model: ObjectModel) -> list[Array]:
 
 
 def _spec() -> mujoco.MjSpec:
+    """Return an empty model with the solver's settings."""
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.compiler.balanceinertia = True
@@ -228,22 +248,26 @@ def _add_object(
 
 
 def _add_hand(spec: mujoco.MjSpec, hand: Hand, config: Config) -> list[tuple[str, Array, Array]]:
-    """Add the hand on its wrist; return body, axis and orientation at zero of the spread's joints.
+    """Add the hand on its wrist; return body, axis and zero orientation of each spread joint.
 
-    The spread is set before an attempt and locked, so its joints are none here: their bodies
-    are turned in the model.
+    The spread is set before an attempt and locked, so the model has no such joints: an attempt
+    turns their bodies.
     """
+    # Drake reads the SDFormat file.
     plant, scene_graph = MultibodyPlant(0.0), SceneGraph()
     plant.RegisterAsSourceForSceneGraph(scene_graph)
     (instance,) = make_parser(plant).AddModels(hand.sdf_path)
     inspector = scene_graph.model_inspector()
-    bodies = _add_wrist(spec)
     add = partial(_add_link, spec, plant, inspector, config.physics.friction_hand)
+
+    # Carriers of the wrist, then the palm, then link by link in the file's order, in which
+    # parents come first.
+    bodies = _add_wrist(spec)
     bodies[hand.palm_link] = add(
         bodies["wrist_z"], plant.GetBodyByName(hand.palm_link, instance), RigidTransform()
     )
     spreads = []
-    for index in plant.GetJointIndices(instance):  # in the file's order: parents come first
+    for index in plant.GetJointIndices(instance):
         joint = plant.get_joint(index)
         parent, child = joint.parent_body().name(), joint.child_body()
         X_PF = joint.frame_on_parent().GetFixedPoseInBodyFrame()
@@ -252,6 +276,7 @@ def _add_hand(spec: mujoco.MjSpec, hand: Hand, config: Config) -> list[tuple[str
         body = bodies[child.name()] = add(bodies[parent], child, X_PC)
         if not isinstance(joint, RevoluteJoint):
             continue
+
         axis = X_CM.rotation().matrix() @ joint.revolute_axis()
         if joint.name() in hand.spread.joints:
             spreads.append((child.name(), axis, _quaternion(X_PC.rotation().matrix())))
@@ -271,6 +296,7 @@ def _add_hand(spec: mujoco.MjSpec, hand: Hand, config: Config) -> list[tuple[str
 
 
 def _add_wrist(spec: mujoco.MjSpec) -> dict[str, mujoco.MjsBody]:
+    """Add three light bodies on sliding joints, each with a position drive; return them."""
     bodies, parent = {}, spec.worldbody
     for name, axis in zip("xyz", np.eye(3), strict=True):
         parent = parent.add_body(name=f"wrist_{name}")
@@ -286,6 +312,7 @@ def _add_wrist(spec: mujoco.MjSpec) -> dict[str, mujoco.MjsBody]:
 
 
 def _add_drives(spec: mujoco.MjSpec, hand: Hand) -> None:
+    """Give each finger its motor, with a limited torque, and its coupled joints."""
     for finger in hand.fingers:
         spec.joint(finger.closing_joint).armature = finger.rotor_inertia * finger.gear_ratio**2
         limit = finger.torque_limit
@@ -297,6 +324,7 @@ def _add_drives(spec: mujoco.MjSpec, hand: Hand) -> None:
             forcerange=[-limit, limit],
         )
         motor.set_to_velocity(kv=FINGER_DAMPING)
+
         for coupling in finger.coupled:
             spec.add_equality(
                 type=mujoco.mjtEq.mjEQ_JOINT,
@@ -316,7 +344,7 @@ def _add_link(
     link: RigidBody,
     X_PL: RigidTransform,
 ) -> mujoco.MjsBody:
-    """Add a link with its inertia and shapes to the body that carries it."""
+    """Add a link L with its inertia and shapes S to its parent P."""
     body = parent.add_body(
         name=link.name(), pos=X_PL.translation(), quat=_quaternion(X_PL.rotation().matrix())
     )
@@ -325,6 +353,7 @@ def _add_link(
     central = inertia.Shift(p_LLcm).CalcRotationalInertia().CopyToFullMatrix3()
     _set_inertia(body, inertia.get_mass(), p_LLcm, central)
     body.gravcomp = 1.0
+
     for geometry in plant.GetCollisionGeometriesForBody(link):
         kind, size, mesh = _shape(spec, inspector, geometry, link.name())
         X_LS = inspector.GetPoseInFrame(geometry)
@@ -345,7 +374,7 @@ def _add_link(
 def _shape(
     spec: mujoco.MjSpec, inspector: SceneGraphInspector, geometry: GeometryId, link: str
 ) -> tuple[mujoco.mjtGeom, list[float], str]:
-    """Return MuJoCo's kind, size and mesh of a shape of the hand.
+    """Return MuJoCo's kind, size and mesh of a shape of the hand; meshes are added to the model.
 
     MuJoCo has these primitives, too; the corners of `hand.shapes` only approximate them.
     """

@@ -1,4 +1,4 @@
-"""Preparing one mesh as a task: what a crash or a hang of its process then means.
+"""Preparing one mesh as a task, and what a crash or a hang of its process means for the mesh.
 
 In: a mesh and the configuration, as plain data. Out: the object's files, and its entry in the
 manifest: what it is, or why it was refused.
@@ -35,21 +35,23 @@ class PrepareTask:
 
     Attributes:
         source: The mesh.
-        out: Directory of the dataset, seen by every worker.
+        out: Directory of the dataset, visible to every worker.
         config: `Config.to_dict()`.
-        expendable: Whether the process that runs it is started again when it dies. Then a
-            crash or a hang costs the mesh; else it is the caller's to see.
+        restartable: Whether the process that runs it is started again when it dies. If so, a
+            crash or a hang costs only the mesh; if not, it propagates to the caller.
     """
 
     source: MeshSource
     out: str
     config: dict[str, Any]
-    expendable: bool
+    restartable: bool
 
 
 @one_thread
 def prepare_one(task: PrepareTask) -> tuple[str, ObjectEntry | RefusedMesh]:
-    """Prepare one mesh; return its name and its entry in the manifest, a refusal among them.
+    """Prepare one mesh; return its name and its entry in the manifest, which may be a refusal.
+
+    An object whose files are complete is not prepared again.
 
     Raises:
         DiskFullError: If there is no room for the object's files.
@@ -58,12 +60,16 @@ def prepare_one(task: PrepareTask) -> tuple[str, ObjectEntry | RefusedMesh]:
     out, source, config = Path(task.out), task.source, parse_config(task.config)
     digest = source_sha256(source)
     with disk_full_named(out):
+        # The worker or the client may have died before the manifest named the object.
         entry = _entry_there(source, digest, out, config)
-        if entry is not None:  # its process, or the client, died before the manifest was written
+        if entry is not None:
             return source.name, entry
-        if not task.expendable:
+
+        if not task.restartable:
             return source.name, _prepared_entry(task, digest)
-        release_memory()  # of the mesh before
+
+        # With a journal, a mesh that kills its process is found and refused.
+        release_memory()
         identity = {
             "name": source.name,
             "mesh_sha256": digest,
@@ -71,11 +77,11 @@ def prepare_one(task: PrepareTask) -> tuple[str, ObjectEntry | RefusedMesh]:
         }
         path = model_path(out, source.name).with_suffix(".journal")
         with open_journal(path, identity) as journal:
-            return source.name, _prepared_or_guilty(task, digest, journal)
+            return source.name, _prepared_or_refused(task, digest, journal)
 
 
 def _entry_there(source: MeshSource, digest: str, out: Path, config: Config) -> ObjectEntry | None:
-    """Return the entry of an object whose files are there and whole, or None."""
+    """Return the entry of an object whose files are complete, or None."""
     try:
         prepared = load_prepared(out, source.name, config)
     except DrakegraspError:
@@ -85,19 +91,17 @@ def _entry_there(source: MeshSource, digest: str, out: Path, config: Config) -> 
     return prepared.entry() if same else None
 
 
-def _prepared_or_guilty(
+def _prepared_or_refused(
     task: PrepareTask, digest: str, journal: Journal
 ) -> ObjectEntry | RefusedMesh:
     name = task.source.name
     verdict = journal.verdict("prepare")
     if verdict is not None:
-        return _refused(
-            task.source, digest, f"{name}: must be fit to prepare, got one that {verdict.value}"
-        )
-    if journal.is_futile:
+        return _refused(task.source, digest, f"{name}: preparing it {verdict.value}")
+    if journal.in_crash_loop:
         raise MachineError(
-            f"{name}: the worker must stay alive to prepare it, got {GIVE_UP_DEATHS} deaths in a "
-            "row; is there enough memory? The same command goes on from here"
+            f"{name}: the worker died {GIVE_UP_DEATHS} times in a row while preparing it; is "
+            "there enough memory? The same command goes on from here"
         )
     with journal.step("prepare", PREPARE_SECONDS):
         inject_fault(name)
@@ -119,7 +123,7 @@ def _refused(source: MeshSource, digest: str, reason: str) -> RefusedMesh:
 
 
 def prepare(source: MeshSource, config: Config) -> PreparedObject:
-    """Return a mesh as an object at rest with its palm poses.
+    """Return a mesh as an object at rest on the table, with its palm poses.
 
     Raises:
         MeshError: If the mesh cannot be repaired, its size is implausible, or the object does

@@ -14,16 +14,22 @@ from drakegrasp.cli.options import manifest_option, set_option, units_option
 
 @click.command()
 @click.option(
-    "--objects", default=BUILTIN, show_default=True, metavar="MESH_DIR|builtin", help="Meshes."
+    "--objects", default=BUILTIN, show_default=True, metavar="MESH_DIR|builtin", help="The meshes."
 )
-@click.option("--only", multiple=True, metavar="NAME", help="Those whose names begin so.")
-@click.option("--config", "preset", metavar="YAML|PRESET", help="[paper]")
+@click.option(
+    "--only",
+    multiple=True,
+    metavar="NAME",
+    help="Only objects whose names begin with NAME; may be given several times.",
+)
+@click.option("--config", "preset", metavar="YAML|PRESET", help="Configuration.  [default: paper]")
 @set_option
 @click.option(
     "--candidates",
     type=click.IntRange(min=1),
     default=100,
     show_default=True,
+    metavar="N",
     help="Palm poses per object.",
 )
 @click.option(
@@ -32,13 +38,14 @@ from drakegrasp.cli.options import manifest_option, set_option, units_option
     default=0,
     metavar="N",
     help="Compare the labels of N attempts per object.",
+    show_default=True,
 )
-@click.option("--peer", is_flag=True, help="Run the same attempts in MuJoCo.")
+@click.option("--peer", "mujoco", is_flag=True, help="Run the same attempts in MuJoCo as well.")
 @click.option(
     "--compare",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
     metavar="FILE",
-    help="An earlier report; print the ratios to it.",
+    help="Print the ratios to this earlier report.",
 )
 @click.option(
     "--out",
@@ -58,18 +65,20 @@ def bench(
     overrides: tuple[str, ...],
     candidates: int,
     fidelity: int,
-    peer: bool,
+    mujoco: bool,
     compare: Path | None,
     out: Path,
     units: str,
     manifest: Path | None,
     quiet: bool,
 ) -> None:
-    """Measure what attempts cost on this machine, in one process.
+    """Measure how fast this machine simulates attempts.
 
-    With --fidelity, N random attempts of each object are simulated again without the screen, at
-    half the step, with four times the faces and by Drake's other solvers. With --peer (extra
-    [peer]), all are simulated plainly in MuJoCo as well.
+    The command runs in one process and writes a report as JSON.
+
+    With --fidelity, it simulates N random attempts of each object again without the screen, at
+    half the time step, with four times the faces and with Drake's other solvers. With --peer
+    (pip install 'drakegrasp[peer]'), it simulates all attempts in MuJoCo as well.
     """
     import json
     import tempfile
@@ -81,13 +90,16 @@ def bench(
     from drakegrasp.objects.sources import find_meshes
     from drakegrasp.runtime.progress import progress_bar
 
-    if peer:
-        _need_peer()
+    # What cannot be used is refused before the measurement, which takes a while.
+    if mujoco:
+        _require_mujoco()
     if not os.access(out if out.exists() else out.absolute().parent, os.W_OK):
         raise click.UsageError(f"--out must be a file that can be written, got {out}")
-    os.environ.setdefault("LP_NUM_THREADS", "0")  # threads of OpenGL would count as this core's
+    # The time of OpenGL's threads would count as this core's.
+    os.environ.setdefault("LP_NUM_THREADS", "0")
     config = load_config(preset, [*overrides, f"candidates.max={candidates}"])
-    then = None if compare is None else _read_report(compare)
+    earlier = None if compare is None else _read_report(compare)
+
     with tempfile.TemporaryDirectory() as folder:
         if objects == BUILTIN:
             export_builtin(Path(folder))
@@ -98,16 +110,17 @@ def bench(
             raise click.UsageError(f"--only must name objects of {objects}, got {', '.join(only)}")
         with progress_bar("bench", "attempts", show=not quiet) as progress:
             measured = measuring.measure(
-                sources, config, sample=fidelity, peer=peer, progress=progress
+                sources, config, sample=fidelity, mujoco=mujoco, progress=progress
             )
             report = measuring.summarize(list(measured), config)
+
     print_table(bench_table(report))
     for line in bench_lines(report):
         click.echo(line)
     if fidelity:
         print_table(fidelity_table(report["all"]["fidelity"]))
-    if then is not None:
-        report["ratio"] = measuring.compare(report, then)
+    if earlier is not None:
+        report["ratio"] = measuring.compare(report, earlier)
         for key, ratio in report["ratio"].items():
             times = "none to compare with" if ratio is None else f"{ratio:.2f} times that"
             click.echo(f"{key.replace('_', ' ')}: {times} of {compare}")
@@ -115,17 +128,21 @@ def bench(
     click.echo(str(out))
 
 
-def _need_peer() -> None:
+def _require_mujoco() -> None:
+    """Refuse --peer where the libraries of its extra are missing."""
     from importlib.util import find_spec
 
     for module in ("mujoco", "coacd"):
         if find_spec(module) is None:
-            raise click.UsageError(
-                f"--peer must find {module}, got none: pip install 'drakegrasp[peer]'"
-            )
+            raise click.UsageError(f"--peer needs {module}: pip install 'drakegrasp[peer]'")
 
 
 def _read_report(path: Path) -> dict[str, Any]:
+    """Return an earlier report.
+
+    Raises:
+        click.UsageError: If the file is none.
+    """
     import json
 
     try:

@@ -27,7 +27,9 @@ if TYPE_CHECKING:
 @workers_option
 @scheduler_option
 @scheduler_file_option
-@click.option("--plan", is_flag=True, help="Only print the hours and bytes that it would take.")
+@click.option(
+    "--plan", is_flag=True, help="Only print the hours and bytes that the build would take."
+)
 @times_option
 def build(
     workers: int | None,
@@ -37,7 +39,11 @@ def build(
     times: Path | None,
     **options: Any,
 ) -> None:
-    """Build the dataset of a directory of meshes."""
+    """Build a dataset from a directory of meshes.
+
+    The command simulates grasps of every object and writes trials.hdf5,
+    grasping_oto.hdf5 and grasping_otm.hdf5 to DIR.
+    """
     from drakegrasp.api import build_dataset
 
     request = parse_request(**options)
@@ -63,17 +69,22 @@ def build(
 @click.option(
     "--reject",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="File with the ids of trials that are no samples, one per line; # starts a comment.",
+    metavar="FILE",
+    help="File with ids of trials that must not become samples, one per line; # starts a comment.",
 )
 @click.option(
     "--set",
     "overrides",
     multiple=True,
     metavar="KEY=VALUE",
-    help="Set a value of the filters or the split, e.g. filters.outlier_sigma=3.",
+    help="Change a setting of the filters or the split, e.g. filters.outlier_sigma=3; may be given "
+    "several times.",
 )
 def assemble(out: Path, reject: Path | None, overrides: tuple[str, ...]) -> None:
-    """Write the three files again from the shards: filters, split, samples."""
+    """Filter and split again, without simulating.
+
+    The command writes trials.hdf5 and both data files again from the shards in OUT.
+    """
     from drakegrasp.dataset.assemble import assemble as assemble_files
     from drakegrasp.dataset.assemble import read_reject_list
     from drakegrasp.dataset.manifest import change_postprocessing
@@ -90,9 +101,9 @@ def assemble(out: Path, reject: Path | None, overrides: tuple[str, ...]) -> None
 @click.command()
 @out_argument
 def stats(out: Path) -> None:
-    """Print the funnel by object and the paper's Table III.
+    """Count outcomes by object and samples by split.
 
-    Of a build that still runs, or was stopped: what is done so far.
+    While a build runs, or after it was stopped, the command counts what is done so far.
     """
     _print_stats(out)
 
@@ -112,7 +123,7 @@ def _print_stats(out: Path) -> None:
     console, unfinished = make_console(), count_unfinished(out)
     funnel = count_funnel(out) if unfinished is None else unfinished.funnel
     table = funnel_table(funnel)
-    # Numbers are never cut: where the columns do not fit, fewer say the same.
+    # Rich would cut numbers in a narrow terminal; the compact table has fewer columns.
     natural = Measurement.get(console, console.options.update(max_width=WIDTH), table).maximum
     if natural > console.width:
         table = funnel_table(funnel, compact=True)
@@ -124,8 +135,9 @@ def _print_stats(out: Path) -> None:
 
 
 def print_plan(request: BuildRequest, workers: int | None, times: Path | None) -> None:
-    """Print what a build that was asked for is expected to take."""
-    from drakegrasp.build.estimate import logged_times, plan_lines, plan_request, read_times
+    """Print how long a requested build is expected to take, and its size."""
+    from drakegrasp.build.estimate import plan_lines, plan_request
+    from drakegrasp.build.stage_times import logged_times, read_times
 
     logged = logged_times(request.out, request.config)
     measured = logged if times is None else read_times(times)
@@ -133,7 +145,7 @@ def print_plan(request: BuildRequest, workers: int | None, times: Path | None) -
 
 
 def print_report(report: BuildReport) -> None:
-    """Print what a build did, and where it put it."""
+    """Print what a build did, and the paths of its files."""
     _print_stats(report.out)
     if report.simulated:
         reused = f" ({report.reused} had been done before)" if report.reused else ""

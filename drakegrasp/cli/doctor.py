@@ -20,6 +20,8 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
+from drakegrasp.runtime.environment import available_cores
+
 PYTHON = (3, 11)
 #: Drake's wheels are built for this C library (manylinux_2_34).
 GLIBC = (2, 34)
@@ -83,7 +85,6 @@ def diagnose(directory: Path | None = None) -> list[Finding]:
         check_allocator(),
         check_egl(),
         check_image(),
-        check_embree(),
         check_writing(place),
         check_disk(place),
         check_cores(),
@@ -185,20 +186,6 @@ def check_image() -> Finding:
     return Finding(name="test image", ok=True, what=what)
 
 
-def check_embree() -> Finding:
-    """Return whether trimesh casts its rays with embree, a hundred times faster than without."""
-    mend = "pip install embreex"
-    # A wheel for another machine fails in its own ways when it is loaded.
-    try:
-        from trimesh import ray
-
-        if ray.has_embree:
-            return Finding(name="embree", ok=True, what=f"embreex {_version('embreex')}")
-    except Exception as error:
-        return _finding("embree", False, f"{type(error).__name__}: {error}", "pip install trimesh")
-    return _finding("embree", False, "trimesh does not find it", mend)
-
-
 def check_writing(directory: Path) -> Finding:
     """Return whether a file can be written in a directory, by writing one."""
     try:
@@ -229,12 +216,12 @@ def check_disk(directory: Path) -> Finding:
 
 def check_cores() -> Finding:
     """Return how many cores this process may use; any number will do."""
-    return Finding(name="cores", ok=True, what=str(_cores()))
+    return Finding(name="cores", ok=True, what=str(available_cores()))
 
 
 def check_memory() -> Finding:
     """Return whether there is memory for a worker on every core."""
-    total, cores = _memory(), _cores()
+    total, cores = _memory(), available_cores()
     if total is None:
         return Finding(name="memory", ok=True, what="unknown")
     return _finding(
@@ -319,12 +306,6 @@ def _signal_name(number: int) -> str:
         return signal.Signals(number).name
     except ValueError:
         return f"signal {number}"
-
-
-def _cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _memory() -> int | None:

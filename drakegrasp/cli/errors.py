@@ -5,18 +5,16 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NoReturn
 
 import click
 
 from drakegrasp.errors import ConfigError, DrakegraspError, GraspError, HandError, MeshError
 
-#: Errors of what was asked for, as against errors of what was done.
+#: Errors in what the user asked for. All other errors are failures of the work.
 WRONG_USAGE = (ConfigError, GraspError, HandError, MeshError)
 
 
@@ -27,63 +25,73 @@ class Commands(click.Group):
         """Return the commands' names."""
         return list(self.commands)
 
+    def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
+        """Read the options before the command's name."""
+        with one_line_errors():
+            return super().make_context(*args, **kwargs)
+
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command that was asked for."""
-        with one_line_errors(ctx):
+        with one_line_errors(resumable=lambda: ctx.invoked_subcommand == "build"):
             return super().invoke(ctx)
 
 
 class OneCommand(click.Command):
-    """A script's only command: a build, with errors in one line."""
+    """The only command of a script that builds, with errors in one line."""
 
     def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
         """Read the command line."""
-        try:
+        with one_line_errors():
             return super().make_context(*args, **kwargs)
-        except click.UsageError as error:
-            click.echo(f"error: {' '.join(error.format_message().split())}", err=True)
-            raise SystemExit(2) from None
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command."""
-        with one_line_errors(ctx, builds=True):
+        with one_line_errors(resumable=lambda: True):
             return super().invoke(ctx)
 
 
 @contextmanager
-def one_line_errors(ctx: click.Context, *, builds: bool = False) -> Iterator[None]:
-    """Turn errors within the block into one line on standard error and an exit code."""
+def one_line_errors(resumable: Callable[[], bool] = lambda: False) -> Iterator[None]:
+    """Turn errors within the block into one line on standard error and an exit code.
+
+    Args:
+        resumable: Says whether the command can be given again after Ctrl-C to go on.
+    """
     before = signal.signal(signal.SIGTERM, _terminate)
     try:
         yield
-    except DrakegraspError as error:
-        click.echo(f"error: {' '.join(str(error).split())}", err=True)
-        ctx.exit(2 if isinstance(error, WRONG_USAGE) else 1)
+    except click.exceptions.NoArgsIsHelpError:
+        raise
     except click.UsageError as error:
-        if isinstance(error, click.exceptions.NoArgsIsHelpError):
-            raise
-        click.echo(f"error: {' '.join(error.format_message().split())}", err=True)
-        ctx.exit(2)
-    except BrokenPipeError:
-        # Whoever reads has what it wanted; at the end Python would complain once more.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        ctx.exit(1)
+        _end(f"error: {_one_line(error.format_message())}", 2)
+    except DrakegraspError as error:
+        code = 2 if isinstance(error, WRONG_USAGE) else 1
+        _end(f"error: {_one_line(str(error))}", code)
+    except (click.Abort, click.exceptions.Exit, BrokenPipeError):
+        # Click handles these: a reader that closes the pipe has what it wanted.
+        raise
     except (OSError, RuntimeError) as error:
-        if isinstance(error, click.exceptions.Exit | click.Abort):
-            raise
         text = str(error).strip() or type(error).__name__
-        click.echo(f"error: {text.splitlines()[0]}", err=True)
-        ctx.exit(1)
+        _end(f"error: {text.splitlines()[0]}", 1)
     except KeyboardInterrupt as stop:
-        goes_on = builds or ctx.invoked_subcommand == "build"
-        click.echo(f"stopped{'; the same command goes on from here' * goes_on}", err=True)
-        ctx.exit(143 if isinstance(stop, _Terminated) else 130)
+        line = "stopped" + "; the same command goes on from here" * resumable()
+        _end(line, 143 if isinstance(stop, _Terminated) else 130)
     finally:
         signal.signal(signal.SIGTERM, before)
 
 
+def _end(line: str, code: int) -> NoReturn:
+    """Print a line and have click end the program; click's own errors take four lines."""
+    click.echo(line, err=True)
+    raise click.exceptions.Exit(code)
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())
+
+
 class _Terminated(KeyboardInterrupt):
-    """SIGTERM: what is begun is left as after Ctrl-C."""
+    """SIGTERM, which is handled as Ctrl-C is: what was begun is put in order."""
 
 
 def _terminate(number: int, frame: object) -> None:

@@ -11,4 +11,4 @@ from drakegrasp.cli.errors import Commands
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="drakegrasp")
 def main() -> None:
-    """Simulate multi-finger grasps of meshes, with the images of every grasp."""
+    """Simulate multi-finger grasps of object meshes and write datasets of them."""

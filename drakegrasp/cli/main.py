@@ -1,8 +1,8 @@
-"""The command line: thin, one function per command.
+"""The command line: the group of all commands, and the commands that take few lines.
 
 Results go to standard output, progress and errors to standard error. Exit codes: 0 done,
-1 the work failed, 2 wrong usage. Heavy imports are within the commands, so that `--help`
-answers at once.
+1 the work failed, 2 wrong usage. Commands import heavy libraries when they run, so that
+`--help` answers at once.
 """
 
 from __future__ import annotations
@@ -28,12 +28,14 @@ from drakegrasp.runtime.allocator import restart_with_jemalloc
 @click.command()
 @click.argument("directory", type=click.Path(path_type=Path), default=Path("."))
 def doctor(directory: Path) -> None:
-    """Say what this machine lacks, with the line that mends it.
+    """Check that this machine can run drakegrasp.
 
-    DIRECTORY is where data would be written.
+    The command names what is missing and how to get it. DIRECTORY is where a dataset would be
+    written. Exit code 1 if anything is missing.
     """
     from drakegrasp.cli.doctor import diagnose
 
+    # A line per need, and one more with the remedy where it is not met.
     findings = diagnose(directory)
     for finding in findings:
         mark = (
@@ -74,9 +76,10 @@ def export_objects(directory: Path) -> None:
 @units_option
 @manifest_option
 def audit(mesh_dir: Path, units: str, manifest: Path | None) -> None:
-    """Say mesh by mesh: fit to simulate, repaired, or refused, and why.
+    """Check which meshes are fit, repaired or refused.
 
     A build also drops each object on the table, and refuses one that does not come to rest.
+    Exit code 1 if every mesh is refused.
     """
     from drakegrasp.cli.tables import audit_table, print_table
     from drakegrasp.objects.audit import audit as audit_meshes
@@ -90,7 +93,11 @@ def audit(mesh_dir: Path, units: str, manifest: Path | None) -> None:
 @click.command()
 @click.argument("path", type=click.Path(path_type=Path), metavar="OUT|FILE")
 def check(path: Path) -> None:
-    """Check every invariant of a dataset, or of one of its files."""
+    """Check every invariant of a dataset.
+
+    OUT is a dataset's directory; FILE is one of its three main files. Exit code 1 if an
+    invariant is broken.
+    """
     from drakegrasp.dataset.checks.run import check_dataset
     from drakegrasp.runtime.progress import progress_bar
 
@@ -105,16 +112,21 @@ def check(path: Path) -> None:
 
 @click.command()
 @out_argument
-@click.option("--trial", required=True, type=int, help="Row of trials.hdf5.")
+@click.option("--trial", required=True, type=int, metavar="ID", help="Row of trials.hdf5.")
 @click.option(
     "--html",
     type=click.Path(path_type=Path),
-    help="File to write that plays the trial in a browser.",
+    metavar="FILE",
+    help="Write a recording of the trial that plays in a browser.",
 )
 def replay(out: Path, trial: int, html: Path | None) -> None:
-    """Run a trial again: the same outcome and contacts, or exit code 1."""
+    """Run a trial again and compare every value.
+
+    Exit code 1 if any value differs from the stored one.
+    """
     from drakegrasp.build.replay import record_trial, replay_trial
 
+    # Whatever differs is printed: values first, then versions, which may explain them.
     again = replay_trial(out, trial)
     click.echo(
         f"trial {trial} of {again.object_name}: was {again.recorded.label}, is {again.found.label}"
@@ -124,6 +136,7 @@ def replay(out: Path, trial: int, html: Path | None) -> None:
         click.echo(f"  {name} differs: {how}")
     for package, change in again.versions.items():
         click.echo(f"  {package}: {change}")
+
     if html is not None:
         record_trial(out, trial, html)
         click.echo(str(html))
@@ -131,7 +144,7 @@ def replay(out: Path, trial: int, html: Path | None) -> None:
         sys.exit(1)
 
 
-# Their order is that of the help.
+# The help lists them in this order.
 for _command in (doctor, objects, audit, build, assemble, check, stats, replay, verify, bench):
     main.add_command(_command)
 

@@ -1,4 +1,4 @@
-"""The options of a build on a command line, shared by `drakegrasp build` and the scripts.
+"""Options that several commands share, and those of a build.
 
 In: what click parsed. Out: a `BuildRequest`, with the configuration resolved.
 """
@@ -17,11 +17,16 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 units_option = click.option(
-    "--units", default="m", show_default=True, help="Unit of length of the meshes: m, cm or mm."
+    "--units",
+    default="m",
+    show_default=True,
+    metavar="m|cm|mm",
+    help="Unit of length of the meshes.",
 )
 manifest_option = click.option(
     "--manifest",
     type=click.Path(path_type=Path),
+    metavar="FILE",
     help="YAML file with units and classes by mesh.  [default: objects.yaml beside the meshes]",
 )
 set_option = click.option(
@@ -29,13 +34,14 @@ set_option = click.option(
     "overrides",
     multiple=True,
     metavar="KEY=VALUE",
-    help="Set one value, e.g. lift.hold_time=1.",
+    help="Change one setting, e.g. lift.hold_time=1; may be given several times.",
 )
 times_option = click.option(
     "--times",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="What pipelines/measurements/measure_stages.py printed, to plan by.  [OUT/log.jsonl, or "
-    "measured on other meshes]",
+    metavar="FILE",
+    help="Estimate from these times, which measure_stages.py of pipelines/measurements printed.  "
+    "[default: OUT/log.jsonl, else times measured on other meshes]",
 )
 
 _OPTIONS = (
@@ -43,29 +49,38 @@ _OPTIONS = (
         "--objects",
         required=True,
         metavar="MESH_DIR|builtin",
-        help="Directory of .obj, .stl, .ply or .glb files, or the built-in objects.",
+        help="A directory of .obj, .stl, .ply or .glb files, or the built-in objects.",
     ),
     click.option(
         "--out",
         required=True,
         type=click.Path(path_type=Path),
-        help="Directory of the dataset; the same command goes on with what is there.",
+        metavar="DIR",
+        help="Directory of the dataset. The same command continues an interrupted build.",
     ),
     click.option(
         "--config",
         metavar="YAML|PRESET",
-        help="Configuration: a file, or paper or released.  [paper]",
+        help="Configuration: a file, or the preset paper or released.  [default: paper]",
     ),
     set_option,
-    click.option("--candidates", type=int, help="Palm poses per object.  [10000]"),
-    click.option("--max-grasps", type=int, help="Grasps per object after which no more are tried."),
+    click.option(
+        "--candidates", type=int, metavar="N", help="Palm poses per object.  [default: 10000]"
+    ),
+    click.option(
+        "--max-grasps",
+        type=int,
+        metavar="N",
+        help="Stop an object after N successes.  [default: no limit]",
+    ),
     click.option(
         "--certify",
         type=click.IntRange(min=0),
         metavar="K",
-        help="Repeat each success K times with noise, to store how robust it is.  [0]",
+        help="Repeat each success K times with noise and store how robust it is.",
+        show_default="0",
     ),
-    click.option("--seed", type=int, help="Of all random draws.  [0]"),
+    click.option("--seed", type=int, metavar="S", help="Seed of all random draws.  [default: 0]"),
     units_option,
     manifest_option,
     click.option("--quiet", is_flag=True, help="Show no progress."),
@@ -74,15 +89,19 @@ _OPTIONS = (
 
 out_argument = click.argument("out", type=click.Path(path_type=Path), metavar="OUT")
 workers_option = click.option(
-    "--workers", type=int, help="Processes on this machine.  [one per core]"
+    "--workers",
+    type=int,
+    metavar="N",
+    help="Processes on this machine.  [default: one per core]",
 )
 scheduler_option = click.option(
-    "--scheduler", metavar="ADDRESS", help="A running Dask scheduler to use instead."
+    "--scheduler", metavar="ADDRESS", help="Use the running Dask scheduler at this address."
 )
 scheduler_file_option = click.option(
     "--scheduler-file",
     type=click.Path(path_type=Path),
-    help="Its JSON file, instead of the address.",
+    metavar="FILE",
+    help="Use the running Dask scheduler that wrote this file.",
 )
 
 
@@ -112,7 +131,7 @@ def parse_request(
     Raises:
         ConfigError: If a value of the configuration cannot be used.
     """
-    # Pydantic takes a while to load, and `--help` answers at once.
+    # Loading pydantic takes a while, and `--help` must answer at once.
     from drakegrasp.config import load_config
 
     chosen = list(overrides)

@@ -1,4 +1,4 @@
-"""What is counted, as tables for a terminal."""
+"""Counts and measurements as tables for a terminal."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _OUTCOME_HEADS = {
 }
 
 
-#: What the outcomes amount to, for terminals that are too narrow for all of them.
+#: Groups of outcomes, for terminals that are too narrow for a column of each.
 _COMPACT_HEADS = {
     "no ray": (Outcome.RAY_MISS, Outcome.BELOW_TABLE),
     "collis.": (Outcome.START_COLLISION, Outcome.SCREENED),
@@ -45,7 +45,7 @@ _COMPACT_HEADS = {
 }
 
 
-#: Width of tables where standard output is not a terminal [characters]: as wide as they are.
+#: Width of the console where standard output is not a terminal [characters]: tables fit always.
 WIDTH = 1000
 
 
@@ -54,7 +54,7 @@ def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
 
     Args:
         funnel: The counts.
-        compact: Whether to put outcomes together; else columns that are all zero are left out.
+        compact: Whether to group outcomes; otherwise columns that are all zero are left out.
     """
     shown = [o for o in _OUTCOME_HEADS if funnel.outcomes[:, o].any() or o is Outcome.SUCCESS]
     groups = _COMPACT_HEADS if compact else {_OUTCOME_HEADS[o]: (o,) for o in shown}
@@ -92,7 +92,7 @@ def split_table(counts: Sequence[SplitCount]) -> Table:
 
 
 def unfinished_line(unfinished: Unfinished) -> str:
-    """Return how far a build is that runs or was stopped."""
+    """Return a line on the progress of a build that is running or was stopped."""
     if not unfinished.total:
         return "not finished: its objects are not prepared yet"
     return (
@@ -102,7 +102,7 @@ def unfinished_line(unfinished: Unfinished) -> str:
 
 
 def audit_table(rows: Sequence[AuditRow]) -> Table:
-    """Return what would become of each mesh."""
+    """Return the findings on each mesh, a row per mesh."""
     table = _table("Meshes")
     table.add_column("object", no_wrap=True)
     table.add_column("class", no_wrap=True)
@@ -125,7 +125,7 @@ def audit_table(rows: Sequence[AuditRow]) -> Table:
 
 
 def verdict_table(outcomes: Sequence[Outcome]) -> Table:
-    """Return how many grasps had each outcome, and which share of those that were judged."""
+    """Return how many grasps had each outcome, and their share of those with a verdict."""
     counts = Counter(outcomes)
     judged = sum(n for outcome, n in counts.items() if not outcome.inconclusive)
     table = _table("Verdicts")
@@ -142,36 +142,36 @@ def verdict_table(outcomes: Sequence[Outcome]) -> Table:
 
 
 def bench_table(report: Mapping[str, Any]) -> Table:
-    """Return what `measure.summarize` found: rates, and seconds of a core by stage."""
+    """Return a report of `measure.summarize` as a table: rates, and CPU seconds by stage."""
     table = _table("Attempts on one core")
     stages = ("scene", "field", "screen", "try", "look")
-    with_peer = "peer" in report["all"]
+    with_mujoco = "peer" in report["all"]
     heads = ["faces", "attempts", "grasps", "attempts\nper s", "grasps\nper h"]
     heads += [f"{stage}\n{escape('[s]')}" for stage in stages]
-    heads += ["MuJoCo\ngrasps/h", "ratio"] if with_peer else []
+    heads += ["MuJoCo\ngrasps/h", "ratio"] if with_mujoco else []
     table.add_column("object", no_wrap=True, overflow="ellipsis", max_width=24)
     for head in heads:
         table.add_column(head, justify="right", no_wrap=True)
 
-    def row(name: str, found: Mapping[str, Any]) -> None:
-        peer = found.get("peer", {})
-        ratio = peer.get("ratio", peer.get("median_ratio"))
+    def row(name: str, rates: Mapping[str, Any]) -> None:
+        mujoco = rates.get("peer", {})
+        ratio = mujoco.get("ratio", mujoco.get("median_ratio"))
         cells = [
-            f"{found['faces']:,}" if "faces" in found else "",
-            f"{found['attempts']:,}",
-            f"{found['outcomes'].get(Outcome.SUCCESS.label, 0):,}",
-            f"{found['resolved_per_core_second']:.1f}",
-            f"{found['grasps_per_core_hour']:,.0f}",
-            *(f"{found['seconds'][stage]:.1f}" for stage in stages),
+            f"{rates['faces']:,}" if "faces" in rates else "",
+            f"{rates['attempts']:,}",
+            f"{rates['outcomes'].get(Outcome.SUCCESS.label, 0):,}",
+            f"{rates['resolved_per_core_second']:.1f}",
+            f"{rates['grasps_per_core_hour']:,.0f}",
+            *(f"{rates['seconds'][stage]:.1f}" for stage in stages),
         ]
-        if with_peer:
-            cells += [f"{peer['grasps_per_core_hour']:,.0f}", f"{ratio:.2f}" if ratio else "-"]
+        if with_mujoco:
+            cells += [f"{mujoco['grasps_per_core_hour']:,.0f}", f"{ratio:.2f}" if ratio else "-"]
         table.add_row(escape(name), *cells)
 
-    for found in report["objects"]:
-        row(found["name"], found)
+    for rates in report["objects"]:
+        row(rates["name"], rates)
     table.add_section()
-    row("all (ratio: median)" if with_peer else "all", report["all"])
+    row("all (ratio: median)" if with_mujoco else "all", report["all"])
     return table
 
 
@@ -189,30 +189,34 @@ def bench_lines(report: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def fidelity_table(found: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Return how labels differ where the same attempts are simulated in other ways."""
-    table = _table("The same attempts in other ways")
-    table.add_column("way", no_wrap=True)
+def fidelity_table(counts_by_variant: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Return how labels differ where variants simulate the same attempts."""
+    # A column of labels, then numbers of attempts and of grasps.
+    table = _table("The same attempts, simulated in other ways")
+    table.add_column("variant", no_wrap=True)
     heads = (
         "attempts",
         "simulated",
         "other\nlabels",
         "of the\nsimulated",
         "grasps",
-        "grasps\nthere",
+        "variant's\ngrasps",
     )
     for head in heads:
         table.add_column(head, justify="right", no_wrap=True)
-    for name, counts in found.items():
+
+    for name, counts in counts_by_variant.items():
         numbers = [counts[key] for key in ("attempts", "simulated", "flips")]
         grasps = [counts[key] for key in ("successes", "successes_other")]
         share = f"{counts['flip_share_of_simulated']:.1%}"
         cells = [*(f"{n:,}" for n in numbers), share, *(f"{n:,}" for n in grasps)]
         table.add_row(name.replace("_", " "), *cells)
-    off = found["screen_off"]
+
+    # Without the screen, the variant's grasps show what the screen loses.
+    off = counts_by_variant["screen_off"]
     lost, successes = off["successes_lost_by_screen"], off["successes_other"]
-    counted = f"{lost:,} of {successes:,}" if successes else "unknown, as there is none"
-    table.caption = f"grasps that the screen took out: {counted}"
+    counted = f"{lost:,} of {successes:,}" if successes else "unknown, as there are no grasps"
+    table.caption = f"grasps that the screen removed: {counted}"
     table.caption_justify = "left"
     return table
 
@@ -229,7 +233,7 @@ def _table(title: str) -> Table:
 
 
 def make_console(*, stderr: bool = False) -> Console:
-    """Return a console for tables; where there is no terminal, as wide as they are."""
+    """Return a console for tables; off a terminal it is wide enough for any."""
     console = Console(stderr=stderr)
     return console if console.is_terminal else Console(width=WIDTH, stderr=stderr)
 

@@ -1,4 +1,4 @@
-"""What `drakegrasp verify` is asked, as tasks: files and options in, nothing simulated.
+"""What `drakegrasp verify` is asked: files and options in, placed grasps out; no simulation.
 
 All that may be wrong with what was asked is a `GraspError`, `MeshError`, `ConfigError` or
 `HandError`: wrong usage.
@@ -13,9 +13,9 @@ from drakegrasp.config import Config, load_config, override_config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError, GraspError
+from drakegrasp.verification.placed_grasp import PlacedGrasp, VerifyArguments, place_grasps
 from drakegrasp.verification.prediction import HDF5_SUFFIXES, read_numbers, read_predictions
 from drakegrasp.verification.result_files import refuse_unwritable
-from drakegrasp.verification.tasks import VerifyTask, plan_verification
 
 #: The split that is meant where a dataset is given and none is named.
 DEFAULT_SPLIT = "test"
@@ -39,19 +39,19 @@ class VerifyRequest:
     out: Path | None = None
 
 
-def plan_request(request: VerifyRequest) -> list[VerifyTask]:
-    """Return the tasks of a request, at least one.
+def place_requested(request: VerifyRequest) -> list[PlacedGrasp]:
+    """Return the grasps of a request on their objects, at least one.
 
     Raises:
         GraspError, MeshError, ConfigError, HandError: If something cannot be used.
     """
     try:
-        return _plan(request)
+        return _place(request)
     except DataError as error:
         raise GraspError(str(error)) from None
 
 
-def _plan(request: VerifyRequest) -> list[VerifyTask]:
+def _place(request: VerifyRequest) -> list[PlacedGrasp]:
     if request.out is not None:
         refuse_unwritable(request.out)
     path = _dataset_path(request)
@@ -59,12 +59,10 @@ def _plan(request: VerifyRequest) -> list[VerifyTask]:
     split = request.split if path is None else request.split or DEFAULT_SPLIT
     data = None if path is None else GraspDataset(path, split=split or DEFAULT_SPLIT)
     predicted = read_predictions(request.grasps, split=split)
-    return plan_verification(
-        predicted.grasps,
-        request.mesh,
+    arguments = VerifyArguments(
+        mesh=request.mesh,
         frame=request.frame,
-        X=None if request.camera is None else read_numbers(request.camera),
-        X_TO=None,
+        X_TC=None if request.camera is None else read_numbers(request.camera),
         units=request.units,
         hand=request.hand,
         method=request.method,
@@ -72,6 +70,7 @@ def _plan(request: VerifyRequest) -> list[VerifyTask]:
         dataset=data,
         rows=None if predicted.rows is None else predicted.rows.tolist(),
     )
+    return place_grasps(predicted.grasps, arguments)
 
 
 def _dataset_path(request: VerifyRequest) -> Path | None:

@@ -50,16 +50,12 @@ class Holder:
         return f"process {self.process.pid} on {self.process.host}, since {self.since}"
 
 
-#: Directories that this process holds, with the dead holder from whom it took them over.
-_held: dict[Path, Holder | None] = {}
-
-
 @contextmanager
 def build_lock(out: Path) -> Iterator[Holder | None]:
     """Hold a directory while the block runs.
 
-    Yields the dead holder from whom the lock was taken over, or None. The process that holds a
-    directory may ask for it again.
+    Yields the dead holder from whom the lock was taken over, or None. One function of a command
+    takes the lock, and what it calls relies on it.
 
     Args:
         out: The directory; made if it is missing, and removed again if it stays empty.
@@ -67,17 +63,11 @@ def build_lock(out: Path) -> Iterator[Holder | None]:
     Raises:
         DataError: If another process builds in the directory, or it cannot be written.
     """
-    path = out.resolve()
-    if path in _held:
-        yield _held[path]
-        return
     made = _make_directory(out)
     file, before = _take(out / FILE_NAME)
     try:
-        _held[path] = before
         yield before
     finally:
-        del _held[path]
         (out / FILE_NAME).unlink(missing_ok=True)
         file.close()
         if made:

@@ -27,7 +27,7 @@ from drakegrasp.hand.files import hand_digest
 from drakegrasp.runtime.files import probe_folder, write_atomic
 
 #: Packages whose versions may change a result.
-VERSIONED = ("drakegrasp", "drake", "numpy", "scipy", "trimesh", "manifold3d", "embreex", "h5py")
+VERSIONED = ("drakegrasp", "drake", "numpy", "scipy", "trimesh", "manifold3d", "h5py")
 #: Versions that must not change within a dataset, nor between a client and its workers.
 REQUIRED_VERSIONS = ("drakegrasp", "drake", "hand")
 
@@ -184,17 +184,21 @@ def read_manifest(out: Path) -> Manifest:
     """
     path = out / FILE_NAME
     try:
+        # The version first: another schema may have other keys.
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["schema_version"] != SCHEMA_VERSION:
             raise DataError(
                 f"{path}: schema must be {SCHEMA_VERSION}, got {content['schema_version']}"
             )
+
         return Manifest(
             config=parse_config(content["config"]),
             objects=tuple(ObjectEntry.from_json(entry) for entry in content["objects"]),
             refused=tuple(RefusedMesh.from_json(entry) for entry in content["refused"]),
             versions=content["versions"],
         )
+
+    # A missing file is another mistake than a broken one.
     except FileNotFoundError:
         raise DataError(
             f"{out}: must be the directory of a dataset, got one without {FILE_NAME}"

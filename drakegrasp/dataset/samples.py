@@ -158,9 +158,13 @@ def _sample(model: ObjectModel, shard: Shard, row: int, k: int, camera: str) -> 
         camera: `oto` or `otm`.
     """
     trials, looks = shard.trials, shard.looks
+
+    # The poses of this sample, and its grasp in {O}.
     X_TO = unpack_pose(trials["X_TO"][row])
     X_TC = {c: unpack_pose(looks[f"X_TC_{c}"][k]) for c in CAMERAS}
     grasp_O = pack_grasp(trials["closed_p_OQ"][row], trials["closed_nhat_Q_O"][row])
+
+    # What does not depend on the camera of the file.
     R_TO = X_TO[:3, :3]
     properties = {
         "object_name": model.name,
@@ -176,6 +180,8 @@ def _sample(model: ObjectModel, shard: Shard, row: int, k: int, camera: str) -> 
         "frame_world2obj": pack_pose(multiply(X_WT, X_TO)),
         "frame_world2work": pack_pose(X_WT),
     }
+
+    # Image, mask, and the grasp in the frame of the file's camera.
     return {
         "images": looks[f"image_{camera}"][k],
         "masks": looks[f"mask_{camera}"][k],

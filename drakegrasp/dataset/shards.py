@@ -143,9 +143,12 @@ def _open_shard(
         refuse_broken_seal(path)
     try:
         with h5py.File(path, "r") as file:
+            # The version first: another schema may have other attributes.
             version = int(file.attrs["schema_version"])
             if version != SCHEMA_VERSION:
                 raise DataError(f"{path}: schema must be {SCHEMA_VERSION}, got {version}")
+
+            # Then its identity: a file may have been copied to the path of another unit.
             own_header = ShardHeader(
                 config_hash=str(file.attrs["config_hash"]),
                 mesh_sha256=str(file.attrs["mesh_sha256"]),
@@ -157,6 +160,7 @@ def _open_shard(
                 raise DataError(
                     f"{path}: must be a shard of {header.label}, got one of {own_header.label}"
                 )
+
             yield file, own_header
     except (OSError, KeyError) as error:
         raise DataError(f"{path}: must be a complete shard, got another file ({error})") from None

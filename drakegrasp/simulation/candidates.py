@@ -21,6 +21,7 @@ import trimesh
 
 from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos_deg
 from drakegrasp.config import CandidateConfig
+from drakegrasp.mesh.rays import first_hits
 from drakegrasp.mesh.surfaces import on_faces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key
@@ -33,13 +34,8 @@ SAME_POSE = 1e-6
 #: A palm this far below the table, or a palm ray this far beside the bounding box, is still valid
 #: [m]: far above rounding, far below what matters.
 EDGE = 1e-6
-#: A palm ray that misses a triangle by this share of it still meets it, so that no ray passes
-#: between two triangles.
-RAY_EDGE = 1e-9
 #: Combinations whose poses are computed together; bounds the memory.
 CHUNK = 131_072
-#: Pairs of a ray and a triangle that are computed together; they fit into a CPU's cache.
-PAIRS = 65_536
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -66,28 +62,37 @@ class Candidates:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Attempt:
-    """One candidate at one stand-off: the start of a trial.
+class Pregrasp:
+    """Palm pose and joint angles before the fingers close: the start of a trial.
+
+    Attributes:
+        X_OG: Pose of the palm (4, 4); the candidate's own where its ray misses.
+        spread: Angle of the spread joints [rad].
+        closing: Angles of the closing joints (k,) [rad] at the start; None is the open hand.
+        ray_hits: Whether the palm ray meets the object; true if no ray places the palm.
+    """
+
+    X_OG: Array
+    spread: float
+    closing: Array | None = None
+    ray_hits: bool = True
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Attempt(Pregrasp):
+    """One candidate at one stand-off, as a dataset counts it.
 
     Attributes:
         candidate: Index of the candidate of its object.
         standoff_index: Index into `candidates.standoffs`.
         standoff: Distance of the palm from the surface point along -Gz [m].
-        spread: Angle of the spread joints [rad].
-        X_OG: Pose of the palm (4, 4); the candidate's own where its ray misses.
-        ray_hits: Whether the palm ray meets the object.
         seed: Seed from which `spread` was drawn.
-        closing: Angles of the closing joints (k,) [rad] at the start; None is the open hand.
     """
 
     candidate: int
     standoff_index: int
     standoff: float
-    spread: float
-    X_OG: Array
-    ray_hits: bool
     seed: int
-    closing: Array | None = None
 
 
 def sample_candidates(
@@ -218,52 +223,9 @@ def ray_meets_box(p_OG: Array, z_O: Array, half: Array) -> npt.NDArray[np.bool_]
 
 
 def palm_ray_distance(mesh: trimesh.Trimesh, X_OG: Array) -> Array:
-    """Return the distance (n,) [m] along +Gz to the mesh's surface; NaN where it is missed.
-
-    Möller and Trumbore's test (1997); a ray through an edge meets it. Embree is no alternative: it
-    works in single precision, with kernels that depend on the CPU.
-    """
-    # A sphere around each triangle, a little larger than rounding needs.
-    a, b, c = np.moveaxis(np.asarray(mesh.triangles, dtype=float), 1, 0)
-    centre = (a + b + c) / 3.0
-    reach = np.sqrt(np.max([dot(q - centre, q - centre) for q in (a, b, c)], axis=0, initial=0.0))
-
-    # Test only triangles whose sphere is near the ray.
-    distance = np.full(len(X_OG), np.inf)
-    step = max(1, PAIRS // max(1, len(a)))
-    for start in range(0, len(X_OG), step):
-        rays = X_OG[start : start + step]
-        near = _near_triangles(rays, centre, reach * (1.0 + RAY_EDGE) + EDGE)
-        ray, triangle = np.nonzero(near)
-        hits = _ray_triangle(
-            rays[ray, :3, 3], rays[ray, :3, 2], a[triangle], b[triangle], c[triangle]
-        )
-        np.minimum.at(distance, start + ray, hits)
+    """Return the distance (n,) [m] along +Gz to the mesh's surface; NaN where it is missed."""
+    distance = first_hits(np.asarray(mesh.triangles), X_OG[:, :3, 3], X_OG[:, :3, 2])
     return np.where(np.isfinite(distance), distance, np.nan)
-
-
-def _near_triangles(X_OG: Array, centre: Array, reach: Array) -> npt.NDArray[np.bool_]:
-    """Return (n, m) whether each ray meets each sphere of centre (m, 3) and radius (m,)."""
-    along, squared = np.zeros((len(X_OG), len(centre))), np.zeros((len(X_OG), len(centre)))
-    for axis in range(3):
-        apart = centre[:, axis] - X_OG[:, None, axis, 3]
-        along += apart * X_OG[:, None, axis, 2]
-        squared += apart * apart
-    # The difference of two squares loses digits; EDGE in the reach is far above that error.
-    return (squared - along * along <= reach * reach) & (along >= -reach)
-
-
-def _ray_triangle(p: Array, z: Array, a: Array, b: Array, c: Array) -> Array:
-    """Return the distance (n,) at which each ray meets its triangle; inf where it does not."""
-    ab, ac, ap = b - a, c - a, p - a
-    across, up = np.cross(z, ac), np.cross(ap, ab)
-    volume = dot(ab, across)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u, v, t = dot(ap, across) / volume, dot(z, up) / volume, dot(ac, up) / volume
-        meets = (u >= -RAY_EDGE) & (v >= -RAY_EDGE) & (u + v <= 1.0 + RAY_EDGE) & (t >= 0.0)
-    # A triangle that is seen edge-on is skipped: the ray meets its neighbours.
-    flat = np.abs(volume) <= RAY_EDGE * norm(ab) * norm(ac)
-    return np.where(meets & ~flat, t, np.inf)
 
 
 def make_attempts(

@@ -27,7 +27,7 @@ from drakegrasp.hand.finger_sweep import GAP_STRIDE, FingerPath, HandPaths, Poin
 from drakegrasp.mesh.distance_field import DistanceField
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.candidates import Pregrasp
 
 Counts = npt.NDArray[np.int64]
 
@@ -65,7 +65,7 @@ def predict(
     model: ObjectModel,
     hand: Hand,
     X_TO: npt.ArrayLike,
-    attempts: Sequence[Attempt],
+    attempts: Sequence[Pregrasp],
     config: ScreenConfig,
 ) -> list[Prediction | None]:
     """Return what geometry decides about attempts; None for an attempt that is not screened.

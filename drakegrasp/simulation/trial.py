@@ -17,7 +17,7 @@ from drakegrasp.config import Config
 from drakegrasp.errors import first_line
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import Contacts, open_hand_collides, read_contacts
 from drakegrasp.simulation.lift import lift
 from drakegrasp.simulation.scene import (
@@ -73,7 +73,7 @@ class TrialRecord:
 def run_attempt(
     scene: Scene,
     X_TO: npt.ArrayLike,
-    attempt: Attempt,
+    attempt: Pregrasp,
     config: Config,
     prediction: Prediction | None = None,
 ) -> TrialRecord:
@@ -111,7 +111,7 @@ def run_attempt(
         if screened is Outcome.START_COLLISION or (screened is not None and not near):
             return replace(start, outcome=screened)
 
-        # Place: object and palm stand still, the fingers are open.
+        # Place: object and palm stand still, the fingers are where the attempt starts them.
         limits = start_limits(config)
         reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=attempt.closing)
         if open_hand_collides(scene):
@@ -158,7 +158,7 @@ def run_attempt(
         return replace(start, outcome=Outcome.SOLVER_ERROR, message=first_line(error))
 
 
-def _predict(scene: Scene, X_TO: Array, attempt: Attempt, config: Config) -> Prediction | None:
+def _predict(scene: Scene, X_TO: Array, attempt: Pregrasp, config: Config) -> Prediction | None:
     if scene.handles is None:
         return None
     (prediction,) = predict(scene.model, scene.handles.hand, X_TO, [attempt], config.screen)

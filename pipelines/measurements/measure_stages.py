@@ -1,11 +1,12 @@
 """Measure the seconds and bytes of every stage of a build on some meshes.
 
+\b
     python pipelines/measurements/measure_stages.py MESH_DIR OUT --candidates 20 > times.json
     drakegrasp build --objects MESH_DIR ... --plan --times times.json
 
-Builds a small dataset in this process alone, so no other worker of it disturbs the clock.
-The defaults of `drakegrasp.build.estimate` are from here.
-"""
+The script builds a small dataset in this process alone, so that no other worker disturbs the
+clock. The defaults of `drakegrasp.build.stage_times` were measured with it.
+"""  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
 
@@ -18,20 +19,23 @@ from pathlib import Path
 from typing import Any
 
 import click
+import h5py
 
-from drakegrasp.build.estimate import StageTimes, measure_storage
 from drakegrasp.build.pipeline import build
+from drakegrasp.build.stage_times import StageTimes
 from drakegrasp.build.work_unit import UnitSummary
 from drakegrasp.cli.options import manifest_option, set_option, units_option
 from drakegrasp.config import load_config
 from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.statistics import count_splits
+from drakegrasp.errors import DataError
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 
 
 class Clock:
-    """An executor that keeps what every task took and said."""
+    """An executor that keeps the time and the result of every task."""
 
     def __init__(self) -> None:
         self.prepare: list[float] = []
@@ -54,9 +58,13 @@ class Clock:
 @click.command(help=__doc__)
 @click.argument("meshes", type=click.Path(path_type=Path, exists=True))
 @click.argument("out", type=click.Path(path_type=Path))
-@click.option("--config", "config_name", metavar="YAML|PRESET", help="[paper]")
+@click.option(
+    "--config", "config_name", metavar="YAML|PRESET", help="Configuration.  [default: paper]"
+)
 @set_option
-@click.option("--candidates", type=int, default=20, show_default=True, help="Per object.")
+@click.option(
+    "--candidates", type=int, default=20, show_default=True, help="Palm poses per object."
+)
 @units_option
 @manifest_option
 def main(
@@ -68,38 +76,43 @@ def main(
     units: str,
     manifest: Path | None,
 ) -> None:
-    """Print the figures as JSON."""
+    """Run the script."""
     sources = find_meshes(meshes, units=units, manifest=manifest)
     config = load_config(config_name, [*overrides, f"candidates.max={candidates}"])
     clock, begin, begin_cpu = Clock(), time.perf_counter(), time.process_time()
     build(sources, out, config, clock, show=False)
     end = time.perf_counter()
-    # Seconds of a whole core, whatever else this machine had to do.
+
+    # The wall clock counts the time of other processes, too; CPU time is the share of this one.
     core = (time.process_time() - begin_cpu) / (end - begin)
     times = stage_times(clock, core, assembled=end - clock.last, out=out)
     click.echo(json.dumps(asdict(times), indent=1))
 
 
 def stage_times(clock: Clock, core: float, *, assembled: float, out: Path) -> StageTimes:
-    """Return what a build took by stage, in seconds of a core of which it had a share."""
+    """Return the seconds of each stage of a build.
+
+    Args:
+        clock: What the tasks took by the wall clock.
+        core: CPU time of this process per wall-clock time.
+        assembled: Time of the assembly [s].
+        out: The dataset.
+    """
+    # Sum over all units, and over those of each object.
     outcomes: Counter[Outcome] = Counter()
     seconds: Counter[str] = Counter()
     for unit in clock.units:
         outcomes.update(unit.outcomes)
         seconds.update({stage: core * spent for stage, spent in unit.seconds.items()})
+
     attempts, successes = sum(outcomes.values()), outcomes[Outcome.SUCCESS]
     samples = sum(split.samples for split in count_splits(out))
     objects = len(read_manifest(out).objects)
-    by_object: dict[str, float] = {}
-    for unit in clock.units:
-        name = unit.header.object_name
-        by_object[name] = by_object.get(name, 0.0) + core * unit.seconds["try"]
-    mean = seconds["try"] / objects
+
     return StageTimes(
         prepare=core * sum(clock.prepare) / len(clock.prepare),
         scene=seconds["build"] / objects,
-        attempt=(seconds["try"] + seconds["write"]) / attempts,
-        shares=tuple(sorted(spent / mean for spent in by_object.values())),
+        attempt=(seconds["try"] + seconds["measure"] + seconds["write"]) / attempts,
         look=seconds["look"] / max(1, successes),
         assemble=core * assembled / attempts,
         successes=successes / attempts,
@@ -107,6 +120,41 @@ def stage_times(clock: Clock, core: float, *, assembled: float, out: Path) -> St
         **measure_storage(out),
         source=f"measured on {objects} objects, {attempts} attempts",
     )
+
+
+def measure_storage(out: Path) -> dict[str, float]:
+    """Return the sizes that `StageTimes` has, of a finished dataset [B].
+
+    Raises:
+        DataError: If there is none.
+    """
+    try:
+        with h5py.File(out / TRIALS_FILE, "r") as file:
+            attempts, successes = len(file["trials/outcome"]), len(file["successes/trial_id"])
+            objects = len(file["objects/name"])
+        with h5py.File(out / DATA_FILES["oto"], "r") as file:
+            samples = sum(len(split["grasps"]) for split in file.values() if "grasps" in split)
+        trials = (out / TRIALS_FILE).stat().st_size
+        data = sum((out / name).stat().st_size for name in DATA_FILES.values())
+    except (OSError, KeyError) as error:
+        raise DataError(f"{out}: must be a finished dataset, got none ({error})") from None
+    shards = list((out / "shards").rglob("*.h5"))
+    rows = sum(_stored_bytes(path, "trials") for path in shards)
+    looks = sum(_stored_bytes(path, "looks") for path in shards)
+    rest = sum(path.stat().st_size for path in shards) - rows - looks
+    kept = sum(path.stat().st_size for path in (out / "objects").iterdir())
+    return {
+        "unit_bytes": rest / len(shards),
+        "attempt_bytes": (trials + rows) / attempts,
+        "success_bytes": looks / max(1, successes),
+        "sample_bytes": data / max(1, samples),
+        "object_bytes": kept / objects,
+    }
+
+
+def _stored_bytes(path: Path, group: str) -> int:
+    with h5py.File(path, "r") as file:
+        return sum(int(column.id.get_storage_size()) for column in file[group].values())
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from drakegrasp.outcomes import Outcome
 pytest.importorskip("mujoco")
 pytest.importorskip("coacd")
 
-from drakegrasp.bench.mujoco_baseline import Peer
+from drakegrasp.bench.mujoco_baseline import MujocoBaseline
 
 pytestmark = pytest.mark.sim
 
@@ -34,15 +34,17 @@ def config() -> Config:
 
 
 @pytest.fixture(scope="module")
-def peer(cube: ObjectModel, config: Config) -> Peer:
-    return Peer(cube, standing(cube), config)
+def baseline(cube: ObjectModel, config: Config) -> MujocoBaseline:
+    return MujocoBaseline(cube, standing(cube), config)
 
 
-def test_cube_is_one_part_and_is_held_across_its_faces(peer: Peer, cube: ObjectModel) -> None:
-    assert peer.parts == 1
+def test_cube_is_one_part_and_is_held_across_its_faces(
+    baseline: MujocoBaseline, cube: ObjectModel
+) -> None:
+    assert baseline.parts == 1
     attempt = from_above(cube, STANDOFF)
-    assert peer.run(attempt) is Outcome.SUCCESS
-    assert peer.run(attempt) is Outcome.SUCCESS  # nothing is left of the first run
+    assert baseline.run(attempt) is Outcome.SUCCESS
+    assert baseline.run(attempt) is Outcome.SUCCESS  # nothing is left of the first run
 
 
 @pytest.mark.parametrize(
@@ -50,25 +52,27 @@ def test_cube_is_one_part_and_is_held_across_its_faces(peer: Peer, cube: ObjectM
     [(0.3, Outcome.MISSING_FINGERTIP), (0.001, Outcome.START_COLLISION)],
 )
 def test_attempts_fail_where_they_should(
-    peer: Peer, cube: ObjectModel, standoff: float, outcome: Outcome
+    baseline: MujocoBaseline, cube: ObjectModel, standoff: float, outcome: Outcome
 ) -> None:
-    assert peer.run(from_above(cube, standoff)) is outcome
+    assert baseline.run(from_above(cube, standoff)) is outcome
 
 
-def test_what_geometry_decides_is_not_simulated(peer: Peer, cube: ObjectModel) -> None:
+def test_what_geometry_decides_is_not_simulated(
+    baseline: MujocoBaseline, cube: ObjectModel
+) -> None:
     attempt = from_above(cube, STANDOFF)
-    assert peer.run(replace(attempt, ray_hits=False)) is Outcome.RAY_MISS
+    assert baseline.run(replace(attempt, ray_hits=False)) is Outcome.RAY_MISS
     below = attempt.X_OG @ make_pose(np.eye(3), [0.0, 0.0, 0.3])
-    assert peer.run(replace(attempt, X_OG=below)) is Outcome.BELOW_TABLE
+    assert baseline.run(replace(attempt, X_OG=below)) is Outcome.BELOW_TABLE
 
 
 def test_slippery_cube_is_not_held(cube: ObjectModel, config: Config) -> None:
     slick = override_config(config, ["physics.friction_hand=0.05"])
-    outcome = Peer(cube, standing(cube), slick).run(from_above(cube, STANDOFF))
+    outcome = MujocoBaseline(cube, standing(cube), slick).run(from_above(cube, STANDOFF))
     assert outcome in (Outcome.DROPPED, Outcome.SLIPPED)
 
 
-def test_spread_turns_the_fingers(peer: Peer, cube: ObjectModel) -> None:
+def test_spread_turns_the_fingers(baseline: MujocoBaseline, cube: ObjectModel) -> None:
     """At 90 degrees both spread fingers are at the sides, where the third does not oppose them."""
-    found = peer.run(from_above(cube, STANDOFF, spread=float(np.deg2rad(90.0))))
-    assert found is not Outcome.SUCCESS
+    outcome = baseline.run(from_above(cube, STANDOFF, spread=float(np.deg2rad(90.0))))
+    assert outcome is not Outcome.SUCCESS

@@ -227,7 +227,7 @@ def test_directory_with_bad_meshes_only_leaves_nothing_behind(tmp_path: Path) ->
     meshes = tmp_path / "meshes"
     meshes.mkdir()
     (meshes / "1_text_a.obj").write_text("no mesh at all\n")
-    with pytest.raises(DataError, match="at least one mesh must be fit to simulate"):
+    with pytest.raises(DataError, match="no mesh can be simulated: "):
         build(find_meshes(meshes), tmp_path / "out", load_config(), run_here, show=False)
     assert not (tmp_path / "out").exists()
 

@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import click
@@ -56,15 +57,49 @@ def test_help_answers_without_loading_the_simulator() -> None:
     code = (
         "import sys; from drakegrasp.cli.main import main; "
         "main(['--help'], standalone_mode=False); "
-        "heavy = {'pydrake', 'dask', 'distributed', 'matplotlib', 'trimesh', 'scipy', 'h5py'}; "
+        "heavy = {'pydrake', 'dask', 'distributed', 'matplotlib', 'trimesh', 'scipy', 'h5py', "
+        "'numpy', 'pydantic', 'yaml', 'rich'}; "
         "assert not heavy & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
 
 
-def test_wrong_usage_is_exit_code_two() -> None:
-    assert run("build").exit_code == 2
-    assert run("fly").exit_code == 2
+@pytest.mark.parametrize(
+    "arguments",
+    [["--fly"], ["fly"], ["build"], ["build", "--fly"], ["objects", "fly"], ["replay", ".", "x"]],
+    ids=" ".join,
+)
+def test_wrong_usage_is_one_line_and_exit_code_two(arguments: list[str]) -> None:
+    result = run(*arguments)
+    assert result.exit_code == 2
+    assert [error_line(result)] == result.stderr.splitlines()
+
+
+def test_an_error_before_any_progress_is_all_that_is_printed(tmp_path: Path) -> None:
+    result = run("check", tmp_path / "nowhere")
+    assert result.exit_code == 1
+    assert [error_line(result)] == result.stderr.splitlines()
+
+
+def test_a_reader_that_closes_the_pipe_sees_no_error() -> None:
+    code = "from drakegrasp.cli.main import main; main(['objects', 'list'])"
+    reader, writer = os.pipe()
+    os.close(reader)
+    child = subprocess.run([sys.executable, "-c", code], stdout=writer, stderr=subprocess.PIPE)
+    os.close(writer)
+    assert (child.returncode, child.stderr) == (1, b"")
+
+
+def test_help_fits_into_80_columns_and_is_not_cut() -> None:
+    def pages(command: click.Command, name: str) -> Iterator[str]:
+        context = click.Context(command, info_name=name, terminal_width=80, max_content_width=80)
+        yield command.get_help(context)
+        for sub in command.commands if isinstance(command, click.Group) else ():
+            yield from pages(command.commands[sub], f"{name} {sub}")
+
+    for page in pages(main, "drakegrasp"):
+        assert "..." not in page.replace("[ARGS]...", "")
+        assert max(map(len, page.splitlines())) <= 80
 
 
 def test_objects_are_listed_and_exported(tmp_path: Path) -> None:

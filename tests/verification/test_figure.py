@@ -63,7 +63,7 @@ def verified(cube: ObjectModel) -> Callable[..., SimpleNamespace]:
             "outcome": Outcome.OFF_SURFACE, "reason": "so it is",
             "placed": SimpleNamespace(model=cube, X_TO=standing(cube)),
             "p_OQ": P_OQ, "nhat_Q_O": NHAT_Q_O,
-            "fit": None, "attempt": None, "trial": None, "lift": None,
+            "fit": None, "pregrasp": None, "trial": None, "lift": None,
             "config": load_config(),
         }  # fmt: skip
         return SimpleNamespace(**result | values)

@@ -116,6 +116,7 @@ def wineglass(
 
     All lengths are in [m].
     """
+    # The cup, outside and inside.
     cup_height = height - stem_height
     outer = smooth(
         [
@@ -128,6 +129,8 @@ def wineglass(
     )
     floor = stem_height + 0.012
     inner = spread_evenly(inset(outer, wall, floor=floor), COARSE * EDGE)[::-1]
+
+    # Foot and stem.
     foot = resample([(0.0, 0.0), (foot_radius, 0.0), (foot_radius, 0.005)], EDGE)
     stem = smooth(
         [
@@ -138,6 +141,8 @@ def wineglass(
         ],
         EDGE,
     )
+
+    # One outline, with longer edges inside.
     bottom = resample([inner[-1], (0.0, floor)], COARSE * EDGE)[1:]
     profile = np.vstack([foot, stem[1:], outer[1:], inner, bottom])
     edges = np.full(len(profile), EDGE)

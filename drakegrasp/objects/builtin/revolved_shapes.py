@@ -21,6 +21,8 @@ def bottle(*, radius: float, height: float, neck_radius: float) -> trimesh.Trime
     All lengths are in [m].
     """
     shoulder, neck, cap = 0.58 * height, 0.78 * height, 0.9 * height
+
+    # From the bottom up: body, shoulder, neck and cap.
     side = np.vstack(
         [
             resample([*bevelled(radius, height, 0.004)[:2], (radius, shoulder)], EDGE),
@@ -57,6 +59,8 @@ def jar(*, radius: float, height: float, lid_radius: float, lid_height: float) -
     """
     shoulder = height - lid_height - 0.018
     neck = min(lid_radius - 0.004, radius - 0.008)
+
+    # From the bottom up: body, shoulder, lid.
     side = np.vstack(
         [
             resample([*bevelled(radius, height, 0.005)[:2], (radius, shoulder)], EDGE),
@@ -126,6 +130,7 @@ def flashlight(
         ],
         EDGE,
     )
+
     z = taper + 0.022
     switch = bar(
         (0.0, 0.0, z),
@@ -156,6 +161,7 @@ def apple(*, radius: float, height: float) -> trimesh.Trimesh:
         ],
         EDGE,
     )
+
     stem = bar(
         (0.0, 0.0, 0.7 * height),
         (0.004, 0.0, height + 0.010),
@@ -184,6 +190,7 @@ def pear(*, radius: float, neck_radius: float, height: float) -> trimesh.Trimesh
         ],
         EDGE,
     )
+
     stem = bar(
         (0.0, 0.0, 0.85 * height),
         (-0.004, 0.0, height + 0.014),
