@@ -1,7 +1,7 @@
-"""Build a small dataset of eight built-in objects in a few minutes and show what is in it.
+"""Build a small dataset of eight built-in objects in a few minutes and show its contents.
 
 Writes DIR/meshes (the objects), DIR/dataset (the dataset) and DIR/contact_sheet.png. The
-same command goes on where one stopped.
+same command continues an interrupted build.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from drakegrasp.errors import DrakegraspError
 from drakegrasp.objects.builtin.catalog import export_builtin
 from drakegrasp.visualization.contact_sheet import contact_sheet
 
-#: Objects that this hand can grasp, two of each class.
+#: Objects that the hand can grasp, two of each class.
 OBJECTS = (
     "7_wineglass_round",
     "8_wineglass_flute",
@@ -61,10 +61,12 @@ def run(directory: Path, *, candidates: int, workers: int | None = None) -> None
         directory / "dataset",
         directory / "contact_sheet.png",
     )
+
     export_builtin(meshes, OBJECTS)
     # Shards of 25 candidates keep all cores busy to the end of so small a dataset.
     config = load_config(None, [f"candidates.max={candidates}", "unit_candidates=25"])
     build_dataset(meshes, out, config=config, workers=workers)
+
     console = Console()
     console = console if console.is_terminal else Console(width=WIDTH)
     console.print(funnel_table(count_funnel(out)))

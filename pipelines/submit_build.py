@@ -7,9 +7,9 @@
     python pipelines/submit_build.py --cluster scheduler tcp://10.0.0.1:8786 ...
     python pipelines/submit_build.py --cluster scheduler-file scheduler.json ...
 
-What will run and what it is expected to take is printed first; --dry-run stops there. The
-same command goes on where one stopped, on any cluster. docs/how-to/clusters.md has the details,
-pipelines/recipes/ an example of each.
+The script first prints what will run and how long it is expected to take; --dry-run stops
+there. The same command continues an interrupted build, on any cluster. See
+docs/how-to/clusters.md for the details and pipelines/recipes/ for an example of each.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -39,27 +39,33 @@ from drakegrasp.errors import ConfigError
     type=click.Choice(KINDS),
     default="local",
     show_default=True,
-    help="What runs the work; ssh is followed by hosts, scheduler by its address, "
-    "scheduler-file by its path.",
+    help="Where the work runs. Hosts follow ssh, an address follows scheduler, and a path follows "
+    "scheduler-file.",
 )
 @click.argument("where", nargs=-1, metavar="[HOST...|ADDRESS|PATH]")
 @build_options
-@click.option("--workers", type=int, help="Processes in all.  [local: one per core]")
-@click.option("--cores", type=int, help="Of each SSH host or SLURM job, a worker on each.")
-@click.option("--memory", metavar="SIZE", help="Of each worker, e.g. 2GB.")
-@click.option("--walltime", metavar="TIME", help="Of each SLURM job, [D-]HH:MM:SS.")
-@click.option("--interface", metavar="NAME", help="Network on which scheduler and workers listen.")
-@click.option("--host", metavar="ADDRESS", help="On which the scheduler listens, instead.")
+@click.option(
+    "--workers", type=int, metavar="N", help="Processes in all.  [default with local: one per core]"
+)
+@click.option(
+    "--cores", type=int, metavar="N", help="Cores of each SSH host or SLURM job, a worker on each."
+)
+@click.option("--memory", metavar="SIZE", help="Memory of each worker, e.g. 2GB.")
+@click.option("--walltime", metavar="TIME", help="Time limit of each SLURM job, [D-]HH:MM:SS.")
+@click.option(
+    "--interface", metavar="NAME", help="Network interface on which scheduler and workers listen."
+)
+@click.option("--host", metavar="ADDRESS", help="Address on which the scheduler listens, instead.")
 @click.option("--tls", is_flag=True, help="Encrypt, with certificates made for this run.")
 @click.option(
     "--tls-ca-file",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="Encrypt, with an authority of yours (PEM); needs the next two.",
+    help="Encrypt, with your own certificate authority (PEM); needs the next two options.",
 )
 @click.option(
     "--tls-cert",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="A certificate by it, of client, scheduler and workers.",
+    help="Certificate of client, scheduler and workers, signed by that authority.",
 )
 @click.option(
     "--tls-key",
@@ -99,12 +105,15 @@ def main(
         tls=tls,
         tls_files=_tls_files(tls_ca_file, tls_cert, tls_key),
     )
+
+    # Say what will run before anything starts.
     click.echo("\n".join(describe(cluster)))
     print_plan(request, _count(cluster, request.out), times)
     if dry_run:
         return
+
     sources = find_sources(request.objects, request.units, request.manifest)
-    # Locked first: a second build is refused before it starts any worker.
+    # The lock comes first, so that a second build is refused before it starts workers.
     with build_lock(request.out), start_cluster(cluster, request.out) as client:
         if request.show:
             click.echo(dashboard_line(client), err=True)
@@ -115,7 +124,7 @@ def main(
 
 
 def _count(cluster: ClusterRequest, out: Path) -> int | None:
-    """Return how many workers there will be; those of a running scheduler are asked for."""
+    """Return the number of workers; a running scheduler is asked for it."""
     if cluster.kind not in ("scheduler", "scheduler-file"):
         return worker_count(cluster)
     with start_cluster(cluster, out) as client:

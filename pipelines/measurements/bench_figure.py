@@ -1,7 +1,8 @@
-"""Draw a report of `drakegrasp bench`: what becomes of attempts, and what they cost.
+"""Draw a report of `drakegrasp bench`: outcomes of attempts, and what they cost.
 
-python pipelines/measurements/bench_figure.py bench.json docs/images/bench.png
-"""
+\b
+    python pipelines/measurements/bench_figure.py bench.json docs/images/bench.png
+"""  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ from matplotlib.figure import Figure
 
 from drakegrasp.outcomes import Outcome
 
-#: What decided, and the outcomes for which it did, with a colour each.
+#: What decided an attempt, the outcomes that it decides, and their colour.
 DECIDED: dict[str, tuple[tuple[Outcome, ...], str]] = {
     "palm ray": ((Outcome.RAY_MISS, Outcome.BELOW_TABLE), "#c9ced6"),
     "start": ((Outcome.START_COLLISION,), "#98a3b3"),
@@ -30,7 +31,7 @@ DECIDED: dict[str, tuple[tuple[Outcome, ...], str]] = {
     "success": ((Outcome.SUCCESS,), "#2f8f5b"),
 }
 STAGES = {"screen": "#5f6f86", "try": "#d9722e", "look": "#2f8f5b", "scene": "#c9ced6"}
-#: Scenes and distance fields are made once per object.
+#: Stages that run once per object.
 ONCE = ("scene", "field")
 
 
@@ -41,28 +42,32 @@ def draw(report: Mapping[str, Any], png: Path) -> None:
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, sharey=True)
     left.invert_yaxis()
-    names = [found["name"].removesuffix("_final").replace("_", " ") for found in objects]
+    names = [rates["name"].removesuffix("_final").replace("_", " ") for rates in objects]
+
+    # Left: what decides the attempts of each object.
     shares = {
-        what: [100.0 * _count(found, outcomes) / found["attempts"] for found in objects]
+        what: [100.0 * _count(rates, outcomes) / rates["attempts"] for rates in objects]
         for what, (outcomes, _) in DECIDED.items()
     }
     colours = {what: colour for what, (_, colour) in DECIDED.items()}
     _stack(left, names, shares, colours, "of 100 attempts, decided by")
+
+    # Right: their cost by stage.
     costs = {
-        stage: [1e3 * _seconds(found, stage) / found["attempts"] for found in objects]
+        stage: [1e3 * _seconds(rates, stage) / rates["attempts"] for rates in objects]
         for stage in STAGES
     }
-    _stack(right, names, costs, STAGES, "milliseconds of a core per attempt")
+    _stack(right, names, costs, STAGES, "CPU milliseconds per attempt")
     figure.savefig(png)
 
 
-def _count(found: Mapping[str, Any], outcomes: Sequence[Outcome]) -> int:
-    return sum(int(found["outcomes"].get(outcome.label, 0)) for outcome in outcomes)
+def _count(rates: Mapping[str, Any], outcomes: Sequence[Outcome]) -> int:
+    return sum(int(rates["outcomes"].get(outcome.label, 0)) for outcome in outcomes)
 
 
-def _seconds(found: Mapping[str, Any], stage: str) -> float:
+def _seconds(rates: Mapping[str, Any], stage: str) -> float:
     stages = ONCE if stage in ONCE else (stage,)
-    return sum(float(found["seconds"][one]) for one in stages)
+    return sum(float(rates["seconds"][name]) for name in stages)
 
 
 def _stack(
@@ -90,7 +95,7 @@ def _stack(
 @click.argument("report", type=click.Path(path_type=Path, exists=True, dir_okay=False))
 @click.argument("png", type=click.Path(path_type=Path, dir_okay=False))
 def main(report: Path, png: Path) -> None:
-    """Draw it."""
+    """Run the script."""
     draw(json.loads(report.read_text(encoding="utf-8")), png)
 
 

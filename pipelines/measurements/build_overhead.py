@@ -1,14 +1,15 @@
-"""What a build spends on anything but its work, and what a second worker is worth.
+"""Measure the overhead of a build, and the gain of a second worker.
 
+\b
     python pipelines/measurements/build_overhead.py [--objects MESH_DIR] [--candidates N]
         [--set KEY=VALUE]
 
-Builds the same dataset with one worker and with two, and reads the logs. With one worker,
-all that is not scene, attempts or images is overhead: scheduling, shards, the log, and
-waiting for any of it; so is the check of every shard when the build is asked for again.
-Two busy cores of one machine are slower than one: how much, two plain loops without Dask
-say. Prints JSON. It needs two cores that have nothing else to do.
-"""
+The script builds the same dataset with one worker and with two and reads the logs. With one
+worker, all time that is not spent on scenes, attempts or images is overhead: scheduling,
+shards, the log, and waiting. It also measures how long it takes to check all shards when the
+build is asked for again. Two busy cores of one machine are slower than one; two plain loops
+without Dask show by how much. Prints JSON. It needs two idle cores.
+"""  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
 
@@ -33,11 +34,9 @@ from drakegrasp.objects.builtin.catalog import export_builtin
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.executor import run_here
 
-#: Stages of a unit that a plain loop without files would have, too.
+#: Stages of a work unit that a plain loop without files would have as well.
 WORK = ("build", "try", "look")
-
-
-#: Built-in objects, if no others are given.
+#: The built-in objects that are used by default.
 OBJECTS = (
     "2_mug_large",
     "4_bottle_stout",
@@ -46,14 +45,12 @@ OBJECTS = (
     "31_spray_bottle_small",
     "40_apple_large",
 )
-
-
-#: The plain loops try one in so many palm poses.
+#: The plain loops try one palm pose in this many.
 LESS = 4
 
 
 def plain_loop(objects: str | Path, units: str, config: Config) -> float:
-    """Return the seconds that a build in this process works, without any Dask."""
+    """Return the seconds of work of a build in this process, without Dask."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "out"
         build(find_meshes(objects, units=units), out, config, run_here, show=False)
@@ -72,11 +69,12 @@ def slow_down(objects: str | Path, units: str, config: Config) -> float:
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         alone = pool.submit(plain_loop, objects, units, few).result()
         both = [pool.submit(plain_loop, objects, units, few) for _ in range(2)]
-        return sum(one.result() for one in both) / (2.0 * alone)
+        return sum(loop.result() for loop in both) / (2.0 * alone)
 
 
 def measure(objects: str | Path, units: str, config: Config, workers: int) -> dict[str, float]:
-    """Return what a build took, in seconds of the wall clock."""
+    """Return the seconds of wall clock that the parts of a build took."""
+    # Build, and ask for the same build again.
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "out"
         build_dataset(objects, out, config=config, units=units, workers=workers, show=False)
@@ -87,6 +85,8 @@ def measure(objects: str | Path, units: str, config: Config, workers: int) -> di
         again = time.monotonic() - begin
         events = list(read_log(out))
     assert report.simulated == 0
+
+    # The log of the first build ends with `finished`.
     first = events[: 1 + next(i for i, e in enumerate(events) if e["event"] == "finished")]
     done = [event for event in first if event["event"] == "unit done"]
     started, prepared, simulated, finished = (
@@ -98,6 +98,7 @@ def measure(objects: str | Path, units: str, config: Config, workers: int) -> di
             first[-1],
         )
     )
+
     return {
         "units": len(done),
         "attempts": sum(sum(event["outcomes"].values()) for event in done),
@@ -121,13 +122,15 @@ def measure(objects: str | Path, units: str, config: Config, workers: int) -> di
 @set_option
 @click.option("--candidates", default=100, show_default=True, help="Per object.")
 def main(objects: Path | None, units: str, overrides: tuple[str, ...], candidates: int) -> None:
-    """Measure it."""
+    """Run the script."""
+    # Both builds and the plain loops use the same meshes.
     config = load_config(overrides=[f"candidates.max={candidates}", *overrides])
     with tempfile.TemporaryDirectory() as folder:
         if objects is None:
             export_builtin(folder, OBJECTS)
         one, two = (measure(objects or folder, units, config, workers) for workers in (1, 2))
         slower = slow_down(objects or folder, units, config)
+
     ratio = one["simulate"] / two["simulate"]
     figures: dict[str, Any] = {
         "seconds with one worker": {k: round(v, 3) for k, v in one.items()},

@@ -1,10 +1,11 @@
-"""How fast work units that do nothing go through, and what they leave in the client's memory.
+"""Measure how fast empty work units pass through Dask, and what the client's memory grows by.
 
+\b
     python pipelines/measurements/empty_units.py [--units N] [--workers W]
 
-The units are those of a real build, but for their work: what remains is the scheduler, the
-client and the wire. Prints JSON with seconds and megabytes.
-"""
+The units are those of a real build but do no work, so what is measured is the scheduler, the
+client and the network. Prints JSON with seconds and megabytes.
+"""  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
 
@@ -22,13 +23,13 @@ from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.outcomes import Outcome
 
-#: Units until the memory that Dask needs once is taken.
+#: Units that run first, so that Dask has allocated what it allocates once.
 WARM_UP = 1000
 STAGES = ("build", "try", "look", "write")
 
 
 def run_nothing(unit: WorkUnit) -> UnitSummary:
-    """Return what a unit would, without doing it."""
+    """Return the summary of a typical unit without running it."""
     outcomes = {Outcome.MISSING_FINGERTIP: 149, Outcome.SUCCESS: 1}
     seconds = dict.fromkeys(STAGES, 0.0)
     return UnitSummary(header=unit.header, outcomes=outcomes, seconds=seconds, errors={})
@@ -49,7 +50,7 @@ def units(count: int) -> Iterator[WorkUnit]:
 
 
 def memory() -> float:
-    """Return the memory that this process holds, with the scheduler in it [MB]."""
+    """Return the memory of this process, which also runs the scheduler [MB]."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * 4096 / 1e6
 
@@ -58,10 +59,11 @@ def memory() -> float:
 @click.option("--units", "count", default=100_000, show_default=True)
 @click.option("--workers", default=2, show_default=True)
 def main(count: int, workers: int) -> None:
-    """Measure it."""
+    """Run the script."""
     with connect(workers) as client:
         execute = DaskExecutor(client)
         done = sum(1 for _ in execute(run_nothing, units(WARM_UP)))
+
         before, peak = memory(), 0.0
         start, start_cpu = time.monotonic(), time.process_time()
         for done, _ in enumerate(execute(run_nothing, units(count)), start=1):

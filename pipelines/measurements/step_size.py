@@ -1,7 +1,8 @@
-"""Measure how many attempts end alike at two time steps, on objects of a dataset.
+"""Measure how many attempts have the same outcome at two time steps.
 
-The attempts are the first of each object's candidates whose palm ray meets the object. Prints JSON:
-how many end alike, of all and of those that were simulated, and which verdicts changed.
+The attempts are the first of each object of a dataset whose palm ray meets the object. Prints
+JSON: the share with the same outcome, of all attempts and of those that were simulated, and
+which outcomes changed.
 """
 
 from __future__ import annotations
@@ -24,21 +25,29 @@ from drakegrasp.simulation.trial import run_attempt
 
 
 def outcomes(prepared: PreparedObject, attempts: list[Attempt], config: Config) -> list[Outcome]:
-    """Return how attempts end under a configuration."""
+    """Return the outcomes of attempts under a configuration."""
     scene = build_scene(prepared.model, config.physics, load_hand(config.hand))
     return [run_attempt(scene, prepared.X_TO, a, config).outcome for a in attempts]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run from the command line."""
+    """Run the script; return its exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("dataset", type=Path, help="directory of a dataset")
     parser.add_argument("--objects", nargs="*", help="names of objects (default: all)")
-    parser.add_argument("--attempts", type=int, default=60, help="of each object (default: 60)")
-    parser.add_argument("--step", type=float, default=0.001, help="other time step in s")
+    parser.add_argument(
+        "--attempts", type=int, default=60, help="attempts of each object (default: 60)"
+    )
+    parser.add_argument(
+        "--step", type=float, default=0.001, help="the other time step [s] (default: 0.001)"
+    )
     arguments = parser.parse_args(argv)
+
+    # Every step of the other configuration is equally long, in a lift too.
     config = read_manifest(arguments.dataset).config
     other = override_config(config, [f"physics.time_step={arguments.step}", "physics.calm_steps=1"])
+
+    # Pairs of outcomes: with the dataset's step, with the other.
     pairs: Counter[tuple[Outcome, Outcome]] = Counter()
     for entry in read_manifest(arguments.dataset).objects:
         if arguments.objects and entry["name"] not in arguments.objects:
@@ -56,6 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 strict=True,
             )
         )
+
     simulated = {p: n for p, n in pairs.items() if max(o.stage for o in p) > Stage.PLACED}
     result = {
         "steps": [config.physics.time_step, arguments.step],
@@ -67,6 +77,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "changed": {f"{a.label} -> {b.label}": n for (a, b), n in pairs.items() if a is not b},
         "successes": [sum(n for p, n in pairs.items() if p[i] is Outcome.SUCCESS) for i in (0, 1)],
     }
+
     json.dump(result, sys.stdout, indent=1)
     sys.stdout.write("\n")
     return 0

@@ -1,10 +1,12 @@
-"""Hand a dataset's grasps back to be verified, and some that must fail: prints JSON.
+"""Verify the grasps of a dataset, and spoilt ones that must fail.
 
+\b
     python pipelines/measurements/verify_round_trip.py OUT [OUT ...] --workers 2 > round_trip.json
 
-Every sample's grasp is verified in the frames of both cameras and of the object, by both
-methods, at the dataset's own friction. Then the same grasps are spoilt in three ways.
-"""
+The script verifies the grasp of every sample in the frames of both cameras and of the object, by
+both methods, at the dataset's own friction. Then it verifies the same grasps, spoilt in three
+ways. Prints JSON.
+"""  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
 
@@ -27,7 +29,7 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import CAMERAS, SPLITS
 from drakegrasp.verification.result import Verification
 
-#: How far contacts are moved off the surface, and apart on one side of the object [m].
+#: Distance of spoilt contacts from the surface, and from each other on one side [m].
 OFF, APART = 0.03, 0.02
 
 Array = npt.NDArray[np.float64]
@@ -36,18 +38,20 @@ Array = npt.NDArray[np.float64]
 @click.command(help=__doc__)
 @click.argument("outs", type=click.Path(path_type=Path, exists=True), nargs=-1, required=True)
 @click.option("--workers", type=int, default=2, show_default=True)
-@click.option("--every", type=int, default=1, show_default=True, help="Take each n-th sample.")
+@click.option("--every", type=int, default=1, show_default=True, help="Verify each n-th sample.")
 def main(outs: tuple[Path, ...], workers: int, every: int) -> None:
-    """Print the figures as JSON."""
-    results: dict[str, dict[str, list[Verification]]] = {}
-    for out in outs:  # what cannot be read is known before anything is simulated
+    """Run the script."""
+    # Datasets that cannot be read are refused before anything is simulated.
+    for out in outs:
         GraspDataset(out / DATA_FILES["oto"])
+
+    results: dict[str, dict[str, list[Verification]]] = {}
     with connect(workers) as client:
 
         def verify(key: str, method: str, grasps: Array, **where: Any) -> None:
             if len(grasps):
-                found = verify_grasps(grasps, client=client, method=method, show=True, **where)
-                results.setdefault(method, {}).setdefault(key, []).extend(found)
+                verdicts = verify_grasps(grasps, client=client, method=method, show=True, **where)
+                results.setdefault(method, {}).setdefault(key, []).extend(verdicts)
 
         for out in outs:
             for split in SPLITS:
@@ -68,6 +72,7 @@ def main(outs: tuple[Path, ...], workers: int, every: int) -> None:
 
 def spoil(out: Path, data: GraspDataset, rows: list[int]) -> dict[str, Array]:
     """Return the grasps of rows in {O}, (n, 6k), as they are and spoilt in three ways."""
+    # Contacts as stored, and the meshes of their objects.
     config = read_manifest(out).config
     with h5py.File(out / TRIALS_FILE, "r") as file:
         trials = data.column("trial_id")[rows]
@@ -75,6 +80,8 @@ def spoil(out: Path, data: GraspDataset, rows: list[int]) -> dict[str, Array]:
         n = file["trials/closed_nhat_Q_O"][:][trials]
     names = data.column("object_props/object_name")[rows]
     meshes = {name: load_prepared(out, name, config).model.collision for name in set(names)}
+
+    # Two normals reversed; all contacts on one side, beside the first.
     backwards = n.copy()
     backwards[:, :2] *= -1.0
     one_side_p, one_side_n = p.copy(), n.copy()
@@ -84,7 +91,8 @@ def spoil(out: Path, data: GraspDataset, rows: list[int]) -> dict[str, Array]:
         beside = [p[i, 0] + APART * along, p[i, 0] + APART * across]
         points, _, faces = meshes[name].nearest.on_surface(beside)
         one_side_p[i, 1:], one_side_n[i, 1:] = points, meshes[name].face_normals[faces]
-    as_vectors = {
+
+    contacts = {
         "object": (p, n),
         "off the surface": (p + OFF * n, n),
         "two normals reversed": (p, backwards),
@@ -92,18 +100,20 @@ def spoil(out: Path, data: GraspDataset, rows: list[int]) -> dict[str, Array]:
     }
     return {
         key: np.concatenate([a.reshape(len(rows), -1), b.reshape(len(rows), -1)], axis=1)
-        for key, (a, b) in as_vectors.items()
+        for key, (a, b) in contacts.items()
     }
 
 
 def figures(by_key: dict[str, list[Verification]]) -> dict[str, Any]:
     """Return the figures of one method."""
+    # Outcomes by frame; errors of the fitted palm poses.
     plain = by_key["object"]
     frames = [[v.outcome for v in by_key[key]] for key in ("object", *CAMERAS)]
     fits = [v.fit for v in plain if v.fit is not None]
     residual = [1e3 * float(fit.residual.max()) for fit in fits]
     angle = [float(np.rad2deg(fit.normal_error).max()) for fit in fits]
     failed = [v for v in plain if not v.success]
+
     return {
         "grasps": len(plain),
         "objects": len({v.placed.model.name for v in plain}),
@@ -121,20 +131,23 @@ def figures(by_key: dict[str, list[Verification]]) -> dict[str, Any]:
         "outcomes of failures": dict(Counter(v.outcome.label for v in failed)),
         "failures": [f"{v.placed.model.name}: {v.outcome.label}: {v.reason}" for v in failed],
         "spoilt": {
-            key: {"held": share(found), "outcomes": dict(Counter(v.outcome.label for v in found))}
-            for key, found in by_key.items()
+            key: {
+                "held": share(verdicts),
+                "outcomes": dict(Counter(v.outcome.label for v in verdicts)),
+            }
+            for key, verdicts in by_key.items()
             if key not in ("object", *CAMERAS)
         },
     }
 
 
-def share(found: list[Verification]) -> float:
-    """Return the share that holds."""
-    return float(np.mean([v.success for v in found]))
+def share(verdicts: list[Verification]) -> float:
+    """Return the share of grasps that hold."""
+    return float(np.mean([v.success for v in verdicts]))
 
 
 def percentiles(values: list[float], which: tuple[int, ...]) -> list[float]:
-    """Return percentiles, rounded; none of no values."""
+    """Return percentiles of the finite values, rounded; an empty list if there are none."""
     finite = [v for v in values if np.isfinite(v)]
     return np.percentile(finite, which).round(4).tolist() if finite else []
 

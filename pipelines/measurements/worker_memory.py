@@ -1,12 +1,13 @@
-"""How much memory one worker holds while it tries attempts on many objects.
+"""Measure how much memory one worker holds while it tries attempts on many objects.
 
+\b
     python pipelines/measurements/worker_memory.py MESH_DIR [--only NAME ...]
         [--trials N] [--set KEY=VALUE]
 
-Builds a dataset with one worker process and looks at its memory after every work unit, until
-so many trials (attempts whose palm ray meets the object) are done. Units of the objects are
-mixed, so that scenes are built and given up all the time. Prints JSON.
-"""
+The script builds a dataset with one worker process and reads its memory after every work unit,
+until the given number of trials (attempts whose palm ray meets the object) is done. It mixes the
+units of the objects, so that the worker builds and drops scenes all the time. Prints JSON.
+"""  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
 
@@ -33,24 +34,24 @@ from drakegrasp.outcomes import Outcome
 T = TypeVar("T")
 R = TypeVar("R")
 NO_TRIAL = (Outcome.RAY_MISS, Outcome.BELOW_TABLE)
-#: Units of one object that follow one another before the next object's.
+#: Units of one object in a row, before the next object's.
 RUN = 2
 
 
 class EnoughError(Exception):
-    """As many trials were done as were asked for."""
+    """The requested number of trials is done."""
 
 
 class Scale:
-    """An executor that weighs the one worker after every unit."""
+    """An executor that reads the memory of the only worker after every unit."""
 
     def __init__(self, client: Client, trials: int) -> None:
-        """Work through a client until so many trials are done."""
+        """Work through a client until this many trials are done."""
         self._execute, self._client, self._trials = DaskExecutor(client), client, trials
         self.weights: list[tuple[int, float]] = []
 
     def __call__(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-        """Yield results; units are mixed."""
+        """Yield results, of the units of all objects in turn."""
         done = 0
         for result in self._execute(function, mixed(items)):
             if isinstance(result, UnitSummary):
@@ -82,9 +83,11 @@ def mixed(items: Iterable[T]) -> Iterator[T]:
 
 @click.command(help=__doc__)
 @click.argument("meshes", type=click.Path(path_type=Path, exists=True))
-@click.option("--only", multiple=True, metavar="NAME", help="Those whose names begin so.")
+@click.option(
+    "--only", multiple=True, metavar="NAME", help="Only objects whose names begin with NAME."
+)
 @click.option("--trials", default=5000, show_default=True)
-@click.option("--candidates", default=2000, show_default=True, help="Per object.")
+@click.option("--candidates", default=2000, show_default=True, help="Palm poses per object.")
 @set_option
 @units_option
 @manifest_option
@@ -97,19 +100,24 @@ def main(
     units: str,
     manifest: Path | None,
 ) -> None:
-    """Print what the worker weighed."""
+    """Run the script."""
     config = load_config(overrides=[f"candidates.max={candidates}", *overrides])
     every = find_meshes(meshes, units=units, manifest=manifest)
     sources = [s for s in every if not only or s.name.startswith(only)]
+
+    # The build is a means only: it ends after enough trials.
     with tempfile.TemporaryDirectory() as folder, connect(1) as client:
         scale = Scale(client, trials)
         with suppress(EnoughError):
             build(sources, Path(folder) / "out", config, scale, show=False)
+
+    # Memory that still grows over the second half would be a leak.
     done, weights = zip(*scale.weights, strict=True)
     half = next(weight for n, weight in scale.weights if n >= done[-1] / 2)
     late = [weight for n, weight in scale.weights if n >= done[-1] / 2]
     quarter = len(late) // 2
     means = [sum(part) / len(part) for part in (late[:quarter], late[quarter:])]
+
     figures = {
         "objects": len(sources),
         "trials": done[-1],
