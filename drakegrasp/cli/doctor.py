@@ -1,8 +1,8 @@
-"""What this machine lacks: every need of drakegrasp, measured, with the line that mends it.
+"""Checks whether this machine meets every need of drakegrasp, and says how to meet it.
 
-Nothing is imported that might be missing: a library that cannot be loaded is a finding,
-not an error. The test image is rendered in a child process, because a broken OpenGL kills
-its process, and because the first thread of a process that renders owns its GL context.
+This module imports no library that might be missing: a library that cannot be loaded is a
+finding, not an error. A child process renders the test image, because a broken OpenGL kills
+its process, and because the first thread that renders in a process owns its GL context.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ BROKEN_DRAKE = (1, 52, 0)
 DRAKE_REQUIREMENT = "drake>=1.51.1,!=1.52.0"
 EGL_LIBRARY = "libEGL.so.1"
 EGL_PACKAGES = "apt-get install libegl1 libgl1-mesa-dri"
-#: The first image may compile shaders on a slow file system [s].
+#: Time for the test image [s]: the first one may compile shaders on a slow file system.
 IMAGE_SECONDS = 60.0
-#: About 3,500 successes: two views of 128 x 128 pixels and 17 bytes, before compression.
+#: Room for about 3,500 successes: two images of 128 x 128 pixels of 17 bytes, uncompressed [B].
 FREE_BYTES = 2e9
-#: A worker holds the scenes of a few objects.
+#: Memory of a worker, which holds the scenes of a few objects [B].
 BYTES_PER_CORE = 1e9
-#: Limits of the control group, version 2 and 1; absent outside of containers.
+#: Memory limits of the control group, version 2 and 1; containers have one of them.
 CGROUP_LIMITS = (
     Path("/sys/fs/cgroup/memory.max"),
     Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
@@ -53,24 +53,24 @@ class Finding:
     """One need of drakegrasp and whether this machine meets it.
 
     Attributes:
-        name: Of the need.
+        name: Name of the need.
         ok: Whether it is met.
         what: What was measured.
-        mend: The line that mends it; empty if it is met.
+        remedy: How to meet it; empty if it is met.
     """
 
     name: str
     ok: bool
     what: str
-    mend: str = ""
+    remedy: str = ""
 
 
 def diagnose(directory: Path | None = None) -> list[Finding]:
-    """Return all findings about this machine, met needs too.
+    """Return a finding on every need, met or not.
 
     Args:
-        directory: Where datasets will be written; None is the current one. It need not
-            exist: then its nearest existing parent is tried.
+        directory: Where datasets will be written; the current directory if None. If it does
+            not exist, its nearest existing parent is checked.
     """
     place = _existing(Path.cwd() if directory is None else Path(directory))
     return [
@@ -111,7 +111,7 @@ def check_glibc() -> Finding:
 
 
 def check_drake() -> Finding:
-    """Return whether a Drake is installed that works."""
+    """Return whether a Drake that works is installed."""
     try:
         version = metadata.version("drake")
     except metadata.PackageNotFoundError:
@@ -121,7 +121,7 @@ def check_drake() -> Finding:
 
 
 def check_egl() -> Finding:
-    """Return whether the library that Drake renders with, without a display, can be loaded."""
+    """Return whether EGL, with which Drake renders without a display, can be loaded."""
     if sys.platform != "linux":
         return Finding(name="EGL", ok=True, what=f"not needed on {sys.platform}")
     try:
@@ -132,8 +132,8 @@ def check_egl() -> Finding:
 
 
 def check_image() -> Finding:
-    """Return whether a box that is rendered in a child process shows up in its image."""
-    # The child finds what this process finds, and nothing that merely lies in its directory.
+    """Return whether a child process can render a box."""
+    # The child imports from the same paths, but not from its working directory.
     paths = os.pathsep.join(str(Path(p).resolve()) for p in sys.path if p)
     try:
         child = subprocess.run(
@@ -149,6 +149,8 @@ def check_image() -> Finding:
         return _bad_image(f"no image within {IMAGE_SECONDS:g} s")
     except OSError as error:
         return _bad_image(f"no child process: {error}")
+
+    # A signal, an error and unexpected output have remedies of their own.
     if child.returncode < 0:
         return _bad_image(f"the renderer crashed with {_signal_name(-child.returncode)}")
     lines = (child.stderr if child.returncode else child.stdout).strip().splitlines()
@@ -159,18 +161,18 @@ def check_image() -> Finding:
     match = re.fullmatch(r"(\d+) (\d+)", last)
     if match is None:
         return _bad_image(f"the renderer must print two numbers, got {last!r}")
+
+    # An edge of the mask may be off by a pixel at either end.
     seen, expected = int(match[1]), int(match[2])
     what = f"{seen} pixels of a box that has {expected}"
-    # An edge of the mask may be off by a pixel at either end.
     if not 0.9 * expected <= seen <= 1.1 * expected:
         return _bad_image(what if seen else f"blank image: {what}")
     return Finding(name="test image", ok=True, what=what)
 
 
 def check_embree() -> Finding:
-    """Return whether trimesh casts its rays with embree, a hundred times faster than without."""
-    mend = "pip install embreex"
-    # A wheel for another machine fails in its own ways when it is loaded.
+    """Return whether trimesh casts rays with embree, which is a hundred times faster."""
+    # A wheel for another kind of machine may fail in any way when it is loaded.
     try:
         from trimesh import ray
 
@@ -178,7 +180,7 @@ def check_embree() -> Finding:
             return Finding(name="embree", ok=True, what=f"embreex {_version('embreex')}")
     except Exception as error:
         return _finding("embree", False, f"{type(error).__name__}: {error}", "pip install trimesh")
-    return _finding("embree", False, "trimesh does not find it", mend)
+    return _finding("embree", False, "trimesh does not find it", "pip install embreex")
 
 
 def check_writing(directory: Path) -> Finding:
@@ -190,7 +192,7 @@ def check_writing(directory: Path) -> Finding:
             os.fsync(file.fileno())
     except OSError as error:
         what = f"{directory}: {error.strerror or error}"
-        return _finding("writing", False, what, "choose another --out, or mend its permissions")
+        return _finding("writing", False, what, "choose another --out, or change its permissions")
     return Finding(name="writing", ok=True, what=str(directory))
 
 
@@ -228,7 +230,7 @@ def check_memory() -> Finding:
 
 
 def render_test_image() -> tuple[int, int]:
-    """Return the object's pixels in an image of a box seen squarely, and how many it has.
+    """Render a box from above; return how many pixels show it, and how many should.
 
     Call it in a process of its own: it needs Drake and may crash.
     """
@@ -241,6 +243,7 @@ def render_test_image() -> tuple[int, int]:
     from drakegrasp.vision.camera import intrinsics
     from drakegrasp.vision.rendering import build_renderer, look
 
+    # A cube of 1 kg.
     config = CameraConfig()
     box = trimesh.creation.box((BOX_EDGE,) * 3)
     model = ObjectModel(
@@ -256,6 +259,8 @@ def render_test_image() -> tuple[int, int]:
         I_OOcm_O=np.eye(3) * BOX_EDGE**2 / 6.0,
         collision_error=0.0,
     )
+
+    # It stands on the table, and the camera looks straight down on it.
     X_TO = make_pose(np.eye(3), [0.0, 0.0, BOX_EDGE / 2.0])
     X_TC = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, BOX_EDGE + BOX_DISTANCE])
     seen = look(build_renderer(model, config), X_TO, X_TC)
@@ -263,16 +268,16 @@ def render_test_image() -> tuple[int, int]:
     return int(seen.mask.sum()), round(edge**2)
 
 
-def _finding(name: str, ok: bool, what: str, mend: str) -> Finding:
-    return Finding(name=name, ok=ok, what=what, mend="" if ok else mend)
+def _finding(name: str, ok: bool, what: str, remedy: str) -> Finding:
+    return Finding(name=name, ok=ok, what=what, remedy="" if ok else remedy)
 
 
-def _bad_image(what: str, mend: str = "") -> Finding:
-    return _finding("test image", False, what, mend or EGL_PACKAGES)
+def _bad_image(what: str, remedy: str = "") -> Finding:
+    return _finding("test image", False, what, remedy or EGL_PACKAGES)
 
 
 def _existing(directory: Path) -> Path:
-    """Return a directory or its nearest parent that exists; a file in the way is returned."""
+    """Return the path itself or its nearest parent that exists, which may be a file."""
     path = directory.absolute()
     while not os.path.lexists(path) and path != path.parent:
         path = path.parent
