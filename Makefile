@@ -1,7 +1,11 @@
 # Everything from a fresh clone with only python3 and make: `make demo`, `make test`.
-# Another Python: `make demo PYTHON=python3.13`; another environment: VENV=/some/where.
+# Another Python: `make demo PYTHON=python3.11`; another environment: VENV=/some/where.
 
-PYTHON ?= python3
+# The newest Python that starts here and can make an environment: a version manager's shim may
+# only print an error. Looked for when it is needed, and not for `make help`.
+STARTS := import ensurepip, sys, venv; sys.exit(sys.version_info < (3, 11))
+PYTHON ?= $(or $(shell for python in python3.13 python3.12 python3.11 python3; do \
+	$$python -c '$(STARTS)' >/dev/null 2>&1 && echo $$python && break; done),python3)
 VENV   ?= .venv
 DEMO   ?= demo
 BIN    := $(VENV)/bin
@@ -11,15 +15,34 @@ STAMP  := $(VENV)/.installed
 export LP_NUM_THREADS := 0
 export DRAKE_ALLOW_NETWORK := none
 
-.PHONY: help install demo test test-fast test-cluster lint format docs clean
+.PHONY: FORCE help install demo test test-fast test-cluster lint format docs clean
 
 help:            ## what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
 install: $(STAMP)  ## the virtual environment with the package and what its tests need
 
-$(STAMP): pyproject.toml
-	$(PYTHON) -m venv $(VENV)
+# An environment that was made here is made anew for another Python that was asked for, or for a
+# newer one that was found. One of a newer Python is kept, and so is one that was not made here.
+WHICH := import sys; print(*sys.version_info[:2], sys.base_prefix)
+NEWER := import sys; a, b = ([*map(int, text.split()[:2])] for text in sys.argv[1:]); sys.exit(a <= b)
+ASKED := $(filter command environment,$(origin PYTHON))
+
+$(VENV)/pyvenv.cfg: FORCE
+	@there=$$($(BIN)/python -c '$(WHICH)' 2>/dev/null); python='$(PYTHON)'; \
+	wanted=$$($$python -c '$(WHICH)') || exit 1; \
+	if test -z "$$there"; then \
+	  $$python -m venv $(VENV); \
+	elif test ! -e $(STAMP) || test "$$there" = "$$wanted"; then \
+	  :; \
+	elif test -n '$(ASKED)' || $$python -c '$(NEWER)' "$$wanted" "$$there"; then \
+	  echo "$(VENV) was of Python $$there: made anew with $$wanted"; \
+	  $$python -m venv --clear $(VENV); \
+	fi
+
+FORCE:
+
+$(STAMP): pyproject.toml $(VENV)/pyvenv.cfg
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --editable '.[dev]'
 	@touch $@

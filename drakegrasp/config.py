@@ -1,8 +1,8 @@
 """The configuration: inert, typed data with a unit and a default for every value.
 
-The defaults are the paper's numbers (preset `paper`); a preset or a user's YAML file
-states only what differs. Angles are degrees here, at the YAML border, and carry `_deg`
-in their names; everywhere else they are radians. `load_config` is the one door.
+The defaults are the paper's numbers (preset `paper`); a preset or a user's YAML file states
+only what differs. Angles are in degrees here, where YAML is read, and have `_deg` in their names;
+everywhere else they are in radians. Use `load_config` to get a configuration.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from drakegrasp.errors import ConfigError
+from drakegrasp.errors import ConfigError, one_line
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -34,7 +34,7 @@ class _Section(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _no_truth_values(cls, value: Any) -> Any:
-        # YAML reads "yes" as true, and pydantic would take that for a 1.
+        # YAML reads "yes" as true, which pydantic would accept as the number 1.
         if isinstance(value, bool):
             raise PydanticCustomError("bool", "Input should be a number or text")
         return value
@@ -58,15 +58,15 @@ class ObjectConfig(_Section):
         return self
 
 
-#: Longest step of a calm lift that is taken [s]; own choice, 24 ms are what was measured.
-MAX_CALM_STEP = 0.06
+#: Longest coarse step that is allowed [s]; own choice, 24 ms are what was measured.
+MAX_COARSE_STEP = 0.06
 
 
 class PhysicsConfig(_Section):
     """Contact and time stepping; reasons and sources in docs/explanation/physics.md."""
 
     time_step: Annotated[float, Field(gt=0.0, le=0.02)] = 0.008  # [s]
-    calm_steps: Annotated[int, Field(ge=1, le=8)] = 3  # time steps in one of a calm lift
+    coarse_steps: Annotated[int, Field(ge=1, le=8)] = 3  # time steps in one coarse step of a lift
     friction_hand: Positive = 0.71  # effective coefficient between hand and object
     friction_table: Positive = 0.71  # effective coefficient between table and object
     fingertip_modulus: Annotated[float, Field(gt=0.0, le=1e8)] = 1e7  # hydroelastic [Pa]
@@ -76,34 +76,36 @@ class PhysicsConfig(_Section):
     relaxation_time: Positive = 0.02  # [s], used by the solver `sap` in place of dissipation
     solver: Literal["lagged", "similar", "sap"] = "lagged"  # Drake's contact approximation
     contact_force: Positive = 0.05  # [N], a weaker contact does not count as one
-    max_speed: Positive = 10.0  # [m/s], a faster object means that the state exploded
+    max_speed: Positive = 10.0  # [m/s], a faster object means that the simulation diverged
 
     @model_validator(mode="after")
     def _short_enough(self) -> PhysicsConfig:
-        if not self.calm_steps * self.time_step <= MAX_CALM_STEP:
+        if not self.coarse_steps * self.time_step <= MAX_COARSE_STEP:
             raise ValueError(
-                f"calm_steps times time_step must be at most {MAX_CALM_STEP} s, "
-                f"got {self.calm_steps} times {self.time_step}"
+                f"coarse_steps times time_step must be at most {MAX_COARSE_STEP} s, "
+                f"got {self.coarse_steps} times {self.time_step}"
             )
         return self
 
 
 class SettleConfig(_Section):
-    """How the object comes to rest on the table."""
+    """Dropping the object on the table until it is at rest."""
 
     drop_height: NonNegative = 0.3  # [m], of the lowest point above the table (paper)
     max_time: Positive = 15.0  # [s] of simulation (released code)
     max_linear_speed: Positive = 1e-3  # [m/s], slower than this is at rest
     max_angular_speed: Positive = 1e-2  # [rad/s], slower than this is at rest
     rest_time: Positive = 0.2  # [s], at rest for this long
-    time_step: Annotated[float, Field(gt=0.0, le=0.02)] = 0.004  # [s]; longer ones turn what lands
+    time_step: Annotated[float, Field(gt=0.0, le=0.02)] = (
+        0.004  # [s]; longer ones tilt it in landing
+    )
 
 
 class CandidateConfig(_Section):
-    """Which palm poses are tried."""
+    """The palm poses that are tried."""
 
     method: Literal["rotations", "normals"] = "rotations"
-    max: Count = 10_000  # kept per object, drawn with the seed (paper)
+    max: Count = 10_000  # per object; more are thinned at random, by the seed (paper)
     global_x_deg: Angles = tuple(range(0, 181, 30))  # paper, Table II
     global_y_deg: Angles = tuple(range(0, 360, 30))
     global_z_deg: Angles = tuple(range(0, 360, 45))
@@ -118,13 +120,13 @@ class CandidateConfig(_Section):
 
 
 class ScreenConfig(_Section):
-    """What geometry decides without a simulation; see docs/explanation/screening.md."""
+    """Attempts that geometry decides without a simulation; see docs/explanation/screening.md."""
 
-    mode: Literal["on", "off"] = "on"  # off simulates every attempt, from the open hand
-    start_margin: Positive = 0.0025  # [m], deeper in object or table is a collision for certain
+    mode: Literal["on", "off"] = "on"  # "off" simulates every attempt, from the open hand
+    start_margin: Positive = 0.0025  # [m], deeper penetration at the start is a certain collision
     reach_margin: Positive = 0.0025  # [m], a fingertip that passes nearer than this may touch
-    block_margin: Positive = 0.005  # [m], no contact lets a finger sink in deeper than this
-    clearance: Positive = 0.004  # [m], fingers start to close this far from what they meet
+    block_margin: Positive = 0.005  # [m], contact stops every finger before it penetrates this far
+    clearance: Positive = 0.004  # [m], fingers start to close at this distance from what they meet
 
     @field_validator("mode", mode="before")
     @classmethod
@@ -136,9 +138,9 @@ class ScreenConfig(_Section):
 class CloseConfig(_Section):
     """Closing the fingers on the static object."""
 
-    max_time: Positive = 2.5  # [s], 140 degrees at 60 degrees per second and a little
+    max_time: Positive = 2.5  # [s], a little more than 140 degrees at 60 degrees per second
     stop_speed: Positive = 0.01  # [rad/s], slower fingers have stopped
-    check_period: Positive = 0.1  # [s] of simulation between two looks
+    check_period: Positive = 0.1  # [s] of simulation between two checks
 
 
 class LiftConfig(_Section):
@@ -151,14 +153,14 @@ class LiftConfig(_Section):
     )  # [m], target of the palm (paper)
     max_speed: Positive = 0.5  # [m/s] of the wrist
     max_acceleration: Positive = 1.0  # [m/s^2] of the wrist
-    hold_time: NonNegative = 0.3  # [s] at the target before the second judgement
-    check_period: Positive = 0.1  # [s] of simulation between two looks, and up to a calm step more
+    hold_time: NonNegative = 0.3  # [s] at the target before the final verdict
+    check_period: Positive = 0.1  # [s] simulated between two checks, and up to a coarse step more
 
 
 class CertifyConfig(_Section):
     """How robust each success is; see docs/explanation/physics.md."""
 
-    repeats: NonNegativeCount = 0  # of each success with noise; 0 certifies nothing
+    repeats: NonNegativeCount = 0  # with noise, of each success; 0 switches certification off
     palm_noise: NonNegative = 0.002  # [m], standard deviation along each axis of the palm
     palm_noise_deg: NonNegative = 1.0  # standard deviation about each axis of the palm
     friction_noise: NonNegative = 0.1  # standard deviation of the coefficient's logarithm
@@ -183,41 +185,40 @@ class CameraConfig(_Section):
 
 
 class FilterConfig(_Section):
-    """The paper's postprocessing; applied when the files are assembled, not when simulating."""
+    """The paper's postprocessing, applied when the files are assembled."""
 
     min_depth_variance: NonNegative = 1e-3  # [m^2], flatter otm depth images are removed
-    min_camera_height: Number = 0.01  # [m] above the table; lower ones see it edge-on
+    min_camera_height: Number = 0.01  # [m] above the table; lower cameras see the table edge-on
     outlier_sigma: NonNegative = 4.0  # per object and component of the grasp; 0 switches it off
     max_surface_distance: Positive = 2e-3  # [m], of a contact point from the object's surface
 
 
 class SplitConfig(_Section):
-    """Who trains, validates and tests."""
+    """How the samples are split for training, validation and test."""
 
     valid_fraction: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.1
     train_classes: tuple[str, ...] | None = None  # None: every class with two objects or more
 
 
 class VerifyConfig(_Section):
-    """What a predicted grasp is held to; see docs/how-to/verify-predictions.md."""
+    """Limits for a predicted grasp; see docs/how-to/verify-predictions.md."""
 
     max_surface_distance: Positive = 0.01  # [m], of a predicted point from the object's surface
     max_residual: Positive = 0.008  # [m], of a fingertip from its point before closing
     max_normal_error_deg: Positive = 45.0  # between a pad's normal and the predicted one
     max_contact_error: Positive = 0.01  # [m], of a contact after closing from its point
     open_margin_deg: Positive = 20.0  # by which fingers are opened before they close
-    # Wrist poses that are simulated before the grasp has failed.
-    max_tries: Annotated[int, Field(ge=1, le=5)] = 5
+    max_tries: Annotated[int, Field(ge=1, le=5)] = 5  # wrist poses simulated before it fails
     max_position_error: Positive = 0.01  # [m], of an object lifted by forces alone
     max_angle_error_deg: Positive = 5.0  # of an object lifted by forces alone
 
 
-#: What acts on assembled shards, or on nothing that a shard holds.
-LATE_KEYS = ("filters", "split", "max_grasps", "attempt_seconds", "verify")
+#: Keys that change no shard: they act on assembled shards, or only say where to stop.
+POSTPROCESSING_KEYS = ("filters", "split", "max_grasps", "attempt_seconds", "verify")
 
 
 class Config(_Section):
-    """Everything that decides what is in a dataset, but for the meshes themselves."""
+    """Everything that decides what is in a dataset, except the meshes."""
 
     hand: str = "barrett"  # a hand in drakegrasp/models, or a path to a hand's YAML
     seed: Annotated[int, Field(ge=0)] = 0
@@ -242,16 +243,16 @@ class Config(_Section):
         return self.model_dump(mode="json")
 
     def simulation_hash(self) -> str:
-        """Return the hash of all that decides what a shard holds (16 hex digits).
+        """Return the hash (16 hex digits) of every value that decides what a shard holds.
 
-        Filters and split act later, on assembled shards, and are left out; so are
-        `max_grasps`, which only says where to stop, the wall-clock limit, and `verify`.
+        Left out are filters and split, which act later on assembled shards, `max_grasps`, which
+        only says where to stop, the wall-clock limit, and `verify`.
         """
         values = self.to_dict()
-        for key in LATE_KEYS:
+        for key in POSTPROCESSING_KEYS:
             del values[key]
         if not self.certify.repeats:
-            del values["certify"]  # without repeats the noise is not asked for
+            del values["certify"]  # without repeats the noise is not used
         canonical = json.dumps(values, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
@@ -269,7 +270,7 @@ def load_config(
     overrides: Sequence[str] = (),
     **values: Any,
 ) -> Config:
-    """Return the configuration of a preset or YAML file with overrides on top.
+    """Return the configuration of a preset or YAML file, with overrides applied.
 
     Args:
         source: A preset's name, or a path to a YAML file; None is the preset `paper`.
@@ -308,14 +309,22 @@ def parse_config(tree: dict[str, Any]) -> Config:
     try:
         return Config.model_validate(tree)
     except ValidationError as error:
-        # A bad item of a list also makes the list too short: say the first thing only.
-        first: dict[Any, Any] = {}
-        for found in error.errors():
-            first.setdefault(found["loc"][:2], found)
-        raise ConfigError("; ".join(_describe(e) for e in first.values())) from None
+        # A bad item of a list also makes the list too short: report the first mistake only.
+        mistakes: dict[Any, Any] = {}
+        for mistake in error.errors():
+            mistakes.setdefault(mistake["loc"][:2], mistake)
+        lines = [
+            describe_mistake(
+                mistake, whole="config", legal=f"a known key ({', '.join(_siblings(place))})"
+            )
+            for place, mistake in mistakes.items()
+        ]
+        raise ConfigError("; ".join(lines)) from None
 
 
 def _read_source(source: str | Path) -> dict[str, Any]:
+    """Return the tree of values in a preset or a YAML file."""
+    # A preset's name, or a path.
     preset = resources.files("drakegrasp") / "presets" / f"{source}.yaml"
     if isinstance(source, str) and source in preset_names():
         text, name = preset.read_text(encoding="utf-8"), source
@@ -330,15 +339,19 @@ def _read_source(source: str | Path) -> dict[str, Any]:
             text, name = path.read_text(encoding="utf-8"), str(path)
         except (OSError, UnicodeDecodeError) as error:
             raise ConfigError(f"{path}: must be a readable UTF-8 file, got: {error}") from None
+
+    # The text must be a YAML mapping; an empty file is one without keys.
     try:
         tree = yaml.safe_load(text)
     except yaml.YAMLError as error:
-        first = str(error).splitlines()[0]
-        raise ConfigError(f"{name}: must be YAML, got text that is not ({first})") from None
+        raise ConfigError(
+            f"{name}: must be YAML, got text that is not ({one_line(error)})"
+        ) from None
     if tree is None:
         return {}
     if not isinstance(tree, dict):
         raise ConfigError(f"{name}: must be a mapping of keys to values, got {type(tree).__name__}")
+
     # A section whose keys are all commented out is read as None.
     empty = [key for key in Config.model_fields if tree.get(key, 0) is None and _is_section(key)]
     return {**tree, **{key: {} for key in empty}}
@@ -366,29 +379,39 @@ def _apply_override(tree: dict[str, Any], text: str) -> None:
         raise ConfigError(f"{path}: must be a YAML value, got {value!r}") from None
 
 
-def _describe(error: Any) -> str:
-    """Return one pydantic error as `path: must ..., got ...`."""
-    path = ".".join(str(part) for part in error["loc"]) or "config"
-    if error["type"] == "extra_forbidden":
-        known = ", ".join(_siblings(error["loc"]))
-        return f"{path}: must be a known key ({known}), got an unknown one"
-    message = str(error["msg"]).removeprefix("Value error, ")
-    if error["type"] == "value_error":
+def describe_mistake(mistake: Any, *, whole: str, legal: str) -> str:
+    """Return one mistake in a YAML file as `path: must ..., got ...`.
+
+    Args:
+        mistake: An item of pydantic's `ValidationError.errors()`.
+        whole: What to call the top level, whose path is empty.
+        legal: What an unknown key must be instead, e.g. "a known key (seed, hand)".
+    """
+    path = ".".join(str(part) for part in mistake["loc"]) or whole
+    kind, context = mistake["type"], mistake.get("ctx", {})
+    message = str(mistake["msg"]).removeprefix("Value error, ")
+    if kind == "value_error":
         return f"{path}: {message}"
-    must = message.removeprefix("Input should be ").removeprefix("Input should ")
-    if error["type"] in ("model_type", "dict_type"):
-        must = "a section, a mapping of keys to values"
-    if error["type"] == "tuple_type":
-        must = "a list"
-    if error["type"] == "too_short":
-        must = f"a list of at least {error['ctx']['min_length']}"
-    if error["type"] == "too_long":
-        must = f"a list of at most {error['ctx']['max_length']}"
-    return f"{path}: must be {must}, got {error['input']!r}"
+    if kind in ("extra_forbidden", "unexpected_keyword_argument"):
+        return f"{path}: must be {legal}, got an unknown one"
+    if kind == "missing":
+        return f"{path}: must be given, got nothing"
+
+    # Pydantic speaks of Python's types; a YAML file has mappings and lists.
+    mapping = "a mapping of keys to values"
+    must = {
+        "model_type": mapping,
+        "dataclass_type": mapping,
+        "dict_type": mapping,
+        "tuple_type": "a list",
+        "too_short": f"a list of at least {context.get('min_length')}",
+        "too_long": f"a list of at most {context.get('max_length')}",
+    }.get(kind, message.removeprefix("Input should be ").removeprefix("Input should "))
+    return f"{path}: must be {must}, got {mistake['input']!r}"
 
 
-def _siblings(loc: tuple[Any, ...]) -> list[str]:
-    section: type[BaseModel] = Config
-    for key in loc[:-1]:
-        section = section.model_fields[key].annotation  # type: ignore[assignment]
+def _siblings(place: tuple[Any, ...]) -> list[str]:
+    """Return the known keys of the section that holds a place in the configuration."""
+    inside = len(place) > 1 and _is_section(place[0])
+    section: Any = Config.model_fields[place[0]].annotation if inside else Config
     return list(section.model_fields)

@@ -8,12 +8,18 @@
   * GraspError           a grasp vector, or its frame, that cannot be verified
     * OffSurfaceError    a grasp whose contacts are not on the object
   * MachineError         something that the machine lacks (EGL, a usable Drake, workers)
-    * DiskFullError      no room to write; what was begun is gone, and the work goes on later
-    * BlankImageError    OpenGL gave an image of nothing
+    * DiskFullError      no space left to write; the same command continues later
+    * BlankImageError    OpenGL rendered a blank image
 
 Failures of the physics are not here: they are values, see `drakegrasp.outcomes`.
-Messages follow one pattern: what, what it must be, what it was.
+Messages about an argument follow one pattern: which argument, what it must be, what it was.
+`first_line` and `one_line` quote errors of other libraries in our messages.
 """
+
+from __future__ import annotations
+
+#: Characters that `one_line` keeps of a message.
+LONGEST_MESSAGE = 200
 
 
 class DrakegraspError(Exception):
@@ -45,12 +51,25 @@ class OffSurfaceError(GraspError):
 
 
 class MachineError(DrakegraspError, RuntimeError):
-    """Something that this machine lacks, with the line that mends it."""
+    """Something that this machine lacks; the message says how to get it."""
 
 
 class DiskFullError(MachineError):
-    """No room to write a file: what was begun of it is gone."""
+    """No space left to write a file; the partial file has been removed."""
 
 
 class BlankImageError(MachineError):
-    """OpenGL gave an image of nothing, which must never become data."""
+    """OpenGL rendered a blank image, which must never become data."""
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of an error's message, or its type if the message is empty."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+def one_line(error: BaseException) -> str:
+    """Return an error's whole message on one line, cut at `LONGEST_MESSAGE` characters.
+
+    For parsers, which say on later lines where in the file the mistake is.
+    """
+    return " ".join(str(error).split())[:LONGEST_MESSAGE] or type(error).__name__

@@ -20,11 +20,10 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array as Array
 from drakegrasp.arithmetic import multiply, sin_cos
-from drakegrasp.errors import GraspError
+from drakegrasp.errors import GraspError, first_line
 
 #: Position of the table-top centre T in the world [m] (Veres et al., "Coordinate frames").
 P_WT = np.array([0.0, 0.0, 0.65])
-
 
 #: How far a rotation matrix may be from orthogonal: files hold them in single precision.
 ROTATION_TOLERANCE = 1e-4
@@ -103,11 +102,11 @@ X_WT = make_pose(np.eye(3), P_WT)
 
 
 def as_numbers(value: npt.ArrayLike, must: str) -> Array:
-    """Return an array of real numbers, of any shape; text and truth values are none.
+    """Return an array of real numbers, of any shape; text and truth values are refused.
 
     Args:
         value: The numbers.
-        must: What the error says that it must be.
+        must: Beginning of the error's message, e.g. "X_TC must be a pose".
 
     Raises:
         GraspError: If it is anything else.
@@ -115,9 +114,10 @@ def as_numbers(value: npt.ArrayLike, must: str) -> Array:
     try:
         array = np.asarray(value)
     except (TypeError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise GraspError(f"{must}, got a {type(value).__name__} that is none ({reason})") from None
-    # No grasps at all may come as an empty list, which NumPy takes for real numbers.
+        raise GraspError(
+            f"{must}, got a {type(value).__name__} that is none ({first_line(error)})"
+        ) from None
+    # An empty list is accepted: NumPy gives it real numbers.
     if array.dtype.kind not in "fiu":
         got = _OTHER_KINDS.get(array.dtype.kind, f"a {type(value).__name__}")
         raise GraspError(f"{must}, got {'None' if value is None else got}")
@@ -132,8 +132,9 @@ def read_pose(X_AB: npt.ArrayLike, name: str) -> Array:
         name: What to call it in an error.
 
     Raises:
-        GraspError: If it is no pose.
+        GraspError: If it is not a pose.
     """
+    # Any layout as (4, 4) or (n, 4, 4).
     X = as_numbers(X_AB, f"{name} must be a pose, 4 x 4 numbers")
     if X.shape[-1:] == (12,):
         X = X.reshape(*X.shape[:-1], 3, 4)
@@ -142,6 +143,8 @@ def read_pose(X_AB: npt.ArrayLike, name: str) -> Array:
         X = np.concatenate([X, last], axis=-2)
     if X.ndim not in (2, 3) or X.shape[-2:] != (4, 4):
         raise GraspError(f"{name} must be a pose, 4 x 4 numbers, got an array of shape {X.shape}")
+
+    # Refuse what is not a rigid transform.
     if not np.isfinite(X).all():
         raise GraspError(f"{name} must be finite, got numbers that are not")
     if np.any(np.abs(X[..., 3, :] - [0.0, 0.0, 0.0, 1.0]) > ROTATION_TOLERANCE):
@@ -155,6 +158,8 @@ def read_pose(X_AB: npt.ArrayLike, name: str) -> Array:
             f"{name} must hold a rotation, an orthogonal matrix with determinant +1, "
             f"got one that is off by {off:.2g} with determinant {np.linalg.det(R).min():.3g}"
         )
+
+    # The nearest exact rotation (orthogonal Procrustes).
     U, _, Vt = np.linalg.svd(R)
     exact = X.copy()
     exact[..., :3, :3], exact[..., 3, :] = U @ Vt, [0.0, 0.0, 0.0, 1.0]

@@ -6,7 +6,7 @@ from enum import IntEnum
 
 
 class Stage(IntEnum):
-    """How far an attempt came; what a row of `trials.hdf5` holds depends on it."""
+    """How far an attempt got; it decides which columns of `trials.hdf5` hold values."""
 
     PLACED = 0  # geometry only: nothing was simulated
     CLOSED = 1  # the fingers were closed and judged
@@ -19,14 +19,14 @@ class Outcome(IntEnum):
     SUCCESS = 0  # every fingertip holds the object at the lift's target, clear of the table
     BELOW_TABLE = 1  # the palm's origin would lie below the table
     RAY_MISS = 2  # the palm ray does not meet the object
-    START_COLLISION = 3  # the open hand meets the object or the table at the start pose
-    SCREENED = 4  # geometry shows that not every fingertip can meet the object
+    START_COLLISION = 3  # the open hand collides with the object or the table at the start pose
+    SCREENED = 4  # geometry shows that not every fingertip can reach the object
     MISSING_FINGERTIP = 5  # after closing, a fingertip does not touch the object
-    HAND_CONTACT = 6  # after closing, a hand part that is no fingertip touches the object
+    HAND_CONTACT = 6  # after closing, a hand link other than a fingertip touches the object
     TABLE_CONTACT = 7  # after closing the hand touches the table, or after the lift the object does
-    SLIPPED = 8  # lost a fingertip's contact during the lift, but not the object
-    DROPPED = 9  # lost the object during the lift
-    SOLVER_ERROR = 10  # Drake failed or the state exploded; says nothing about the grasp
+    SLIPPED = 8  # a fingertip lost contact during the lift, but the object was held
+    DROPPED = 9  # the object fell during the lift
+    SOLVER_ERROR = 10  # Drake failed or the state diverged; says nothing about the grasp
     TIMEOUT = 11  # the attempt's wall-clock limit passed; says nothing about the grasp
     CRASHED = 12  # the attempt killed its process; says nothing about the grasp
     UNREACHABLE = 13  # verification only: no wrist pose brings the fingertips to the contacts
@@ -38,18 +38,18 @@ class Outcome(IntEnum):
         return self.name.lower()
 
     @property
-    def says_nothing(self) -> bool:
-        """Whether the simulator failed, not the grasp: never count it as a negative."""
+    def inconclusive(self) -> bool:
+        """Whether the simulator failed rather than the grasp: never count it as a negative."""
         return self in (Outcome.SOLVER_ERROR, Outcome.TIMEOUT, Outcome.CRASHED)
 
     @property
-    def only_verified(self) -> bool:
-        """Whether only verification has this outcome, so that no file of a dataset holds it."""
+    def verification_only(self) -> bool:
+        """Whether only verification gives this outcome; no file of a dataset holds it."""
         return self in (Outcome.UNREACHABLE, Outcome.OFF_SURFACE)
 
     @property
     def stage(self) -> Stage:
-        """The stage that every attempt with this outcome reached at least."""
+        """The stage that every attempt with this outcome has reached, at least."""
         return _STAGE[self]
 
 

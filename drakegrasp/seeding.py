@@ -1,6 +1,6 @@
 """Random numbers that are the same on every machine and with every release of NumPy.
 
-NumPy promises the raw stream of PCG64 and the mixing of `SeedSequence`; what its `Generator`
+NumPy guarantees the raw stream of PCG64 and the mixing of `SeedSequence`; what its `Generator`
 makes of them may change from release to release. So everything that is drawn comes from the raw
 64-bit words, by the rules below.
 """
@@ -15,28 +15,28 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array
 
-#: Normal numbers are multiples of this: the C library's logarithm, which the tails need, may
-#: differ by far less.
+#: Normal numbers are rounded to multiples of this. The tails need the C library's logarithm, whose
+#: last bits differ between machines, by far less than this.
 _NORMAL_GRID = 2.0**-32
 
 
 class Stream:
-    """A stream of random numbers, decided by a seed and the place that it is for."""
+    """A stream of random numbers, determined by a seed and the place where it is used."""
 
     def __init__(self, seed: int, *place: int) -> None:
-        """Begin the stream.
+        """Start the stream.
 
         Args:
-            seed: Of the dataset; not negative.
-            place: What the stream is for, e.g. object and candidate; streams of different places
-                are independent.
+            seed: Seed of the dataset; not negative.
+            place: What the stream is for, e.g. object and candidate, each 0..2^32-1. Streams of
+                different places are independent.
         """
         self._sequence = np.random.SeedSequence(seed, spawn_key=place)
         self._bits = np.random.PCG64(self._sequence)
 
     @property
     def key(self) -> int:
-        """A 64-bit number that stands for the stream; it does not change with drawing."""
+        """A 64-bit number that identifies the stream; drawing does not change it."""
         return int(self._sequence.generate_state(1, np.uint64)[0])
 
     def words(self, count: int) -> npt.NDArray[np.uint64]:
@@ -44,27 +44,28 @@ class Stream:
         return np.asarray(self._bits.random_raw(count), dtype=np.uint64)
 
     def uniform(self, count: int) -> Array:
-        """Return (count,) numbers of [0, 1): multiples of 2^-53."""
+        """Return (count,) numbers in [0, 1), multiples of 2^-53."""
         return (self.words(count) >> np.uint64(11)).astype(np.float64) * 2.0**-53
 
     def integers(self, bound: int, count: int) -> npt.NDArray[np.int64]:
-        """Return (count,) integers of 0..bound-1; the bias is below bound / 2^64."""
+        """Return (count,) integers in 0..bound-1; the bias is below bound / 2^64."""
         return (self.words(count) % np.uint64(bound)).astype(np.int64)
 
     def permutation(self, count: int) -> npt.NDArray[np.int64]:
-        """Return 0..count-1 in random order: sorted by a word each, and by number among equals."""
+        """Return 0..count-1 (count,) in random order: sorted by a word for each."""
         return np.argsort(self.words(count), kind="stable").astype(np.int64)
 
     def normal(self, count: int) -> Array:
-        """Return (count,) numbers of mean 0 and deviation 1, multiples of 2^-32."""
-        # Half a step up, because the normal distribution's inverse has no value at 0.
-        share = self.uniform(count) + 2.0**-54
+        """Return (count,) normal numbers of mean 0 and standard deviation 1, multiples of 2^-32."""
+        # Half a step up, because the inverse of the distribution has no value at 0; it has none
+        # at 1 either, to which the largest number would be rounded up.
+        share = np.minimum(self.uniform(count) + 2.0**-54, 1.0 - 2.0**-53)
         drawn = np.array([NormalDist().inv_cdf(u) for u in share.tolist()])
         return np.asarray(np.rint(drawn / _NORMAL_GRID) * _NORMAL_GRID)
 
 
 def object_key(name: str) -> int:
-    """Return the integer by which an object or a class enters the random streams.
+    """Return the integer in 0..2^32-1 that stands for an object or a class in a stream's place.
 
     It depends on the name alone, so adding a mesh to a directory changes no other object.
     """

@@ -14,10 +14,13 @@ docs/how-to/clusters.md for the details and pipelines/recipes/ for an example of
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
 import click
+from distributed import Client
 
 from drakegrasp.api import build_on, find_sources
 from drakegrasp.cli.build import print_plan, print_report
@@ -26,7 +29,6 @@ from drakegrasp.cli.options import build_options, parse_request, times_option
 from drakegrasp.cluster.connect import dashboard_line
 from drakegrasp.cluster.launch import start_cluster
 from drakegrasp.cluster.request import KINDS, ClusterRequest, describe, worker_count
-from drakegrasp.dataset.lock import build_lock
 from drakegrasp.errors import ConfigError
 
 
@@ -113,14 +115,20 @@ def main(
         return
 
     sources = find_sources(request.objects, request.units, request.manifest)
-    # The lock comes first, so that a second build is refused before it starts workers.
-    with build_lock(request.out), start_cluster(cluster, request.out) as client:
-        if request.show:
+    running = _present(start_cluster(cluster, request.out), request.show)
+    print_report(build_on(running, sources, request.out, request.config, show=request.show))
+
+
+@contextmanager
+def _present(cluster: AbstractContextManager[Client], show: bool) -> Iterator[Client]:
+    """Enter a cluster, say where its dashboard is, and wait for its first worker."""
+    with cluster as client:
+        if show:
             click.echo(dashboard_line(client), err=True)
         if not client.nthreads():
             click.echo("waiting for the first worker", err=True)
             client.wait_for_workers(1)
-        print_report(build_on(client, sources, request.out, request.config, show=request.show))
+        yield client
 
 
 def _count(cluster: ClusterRequest, out: Path) -> int | None:

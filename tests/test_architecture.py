@@ -40,6 +40,8 @@ ORDER = (
 DATA = {"models", "presets"}
 #: Modules in a folder, and at the top of the package, at most.
 MODULES, TOP_MODULES = 15, 10
+#: A body of so many lines has paragraphs.
+LONG_BODY = 20
 #: What only some places may import, at any depth of their code.
 WALLS = {
     "dask": ("cluster",),
@@ -215,3 +217,35 @@ def test_code_names_a_hand_only_as_a_default(module: str) -> None:
     texts = [n.value for n in ast.walk(tree) if isinstance(n, ast.Constant)]
     named = [t for t in texts if isinstance(t, str) and t.lower().startswith("barrett")]
     assert named == (["barrett"] if module in ("config", "hand.description") else [])
+
+
+def statements_of(function: ast.FunctionDef) -> list[ast.stmt]:
+    """Return the body of a function without its docstring."""
+    return function.body[1:] if ast.get_docstring(function) is not None else function.body
+
+
+def has_paragraphs(function: ast.FunctionDef, lines: list[str]) -> bool:
+    """Return whether a body is short, or has a blank line or a line of comment."""
+    body = statements_of(function)
+    if not body:
+        return True
+    text = [line.strip() for line in lines[body[0].lineno - 1 : body[-1].end_lineno]]
+    return len(text) < LONG_BODY or any(not line or line.startswith("#") for line in text)
+
+
+@pytest.mark.parametrize("module", MODULE_NAMES)
+def test_long_bodies_have_paragraphs(module: str) -> None:
+    """A reader sees the steps: a line of intent, or at least a blank line, between them."""
+    source = MODULE_NAMES[module].read_text(encoding="utf-8")
+    functions = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.FunctionDef)]
+    lines = source.splitlines()
+    assert not {f"{module}.{f.name}" for f in functions if not has_paragraphs(f, lines)}
+
+
+def test_a_body_without_paragraphs_is_noticed() -> None:
+    steps = [f"    x = {k}" for k in range(LONG_BODY)]
+    for extra, accepted in (("    y = 0", False), ("", True), ("    # Why.", True)):
+        source = ["def f():", '    """Text.', "", '    More."""', *steps, extra, *steps]
+        (function,) = ast.parse("\n".join(source)).body
+        assert isinstance(function, ast.FunctionDef)
+        assert has_paragraphs(function, source) is accepted

@@ -41,7 +41,7 @@ physics:
   relaxation_time: 0.01
   solver: sap
   contact_force: 0.1
-  calm_steps: 2
+  coarse_steps: 2
   max_speed: 5.0
 settle:
   drop_height: 0.1
@@ -271,8 +271,8 @@ def test_number_may_be_written_as_people_do(text: str, value: float) -> None:
         ("objects.min_diagonal=3", r"objects: min_diagonal must be less than .*, got 3\.0 and 2\."),
         ("physics.time_step=.nan", r"physics\.time_step: must be .*, got nan"),
         (
-            "physics.calm_steps=8",
-            r"calm_steps times time_step must be at most .*, got 8 times",
+            "physics.coarse_steps=8",
+            r"coarse_steps times time_step must be at most .*, got 8 times",
         ),
         ("physics.time_step=0.1", r"physics\.time_step: must be less than .* 0\.02, got 0\.1"),
         ("physics.solver=tamsi", r"solver: must be 'lagged', 'similar' or 'sap', got 'tamsi'"),

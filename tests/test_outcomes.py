@@ -36,14 +36,14 @@ def test_numbers_fit_the_files_byte() -> None:
     assert 0 <= min(Outcome) <= max(Outcome) <= 255
 
 
-@pytest.mark.parametrize(("label", "value", "stage", "says_nothing"), TABLE)
+@pytest.mark.parametrize(("label", "value", "stage", "inconclusive"), TABLE)
 def test_number_from_a_file_tells_label_and_stage(
-    label: str, value: int, stage: Stage, says_nothing: bool
+    label: str, value: int, stage: Stage, inconclusive: bool
 ) -> None:
     outcome = Outcome(value)
     assert outcome.label == label
     assert outcome.stage is stage
-    assert outcome.says_nothing is says_nothing
+    assert outcome.inconclusive is inconclusive
 
 
 def test_every_outcome_has_a_stage() -> None:
@@ -61,4 +61,4 @@ def test_number_of_no_outcome_is_refused() -> None:
 
 
 def test_no_file_of_a_dataset_holds_what_only_verification_tells() -> None:
-    assert {o.label for o in Outcome if o.only_verified} == {"unreachable", "off_surface"}
+    assert {o.label for o in Outcome if o.verification_only} == {"unreachable", "off_surface"}

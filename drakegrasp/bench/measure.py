@@ -13,8 +13,8 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from drakegrasp.build.attempts import Workbench, predict_all, try_on
+from drakegrasp.build.attempts import TrialSetup, predict_attempts, try_attempt
 from drakegrasp.build.prepare import prepare
-from drakegrasp.build.work_unit import look_at_successes
+from drakegrasp.build.work_unit import render_successes
 from drakegrasp.config import Config, override_config
 from drakegrasp.dataset.manifest import installed_versions
 from drakegrasp.dataset.prepared_objects import PreparedObject
@@ -33,8 +33,10 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.outcomes import Outcome, Stage
+from drakegrasp.runtime.allocator import allocator
 from drakegrasp.runtime.blas import one_thread
 from drakegrasp.runtime.progress import Report, silent
+from drakegrasp.runtime.timing import timed
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.candidates import Attempt, make_attempts
 from drakegrasp.simulation.construction import build_scene
@@ -43,6 +45,8 @@ from drakegrasp.simulation.trial import TrialRecord
 
 #: Attempts between two reports of progress.
 STRIDE = 50
+#: Other work on the machine disturbs CPU time less than the wall clock.
+_cpu_timed = partial(timed, clock=time.process_time)
 
 
 @dataclass(frozen=True)
@@ -60,8 +64,8 @@ class Variant:
 
 VARIANTS = {
     "screen_off": Variant(("screen.mode=off",)),
-    "half_step": Variant(("physics.time_step={half}", "physics.calm_steps=1")),
-    "calm_off": Variant(("physics.calm_steps=1",)),
+    "half_step": Variant(("physics.time_step={half}", "physics.coarse_steps=1")),
+    "coarse_steps_off": Variant(("physics.coarse_steps=1",)),
     "double_resolution": Variant(fine=True),
     "similar": Variant(("physics.solver=similar",)),
     "sap": Variant(("physics.solver=sap",)),
@@ -128,6 +132,7 @@ def summarize(objects: Sequence[dict[str, Any]], config: Config) -> dict[str, An
         "objects": list(objects),
         "peak_memory": _peak_memory(),
         "cpu": _cpu(),
+        "allocator": allocator(),
         "versions": installed_versions(config),
         "config": config.to_dict(),
     }
@@ -156,29 +161,29 @@ def _measure_object(
     """Return the measurements of one object."""
     # Prepare the object and list its attempts, as a build does.
     seconds: dict[str, float] = {}
-    with _timed(seconds, "prepare"):
+    with _cpu_timed(seconds, "prepare"):
         prepared = prepare(source, config)
     attempts = _attempts(prepared, config)
     hits = [row for row, attempt in enumerate(attempts) if attempt.ray_hits]
     counter.begin(len(attempts), len(hits))
 
     # Build what all attempts share, and screen them by geometry.
-    with _timed(seconds, "scene"):
+    with _cpu_timed(seconds, "scene"):
         scene = build_scene(prepared.model, config.physics, load_hand(config.hand))
-        bench = Workbench(prepared=prepared, config=config, scene=scene)
-    with _timed(seconds, "field"):
+        bench = TrialSetup(prepared=prepared, config=config, scene=scene)
+    with _cpu_timed(seconds, "field"):
         _ = prepared.model.field
-    with _timed(seconds, "screen"):
-        predictions = predict_all(bench, attempts)
+    with _cpu_timed(seconds, "screen"):
+        predictions = predict_attempts(bench, attempts)
 
     # Simulate what is left, and render the successes.
     records: list[TrialRecord] = []
     for attempt, prediction in zip(attempts, predictions, strict=True):
-        with _timed(seconds, "try"):
-            records.append(try_on(bench, attempt, prediction))
+        with _cpu_timed(seconds, "try"):
+            records.append(try_attempt(bench, attempt, prediction))
         counter.add(records[-1].outcome)
-    with _timed(seconds, "look"):
-        look_at_successes(bench, records)
+    with _cpu_timed(seconds, "look"):
+        render_successes(bench, records)
 
     report = {
         "name": source.name,
@@ -240,11 +245,11 @@ def _run_baseline(
     from drakegrasp.bench.mujoco_baseline import MujocoBaseline
 
     seconds: dict[str, float] = {}
-    with _timed(seconds, "prepare"):
+    with _cpu_timed(seconds, "prepare"):
         baseline = MujocoBaseline(prepared.model, prepared.X_TO, config)
     outcomes: Counter[str] = Counter()
     for attempt in attempts:
-        with _timed(seconds, "try"):
+        with _cpu_timed(seconds, "try"):
             outcome = baseline.run(attempt)
         outcomes[outcome.label] += 1
         counter.add(outcome)
@@ -258,7 +263,7 @@ def _sum_baseline(reports: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _compare_labels(
-    bench: Workbench,
+    bench: TrialSetup,
     attempts: Sequence[Attempt],
     records: Sequence[TrialRecord],
     predictions: Sequence[Prediction | None],
@@ -271,19 +276,19 @@ def _compare_labels(
     half = bench.config.physics.time_step / 2.0
     other = override_config(bench.config, [t.format(half=half) for t in variant.overrides])
     sample = [attempts[row] for row in rows]
-    other_predictions = predict_all(replace(bench, config=other), sample)
+    other_predictions = predict_attempts(replace(bench, config=other), sample)
 
     # The scene is the variant's.
     prepared = bench.prepared
     if variant.fine:
         prepared = replace(prepared, model=_finer(prepared.model))
     scene = build_scene(prepared.model, other.physics, load_hand(other.hand))
-    bench = Workbench(prepared=prepared, config=other, scene=scene)
+    bench = TrialSetup(prepared=prepared, config=other, scene=scene)
 
     # Pairs of outcomes, the first as measured; whether geometry decided the first.
     pairs, decided = [], []
     for row, attempt, prediction in zip(rows, sample, other_predictions, strict=True):
-        outcome = try_on(bench, attempt, prediction).outcome
+        outcome = try_attempt(bench, attempt, prediction).outcome
         counter.add(outcome)
         pairs.append((records[row].outcome, outcome))
         first = predictions[row]
@@ -354,10 +359,3 @@ def _cpu() -> str:
         return next(line.partition(":")[2].strip() for line in lines if "model name" in line)
     except (OSError, StopIteration):
         return platform.processor() or platform.machine()
-
-
-@contextmanager
-def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    start = time.process_time()
-    yield
-    seconds[stage] = seconds.get(stage, 0.0) + time.process_time() - start

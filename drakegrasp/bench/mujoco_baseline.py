@@ -29,9 +29,11 @@ from pydrake.multibody.tree import RevoluteJoint, RigidBody
 from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.description import Hand, load_hand, make_parser
+from drakegrasp.hand.shapes import hull_corners
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.verdict import judge_closed, judge_lifted
 
 #: Time step [s].
 TIME_STEP = 0.002
@@ -112,12 +114,9 @@ class MujocoBaseline:
         # Close on the clamped object and judge the contacts.
         self._close(start)
         links, hand_on_table, _ = self._touching()
-        if not self._tips <= links:
-            return Outcome.MISSING_FINGERTIP
-        if links > self._tips:
-            return Outcome.HAND_CONTACT
-        if hand_on_table:
-            return Outcome.TABLE_CONTACT
+        verdict = judge_closed(*self._held_by(links), hand_on_table)
+        if verdict != Outcome.SUCCESS:
+            return Outcome(int(verdict))
 
         # Lift: the wrist is commanded by B's origin, and the target is the palm's.
         X_BG = self._hand.X_BG
@@ -174,11 +173,11 @@ class MujocoBaseline:
                 return Outcome.DROPPED
 
         links, _, object_on_table = self._touching()
-        if not links:
-            return Outcome.DROPPED
-        if not self._tips <= links:
-            return Outcome.SLIPPED
-        return Outcome.TABLE_CONTACT if object_on_table else Outcome.SUCCESS
+        return Outcome(int(judge_lifted(*self._held_by(links), object_on_table)))
+
+    def _held_by(self, links: set[int]) -> tuple[list[bool], int]:
+        """Return whether each fingertip is among links, and the number of other links."""
+        return [tip in links for tip in self._tips], len(links - self._tips)
 
     def _touching(self) -> tuple[set[int], bool, bool]:
         """Return the links that touch the object, and whether hand and object touch the table."""
@@ -375,7 +374,10 @@ def _add_link(
 def _shape(
     spec: mujoco.MjSpec, inspector: SceneGraphInspector, geometry: GeometryId, link: str
 ) -> tuple[mujoco.mjtGeom, list[float], str]:
-    """Return MuJoCo's kind, size and mesh of a shape of the hand; meshes are added to the model."""
+    """Return MuJoCo's kind, size and mesh of a shape of the hand; meshes are added to the model.
+
+    MuJoCo has these primitives, too; the corners of `hand.shapes` only approximate them.
+    """
     shape, kinds = inspector.GetShape(geometry), mujoco.mjtGeom
     if isinstance(shape, Box):
         return kinds.mjGEOM_BOX, list(shape.size() / 2.0), ""
@@ -385,9 +387,9 @@ def _shape(
         return kinds.mjGEOM_CAPSULE, [shape.radius(), shape.length() / 2.0, 0.0], ""
     if isinstance(shape, Sphere):
         return kinds.mjGEOM_SPHERE, [shape.radius(), 0.0, 0.0], ""
-    hull = inspector.GetConvexHull(geometry)
+    corners = hull_corners(inspector, geometry)
+    assert corners is not None
     name = f"{link}.{inspector.GetName(geometry)}"
-    corners = np.array([hull.vertex(i) for i in range(hull.num_vertices())])
     spec.add_mesh(name=name, uservert=corners.ravel())
     return kinds.mjGEOM_MESH, [0.0, 0.0, 0.0], name
 

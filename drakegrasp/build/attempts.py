@@ -1,38 +1,50 @@
-"""The diagrams of one object in this process, and one attempt on them.
+"""One object's trial setup in this process, and the steps of a trial on it.
 
-In: a prepared object of a dataset. Out: a `Workbench`, kept for the next work unit of the same
-object, on which attempts are tried and successes are looked at.
+In: a prepared object of a dataset, and attempts. Out: what geometry predicts of them, the records
+of their trials, the distances of contacts from the surface, and the views of a success. Nothing
+is written here, see `drakegrasp.build.columns`.
 """
 
 from __future__ import annotations
 
-import atexit
-import ctypes
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.errors import DataError
+from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import release_memory
 from drakegrasp.simulation.candidates import Attempt
-from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.scene import Scene
+from drakegrasp.simulation.scene_cache import cached_renderer, cached_scene, forget_scenes
 from drakegrasp.simulation.screen import Prediction, predict
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
-from drakegrasp.vision.rendering import Renderer, build_renderer
+from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, image_frame, intrinsics
+from drakegrasp.vision.rendering import Renderer, render
 
-#: Objects whose diagrams a process keeps; a unit follows units of the same object.
+#: Prepared objects that a process keeps: the next unit is mostly of the same object.
 KEPT_OBJECTS = 2
 
 
 @dataclass(eq=False)
-class Workbench:
-    """The diagrams of one object in this process; the renderer is made when first needed."""
+class TrialSetup:
+    """What every trial of an object needs.
+
+    Attributes:
+        prepared: The object, its resting pose and its palm poses.
+        config: All the rules.
+        scene: Physics of object, table and hand. A scene in which Drake failed is replaced.
+    """
 
     prepared: PreparedObject
     config: Config
@@ -41,56 +53,98 @@ class Workbench:
 
     @property
     def renderer(self) -> Renderer:
-        """The object's renderer."""
+        """The object's renderer, built when it is first needed."""
         if self._renderer is None:
-            self._renderer = build_renderer(self.prepared.model, self.config.camera)
+            self._renderer = cached_renderer(self.prepared.model, self.config.camera)
         return self._renderer
 
 
-_workbenches: dict[tuple[Path, str, str, str], Workbench] = {}
+@dataclass(frozen=True, kw_only=True, eq=False)
+class View:
+    """What one camera sees of the resting object.
+
+    Attributes:
+        image: (4, S, S) float32, R, G, B in 0..1 and depth [m].
+        mask: (S, S) uint8, 1 where the object is seen.
+        X_TC: Pose of the camera in the table-top frame, (4, 4).
+        X_CI: The object's frame as the image shows it, (4, 4); None where none was estimated.
+    """
+
+    image: npt.NDArray[np.float32]
+    mask: npt.NDArray[np.uint8]
+    X_TC: Array
+    X_CI: Array | None = None
 
 
-def workbench(out: Path, header: ShardHeader, config: Config) -> Workbench:
-    """Return the diagrams of a unit's object, built now or kept from an earlier unit.
+def trial_setup(out: Path, header: ShardHeader, config: Config) -> TrialSetup:
+    """Return the setup of a unit's object; what it holds is kept from an earlier unit.
 
     Raises:
         DataError: If the object's files are damaged, or of another configuration or mesh.
     """
-    key = (out, header.config_hash, header.object_name, header.mesh_sha256)
-    if key not in _workbenches:
-        prepared = load_prepared(out, header.object_name, config)
-        if prepared.model.mesh_sha256 != header.mesh_sha256:
-            raise DataError(f"{out}: {header.object_name} must be of the unit's mesh, got another")
-        while len(_workbenches) >= KEPT_OBJECTS:
-            del _workbenches[next(iter(_workbenches))]
-        release_memory()  # what other objects left, also in preparing them
-        scene = build_scene(prepared.model, config.physics, load_hand(config.hand))
-        _workbenches[key] = Workbench(prepared=prepared, config=config, scene=scene)
-    return _workbenches[key]
+    prepared = _load(out, header.object_name, header.mesh_sha256, config)
+    scene = cached_scene(prepared.model, config.physics, config.hand)
+    return TrialSetup(prepared=prepared, config=config, scene=scene)
 
 
-@atexit.register
-def _leave_renderers_to_the_system() -> None:
-    """Keep the renderers from being destroyed when the process ends.
+@lru_cache(maxsize=KEPT_OBJECTS)
+def _load(out: Path, name: str, mesh_sha256: str, config: Config) -> PreparedObject:
+    prepared = load_prepared(out, name, config)
+    # A mesh may have changed since the unit was planned.
+    if prepared.model.mesh_sha256 != mesh_sha256:
+        raise DataError(
+            f"{out}: the prepared {name} must be of the work unit's mesh {mesh_sha256[:12]}, "
+            f"got {prepared.model.mesh_sha256[:12]}"
+        )
+    release_memory()  # what other objects left, also in preparing them
+    return prepared
 
-    That would happen in another thread than the one that made them, which VTK answers with a
-    page of warnings. A reference that nobody gives back keeps them until the process is gone.
-    """
-    for bench in _workbenches.values():
-        ctypes.pythonapi.Py_IncRef(ctypes.py_object(bench))
 
-
-def predict_all(bench: Workbench, attempts: Sequence[Attempt]) -> list[Prediction | None]:
-    """Return what geometry says of each attempt; asking for all at once is what is fast."""
-    config, prepared = bench.config, bench.prepared
+def predict_attempts(setup: TrialSetup, attempts: Sequence[Attempt]) -> list[Prediction | None]:
+    """Return what geometry says of each attempt; one call for all of them is much faster."""
+    config, prepared = setup.config, setup.prepared
     hand = load_hand(config.hand)
     return predict(prepared.model, hand, prepared.X_TO, attempts, config.screen)
 
 
-def try_on(bench: Workbench, attempt: Attempt, prediction: Prediction | None = None) -> TrialRecord:
-    """Run one attempt; a scene in which Drake failed is replaced, never used again."""
-    record = run_attempt(bench.scene, bench.prepared.X_TO, attempt, bench.config, prediction)
+def try_attempt(
+    setup: TrialSetup, attempt: Attempt, prediction: Prediction | None = None
+) -> TrialRecord:
+    """Run the trial of one attempt; replace the scene if Drake failed in it."""
+    record = run_attempt(setup.scene, setup.prepared.X_TO, attempt, setup.config, prediction)
     if record.outcome is Outcome.SOLVER_ERROR:
-        hand = load_hand(bench.config.hand)
-        bench.scene = build_scene(bench.prepared.model, bench.config.physics, hand)
+        forget_scenes()
+        setup.scene = cached_scene(setup.prepared.model, setup.config.physics, setup.config.hand)
     return record
+
+
+def surface_distance(setup: TrialSetup, record: TrialRecord) -> Array | None:
+    """Return how far the contacts after closing are from the object's mesh, (k,) [m].
+
+    Returns:
+        A distance per finger; None if the hand lifted nothing.
+    """
+    if record.closed is None or record.lifted is None:
+        return None
+    _, distance, _ = setup.prepared.model.visual.nearest.on_surface(record.closed.p_OQ)
+    return np.asarray(distance)
+
+
+def render_views(setup: TrialSetup, record: TrialRecord) -> dict[str, View]:
+    """Return what both cameras see of a success, by the names of `CAMERAS`.
+
+    Raises:
+        BlankImageError: If an image is blank, because OpenGL failed.
+    """
+    camera = setup.config.camera
+    X_TG = multiply(record.X_TO, record.X_OG)
+    oto = _render_view(setup, record, camera_pose_oto(X_TG, camera))
+    otm = _render_view(setup, record, camera_pose_otm(X_TG, camera))
+    if otm.mask.any():
+        otm = replace(otm, X_CI=image_frame(intrinsics(camera), otm.mask, otm.image[3]))
+    return {"oto": oto, "otm": otm}
+
+
+def _render_view(setup: TrialSetup, record: TrialRecord, X_TC: Array) -> View:
+    seen = render(setup.renderer, record.X_TO, X_TC)
+    return View(image=seen.image, mask=seen.mask, X_TC=X_TC)

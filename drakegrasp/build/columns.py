@@ -1,6 +1,7 @@
-"""What is written of an attempt: the columns of `/trials`, and of `/looks` for a success.
+"""The columns of a shard: `/trials`, a row per attempt, and `/looks`, a row per success.
 
-In: attempts with their records, or one record. Out: values by the names of `schema`.
+In: attempts, their records and what was measured of them. Out: arrays by the names of
+`drakegrasp.dataset.schema`. This only lays out values; `drakegrasp.build.attempts` makes them.
 """
 
 from __future__ import annotations
@@ -8,53 +9,74 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from drakegrasp.arithmetic import multiply
-from drakegrasp.build.attempts import Workbench
+from drakegrasp.build.attempts import TrialSetup, View
 from drakegrasp.dataset.hdf5 import AnyArray
-from drakegrasp.dataset.prepared_objects import PreparedObject
-from drakegrasp.dataset.schema import CAMERAS, sizes
+from drakegrasp.dataset.schema import CONTACT_NAMES, LOOK_FIELDS, sizes
 from drakegrasp.dataset.shards import trial_columns
-from drakegrasp.frames import pack_pose
+from drakegrasp.frames import Array, pack_pose
 from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.scene import hand_joint_names
 from drakegrasp.simulation.trial import TrialRecord
-from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, image_frame, intrinsics
-from drakegrasp.vision.rendering import look
 
 
 def trial_rows(
-    bench: Workbench, attempts: Sequence[Attempt], records: Sequence[TrialRecord]
+    setup: TrialSetup,
+    attempts: Sequence[Attempt],
+    records: Sequence[TrialRecord],
+    distances: Sequence[Array | None],
 ) -> dict[str, AnyArray]:
-    """Return the columns of `/trials` of attempts and their records."""
-    shape = array_sizes(bench)
+    """Return the columns of `/trials`.
+
+    Args:
+        setup: Says how many fingers, joints and pixels there are.
+        attempts: What was tried, in the order of the rows.
+        records: The result of each attempt.
+        distances: `surface_distance` of each record.
+    """
+    shape = array_sizes(setup)
     columns = {f.name: f.empty(len(records), shape) for f in trial_columns()}
-    for row, (attempt, record) in enumerate(zip(attempts, records, strict=True)):
-        for name, value in _row(bench.prepared, attempt, record).items():
+    for row, (attempt, record, distance) in enumerate(
+        zip(attempts, records, distances, strict=True)
+    ):
+        for name, value in _trial_values(attempt, record, distance).items():
             columns[name][row] = value
     return columns
 
 
-def look_values(bench: Workbench, record: TrialRecord) -> dict[str, AnyArray]:
-    """Return both images of a success, by the names of LOOK_FIELDS."""
-    camera = bench.config.camera
-    found: dict[str, AnyArray] = {}
-    poses = {"oto": camera_pose_oto, "otm": camera_pose_otm}
-    for name in CAMERAS:
-        X_TC = poses[name](multiply(record.X_TO, record.X_OG), camera)
-        seen = look(bench.renderer, record.X_TO, X_TC)
-        found[f"image_{name}"] = seen.image
-        found[f"mask_{name}"] = seen.mask
-        found[f"X_TC_{name}"] = pack_pose(X_TC)
-        # Where the object is out of sight the frame stays NaN, and a filter removes the row.
-        if name == "otm" and seen.mask.any():
-            X_CI = image_frame(intrinsics(camera), seen.mask, seen.image[3])
-            found["X_CI_otm"] = pack_pose(X_CI)
-    return found
+def empty_looks(setup: TrialSetup, count: int) -> dict[str, AnyArray]:
+    """Return the columns of `/looks` for a number of successes, without their values."""
+    shape = array_sizes(setup)
+    return {f.name: f.empty(count, shape) for f in LOOK_FIELDS}
 
 
-def _row(prepared: PreparedObject, attempt: Attempt, record: TrialRecord) -> dict[str, Any]:
-    row: dict[str, Any] = {
+def fill_look(looks: dict[str, AnyArray], k: int, views: dict[str, View]) -> None:
+    """Put the views of the k-th success into the columns of `/looks`."""
+    for camera, view in views.items():
+        looks[f"image_{camera}"][k] = view.image
+        looks[f"mask_{camera}"][k] = view.mask
+        looks[f"X_TC_{camera}"][k] = pack_pose(view.X_TC)
+        # Where the object is out of sight the frame stays NaN, and a filter removes the sample.
+        if view.X_CI is not None:
+            looks[f"X_CI_{camera}"][k] = pack_pose(view.X_CI)
+
+
+def array_sizes(setup: TrialSetup) -> dict[str, int]:
+    """Return the array lengths that `schema` leaves open: fingers, joints and pixels."""
+    handles = setup.scene.handles
+    assert handles is not None
+    return sizes(
+        fingers=handles.hand.num_fingers,
+        joints=len(hand_joint_names(setup.scene)),
+        image=setup.config.camera.size,
+    )
+
+
+def _trial_values(
+    attempt: Attempt, record: TrialRecord, surface_distance: Array | None
+) -> dict[str, Any]:
+    # Every attempt has its start.
+    values: dict[str, Any] = {
         "candidate": attempt.candidate,
         "standoff_index": attempt.standoff_index,
         "spread": attempt.spread,
@@ -63,41 +85,20 @@ def _row(prepared: PreparedObject, attempt: Attempt, record: TrialRecord) -> dic
         "X_TO": pack_pose(record.X_TO),
         "X_OG": pack_pose(record.X_OG),
     }
+
+    # What a stage did not reach keeps the column's fill value.
     if record.closed is not None:
-        row |= {"time_close": record.time_close, "closed_q": record.q_closed}
-        row |= _contact_values("closed", record.closed)
-    if record.lifted is not None and record.closed is not None and record.X_TO_lifted is not None:
-        row |= {"time_lift": record.time_lift, "lifted_q": record.q_lifted}
-        row |= _contact_values("lifted", record.lifted)
-        row |= {"slip": record.slip, "slip_angle": record.slip_angle}
-        row["X_TO_lifted"] = pack_pose(record.X_TO_lifted)
-        _, distance, _ = prepared.model.visual.nearest.on_surface(record.closed.p_OQ)
-        row["surface_distance"] = distance
-    return row
+        values |= {"time_close": record.time_close, "closed_q": record.q_closed}
+        values |= _contact_values("closed", record.closed)
+    if record.lifted is not None and record.X_TO_lifted is not None:
+        values |= {"time_lift": record.time_lift, "lifted_q": record.q_lifted}
+        values |= _contact_values("lifted", record.lifted)
+        values |= {"slip": record.slip, "slip_angle": record.slip_angle}
+        values["X_TO_lifted"] = pack_pose(record.X_TO_lifted)
+    if surface_distance is not None:
+        values["surface_distance"] = surface_distance
+    return values
 
 
 def _contact_values(prefix: str, contacts: Contacts) -> dict[str, Any]:
-    names = (
-        "touching",
-        "p_OQ",
-        "nhat_Q_O",
-        "f_Q_O",
-        "area",
-        "penetration",
-        "other_links",
-        "hand_on_table",
-        "object_on_table",
-        "point_contacts",
-    )
-    return {f"{prefix}_{name}": getattr(contacts, name) for name in names}
-
-
-def array_sizes(bench: Workbench) -> dict[str, int]:
-    """Return the lengths that the shapes of `schema` leave open, of a workbench's rows."""
-    handles = bench.scene.handles
-    assert handles is not None
-    return sizes(
-        fingers=handles.hand.num_fingers,
-        joints=len(hand_joint_names(bench.scene)),
-        image=bench.config.camera.size,
-    )
+    return {f"{prefix}_{name}": getattr(contacts, name) for name in CONTACT_NAMES}

@@ -1,4 +1,4 @@
-"""Preparing one mesh as a task: what a crash or a hang of its process then means.
+"""Preparing one mesh as a task, and what a crash or a hang of its process means for the mesh.
 
 In: a mesh and the configuration, as plain data. Out: the object's files, and its entry in the
 manifest: what it is, or why it was refused.
@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from drakegrasp.config import Config, parse_config
+from drakegrasp.dataset.manifest import ObjectEntry, RefusedMesh
 from drakegrasp.dataset.paths import model_path
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared, save_prepared
 from drakegrasp.errors import DrakegraspError, MachineError, MeshError
@@ -34,21 +35,23 @@ class PrepareTask:
 
     Attributes:
         source: The mesh.
-        out: Directory of the dataset, seen by every worker.
+        out: Directory of the dataset, visible to every worker.
         config: `Config.to_dict()`.
-        expendable: Whether the process that runs it is started again when it dies. Then a
-            crash or a hang costs the mesh; else it is the caller's to see.
+        restartable: Whether the process that runs it is started again when it dies. If so, a
+            crash or a hang costs only the mesh; if not, it propagates to the caller.
     """
 
     source: MeshSource
     out: str
     config: dict[str, Any]
-    expendable: bool
+    restartable: bool
 
 
 @one_thread
-def prepare_one(task: PrepareTask) -> tuple[str, dict[str, Any]]:
-    """Prepare one mesh; return its name and its entry in the manifest, a refusal among them.
+def prepare_one(task: PrepareTask) -> tuple[str, ObjectEntry | RefusedMesh]:
+    """Prepare one mesh; return its name and its entry in the manifest, which may be a refusal.
+
+    An object whose files are complete is not prepared again.
 
     Raises:
         DiskFullError: If there is no room for the object's files.
@@ -57,12 +60,16 @@ def prepare_one(task: PrepareTask) -> tuple[str, dict[str, Any]]:
     out, source, config = Path(task.out), task.source, parse_config(task.config)
     digest = source_sha256(source)
     with disk_full_named(out):
+        # The worker or the client may have died before the manifest named the object.
         entry = _entry_there(source, digest, out, config)
-        if entry is not None:  # its process, or the client, died before the manifest was written
+        if entry is not None:
             return source.name, entry
-        if not task.expendable:
-            return source.name, _prepared_entry(task)
-        release_memory()  # of the mesh before
+
+        if not task.restartable:
+            return source.name, _prepared_entry(task, digest)
+
+        # With a journal, a mesh that kills its process is found and refused.
+        release_memory()
         identity = {
             "name": source.name,
             "mesh_sha256": digest,
@@ -70,58 +77,56 @@ def prepare_one(task: PrepareTask) -> tuple[str, dict[str, Any]]:
         }
         path = model_path(out, source.name).with_suffix(".journal")
         with open_journal(path, identity) as journal:
-            return source.name, _prepared_or_guilty(task, journal)
+            return source.name, _prepared_or_refused(task, digest, journal)
 
 
-def _entry_there(
-    source: MeshSource, digest: str, out: Path, config: Config
-) -> dict[str, Any] | None:
-    """Return the entry of an object whose files are there and whole, or None."""
+def _entry_there(source: MeshSource, digest: str, out: Path, config: Config) -> ObjectEntry | None:
+    """Return the entry of an object whose files are complete, or None."""
     try:
         prepared = load_prepared(out, source.name, config)
     except DrakegraspError:
         return None
     model = prepared.model
     same = (model.class_name, model.mesh_sha256) == (source.class_name, digest)
-    return prepared.summary() if same else None
+    return prepared.entry() if same else None
 
 
-def _prepared_or_guilty(task: PrepareTask, journal: Journal) -> dict[str, Any]:
+def _prepared_or_refused(
+    task: PrepareTask, digest: str, journal: Journal
+) -> ObjectEntry | RefusedMesh:
     name = task.source.name
     verdict = journal.verdict("prepare")
     if verdict is not None:
-        return _refused(
-            task.source, f"{name}: must be fit to prepare, got one that {verdict.value}"
-        )
-    if journal.is_futile:
+        return _refused(task.source, digest, f"{name}: preparing it {verdict.value}")
+    if journal.in_crash_loop:
         raise MachineError(
-            f"{name}: the worker must stay alive to prepare it, got {GIVE_UP_DEATHS} deaths in a "
-            "row; is there enough memory? The same command goes on from here"
+            f"{name}: the worker died {GIVE_UP_DEATHS} times in a row while preparing it; is "
+            "there enough memory? The same command goes on from here"
         )
     with journal.step("prepare", PREPARE_SECONDS):
         inject_fault(name)
-        return _prepared_entry(task)
+        return _prepared_entry(task, digest)
 
 
-def _prepared_entry(task: PrepareTask) -> dict[str, Any]:
+def _prepared_entry(task: PrepareTask, digest: str) -> ObjectEntry | RefusedMesh:
     config = parse_config(task.config)
     try:
         prepared = prepare(task.source, config)
     except MeshError as error:
-        return _refused(task.source, str(error))
+        return _refused(task.source, digest, str(error))
     save_prepared(prepared, Path(task.out), config)
-    return prepared.summary()
+    return prepared.entry()
 
 
-def _refused(source: MeshSource, reason: str) -> dict[str, Any]:
-    return {"name": source.name, "mesh_sha256": source_sha256(source), "reason": reason}
+def _refused(source: MeshSource, digest: str, reason: str) -> RefusedMesh:
+    return RefusedMesh(name=source.name, mesh_sha256=digest, reason=reason)
 
 
 def prepare(source: MeshSource, config: Config) -> PreparedObject:
-    """Return a mesh as an object at rest with its palm poses.
+    """Return a mesh as an object at rest on the table, with its palm poses.
 
     Raises:
-        MeshError: If the mesh cannot be mended, its size is implausible, or the object does
+        MeshError: If the mesh cannot be repaired, its size is implausible, or the object does
             not come to rest.
     """
     model = prepare_object(source, config.objects)

@@ -1,4 +1,4 @@
-"""Running a trial of a dataset again: the same outcome and the same contacts, or it says so."""
+"""Runs a trial of a dataset again and says which stored values differ."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from drakegrasp.build.attempts import Workbench, try_on
+from drakegrasp.build.attempts import TrialSetup, surface_distance, try_attempt
 from drakegrasp.build.columns import trial_rows
 from drakegrasp.build.work_unit import unit_attempts
 from drakegrasp.dataset.manifest import Manifest, installed_versions, read_manifest
@@ -31,8 +31,9 @@ class Replay:
     Attributes:
         trial_id: Its row.
         object_name: Its object.
-        recorded, found: The outcome in the file and the one now.
-        differences: Largest absolute difference of each field that is not the same.
+        recorded: The outcome in the file.
+        found: The outcome now.
+        differences: Largest absolute difference of each field whose values differ.
         versions: Packages whose versions differ, as "then -> now".
     """
 
@@ -45,7 +46,7 @@ class Replay:
 
     @property
     def same(self) -> bool:
-        """Whether every stored value came out bit for bit."""
+        """Whether every stored value came out the same, bit for bit."""
         return not self.differences
 
 
@@ -53,27 +54,32 @@ class Replay:
 def replay_trial(out: str | Path, trial_id: int) -> Replay:
     """Run one trial of a dataset again, from its prepared object and its candidate.
 
-    The same machine and versions give the same bits. Other versions may not: `versions`
-    then says which differ.
+    The same machine, versions and BLAS kernel give the same bits. `versions` says which packages
+    have other versions now.
 
     Raises:
         DataError: If the dataset or the trial is not there.
     """
     stored = _stored_trial(Path(out), trial_id)
     prepared, config = stored.prepared, stored.manifest.config
+
+    # Run the attempt as a work unit would, up to the row that it would store.
     scene = build_scene(prepared.model, config.physics, load_hand(config.hand))
-    bench = Workbench(prepared=prepared, config=config, scene=scene)
-    again = trial_rows(bench, [stored.attempt], [try_on(bench, stored.attempt)])
+    setup = TrialSetup(prepared=prepared, config=config, scene=scene)
+    record = try_attempt(setup, stored.attempt)
+    row = trial_rows(setup, [stored.attempt], [record], [surface_distance(setup, record)])
+
+    # Compare bit for bit; other versions may explain a difference.
     now = installed_versions(config)
     return Replay(
         trial_id=trial_id,
         object_name=prepared.model.name,
         recorded=Outcome(int(stored.row["outcome"])),
-        found=Outcome(int(again["outcome"][0])),
+        found=Outcome(int(row["outcome"][0])),
         differences={
-            field.name: _difference(stored.row[field.name], again[field.name][0])
+            field.name: _difference(stored.row[field.name], row[field.name][0])
             for field in trial_columns()
-            if not np.array_equal(stored.row[field.name], again[field.name][0], equal_nan=True)
+            if not np.array_equal(stored.row[field.name], row[field.name][0], equal_nan=True)
         },
         versions={
             key: f"{then} -> {now.get(key)}"
@@ -84,7 +90,7 @@ def replay_trial(out: str | Path, trial_id: int) -> Replay:
 
 
 def record_trial(out: str | Path, trial_id: int, path: str | Path) -> Outcome:
-    """Run one trial of a dataset again and write an HTML file that plays it.
+    """Run one trial of a dataset again and write an HTML file that plays it back.
 
     Returns:
         The outcome now.
@@ -101,7 +107,7 @@ def record_trial(out: str | Path, trial_id: int, path: str | Path) -> Outcome:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _StoredTrial:
-    """A row of trials.hdf5 and what it was tried with."""
+    """A row of trials.hdf5, and what to run it again with."""
 
     row: dict[str, np.ndarray]
     prepared: PreparedObject

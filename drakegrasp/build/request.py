@@ -1,4 +1,4 @@
-"""What is to be built, whoever does the work."""
+"""What a caller asks to be built."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ if TYPE_CHECKING:
     from drakegrasp.config import Config
 
 
-#: What stands for the built-in objects in place of a directory.
+#: Stands for the built-in objects in place of a directory.
 BUILTIN = "builtin"
 
 
 @dataclass(frozen=True, kw_only=True)
 class BuildRequest:
-    """What is to be built, whoever does the work.
+    """What to build; who does the work is said elsewhere.
 
     Attributes:
         objects: Directory of meshes, or "builtin".

@@ -1,14 +1,13 @@
-"""Work units: a range of one object's candidates, tried one after the other, to one shard.
+"""Work units: one object's attempts at a range of its candidates, from trials to a shard.
 
-A work unit is plain data, so it can cross a process border. What a shard holds depends on its
-header and the configuration alone: not on who runs it, nor on what ran before, nor on how
-often its process died on the way (see `drakegrasp.runtime.journal`).
+A work unit is plain data, so it can be sent to another process. Its header and the configuration
+alone decide what its shard holds: not who runs it, nor what ran before, nor how often its process
+died (see `drakegrasp.runtime.journal`).
 """
 
 from __future__ import annotations
 
 import threading
-import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -18,12 +17,18 @@ from typing import Any
 
 import numpy as np
 
-from drakegrasp.build.attempts import Workbench, predict_all, try_on, workbench
-from drakegrasp.build.columns import array_sizes, look_values, trial_rows
+from drakegrasp.build.attempts import (
+    TrialSetup,
+    predict_attempts,
+    render_views,
+    surface_distance,
+    trial_setup,
+    try_attempt,
+)
+from drakegrasp.build.columns import empty_looks, fill_look, trial_rows
 from drakegrasp.config import Config, parse_config
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.prepared_objects import PreparedObject
-from drakegrasp.dataset.schema import LOOK_FIELDS
 from drakegrasp.dataset.shards import Shard, ShardHeader, read_outcomes, write_shard
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.outcomes import Outcome
@@ -39,19 +44,25 @@ from drakegrasp.runtime.journal import (
     Verdict,
     open_journal,
 )
+from drakegrasp.runtime.timing import timed
 from drakegrasp.simulation.candidates import Attempt, make_attempts
 from drakegrasp.simulation.robustness import UNKNOWN, Certificate, certify
 from drakegrasp.simulation.screen import Prediction
 from drakegrasp.simulation.trial import TrialRecord
 
-#: An attempt that is that many times over its wall-clock limit will never look at the clock.
+#: An attempt that takes this many times its wall-clock limit hangs: it never checks the clock.
 HANG_FACTOR = 1.5
-#: Wall clock after which anything else that a unit does hangs [s].
+#: Wall clock after which any other step of a unit hangs [s].
 STAGE_SECONDS = 600.0
-#: What else a unit does, by the name of its step.
-_STAGES = {"build": "building its scene", "look": "its images", "write": "writing its shard"}
-#: How many attempts' time a certificate may take before it hangs.
+#: A certificate hangs when it takes this many times the limit of all its simulations.
 CERTIFY_FACTOR = 2.0
+#: What each step of a unit that is no attempt does, for error messages.
+_STEPS = {
+    "build": "building its scene",
+    "look": "rendering its images",
+    "measure": "measuring its contacts",
+    "write": "writing its shard",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,28 +70,28 @@ class WorkUnit:
     """What one task does: plain data.
 
     Attributes:
-        out: Directory of the dataset, seen by every worker.
+        out: Directory of the dataset, visible to every worker.
         header: Object and range of candidates.
         config: `Config.to_dict()`.
-        expendable: Whether the process that runs it is started again when it dies. Then a
-            crash or a hang costs the guilty attempt; else it is the caller's to see.
+        restartable: Whether the process that runs it is started again when it dies. If so, a
+            crash or a hang costs only the attempt; if not, it propagates to the caller.
     """
 
     out: str
     header: ShardHeader
     config: dict[str, Any]
-    expendable: bool = False
+    restartable: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class UnitSummary:
-    """What comes back from a unit; the data itself went into its shard.
+    """What a unit returns; its data are in its shard.
 
     Attributes:
         header: Of the unit.
         outcomes: Number of attempts by outcome.
-        seconds: Wall clock by stage (`build`, `try`, `look`, `certify` if there are repeats,
-            `write`) [s]; for logs only.
+        seconds: Wall clock by stage (`build`, `try`, `measure`, `look`, `certify` if there are
+            repeats, `write`) [s]; for logs only. Empty if the shard was there already.
         errors: Number of solver errors by their message.
     """
 
@@ -90,142 +101,88 @@ class UnitSummary:
     errors: dict[str, int]
 
 
-#: Two threads in one scene would give each other's results: only one unit runs at a time.
+#: Two threads in one scene would mix up their results: only one unit runs at a time.
 _one_unit = threading.Lock()
 
 
 @one_thread
 def run_unit(unit: WorkUnit) -> UnitSummary:
-    """Try all attempts of a unit, look at the successes, and write the shard.
+    """Run all attempts of a unit, render and certify its successes, and write its shard.
+
+    A unit whose shard is complete is not run again.
 
     Raises:
         DataError: If the object's files are damaged, or Drake cannot build its scene.
-        BlankImageError: If OpenGL gives nothing.
+        BlankImageError: If OpenGL renders blank images.
         DiskFullError: If there is no room for the shard.
         MachineError: If something other than an attempt kills the process again and again.
     """
     out, header = Path(unit.out), unit.header
     with _one_unit, disk_full_named(out):
         outcomes = _outcomes_there(out, header)
-        if outcomes is not None:  # its process died between the shard and the answer
+        if outcomes is not None:
+            # A process died after it wrote the shard and before it answered.
             summary = UnitSummary(header=header, outcomes=outcomes, seconds={}, errors={})
-        elif unit.expendable:
+        elif unit.restartable:
             with open_journal(header.journal_path(out), asdict(header)) as journal:
-                summary = _run_unit(unit, journal)
+                summary = _run_experiment(unit, journal)
         else:
-            summary = _run_unit(unit, NO_JOURNAL)
+            summary = _run_experiment(unit, NO_JOURNAL)
         header.journal_path(out).unlink(missing_ok=True)
         trim_memory()
         return summary
+
+
+def _run_experiment(unit: WorkUnit, journal: Journal) -> UnitSummary:
+    """Tell the whole experiment: set up, predict, try, measure, render, certify, write."""
+    config, out, header = parse_config(unit.config), Path(unit.out), unit.header
+    seconds: dict[str, float] = {}
+    _refuse_crash_loop(journal, header)
+
+    # Build the object's scene, or take the one of the unit before, and list the attempts.
+    with _stage(journal, "build", header, seconds):
+        setup = _build_setup(out, header, config)
+        attempts = unit_attempts(setup.prepared, header, config)
+
+    # Try each attempt: what geometry already decides is not simulated.
+    with timed(seconds, "try"):
+        predictions = predict_attempts(setup, attempts)
+        records = _try_all(setup, attempts, predictions, journal)
+
+    # Measure how far the contacts of each lift are from the object's true surface.
+    with _stage(journal, "measure", header, seconds):
+        distances = [surface_distance(setup, record) for record in records]
+
+    # Render both cameras' images of each success.
+    with timed(seconds, "look"):
+        looks = render_successes(setup, records, journal)
+
+    # Certify: simulate each success again with noise and with less friction, if asked for.
+    if config.certify.repeats:
+        with timed(seconds, "certify"):
+            _certify_successes(setup, attempts, looks, journal)
+
+    # Write the shard: all of it or nothing.
+    with _stage(journal, "write", header, seconds):
+        trials = trial_rows(setup, attempts, records, distances)
+        write_shard(out, Shard(header=header, trials=trials, looks=looks))
+
+    return UnitSummary(
+        header=header,
+        outcomes=count_outcomes(trials["outcome"]),
+        seconds=seconds,
+        errors=dict(Counter(record.message for record in records if record.message)),
+    )
 
 
 def find_outcomes(out: Path, header: ShardHeader) -> dict[Outcome, int] | None:
     """Return the number of attempts by outcome of a unit that is done, or None if it is not.
 
     Raises:
-        DataError: If its shard is there, but damaged or of something else.
+        DataError: If its shard is damaged or of something else.
     """
     path = header.path(out)
     return count_outcomes(read_outcomes(path, header)) if path.exists() else None
-
-
-def _outcomes_there(out: Path, header: ShardHeader) -> dict[Outcome, int] | None:
-    try:
-        return find_outcomes(out, header)
-    except DataError:
-        return None
-
-
-def _run_unit(unit: WorkUnit, journal: Journal) -> UnitSummary:
-    config, out, header = parse_config(unit.config), Path(unit.out), unit.header
-    _refuse_futile(journal, header)
-    seconds: dict[str, float] = {}
-    with _stage(journal, "build", header, seconds):
-        bench = _workbench(out, header, config)
-        attempts = unit_attempts(bench.prepared, header, config)
-    with _timed(seconds, "try"):
-        records = _try_all(bench, attempts, journal)
-    with _timed(seconds, "look"):
-        looks = look_at_successes(bench, records, journal)
-    if config.certify.repeats:
-        with _timed(seconds, "certify"):
-            _certify_all(bench, attempts, looks, journal)
-    with _stage(journal, "write", header, seconds):
-        shard = Shard(header=header, trials=trial_rows(bench, attempts, records), looks=looks)
-        write_shard(out, shard)
-    return UnitSummary(
-        header=header,
-        outcomes=count_outcomes(shard.trials["outcome"]),
-        seconds=seconds,
-        errors=dict(Counter(record.message for record in records if record.message)),
-    )
-
-
-def _workbench(out: Path, header: ShardHeader, config: Config) -> Workbench:
-    try:
-        return workbench(out, header, config)
-    # A failed assertion within Drake arrives as SystemExit, which would end the worker.
-    except SystemExit as error:
-        raise DataError(
-            f"{header.object_name}: Drake must be able to build its scene, got: {error}"
-        ) from None
-
-
-def _try_all(bench: Workbench, attempts: Sequence[Attempt], journal: Journal) -> list[TrialRecord]:
-    """Return the records of attempts in their order; those under suspicion run first."""
-    steps = [f"{ATTEMPT} {row}" for row in range(len(attempts))]
-    suspects = set(journal.suspects)
-    order = sorted(range(len(attempts)), key=lambda row: steps[row] not in suspects)
-    predictions = predict_all(bench, attempts)
-    records = {
-        row: _try_step(bench, attempts[row], journal, steps[row], predictions[row]) for row in order
-    }
-    return [records[row] for row in range(len(attempts))]
-
-
-def _try_step(
-    bench: Workbench,
-    attempt: Attempt,
-    journal: Journal,
-    step: str,
-    prediction: Prediction | None,
-) -> TrialRecord:
-    verdict = journal.verdict(step)
-    if verdict is not None:
-        outcome = Outcome.TIMEOUT if verdict is Verdict.HUNG else Outcome.CRASHED
-        return TrialRecord(outcome=outcome, X_TO=bench.prepared.X_TO, X_OG=attempt.X_OG)
-    with journal.step(step, HANG_FACTOR * bench.config.attempt_seconds):
-        inject_fault(bench.prepared.model.name, attempt.candidate, attempt.standoff_index)
-        return try_on(bench, attempt, prediction)
-
-
-def _refuse_futile(journal: Journal, header: ShardHeader) -> None:
-    if journal.is_futile:
-        raise MachineError(
-            f"{header.object_name}, palm poses {header.start} to {header.stop - 1}: the worker "
-            f"must stay alive for one work unit, got {GIVE_UP_DEATHS} deaths in a row; is there "
-            "enough memory? The same command goes on from here"
-        )
-
-
-def _refuse_guilty(journal: Journal, step: str, name: str) -> None:
-    """Refuse a step that is no attempt and ended its process: that is not the grasp's fault."""
-    verdict = journal.verdict(step)
-    if verdict is not None:
-        what = _STAGES[step.partition(" ")[0]]
-        raise MachineError(
-            f"{name}: {what} must not end the process, got one that {verdict.value}; see "
-            "`drakegrasp doctor`. The same command tries again"
-        )
-
-
-@contextmanager
-def _stage(
-    journal: Journal, step: str, header: ShardHeader, seconds: dict[str, float]
-) -> Iterator[None]:
-    _refuse_guilty(journal, step, header.object_name)
-    with _timed(seconds, step), journal.step(step, STAGE_SECONDS):
-        yield
 
 
 def unit_attempts(
@@ -244,51 +201,134 @@ def unit_attempts(
 
 
 def count_outcomes(outcomes: AnyArray) -> dict[Outcome, int]:
-    """Return the number of attempts by outcome, of a column of outcomes."""
+    """Return the number of attempts by outcome, given a column of outcomes (n,)."""
     values, counts = np.unique(outcomes, return_counts=True)
     return {Outcome(int(v)): int(n) for v, n in zip(values, counts, strict=True)}
 
 
-def look_at_successes(
-    bench: Workbench, records: Sequence[TrialRecord], journal: Journal = NO_JOURNAL
+def render_successes(
+    setup: TrialSetup, records: Sequence[TrialRecord], journal: Journal = NO_JOURNAL
 ) -> dict[str, AnyArray]:
-    """Return the columns of `/looks`: both images of every success."""
+    """Return the columns of `/looks`: both images of every success.
+
+    Raises:
+        BlankImageError: If OpenGL renders blank images.
+        MachineError: If rendering ended the process before.
+    """
     rows = [i for i, record in enumerate(records) if record.outcome is Outcome.SUCCESS]
-    columns = {f.name: f.empty(len(rows), array_sizes(bench)) for f in LOOK_FIELDS}
+    looks = empty_looks(setup, len(rows))
     for k, row in enumerate(rows):
         step = f"look {row}"
-        _refuse_guilty(journal, step, bench.prepared.model.name)
-        columns["row"][k] = row
+        _refuse_failing(journal, step, setup.prepared.model.name)
+        looks["row"][k] = row
         with journal.step(step, STAGE_SECONDS):
-            for name, value in look_values(bench, records[row]).items():
-                columns[name][k] = value
-    return columns
+            fill_look(looks, k, render_views(setup, records[row]))
+    return looks
 
 
-def _certify_all(
-    bench: Workbench,
+def _outcomes_there(out: Path, header: ShardHeader) -> dict[Outcome, int] | None:
+    """Return the outcomes of a complete shard; None if it is missing or damaged."""
+    try:
+        return find_outcomes(out, header)
+    except DataError:
+        return None
+
+
+def _build_setup(out: Path, header: ShardHeader, config: Config) -> TrialSetup:
+    try:
+        return trial_setup(out, header, config)
+    # A failed assertion within Drake arrives as SystemExit, which would end the worker.
+    except SystemExit as error:
+        raise DataError(f"{header.object_name}: Drake cannot build its scene: {error}") from None
+
+
+def _try_all(
+    setup: TrialSetup,
+    attempts: Sequence[Attempt],
+    predictions: Sequence[Prediction | None],
+    journal: Journal,
+) -> list[TrialRecord]:
+    """Return the records of attempts in their order.
+
+    Attempts in which an earlier process died, and that are not yet judged, run first: then a
+    failing one is found at once.
+    """
+    steps = [f"{ATTEMPT} {row}" for row in range(len(attempts))]
+    unresolved = set(journal.unresolved)
+    order = sorted(range(len(attempts)), key=lambda row: steps[row] not in unresolved)
+    records = {
+        row: _try_step(setup, attempts[row], predictions[row], journal, steps[row]) for row in order
+    }
+    return [records[row] for row in range(len(attempts))]
+
+
+def _try_step(
+    setup: TrialSetup,
+    attempt: Attempt,
+    prediction: Prediction | None,
+    journal: Journal,
+    step: str,
+) -> TrialRecord:
+    verdict = journal.verdict(step)
+    if verdict is not None:
+        outcome = Outcome.TIMEOUT if verdict is Verdict.HUNG else Outcome.CRASHED
+        return TrialRecord(outcome=outcome, X_TO=setup.prepared.X_TO, X_OG=attempt.X_OG)
+    with journal.step(step, HANG_FACTOR * setup.config.attempt_seconds):
+        inject_fault(setup.prepared.model.name, attempt.candidate, attempt.standoff_index)
+        return try_attempt(setup, attempt, prediction)
+
+
+def _certify_successes(
+    setup: TrialSetup,
     attempts: Sequence[Attempt],
     looks: dict[str, AnyArray],
     journal: Journal,
 ) -> None:
-    """Fill in how robust each success is."""
+    """Fill in the robustness of each success."""
     for k, row in enumerate(looks["row"].tolist()):
-        found = _certify_step(bench, attempts[row], journal, f"certify {row}")
-        looks["certified_share"][k] = found.share
-        looks["certified_friction"][k] = found.friction
+        certificate = _certify_step(setup, attempts[row], journal, f"certify {row}")
+        looks["certified_share"][k] = certificate.share
+        looks["certified_friction"][k] = certificate.friction
 
 
-def _certify_step(bench: Workbench, attempt: Attempt, journal: Journal, step: str) -> Certificate:
-    if journal.verdict(step) is not None:  # it ended its process: the grasp itself held
+def _certify_step(setup: TrialSetup, attempt: Attempt, journal: Journal, step: str) -> Certificate:
+    # A certificate that ended its process costs the certificate: the grasp itself held.
+    if journal.verdict(step) is not None:
         return UNKNOWN
-    rules, config = bench.config.certify, bench.config
-    trials = rules.repeats + rules.friction_steps + 1
-    with journal.step(step, CERTIFY_FACTOR * trials * config.attempt_seconds):
-        return certify(bench.prepared.model, bench.prepared.X_TO, attempt, config)
+    rules, config = setup.config.certify, setup.config
+    simulations = rules.repeats + rules.friction_steps + 1
+    with journal.step(step, CERTIFY_FACTOR * simulations * config.attempt_seconds):
+        return certify(setup.prepared.model, setup.prepared.X_TO, attempt, config)
 
 
 @contextmanager
-def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    start = time.perf_counter()
-    yield
-    seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - start
+def _stage(
+    journal: Journal, step: str, header: ShardHeader, seconds: dict[str, float]
+) -> Iterator[None]:
+    """Run and time a stage that is one step of the journal.
+
+    Raises:
+        MachineError: If the stage ended the process before.
+    """
+    _refuse_failing(journal, step, header.object_name)
+    with timed(seconds, step), journal.step(step, STAGE_SECONDS):
+        yield
+
+
+def _refuse_crash_loop(journal: Journal, header: ShardHeader) -> None:
+    if journal.in_crash_loop:
+        raise MachineError(
+            f"{header.object_name}, palm poses {header.start} to {header.stop - 1}: the worker "
+            f"died {GIVE_UP_DEATHS} times in a row in this work unit; is there enough memory? "
+            "The same command goes on from here"
+        )
+
+
+def _refuse_failing(journal: Journal, step: str, name: str) -> None:
+    """Refuse a step that is no attempt and ended its process: that is not the grasp's fault."""
+    verdict = journal.verdict(step)
+    if verdict is not None:
+        what = _STEPS[step.partition(" ")[0]]
+        raise MachineError(
+            f"{name}: {what} {verdict.value}; see `drakegrasp doctor`. The same command tries again"
+        )

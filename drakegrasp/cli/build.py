@@ -136,7 +136,8 @@ def _print_stats(out: Path) -> None:
 
 def print_plan(request: BuildRequest, workers: int | None, times: Path | None) -> None:
     """Print how long a requested build is expected to take, and its size."""
-    from drakegrasp.build.estimate import logged_times, plan_lines, plan_request, read_times
+    from drakegrasp.build.estimate import plan_lines, plan_request
+    from drakegrasp.build.stage_times import logged_times, read_times
 
     logged = logged_times(request.out, request.config)
     measured = logged if times is None else read_times(times)
@@ -156,6 +157,6 @@ def print_report(report: BuildReport) -> None:
     for notice in report.notices:
         click.echo(notice)
     for entry in report.refused:
-        click.echo(f"refused: {entry['name']}: {entry['reason']}")
+        click.echo(f"refused: {entry.name}: {entry.reason}")
     for name in ("grasping_oto.hdf5", "grasping_otm.hdf5", "trials.hdf5"):
         click.echo(str(report.out / name))

@@ -20,15 +20,20 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
+from drakegrasp.runtime.environment import available_cores
+
 PYTHON = (3, 11)
 #: Drake's wheels are built for this C library (manylinux_2_34).
 GLIBC = (2, 34)
 DRAKE = (1, 51, 1)
 #: Segfaults when it makes a renderer on Linux (RobotLocomotion/drake#24421).
 BROKEN_DRAKE = (1, 52, 0)
+#: With the last Drake for Python 3.11, which is 1.51.1, attempts take a fifth longer.
+FAST_DRAKE, FAST_PYTHON = (1, 58, 0), (3, 12)
 DRAKE_REQUIREMENT = "drake>=1.51.1,!=1.52.0"
 EGL_LIBRARY = "libEGL.so.1"
 EGL_PACKAGES = "apt-get install libegl1 libgl1-mesa-dri"
+JEMALLOC_PACKAGE = "apt-get install libjemalloc2"
 #: Time for the test image [s]: the first one may compile shaders on a slow file system.
 IMAGE_SECONDS = 60.0
 #: Room for about 3,500 successes: two images of 128 x 128 pixels of 17 bytes, uncompressed [B].
@@ -77,9 +82,9 @@ def diagnose(directory: Path | None = None) -> list[Finding]:
         check_python(),
         check_glibc(),
         check_drake(),
+        check_allocator(),
         check_egl(),
         check_image(),
-        check_embree(),
         check_writing(place),
         check_disk(place),
         check_cores(),
@@ -117,7 +122,21 @@ def check_drake() -> Finding:
     except metadata.PackageNotFoundError:
         return _finding("Drake", False, "not installed", f"pip install '{DRAKE_REQUIREMENT}'")
     ok = _numbers(version) >= DRAKE and _numbers(version) != BROKEN_DRAKE
-    return _finding("Drake", ok, version, f"pip install '{DRAKE_REQUIREMENT}'")
+    what = version
+    if ok and _numbers(version) < FAST_DRAKE:
+        newer = f"{_dotted(FAST_DRAKE)} on Python {_dotted(FAST_PYTHON)} or newer"
+        what += f": works; attempts take a fifth longer than with {newer}"
+    return _finding("Drake", ok, what, f"pip install '{DRAKE_REQUIREMENT}'")
+
+
+def check_allocator() -> Finding:
+    """Return which allocator the workers have; any will do, but jemalloc is the fastest."""
+    from drakegrasp.runtime.allocator import LIBRARY, allocator, jemalloc_environment
+
+    if jemalloc_environment():
+        return Finding(name="allocator", ok=True, what=f"{LIBRARY} for workers, bench and verify")
+    what = f"{allocator()}: works; with jemalloc a build is a tenth faster: {JEMALLOC_PACKAGE}"
+    return Finding(name="allocator", ok=True, what=what)
 
 
 def check_egl() -> Finding:
@@ -170,19 +189,6 @@ def check_image() -> Finding:
     return Finding(name="test image", ok=True, what=what)
 
 
-def check_embree() -> Finding:
-    """Return whether trimesh casts rays with embree, which is a hundred times faster."""
-    # A wheel for another kind of machine may fail in any way when it is loaded.
-    try:
-        from trimesh import ray
-
-        if ray.has_embree:
-            return Finding(name="embree", ok=True, what=f"embreex {_version('embreex')}")
-    except Exception as error:
-        return _finding("embree", False, f"{type(error).__name__}: {error}", "pip install trimesh")
-    return _finding("embree", False, "trimesh does not find it", "pip install embreex")
-
-
 def check_writing(directory: Path) -> Finding:
     """Return whether a file can be written in a directory, by writing one."""
     try:
@@ -213,12 +219,12 @@ def check_disk(directory: Path) -> Finding:
 
 def check_cores() -> Finding:
     """Return how many cores this process may use; any number will do."""
-    return Finding(name="cores", ok=True, what=str(_cores()))
+    return Finding(name="cores", ok=True, what=str(available_cores()))
 
 
 def check_memory() -> Finding:
     """Return whether there is memory for a worker on every core."""
-    total, cores = _memory(), _cores()
+    total, cores = _memory(), available_cores()
     if total is None:
         return Finding(name="memory", ok=True, what="unknown")
     return _finding(
@@ -241,7 +247,7 @@ def render_test_image() -> tuple[int, int]:
     from drakegrasp.frames import make_pose
     from drakegrasp.objects.model import ObjectModel
     from drakegrasp.vision.camera import intrinsics
-    from drakegrasp.vision.rendering import build_renderer, look
+    from drakegrasp.vision.rendering import build_renderer, render
 
     # A cube of 1 kg.
     config = CameraConfig()
@@ -263,7 +269,7 @@ def render_test_image() -> tuple[int, int]:
     # It stands on the table, and the camera looks straight down on it.
     X_TO = make_pose(np.eye(3), [0.0, 0.0, BOX_EDGE / 2.0])
     X_TC = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, BOX_EDGE + BOX_DISTANCE])
-    seen = look(build_renderer(model, config), X_TO, X_TC)
+    seen = render(build_renderer(model, config), X_TO, X_TC)
     edge = intrinsics(config)[0, 0] * BOX_EDGE / BOX_DISTANCE
     return int(seen.mask.sum()), round(edge**2)
 
@@ -306,12 +312,6 @@ def _signal_name(number: int) -> str:
         return signal.Signals(number).name
     except ValueError:
         return f"signal {number}"
-
-
-def _cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _memory() -> int | None:

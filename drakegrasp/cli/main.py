@@ -22,6 +22,7 @@ from drakegrasp.cli.options import (
     units_option,
 )
 from drakegrasp.cli.verify import verify
+from drakegrasp.runtime.allocator import restart_with_jemalloc
 
 
 @click.command()
@@ -146,3 +147,10 @@ def replay(out: Path, trial: int, html: Path | None) -> None:
 # The help lists them in this order.
 for _command in (doctor, objects, audit, build, assemble, check, stats, replay, verify, bench):
     main.add_command(_command)
+
+
+def run() -> None:
+    """Run the program; commands that may simulate in this process have jemalloc for it."""
+    if sys.argv[1:2] in (["bench"], ["verify"]):
+        restart_with_jemalloc()
+    main()

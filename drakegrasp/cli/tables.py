@@ -110,7 +110,7 @@ def audit_table(rows: Sequence[AuditRow]) -> Table:
     table.add_column("faces", justify="right")
     table.add_column(escape("size [mm]"), justify="right", no_wrap=True)
     table.add_column("notes", overflow="fold")
-    colours = {"fit": "green", "mended": "yellow", "refused": "red"}
+    colours = {"fit": "green", "repaired": "yellow", "refused": "red"}
     for row in rows:
         size = "-" if row.extents is None else "x".join(f"{1e3 * e:.0f}" for e in row.extents)
         table.add_row(
@@ -127,14 +127,14 @@ def audit_table(rows: Sequence[AuditRow]) -> Table:
 def verdict_table(outcomes: Sequence[Outcome]) -> Table:
     """Return how many grasps had each outcome, and their share of those with a verdict."""
     counts = Counter(outcomes)
-    judged = sum(n for outcome, n in counts.items() if not outcome.says_nothing)
+    judged = sum(n for outcome, n in counts.items() if not outcome.inconclusive)
     table = _table("Verdicts")
     table.add_column("outcome", no_wrap=True)
     for head in ("grasps", "share"):
         table.add_column(head, justify="right", no_wrap=True)
     others = sorted(counts.keys() - {Outcome.SUCCESS}, key=lambda o: (-counts[o], o))
     for outcome in (Outcome.SUCCESS, *others):
-        share = "-" if outcome.says_nothing or not judged else f"{counts[outcome] / judged:.1%}"
+        share = "-" if outcome.inconclusive or not judged else f"{counts[outcome] / judged:.1%}"
         table.add_row(outcome.label, f"{counts[outcome]:,}", share)
     table.add_section()
     table.add_row("all", f"{len(outcomes):,}", "")

@@ -107,7 +107,7 @@ def verify(
     """
     from drakegrasp.api import run_verification
     from drakegrasp.cli.tables import make_console, verdict_table
-    from drakegrasp.cli.verify_request import VerifyRequest, plan_request
+    from drakegrasp.cli.verify_request import VerifyRequest, place_requested
     from drakegrasp.verification.result_files import (
         json_lines,
         part_path,
@@ -115,17 +115,16 @@ def verify(
         write_json_line,
         write_results,
     )
-    from drakegrasp.verification.tasks import refuse_off_surface
+    from drakegrasp.verification.verify import refuse_off_surface
 
     # All input is read and checked before anything is simulated.
-    tasks = plan_request(VerifyRequest(**options, out=out))
-    single = sum(len(task.indices) for task in tasks) == 1
+    grasps = place_requested(VerifyRequest(**options, out=out))
 
     def print_line(index: int, result: Verification) -> None:
         write_json_line(index, result, sys.stdout)
 
     def deliver(index: int, result: Verification) -> None:
-        if single:
+        if len(grasps) == 1:
             refuse_off_surface(result)
         write(index, result)
 
@@ -133,11 +132,11 @@ def verify(
     try:
         with nullcontext(print_line) if out is None else json_lines(out) as write:
             results = run_verification(
-                tasks,
+                grasps,
                 workers=workers,
                 scheduler=scheduler,
                 scheduler_file=scheduler_file,
-                deliver=deliver,
+                on_result=deliver,
                 show=not quiet,
             )
             if out is not None:

@@ -1,4 +1,4 @@
-"""Turns files and options of `drakegrasp verify` into tasks. Nothing is simulated here.
+"""Turns files and options of `drakegrasp verify` into placed grasps. Nothing is simulated.
 
 Whatever is wrong with the files or the options is a `GraspError`, `MeshError`, `ConfigError` or
 `HandError`, that is wrong usage.
@@ -13,9 +13,9 @@ from drakegrasp.config import Config, load_config, override_config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError, GraspError
+from drakegrasp.verification.placed_grasp import PlacedGrasp, VerifyArguments, place_grasps
 from drakegrasp.verification.prediction import HDF5_SUFFIXES, read_numbers, read_predictions
 from drakegrasp.verification.result_files import refuse_unwritable
-from drakegrasp.verification.tasks import VerifyTask, plan_verification
 
 #: The split of a dataset if none is named.
 DEFAULT_SPLIT = "test"
@@ -39,19 +39,19 @@ class VerifyRequest:
     out: Path | None = None
 
 
-def plan_request(request: VerifyRequest) -> list[VerifyTask]:
-    """Return the tasks of a request, at least one.
+def place_requested(request: VerifyRequest) -> list[PlacedGrasp]:
+    """Return the grasps of a request on their objects, at least one.
 
     Raises:
         GraspError, MeshError, ConfigError, HandError: If a file or an option cannot be used.
     """
     try:
-        return _plan(request)
+        return _place(request)
     except DataError as error:
         raise GraspError(str(error)) from None
 
 
-def _plan(request: VerifyRequest) -> list[VerifyTask]:
+def _place(request: VerifyRequest) -> list[PlacedGrasp]:
     # Refuse results that could not be written, and options without effect.
     if request.out is not None:
         refuse_unwritable(request.out)
@@ -63,12 +63,10 @@ def _plan(request: VerifyRequest) -> list[VerifyTask]:
     data = None if path is None else GraspDataset(path, split=split or DEFAULT_SPLIT)
     predicted = read_predictions(request.grasps, split=split)
 
-    return plan_verification(
-        predicted.grasps,
-        request.mesh,
+    arguments = VerifyArguments(
+        mesh=request.mesh,
         frame=request.frame,
-        X=None if request.camera is None else read_numbers(request.camera),
-        X_TO=None,
+        X_TC=None if request.camera is None else read_numbers(request.camera),
         units=request.units,
         hand=request.hand,
         method=request.method,
@@ -76,6 +74,7 @@ def _plan(request: VerifyRequest) -> list[VerifyTask]:
         dataset=data,
         rows=None if predicted.rows is None else predicted.rows.tolist(),
     )
+    return place_grasps(predicted.grasps, arguments)
 
 
 def _dataset_path(request: VerifyRequest) -> Path | None:

@@ -1,38 +1,82 @@
-"""Which workers may do the work: checked when they are there, and when they join later.
+"""Which workers may do the work: checked at the start of a build, and when a worker joins later.
 
-In: a Dask client. A worker with several threads, or with another Drake, drakegrasp or hand,
-would give other results than this machine; one that was started by hand lacks settings.
-Those that are there are refused by name; one that joins later is closed before its first
-task, with a line on standard error, and the build goes on without it.
+In: a Dask client. Out: workers that give the results of this machine. A worker with several
+threads, or with another version of Drake, drakegrasp or the hand, is refused: at the start with an
+error, later by closing it before its first task. All workers get the same BLAS kernel; one whose
+kernel cannot be set still works, with a line on standard error.
 """
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from distributed import Client, Scheduler, Worker, WorkerPlugin
+from distributed import Client, Nanny, NannyPlugin, Scheduler, Worker, WorkerPlugin
 
 from drakegrasp.config import Config
-from drakegrasp.dataset.manifest import DECISIVE, installed_versions
+from drakegrasp.dataset.manifest import REQUIRED_VERSIONS, installed_versions
 from drakegrasp.errors import MachineError
+from drakegrasp.runtime import kernels
+from drakegrasp.runtime.blas import running_kernel
+from drakegrasp.runtime.kernels import KERNELS, agreed_kernel, common_kernel, supported_kernel
 
-#: Environment of the workers. Software OpenGL would start threads of its own beside the
-#: one process per core, and nothing that a worker does may need the network.
-WORKER_ENVIRONMENT = {
-    "LP_NUM_THREADS": "0",
-    "DRAKE_ALLOW_NETWORK": "none",
-    "OMP_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-}
-#: Tasks that the scheduler gives a worker, per thread: one that waits would share the blame
-#: when the one that runs kills the worker.
+#: Tasks that the scheduler gives to a worker, per thread: a task that waits behind another would
+#: be blamed, too, when that one kills the worker.
 SATURATION = 1.0
-_TOPIC = "drakegrasp-refused"
+#: Topic of the messages from workers that join later.
+_TOPIC = "drakegrasp-admission"
+_MAY_DIFFER = "last bits of simulated values may differ"
+
+
+def worker_environment() -> dict[str, str]:
+    """Return the environment variables that every worker gets, on this machine and on others.
+
+    Software OpenGL and BLAS would start threads beside the one process per core, and nothing that
+    a worker does needs the network. The BLAS kernel is not among them: another machine's CPU may
+    not support this machine's (see `KernelSetting`), and workers here inherit it.
+    """
+    return {
+        "LP_NUM_THREADS": "0",
+        "DRAKE_ALLOW_NETWORK": "none",
+        "OMP_NUM_THREADS": "1",
+        "MKL_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+    }
+
+
+class KernelSetting(NannyPlugin):
+    """Makes the workers of a nanny run a BLAS kernel.
+
+    Dask sets this up in every nanny: in one that joins later before it starts its worker, in one
+    that runs already it restarts the worker if that has another kernel.
+    """
+
+    name = "drakegrasp-kernel"
+
+    def __init__(self, kernel: str) -> None:
+        self._kernel = kernel
+
+    def setup(self, nanny: Nanny) -> None:
+        """Set the kernel in a nanny; a CPU that does not support it gets its own fastest."""
+        if self._kernel not in KERNELS:
+            return  # OpenBLAS chose it by itself; the worker tells if it has another
+        kernel = common_kernel([self._kernel, supported_kernel()])
+        if kernel in (None, _kernel_of(nanny)):
+            return
+        # The worker is a new process that loads NumPy before it sees `env`.
+        nanny.env[kernels.VARIABLE] = nanny.pre_spawn_env[kernels.VARIABLE] = kernel
+        self.restart = True  # Dask reads this after the setup
+
+
+def _kernel_of(nanny: Nanny) -> str:
+    """Return the BLAS kernel with which a nanny starts its worker."""
+    for environment in (nanny.env, nanny.pre_spawn_env, os.environ):
+        if kernels.VARIABLE in environment:
+            return str(environment[kernels.VARIABLE])
+    return running_kernel()
 
 
 class Admission(WorkerPlugin):  # type: ignore[misc]
@@ -40,62 +84,103 @@ class Admission(WorkerPlugin):  # type: ignore[misc]
 
     name = "drakegrasp-admission"
 
-    def __init__(self, config: Config) -> None:
-        self._config, self._wanted = config, installed_versions(config)
+    def __init__(self, config: Config, kernel: str | None) -> None:
+        self._config, self._kernel = config, kernel
+        self._versions = installed_versions(config)
 
     def setup(self, worker: Worker) -> None:
         """Check and set up the worker; Dask calls this before it gives it any task."""
-        os.environ.update(WORKER_ENVIRONMENT)  # for a worker that was started by hand
-        fault = unfitness(worker.state.nthreads, installed_versions(self._config), self._wanted)
+        os.environ.update(worker_environment())  # for a worker that was started by hand
+        fault = unfitness(worker.state.nthreads, installed_versions(self._config), self._versions)
         if fault is not None:
-            worker.log_event(_TOPIC, f"worker {worker.address}: {fault}")
-            # Its nanny goes too: a new process would not be fitter.
+            worker.log_event(_TOPIC, f"not used: worker {worker.address}: {fault}")
+            # Its nanny is closed, too: a new process would not be fitter.
             worker.loop.add_callback(worker.close, nanny=True, reason="drakegrasp-unfit")
+        elif self._kernel not in (None, running_kernel()):
+            worker.log_event(
+                _TOPIC,
+                f"warning: worker {worker.address} runs BLAS kernel {running_kernel()}, not "
+                f"{self._kernel} like the others: {_MAY_DIFFER}",
+            )
 
 
 @contextmanager
-def admitted_workers(client: Client, config: Config) -> Iterator[None]:
+def admitted_workers(client: Client, config: Config) -> Iterator[str | None]:
     """Refuse workers that are not fit for the work; check those that join while the block runs.
 
+    Yields the BLAS kernel that the workers run; None if they have none in common.
+
+    Args:
+        client: Of the cluster.
+        config: Its hand is among the versions that must agree.
+
     Raises:
-        MachineError: If a worker that is there has several threads, or other versions of what
-            decides.
+        MachineError: If a worker that is there has several threads, or another version of
+            drakegrasp, Drake or the hand.
     """
-    wanted = installed_versions(config)
-    found = client.run(installed_versions, config)
+    # Refuse what the user must change.
+    versions = installed_versions(config)
+    theirs = client.run(installed_versions, config)
     for address, threads in client.nthreads().items():
-        fault = unfitness(threads, found.get(address, wanted), wanted)
+        fault = unfitness(threads, theirs.get(address, versions), versions)
         if fault is not None:
             raise MachineError(f"worker {address}: {fault}")
+
+    # Set what this program can change: for the workers that are there and for later ones.
     client.run_on_scheduler(_saturate)
-    client.subscribe_topic(_TOPIC, _say)
-    client.register_plugin(Admission(config))
+    client.subscribe_topic(_TOPIC, _print_message)
     try:
-        yield
+        kernel = _set_kernel(client)
+        client.register_plugin(Admission(config, kernel))
+        yield kernel
     finally:
-        # A scheduler of the user's lives on, and its later workers are no business of ours.
+        # A scheduler of the user's lives on; its later workers are not ours to check.
         with suppress(Exception):
             client.unsubscribe_topic(_TOPIC)
+            client.unregister_worker_plugin(KernelSetting.name, nanny=True)
+        with suppress(Exception):
             client.unregister_worker_plugin(Admission.name)
 
 
-def unfitness(threads: int, theirs: dict[str, str], ours: dict[str, str]) -> str | None:
-    """Return why a worker with these threads and versions must not work, or None."""
+def unfitness(threads: int, theirs: Mapping[str, str], ours: Mapping[str, str]) -> str | None:
+    """Return why a worker with these threads and versions must not work, or None if it may."""
     if threads != 1:
         return (
-            "must have one thread (dask worker --nthreads 1), because the first that renders "
-            f"owns the images, got {threads}"
+            "must have one thread (dask worker --nthreads 1), because OpenGL renders in one "
+            f"thread of a process only, got {threads}"
         )
-    for name in DECISIVE:
+    for name in REQUIRED_VERSIONS:
         if theirs[name] != ours[name]:
             return f"must have {name} {ours[name]} like the client, got {theirs[name]}"
     return None
 
 
+def _set_kernel(client: Client) -> str | None:
+    """Give all workers the BLAS kernel on which they agree; return it.
+
+    Workers without a nanny keep theirs: `Admission` says so. Without a worker yet, it is the
+    client's.
+    """
+    supported = client.run(supported_kernel)
+    kernel = agreed_kernel(
+        running_kernel(), client.run(running_kernel).values(), supported.values()
+    )
+    if kernel is not None:
+        client.register_plugin(KernelSetting(kernel))
+        return kernel
+
+    # Nothing is known of other CPUs: machines of one kind run one kernel all the same.
+    running = sorted(set(client.run(running_kernel).values()))
+    if len(running) == 1:
+        return running[0]
+    sys.stderr.write(f"warning: workers run BLAS kernels {', '.join(running)}: {_MAY_DIFFER}\n")
+    return None
+
+
 def _saturate(dask_scheduler: Scheduler) -> None:
-    """Set what a scheduler that was started by hand did not read from this program's settings."""
+    """Set what a scheduler that was started by hand has not read from this program's settings."""
     dask_scheduler.WORKER_SATURATION = SATURATION
 
 
-def _say(event: tuple[float, Any]) -> None:
-    sys.stderr.write(f"not used: {event[1]}\n")
+def _print_message(event: tuple[float, Any]) -> None:
+    sys.stderr.write(f"{event[1]}\n")

@@ -1,7 +1,7 @@
-"""Certificates of a cluster: made for one run, or somebody's own.
+"""TLS certificates of a cluster: made for one run, or the user's own.
 
-Dask's servers and clients then refuse whoever has none. Those that processes on other machines
-must read are files that only this user can.
+With them, Dask's servers and clients refuse anybody who has none. Certificates that processes on
+other machines must read are files that only this user can read.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from drakegrasp.errors import MachineError
 def make_certificates(folder: Path) -> tuple[Path, Path, Path]:
     """Write an authority, a certificate and its key to a folder: ca.pem, cert.pem, key.pem.
 
-    Whoever reads them can use the cluster, so the folder must be this user's alone.
+    Anybody who can read them can use the cluster, so the folder must be private.
 
     Raises:
         MachineError: If the package cryptography is missing.
@@ -30,7 +30,7 @@ def make_certificates(folder: Path) -> tuple[Path, Path, Path]:
 
 
 def temporary_security() -> Security:
-    """Return an authority and a certificate that are in this process's memory only.
+    """Return an authority and a certificate that exist in this process's memory only.
 
     Raises:
         MachineError: If the package cryptography is missing.
@@ -44,7 +44,7 @@ def temporary_security() -> Security:
 
 
 def _write(security: Security, folder: Path) -> tuple[Path, Path, Path]:
-    """Write an authority that is its only certificate to a private folder."""
+    """Write an authority, its only certificate and the key to a private folder."""
     paths = folder / "ca.pem", folder / "cert.pem", folder / "key.pem"
     texts = security.tls_ca_file, security.tls_worker_cert, security.tls_worker_key
     for path, text in zip(paths, texts, strict=True):
@@ -54,7 +54,7 @@ def _write(security: Security, folder: Path) -> tuple[Path, Path, Path]:
 
 
 def security_of(files: tuple[Path, Path, Path]) -> Security:
-    """Return what Dask needs of an authority, a certificate and its key, for every role."""
+    """Return Dask's settings for an authority, a certificate and its key, for every role."""
     ca, cert, key = (str(path.absolute()) for path in files)
     options: dict[str, Any] = {"require_encryption": True, "tls_ca_file": ca}
     for role in ("client", "scheduler", "worker"):
@@ -66,15 +66,15 @@ def security_of(files: tuple[Path, Path, Path]) -> Security:
 def private_directory(out: Path) -> Iterator[Path]:
     """Yield a directory in `out` that only this user can enter, and remove it again.
 
-    Those of clients that were killed go as well: whoever calls holds the lock of `out`.
+    Directories of clients that were killed are removed, too: the caller holds the lock of `out`.
 
     Raises:
-        MachineError: If there can be none.
+        MachineError: If it cannot be made.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
-        for dead in out.glob(".tls-*"):
-            shutil.rmtree(dead, ignore_errors=True)
+        for leftover in out.glob(".tls-*"):
+            shutil.rmtree(leftover, ignore_errors=True)
         folder = Path(tempfile.mkdtemp(prefix=".tls-", dir=out))  # mode 0700
     except OSError as error:
         raise MachineError(f"{out}: must be a directory that can be written: {error}") from None
@@ -82,7 +82,7 @@ def private_directory(out: Path) -> Iterator[Path]:
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-        with suppress(OSError):  # nothing was built, and the directory is empty again
+        with suppress(OSError):  # only an empty directory goes: nothing was built
             out.rmdir()
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import logging
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,38 +13,49 @@ import dask
 from distributed import Client, LocalCluster, SpecCluster
 from distributed.security import Security
 
-from drakegrasp.cluster.admission import SATURATION, WORKER_ENVIRONMENT
+from drakegrasp.cluster.admission import SATURATION, worker_environment
 from drakegrasp.errors import MachineError
+from drakegrasp.runtime.allocator import own_environment
+from drakegrasp.runtime.environment import available_cores
 
 #: How long to wait for a scheduler to answer [s].
 CONNECT_SECONDS = 10
-#: Settings of Dask: a worker's process must not be a fork, because a fork after the first
-#: image hangs; its profiler costs time; a worker takes no task before it can start it.
-DASK_SETTINGS: dict[str, Any] = {
-    "distributed.worker.multiprocessing-method": "spawn",
-    # Ctrl-C reaches every process of a terminal: the client stops, and then its workers.
-    "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],
-    "distributed.worker.profile.enabled": False,
-    "distributed.scheduler.worker-saturation": SATURATION,
-    "distributed.nanny.pre-spawn-environ": WORKER_ENVIRONMENT,
-    # A busy machine takes its time to start a worker again; Dask would close its nanny.
-    "distributed.deploy.lost-worker-timeout": "60 s",
-    "distributed.worker.memory.target": False,
-    "distributed.worker.memory.spill": False,
-    # A paused worker has no task whose end would free memory: it would wait for ever.
-    "distributed.worker.memory.pause": False,
-}
+#: Module that a nanny loads before it starts its worker: it chooses the worker's allocator.
+NANNY_PRELOAD = "drakegrasp.runtime.allocator"
+
+
+def dask_settings() -> dict[str, Any]:
+    """Return the settings of Dask that every scheduler, nanny and worker of ours needs."""
+    return {
+        # A forked process hangs if its parent has rendered an image.
+        "distributed.worker.multiprocessing-method": "spawn",
+        # Ctrl-C reaches every process of a terminal: the client stops, and then its workers.
+        "distributed.worker.preload": [
+            "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
+        ],
+        # The profiler costs time.
+        "distributed.worker.profile.enabled": False,
+        "distributed.scheduler.worker-saturation": SATURATION,
+        "distributed.nanny.pre-spawn-environ": worker_environment(),
+        "distributed.nanny.preload": [NANNY_PRELOAD],
+        # On a busy machine a worker takes long to start again; Dask would close its nanny.
+        "distributed.deploy.lost-worker-timeout": "60 s",
+        "distributed.worker.memory.target": False,
+        "distributed.worker.memory.spill": False,
+        # A paused worker has no task whose end would free memory: it would wait for ever.
+        "distributed.worker.memory.pause": False,
+    }
 
 
 def dashboard_line(client: Client) -> str:
-    """Return where the dashboard of a client's cluster is, or what it takes to have one."""
+    """Return the link to the dashboard of a client's cluster, or how to install one."""
     if not has_dashboard():
         return "dashboard: none; pip install 'drakegrasp[dashboard]'"
     return f"dashboard: {client.dashboard_link}"
 
 
 def has_dashboard() -> bool:
-    """Return whether Dask can show its dashboard here."""
+    """Return whether Dask can serve its dashboard in this environment."""
     return importlib.util.find_spec("bokeh") is not None
 
 
@@ -64,48 +74,59 @@ def connect(
         workers: Processes of a cluster on this machine; one per core if None.
         scheduler: Address of a running scheduler.
         scheduler_file: Its JSON file, instead of the address.
-        security: Certificates; without, nothing is encrypted.
+        security: Certificates; without them nothing is encrypted.
         memory: Limit per process on this machine, e.g. "2GB"; an equal share of it if None.
 
     Raises:
         MachineError: If there is no scheduler at the address.
     """
-    with dask.config.set(DASK_SETTINGS):
+    with own_environment(), dask.config.set(dask_settings()):
         if scheduler or scheduler_file:
-            file = None if scheduler_file is None else str(scheduler_file)
-            # Dask waits for the file for ever.
-            if file is not None and not scheduler and not Path(file).is_file():
-                raise MachineError(
-                    f"{file}: must be the file of a running Dask scheduler, got none"
-                )
-            try:
-                client = _RemoteClient(
-                    scheduler, scheduler_file=file, timeout=CONNECT_SECONDS, security=security
-                )
-            except (OSError, RuntimeError, TypeError, ValueError) as error:
-                raise MachineError(
-                    f"{scheduler or file}: must be a running Dask scheduler, got none ({error})"
-                ) from None
-            with client:
+            with _connect_remote(scheduler, scheduler_file, security) as client:
                 yield client
         else:
-            cluster = LocalCluster(
-                n_workers=workers or cores(),
-                threads_per_worker=1,
-                dashboard_address="127.0.0.1:0",
-                silence_logs=logging.CRITICAL,
-                security=security,
-                memory_limit=memory or "auto",
-            )
-            with closing_cluster(cluster), Client(cluster) as client:
+            with _start_local(workers, security, memory) as client:
                 yield client
+
+
+def _connect_remote(
+    scheduler: str | None, scheduler_file: str | Path | None, security: Security | None
+) -> Client:
+    file = None if scheduler_file is None else str(scheduler_file)
+    # Dask waits for a missing file for ever.
+    if file is not None and not scheduler and not Path(file).is_file():
+        raise MachineError(f"{file}: must be the file of a running Dask scheduler, got none")
+    try:
+        return _RemoteClient(
+            scheduler, scheduler_file=file, timeout=CONNECT_SECONDS, security=security
+        )
+    except (OSError, RuntimeError, TypeError, ValueError) as error:
+        raise MachineError(
+            f"{scheduler or file}: must be a running Dask scheduler, got none ({error})"
+        ) from None
+
+
+@contextmanager
+def _start_local(
+    workers: int | None, security: Security | None, memory: str | None
+) -> Iterator[Client]:
+    cluster = LocalCluster(
+        n_workers=workers or available_cores(),
+        threads_per_worker=1,
+        dashboard_address="127.0.0.1:0",
+        silence_logs=logging.CRITICAL,
+        security=security,
+        memory_limit=memory or "auto",
+    )
+    with closing_cluster(cluster), Client(cluster) as client:
+        yield client
 
 
 class _RemoteClient(Client):
-    """A client that closes at once where it cannot start.
+    """A client that closes at once if it cannot start.
 
-    Dask leaves that to the garbage collector. Should it run while the next client starts, it waits
-    for ever for the lock that this one holds (distributed 2026.8, `LoopRunner.stop`).
+    Dask leaves the closing to the garbage collector. If that runs while the next client starts, it
+    waits for ever for the lock that this one holds (distributed 2026.8, `LoopRunner.stop`).
     """
 
     def start(self, **kwargs: Any) -> None:
@@ -119,15 +140,10 @@ class _RemoteClient(Client):
 
 @contextmanager
 def closing_cluster(cluster: SpecCluster) -> Iterator[None]:
-    """Close a cluster when the block ends; a worker that takes its time changes nothing."""
+    """Close a cluster when the block ends; ignore a worker that takes long to end."""
     try:
         yield
     finally:
-        # On a busy machine one may not end within Dask's limit: it ends with this process.
+        # On a busy machine a worker may not end within Dask's limit: it ends with this process.
         with suppress(TimeoutError):
             cluster.close()
-
-
-def cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0))

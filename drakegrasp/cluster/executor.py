@@ -1,14 +1,17 @@
-"""Tasks on Dask's workers, some of which die.
+"""Running tasks on Dask's workers, some of which die.
 
-In: a function and items. Out: the results, in any order. A few tasks per worker are in
-flight, whatever their number, and nothing is kept of those that are done. Items that take
-next to no time go several to a task, as each task costs some messages. A task whose
-worker died is given to another: that it comes to an end is the items' own business (see
-`drakegrasp.runtime.journal`), so the number of deaths is bounded generously. One that got an image
-of nothing is tried again, too, as it may be one worker's OpenGL.
+In: a function and items. Out: the results, in any order. A few tasks per worker are in flight,
+whatever their number, and a task that is done is forgotten. Items that take almost no time go
+several to a task, because each task costs some messages. A task whose worker died is given to
+another; the items themselves make sure that this ends (see `drakegrasp.runtime.journal`), so the
+limit on deaths is generous. A task that rendered a blank image is retried: one worker's OpenGL may
+be broken.
 
-Without any worker the work waits where others may come: from SLURM's queue, or to a
-scheduler that somebody runs. Those that this process started itself do not come back.
+When there is no worker, the work waits if others may come: from SLURM's queue, or to a scheduler
+that somebody else runs. Workers that this process started itself do not come back.
+
+`distributed.as_completed` with `add` would be the same loop, but its iterator cannot be left while
+it waits: workers could not be counted, nor their loss be noticed, while no task is done.
 """
 
 from __future__ import annotations
@@ -26,35 +29,42 @@ from distributed.core import Status
 from distributed.deploy import Cluster
 
 from drakegrasp.errors import BlankImageError, MachineError
-from drakegrasp.runtime.executor import Crew
+from drakegrasp.runtime.executor import WorkerPool
 
 T = TypeVar("T")
 R = TypeVar("R")
 
-#: Tasks in flight per worker: one that runs, and one so that it never waits.
+#: Tasks in flight per worker: one that runs, and one that waits so that the worker never does.
 IN_FLIGHT = 2
-#: Items go together until their task takes about so long [s]: many times what its messages do.
+#: Items go together until their task takes about this long [s]: many times its messages.
 TASK_SECONDS = 0.25
-#: Most items of a task: the next ones may take far longer than the last ones did.
+#: Most items of a task: the next items may take far longer than the last ones did.
 LARGEST = 4
-#: How often the workers are counted [s].
+#: Time between two counts of the workers [s].
 COUNT_SECONDS = 2.0
-#: How long a result may take from a worker to here, until the workers are counted again [s].
+#: Time that a result may take from a worker to here before the workers are counted again [s].
 GATHER_SECONDS = 30.0
-#: How long there may be no worker at all where none come by themselves [s].
+#: Time without any worker after which the work stops, if none can come by themselves [s].
 LOST_SECONDS = 300.0
-#: How long until it is said that there is none [s]; shorter gaps are those of restarts.
+#: Time without any worker after which the user is told [s]; shorter gaps are restarts.
 SAY_SECONDS = 60.0
-#: How often a task is given out again after Dask gave it up (after four deaths each time).
+#: How often a task is submitted again after Dask gave it up (after four deaths each time).
 RESUBMISSIONS = 100
-#: How often a task may get an image of nothing.
+#: How often a task may render a blank image.
 BLANKS = 3
 _GOES_ON = "the same command goes on from here"
 
 
 @dataclass(eq=False)
-class _Flight(Generic[T]):
-    """A task that was given out: some items, one after the other."""
+class _PendingTask(Generic[T]):
+    """A task in flight: some items, run one after the other.
+
+    Attributes:
+        items: What the function is called with.
+        future: Of the task's last submission.
+        given_up: How often Dask gave it up.
+        blank: How often it rendered a blank image.
+    """
 
     items: Sequence[T]
     future: Future | None = None
@@ -63,17 +73,17 @@ class _Flight(Generic[T]):
 
 
 @dataclass(frozen=True)
-class _Landing(Generic[R]):
-    """What a task brings back: the results of its first items, one at least."""
+class _TaskResult(Generic[R]):
+    """What a task returns: the results of its first items, at least one, and its duration [s]."""
 
     results: list[R]
     seconds: float
 
 
-def _run_items(function: Callable[[T], R], items: Sequence[T]) -> _Landing[R]:
+def _run_items(function: Callable[[T], R], items: Sequence[T]) -> _TaskResult[R]:
     """Return the results up to the first item that raises; if that is the first, raise it.
 
-    So an error comes back as Dask sends errors, and costs no results.
+    An error then costs no results, and arrives as Dask sends errors.
     """
     start, results = time.monotonic(), list[R]()
     for item in items:
@@ -83,27 +93,31 @@ def _run_items(function: Callable[[T], R], items: Sequence[T]) -> _Landing[R]:
             if not results:
                 raise
             break
-    return _Landing(results, time.monotonic() - start)
+    return _TaskResult(results, time.monotonic() - start)
 
 
 class DaskExecutor:
-    """An `Executor` that keeps a few tasks per worker in flight on a Dask cluster."""
+    """An `Executor` that keeps a few tasks per worker in flight on a Dask cluster.
+
+    Attributes:
+        pool: The workers.
+    """
 
     def __init__(self, client: Client, *, resubmissions: int = 0) -> None:
-        """Work through a client.
+        """Use the workers of a client.
 
         Args:
             client: Of the cluster.
-            resubmissions: How often a task is given out again that Dask gave up because its
+            resubmissions: How often a task is submitted again that Dask gave up because its
                 workers died.
         """
         self._client, self._resubmissions = client, resubmissions
         self._workers: set[str] = set()
         self._counted = -float("inf")
-        self._lost: float | None = None
+        self._empty_since: float | None = None
         self._said = False
         self._together = 1
-        self.crew = Crew()
+        self.pool = WorkerPool()
 
     def __call__(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
         """Yield function(item) of every item as they are done.
@@ -113,83 +127,96 @@ class DaskExecutor:
                 the scheduler are lost.
             Exception: What the function raised.
         """
-        waiting, self._together = iter(items), 1
-        arrived: SimpleQueue[str] = SimpleQueue()
-        flights: dict[str, _Flight[T]] = {}
-
-        def launch(flight: _Flight[T]) -> None:
-            # A task writes files, so it is never the same as one that was done before.
-            future = self._client.submit(_run_items, function, flight.items, pure=False)
-            flight.future, flights[future.key] = future, flight
-            future.add_done_callback(lambda done: arrived.put(done.key))
+        remaining, self._together = iter(items), 1
+        done: SimpleQueue[str] = SimpleQueue()
+        pending: dict[str, _PendingTask[T]] = {}
 
         while True:
-            self._count()
-            while len(flights) < IN_FLIGHT * max(1, len(self._workers)):
-                together = tuple(islice(waiting, self._together))
+            # Keep a few tasks per worker in flight; items are taken only when there is room.
+            self._count_workers()
+            while len(pending) < IN_FLIGHT * max(1, len(self._workers)):
+                together = tuple(islice(remaining, self._together))
                 if not together:
                     break
-                launch(_Flight(together))
-            if not flights:
+                self._submit(function, _PendingTask(together), pending, done)
+            if not pending:
                 return
-            flight = flights.pop(self._next(arrived))
+
+            # Wait for one; a task that failed through no fault of its own is submitted again.
+            task = pending.pop(self._next_done(done))
             try:
-                landing: _Landing[R] = self._result(cast(Future, flight.future))
+                result: _TaskResult[R] = self._gather(cast(Future, task.future))
             except (KilledWorker, BlankImageError) as error:
-                self._refuse_more(flight, error)
-                launch(flight)
+                self._refuse_retry(task, error)
+                self._submit(function, task, pending, done)
                 continue
-            self._adapt(landing)
-            left = flight.items[len(landing.results) :]
-            if left:
-                launch(_Flight(left))
-            yield from landing.results
 
-    def _adapt(self, landing: _Landing[Any]) -> None:
-        """Choose how many of the next items go together, by how long the last ones took."""
-        fit = TASK_SECONDS * len(landing.results) / max(landing.seconds, 1e-6)
-        self._together = int(max(1, min(fit, 2 * self._together, LARGEST)))
+            # Items behind one that raised go again, and raise by themselves then.
+            self._adapt_together(result)
+            rest = task.items[len(result.results) :]
+            if rest:
+                self._submit(function, _PendingTask(rest), pending, done)
+            yield from result.results
 
-    def _result(self, future: Future) -> Any:
-        """Return the result of a task that is done, or raise what it raised."""
-        while not future.cancelled():
-            try:
-                return future.result(timeout=GATHER_SECONDS)
-            except (CancelledError, TimeoutError):
-                if future.status == "error":
-                    raise
-                self._count()
-        raise _scheduler_lost("none any more")
+    def _submit(
+        self,
+        function: Callable[[T], R],
+        task: _PendingTask[T],
+        pending: dict[str, _PendingTask[T]],
+        done: SimpleQueue[str],
+    ) -> None:
+        """Submit a task; its key goes into `done` when it ends."""
+        # A task writes files, so Dask must not take its result from an equal one before.
+        future = self._client.submit(_run_items, function, task.items, pure=False)
+        task.future, pending[future.key] = future, task
+        future.add_done_callback(lambda ended: done.put(ended.key))
 
-    def _refuse_more(self, flight: _Flight[Any], error: Exception) -> None:
-        """Refuse to give a task out again for ever.
-
-        Raises:
-            MachineError: If it failed too often in ways that are not its own.
-        """
-        if isinstance(error, BlankImageError):
-            flight.blank += 1
-            if flight.blank == BLANKS:
-                raise error
-            return
-        flight.given_up += 1
-        if flight.given_up > self._resubmissions:
-            raise MachineError(f"the workers must stay alive, got: {error}") from None
-
-    def _next(self, arrived: SimpleQueue[str]) -> str:
-        """Return the key of a task that is done, once there is one.
+    def _next_done(self, done: SimpleQueue[str]) -> str:
+        """Return the key of a task that has ended, once there is one.
 
         Raises:
             MachineError: If there is no worker for long.
         """
         while True:
             try:
-                return arrived.get(timeout=COUNT_SECONDS)
+                return done.get(timeout=COUNT_SECONDS)
             except Empty:
-                self._count()
+                self._count_workers()
 
-    def _count(self) -> None:
-        """Count the workers, now and then.
+    def _gather(self, future: Future) -> Any:
+        """Return the result of a task that has ended, or raise what it raised."""
+        while not future.cancelled():
+            try:
+                return future.result(timeout=GATHER_SECONDS)
+            except (CancelledError, TimeoutError):
+                if future.status == "error":
+                    raise
+                self._count_workers()
+        raise _scheduler_lost("its tasks are cancelled")
+
+    def _adapt_together(self, result: _TaskResult[Any]) -> None:
+        """Choose how many of the next items go together, by how long the last ones took."""
+        fit = TASK_SECONDS * len(result.results) / max(result.seconds, 1e-6)
+        self._together = int(max(1, min(fit, 2 * self._together, LARGEST)))
+
+    def _refuse_retry(self, task: _PendingTask[Any], error: Exception) -> None:
+        """Refuse to submit a task again that failed too often.
+
+        Raises:
+            MachineError: If workers died of it too often.
+            BlankImageError: If it rendered too many blank images.
+        """
+        if isinstance(error, BlankImageError):
+            task.blank += 1
+            if task.blank == BLANKS:
+                raise error
+            return
+        task.given_up += 1
+        if task.given_up > self._resubmissions:
+            raise MachineError(f"workers died again and again: {error}") from None
+
+    def _count_workers(self) -> None:
+        """Count the workers, unless that was done less than `COUNT_SECONDS` ago.
 
         Raises:
             MachineError: If the scheduler is lost, or all workers are for long.
@@ -199,52 +226,53 @@ class DaskExecutor:
             return
         self._counted = now
         try:
-            found = set(self._client.nthreads())
+            workers = set(self._client.nthreads())
         except (OSError, RuntimeError, TimeoutError) as error:
             raise _scheduler_lost(str(error)) from None
-        joined, left = found - self._workers, self._workers - found
+
+        # Tell who wants to know.
+        joined, left = workers - self._workers, self._workers - workers
         if joined or left:
-            self._workers, self.crew.size = found, len(found)
-            self.crew.on_change(joined, left)
+            self._workers, self.pool.size = workers, len(workers)
+            self.pool.on_change(joined, left)
+
         if isinstance(self._client.cluster, LocalCluster):
             self._client.cluster.loop.add_callback(_reopen, self._client.cluster)
-        self._wait(now)
+        self._check_empty(now)
 
-    def _wait(self, now: float) -> None:
-        """Say that there is no worker, if there is none for long.
+    def _check_empty(self, now: float) -> None:
+        """Say that there is no worker if there has been none for long.
 
         Raises:
-            MachineError: If none will come either.
+            MachineError: If none can come either.
         """
         if self._workers:
-            self._lost = None
+            self._empty_since = None
             return
-        if self._lost is None:
-            self._lost, self._said = now, False
-        missed = now - self._lost
-        if missed > LOST_SECONDS and not _may_come(self._client.cluster):
-            raise MachineError(
-                f"there must be a worker, got none for {LOST_SECONDS:g} s; {_GOES_ON}"
-            )
-        if missed > SAY_SECONDS and not self._said:
+        if self._empty_since is None:
+            self._empty_since, self._said = now, False
+        seconds = now - self._empty_since
+        if seconds > LOST_SECONDS and not _may_come(self._client.cluster):
+            raise MachineError(f"there has been no worker for {LOST_SECONDS:g} s; {_GOES_ON}")
+        if seconds > SAY_SECONDS and not self._said:
             self._said = True
-            self.crew.on_none()
+            self.pool.on_none()
 
 
-def _scheduler_lost(got: str) -> MachineError:
-    return MachineError(f"the scheduler must stay, got: {got}; {_GOES_ON}")
+def _scheduler_lost(reason: str) -> MachineError:
+    return MachineError(f"the scheduler was lost: {reason}; {_GOES_ON}")
 
 
 def _may_come(cluster: Cluster | None) -> bool:
-    """Return whether workers may come by themselves: to a scheduler of others, or from a queue."""
+    """Return whether workers may come by themselves: to somebody's scheduler, or from a queue."""
     return cluster is None or hasattr(cluster, "job_script")
 
 
 def _reopen(cluster: LocalCluster) -> None:
     """Replace the nannies of a cluster on this machine that gave up.
 
-    One does when its worker dies while it starts; Dask drops one whose worker stays away for
-    long. To be called in the cluster's event loop.
+    A nanny gives up when its worker dies while it starts; Dask drops a nanny whose worker is away
+    for long. Call this in the cluster's event loop.
     """
     for name, nanny in list(cluster.workers.items()):
         if nanny.status in (Status.closed, Status.failed):

@@ -1,10 +1,10 @@
 """Starting the workers: on this machine, over SSH, under SLURM, or on a running scheduler.
 
 In: a `ClusterRequest`, plain data from a command line. Out: a Dask client, while a block
-runs. What the workers need is set here for every kind of cluster, because those of other
-machines inherit nothing: SSH hands on the settings of this process, SLURM's jobs get them
-in their script, and a running scheduler's workers are set up when they are admitted (see
-`admission`). Nothing listens beyond this machine unless `host` or `interface` says so.
+runs. Workers on other machines inherit nothing, so their settings are sent here for every kind of
+cluster: SSH sends those of this process, SLURM's jobs get them in their script, and the workers of
+a running scheduler are set up when they are admitted (see `admission`). Nothing listens beyond
+this machine unless `host` or `interface` says so.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from distributed import Client, SpecCluster, SSHCluster, Status
 from distributed.security import Security
 from tornado.ioloop import PeriodicCallback
 
-from drakegrasp.cluster.admission import WORKER_ENVIRONMENT
+from drakegrasp.cluster.admission import worker_environment
 from drakegrasp.cluster.certificates import (
     make_certificates,
     private_directory,
@@ -31,7 +31,7 @@ from drakegrasp.cluster.certificates import (
     server_options,
     temporary_security,
 )
-from drakegrasp.cluster.connect import DASK_SETTINGS, closing_cluster, connect
+from drakegrasp.cluster.connect import NANNY_PRELOAD, closing_cluster, connect, dask_settings
 from drakegrasp.cluster.request import (
     LOOPBACK,
     WORKER_MEMORY,
@@ -47,14 +47,13 @@ from drakegrasp.cluster.request import (
 )
 from drakegrasp.errors import ConfigError, MachineError
 
-#: How often lost jobs are looked for [s]; one is lost that is missing twice.
+#: Time between two looks for lost jobs [s]; a job that is missing twice in a row is lost.
 REFILL_SECONDS = 20.0
-#: A worker ends by itself between these times before its job's walltime does [s], or
-#: fractions of it if that is shorter: then its unit is not cut off, and jobs do not all
-#: end together.
+#: A worker ends by itself this long before its job's walltime, give or take the second [s]; less
+#: for short jobs. Then its unit is not cut off, and jobs do not all end together.
 LIFETIME_MARGIN, LIFETIME_STAGGER = 300.0, 120.0
-#: A scheduler on another machine ends by itself when it had nothing to do for this long,
-#: because its client was killed.
+#: A scheduler on another machine ends by itself after this time without work: its client was
+#: killed.
 IDLE_TIME = "1 hour"
 
 
@@ -63,15 +62,15 @@ def start_cluster(request: ClusterRequest, out: Path) -> Iterator[Client]:
     """Start the workers, and stop them when the block ends; yield a client.
 
     Args:
-        request: What is wanted.
-        out: Directory that all machines see; certificates for this run are put there.
+        request: The workers to start.
+        out: Directory that all machines see; certificates for this run are written there.
 
     Raises:
         ConfigError: If the request contradicts itself, or lacks something.
         MachineError: If a package or a program is missing, or the workers do not start.
     """
     worker_count(request)
-    with _security(request, out) as security, dask.config.set(DASK_SETTINGS):
+    with _security(request, out) as security, dask.config.set(dask_settings()):
         if request.kind == "ssh":
             with _running(partial(_ssh, request, security)) as client:
                 yield client
@@ -93,30 +92,32 @@ def _connected(
 
 @contextmanager
 def _running(make: Callable[[], SpecCluster]) -> Iterator[Client]:
-    """Run a cluster while the block does."""
+    """Run a cluster while the block runs."""
     try:
         cluster = make()
     except (ConfigError, MachineError):
         raise
-    # Each kind of cluster has failures of its own, and none of them is this program's.
+    # Each kind of cluster fails in its own ways; to the user they are all the machine's.
     except Exception as error:
         reason = str(error) or type(error).__name__
-        raise MachineError(f"the workers must start, got: {reason}") from None
+        raise MachineError(f"the workers did not start: {reason}") from None
     with closing_cluster(cluster), Client(cluster) as client:
         yield client
 
 
 def _ssh(request: ClusterRequest, security: Security | None) -> SpecCluster:
-    # Settings of Dask go to the other machines with every command that SSHCluster runs there.
+    # SSHCluster sends Dask's settings with every command that it runs on another machine.
     listening = scheduler_listening(request)
     worker = {
         "n_workers": cores_per_host(request),
         "nthreads": 1,
         "memory_limit": request.memory or "auto",
-        "env": WORKER_ENVIRONMENT,
+        "env": worker_environment(),
         **workers_listening(listening),
         **server_options(security),
     }
+
+    # The first host also runs the scheduler.
     scheduler = {
         "port": 0,
         "dashboard_address": f"{LOOPBACK}:0",
@@ -134,13 +135,12 @@ def _ssh(request: ClusterRequest, security: Security | None) -> SpecCluster:
 
 
 def _slurm(request: ClusterRequest, security: Security | None) -> SpecCluster:
-    cores, listening = cores_per_job(request), scheduler_listening(request)
-    jobs = math.ceil((request.workers or 0) / cores)
-    default = None if jobqueue("memory") else WORKER_MEMORY
-    memory = request.memory or default
-    # What is None or not named here is as jobqueue.yaml says.
     from dask_jobqueue import SLURMCluster
 
+    # Whatever is None or not named here is as the user's jobqueue.yaml says.
+    cores, listening = cores_per_job(request), scheduler_listening(request)
+    jobs = math.ceil((request.workers or 0) / cores)
+    memory = request.memory or (None if jobqueue("memory") else WORKER_MEMORY)
     cluster = SLURMCluster(
         cores=cores,
         processes=cores,
@@ -152,6 +152,8 @@ def _slurm(request: ClusterRequest, security: Security | None) -> SpecCluster:
             *(jobqueue("worker-extra-args") or ()),
             *_lifetime(request.walltime or jobqueue("walltime")),
             f"--dashboard-address={LOOPBACK}:0",
+            # The settings' preload is not read by the command that starts a worker.
+            f"--preload-nanny={NANNY_PRELOAD}",
             *([f"--host={LOOPBACK}"] if "host" in workers_listening(listening) else []),
         ],
         job_script_prologue=[*(jobqueue("job-script-prologue") or ()), *_exports()],
@@ -161,6 +163,8 @@ def _slurm(request: ClusterRequest, security: Security | None) -> SpecCluster:
             **listening,
         },
     )
+
+    # Submit jobs only if SLURM would run them.
     try:
         _refuse_bad_job(cluster.job_script())
     except MachineError:
@@ -172,7 +176,7 @@ def _slurm(request: ClusterRequest, security: Security | None) -> SpecCluster:
 
 
 def _refuse_bad_job(script: str) -> None:
-    """Have SLURM look at a job before any is submitted: those that fail later fail unseen.
+    """Ask SLURM whether it would run a job, before any is submitted: later nobody sees it fail.
 
     Raises:
         MachineError: If there is no SLURM here, or it would not run the job.
@@ -183,14 +187,19 @@ def _refuse_bad_job(script: str) -> None:
         )
     except FileNotFoundError:
         raise MachineError(
-            "sbatch must be on the PATH, got none: start this on a machine that submits jobs"
+            "there is no sbatch on the PATH: start this on a machine that submits jobs"
         ) from None
     if test.returncode:
-        raise MachineError(f"SLURM must accept the job, got: {test.stderr.strip()}")
+        raise MachineError(f"SLURM does not accept the job: {test.stderr.strip()}")
 
 
 class _Refill:
-    """Asks for a new job in place of each that is over: at its walltime, or with its machine."""
+    """Submits a new job in place of each that ended: at its walltime, or with its machine.
+
+    `SLURMCluster.adapt(minimum_jobs=n, maximum_jobs=n)` does not: it compares n with the jobs that
+    were asked for, and a job of several workers stays among these when it has ended (dask-jobqueue
+    0.9, distributed 2026.8).
+    """
 
     def __init__(self, cluster: SpecCluster, jobs: int) -> None:
         self._cluster, self._jobs = cluster, jobs
@@ -198,13 +207,17 @@ class _Refill:
         self._missing: set[str] = set()
 
     async def __call__(self) -> None:
-        """Look for jobs that had workers and have none, twice in a row."""
+        """Replace jobs that had workers and have none, twice in a row."""
         cluster = self._cluster
         if cluster.status is not Status.running:
             return
+
+        # A job is there if it has a worker; one that still queues never was.
         names = {str(w["name"]) for w in cluster.scheduler_info["workers"].values()}
         present = {job for job in cluster.worker_spec if _has_worker(str(job), names)}
         missing = self._seen - present
+
+        # Forget the lost jobs: to reach the number of jobs again, Dask submits new ones.
         for job in missing & self._missing:
             if job in cluster.workers:
                 await cluster.workers.pop(job).close()
@@ -226,16 +239,16 @@ def _refill(cluster: SpecCluster, jobs: int) -> None:
 
 
 def _exports() -> list[str]:
-    """Return the settings of Dask as lines of a job script, which inherits no others."""
+    """Return Dask's settings as lines of a job script, which inherits nothing."""
     lines = []
-    for key, value in DASK_SETTINGS.items():
+    for key, value in dask_settings().items():
         name = "DASK_" + key.upper().replace(".", "__").replace("-", "_")
         lines.append(f"export {name}={shlex.quote(repr(value))}")
     return lines
 
 
 def _lifetime(walltime: str | None) -> list[str]:
-    """Return the options that end a worker before its job's walltime."""
+    """Return the options by which a worker ends before its job's walltime."""
     if walltime is None:
         return []
     seconds = walltime_seconds(walltime)
@@ -246,7 +259,7 @@ def _lifetime(walltime: str | None) -> list[str]:
 
 @contextmanager
 def _security(request: ClusterRequest, out: Path) -> Iterator[Security | None]:
-    """Yield the certificates; those that are made for other machines to read are removed."""
+    """Yield the certificates; those that are made for this run are removed."""
     if request.tls_files is not None:
         yield security_of(request.tls_files)
     elif not request.tls:

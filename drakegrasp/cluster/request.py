@@ -1,4 +1,4 @@
-"""What workers are wanted: plain data from a command line, its contradictions, and its words.
+"""The requested cluster: options, validation, description.
 
 In: a `ClusterRequest` and the user's jobqueue.yaml. Out: numbers and options for `launch`, and
 lines for the user. Nothing is started here.
@@ -18,20 +18,20 @@ from dask.utils import parse_bytes
 from drakegrasp.errors import ConfigError, MachineError
 
 KINDS = ("local", "ssh", "slurm", "scheduler", "scheduler-file")
-#: Memory of a worker under SLURM, where neither the user nor jobqueue.yaml says it.
+#: Memory of a worker under SLURM, if neither the user nor jobqueue.yaml gives it.
 WORKER_MEMORY = "2GB"
-#: Address of this machine alone.
+#: Address that only this machine can reach.
 LOOPBACK = "127.0.0.1"
 #: Least and largest number of words after each kind, and what they are.
-_PLACES: dict[str, tuple[int, float, str]] = {
+_WHERE: dict[str, tuple[int, float, str]] = {
     "local": (0, 0, "nothing"),
     "ssh": (1, math.inf, "the names of the hosts"),
     "slurm": (0, 0, "nothing"),
     "scheduler": (1, 1, "its address"),
     "scheduler-file": (1, 1, "its path"),
 }
-#: What may be asked of each kind; a running scheduler has its own workers.
-_TAKES: dict[str, tuple[str, ...]] = {
+#: Options of each kind; a running scheduler has its own workers.
+_OPTIONS: dict[str, tuple[str, ...]] = {
     "local": ("workers", "memory", "tls"),
     "ssh": ("workers", "cores", "memory", "host", "interface", "tls"),
     "slurm": ("workers", "cores", "memory", "walltime", "host", "interface", "tls"),
@@ -42,20 +42,20 @@ _TAKES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class ClusterRequest:
-    """What workers are wanted, as on the command line of `pipelines/submit_build.py`.
+    """The requested workers, as on the command line of `pipelines/submit_build.py`.
 
     Attributes:
         kind: One of `KINDS`.
         where: Hosts, the address of a scheduler, or its file.
-        workers: Processes in all.
-        cores: Of each host or job, a worker on each.
-        memory: Of each worker, e.g. "2GB".
-        walltime: Of each SLURM job, as SLURM writes it: [D-]HH:MM:SS.
+        workers: Number of processes in all.
+        cores: Number of cores of each host or job, with a worker on each.
+        memory: Memory of each worker, e.g. "2GB".
+        walltime: Time limit of each SLURM job, as SLURM writes it: [D-]HH:MM:SS.
         host: Address on which the scheduler listens.
         interface: Name of the network interface on which scheduler and workers listen.
         tls: Whether to make certificates for this run.
-        tls_files: Files in PEM format: authority, certificate and private key; every machine
-            must see them.
+        tls_files: Files in PEM format that every machine sees: authority, certificate and
+            private key.
     """
 
     kind: str
@@ -71,7 +71,7 @@ class ClusterRequest:
 
 
 def worker_count(request: ClusterRequest) -> int | None:
-    """Return how many workers there will be, as far as that is known before they start.
+    """Return how many workers there will be; None if that is known only when they start.
 
     Raises:
         ConfigError: If the request contradicts itself, or lacks something.
@@ -86,7 +86,7 @@ def worker_count(request: ClusterRequest) -> int | None:
 
 
 def describe(request: ClusterRequest) -> list[str]:
-    """Return what will be started, in lines for the user; of an open port it warns."""
+    """Return what will be started, in lines for the user, with a warning of an open port."""
     count = worker_count(request)
     lines = [
         {
@@ -100,7 +100,7 @@ def describe(request: ClusterRequest) -> list[str]:
     lines.append(f"connections: {'TLS' if encrypted else 'not encrypted'}")
     if not encrypted and _listens_beyond(request):
         lines.append(
-            "warning: whoever reaches the scheduler's port can run programs as you; give --tls"
+            "warning: anybody who reaches the scheduler's port can run programs as you; give --tls"
         )
     return lines
 
@@ -111,7 +111,7 @@ def walltime_seconds(text: str) -> float:
     SLURM's forms: M, M:S, H:M:S, D-H, D-H:M, D-H:M:S.
 
     Raises:
-        ConfigError: If it is none of them.
+        ConfigError: If the text is none of them.
     """
     days, dash, rest = text.partition("-") if "-" in text else ("0", "", text)
     parts = rest.split(":")
@@ -124,15 +124,15 @@ def walltime_seconds(text: str) -> float:
         hours, (minutes, seconds) = 0, [*numbers, 0][:2]
     total = 86400.0 * int(days) + 3600.0 * hours + 60.0 * minutes + seconds
     if total <= 0.0:
-        raise ConfigError(f"walltime must be longer than nothing, got {text!r}")
+        raise ConfigError(f"walltime must be longer than 0 s, got {text!r}")
     return total
 
 
 def scheduler_listening(request: ClusterRequest) -> dict[str, str]:
-    """Return where a scheduler listens, as its options; nothing if jobqueue.yaml says it.
+    """Return the options that say where a scheduler listens; none if jobqueue.yaml says it.
 
     Raises:
-        ConfigError: If the workers are on other machines and nobody said where to listen.
+        ConfigError: If the workers are on other machines and it is not said where to listen.
     """
     if request.host is not None:
         return {"host": request.host}
@@ -143,16 +143,16 @@ def scheduler_listening(request: ClusterRequest) -> dict[str, str]:
     if request.kind == "slurm" and _jobqueue_listens():
         return {}
     raise ConfigError(
-        "--interface NAME or --host ADDRESS must be given for workers on other machines, because "
-        "the scheduler listens to nobody else's machine without"
+        "--interface NAME or --host ADDRESS must be given for workers on other machines: without, "
+        "the scheduler listens to this machine only"
     )
 
 
 def workers_listening(listening: dict[str, str]) -> dict[str, str]:
-    """Return where workers listen, as their options, given where their scheduler does."""
+    """Return the options that say where workers listen, given those of their scheduler."""
     if "interface" in listening:
         return listening
-    # Without, a worker takes an address of its machine by which others reach it.
+    # Without options a worker chooses an address by which other machines reach it.
     return listening if _is_loopback(listening.get("host", "")) else {}
 
 
@@ -173,13 +173,13 @@ def _is_loopback(host: str) -> bool:
 
 
 def jobqueue(key: str) -> Any:
-    """Return a value of the user's jobqueue.yaml, or of dask-jobqueue's own.
+    """Return a value of the user's jobqueue.yaml, or dask-jobqueue's default.
 
     Raises:
         MachineError: If dask-jobqueue is not installed.
     """
     try:
-        import dask_jobqueue  # noqa: F401  (it is what reads the file)
+        import dask_jobqueue  # noqa: F401  (its import reads the file)
     except ImportError:
         raise MachineError(
             "--cluster slurm needs dask-jobqueue: pip install 'drakegrasp[slurm]'"
@@ -196,13 +196,13 @@ def cores_per_host(request: ClusterRequest) -> int:
     """Return how many workers run on each host over SSH.
 
     Raises:
-        ConfigError: If the request does not say it, or says two things.
+        ConfigError: If the request does not say it, or contradicts itself.
     """
     hosts = len(request.where)
     if request.cores is not None:
         if request.workers not in (None, hosts * request.cores):
             raise ConfigError(
-                f"--workers must be --cores on each of {hosts} hosts, {hosts * request.cores}, or "
+                f"--workers must be --cores times the number of hosts, {hosts * request.cores}, or "
                 f"not be given, got {request.workers}"
             )
         return request.cores
@@ -217,7 +217,7 @@ def cores_per_host(request: ClusterRequest) -> int:
 
 
 def _job_size(request: ClusterRequest) -> str:
-    """Return what each of SLURM's jobs asks for, in words; nothing for other clusters."""
+    """Return what each SLURM job asks for, in words; nothing for other clusters."""
     if request.kind != "slurm":
         return ""
     memory = request.memory or (None if jobqueue("memory") else WORKER_MEMORY)
@@ -236,22 +236,27 @@ def cores_per_job(request: ClusterRequest) -> int:
 
 
 def _refuse_contradictions(request: ClusterRequest) -> None:
-    least, most, what = _PLACES[request.kind]
+    # Each kind of cluster has its own words and options.
+    least, most, what = _WHERE[request.kind]
     if not least <= len(request.where) <= most:
         got = " ".join(request.where) or "nothing"
         raise ConfigError(f"--cluster {request.kind} must be followed by {what}, got {got}")
     for name in ("workers", "cores", "memory", "walltime", "host", "interface", "tls"):
         value = getattr(request, name)
-        if value not in (None, False) and name not in _TAKES[request.kind]:
+        if value not in (None, False) and name not in _OPTIONS[request.kind]:
             raise ConfigError(f"--{name} must not be given with --cluster {request.kind}")
         if name in ("workers", "cores") and value is not None and value < 1:
             raise ConfigError(f"{name} must be at least 1, got {value}")
     if request.tls and request.tls_files is not None:
         raise ConfigError("--tls makes certificates and must not be given with files of them")
+
+    # Sizes and times must be readable.
     if request.memory is not None:
         memory_bytes(request.memory)
     if request.walltime is not None:
         walltime_seconds(request.walltime)
+
+    # What a cluster on other machines cannot do without.
     if request.kind == "slurm" and request.workers is None:
         raise ConfigError("--workers must be given with --cluster slurm")
     if request.kind == "ssh":
@@ -270,7 +275,7 @@ def memory_bytes(text: str) -> int:
     """Return a size of memory such as "2GB" in bytes.
 
     Raises:
-        ConfigError: If it is none.
+        ConfigError: If the text is no such size.
     """
     try:
         return int(parse_bytes(text))

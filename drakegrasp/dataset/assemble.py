@@ -1,8 +1,8 @@
-"""Stage "build": from shards to trials.hdf5, grasping_oto.hdf5 and grasping_otm.hdf5.
+"""From shards to trials.hdf5, grasping_oto.hdf5 and grasping_otm.hdf5.
 
-In: a directory whose work units are all done. Out: the three files, all or none. Two
-passes over the shards, so memory holds one shard's images and a few numbers per success,
-whatever the size of the dataset. No simulation, no Drake.
+In: a directory whose work units are all done. Out: the three files, all or none. Two passes over
+the shards keep memory at the images of one shard and a few numbers per success, whatever the size
+of the dataset. Imports no Drake.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from drakegrasp.dataset.hdf5 import AnyArray, create_field, write_field
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import Manifest, read_manifest, write_origin
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
-from drakegrasp.dataset.samples import Part, create_splits, walk_parts, write_samples
+from drakegrasp.dataset.samples import ShardSlice, create_splits, walk_shards, write_samples
 from drakegrasp.dataset.schema import (
     CAMERAS,
     CERTIFICATE_FIELDS,
@@ -44,13 +44,13 @@ from drakegrasp.vision.camera import intrinsics, project
 
 @dataclass(frozen=True, kw_only=True)
 class Assembly:
-    """What the files hold.
+    """What the files of a dataset hold.
 
     Attributes:
         trials: Number of attempts.
         grasps: Number of successes.
-        removed: Successes by reason of removal; `Removal.KEPT` are the samples.
-        samples: Samples by split.
+        removed: Number of successes by reason of removal; `Removal.KEPT` are the samples.
+        samples: Number of samples by split.
     """
 
     trials: int
@@ -64,53 +64,79 @@ def assemble(out: Path, *, rejected: Sequence[int] = (), progress: Report = sile
 
     Args:
         out: Directory of the dataset.
-        rejected: Ids of trials that inspection found wrong; they become no samples.
+        rejected: Ids of trials that an inspection rejects; they become no samples.
         progress: Called with the number of shards read and to read.
 
     Raises:
-        DataError: If a shard is missing or damaged, or another process builds there; the old
-            files stay as they were.
-        DiskFullError: If there is no room; likewise.
+        DataError: If a shard is missing or damaged, or another process builds in the directory;
+            the old files stay.
+        DiskFullError: If there is no room; the old files stay.
     """
-    read_manifest(out)  # nothing is made where no dataset is
-    with build_lock(out), disk_full_named(out):
-        return _assemble(out, rejected, progress)
+    read_manifest(out)  # before the lock, which would make a missing directory
+    with build_lock(out):
+        return assemble_locked(out, rejected=rejected, progress=progress)
 
 
-def _assemble(out: Path, rejected: Sequence[int], progress: Report) -> Assembly:
+def assemble_locked(
+    out: Path, *, rejected: Sequence[int] = (), progress: Report = silent
+) -> Assembly:
+    """Write the three files, as `assemble`, in a directory whose lock the caller holds."""
     manifest = read_manifest(out)
-    K = intrinsics(manifest.config.camera)
-    total = manifest.units
-    parts, found = [], []
-    with ExitStack() as stack:
+    with disk_full_named(out), ExitStack() as stack:
+        # First pass: copy the trials, and learn of each success what the filters need.
         trials = stack.enter_context(atomic_hdf5(out / TRIALS_FILE))
-        _write_attributes(trials, manifest)
-        _write_objects(trials, manifest)
-        for part, shard in walk_parts(out, manifest):
-            _append_trials(trials, part, shard)
-            parts.append(part)
-            found.append(_successes(part, shard, K))
-            progress(len(parts), 2 * total)
-        if not parts:
-            raise DataError(f"{out}: at least one object must have a palm pose to try, got none")
-        successes = _concatenate(found)
-        unknown = sorted(set(rejected) - set(successes.trial_id.tolist()))
-        if unknown:
-            raise DataError(
-                f"{out}: rejected trials must be successes, got {unknown[0]}, which is none"
-            )
+        slices, successes = _write_trials(trials, out, manifest, progress)
+
+        # Decide which successes are samples, and in which split.
+        _refuse_unknown(out, rejected, successes)
         removal = judge_successes(successes, manifest.config.filters, rejected)
         _write_removal(trials, successes, removal)
         ids = _split_ids(manifest, successes, removal)
+
+        # Second pass: copy the samples. It reads the shards again, because the split of a sample
+        # depends on the successes of all shards, and their images do not fit into memory.
         files = {c: stack.enter_context(atomic_hdf5(out / DATA_FILES[c])) for c in CAMERAS}
         for camera, file in files.items():
             _write_attributes(file, manifest)
             file.attrs["camera"] = camera
-            create_splits(file, ids, parts[0].shapes)
-        for number, part in enumerate(parts):
-            write_samples(files, out, part, ids)
-            progress(len(parts) + number + 1, 2 * len(parts))
+            create_splits(file, ids, slices[0].shapes)
+        for done, shard_slice in enumerate(slices, start=len(slices) + 1):
+            write_samples(files, out, shard_slice, ids)
+            progress(done, 2 * len(slices))
     return summarise(out)
+
+
+def _write_trials(
+    file: h5py.File, out: Path, manifest: Manifest, progress: Report
+) -> tuple[list[ShardSlice], Successes]:
+    """Write /objects and /trials; return the place of each shard, and all successes.
+
+    Raises:
+        DataError: If a shard is missing or damaged, or there is none.
+    """
+    K = intrinsics(manifest.config.camera)
+    _write_attributes(file, manifest)
+    _write_objects(file, manifest)
+    slices, successes = [], []
+    for shard_slice, shard in walk_shards(out, manifest):
+        _append_trials(file, shard_slice, shard)
+        slices.append(shard_slice)
+        successes.append(_successes(shard_slice, shard, K))
+        progress(len(slices), 2 * manifest.units)
+    if not slices:
+        raise DataError(f"{out}: no object has a palm pose to try")
+    return slices, _concatenate(successes)
+
+
+def _refuse_unknown(out: Path, rejected: Sequence[int], successes: Successes) -> None:
+    """Refuse rejected trials that are no successes.
+
+    Raises:
+        DataError: If there is one.
+    """
+    unknown = sorted(set(rejected) - set(successes.trial_id.tolist()))
+    if unknown:
+        raise DataError(f"{out}: rejected trials must be successes, got trial {unknown[0]}")
 
 
 def summarise(out: Path) -> Assembly:
@@ -137,15 +163,15 @@ def summarise(out: Path) -> Assembly:
 
 
 def read_reject_list(path: Path) -> list[int]:
-    """Return the trial ids in a text file: one per line, # starts a comment.
+    """Return the trial ids in a text file: one per line; # starts a comment.
 
     Raises:
-        DataError: If a line is no id.
+        DataError: If the file is no text, or a line is no id.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError:
-        raise DataError(f"{path}: must be a text file of trial ids, got other bytes") from None
+        raise DataError(f"{path}: must be a text file of trial ids, got a binary file") from None
     ids = []
     for number, line in enumerate(lines, start=1):
         text = line.partition("#")[0].strip()
@@ -157,7 +183,7 @@ def read_reject_list(path: Path) -> list[int]:
 
 
 def is_assembled(out: Path) -> bool:
-    """Return whether the three files are there and of the manifest's configuration and units."""
+    """Return whether the three files exist and are of the manifest's configuration and units."""
     signature = _signature(read_manifest(out))
     try:
         for name in (TRIALS_FILE, *DATA_FILES.values()):
@@ -170,7 +196,7 @@ def is_assembled(out: Path) -> bool:
 
 
 def _signature(manifest: Manifest) -> str:
-    """Return a hash of all that decides what the files hold, but for a reject list."""
+    """Return a hash of what decides the content of the files, without the rejected trials."""
     digest = hashlib.sha256(json.dumps(manifest.config.to_dict(), sort_keys=True).encode())
     for header in manifest.headers():
         digest.update(f"\n{header}".encode())
@@ -187,33 +213,39 @@ def _write_attributes(file: h5py.File, manifest: Manifest) -> None:
 
 def _write_objects(file: h5py.File, manifest: Manifest) -> None:
     group = file.create_group("objects")
-    keys = {"class_name": "class"}
     for field in OBJECT_FIELDS:
-        values = [entry[keys.get(field.name, field.name)] for entry in manifest.objects]
+        values = [getattr(entry, field.name) for entry in manifest.objects]
         dtype = object if field.dtype == "str" else field.dtype
         write_field(group, field, np.array(values, dtype=dtype))
 
 
-def _append_trials(file: h5py.File, part: Part, shard: Shard) -> None:
+def _append_trials(file: h5py.File, shard_slice: ShardSlice, shard: Shard) -> None:
+    """Append the rows of a shard to /trials."""
     group = file.require_group("trials")
-    columns = {f.name: shard.trials[f.name][: part.rows] for f in trial_columns()}
-    columns["trial_id"] = np.arange(part.first, part.first + part.rows, dtype=np.int64)
-    columns["object"] = np.full(part.rows, part.object, dtype=np.int32)
+    first, rows = shard_slice.first, shard_slice.rows
+
+    # Only the whole dataset knows the number of a row and of its object.
+    columns = {f.name: shard.trials[f.name][:rows] for f in trial_columns()}
+    columns["trial_id"] = np.arange(first, first + rows, dtype=np.int64)
+    columns["object"] = np.full(rows, shard_slice.object, dtype=np.int32)
+
     for field in TRIAL_FIELDS:
         values = columns[field.name]
         if field.name not in group:
             create_field(group, field, values.shape[1:])
         dataset = group[field.name]
-        dataset.resize(part.first + part.rows, axis=0)
-        dataset[part.first :] = values
+        dataset.resize(first + rows, axis=0)
+        dataset[first:] = values
 
 
-def _successes(part: Part, shard: Shard, K: Array) -> Successes:
-    """Return what the filters must know of a shard's successes."""
-    taken = shard.looks["row"] < part.rows
+def _successes(shard_slice: ShardSlice, shard: Shard, K: Array) -> Successes:
+    """Return what the filters need of a shard's successes."""
+    taken = shard.looks["row"] < shard_slice.rows
     rows = shard.looks["row"][taken]
     trials = {name: values[rows] for name, values in shard.trials.items()}
     looks = {name: values[taken] for name, values in shard.looks.items()}
+
+    # The grasps in {T}, and whether both cameras see all their contacts.
     X_TO = unpack_pose(trials["X_TO"])
     grasps = [
         transform_grasp(X, pack_grasp(p, n))
@@ -224,13 +256,14 @@ def _successes(part: Part, shard: Shard, K: Array) -> Successes:
         all(_in_view(K, looks[f"mask_{c}"][i], looks[f"X_TC_{c}"][i], grasp) for c in CAMERAS)
         for i, grasp in enumerate(grasps)
     ]
+
     return Successes(
-        trial_id=part.first + rows.astype(np.int64),
-        object=np.full(len(rows), part.object, dtype=np.int32),
+        trial_id=shard_slice.first + rows.astype(np.int64),
+        object=np.full(len(rows), shard_slice.object, dtype=np.int32),
         grasp_T=np.array(grasps).reshape(-1, length),
         seen=np.all([looks[f"mask_{c}"].any(axis=(1, 2)) for c in CAMERAS], axis=0),
         in_view=np.array(in_view, dtype=bool),
-        # Both cameras stand at the same point.
+        # Both cameras are at the same point.
         camera_height=unpack_pose(looks["X_TC_otm"])[:, 2, 3],
         depth_variance=looks["image_otm"][:, 3].astype(float).var(axis=(1, 2)),
         surface_distance=trials["surface_distance"].max(axis=1, initial=0.0),
@@ -239,19 +272,20 @@ def _successes(part: Part, shard: Shard, K: Array) -> Successes:
 
 
 def _in_view(K: Array, mask: AnyArray, X_TC: Array, grasp_T: Array) -> bool:
+    """Return whether all contacts of a grasp are before a camera and within its image."""
     p_TQ, _ = unpack_grasp(grasp_T)
     p_CQ = transform_points(invert_pose(unpack_pose(X_TC)), p_TQ)
     uv = project(K, p_CQ)
     return bool(np.all(p_CQ[:, 2] > 0.0) and np.all(uv >= 0.0) and np.all(uv <= len(mask) - 1))
 
 
-def _concatenate(found: Sequence[Successes]) -> Successes:
+def _concatenate(successes: Sequence[Successes]) -> Successes:
     names = [f.name for f in dataclasses.fields(Successes)]
-    return Successes(**{n: np.concatenate([getattr(s, n) for s in found]) for n in names})
+    return Successes(**{n: np.concatenate([getattr(s, n) for s in successes]) for n in names})
 
 
 def _write_removal(file: h5py.File, successes: Successes, removal: AnyArray) -> None:
-    """Keep beside the trials why each success is, or is not, a sample."""
+    """Write /successes: why each success is, or is not, a sample."""
     group = file.create_group("successes")
     for field in SUCCESS_FIELDS:
         values = removal if field.name == "removal" else getattr(successes, field.name)
@@ -261,11 +295,12 @@ def _write_removal(file: h5py.File, successes: Successes, removal: AnyArray) -> 
 def _split_ids(
     manifest: Manifest, successes: Successes, removal: AnyArray
 ) -> dict[str, npt.NDArray[np.int64]]:
+    """Return the trial ids of the samples, by split."""
     kept = np.flatnonzero(removal == Removal.KEPT)
     split = split_samples(
         successes.object[kept],
-        [entry["name"] for entry in manifest.objects],
-        [entry["class"] for entry in manifest.objects],
+        [entry.name for entry in manifest.objects],
+        [entry.class_name for entry in manifest.objects],
         manifest.config.split,
         manifest.config.seed,
     )

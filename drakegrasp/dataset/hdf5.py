@@ -1,4 +1,4 @@
-"""How a field of the schema is written into an HDF5 file."""
+"""Writing a field of the schema into an HDF5 file."""
 
 from __future__ import annotations
 
@@ -16,10 +16,15 @@ COLUMN_CHUNK = 2048
 
 
 def create_field(group: h5py.Group, field: Field, shape: tuple[int, ...]) -> h5py.Dataset:
-    """Create an empty, growing dataset of a field whose rows have a shape.
+    """Create the dataset of a field, without rows; it can be resized.
 
-    Unit, frame and meaning become attributes. Images get a chunk per sample, because
-    loaders read them one by one in random order.
+    Unit, frame and meaning become attributes. An image is one chunk, because loaders read single
+    samples in random order.
+
+    Args:
+        group: Where to create it.
+        field: The field.
+        shape: Shape of one row.
     """
     text = field.dtype == "str"
     dataset = group.create_dataset(
@@ -37,7 +42,7 @@ def create_field(group: h5py.Group, field: Field, shape: tuple[int, ...]) -> h5p
 
 
 def write_field(group: h5py.Group, field: Field, values: AnyArray) -> h5py.Dataset:
-    """Write all rows of one field, see `create_field`."""
+    """Create the dataset of a field from all of its rows (n, ...), see `create_field`."""
     dataset = create_field(group, field, values.shape[1:])
     dataset.resize(len(values), axis=0)
     if len(values):

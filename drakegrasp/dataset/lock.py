@@ -1,14 +1,17 @@
-"""One build at a time in a directory.
+"""The lock of a dataset's directory: one build at a time.
 
-In: a dataset's directory. Out: `build.lock` in it, a line of JSON that says which process
-builds there, held by the kernel's lock (flock) while the process lives and removed when the
-build ends. Of two builds the second refuses and names the first. A dead one's lock is free,
-because the kernel let go of it: it is taken over and named.
+`build.lock` in the directory is a line of JSON that names the process that builds there. The
+process holds the kernel's lock (flock) on the file and removes it at the end of the build. A
+second build is refused and names the first. The kernel frees the lock of a process that dies: the
+next build takes the file over and names the dead one.
 
-Between machines this is as good as the file system's locks: NFS and Lustre (mounted with
-`flock`) have them for all machines. Where there are none, the line decides: a process of
-this machine that is gone is taken over, one of another machine is believed to be alive, and
-the message says which file to remove if it is not.
+Between machines the lock is as good as the file system's: NFS and Lustre (mounted with `flock`)
+lock for all machines. On a file system without locks the line of JSON decides: if its process ran
+on this machine and is gone, the next build takes over. A process of another machine counts as
+alive; the message says which file to remove if it is dead.
+
+The library filelock is no substitute: its flock names no holder, so a refusal could not say who
+builds, and a build could not report whose lock it took over.
 """
 
 from __future__ import annotations
@@ -31,11 +34,11 @@ FILE_NAME = "build.lock"
 
 @dataclass(frozen=True, kw_only=True)
 class Holder:
-    """Who builds in a directory.
+    """The process that holds a directory.
 
     Attributes:
-        process: Which process.
-        since: When it began to, in ISO 8601.
+        process: The process.
+        since: When it took the lock, in ISO 8601.
         command: Its command line.
     """
 
@@ -47,42 +50,33 @@ class Holder:
         return f"process {self.process.pid} on {self.process.host}, since {self.since}"
 
 
-#: Directories that this process holds, so that a step of a build may ask for what it has,
-#: and who held them before and died.
-_held: dict[Path, Holder | None] = {}
-
-
 @contextmanager
 def build_lock(out: Path) -> Iterator[Holder | None]:
-    """Hold a directory while the block runs; again within it is allowed.
+    """Hold a directory while the block runs.
 
-    Yields who held it before and died, if anybody did.
+    Yields the dead holder from whom the lock was taken over, or None. One function of a command
+    takes the lock, and what it calls relies on it.
 
     Args:
-        out: The directory; made if it is not there, and removed again if it stays empty.
+        out: The directory; made if it is missing, and removed again if it stays empty.
 
     Raises:
-        DataError: If another process builds in it, or it cannot be written.
+        DataError: If another process builds in the directory, or it cannot be written.
     """
-    path = out.resolve()
-    if path in _held:
-        yield _held[path]
-        return
     made = _make_directory(out)
     file, before = _take(out / FILE_NAME)
     try:
-        _held[path] = before
         yield before
     finally:
-        del _held[path]
         (out / FILE_NAME).unlink(missing_ok=True)
         file.close()
         if made:
-            with suppress(OSError):  # something was built
+            with suppress(OSError):  # not empty: something was built
                 out.rmdir()
 
 
 def _make_directory(out: Path) -> bool:
+    """Make a directory; return whether it was missing."""
     try:
         made = not out.exists()
         out.mkdir(parents=True, exist_ok=True)
@@ -96,18 +90,22 @@ def _unwritable(out: Path, error: OSError) -> DataError:
 
 
 def _take(path: Path) -> tuple[FileIO, Holder | None]:
-    """Return the open lock file, now ours, and who left it behind, if anybody did."""
+    """Return the open lock file, which is ours now, and its dead holder, if there was one.
+
+    Raises:
+        DataError: If another process holds it, or it cannot be written.
+    """
     while True:
         try:
             file = FileIO(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666), "r+")
         except OSError as error:
             raise _unwritable(path.parent, error) from None
         try:
+            # The kernel decides, or on a file system without locks (None) the file's content.
             locked = lock_file(file)
             before = _read(file)
-            if locked is False or (
-                locked is None and before and before.process.runs() is not False
-            ):
+            alive = before is not None and before.process.runs() is not False
+            if locked is False or (locked is None and alive):
                 raise _refusal(path, before, certain=locked is False)
             if _is_at(path, file):
                 _write(file)
@@ -115,10 +113,11 @@ def _take(path: Path) -> tuple[FileIO, Holder | None]:
         except BaseException:
             file.close()
             raise
-        file.close()  # its holder removed it between our opening and locking: once more
+        file.close()  # its holder removed it after we opened it: try again
 
 
 def _is_at(path: Path, file: FileIO) -> bool:
+    """Return whether an open file is still the one at a path."""
     try:
         return os.path.samestat(path.stat(), os.fstat(file.fileno()))
     except FileNotFoundError:
@@ -126,6 +125,7 @@ def _is_at(path: Path, file: FileIO) -> bool:
 
 
 def _read(file: FileIO) -> Holder | None:
+    """Return the holder that a lock file names, or None if it names none."""
     try:
         content = json.loads(os.pread(file.fileno(), 1 << 16, 0))
         return Holder(
@@ -134,10 +134,11 @@ def _read(file: FileIO) -> Holder | None:
             command=tuple(content["command"]),
         )
     except (KeyError, TypeError, ValueError):
-        return None  # empty: its holder died before it wrote, or has not written yet
+        return None  # empty: its holder died before it wrote its name, or is about to
 
 
 def _write(file: FileIO) -> None:
+    """Write this process into the lock file."""
     now = datetime.now().astimezone().isoformat(timespec="seconds")
     holder = Holder(process=this_process(), since=now, command=tuple(sys.argv))
     file.truncate(0)
@@ -146,7 +147,7 @@ def _write(file: FileIO) -> None:
 
 def _refusal(path: Path, holder: Holder | None, *, certain: bool) -> DataError:
     who = "another process" if holder is None else str(holder)
-    mend = "wait for it or choose another --out"
+    advice = "wait for it or choose another --out"
     if not certain:
-        mend = f"wait for it, or remove {path.name} there if it is dead"
-    return DataError(f"{path.parent}: must be built by one process at a time, got {who}; {mend}")
+        advice = f"wait for it, or remove {path.name} there if it is dead"
+    return DataError(f"{path.parent}: must be built by one process at a time, got {who}; {advice}")

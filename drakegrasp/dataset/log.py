@@ -1,7 +1,7 @@
-"""`log.jsonl`: what happened in a build and when, a line of JSON per event.
+"""`log.jsonl`: the events of a dataset's builds, with their times, a line of JSON each.
 
-In: events. Out: lines at the end of the file, for people, their tools, and the plan of the
-rest; no data come from it, and it is the one file of a dataset that has the clock in it.
+People, their tools and the estimate of the remaining time read it. No data come from it, and it
+is the only file of a dataset that depends on the clock.
 """
 
 from __future__ import annotations
@@ -17,17 +17,21 @@ FILE_NAME = "log.jsonl"
 
 
 class BuildLog:
-    """The log of the builds of a directory."""
+    """The log of a directory's builds.
+
+    Args:
+        out: Directory of the dataset.
+    """
 
     def __init__(self, out: Path) -> None:
         self._path = out / FILE_NAME
 
     def __call__(self, event: str, **facts: Any) -> None:
-        """Add an event, in one write, so that a crash leaves whole lines.
+        """Append an event in one write, so that a crash leaves whole lines.
 
         Args:
-            event: What happened, e.g. "unit done".
-            facts: More about it, as JSON types.
+            event: Name of the event, e.g. "unit done".
+            facts: Its details, as JSON types.
 
         Raises:
             OSError: If the file cannot be written.
@@ -44,7 +48,7 @@ class BuildLog:
 def read_log(out: Path) -> Iterator[dict[str, Any]]:
     """Yield the events of a directory's builds, oldest first; none if there is no log.
 
-    A line that is cut off, by a full disk, is passed over.
+    A line that a full disk has cut off is skipped.
     """
     try:
         file = (out / FILE_NAME).open(encoding="utf-8")

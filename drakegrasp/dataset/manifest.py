@@ -1,81 +1,158 @@
-"""`manifest.json`: what a dataset's directory is of, and what it is made of.
+"""`manifest.json`: the configuration, the objects and the versions of a dataset.
 
-It is written before the first work unit, so a directory without a readable manifest holds
-no dataset, and one with another configuration's is refused. It says nothing of the time,
-the machine or the number of workers: the same command gives the same bytes.
+A build writes it before the first work unit. A directory without a readable manifest holds no
+dataset; a directory with the manifest of another configuration is refused. It has no time, no
+machine and no number of workers in it: the same command gives the same bytes.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import h5py
 
-from drakegrasp.config import LATE_KEYS, Config, override_config, parse_config
+from drakegrasp.config import POSTPROCESSING_KEYS, Config, override_config, parse_config
 from drakegrasp.dataset import log as build_log
 from drakegrasp.dataset.paths import FILE_NAME, OWN_FILES, OWN_FOLDERS
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.hand.files import hand_digest
-from drakegrasp.runtime.files import sync_and_rename, temporary_name
+from drakegrasp.runtime.files import probe_folder, write_atomic
 
 #: Packages whose versions may change a result.
-VERSIONED = ("drakegrasp", "drake", "numpy", "scipy", "trimesh", "manifold3d", "embreex", "h5py")
-#: Those that a dataset is never continued with another version of.
-DECISIVE = ("drakegrasp", "drake", "hand")
+VERSIONED = ("drakegrasp", "drake", "numpy", "scipy", "trimesh", "manifold3d", "h5py")
+#: Versions that must not change within a dataset, nor between a client and its workers.
+REQUIRED_VERSIONS = ("drakegrasp", "drake", "hand")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectEntry:
+    """An object that was prepared, in the manifest.
+
+    Attributes:
+        name, class_name: Of the object.
+        mesh_sha256: Hash of the mesh file and its scale, hexadecimal.
+        mass: Mass [kg].
+        X_TO: Resting pose, (12,): the first three rows of the 4x4 matrix [m, -].
+        rolled: Whether the object would have rolled on and was stopped.
+        candidates: Number of palm poses to try, drawn from the distinct ones.
+        combinations: Number of combinations of rotations that were considered.
+        valid: Number of those above the table whose palm ray meets the bounding box.
+        distinct: Number of different palm poses among the valid ones.
+        notes: What was repaired in the mesh.
+    """
+
+    name: str
+    class_name: str
+    mesh_sha256: str
+    mass: float
+    X_TO: tuple[float, ...]
+    rolled: bool
+    candidates: int
+    combinations: int
+    valid: int
+    distinct: int
+    notes: tuple[str, ...]
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> ObjectEntry:
+        """Return the entry that `to_json` gave.
+
+        Raises:
+            KeyError, TypeError: If the content is not an entry.
+        """
+        converted = {
+            "class_name": content["class"],
+            "X_TO": tuple(content["X_TO"]),
+            "notes": tuple(content["notes"]),
+        }
+        plain = {key: value for key, value in content.items() if key not in ("class", *converted)}
+        return cls(**converted, **plain)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the entry as JSON types, in the order of the manifest."""
+        return {"class" if key == "class_name" else key: v for key, v in asdict(self).items()}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefusedMesh:
+    """A mesh that cannot be simulated, in the manifest.
+
+    Attributes:
+        name: Of the object.
+        mesh_sha256: Hash of the mesh file and its scale, hexadecimal.
+        reason: Why it was refused, in words.
+    """
+
+    name: str
+    mesh_sha256: str
+    reason: str
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> RefusedMesh:
+        """Return the entry that `to_json` gave.
+
+        Raises:
+            TypeError: If the content is not an entry.
+        """
+        return cls(**content)
+
+    def to_json(self) -> dict[str, str]:
+        """Return the entry as JSON types, in the order of the manifest."""
+        return asdict(self)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Manifest:
-    """What a dataset is of.
+    """The description of a dataset.
 
     Attributes:
         config: Resolved configuration, with the seed.
-        objects: `PreparedObject.summary` of each object, by name.
-        refused: Name and reason of each mesh that was refused.
-        versions: Of the packages that made it, and a hash of the hand's files.
+        objects: The objects, in the order of the dataset's rows.
+        refused: The meshes that were refused.
+        versions: Versions of the packages that made the dataset, and a hash of the hand's files.
     """
 
     config: Config
-    objects: tuple[dict[str, Any], ...] = ()
-    refused: tuple[dict[str, str], ...] = ()
+    objects: tuple[ObjectEntry, ...] = ()
+    refused: tuple[RefusedMesh, ...] = ()
     versions: dict[str, str]
 
     def headers(self) -> Iterator[ShardHeader]:
         """Yield the work units of the dataset in the order of its rows."""
         step, config_hash = self.config.unit_candidates, self.config.simulation_hash()
         for entry in self.objects:
-            for start in range(0, entry["candidates"], step):
+            for start in range(0, entry.candidates, step):
                 yield ShardHeader(
                     config_hash=config_hash,
-                    mesh_sha256=entry["mesh_sha256"],
-                    object_name=entry["name"],
+                    mesh_sha256=entry.mesh_sha256,
+                    object_name=entry.name,
                     start=start,
-                    stop=min(start + step, entry["candidates"]),
+                    stop=min(start + step, entry.candidates),
                 )
 
     @property
     def units(self) -> int:
         """Number of work units."""
         step = self.config.unit_candidates
-        return sum(-(-entry["candidates"] // step) for entry in self.objects)
+        return sum(-(-entry.candidates // step) for entry in self.objects)
 
 
 def installed_versions(config: Config) -> dict[str, str]:
-    """Return the versions of what may change a result: packages, and the hand's files."""
+    """Return the versions of all that may change a result: packages, and the hand's files."""
     packages = {name: metadata.version(name) for name in VERSIONED}
     return {**packages, "hand": hand_digest(config.hand)}
 
 
 def write_origin(file: h5py.File, config: Config, versions: dict[str, str]) -> None:
-    """Write what every file says of itself: conventions, configuration and versions."""
+    """Write the attributes that every file has: conventions, configuration and versions."""
     file.attrs.update({f"convention_{key}": text for key, text in CONVENTIONS.items()})
     file.attrs["schema_version"] = SCHEMA_VERSION
     file.attrs["config"] = json.dumps(config.to_dict(), sort_keys=True)
@@ -85,25 +162,18 @@ def write_origin(file: h5py.File, config: Config, versions: dict[str, str]) -> N
 
 
 def write_manifest(manifest: Manifest, out: Path) -> None:
-    """Write the manifest, atomically."""
+    """Write the manifest into a dataset's directory, atomically."""
     content = {
         "schema_version": SCHEMA_VERSION,
         "config_hash": manifest.config.simulation_hash(),
         "seed": manifest.config.seed,
         "config": manifest.config.to_dict(),
         "versions": manifest.versions,
-        "objects": list(manifest.objects),
-        "refused": list(manifest.refused),
+        "objects": [entry.to_json() for entry in manifest.objects],
+        "refused": [entry.to_json() for entry in manifest.refused],
     }
-    path = out / FILE_NAME
-    temporary = temporary_name(path)
-    try:
-        temporary.write_text(
-            json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
-        )
-        sync_and_rename(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+    write_atomic(out / FILE_NAME, text.encode())
 
 
 def read_manifest(out: Path) -> Manifest:
@@ -114,79 +184,97 @@ def read_manifest(out: Path) -> Manifest:
     """
     path = out / FILE_NAME
     try:
+        # The version first: another schema may have other keys.
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["schema_version"] != SCHEMA_VERSION:
             raise DataError(
                 f"{path}: schema must be {SCHEMA_VERSION}, got {content['schema_version']}"
             )
+
         return Manifest(
             config=parse_config(content["config"]),
-            objects=tuple(content["objects"]),
-            refused=tuple(content["refused"]),
+            objects=tuple(ObjectEntry.from_json(entry) for entry in content["objects"]),
+            refused=tuple(RefusedMesh.from_json(entry) for entry in content["refused"]),
             versions=content["versions"],
         )
+
+    # A missing file is another mistake than a broken one.
     except FileNotFoundError:
         raise DataError(
             f"{out}: must be the directory of a dataset, got one without {FILE_NAME}"
         ) from None
-    except (OSError, KeyError, TypeError, json.JSONDecodeError) as error:
+    except (OSError, KeyError, TypeError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise DataError(
             f"{path}: must be a readable manifest, got a broken one ({error})"
         ) from None
 
 
 def claim_directory(out: Path, config: Config) -> Manifest | None:
-    """Make sure that a dataset of this configuration may be built in a directory.
+    """Return the manifest of the dataset that a build with this configuration continues.
+
+    Args:
+        out: The directory; made if it is missing.
+        config: Configuration of the build.
 
     Returns:
-        The manifest that is there, or None in an empty or new directory.
+        The manifest in the directory, or None if the directory is empty or new.
 
     Raises:
-        DataError: If the directory holds something else, another configuration's dataset, or
+        DataError: If the directory holds other files, the dataset of another configuration, or
             cannot be written; nothing in it is changed.
     """
+    # The directory must be writable: better to fail now than after the first work unit.
     try:
         out.mkdir(parents=True, exist_ok=True)
-        probe = temporary_name(out / "probe")
-        probe.touch()
-        probe.unlink()
+        probe_folder(out)
     except OSError as error:
         raise DataError(
             f"{out}: must be a directory that can be written, got: {error.strerror}"
         ) from None
+
+    # Without a manifest it must be empty, but for what an interrupted build may leave.
     if not (out / FILE_NAME).exists():
-        strangers = sorted(
-            p.name
-            for p in out.iterdir()
-            if not p.name.startswith(".") and p.name not in (*OWN_FOLDERS, *OWN_FILES)
-        )
-        if strangers:
-            raise DataError(
-                f"{out}: must be empty or hold a dataset of drakegrasp, got {strangers[0]!r} "
-                "and no manifest.json; choose another --out"
-            )
+        _refuse_other_files(out)
         return None
+
+    # With a manifest it must continue the same dataset.
     manifest = read_manifest(out)
     if manifest.config.simulation_hash() != config.simulation_hash():
         raise DataError(
             f"{out}: must be empty or hold this configuration's dataset, got one that differs in "
             f"{_differences(manifest.config, config)}; choose another --out"
         )
-    for name in DECISIVE:
-        then, now = manifest.versions.get(name), installed_versions(config)[name]
-        if then != now:
+    installed = installed_versions(config)
+    for name in REQUIRED_VERSIONS:
+        if manifest.versions.get(name) != installed[name]:
             raise DataError(
-                f"{out}: must be continued with {name} {then}, which made it, got {now}; "
-                "choose another --out"
+                f"{out}: must be continued with {name} {manifest.versions.get(name)}, which made "
+                f"it, got {installed[name]}; choose another --out"
             )
     return manifest
 
 
+def _refuse_other_files(out: Path) -> None:
+    """Refuse a directory with files that no build of ours writes.
+
+    Raises:
+        DataError: If there is one.
+    """
+    own = (*OWN_FOLDERS, *OWN_FILES)
+    names = (path.name for path in out.iterdir())
+    others = sorted(name for name in names if not name.startswith(".") and name not in own)
+    if others:
+        raise DataError(
+            f"{out}: must be empty or hold a dataset of drakegrasp, got {others[0]!r} "
+            f"and no {FILE_NAME}; choose another --out"
+        )
+
+
 def release_directory(out: Path) -> None:
-    """Take back a claim on a directory in which nothing was made."""
+    """Remove the files of a build that made nothing, and the directory if it is then empty."""
     for name in (FILE_NAME, build_log.FILE_NAME):
         (out / name).unlink(missing_ok=True)
-    # A directory that holds anything else was there before.
+    # A directory with anything else in it was there before.
     for folder in (*(out / name for name in OWN_FOLDERS), out):
         with suppress(OSError):
             folder.rmdir()
@@ -195,8 +283,13 @@ def release_directory(out: Path) -> None:
 def change_postprocessing(out: Path, overrides: Sequence[str]) -> None:
     """Change values of the filters or the split in a dataset's manifest.
 
+    Args:
+        out: Directory of the dataset.
+        overrides: `key=value` texts, e.g. "split.valid_fraction=0.2".
+
     Raises:
         ConfigError: If a value cannot be used, or would change what was simulated.
+        DataError: If the directory holds no dataset.
     """
     manifest = read_manifest(out)
     config = override_config(manifest.config, overrides)
@@ -209,15 +302,18 @@ def change_postprocessing(out: Path, overrides: Sequence[str]) -> None:
 
 
 def _differences(theirs: Config, ours: Config) -> str:
-    def flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-        found: dict[str, Any] = {}
-        for key, value in tree.items():
-            if isinstance(value, dict):
-                found |= flat(value, f"{prefix}{key}.")
-            else:
-                found[prefix + key] = value
-        return found
-
-    a, b = flat(theirs.to_dict()), flat(ours.to_dict())
-    keys = [k for k in a if a[k] != b[k] and k.partition(".")[0] not in LATE_KEYS]
+    """Return the values that differ and change the simulation, in words."""
+    a, b = _flatten(theirs.to_dict()), _flatten(ours.to_dict())
+    keys = [k for k in a if a[k] != b[k] and k.partition(".")[0] not in POSTPROCESSING_KEYS]
     return ", ".join(f"{k} ({a[k]} there, {b[k]} here)" for k in keys)
+
+
+def _flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the leaves of a tree of dicts, by their dotted keys."""
+    leaves: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            leaves |= _flatten(value, f"{prefix}{key}.")
+        else:
+            leaves[prefix + key] = value
+    return leaves

@@ -1,4 +1,4 @@
-"""Where a dataset's files are, and which belong to one."""
+"""Names and paths of a dataset's files."""
 
 from __future__ import annotations
 
@@ -13,37 +13,40 @@ from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import DataError
 from drakegrasp.runtime.files import refuse_broken_seal
 
+#: The file of all attempts, the two files of samples by camera, and the manifest.
 TRIALS_FILE = "trials.hdf5"
 DATA_FILES = {camera: f"grasping_{camera}.hdf5" for camera in CAMERAS}
 FILE_NAME = "manifest.json"
-#: Where the built-in objects' meshes are put when they are asked for.
+#: Folder of the meshes of the built-in objects, in a dataset that is built from them.
 BUILTIN_FOLDER = "builtin"
-#: Folders that a build makes; alone they do not make a directory somebody else's.
+#: Folders that a build makes.
 OWN_FOLDERS = (BUILTIN_FOLDER, "objects", "shards")
-#: Files that a build writes besides the manifest; likewise.
+#: Files that a build writes besides the manifest.
 OWN_FILES = (build_lock.FILE_NAME, build_log.FILE_NAME)
 
 
 def model_path(out: Path, name: str) -> Path:
-    """Return where a dataset keeps an object's meshes and mass properties."""
+    """Return the path of an object's meshes and mass properties."""
     return out / "objects" / f"{name}.npz"
 
 
 def plan_path(out: Path, name: str) -> Path:
-    """Return where a dataset keeps an object's resting pose and palm poses."""
+    """Return the path of an object's resting pose and palm poses."""
     return out / "objects" / f"{name}.plan.h5"
 
 
 def model_file_sha256(out: Path, name: str) -> str:
-    """Return the hash of the file that keeps an object's meshes, hexadecimal."""
+    """Return the hash of the file of an object's meshes, hexadecimal."""
     return hashlib.sha256(model_path(out, name).read_bytes()).hexdigest()
 
 
 def refuse_changed_object(out: Path, name: str) -> None:
-    """Refuse an object of which either file is missing or not as it was written.
+    """Refuse an object if one of its two files is missing or has changed.
+
+    The plan is sealed, and holds the hash of the other file.
 
     Raises:
-        DataError: If so. The plan is sealed, and vouches for the other file.
+        DataError: If a file is missing or has changed.
     """
     path, model = plan_path(out, name), model_path(out, name)
     refuse_broken_seal(path, "plan of an object")

@@ -1,20 +1,20 @@
-"""Objects at rest with their palm poses, and where they are kept.
+"""Objects at rest with their palm poses, and their files.
 
-In: an object as `build.prepare` makes it. Out: `objects/<name>.npz` with the object and
-`objects/<name>.plan.h5` with its resting pose and its palm poses, in the dataset's directory. Work
-units, `check` and `replay` start from these two files and need the mesh file no more.
+In: an object that `build.prepare` made. Out: `objects/<name>.npz` with the object and
+`objects/<name>.plan.h5` with its resting pose and palm poses, in the dataset's directory. Work
+units, `check` and `replay` read these two files and do not need the mesh file.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 
 from drakegrasp.config import Config
+from drakegrasp.dataset.manifest import ObjectEntry
 from drakegrasp.dataset.paths import model_file_sha256, model_path, plan_path, refuse_changed_object
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array
@@ -32,7 +32,7 @@ class PreparedObject:
         X_TO: Resting pose (4, 4).
         candidates: Palm poses and their rays.
         table_force: Upward force of the table at rest [N].
-        stopped: Whether it would have rolled on and was stopped, see `settle.settle`.
+        stopped: Whether the object would have rolled on and was stopped, see `settle.settle`.
     """
 
     model: ObjectModel
@@ -41,27 +41,31 @@ class PreparedObject:
     table_force: float
     stopped: bool
 
-    def summary(self) -> dict[str, Any]:
-        """Return what the manifest says of the object, as JSON types."""
-        return {
-            "name": self.model.name,
-            "class": self.model.class_name,
-            "mesh_sha256": self.model.mesh_sha256,
-            "mass": self.model.mass,
-            "X_TO": self.X_TO[:3].ravel().tolist(),
-            "rolled": self.stopped,
-            "candidates": len(self.candidates),
-            "combinations": self.candidates.combinations,
-            "valid": self.candidates.valid,
-            "distinct": self.candidates.distinct,
-            "notes": list(self.model.notes),
-        }
+    def entry(self) -> ObjectEntry:
+        """Return the object's entry in the manifest."""
+        return ObjectEntry(
+            name=self.model.name,
+            class_name=self.model.class_name,
+            mesh_sha256=self.model.mesh_sha256,
+            mass=self.model.mass,
+            X_TO=tuple(self.X_TO[:3].ravel().tolist()),
+            rolled=self.stopped,
+            candidates=len(self.candidates),
+            combinations=self.candidates.combinations,
+            valid=self.candidates.valid,
+            distinct=self.candidates.distinct,
+            notes=self.model.notes,
+        )
 
 
 def save_prepared(prepared: PreparedObject, out: Path, config: Config) -> None:
-    """Write both files of an object; the plan comes last, so it vouches for the other."""
-    folder = out / "objects"
-    folder.mkdir(parents=True, exist_ok=True)
+    """Write both files of an object; the plan comes last, with the hash of the other file.
+
+    Args:
+        prepared: The object.
+        out: Directory of the dataset.
+        config: Configuration of the dataset.
+    """
     model, candidates = prepared.model, prepared.candidates
     save_object(model, model_path(out, model.name))
     with atomic_hdf5(plan_path(out, model.name), sealed=True) as file:
@@ -85,9 +89,11 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
 
     Raises:
         DataError: If its files are missing, damaged or of another configuration.
-        MeshError: If the object's file is damaged.
+        MeshError: If the file of its meshes is of another version.
     """
     path = plan_path(out, name)
+
+    # Both files must be as they were written, and of this configuration.
     refuse_changed_object(out, name)
     try:
         with h5py.File(path, "r") as file:
@@ -100,9 +106,11 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
             f"{path}: must be of configuration {config.simulation_hash()}, "
             f"got {attributes['config_hash']}"
         )
+
     model = load_object(model_path(out, name))
     if model.mesh_sha256 != attributes["mesh_sha256"]:
         raise DataError(f"{path}: must be of the same mesh as {name}.npz, got another")
+
     return PreparedObject(
         model=model,
         X_TO=arrays["X_TO"],

@@ -1,4 +1,4 @@
-"""Reading a dataset: h5py and NumPy only, no Drake, no trimesh, no Dask.
+"""Reading a dataset. Imports h5py and NumPy, but no Drake, no trimesh and no Dask.
 
 >>> data = GraspDataset("OUT/grasping_oto.hdf5", split="train")   # doctest: +SKIP
 >>> data[0].image.shape, data[0].grasp.shape                      # doctest: +SKIP
@@ -24,14 +24,14 @@ from drakegrasp.errors import DataError
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sample:
-    """One grasp with what its camera saw.
+    """One grasp with the image of its camera.
 
     Attributes:
         image: (4, S, S) float32: R, G, B in 0..1 and depth [m].
-        mask: (S, S) uint8, 1 where the object is.
-        grasp: (6k,) float32, contact points [m] and outward unit normals, in the camera frame.
-        trial_id: Row of trials.hdf5.
-        props: The fields of `object_props` by name: names, mass properties, frames.
+        mask: (S, S) uint8, 1 where the object is seen.
+        grasp: (6k,) float32, contact points [m], then outward unit normals, in the camera frame.
+        trial_id: Row of /trials in trials.hdf5.
+        props: Fields of `object_props` by name: names, mass properties, frames.
     """
 
     image: npt.NDArray[np.float32]
@@ -44,19 +44,20 @@ class Sample:
 class GraspDataset:
     """One split of a data file as a sequence of samples.
 
-    It works under torch's DataLoader with any number of workers: the file is opened when a
-    process first reads from it, never before a fork, and is left out when pickled.
+    Works with torch's DataLoader and any number of workers: each process opens the file when it
+    first reads from it, and a pickle holds no open file.
 
     Args:
         path: `grasping_oto.hdf5` or `grasping_otm.hdf5`.
         split: `train`, `valid` or `test`.
 
     Attributes:
-        camera: Whose images and frame the file has, `oto` or `otm`.
-        K: (3, 3), camera matrix [px].
+        path, split: As given.
+        camera: Camera of the images and of the grasps' frame, `oto` or `otm`.
+        K: Camera matrix (3, 3) [px].
 
     Raises:
-        DataError: If the file is missing, of another kind or schema, or the split unknown.
+        DataError: If the file is missing, of another kind or schema, or the split is unknown.
     """
 
     def __init__(self, path: str | Path, *, split: str = "train") -> None:
@@ -82,9 +83,11 @@ class GraspDataset:
         return self._length
 
     def __getitem__(self, index: int) -> Sample:
+        # As a list: negative from the end, IndexError beyond it.
         index = operator.index(index)
         if not -self._length <= index < self._length:
             raise IndexError(f"index must be below {self._length}, got {index}")
+
         group = self._open()[self.split]
         row = index % self._length
         values = {f.name: _value(group[f.name], row, f.dtype) for f in DATA_FIELDS}
@@ -101,7 +104,7 @@ class GraspDataset:
         return (self[i] for i in range(len(self)))
 
     def column(self, name: str) -> npt.NDArray[Any]:
-        """Return all rows of a field at once, e.g. `grasps` or `object_props/work2com`.
+        """Return all rows (n, ...) of a field, e.g. `grasps` or `object_props/work2com`.
 
         Raises:
             DataError: If there is no such field.
@@ -129,5 +132,6 @@ class GraspDataset:
 
 
 def _value(dataset: h5py.Dataset, row: int, dtype: str) -> Any:
+    """Return one row of a dataset; text as str."""
     value = dataset[row]
     return value.decode() if dtype == "str" else value

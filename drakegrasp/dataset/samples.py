@@ -1,7 +1,7 @@
-"""Writing samples: from the looks of a shard to their places in both data files.
+"""The shards in the order of the dataset's rows, and the samples that are copied from them.
 
-In: a part of the dataset and, by split, the ids of the trials that are samples. Out: rows
-of `grasping_oto.hdf5` and `grasping_otm.hdf5`.
+In: the manifest, the shards and, by split, the ids of the trials that are samples. Out: rows of
+`grasping_oto.hdf5` and `grasping_otm.hdf5`.
 """
 
 from __future__ import annotations
@@ -27,17 +27,76 @@ from drakegrasp.objects.model import ObjectModel, load_object
 from drakegrasp.outcomes import Outcome
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ShardSlice:
+    """The rows of a shard that the dataset takes, and their place.
+
+    Attributes:
+        header: Of the shard.
+        object: Row of its object in /objects.
+        first: Id of the trial in its first row.
+        rows: Number of rows taken, from the first.
+        shapes: Shape of one row of each column, and of an image as "image".
+    """
+
+    header: ShardHeader
+    object: int
+    first: int
+    rows: int
+    shapes: Mapping[str, tuple[int, ...]]
+
+
+def walk_shards(out: Path, manifest: Manifest) -> Iterator[tuple[ShardSlice, Shard]]:
+    """Yield the shards in the order of their rows, each object's up to its last wanted grasp.
+
+    Raises:
+        DataError: If a shard is missing or damaged.
+    """
+    index = {entry.name: i for i, entry in enumerate(manifest.objects)}
+    wanted: dict[str, int | None] = dict.fromkeys(index, manifest.config.max_grasps)
+    first = 0
+    for header in manifest.headers():
+        name = header.object_name
+        if wanted[name] == 0:
+            continue
+        shard = read_shard(header.path(out), header)
+        rows, wanted[name] = rows_within(shard, wanted[name])
+        shapes = {f.name: shard.trials[f.name].shape[1:] for f in trial_columns()}
+        shapes["image"] = shard.looks["mask_oto"].shape[1:]
+        shard_slice = ShardSlice(
+            header=header, object=index[name], first=first, rows=rows, shapes=shapes
+        )
+        yield shard_slice, shard
+        first += rows
+
+
+def rows_within(shard: Shard, wanted: int | None) -> tuple[int, int | None]:
+    """Return how many rows of a shard an object needs, and how many grasps it wants after it.
+
+    The rows end with the last wanted grasp. So a dataset does not depend on how many more
+    attempts the workers had begun when enough grasps were there.
+
+    Args:
+        shard: The shard.
+        wanted: Number of grasps that the object still wants; None for all.
+    """
+    hits = np.flatnonzero(shard.trials["outcome"] == Outcome.SUCCESS)
+    if wanted is None or len(hits) < wanted:
+        return len(shard.trials["outcome"]), None if wanted is None else wanted - len(hits)
+    return int(hits[wanted - 1]) + 1, 0
+
+
 def create_splits(
     file: h5py.File,
     ids: Mapping[str, npt.NDArray[np.int64]],
     shapes: Mapping[str, tuple[int, ...]],
 ) -> None:
-    """Make the splits of a data file with room for their samples.
+    """Create the splits of a data file, with room for their samples.
 
     Args:
         file: The data file.
         ids: Ids of the trials that are samples, by split.
-        shapes: Of a row's columns, see `Part`.
+        shapes: Shapes of one row, see `ShardSlice`.
     """
     letters = sizes(
         fingers=shapes["closed_touching"][0],
@@ -54,20 +113,33 @@ def create_splits(
 def write_samples(
     files: Mapping[str, h5py.File],
     out: Path,
-    part: Part,
+    shard_slice: ShardSlice,
     ids: Mapping[str, npt.NDArray[np.int64]],
 ) -> None:
-    """Write the samples that come from one shard into their places in both files."""
-    bounds = {s: np.searchsorted(ids[s], [part.first, part.first + part.rows]) for s in SPLITS}
+    """Copy the samples of one shard to their places in both data files.
+
+    Args:
+        files: The data files by camera, with their splits.
+        out: Directory of the dataset.
+        shard_slice: Place of the shard, from `walk_shards`, which has verified its seal.
+        ids: Ids of the trials that are samples, in rising order, by split.
+
+    Raises:
+        DataError: If the shard is no longer there.
+    """
+    # Most shards of a hard object have no sample: do not read those.
+    header, first = shard_slice.header, shard_slice.first
+    bounds = {s: np.searchsorted(ids[s], [first, first + shard_slice.rows]) for s in SPLITS}
     if all(start == stop for start, stop in bounds.values()):
         return
-    shard = read_shard(part.header.path(out), part.header)
-    model = load_object(model_path(out, part.header.object_name))
+
+    shard = read_shard(header.path(out), header, verify_seal=False)
+    model = load_object(model_path(out, header.object_name))
     look_of = {int(row): k for k, row in enumerate(shard.looks["row"])}
     for split, (start, stop) in bounds.items():
         for place in range(start, stop):
             trial_id = int(ids[split][place])
-            row = trial_id - part.first
+            row = trial_id - first
             for camera, file in files.items():
                 sample = _sample(model, shard, row, look_of[row], camera)
                 sample["trial_id"] = trial_id
@@ -76,11 +148,23 @@ def write_samples(
 
 
 def _sample(model: ObjectModel, shard: Shard, row: int, k: int, camera: str) -> dict[str, Any]:
-    """Return a sample by the names of DATA_FIELDS, without its trial's id."""
+    """Return a sample by the names of DATA_FIELDS, without its trial's id.
+
+    Args:
+        model: The object.
+        shard: The shard.
+        row: Row of its /trials.
+        k: Row of its /looks.
+        camera: `oto` or `otm`.
+    """
     trials, looks = shard.trials, shard.looks
+
+    # The poses of this sample, and its grasp in {O}.
     X_TO = unpack_pose(trials["X_TO"][row])
     X_TC = {c: unpack_pose(looks[f"X_TC_{c}"][k]) for c in CAMERAS}
     grasp_O = pack_grasp(trials["closed_p_OQ"][row], trials["closed_nhat_Q_O"][row])
+
+    # What does not depend on the camera of the file.
     R_TO = X_TO[:3, :3]
     properties = {
         "object_name": model.name,
@@ -96,52 +180,11 @@ def _sample(model: ObjectModel, shard: Shard, row: int, k: int, camera: str) -> 
         "frame_world2obj": pack_pose(multiply(X_WT, X_TO)),
         "frame_world2work": pack_pose(X_WT),
     }
+
+    # Image, mask, and the grasp in the frame of the file's camera.
     return {
         "images": looks[f"image_{camera}"][k],
         "masks": looks[f"mask_{camera}"][k],
         "grasps": transform_grasp(multiply(invert_pose(X_TC[camera]), X_TO), grasp_O),
         **{f"object_props/{name}": value for name, value in properties.items()},
     }
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Part:
-    """A shard's place in the dataset: its first row, how many rows are taken, their shapes."""
-
-    header: ShardHeader
-    object: int
-    first: int
-    rows: int
-    shapes: Mapping[str, tuple[int, ...]]
-
-
-def walk_parts(out: Path, manifest: Manifest) -> Iterator[tuple[Part, Shard]]:
-    """Yield the shards in the order of their rows, each object's up to its last wanted grasp."""
-    index = {entry["name"]: i for i, entry in enumerate(manifest.objects)}
-    wanted: dict[str, int | None] = dict.fromkeys(index, manifest.config.max_grasps)
-    first = 0
-    for header in manifest.headers():
-        name = header.object_name
-        if wanted[name] == 0:
-            continue
-        shard = read_shard(header.path(out), header)
-        rows, wanted[name] = rows_within(shard, wanted[name])
-        shapes = {f.name: shard.trials[f.name].shape[1:] for f in trial_columns()}
-        shapes["image"] = shard.looks["mask_oto"].shape[1:]
-        yield (
-            Part(header=header, object=index[name], first=first, rows=rows, shapes=shapes),
-            shard,
-        )
-        first += rows
-
-
-def rows_within(shard: Shard, wanted: int | None) -> tuple[int, int | None]:
-    """Return how many rows of a shard an object needs, and how many grasps it then wants.
-
-    The rows end with the last wanted grasp, so what is in a dataset does not depend on how
-    far work had gone when enough was found.
-    """
-    hits = np.flatnonzero(shard.trials["outcome"] == Outcome.SUCCESS)
-    if wanted is None or len(hits) < wanted:
-        return len(shard.trials["outcome"]), None if wanted is None else wanted - len(hits)
-    return int(hits[wanted - 1]) + 1, 0

@@ -1,7 +1,7 @@
-"""Immutable shards: what one work unit found, in one HDF5 file that is whole or absent.
+"""Shards: the results of one work unit, in one immutable HDF5 file that is whole or absent.
 
-A shard's header says what it is of. Its seal, see `drakegrasp.runtime.files`, shows any change
-of a single bit.
+The header of a shard identifies its work unit. Its seal, see `drakegrasp.runtime.files`, shows
+any change of a single bit.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from drakegrasp.dataset.schema import LOOK_FIELDS, SCHEMA_VERSION, TRIAL_FIELDS,
 from drakegrasp.errors import DataError
 from drakegrasp.runtime.files import atomic_hdf5, refuse_broken_seal
 
-#: Fields of `/trials` that only the whole dataset can fill, so no shard has them.
+#: Fields of `/trials` that only the whole dataset knows; no shard has them.
 ASSEMBLED_FIELDS = ("trial_id", "object")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ShardHeader:
-    """What a shard is of: the identity of a work unit.
+    """The identity of a work unit.
 
     Attributes:
         config_hash: `Config.simulation_hash` of the dataset.
@@ -43,7 +43,7 @@ class ShardHeader:
 
     @property
     def label(self) -> str:
-        """What it is of, in words."""
+        """The work unit in words."""
         return (
             f"{self.object_name}, palm poses {self.start} to {self.stop - 1}, "
             f"configuration {self.config_hash}, mesh {self.mesh_sha256[:12]}"
@@ -55,17 +55,23 @@ class ShardHeader:
         return f"{self.start:07d}-{self.stop:07d}.h5"
 
     def path(self, out: Path) -> Path:
-        """Return where the shard is in a dataset's directory."""
+        """Return the path of the shard in a dataset's directory."""
         return out / "shards" / self.object_name / self.file_name
 
     def journal_path(self, out: Path) -> Path:
-        """Return where the journal of a run of the unit is, see `drakegrasp.runtime.journal`."""
+        """Return the path of the work unit's journal, see `drakegrasp.runtime.journal`."""
         return self.path(out).with_suffix(".journal")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Shard:
-    """The arrays of a work unit: `trials` by TRIAL_FIELDS, `looks` by LOOK_FIELDS."""
+    """The results of a work unit.
+
+    Attributes:
+        header: Identity of the unit.
+        trials: Columns by the names of `trial_columns`, a row per attempt.
+        looks: Columns by the names of LOOK_FIELDS, a row per success.
+    """
 
     header: ShardHeader
     trials: Mapping[str, AnyArray]
@@ -91,62 +97,70 @@ def write_shard(out: Path, shard: Shard) -> Path:
     return path
 
 
-def read_shard(path: Path, header: ShardHeader | None = None) -> Shard:
-    """Return a shard, whole and unharmed.
+def read_shard(path: Path, header: ShardHeader | None = None, *, verify_seal: bool = True) -> Shard:
+    """Return a shard.
 
     Args:
         path: Of the file.
-        header: What it must be of, if that matters.
+        header: Identity that the shard must have; any if None.
+        verify_seal: Whether to hash the whole file and compare it with its seal.
 
     Raises:
-        DataError: If it is missing, truncated or changed by a single bit, or of another schema,
-            configuration, mesh or range; the message names the file and the reason.
+        DataError: If the file is missing, truncated or changed by a single bit, or of another
+            schema, configuration, mesh or range; the message names the file and the reason.
     """
-    with _open_shard(path, header) as (file, found):
+    with _open_shard(path, header, verify_seal=verify_seal) as (file, own_header):
         return Shard(
-            header=found,
+            header=own_header,
             trials={f.name: file["trials"][f.name][:] for f in trial_columns()},
             looks={f.name: file["looks"][f.name][:] for f in LOOK_FIELDS},
         )
 
 
-def read_outcomes(path: Path, header: ShardHeader, *, trust: bool = False) -> npt.NDArray[np.uint8]:
-    """Return the outcomes of a shard's attempts, without its other columns.
+def read_outcomes(
+    path: Path, header: ShardHeader, *, verify_seal: bool = True
+) -> npt.NDArray[np.uint8]:
+    """Return the `Outcome` (n,) of each attempt of a shard, without its other columns.
 
     Args:
         path: Of the file.
-        header: What it must be of.
-        trust: Whether to leave out the check of its seal, which reads all of it.
+        header: Identity that the shard must have.
+        verify_seal: Whether to verify the seal, which reads the whole file.
 
     Raises:
         DataError: See `read_shard`.
     """
-    with _open_shard(path, header, trust=trust) as (file, _):
+    with _open_shard(path, header, verify_seal=verify_seal) as (file, _):
         return np.asarray(file["trials/outcome"][:])
 
 
 @contextmanager
 def _open_shard(
-    path: Path, header: ShardHeader | None, *, trust: bool = False
+    path: Path, header: ShardHeader | None, *, verify_seal: bool
 ) -> Iterator[tuple[h5py.File, ShardHeader]]:
-    if not trust:
+    """Open a shard for reading, with its header; errors of the block mean a damaged shard."""
+    if verify_seal:
         refuse_broken_seal(path)
     try:
         with h5py.File(path, "r") as file:
+            # The version first: another schema may have other attributes.
             version = int(file.attrs["schema_version"])
             if version != SCHEMA_VERSION:
                 raise DataError(f"{path}: schema must be {SCHEMA_VERSION}, got {version}")
-            found = ShardHeader(
+
+            # Then its identity: a file may have been copied to the path of another unit.
+            own_header = ShardHeader(
                 config_hash=str(file.attrs["config_hash"]),
                 mesh_sha256=str(file.attrs["mesh_sha256"]),
                 object_name=str(file.attrs["object_name"]),
                 start=int(file.attrs["start"]),
                 stop=int(file.attrs["stop"]),
             )
-            if header is not None and found != header:
+            if header is not None and own_header != header:
                 raise DataError(
-                    f"{path}: must be a shard of {header.label}, got one of {found.label}"
+                    f"{path}: must be a shard of {header.label}, got one of {own_header.label}"
                 )
-            yield file, found
+
+            yield file, own_header
     except (OSError, KeyError) as error:
         raise DataError(f"{path}: must be a complete shard, got another file ({error})") from None

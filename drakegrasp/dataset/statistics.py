@@ -1,6 +1,6 @@
-"""Counting what a dataset holds: the funnel by object and the paper's Table III.
+"""Counts of a dataset: the funnel by object, and the paper's Table III.
 
-While a build runs, or after one that was stopped, the funnel is counted from the shards.
+While a build runs, or after it was stopped, the funnel is counted from the shards.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from drakegrasp.outcomes import Outcome
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Funnel:
-    """What became of the candidates, by object.
+    """Numbers of candidates, outcomes and removals, by object, for m objects.
 
     Attributes:
         names, classes: (m,), of the objects.
-        candidates: (m,) palm poses that were tried, drawn from `distinct` different ones of
-            `valid` combinations.
-        distinct, valid: (m,).
-        outcomes: (m, number of outcomes), attempts by object and outcome.
-        removals: (m, number of removals), successes by object and reason of removal.
+        candidates: (m,), palm poses to try, drawn from the distinct ones.
+        distinct: (m,), different palm poses among the valid ones.
+        valid: (m,), combinations of rotations above the table whose palm ray meets the object.
+        outcomes: (m, 1 + max(Outcome)), attempts by object and outcome.
+        removals: (m, 1 + max(Removal)), successes by object and reason of removal.
     """
 
     names: tuple[str, ...]
@@ -46,7 +46,7 @@ class Funnel:
 
 @dataclass(frozen=True, kw_only=True)
 class SplitCount:
-    """A row of the paper's Table III."""
+    """A row of the paper's Table III: numbers of samples, objects and classes of a split."""
 
     split: str
     samples: int
@@ -56,11 +56,11 @@ class SplitCount:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Unfinished:
-    """What a build that runs, or was stopped, has done.
+    """The state of a build that runs or was stopped.
 
     Attributes:
-        funnel: Of the work units that are done; no success is a sample yet.
-        done, total: Number of work units; `max_grasps` may leave some out.
+        funnel: Counts of the work units that are done; no success is a sample yet.
+        done, total: Numbers of work units; `max_grasps` may leave some out.
     """
 
     funnel: Funnel
@@ -69,33 +69,35 @@ class Unfinished:
 
 
 def count_unfinished(out: Path) -> Unfinished | None:
-    """Return what a build has done so far, or None if its files are complete.
+    """Return the state of a build, or None if its files are complete or there is none.
 
-    Shards are counted as they are, without a look at their seals; what is being written is
-    not there yet.
+    The seals of the shards are not verified, which would read all of them.
 
     Raises:
         DataError: If the directory holds no dataset.
     """
     if not (out / FILE_NAME).exists() or is_assembled(out):
         return None
+
+    # Add up the outcomes of the shards that exist.
     manifest = read_manifest(out)
-    names = [entry["name"] for entry in manifest.objects]
+    names = [entry.name for entry in manifest.objects]
     rows = {name: i for i, name in enumerate(names)}
     outcomes, done = np.zeros((len(names), 1 + max(Outcome)), dtype=np.int64), 0
     for header in manifest.headers():
         try:
-            found = read_outcomes(header.path(out), header, trust=True)
+            unit = read_outcomes(header.path(out), header, verify_seal=False)
         except DataError:
             continue
-        outcomes[rows[header.object_name]] += np.bincount(found, minlength=1 + max(Outcome))
+        outcomes[rows[header.object_name]] += np.bincount(unit, minlength=1 + max(Outcome))
         done += 1
+
     funnel = Funnel(
         names=tuple(names),
-        classes=tuple(entry["class"] for entry in manifest.objects),
-        candidates=np.array([entry["candidates"] for entry in manifest.objects], dtype=np.int64),
-        distinct=np.array([entry["distinct"] for entry in manifest.objects], dtype=np.int64),
-        valid=np.array([entry["valid"] for entry in manifest.objects], dtype=np.int64),
+        classes=tuple(entry.class_name for entry in manifest.objects),
+        candidates=np.array([entry.candidates for entry in manifest.objects], dtype=np.int64),
+        distinct=np.array([entry.distinct for entry in manifest.objects], dtype=np.int64),
+        valid=np.array([entry.valid for entry in manifest.objects], dtype=np.int64),
         outcomes=outcomes,
         removals=np.zeros((len(names), 1 + max(Removal)), dtype=np.int64),
     )
@@ -108,6 +110,7 @@ def count_funnel(out: Path) -> Funnel:
     Raises:
         DataError: If trials.hdf5 is missing or damaged.
     """
+    # The columns that are counted, whole: a few bytes per trial.
     try:
         with h5py.File(out / TRIALS_FILE, "r") as file:
             objects = {name: values[:] for name, values in file["objects"].items()}
@@ -117,6 +120,7 @@ def count_funnel(out: Path) -> Funnel:
             removal = file["successes/removal"][:]
     except (OSError, KeyError) as error:
         raise DataError(f"{out}: must hold {TRIALS_FILE}, got none ({error})") from None
+
     count = len(objects["name"])
     return Funnel(
         names=tuple(name.decode() for name in objects["name"]),
@@ -154,6 +158,7 @@ def count_splits(out: Path) -> list[SplitCount]:
 def _count_pairs(
     rows: npt.NDArray[np.int32], columns: npt.NDArray[np.uint8], height: int, width: int
 ) -> npt.NDArray[np.int64]:
+    """Return how often each pair of a row and a column occurs, (height, width)."""
     counts = np.zeros((height, width), dtype=np.int64)
     np.add.at(counts, (rows, columns), 1)
     return counts

@@ -1,13 +1,12 @@
-"""The hand: what an SDFormat file and a YAML file say of it.
+"""The description of a hand, from an SDFormat file and a YAML file.
 
-In: a YAML file and the SDFormat file that it names. Out: a `Hand`. Nothing here knows a
-particular hand or a number of fingers. `load_hand` reads the YAML, has Drake parse the
-SDFormat file once, checks one against the other, and keeps each finger's joints as
-constants; `kinematics` needs no more than those.
+In: a YAML file and the SDFormat file that it names. Out: a `Hand`, of any kind and with any number
+of fingers. `load_hand` reads the YAML, lets Drake parse the SDFormat file once, checks one against
+the other, and stores the joints of each finger as constants, which is all that `kinematics` needs.
 
-The coordinates of a hand with k fingers are c = (spread, closing of finger 1..k) [rad];
-each joint is driven by exactly one of them: its angle is `gain @ c`. Frames: B palm link,
-G palm, Fi distal (fingertip) link of finger i, P a point on it.
+The coordinates of a hand with k fingers are c = (spread, closing of finger 1..k) [rad]. Exactly one
+coordinate drives each joint; the joint's angle is `gain @ c`. Frames: B palm link, G palm, Fi
+distal (fingertip) link of finger i, P a point on it, J a joint.
 """
 
 from __future__ import annotations
@@ -25,7 +24,8 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RevoluteJoint, RigidBody, WeldJoint
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.errors import HandError
+from drakegrasp.config import describe_mistake
+from drakegrasp.errors import HandError, first_line, one_line
 from drakegrasp.frames import Array, invert_pose, make_pose
 from drakegrasp.hand.files import hand_file
 from drakegrasp.runtime.environment import allow_network
@@ -54,7 +54,7 @@ class Coupling:
 @with_config(_STRICT)
 @dataclass(frozen=True, kw_only=True)
 class Finger:
-    """A finger as the YAML describes it; its kinematics is the hand's `Chain`."""
+    """A finger as the YAML describes it; its kinematics is its `Chain`."""
 
     name: Name
     fingertip: Name  # link, frame Fi
@@ -63,7 +63,7 @@ class Finger:
     rotor_inertia: NonNegative = 0.0  # of the motor [kg m^2]
     gear_ratio: Positive = 1.0  # motor angle / closing angle
     coupled: tuple[Coupling, ...] = ()
-    pad_point: Vector  # where contacts usually are, in Fi [m]
+    pad_point: Vector  # usual contact point, in Fi [m]
 
     @property
     def p_FiP(self) -> Array:
@@ -74,7 +74,7 @@ class Finger:
 @with_config(_STRICT)
 @dataclass(frozen=True, kw_only=True)
 class Spread:
-    """The joints that all stand at the spread angle during an attempt; a hand may have none."""
+    """The joints that keep the spread angle during an attempt; a hand may have none."""
 
     joints: tuple[Name, ...] = ()
 
@@ -83,14 +83,14 @@ class Spread:
 class Chain:
     """The m revolute joints from the palm to one link, as constants.
 
-    With angles q = gain @ c the pose of the link in the palm frame is
+    With angles q = gain @ c, the pose of the link in the palm frame is
     X_GFi = X_PJ[0] R(axis[0], q[0]) X_PJ[1] R(axis[1], q[1]) ... X_JFi.
     """
 
-    X_PJ: Array  # (m, 4, 4), of each joint in the turning frame before it; the first in G
+    X_PJ: Array  # (m, 4, 4), each joint in the moving frame of the joint before; the first in G
     axis: Array  # (m, 3), unit, in the joint's frame J
     gain: Array  # (m, 1 + k), angles per coordinate
-    X_JFi: Array  # (4, 4), the link in the last joint's turning frame
+    X_JFi: Array  # (4, 4), the link in the moving frame of the last joint
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -109,7 +109,7 @@ class Hand:
     joint_gain: Array  # (n, 1 + k), angles per coordinate; one non-zero in each row
     joint_limits: Array  # (n, 2), lower and upper [rad]
     chains: tuple[Chain, ...]  # one per finger, to its fingertip
-    link_chains: dict[str, Chain]  # one per link that the palm carries, itself included
+    link_chains: dict[str, Chain]  # one per link that the palm carries, including the palm
 
     @property
     def num_fingers(self) -> int:
@@ -142,30 +142,32 @@ class _Description(BaseModel):
 
 
 def make_parser(plant: MultibodyPlant) -> Parser:
-    """Return a parser for a plant that works where Drake is told to stay off the network.
+    """Return a parser for a plant that also works under `DRAKE_ALLOW_NETWORK=none`.
 
-    A Drake parser registers a remote package that our models do not use; under the ban that
-    alone raises. Nothing is downloaded.
+    A Drake parser registers a remote package, which raises under that setting even though our
+    models do not use the package. Nothing is downloaded.
     """
     with allow_network("package_map"):
         return Parser(plant)
 
 
 def load_hand(name_or_yaml: str | Path = "barrett") -> Hand:
-    """Return a hand that comes with the package, or the one of a YAML file.
+    """Return a hand that comes with the package, or the hand of a YAML file.
 
     Args:
         name_or_yaml: One of `files.hand_names()`, or the path of a YAML file with the keys of
-            `models/barrett_hand.yaml`, whose `model` is found relative to it.
+            `models/barrett_hand.yaml`; its `model` is a path relative to the YAML file.
 
     Raises:
         HandError: If there is no such hand, a key or value of the YAML cannot be used, or
             the SDFormat model lacks a link or joint that the YAML names.
     """
+    # Use a hand that was loaded before, if its files did not change.
     path = hand_file(name_or_yaml)
     known = _loaded.get(path)
     if known is not None and known[1] == _stamp(path, known[0].sdf_path):
         return known[0]
+
     description = _read_description(path)
     sdf_path = path.parent.resolve() / description.model
     try:
@@ -176,44 +178,33 @@ def load_hand(name_or_yaml: str | Path = "barrett") -> Hand:
     return hand
 
 
-#: Hands that were loaded, with what their two files were like then: parsing takes 40 ms.
+#: Loaded hands, with the sizes and times of their two files: parsing takes 40 ms.
 _loaded: dict[Path, tuple[Hand, tuple[int, ...]]] = {}
 
 
 def _stamp(*paths: Path) -> tuple[int, ...]:
-    """Return sizes and times of change of files; a file that is gone has neither."""
-    found = [path.stat() for path in paths if path.exists()]
-    return tuple(number for s in found for number in (s.st_size, s.st_mtime_ns))
+    """Return sizes [byte] and modification times [ns] of the files that exist."""
+    stats = [path.stat() for path in paths if path.exists()]
+    return tuple(number for s in stats for number in (s.st_size, s.st_mtime_ns))
 
 
 def _read_description(path: Path) -> _Description:
     try:
         tree = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        first = str(error).splitlines()[0]
-        raise HandError(f"{path}: must be YAML, got text that is not ({first})") from None
+        raise HandError(f"{path}: must be YAML, got text that is not ({one_line(error)})") from None
     try:
         return _Description.model_validate(tree)
     except ValidationError as error:
-        lines = "; ".join(_describe(e) for e in error.errors())
-        raise HandError(f"{path}: {lines}") from None
-
-
-def _describe(error: Any) -> str:
-    """Return one pydantic error as `path: must ..., got ...`."""
-    where = ".".join(str(part) for part in error["loc"]) or "hand"
-    kind, got = error["type"], error["input"]
-    if kind in ("extra_forbidden", "unexpected_keyword_argument"):
-        return f"{where}: must be a key of a hand file, got an unknown one"
-    if kind == "missing":
-        return f"{where}: must be given, got nothing"
-    message = str(error["msg"]).removeprefix("Value error, ")
-    if kind == "value_error":
-        return f"{where}: {message}"
-    return f"{where}: must be {message.removeprefix('Input should be ')}, got {got!r}"
+        lines = [
+            describe_mistake(mistake, whole="hand", legal="a key of a hand file")
+            for mistake in error.errors()
+        ]
+        raise HandError(f"{path}: {'; '.join(lines)}") from None
 
 
 def _build_hand(name: str, description: _Description, sdf_path: Path) -> Hand:
+    # Parse the model, and assign each joint to a coordinate.
     plant, instance = _parse(sdf_path)
     palm = description.palm
     R_BG = RollPitchYaw(np.deg2rad(palm.rpy_deg)).ToRotationMatrix()
@@ -221,6 +212,8 @@ def _build_hand(name: str, description: _Description, sdf_path: Path) -> Hand:
     joints = _joints(plant, instance)
     revolute = {j.name(): j for j in joints if isinstance(j, RevoluteJoint)}
     gains = _gains(description, list(revolute))
+
+    # The chain from the palm to each fingertip; the finger's own closing joint must be in it.
     bodies = {body.name(): body for body in map(plant.get_body, plant.GetBodyIndices(instance))}
     base = _body(bodies, palm.link, "palm.link")
     chains = []
@@ -233,6 +226,7 @@ def _build_hand(name: str, description: _Description, sdf_path: Path) -> Hand:
                 f"got {finger.closing_joint!r}"
             )
         chains.append(chain)
+
     return Hand(
         name=name,
         sdf_path=sdf_path,
@@ -257,9 +251,9 @@ def _build_hand(name: str, description: _Description, sdf_path: Path) -> Hand:
 
 
 def _parse(sdf_path: Path) -> tuple[MultibodyPlant, ModelInstanceIndex]:
-    """Return the model alone in a plant, without its geometry and not finalized.
+    """Return a plant with the model alone, without geometry and not finalized.
 
-    Finalizing would add a floating joint for the palm to the model's own joints.
+    Finalizing would add a floating joint for the palm.
     """
     if not sdf_path.is_file():
         raise HandError(f"model: must be an SDFormat file, got {str(sdf_path)!r}")
@@ -267,8 +261,7 @@ def _parse(sdf_path: Path) -> tuple[MultibodyPlant, ModelInstanceIndex]:
     try:
         (instance,) = make_parser(plant).AddModels(sdf_path)
     except (RuntimeError, ValueError) as error:
-        first = str(error).splitlines()[0]
-        raise HandError(f"model: must be a file of one model, got {first}") from None
+        raise HandError(f"model: must be a file of one model, got {first_line(error)}") from None
     return plant, instance
 
 
@@ -291,11 +284,14 @@ def _body(bodies: dict[str, RigidBody], name: str, key: str) -> RigidBody:
 
 def _gains(description: _Description, joints: list[str]) -> dict[str, Array]:
     """Return each revolute joint's angle per coordinate, (1 + k,)."""
+    # List which coordinate the YAML gives each joint, with the key that says so.
     drives = [(f"spread.joints.{n}", j, 0, 1.0) for n, j in enumerate(description.spread.joints)]
     for i, finger in enumerate(description.fingers):
         drives.append((f"fingers.{i}.closing_joint", finger.closing_joint, 1 + i, 1.0))
         for n, coupling in enumerate(finger.coupled):
             drives.append((f"fingers.{i}.coupled.{n}.joint", coupling.joint, 1 + i, coupling.ratio))
+
+    # Each joint must be driven once, and only once.
     gains: dict[str, Array] = {}
     for key, joint, column, ratio in drives:
         if joint not in joints:
@@ -314,7 +310,7 @@ def _gains(description: _Description, joints: list[str]) -> dict[str, Array]:
 
 
 def _is_carried(joints: list[Any], body: RigidBody, base: RigidBody) -> bool:
-    """Return whether a link is the palm link or hangs on it."""
+    """Return whether a link is the palm link or is joined to it."""
     parents = {joint.child_body().index(): joint.parent_body().index() for joint in joints}
     index = body.index()
     while index != base.index() and index in parents:
@@ -325,11 +321,17 @@ def _is_carried(joints: list[Any], body: RigidBody, base: RigidBody) -> bool:
 def _chain(
     joints: list[Any], tip: RigidBody, base: RigidBody, gains: dict[str, Array], X_GB: Array
 ) -> Chain:
+    """Return the chain of joints from the palm to a link.
+
+    Raises:
+        HandError: If no chain of joints connects them.
+    """
+    # Collect the joints on the way from the link up to the palm link.
     by_child = {joint.child_body().index(): joint for joint in joints}
     path: list[Any] = []
     body = tip
     while body.index() != base.index():
-        # Taken out, so that a closed loop of links ends here as well.
+        # Remove each joint that was used, so that a closed loop of links ends, too.
         joint = by_child.pop(body.index(), None)
         if joint is None:
             raise HandError(
@@ -338,6 +340,8 @@ def _chain(
             )
         path.insert(0, joint)
         body = joint.parent_body()
+
+    # Multiply the constant poses between two revolute joints into one.
     X, X_PJ, axes = X_GB, [], []
     for joint in path:
         X = multiply(X, joint.frame_on_parent().GetFixedPoseInBodyFrame().GetAsMatrix4())
@@ -350,6 +354,7 @@ def _chain(
         X = multiply(
             X, invert_pose(joint.frame_on_child().GetFixedPoseInBodyFrame().GetAsMatrix4())
         )
+
     gain = [gains[joint.name()] for joint in path if isinstance(joint, RevoluteJoint)]
     k = len(next(iter(gains.values())))
     return Chain(

@@ -1,4 +1,4 @@
-"""Where a hand's files are and which they are; without Drake, so that readers can ask."""
+"""Locates and hashes a hand's files. Does not import Drake."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from drakegrasp.errors import HandError
 
-#: Where the table and the hands that come with the package are, these as `<name>_hand.yaml`.
+#: Folder of the table and of the hands that come with the package, as `<name>_hand.yaml`.
 MODELS = Path(__file__).resolve().parent.parent / "models"
 
 
@@ -18,7 +18,7 @@ def hand_names() -> list[str]:
 
 
 def hand_file(name_or_yaml: str | Path) -> Path:
-    """Return the YAML file of a hand that comes with the package, or the one that is named.
+    """Return the YAML file of a hand that comes with the package, or the given YAML file.
 
     Raises:
         HandError: If there is no such file.
@@ -35,8 +35,8 @@ def hand_file(name_or_yaml: str | Path) -> Path:
 def hand_digest(name_or_yaml: str | Path) -> str:
     """Return a hash (16 hex digits) of a hand's YAML, its SDFormat model and the meshes in it.
 
-    It tells two hands of one name apart. A file that is named but missing counts as empty:
-    `description.load_hand` is the one that refuses it.
+    It distinguishes two hands of the same name. A missing file counts as empty; refusing it is
+    left to `description.load_hand`.
 
     Raises:
         HandError: If there is no such hand.

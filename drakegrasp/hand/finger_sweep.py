@@ -1,8 +1,8 @@
-"""Where points of a hand's surface are while its fingers close, for one angle of the spread.
+"""Paths of points on a hand's surface while its fingers close, at one angle of the spread.
 
-In: a `Hand` and a spread. Out: `HandPaths`, in the palm frame: points of the links that
-closing does not move, and for each finger those of the links that it does, at closing angles
-from the open hand to the limit, half a degree apart. Only geometry is looked at here.
+In: a `Hand` and a spread. Out: `HandPaths`, in the palm frame: points of the links that closing
+does not move, and for each finger the points of the links that it moves, at closing angles half a
+degree apart, from the open hand to the limit. This is geometry only, without a simulation.
 """
 
 from __future__ import annotations
@@ -20,18 +20,19 @@ from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import coordinate_limits, link_poses
 from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.mesh.distance_field import DistanceField, make_distance_field
+from drakegrasp.mesh.surfaces import cover_triangles
 
 Points = npt.NDArray[np.float32]
 
-#: Between two closing angles of a path [rad]; a fingertip of a hand moves by about 1 mm.
+#: Step between two closing angles of a path [rad]; a fingertip moves by about 1 mm.
 ANGLE_STEP = np.deg2rad(0.5)
-#: Points of a fingertip link, and of another link, are about so far apart [m].
+#: Approximate spacing of the points of a fingertip link, and of another link [m].
 TIP_SPACING, LINK_SPACING = 0.003, 0.005
-#: A point that moves by less than this from one angle to the next is on the joint [m].
+#: A point that moves by less than this per step is on the joint's axis and left out [m].
 STILL = 5e-5
-#: Angles of a path from one look at the gap between fingertips to the next.
+#: The gap between fingertips is computed at every so many-th angle of a path.
 GAP_STRIDE = 5
-#: Postures of hands whose paths a process keeps.
+#: Number of hands and spreads whose paths a process keeps.
 KEPT = 16
 
 
@@ -41,7 +42,7 @@ class FingerPath:
 
     Attributes:
         angles: (m,), closing angles from 0 to the limit [rad].
-        points: (m, n, 3), points of the links in {G} [m]; those of the fingertip come first.
+        points: (m, n, 3), points of the links in {G} [m]; the points of the fingertip come first.
         tip: Number of points of the fingertip.
         travel: (n,), largest distance that each moves from one angle to the next [m].
     """
@@ -72,14 +73,17 @@ class HandPaths:
 def hand_paths(hand: Hand, spread: float) -> HandPaths | None:
     """Return the paths of a hand's fingers at a spread [rad].
 
-    None is for a hand in which a link is moved by several fingers or the fingers' closing
-    is not limited: its attempts are all simulated.
+    They are None for a hand in which several fingers move one link, or a finger's closing has no
+    limit: all its attempts are simulated.
     """
+    # Which fingers move each link.
     closing_gain = {link: chain.gain[:, 1:] for link, chain in hand.link_chains.items()}
     movers = {link: np.flatnonzero(gain.any(axis=0)) for link, gain in closing_gain.items()}
     limits = coordinate_limits(hand)[1:, 1]
     if max(map(len, movers.values())) > 1 or not np.all((limits > 0.0) & np.isfinite(limits)):
         return None
+
+    # Links that no finger moves stay where they are at this spread.
     surfaces = link_points(hand)
     opened = np.zeros(hand.num_fingers)
     still = [
@@ -87,6 +91,8 @@ def hand_paths(hand: Hand, spread: float) -> HandPaths | None:
         for link, moved_by in movers.items()
         if not len(moved_by)
     ]
+
+    # Each finger moves its fingertip and its other links.
     fingers = []
     for i, finger in enumerate(hand.fingers):
         rest = [link for link, by in movers.items() if i in by and link != finger.fingertip]
@@ -101,6 +107,7 @@ def hand_paths(hand: Hand, spread: float) -> HandPaths | None:
 def _finger_path(
     hand: Hand, i: int, rest: list[str], spread: float, limit: float, surfaces: dict[str, Array]
 ) -> FingerPath:
+    """Return the path of finger i, from its fingertip and the rest of its links."""
     angles = np.linspace(0.0, limit, int(np.ceil(limit / ANGLE_STEP)) + 1)
     closing = np.zeros((len(angles), hand.num_fingers))
     closing[:, i] = angles
@@ -109,8 +116,11 @@ def _finger_path(
         X_GL = link_poses(hand, link, spread=spread, closing=closing)
         return _place(X_GL, surfaces[link])
 
+    # Points of all links, the fingertip first.
     tip = placed(hand.fingers[i].fingertip)
     points = np.concatenate([tip, *map(placed, rest)], axis=1)
+
+    # Leave out points that do not move.
     travel = norm(np.diff(points, axis=0)).astype(np.float32).max(axis=0)
     moving = travel > STILL
     return FingerPath(
@@ -130,12 +140,16 @@ def _place(X_GL: Array, p_LQ: Array) -> Points:
 def _gaps(
     hand: Hand, fingers: list[FingerPath], spread: float
 ) -> dict[tuple[int, int], npt.NDArray[np.float32]]:
+    """Return `HandPaths.gaps`: look up points of finger a in the distance field of fingertip b."""
     fields, gaps = _tip_fields(hand), {}
     for b, other in enumerate(fingers):
+        # Poses of fingertip b at its angles.
         closing = np.zeros((len(other.angles[::GAP_STRIDE]), hand.num_fingers))
         closing[:, b] = other.angles[::GAP_STRIDE]
         tip = hand.fingers[b].fingertip
         X_FbG = invert_pose(link_poses(hand, tip, spread=spread, closing=closing))
+
+        # Least distance of fingertip a from it, angle by angle.
         for a in range(b):
             points = fingers[a].points[::GAP_STRIDE, : fingers[a].tip]
             gaps[a, b] = np.column_stack([_gap(fields[b], X, points) for X in X_FbG])
@@ -166,7 +180,7 @@ def link_points(hand: Hand) -> dict[str, Array]:
     points = {}
     for link, shapes in link_shapes(hand).items():
         spacing = TIP_SPACING if link in hand.fingertip_links else LINK_SPACING
-        found = [_surface_points(corners, spacing) for corners in shapes]
+        found = [_thinned_points(corners, spacing) for corners in shapes]
         points[link] = np.concatenate([np.zeros((0, 3)), *found])
     return points
 
@@ -181,18 +195,12 @@ def _triangles(corners: Array) -> Array:
     return triangles
 
 
-def _surface_points(corners: Array, spacing: float) -> Array:
+def _thinned_points(corners: Array, spacing: float) -> Array:
     """Return the corners of a convex shape and evenly spread points of its surface."""
-    triangles, fine = _triangles(corners), spacing / 2.0
-    edges = norm(triangles - np.roll(triangles, 1, axis=1)).max(axis=1)
-    parts = np.ceil(edges / fine).astype(int)
-    points = [corners]
-    for triangle, n in zip(triangles, parts, strict=True):
-        i, j = (a.ravel() for a in np.indices((n + 1, n + 1)))
-        inside = i + j <= n
-        points.append(multiply(np.column_stack([i, j, n - i - j])[inside] / n, triangle))
-    dense = np.concatenate(points)
-    # The corners come first, so they are the ones that stay in their cells.
+    points, owner = cover_triangles(_triangles(corners), spacing / 2.0)
+    dense = np.concatenate([corners, points[np.argsort(owner, kind="stable")]])
+
+    # One point stays in each cell of a grid; corners come first, so they are the ones that stay.
     cells = np.floor(dense / spacing).astype(np.int64)
     _, first = np.unique(cells, axis=0, return_index=True)
     return dense[np.union1d(np.arange(len(corners)), first)]

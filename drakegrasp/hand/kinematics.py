@@ -1,7 +1,7 @@
-"""Forward kinematics of a hand: where its joints and fingertips are.
+"""Forward kinematics of a hand.
 
-In: a `Hand` and its coordinates, the spread and the closing of each finger. Out: joint
-angles, poses of the fingertip links, limits of the coordinates. NumPy only.
+In: a `Hand` and its coordinates, the spread and the closing of each finger. Out: joint angles,
+poses of the links, limits of the coordinates. NumPy only.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from drakegrasp.hand.description import Chain, Hand
 
 
 def coordinate_limits(hand: Hand) -> Array:
-    """Return the least and greatest value of each coordinate, (1 + k, 2) [rad].
+    """Return the lower and upper limit of each coordinate, (1 + k, 2) [rad].
 
-    Row 0 is the spread, row 1 + i the closing of finger i. A coordinate's limits are those
-    of all joints that it drives, couplings included. A hand without spread has 0, 0 there.
+    Row 0 is the spread, row 1 + i the closing of finger i. A coordinate keeps the limits of all
+    joints that it drives, coupled joints included. Without spread joints row 0 is 0, 0.
     """
     limits = np.tile([-np.inf, np.inf], (1 + hand.num_fingers, 1))
     for gain, joint_limits in zip(hand.joint_gain, hand.joint_limits, strict=True):
@@ -43,7 +43,7 @@ def joint_positions(hand: Hand, spread: float, closing: npt.ArrayLike) -> dict[s
 def fingertip_poses(hand: Hand, *, spread: npt.ArrayLike, closing: npt.ArrayLike) -> Array:
     """Return the poses X_GFi (k, 4, 4) of the fingertip links in the palm frame.
 
-    Limits are not looked at.
+    Joint limits are not checked.
 
     Args:
         hand: The hand.
@@ -74,7 +74,7 @@ def link_poses(hand: Hand, link: str, *, spread: npt.ArrayLike, closing: npt.Arr
 
 
 def _coordinates(hand: Hand, spread: npt.ArrayLike, closing: npt.ArrayLike) -> Array:
-    """Return (..., 1 + k) of a spread (...,) and closing angles (..., k)."""
+    """Return coordinates (..., 1 + k) from a spread (...,) and closing angles (..., k)."""
     angles = np.asarray(closing, dtype=float)
     k = hand.num_fingers
     if angles.shape[-1:] != (k,):
@@ -87,6 +87,7 @@ def _coordinates(hand: Hand, spread: npt.ArrayLike, closing: npt.ArrayLike) -> A
 
 
 def _chain_pose(chain: Chain, c: Array) -> Array:
+    """Return the poses (..., 4, 4) of a chain's link in {G} at coordinates (..., 1 + k)."""
     q = multiply(c[..., None, :], chain.gain.T)[..., 0, :]
     X = np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))
     for j, (X_PJ, axis) in enumerate(zip(chain.X_PJ, chain.axis, strict=True)):
@@ -95,7 +96,7 @@ def _chain_pose(chain: Chain, c: Array) -> Array:
 
 
 def _turn(axis: Array, angle: Array) -> Array:
-    """Return the poses (..., 4, 4) that turn by angles (...,) about an axis."""
+    """Return the poses (..., 4, 4) that rotate by angles (...,) about an axis."""
     X = np.zeros((*np.shape(angle), 4, 4))
     X[..., :3, :3] = rotation_about(axis, angle)
     X[..., 3, 3] = 1.0

@@ -1,7 +1,7 @@
-"""The shapes of a hand's links as convex sets of points, without a simulation.
+"""The collision shapes of a hand's links, as convex sets of points.
 
 In: a `Hand`. Out: for each link the corners of its collision shapes, in the link's frame.
-Every shape of a hand is convex (`models/README.md`), so its corners are all of it.
+Every shape of a hand is convex (`models/README.md`), so its corners describe it fully.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from pydrake.geometry import (
     Capsule,
     Cylinder,
     GeometryId,
-    Mesh,
     SceneGraph,
     SceneGraphInspector,
     Sphere,
@@ -27,7 +26,7 @@ from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, transform_points
 from drakegrasp.hand.description import Hand, make_parser
 
-#: Corners of the polygon that stands for a circle; it lies outside of it.
+#: Corners of the polygon that replaces a circle and encloses it.
 CIRCLE = 16
 
 
@@ -49,17 +48,25 @@ def _link_shapes(sdf_path: Path) -> dict[str, tuple[Array, ...]]:
     shapes = {}
     for index in plant.GetBodyIndices(instance):
         body = plant.get_body(index)
-        found = plant.GetCollisionGeometriesForBody(body)
-        shapes[body.name()] = tuple(_corners(inspector, geometry) for geometry in found)
+        geometries = plant.GetCollisionGeometriesForBody(body)
+        shapes[body.name()] = tuple(_corners(inspector, geometry) for geometry in geometries)
     return shapes
+
+
+def hull_corners(inspector: SceneGraphInspector, geometry: GeometryId) -> Array | None:
+    """Return the corners (n, 3) [m] of a mesh's hull in its own frame; None for a primitive."""
+    hull = inspector.GetConvexHull(geometry)
+    if hull is None:
+        return None
+    return np.array([hull.vertex(i) for i in range(hull.num_vertices())])
 
 
 def _corners(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
     """Return the corners of a shape in its body's frame."""
-    shape = inspector.GetShape(geometry)
-    if isinstance(shape, Mesh) or inspector.GetConvexHull(geometry) is not None:
-        hull = inspector.GetConvexHull(geometry)
-        corners = np.array([hull.vertex(i) for i in range(hull.num_vertices())])
+    # Corners in the shape's own frame.
+    shape, hull = inspector.GetShape(geometry), hull_corners(inspector, geometry)
+    if hull is not None:
+        corners = hull
     elif isinstance(shape, Box):
         corners = _box(shape.size() / 2.0)
     elif isinstance(shape, Cylinder):
@@ -75,6 +82,7 @@ def _corners(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
             f"{inspector.GetName(geometry)}: must be a box, cylinder, capsule, sphere or convex "
             f"mesh, got {type(shape).__name__}"
         )
+
     X_BS = inspector.GetPoseInFrame(geometry).GetAsMatrix4()
     return transform_points(X_BS, corners)
 
@@ -93,8 +101,8 @@ def _prism(radius: float, half_length: float) -> Array:
 
 
 def _ball(radius: float) -> Array:
-    """Return the corners of a polyhedron about the origin whose corners are on a sphere."""
-    # Fibonacci's lattice: even spacing without poles.
+    """Return points on a sphere about the origin."""
+    # A Fibonacci lattice: even spacing without poles.
     i = np.arange(CIRCLE**2) + 0.5
     z, turn = 1.0 - 2.0 * i / CIRCLE**2, np.pi * (1.0 + np.sqrt(5.0)) * i
     across = np.sqrt(1.0 - z**2)

@@ -1,7 +1,7 @@
-"""Bodies: the triangles of a file come in, its connected pieces of surface go out.
+"""Components: the triangles of a file come in, its connected pieces of surface go out.
 
-A body's faces agree on which side is which, and it shares no vertex with another body.
-Half-edge 3f + i leaves corner i of face f; its twin is the half-edge of the neighbouring
+The faces of a component agree on which side is outside, and it shares no vertex with another.
+Half-edge 3f + i leaves corner i of face f; its twin is the opposite half-edge of the neighbouring
 face, or -1 at a rim.
 """
 
@@ -19,8 +19,14 @@ from drakegrasp.mesh.surfaces import Faces, compact, face_areas, half_edges, sig
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Body:
-    """One connected piece of surface; `twins[h]` is the half-edge opposite to h, or -1."""
+class Component:
+    """One connected piece of surface.
+
+    Attributes:
+        vertices: (n, 3) [m].
+        faces: (m, 3).
+        twins: (3m,), the half-edge opposite to each half-edge, or -1.
+    """
 
     vertices: Array
     faces: Faces
@@ -32,12 +38,21 @@ class Body:
         return bool((self.twins >= 0).all())
 
 
-def find_bodies(vertices: Array, faces: Faces, notes: list[str]) -> list[Body]:
-    """Return the connected bodies, each with agreeing faces and vertices of its own."""
+def find_components(vertices: Array, faces: Faces, notes: list[str]) -> list[Component]:
+    """Return the components of a surface, each with agreeing faces and vertices of its own.
+
+    Args:
+        vertices: (n, 3) [m].
+        faces: (m, 3).
+        notes: Repairs are appended here, in sentences.
+
+    Raises:
+        MeshError: If a component has only one side.
+    """
     twins = pair_half_edges(vertices, faces, radial=True)
 
-    # Corners that meet across a paired edge share a vertex; all others are parted, also
-    # where the file makes two bodies touch in a single point.
+    # Corners that meet across a paired edge share a vertex; all others are separated, even
+    # where two components of the file touch at a single point.
     halves = np.flatnonzero(twins >= 0)
     ends = half_edges(faces)
     start, end = halves, halves - halves % 3 + (halves + 1) % 3
@@ -52,28 +67,32 @@ def find_bodies(vertices: Array, faces: Faces, notes: list[str]) -> list[Body]:
     vertices = vertices[faces.ravel()[first]]
     faces = corner_vertex.reshape(-1, 3).astype(np.int64)
 
+    # Neighbouring faces must run along their common edge in opposite directions.
     flip, flipped = _orient(vertices, faces, twins)
     if flipped:
         notes.append(
             f"{flipped} of {len(faces)} faces ran against their neighbours and were turned"
         )
-    count, piece = face_components(twins, len(faces))
     faces = np.where(flip[:, None], faces[:, ::-1], faces)
-    bodies = []
+
+    # One component for each connected set of faces.
+    count, piece = face_components(twins, len(faces))
+    components = []
     for index in range(count):
         own = np.flatnonzero(piece == index)
         part_vertices, part_faces = compact(vertices, faces[own])
         part_twins = pair_half_edges(part_vertices, part_faces, radial=False)
-        bodies.append(Body(vertices=part_vertices, faces=part_faces, twins=part_twins))
-    return bodies
+        components.append(Component(vertices=part_vertices, faces=part_faces, twins=part_twins))
+    return components
 
 
 def _orient(vertices: Array, faces: Faces, twins: Faces) -> tuple[Faces, int]:
-    """Return for every face (m,) whether to flip it, so that neighbours agree.
+    """Return whether to flip each face (m,) so that neighbours agree, and how many to flip.
 
-    A face and its flipped copy are two nodes of a graph: components of the graph are
-    consistent choices. The choice that keeps more of the file's surface wins.
+    Each face and its flipped copy are two nodes of a graph, whose connected components are
+    consistent choices. The choice that keeps the orientation of more of the area wins.
     """
+    # A node is joined to the neighbour's node that runs the opposite way along their edge.
     m = len(faces)
     halves = np.flatnonzero(twins >= 0)
     ends = half_edges(faces)
@@ -84,6 +103,8 @@ def _orient(vertices: Array, faces: Faces, twins: Faces) -> tuple[Faces, int]:
     _, labels = connected_components(graph, directed=False)
     if (labels[:m] == labels[m:]).any():
         raise MeshError("the surface must have two sides, got one like a Möbius strip")
+
+    # Keep the first face of each component, or flip all of it if that keeps more of the area.
     count, piece = face_components(twins, m)
     _, first = np.unique(piece, return_index=True)
     flip = labels[:m] != labels[first[piece]]
@@ -94,7 +115,7 @@ def _orient(vertices: Array, faces: Faces, twins: Faces) -> tuple[Faces, int]:
 
 
 def count_parts(vertices: Array, faces: Faces) -> int:
-    """Return the number of pieces of a solid that do not touch; cavities do not count."""
+    """Return how many separate parts a solid has; cavities do not count."""
     count, piece = face_components(pair_half_edges(vertices, faces, radial=False), len(faces))
     if count == 1:
         return 1
@@ -116,14 +137,17 @@ def pair_half_edges(vertices: Array, faces: Faces, *, radial: bool) -> Faces:
     """Return the opposite of every half-edge (3m,), -1 where there is none.
 
     At an edge with four or more faces, `radial` pairs those that bound the same wedge
-    of solid, so that bodies that touch along an edge come apart.
+    of solid, so that components that touch along an edge come apart.
     """
+    # An edge with two faces: they are each other's neighbours.
     ids, counts = edge_ids(faces)
     order = np.argsort(ids, kind="stable")
     starts = np.concatenate(([0], np.cumsum(counts)[:-1]))
     twins = np.full(3 * len(faces), -1, dtype=np.int64)
     pairs = starts[counts == 2]
     twins[order[pairs]], twins[order[pairs + 1]] = order[pairs + 1], order[pairs]
+
+    # An edge with four or more.
     if radial:
         for edge in np.flatnonzero((counts > 2) & (counts % 2 == 0)):
             _pair_radially(
@@ -133,12 +157,17 @@ def pair_half_edges(vertices: Array, faces: Faces, *, radial: bool) -> Faces:
 
 
 def _pair_radially(vertices: Array, faces: Faces, halves: Faces, twins: Faces) -> None:
-    """Pair the half-edges of one edge by their angles; leave them if they do not add up."""
+    """Pair the half-edges of one edge by their angles about it.
+
+    They stay unpaired if not equally many run each way along the edge.
+    """
     face, corner = halves // 3, halves % 3
     start, end = faces[face, corner], faces[face, (corner + 1) % 3]
     leaves = start < end
     if 2 * int(leaves.sum()) != len(halves):
         return
+
+    # The angle of each face about the edge, from its third corner.
     low, high = int(start.min()), int(end.max())
     axis = vertices[high] - vertices[low]
     axis = axis / np.linalg.norm(axis)
@@ -147,11 +176,14 @@ def _pair_radially(vertices: Array, faces: Faces, halves: Faces, twins: Faces) -
     second = np.cross(axis, first)
     angles = np.round(np.arctan2(arms @ second, arms @ first) % (2.0 * np.pi), 6)
     angles[angles >= 6.283185] = 0.0
-    # Around the axis, a face that runs along it is where the solid ends. At equal
-    # angles it comes first: bodies that share a wall are two, not one.
+
+    # Going around the axis, the solid ends at a face that runs along it, and begins at one that
+    # runs against it. At equal angles the end comes first: components that share a wall are two.
     turn = np.lexsort((~leaves, angles))
     depth = np.cumsum(np.where(leaves[turn], -1, 1))
     turn = np.roll(turn, -(int(np.argmin(depth)) + 1))
+
+    # Each end belongs to the last beginning before it.
     entered: list[int] = []
     for half in turn:
         if leaves[half]:
@@ -162,7 +194,7 @@ def _pair_radially(vertices: Array, faces: Faces, halves: Faces, twins: Faces) -
 
 
 def face_components(twins: Faces, face_count: int) -> tuple[int, Faces]:
-    """Return how many pieces the paired half-edges join, and the piece of every face (m,)."""
+    """Return the number of connected components, and the component of every face (m,)."""
     halves = np.flatnonzero(twins >= 0)
     graph = coo_matrix(
         (np.ones(len(halves)), (halves // 3, twins[halves] // 3)), shape=(face_count, face_count)

@@ -1,4 +1,4 @@
-"""Decimation: a solid comes in; one with fewer faces goes out, and how far it deviates."""
+"""Decimation: a solid comes in; one with fewer faces and its deviation go out."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 from drakegrasp.errors import MeshError
-from drakegrasp.mesh.components import find_bodies
+from drakegrasp.mesh.components import find_components
 from drakegrasp.mesh.surfaces import (
     MAX_OVERLAP,
     Solid,
@@ -26,9 +26,9 @@ from drakegrasp.mesh.surfaces import (
 
 #: Aggressiveness of the quadric decimation, best quality first.
 DECIMATION_STEPS = (2.0, 3.0, 5.0, 7.0)
-#: Deviation, as a part of the diagonal, from which a second decimation is tried.
+#: Deviation, as a fraction of the diagonal, above which the second method is tried.
 FAITHFUL = 2e-3
-#: Volume that a decimated mesh may gain or lose.
+#: Fraction of its volume that a decimated mesh may gain or lose.
 MAX_VOLUME_CHANGE = 0.05
 #: Points on each surface at which the deviation of two surfaces is measured.
 DEVIATION_POINTS = 3000
@@ -37,15 +37,17 @@ DEVIATION_POINTS = 3000
 def decimate(solid: Solid, max_faces: int) -> tuple[Solid, float]:
     """Return a solid with at most `max_faces` faces, and its deviation from the given one [m].
 
-    Quadric decimation keeps the shape better, but promises no closed surface;
-    manifold3d's simplification does. The second is tried where the first fails or
-    leaves the surface by more than `FAITHFUL`; the closer one wins.
+    Quadric decimation (Garland and Heckbert 1997) keeps the shape better, but does not guarantee
+    a closed surface; manifold3d's simplification does. The second is tried where the first fails
+    or deviates by more than `FAITHFUL`; the closer result wins.
 
     Raises:
         MeshError: If neither gives a closed surface of about the same volume.
     """
     if len(solid.faces) <= max_faces:
         return solid, 0.0
+
+    # The closest sound result; the first that is close enough ends the search.
     faithful = FAITHFUL * diagonal(solid.vertices)
     best: tuple[Solid, float] | None = None
     for candidate in (_decimate_quadric, _simplify_manifold):
@@ -56,6 +58,7 @@ def decimate(solid: Solid, max_faces: int) -> tuple[Solid, float]:
                 best = reduced, error
             if error <= faithful:
                 break
+
     if best is None:
         raise MeshError(
             f"the collision mesh must keep its shape with at most {max_faces} faces, got a broken "
@@ -68,16 +71,18 @@ def surface_deviation(first: Solid, second: Solid) -> float:
     """Return the largest distance between two surfaces [m], both ways, at fixed points."""
     meshes = [trimesh.Trimesh(s.vertices, s.faces, process=False) for s in (first, second)]
     worst = 0.0
-    for here, there in (meshes, meshes[::-1]):
-        points = on_faces(here.vertices, here.faces, even_points(DEVIATION_POINTS))[0]
-        count = min(DEVIATION_POINTS, len(here.vertices))
-        corners = np.linspace(0, len(here.vertices) - 1, count).astype(int)
-        points = np.vstack((points, here.vertices[corners]))
-        worst = max(worst, float(trimesh.proximity.closest_point(there, points)[1].max()))
+    for mesh, other in (meshes, meshes[::-1]):
+        # Points evenly spread over the faces, and vertices, where the deviation is largest.
+        points = on_faces(mesh.vertices, mesh.faces, even_points(DEVIATION_POINTS))[0]
+        count = min(DEVIATION_POINTS, len(mesh.vertices))
+        corners = np.linspace(0, len(mesh.vertices) - 1, count).astype(int)
+        points = np.vstack((points, mesh.vertices[corners]))
+        worst = max(worst, float(trimesh.proximity.closest_point(other, points)[1].max()))
     return worst
 
 
 def _is_sound(reduced: Solid, solid: Solid) -> bool:
+    """Return whether a surface bounds a solid of about the same volume."""
     volume = signed_volume(solid.vertices, solid.faces)
     change = signed_volume(reduced.vertices, reduced.faces) / volume - 1.0
     return (
@@ -88,6 +93,7 @@ def _is_sound(reduced: Solid, solid: Solid) -> bool:
 
 
 def _decimate_quadric(solid: Solid, max_faces: int) -> Solid | None:
+    """Return the result of the least aggressive decimation that gives few enough faces."""
     for aggressiveness in DECIMATION_STEPS:
         vertices, faces = fast_simplification.simplify(
             np.ascontiguousarray(solid.vertices),
@@ -97,16 +103,16 @@ def _decimate_quadric(solid: Solid, max_faces: int) -> Solid | None:
         )
         if not 0 < len(faces) <= max_faces:
             continue
-        # Walls that have come to touch share edges now; parting them closes both again.
-        bodies = find_bodies(
+        # Walls that have come to touch now share edges; separating them closes both again.
+        components = find_components(
             np.asarray(vertices, dtype=np.float64), np.asarray(faces, np.int64), []
         )
-        return stack([(body.vertices, body.faces) for body in bodies])
+        return stack([(part.vertices, part.faces) for part in components])
     return None
 
 
 def _simplify_manifold(solid: Solid, max_faces: int) -> Solid | None:
-    """Find the smallest tolerance that gives few enough faces, by bisection of its logarithm."""
+    """Return the result of the smallest tolerance that gives few enough faces, by bisection."""
     source = to_manifold(solid.vertices, solid.faces).as_original()
     low, high = 1e-6 * diagonal(solid.vertices), 0.05 * diagonal(solid.vertices)
     best = None

@@ -1,6 +1,6 @@
-"""Holes: a body with open rims comes in, the triangles that close them go out.
+"""Hole filling: a component with open rims comes in, the triangles that close them go out.
 
-Only what surely is a hole is closed: a flat rim, or a small one. Others raise `MeshError`.
+Only a flat or a small rim is surely a hole, and is closed; others raise `MeshError`.
 """
 
 from __future__ import annotations
@@ -10,23 +10,34 @@ import numpy as np
 
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
-from drakegrasp.mesh.components import Body
+from drakegrasp.mesh.components import Component
 from drakegrasp.mesh.surfaces import Faces, diagonal, half_edges
 
-#: A rim is planar if it leaves its plane by no more than this part of its own size ...
+#: A rim is planar if it leaves its plane by no more than this fraction of its own size ...
 PLANAR = 0.05
-#: ... and small if its size is below this part of the object's diagonal.
+#: ... and small if its size is below this fraction of the object's diagonal.
 SMALL_RIM = 0.15
 
 
-def close_rims(body: Body, size: float) -> tuple[list[Faces], int]:
-    """Return triangles that close all rims of a body, and the number of holes."""
-    rims = sorted(_rims(body), key=lambda r: -float(np.linalg.norm(_area_vector(body.vertices[r]))))
+def close_rims(component: Component, size: float) -> tuple[list[Faces], int]:
+    """Return the triangles that close all rims of a component, and the number of rims.
+
+    Args:
+        component: The surface; the triangles use its vertices.
+        size: Diagonal of the whole object [m].
+
+    Raises:
+        MeshError: If a rim is neither flat nor small, or crosses itself.
+    """
+    # Large rims first, so that an outer rim comes before the inner ones in its plane.
+    vertices = component.vertices
+    rims = sorted(_rims(component), key=lambda r: -float(np.linalg.norm(_area_vector(vertices[r]))))
     lids: list[Faces] = []
     holes = 0
     while rims:
+        # The plane through the rim, by least squares, with its normal towards the missing side.
         outer = rims.pop(0)
-        points = body.vertices[outer]
+        points = vertices[outer]
         centre, width = points.mean(axis=0), diagonal(points)
         basis = np.linalg.svd(points - centre, full_matrices=False)[2][:2]
         if np.dot(np.cross(basis[0], basis[1]), _area_vector(points)) < 0.0:
@@ -44,13 +55,15 @@ def close_rims(body: Body, size: float) -> tuple[list[Faces], int]:
         flat = (points - centre) @ basis.T
         loops, polygons = [outer], [flat]
         for rim in list(rims):
-            local = (body.vertices[rim] - centre) @ basis.T
-            away = np.abs((body.vertices[rim] - centre) @ normal).max()
-            backward = float(np.dot(_area_vector(body.vertices[rim]), normal)) < 0.0
+            local = (vertices[rim] - centre) @ basis.T
+            away = np.abs((vertices[rim] - centre) @ normal).max()
+            backward = float(np.dot(_area_vector(vertices[rim]), normal)) < 0.0
             if away < 1e-3 * width and backward and _inside_polygon(local[0], flat):
                 loops.append(rim)
                 polygons.append(local)
                 rims = [r for r in rims if r is not rim]
+
+        # Triangulate in the plane; a rim that crosses itself covers more than its area.
         triangles = manifold3d.triangulate([np.ascontiguousarray(p) for p in polygons])
         corners = np.vstack(polygons)[triangles]
         u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -63,13 +76,16 @@ def close_rims(body: Body, size: float) -> tuple[list[Faces], int]:
     return lids, holes
 
 
-def _rims(body: Body) -> list[Faces]:
+def _rims(component: Component) -> list[Faces]:
     """Return the boundary loops as vertex indices, in the direction of the missing faces."""
-    open_halves = np.flatnonzero(body.twins < 0)
-    ends = half_edges(body.faces)[open_halves]
+    # The vertex that follows each vertex; two followers mean that two rims touch.
+    open_halves = np.flatnonzero(component.twins < 0)
+    ends = half_edges(component.faces)[open_halves]
     after = {int(b): int(a) for a, b in ends}
     if len(after) != len(ends):
         raise MeshError("the rim of a hole must not cross itself")
+
+    # Follow each loop from its lowest vertex.
     loops = []
     while after:
         first = min(after)
@@ -83,11 +99,13 @@ def _rims(body: Body) -> list[Faces]:
 
 
 def _area_vector(points: Array) -> Array:
+    """Return the vector area (3,) [m^2] of a closed polygon (n, 3)."""
     centred = points - points.mean(axis=0)
     return np.asarray(np.cross(centred, np.roll(centred, -1, axis=0)).sum(axis=0) / 2.0)
 
 
 def _inside_polygon(point: Array, polygon: Array) -> bool:
+    """Return whether a point (2,) is in a polygon (n, 2), by the crossings of a ray."""
     (x, y), a, b = point, polygon, np.roll(polygon, -1, axis=0)
     crosses = (a[:, 1] > y) != (b[:, 1] > y)
     a, b = a[crosses], b[crosses]

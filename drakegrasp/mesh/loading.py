@@ -1,4 +1,4 @@
-"""Mesh files: a path comes in, triangles go out."""
+"""Mesh files: a file's bytes come in, triangles go out."""
 
 from __future__ import annotations
 
@@ -8,26 +8,23 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from drakegrasp.errors import MeshError
+from drakegrasp.errors import MeshError, one_line
 from drakegrasp.frames import Array
 from drakegrasp.mesh.repair import weld
 from drakegrasp.mesh.surfaces import Faces
 
-#: Mesh files that are read; everything else in the directory is ignored.
+#: Mesh files that can be read; other files are ignored.
 SUFFIXES = (".obj", ".stl", ".ply", ".glb")
 
 
 def load_mesh(path: str | Path) -> trimesh.Trimesh:
     """Return the triangles of a mesh file, in the file's units and axes.
 
-    All geometries of a scene are put together with their transforms. Equal vertices
-    are merged and duplicate and degenerate faces dropped; materials are not read.
-
     Raises:
         MeshError: If the file cannot be read or holds no finite triangles.
     """
     path = Path(path)
-    return _parse(path, read_bytes(path))
+    return parse_mesh(path.name, read_bytes(path))
 
 
 def read_bytes(path: Path) -> bytes:
@@ -44,17 +41,30 @@ def read_bytes(path: Path) -> bytes:
         ) from error
 
 
-def _parse(path: Path, data: bytes) -> trimesh.Trimesh:
-    suffix = path.suffix.lower()
+def parse_mesh(name: str, content: bytes) -> trimesh.Trimesh:
+    """Return the triangles of a mesh file's content, in the file's units and axes.
+
+    All geometries of a scene are joined, with their transforms applied. Equal vertices are
+    merged, duplicate and degenerate faces dropped; materials are not read.
+
+    Args:
+        name: Name of the file; its suffix gives the format.
+        content: The file's bytes.
+
+    Raises:
+        MeshError: If it holds no finite triangles.
+    """
+    suffix = Path(name).suffix.lower()
     if suffix not in SUFFIXES:
-        raise MeshError(f"{path.name}: must be one of {', '.join(SUFFIXES)}, got {suffix!r}")
-    if not data:
-        raise MeshError(f"{path.name}: must hold a mesh, got an empty file")
-    # Parsers fail on foreign bytes in countless ways, none of them of use to a caller.
+        raise MeshError(f"{name}: must be one of {', '.join(SUFFIXES)}, got {suffix!r}")
+    if not content:
+        raise MeshError(f"{name}: must hold a mesh, got an empty file")
+
+    # Parsers raise all kinds of exceptions on foreign bytes.
     try:
         with np.errstate(all="ignore"):
             scene = trimesh.load_scene(
-                io.BytesIO(data), file_type=suffix[1:], process=False, skip_materials=True
+                io.BytesIO(content), file_type=suffix[1:], process=False, skip_materials=True
             )
             parts = []
             for node in scene.graph.nodes_geometry:
@@ -65,10 +75,8 @@ def _parse(path: Path, data: bytes) -> trimesh.Trimesh:
                     parts.append(part.apply_transform(X_SN))
             vertices, faces = _concatenate(parts)
     except Exception as error:
-        raise MeshError(
-            f"{path.name}: must be a valid {suffix} mesh, got: {one_line(error)}"
-        ) from error
-    return clean_triangles(vertices, faces, path.name)
+        raise MeshError(f"{name}: must be a valid {suffix} mesh, got: {one_line(error)}") from error
+    return clean_triangles(vertices, faces, name)
 
 
 def clean_triangles(vertices: Array, faces: Faces, name: str) -> trimesh.Trimesh:
@@ -77,11 +85,12 @@ def clean_triangles(vertices: Array, faces: Faces, name: str) -> trimesh.Trimesh
     Args:
         vertices: (n, 3).
         faces: (m, 3).
-        name: What to call them in an error.
+        name: What to call the mesh in an error.
 
     Raises:
-        MeshError: If they are no finite triangles.
+        MeshError: If there are no triangles, or vertices that are missing or not finite.
     """
+    # Refuse what is no mesh.
     if not len(faces):
         raise MeshError(f"{name}: must hold triangles, got no faces")
     if faces.min() < 0 or faces.max() >= len(vertices):
@@ -93,6 +102,8 @@ def clean_triangles(vertices: Array, faces: Faces, name: str) -> trimesh.Trimesh
     if not np.isfinite(used).all():
         bad = int((~np.isfinite(used)).any(axis=1).sum())
         raise MeshError(f"{name}: vertices must be finite, got NaN or inf at {bad} corners")
+
+    # Merge equal vertices.
     vertices, faces = weld(vertices, faces)
     if not len(faces):
         raise MeshError(f"{name}: must hold triangles, got only degenerate faces")
@@ -100,14 +111,10 @@ def clean_triangles(vertices: Array, faces: Faces, name: str) -> trimesh.Trimesh
 
 
 def _concatenate(parts: list[trimesh.Trimesh]) -> tuple[Array, Faces]:
+    """Return the vertices and faces of several meshes as one; of none, empty arrays."""
     if not parts:
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
     offsets = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
     faces = [part.faces + offset for part, offset in zip(parts, offsets, strict=True)]
     vertices = np.vstack([part.vertices for part in parts])
     return np.array(vertices, dtype=np.float64), np.vstack(faces).astype(np.int64)
-
-
-def one_line(error: Exception) -> str:
-    """Return what another library says is wrong, fit to stand in a message of ours."""
-    return " ".join(str(error).split())[:200] or type(error).__name__

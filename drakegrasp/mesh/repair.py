@@ -1,15 +1,15 @@
 """Geometric repair: from a soup of triangles to one watertight solid.
 
-`mend_solid` takes welded triangles in metres and returns the surface of one solid:
-closed, every edge shared by exactly two faces that run along it in opposite
-directions, normals outward. What it had to change it says in sentences. What it
-cannot change honestly raises `MeshError` with the reason and without a file name,
-which `drakegrasp.objects.model` adds. A mesh that is a clean solid keeps its own vertices.
+`repair_solid` takes welded triangles in metres and returns the surface of one solid: closed, every
+edge shared by exactly two faces that run along it in opposite directions, normals outward. Notes
+say what was changed. A mesh that cannot be repaired without inventing shape raises `MeshError`
+with the reason; `drakegrasp.objects.model` adds the file's name. A mesh that is a clean solid keeps
+its own vertices.
 
-The order matters: gaps are stitched and inner walls dropped while the neighbours are
-still known, then the surface falls apart into `components`, whose holes (`hole_filling`) are closed
-and whose insides are told from their outsides; last come the `union` and a check of the result by
-generalised winding numbers, which knows nothing of the steps before it.
+The order matters: gaps are stitched and inner walls dropped while neighbours are still known. Then
+the surface is separated into `components`, whose holes are closed (`hole_filling`). Last come their
+`union` and a check of the result by generalised winding numbers, which is independent of the steps
+before.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
-from drakegrasp.mesh.components import edge_ids, face_components, find_bodies, pair_half_edges
+from drakegrasp.mesh.components import edge_ids, face_components, find_components, pair_half_edges
 from drakegrasp.mesh.hole_filling import close_rims
 from drakegrasp.mesh.surfaces import (
     Faces,
@@ -36,35 +36,40 @@ from drakegrasp.mesh.surfaces import (
 )
 from drakegrasp.mesh.union import separate, unite
 
-#: Vertices closer than this part of the diagonal are one: above the rounding of files
+#: Vertices closer than this fraction of the diagonal are merged: above the rounding of files
 #: with eight digits, far below the detail of any scan.
 WELD = 1e-8
-#: Rims closer than this part of the diagonal are the two sides of one seam.
+#: Rims closer than this fraction of the diagonal are the two sides of one seam.
 STITCH = 1e-4
-#: A body whose mean thickness is below this part of its diagonal encloses nothing.
+#: A component whose mean thickness is below this fraction of its diagonal encloses nothing.
 FLAT = 1e-4
-#: Filled holes may make up this part of the surface: an open box just passes (1/6),
-#: a hemispherical bowl made of a single sheet (1/3) is not taken for a solid one.
+#: Fraction of the surface that filled holes may make up: an open box just passes (1/6);
+#: a hemispherical bowl made of a single sheet (1/3) does not, as it would become solid.
 MAX_FILLED = 0.25
-#: Fragments outside the solid that may be dropped, as a part of the surface.
+#: Fragments outside the solid that may be dropped, as a fraction of the surface.
 MAX_DROPPED = 0.01
 #: Inner walls are found by trying all subsets of patches; 2^12 take milliseconds.
 MAX_PATCHES = 12
 
 
 def weld(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
-    """Return a mesh with equal vertices merged and worthless faces dropped.
+    """Return a mesh with equal vertices merged and degenerate and duplicate faces dropped.
 
-    Faces that use a vertex twice, and faces that occur twice, go. Collinear faces
-    with three different vertices stay, because dropping them would open the surface.
+    Collinear faces with three different vertices stay, because dropping them would open the
+    surface.
+
+    Args:
+        vertices: (n, 3).
+        faces: (m, 3).
     """
+    # Merge vertices that round to the same grid point; drop faces that then use one twice.
     grid = np.round(vertices / (WELD * max(diagonal(vertices[faces.ravel()]), 1e-300)))
     _, first, inverse = np.unique(grid, axis=0, return_index=True, return_inverse=True)
     faces = first[inverse.reshape(-1)][faces].astype(np.int64)
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
 
     # A face that occurs twice is a copy, or the wall between two touching solids. The
-    # reading that leaves fewer edges with an odd number of faces is the right one.
+    # interpretation that leaves fewer edges with an odd number of faces is the right one.
     _, index, inverse, counts = np.unique(
         np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True, return_counts=True
     )
@@ -75,7 +80,7 @@ def weld(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
     return compact(vertices, faces)
 
 
-def mend_solid(vertices: Array, faces: Faces) -> Solid:
+def repair_solid(vertices: Array, faces: Faces) -> Solid:
     """Return the surface of one solid from welded triangles.
 
     Args:
@@ -85,6 +90,7 @@ def mend_solid(vertices: Array, faces: Faces) -> Solid:
     Raises:
         MeshError: If the surface cannot become a solid without inventing shape.
     """
+    # Make one surface of it, while neighbours are still known.
     notes: list[str] = []
     size = diagonal(vertices)
     vertices, faces = _stitch(vertices, faces, notes)
@@ -92,28 +98,31 @@ def mend_solid(vertices: Array, faces: Faces) -> Solid:
     total = float(face_areas(vertices, faces).sum())
     fragments = [(vertices[walls], "it ends at edges with three faces")] if len(walls) else []
 
+    # Close each component; those that enclose nothing are fragments.
     closed: list[tuple[Array, Faces]] = []
     holes, filled = 0, 0.0
-    for body in find_bodies(vertices, faces, notes):
-        new_faces, new_holes, new_area = body.faces, 0, 0.0
-        if not body.is_closed:
+    for component in find_components(vertices, faces, notes):
+        new_faces, new_holes, new_area = component.faces, 0, 0.0
+        if not component.is_closed:
             try:
-                lids, new_holes = close_rims(body, size)
+                lids, new_holes = close_rims(component, size)
             except MeshError as error:
-                fragments.append((body.vertices[body.faces], str(error)))
+                fragments.append((component.vertices[component.faces], str(error)))
                 continue
-            new_area = sum(float(face_areas(body.vertices, lid).sum()) for lid in lids)
-            new_faces = np.vstack((body.faces, *lids))
-        area = float(face_areas(body.vertices, new_faces).sum())
-        thickness = 2.0 * abs(signed_volume(body.vertices, new_faces)) / max(area, 1e-300)
-        if thickness < FLAT * diagonal(body.vertices):
+            new_area = sum(float(face_areas(component.vertices, lid).sum()) for lid in lids)
+            new_faces = np.vstack((component.faces, *lids))
+        area = float(face_areas(component.vertices, new_faces).sum())
+        thickness = 2.0 * abs(signed_volume(component.vertices, new_faces)) / max(area, 1e-300)
+        if thickness < FLAT * diagonal(component.vertices):
             fragments.append(
-                (body.vertices[body.faces], "it must enclose a volume, got a flat sheet")
+                (component.vertices[component.faces], "it must enclose a volume, got a flat sheet")
             )
             continue
-        closed.append((body.vertices, new_faces))
+        closed.append((component.vertices, new_faces))
         holes += new_holes
         filled += new_area
+
+    # Refuse a surface that is too open to be a solid.
     if not closed:
         raise MeshError(max(fragments, key=lambda fragment: _triangle_area(fragment[0]))[1])
     share = filled / (filled + total)
@@ -125,19 +134,22 @@ def mend_solid(vertices: Array, faces: Faces) -> Solid:
     if holes:
         notes.append(f"{holes} open rims were closed, {share:.1%} of the surface: solid there now")
 
+    # Unite the components, and check the result.
     vertices, faces = separate(*unite(closed, size, notes), notes)
     if not len(faces) or not is_solid_surface(faces) or signed_volume(vertices, faces) <= 0.0:
-        raise MeshError("the mended surface must be watertight with outward normals, got gaps")
+        raise MeshError("the repaired surface must be watertight with outward normals, got gaps")
     _drop_fragments(fragments, vertices, faces, total, notes)
     return Solid(vertices=vertices, faces=faces, notes=tuple(notes))
 
 
 def _stitch(vertices: Array, faces: Faces, notes: list[str]) -> tuple[Array, Faces]:
-    """Merge vertices on rims that nearly touch, if that closes edges."""
+    """Return a surface with vertices on rims that nearly touch merged, if that closes edges."""
     ids, counts = edge_ids(faces)
     rim = np.unique(half_edges(faces)[counts[ids] == 1])
     if not len(rim):
         return vertices, faces
+
+    # Merge rim vertices that are close to each other, directly or by others between them.
     pairs = cKDTree(vertices[rim]).query_pairs(STITCH * diagonal(vertices), output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(rim), len(rim)))
     _, labels = connected_components(graph, directed=False)
@@ -146,6 +158,8 @@ def _stitch(vertices: Array, faces: Faces, notes: list[str]) -> tuple[Array, Fac
     merged[rim] = rim[first[labels]]
     stitched = merged[faces]
     stitched = stitched[(stitched != np.roll(stitched, 1, axis=1)).all(axis=1)]
+
+    # Keep the result only if fewer edges have an odd number of faces.
     before, after = int((counts == 1).sum()), int((edge_ids(stitched)[1] == 1).sum())
     if not len(stitched) or _odd_edges(stitched) >= _odd_edges(faces):
         return vertices, faces
@@ -154,17 +168,19 @@ def _stitch(vertices: Array, faces: Faces, notes: list[str]) -> tuple[Array, Fac
 
 
 def _drop_inner_walls(vertices: Array, faces: Faces) -> tuple[Faces, Faces]:
-    """Split faces into those that bound the solid and patches that end inside it.
+    """Return the faces that bound the solid, and the faces of inner walls and fins.
 
-    Where three faces meet at an edge, one of them is a wall inside the solid or a fin.
-    Among all choices of patches, the best leaves the fewest edges with an odd number
-    of faces, and then keeps the most surface.
+    Where three faces meet at an edge, one of them is a wall inside the solid or a fin. Patches
+    are pieces of surface between such edges. The best choice of patches to keep leaves the fewest
+    edges with an odd number of faces; of equals, the one that keeps the most area.
     """
     ids, counts = edge_ids(faces)
     if not ((counts > 2) & (counts % 2 == 1)).any():
         return faces, faces[:0]
     twins = pair_half_edges(vertices, faces, radial=False)
     patch_count, patch = face_components(twins, len(faces))
+
+    # How many faces each patch (column) has at each edge (row) that has not just two.
     bad = counts != 2
     order = np.cumsum(bad) - 1
     table = np.zeros((int(bad.sum()), patch_count), dtype=np.int64)
@@ -176,6 +192,8 @@ def _drop_inner_walls(vertices: Array, faces: Faces) -> tuple[Faces, Faces]:
             f"edges with three or more faces must part at most {MAX_PATCHES} pieces of surface "
             f"from each other, got {len(doubtful)}"
         )
+
+    # Try all subsets of those patches.
     bits = (np.arange(2 ** len(doubtful))[:, None] >> np.arange(len(doubtful))) & 1
     odd = ((bits @ table[:, doubtful].T) % 2).sum(axis=1)
     areas = np.bincount(patch, face_areas(vertices, faces), patch_count)[doubtful]
@@ -185,6 +203,7 @@ def _drop_inner_walls(vertices: Array, faces: Faces) -> tuple[Faces, Faces]:
 
 
 def _odd_edges(faces: Faces) -> int:
+    """Return the number of edges with an odd number of faces."""
     return int((edge_ids(faces)[1] % 2).sum())
 
 
@@ -195,7 +214,18 @@ def _drop_fragments(
     total: float,
     notes: list[str],
 ) -> None:
-    """Note the pieces that are no part of the solid; refuse to lose visible ones."""
+    """Note the fragments that are not part of the solid.
+
+    Args:
+        fragments: Corners (m, 3, 3) [m] of each fragment, and why it is one.
+        vertices: Vertices of the solid (n, 3) [m].
+        faces: Faces of the solid (k, 3).
+        total: Area of the whole surface [m^2].
+        notes: The note is appended here.
+
+    Raises:
+        MeshError: If too much of the visible surface would be lost.
+    """
     lost, worst, reason = 0.0, 0.0, ""
     for triangles, why in fragments:
         # A quarter, not a half: a wall that lies in the surface itself is not visible.
@@ -217,6 +247,7 @@ def _drop_fragments(
 
 
 def _triangle_area(triangles: Array) -> float:
+    """Return the total area of triangles (m, 3, 3) [m^2]."""
     return float(
         face_areas(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3)).sum()
     )

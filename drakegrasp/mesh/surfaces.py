@@ -1,4 +1,4 @@
-"""Surfaces of triangles: vertices in metres and faces come in, measures of them go out.
+"""Surfaces of triangles: measures, points on them, inside and outside, other forms.
 
 Vertices are (n, 3) [m], faces (m, 3), counter-clockwise seen from outside. Nothing here
 changes a shape.
@@ -12,7 +12,7 @@ import manifold3d
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.arithmetic import dot, norm
+from drakegrasp.arithmetic import dot, multiply, norm
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
 
@@ -21,17 +21,25 @@ Faces = npt.NDArray[np.int64]
 #: Points of the winding-number check, and its budget of point-triangle pairs.
 CHECK_POINTS = 2000
 CHECK_BUDGET = 20_000_000
-#: Distance from the faces at which thin objects are checked, as a part of the diagonal.
+#: Point-triangle pairs of winding numbers that are in memory at a time.
+CHUNK_PAIRS = 400_000
+#: Distance from the faces at which thin objects are checked, as a fraction of the diagonal.
 NEAR = 3e-4
-#: Part of its volume that a surface may enclose twice or backwards: an error of the mass
-#: properties, not of the surface that is touched (slots of real toasters are dents deeper
+#: Fraction of its volume that a surface may enclose twice or backwards. This makes the mass
+#: properties wrong, not the surface that is touched (slots of real toasters are dents deeper
 #: than the wall).
 MAX_OVERLAP = 0.05
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solid:
-    """A mended surface: vertices (n, 3) [m], faces (m, 3), and what was mended."""
+    """A closed surface whose faces point outwards.
+
+    Attributes:
+        vertices: (n, 3) [m].
+        faces: (m, 3).
+        notes: What was repaired, in sentences.
+    """
 
     vertices: Array
     faces: Faces
@@ -68,7 +76,7 @@ def is_solid_surface(faces: Faces) -> bool:
 
 
 def half_edges(faces: Faces) -> Faces:
-    """Return the half-edges (3m, 2); half-edge 3f + i leaves corner i of face f."""
+    """Return the half-edges (3m, 2): start and end; 3f + i leaves corner i of face f."""
     return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
 
 
@@ -79,32 +87,42 @@ def winding_numbers(p_OQ: Array, vertices: Array, faces: Faces) -> Array:
     """Return how often a surface winds around points (k, 3), as (k,).
 
     1 is inside, 0 outside; other integers mean a surface that is inside out or passes
-    through itself, and fractions an open one (Jacobson et al. 2013; solid angles after
-    Van Oosterom and Strackee 1983).
+    through itself, and fractions an open one (Jacobson et al. 2013, "Robust inside-outside
+    segmentation using generalized winding numbers"; solid angles after Van Oosterom and
+    Strackee 1983, "The solid angle of a plane triangle").
     """
     triangles = vertices[faces]
-    out = np.empty(len(p_OQ))
-    step = max(1, 400_000 // len(faces))
+    winding = np.empty(len(p_OQ))
+    step = max(1, CHUNK_PAIRS // len(faces))
     for start in range(0, len(p_OQ), step):
+        # Half of the solid angle that each triangle covers, seen from each point.
         a, b, c = np.moveaxis(triangles[None] - p_OQ[start : start + step, None, None], 2, 0)
         la, lb, lc = (norm(x) for x in (a, b, c))
         numerator = dot(a, np.cross(b, c))
         ab, bc, ca = (dot(x, y) for x, y in ((a, b), (b, c), (c, a)))
         angle = np.arctan2(numerator, la * lb * lc + ab * lc + bc * la + ca * lb)
-        out[start : start + step] = angle.sum(axis=1) / (2.0 * np.pi)
-    return out
+        winding[start : start + step] = angle.sum(axis=1) / (2.0 * np.pi)
+    return winding
 
 
 def overlap_share(vertices: Array, faces: Faces, *, points: int = CHECK_POINTS) -> float:
-    """Return the part of the volume that a surface encloses more than once or backwards.
+    """Return the fraction of the volume that a surface encloses more than once or backwards.
 
-    Measured at a fixed set of evenly spread points of the bounding box, or, if the
-    object fills little of it, on both sides of its faces.
+    It is measured at fixed, evenly spread points of the bounding box, or on both sides of the
+    faces if the object fills little of the box.
+
+    Args:
+        vertices: (n, 3) [m].
+        faces: (m, 3).
+        points: Number of points; fewer, but at least 200, for very many faces.
     """
+    # In the bounding box.
     count = int(np.clip(CHECK_BUDGET // len(faces), min(points, 200), points))
     spread = even_points(count)
     low, size = vertices.min(axis=0), np.ptp(vertices, axis=0)
     inside, wrong = _count_wrong(low + spread * size, vertices, faces)
+
+    # Near the faces, if too few of those points are inside.
     if inside < count // 20:
         on_face, picked = on_faces(vertices, faces, spread[: count // 2])
         a, b, c = np.moveaxis(vertices[faces[picked]], 1, 0)
@@ -117,18 +135,20 @@ def overlap_share(vertices: Array, faces: Faces, *, points: int = CHECK_POINTS) 
 
 
 def _count_wrong(points: Array, vertices: Array, faces: Faces) -> tuple[int, int]:
+    """Return how many points are inside, and how many have a winding number besides 0 and 1."""
     w = winding_numbers(points, vertices, faces)
     wrong = np.minimum(np.abs(w), np.abs(w - 1.0)) > 0.05
     return int((np.abs(w) > 0.5).sum()), int(wrong.sum())
 
 
 def on_faces(vertices: Array, faces: Faces, spread: Array) -> tuple[Array, Faces]:
-    """Return points (k, 3) [m] of a surface and the face (k,) of each.
+    """Return points (k, 3) [m] on a surface and the face (k,) of each.
 
     Args:
         vertices: (n, 3) [m].
         faces: (m, 3).
-        spread: Points (k, 3) of the unit cube; even ones give points that are even over the area.
+        spread: Points (k, 3) of the unit cube; if they are spread evenly, so are the results
+            over the area.
     """
     until = np.cumsum(face_areas(vertices, faces))
     picked = np.minimum(np.searchsorted(until, spread[:, 2] * until[-1]), len(faces) - 1)
@@ -138,29 +158,58 @@ def on_faces(vertices: Array, faces: Faces, spread: Array) -> tuple[Array, Faces
 
 
 def even_points(count: int) -> Array:
-    """Return points (count, 3) that fill the unit cube evenly and are always the same."""
-    root = 1.2207440846057596  # of x^4 = x + 1: the R3 sequence
+    """Return points (count, 3) that fill the unit cube evenly: the R3 sequence.
+
+    The points are always the same (Roberts 2018, "The unreasonable effectiveness of quasirandom
+    sequences").
+    """
+    root = 1.2207440846057596  # of x^4 = x + 1
     return np.asarray((0.5 + np.arange(1, count + 1)[:, None] / root ** np.arange(1, 4)) % 1.0)
+
+
+def cover_triangles(triangles: Array, spacing: float) -> tuple[Array, Faces]:
+    """Return points (k, 3) [m] that cover triangles, and the triangle (k,) of each.
+
+    Each triangle carries a regular grid of points, its corners among them. Triangles with
+    equally fine grids come together.
+
+    Args:
+        triangles: (m, 3, 3) [m], without degenerate ones.
+        spacing: Largest distance between neighbouring points [m].
+    """
+    edges = norm(triangles - np.roll(triangles, 1, axis=1)).max(axis=1)
+    parts = np.maximum(1, np.ceil(edges / spacing)).astype(int)
+    points, owners = [], []
+    for n in np.unique(parts):
+        same = np.flatnonzero(parts == n)
+
+        # Barycentric coordinates (i, j, n - i - j) / n of all grid points.
+        i, j = (a.ravel() for a in np.indices((n + 1, n + 1)))
+        i, j = i[i + j <= n], j[i + j <= n]
+        weights = np.column_stack([i, j, n - i - j]) / n
+        points.append(multiply(weights, triangles[same]).reshape(-1, 3))
+        owners.append(np.repeat(same, len(weights)))
+    return np.concatenate(points), np.concatenate(owners)
 
 
 # Other forms
 
 
 def compact(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
-    """Drop unused vertices and keep the order of the others."""
+    """Return a surface without its unused vertices; the others keep their order."""
     used, inverse = np.unique(faces, return_inverse=True)
     return vertices[used], inverse.reshape(-1, 3).astype(np.int64)
 
 
 def stack(parts: list[tuple[Array, Faces]]) -> Solid:
-    """Return surfaces as one, in their order and sharing no vertex."""
+    """Return several surfaces as one, in their order; they share no vertices."""
     offsets = np.cumsum([0] + [len(vertices) for vertices, _ in parts[:-1]])
     faces = [faces + offset for (_, faces), offset in zip(parts, offsets, strict=True)]
     return Solid(vertices=np.vstack([vertices for vertices, _ in parts]), faces=np.vstack(faces))
 
 
 def to_manifold(vertices: Array, faces: Faces) -> manifold3d.Manifold:
-    """Return a closed surface as Manifold's solid, for Boolean operations.
+    """Return a closed surface as a solid of manifold3d, for Boolean operations.
 
     Raises:
         MeshError: If the surface is not closed.
@@ -177,7 +226,7 @@ def to_manifold(vertices: Array, faces: Faces) -> manifold3d.Manifold:
 
 
 def from_manifold(solid: manifold3d.Manifold) -> tuple[Array, Faces]:
-    """Return the surface of a solid of Manifold's."""
+    """Return the vertices (n, 3) [m] and faces (m, 3) of a solid of manifold3d."""
     mesh = solid.to_mesh64()
     faces = np.array(mesh.tri_verts, dtype=np.int64)
     return compact(np.array(mesh.vert_properties[:, :3], dtype=np.float64), faces)

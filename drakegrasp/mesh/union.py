@@ -1,6 +1,6 @@
-"""The union: closed bodies come in, one surface that encloses every place once goes out.
+"""Union: closed components come in, one surface that encloses every place once goes out.
 
-Bodies may overlap, lie in each other, be inside out, and pass through themselves.
+Components may overlap, lie inside each other, be inside out, and pass through themselves.
 """
 
 from __future__ import annotations
@@ -26,36 +26,45 @@ from drakegrasp.mesh.surfaces import (
     winding_numbers,
 )
 
-#: Triangles lower than this part of the diagonal are slivers of rounding.
+#: Triangles lower than this fraction of the diagonal are slivers, made by rounding.
 SLIVER = 1e-8
-#: Tolerance of the clean-up after a Boolean operation, as a part of the diagonal.
+#: Tolerance of the clean-up after a Boolean operation, as a fraction of the diagonal.
 TIDY = 1e-5
-#: Pieces of a union below this part of its volume are rounding, not geometry.
+#: Pieces of a union below this fraction of its volume are rounding, not geometry.
 CHIP = 1e-6
-#: Part of the volume in which a surface may pass through itself and still be trusted
-#: (`MAX_OVERLAP` is what may be left of that after it was untangled) ...
-MAX_TANGLED = 0.10
-#: ... how much of the volume untangling may change by mistake ...
-MAX_CHANGED = 0.01
-#: ... from where it is worth new triangles, and from where a note.
+#: A surface is untangled if it passes through itself in more than the first fraction of its volume,
+#: and in at most the second. What is left is noted above the third, refused above `MAX_OVERLAP`.
 NOTICED_OVERLAP = 0.01
+MAX_TANGLED = 0.10
 NOTED_OVERLAP = 0.002
-#: Untangling cuts a body in two at most so often in a row, and not quite in the middle,
-#: where modelled objects like to have a face.
+#: Fraction of the volume that untangling may change by mistake.
+MAX_CHANGED = 0.01
+#: Largest number of cuts in a row while untangling, and where each cut lies: not quite in the
+#: middle, where modelled objects often have a face.
 MAX_CUTS = 6
 CUT = 0.4871
 #: Points at which a piece is checked.
 CELL_POINTS = 300
-#: Bodies smaller than this [m^3] are rounding.
+#: Pieces smaller than this [m^3] are rounding.
 NOTHING = 1e-15
-#: Untangling leaves crumbs where walls cross, which are loose and of no use.
+#: Pieces of an untangled surface below this fraction of its volume are dropped: loose crumbs
+#: where walls cross.
 CRUMB = 1e-3
 
 
-def unite(bodies: list[tuple[Array, Faces]], size: float, notes: list[str]) -> tuple[Array, Faces]:
-    """Return the surface of the union of closed bodies."""
-    if len(bodies) == 1:
-        vertices, faces = bodies[0]
+def unite(
+    components: list[tuple[Array, Faces]], size: float, notes: list[str]
+) -> tuple[Array, Faces]:
+    """Return the surface of the union of closed components.
+
+    Args:
+        components: Vertices (n, 3) [m] and faces (m, 3) of each.
+        size: Diagonal of the whole object [m].
+        notes: Repairs are appended here, in sentences.
+    """
+    # A single component keeps its triangles, unless some are degenerate.
+    if len(components) == 1:
+        vertices, faces = components[0]
         if signed_volume(vertices, faces) < 0.0:
             notes.append("the surface was inside out and was turned")
             faces = faces[:, ::-1]
@@ -66,25 +75,28 @@ def unite(bodies: list[tuple[Array, Faces]], size: float, notes: list[str]) -> t
             return vertices, faces
         notes.append("degenerate triangles were collapsed")
         return _tidy(to_manifold(vertices, faces), size)
-    shells = _shells(bodies, notes)
+
+    shells = _shells(components, notes)
     if len(shells) > 1:
         notes.append(f"{len(shells)} bodies were united into one solid")
     return _tidy(manifold3d.Manifold.batch_boolean(shells, manifold3d.OpType.Add), size)
 
 
-def _shells(bodies: list[tuple[Array, Faces]], notes: list[str]) -> list[manifold3d.Manifold]:
-    """Return closed bodies as solids: cavities cut out, other inside-out bodies turned."""
-    volumes = [signed_volume(*body) for body in bodies]
+def _shells(components: list[tuple[Array, Faces]], notes: list[str]) -> list[manifold3d.Manifold]:
+    """Return closed components as solids: cavities cut out, others that are inside out turned."""
+    volumes = [signed_volume(*component) for component in components]
     if volumes[int(np.argmax(np.abs(volumes)))] < 0.0:
-        # The largest body decides: the whole file is inside out, cavities included.
+        # The largest component decides: the whole file is inside out, cavities included.
         notes.append("the surface was inside out and was turned")
-        bodies = [(v, f[:, ::-1]) for v, f in bodies]
+        components = [(v, f[:, ::-1]) for v, f in components]
         volumes = [-volume for volume in volumes]
     solids = [
         to_manifold(v, f if volume > 0.0 else f[:, ::-1])
-        for (v, f), volume in zip(bodies, volumes, strict=True)
+        for (v, f), volume in zip(components, volumes, strict=True)
     ]
-    boxes = [(v.min(axis=0), v.max(axis=0)) for v, _ in bodies]
+
+    # A component that is inside out is a cavity of the smallest one around it, if there is any.
+    boxes = [(v.min(axis=0), v.max(axis=0)) for v, _ in components]
     outer = [i for i, volume in enumerate(volumes) if volume > 0.0]
     inverted = [i for i, volume in enumerate(volumes) if volume <= 0.0]
     cavities: dict[int, list[int]] = {}
@@ -100,10 +112,11 @@ def _shells(bodies: list[tuple[Array, Faces]], notes: list[str]) -> list[manifol
             cavities.setdefault(min(around, key=lambda j: volumes[j]), []).append(i)
     hollow = sum(len(holes) for holes in cavities.values())
     if turned := len(inverted) - hollow:
-        notes.append(f"{turned} of {len(bodies)} bodies were inside out and were turned")
+        notes.append(f"{turned} of {len(components)} bodies were inside out and were turned")
     if hollow:
         notes.append(f"{hollow} sealed cavities were kept hollow")
-    # A cavity is cut from the body around it only, so that a body inside it survives.
+
+    # A cavity is cut only from the component around it, so that a component inside it survives.
     cut = {i for holes in cavities.values() for i in holes}
     return [
         manifold3d.Manifold.batch_boolean(
@@ -111,13 +124,13 @@ def _shells(bodies: list[tuple[Array, Faces]], notes: list[str]) -> list[manifol
         )
         if i in cavities
         else solids[i]
-        for i in range(len(bodies))
+        for i in range(len(components))
         if i not in cut
     ]
 
 
 def _tidy(solid: manifold3d.Manifold, size: float, *, chip: float = CHIP) -> tuple[Array, Faces]:
-    """Collapse the slivers that a Boolean operation leaves, and drop its chips."""
+    """Return the result of a Boolean operation without its slivers and chips."""
     solid = solid.as_original().simplify(TIDY * size)
     pieces = solid.decompose()
     kept = [p for p in pieces if abs(p.volume()) > chip * abs(solid.volume())]
@@ -131,7 +144,17 @@ def _tidy(solid: manifold3d.Manifold, size: float, *, chip: float = CHIP) -> tup
 
 
 def separate(vertices: Array, faces: Faces, notes: list[str]) -> tuple[Array, Faces]:
-    """Return a surface that does not pass through itself, counting every place once."""
+    """Return a surface that does not pass through itself and encloses every place once.
+
+    Args:
+        vertices: (n, 3) [m].
+        faces: (m, 3).
+        notes: Repairs are appended here, in sentences.
+
+    Raises:
+        MeshError: If it still passes through itself in more than `MAX_OVERLAP` of its volume.
+    """
+    # Untangle it if that is needed, and keep the result if it is better and the same shape.
     tangled = left = overlap_share(vertices, faces)
     if NOTICED_OVERLAP < tangled <= MAX_TANGLED:
         solid = to_manifold(vertices, faces)
@@ -145,6 +168,8 @@ def separate(vertices: Array, faces: Faces, notes: list[str]) -> tuple[Array, Fa
                 f"the surface passed through itself in {tangled:.1%} of its volume, "
                 "which now counts once"
             )
+
+    # Report what is left.
     if left > MAX_OVERLAP:
         raise MeshError(
             f"the surface must not pass through itself, got {left:.1%} of its volume "
@@ -158,17 +183,20 @@ def separate(vertices: Array, faces: Faces, notes: list[str]) -> tuple[Array, Fa
 def _untangle(solid: manifold3d.Manifold, depth: int) -> list[manifold3d.Manifold]:
     """Return pieces that do not pass through themselves and together make up the solid.
 
-    A surface that passes through itself falls apart into separate bodies when it is
-    cut small enough, and separate bodies can be united. Only what is still tangled is
+    A surface that passes through itself falls apart into separate pieces when it is
+    cut small enough, and separate pieces can be united. Only what is still tangled is
     cut again, so that the rest keeps its large triangles. Where the surface lies
     inside out there is no material: such places are dents deeper than the wall is thick.
     """
+    # Drop dents.
     pieces = [piece for piece in solid.decompose() if abs(piece.volume()) > NOTHING]
     if any(piece.volume() < 0.0 for piece in pieces):
         pieces = [piece for piece in pieces if not _is_dent(piece, pieces)]
-        # What is left of negative volume is a cavity, or too tangled to tell: it stays
+        # What else has negative volume is a cavity, or too tangled to tell: it stays
         # together with what is around it.
         pieces = [manifold3d.Manifold.compose(pieces)] if pieces else []
+
+    # Cut what is still tangled across its longest side, and go on with the halves.
     done: list[manifold3d.Manifold] = []
     for piece in pieces:
         vertices, faces = from_manifold(piece)
@@ -186,7 +214,7 @@ def _untangle(solid: manifold3d.Manifold, depth: int) -> list[manifold3d.Manifol
 
 
 def _is_dent(piece: manifold3d.Manifold, pieces: list[manifold3d.Manifold]) -> bool:
-    """Return whether a piece is inside out throughout and in no other piece."""
+    """Return whether a piece is inside out throughout and lies in no other piece."""
     if piece.volume() > 0.0:
         return False
     vertices, faces = from_manifold(piece)
@@ -199,7 +227,7 @@ def _is_dent(piece: manifold3d.Manifold, pieces: list[manifold3d.Manifold]) -> b
 
 
 def _changed_share(candidate: tuple[Array, Faces], vertices: Array, faces: Faces) -> float:
-    """Return the part of a solid's volume that a candidate has lost or added."""
+    """Return the fraction of a solid's volume that a candidate has lost or added."""
     points = vertices.min(axis=0) + np.ptp(vertices, axis=0) * even_points(CHECK_POINTS)
     before = winding_numbers(points, vertices, faces) > 0.5
     after = winding_numbers(points, *candidate) > 0.5

@@ -1,4 +1,4 @@
-"""Wavefront text: a triangle mesh comes in, what Drake reads from memory goes out."""
+"""Wavefront text: a triangle mesh comes in, the .obj text for Drake's in-memory meshes goes out."""
 
 from __future__ import annotations
 
@@ -22,10 +22,13 @@ def obj_text(vertices: npt.ArrayLike, faces: npt.ArrayLike, *, normals: bool) ->
     """
     v = np.asarray(vertices, dtype=np.float64)
     f = np.asarray(faces, dtype=np.int64)
+    # Positions, and faces alone if no normals are wanted.
     lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in v.tolist()]
     if not normals:
         lines += [f"f {a} {b} {c}" for a, b, c in (f + 1).tolist()]
         return "\n".join(lines) + "\n"
+
+    # Equal normals are written once; each corner refers to one.
     vn, index = np.unique(np.round(_corner_normals(v, f), 6), axis=0, return_inverse=True)
     lines += [f"vn {x:.6f} {y:.6f} {z:.6f}" for x, y, z in (vn + 0.0).tolist()]
     corners = np.stack((f, index.reshape(f.shape)), axis=2).reshape(-1, 6) + 1
@@ -34,15 +37,19 @@ def obj_text(vertices: npt.ArrayLike, faces: npt.ArrayLike, *, normals: bool) ->
 
 
 def _corner_normals(vertices: Array, faces: Faces) -> Array:
-    """Return the shading normal of every corner (3m, 3)."""
+    """Return the unit shading normal of every corner (3m, 3)."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     weighted = np.cross(b - a, c - a)
     unit = weighted / np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-300)
+
+    # Pairs of a corner and a face at its vertex.
     corner = np.arange(faces.size)
     at_vertex = coo_matrix(
         (np.ones(faces.size), (faces.ravel(), corner // 3)), shape=(len(vertices), len(faces))
     ).tocsr()
     pairs = at_vertex[faces.ravel()].tocoo()
+
+    # The mean of those within the crease angle of the corner's own face, weighted by area.
     smooth = (unit[pairs.row // 3] * unit[pairs.col]).sum(axis=1) >= np.cos(np.radians(CREASE_DEG))
     smooth |= pairs.row // 3 == pairs.col
     rows, columns = pairs.row[smooth], pairs.col[smooth]

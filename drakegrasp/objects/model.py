@@ -1,10 +1,10 @@
 """The object that Drake simulates: a mesh file comes in, an `ObjectModel` goes out.
 
-That is a watertight solid in metres with its origin {O} at the centre of the bounding box,
-mass properties of uniform density, and a collision mesh that is not too fine for
-hydroelastic contact. Drake itself accepts open, inverted and flat meshes without a word and
-simulates nonsense, so everything it needs is checked here; what is wrong is mended
-(`drakegrasp.mesh.repair`) and noted, or refused as `MeshError`.
+An `ObjectModel` is a watertight solid in metres with its origin {O} at the centre of the bounding
+box, mass properties of uniform density, and a collision mesh that is not too fine for
+hydroelastic contact. Drake accepts open, inverted and flat meshes without a warning and
+simulates nonsense, so everything that it needs is checked here. Faults are repaired
+(`drakegrasp.mesh.repair`) and noted, or the mesh is refused with a `MeshError`.
 """
 
 from __future__ import annotations
@@ -21,19 +21,18 @@ import numpy.typing as npt
 import trimesh
 
 from drakegrasp.config import ObjectConfig
-from drakegrasp.errors import MeshError
+from drakegrasp.errors import MeshError, one_line
 from drakegrasp.frames import Array
 from drakegrasp.mesh.components import count_parts
 from drakegrasp.mesh.decimation import decimate
 from drakegrasp.mesh.distance_field import DistanceField, make_distance_field
-from drakegrasp.mesh.loading import load_mesh, one_line
-from drakegrasp.mesh.repair import mend_solid
+from drakegrasp.mesh.repair import repair_solid
 from drakegrasp.mesh.surfaces import Solid, diagonal, signed_volume
-from drakegrasp.objects.sources import MANIFEST_NAME, UNITS, MeshSource, source_sha256
-from drakegrasp.runtime.files import sync_and_rename, temporary_name
+from drakegrasp.objects.sources import MANIFEST_NAME, UNITS, MeshSource, load_source
+from drakegrasp.runtime.files import write_atomic
 from drakegrasp.seeding import object_key
 
-#: Below these an object is a sheet or a speck, which no hydroelastic contact resolves.
+#: Smaller objects are sheets or specks, which hydroelastic contact does not resolve.
 MIN_EXTENT = 0.5e-3  # [m]
 MIN_VOLUME = 1e-9  # [m^3]
 
@@ -54,7 +53,7 @@ class ObjectModel:
         p_OOcm: (3,) centre of mass.
         I_OOcm_O: (3, 3) rotational inertia about the centre of mass, in axes of {O} [kg m^2].
         collision_error: Largest distance between visual and collision surface.
-        notes: What was mended, in sentences.
+        notes: What was repaired, in sentences.
     """
 
     name: str
@@ -116,17 +115,17 @@ class ObjectModel:
 
 
 def prepare_object(source: MeshSource, config: ObjectConfig | None = None) -> ObjectModel:
-    """Return the simulated object of a mesh file, mended where that is honest.
+    """Return the simulated object of a mesh file, repaired where that invents no shape.
 
     Args:
         source: Where the mesh is and what unit it is in.
         config: Mass, and limits of size and faces; the defaults if None.
 
     Raises:
-        MeshError: If the file is no mesh, has an implausible size, or no solid can be
-            made of it; the message gives the reason.
+        MeshError: If the file is no mesh, its size is implausible, or it cannot be made a
+            solid; the message gives the reason.
     """
-    mesh = load_mesh(source.path)
+    mesh, digest = load_source(source)
     vertices, faces = np.asarray(mesh.vertices) * source.scale, np.asarray(mesh.faces)
     try:
         return make_object(
@@ -135,7 +134,7 @@ def prepare_object(source: MeshSource, config: ObjectConfig | None = None) -> Ob
             config or ObjectConfig(),
             name=source.name,
             class_name=source.class_name,
-            mesh_sha256=source_sha256(source),
+            mesh_sha256=digest,
             unit=f" with 1 unit = {source.scale:g} m",
         )
     except MeshError as reason:
@@ -158,14 +157,15 @@ def make_object(
         vertices: (n, 3) [m].
         faces: (m, 3).
         config: Mass, and limits of size and faces.
-        name: Of the object.
-        class_name: Of the object.
-        mesh_sha256: Digest of where it comes from.
-        unit: What to say of the unit of length where the size is refused.
+        name: Name of the object.
+        class_name: Class of the object.
+        mesh_sha256: Digest of its source.
+        unit: The assumed unit of length, for the message if the size is refused.
 
     Raises:
-        MeshError: If the size is implausible, or no solid can be made of it.
+        MeshError: If the size is implausible, or the surface cannot be made a solid.
     """
+    # A wrong unit shows as an implausible size.
     vertices, faces = np.asarray(vertices, dtype=float), np.asarray(faces)
     size = diagonal(vertices)
     if not config.min_diagonal <= size <= config.max_diagonal:
@@ -174,12 +174,17 @@ def make_object(
             f"{config.max_diagonal:g} m, got {size:.4g} m{unit}: give the "
             f"file's unit with --units ({', '.join(UNITS)}) or for this mesh in {MANIFEST_NAME}"
         )
-    solid = mend_solid(vertices, faces)
+
+    # One watertight solid.
+    solid = repair_solid(vertices, faces)
     _refuse_slight(solid)
+
+    # In {O}: the origin is the centre of the bounding box.
     centre = (solid.vertices.min(axis=0) + solid.vertices.max(axis=0)) / 2.0
     visual = Solid(vertices=solid.vertices - centre, faces=solid.faces)
     p_OOcm, I_OOcm_O = _mass_properties(visual, config.mass)
     collision, error = decimate(visual, config.max_collision_faces)
+
     notes = solid.notes
     parts = count_parts(solid.vertices, solid.faces)
     if parts > 1:
@@ -219,18 +224,18 @@ def _refuse_slight(solid: Solid) -> None:
 
 
 def _mass_properties(solid: Solid, mass: float) -> tuple[Array, Array]:
-    """Return p_OOcm (3,) and I_OOcm_O (3, 3) of a solid of uniform density."""
+    """Return p_OOcm (3,) [m] and I_OOcm_O (3, 3) [kg m^2] of a solid of uniform density."""
     triangles = solid.vertices[solid.faces]
     volume = signed_volume(solid.vertices, solid.faces)
     properties = trimesh.triangles.mass_properties(triangles, density=mass / volume)
     p_OOcm = np.asarray(properties["center_mass"])
     inertia = np.asarray(properties["inertia"])
     I_OOcm_O = (inertia + inertia.T) / 2.0
+
+    # What no solid has is an error of the surface.
     moments = np.linalg.eigvalsh(I_OOcm_O)
     if not (moments[0] > 0.0 and moments[0] + moments[1] >= moments[2] * (1.0 - 1e-9)):
         raise MeshError(f"the moments of inertia must obey the triangle inequality, got {moments}")
-    # A centre of mass outside the hull is impossible for a solid, and trimesh's search
-    # for resting poses never returns from it.
     hull = trimesh.Trimesh(solid.vertices, solid.faces, process=False).convex_hull
     outside = np.einsum("ij,ij->i", p_OOcm - hull.triangles[:, 0], hull.face_normals).max()
     if outside > 1e-9:
@@ -243,17 +248,12 @@ def _mass_properties(solid: Solid, mass: float) -> tuple[Array, Array]:
 
 def save_object(model: ObjectModel, path: str | Path) -> None:
     """Write an object to a .npz file, atomically; equal objects give equal bytes."""
-    path = Path(path)
+    # The same bytes for the same object: `np.savez` stores no time stamps.
     content: dict[str, Any] = {f.name: np.asarray(getattr(model, f.name)) for f in fields(model)}
     content["notes"] = np.array(model.notes, dtype=np.str_)
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **content)
-    temporary = temporary_name(path)
-    try:
-        temporary.write_bytes(buffer.getvalue())
-        sync_and_rename(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_atomic(Path(path), buffer.getvalue())
 
 
 def load_object(path: str | Path) -> ObjectModel:
@@ -277,6 +277,6 @@ def load_object(path: str | Path) -> ObjectModel:
 
 
 def object_colour(name: str) -> tuple[float, float, float]:
-    """Return the RGB colour that an object's name gives it, well apart from the table's."""
+    """Return the RGB colour of an object, 0 to 1: its hue depends on its name alone."""
     hue = (object_key(name) % 997) / 997.0
     return colorsys.hsv_to_rgb(hue, 0.65, 0.85)

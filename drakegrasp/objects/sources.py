@@ -1,13 +1,13 @@
-"""Mesh files: a directory comes in, their names, classes and units go out.
+"""Sources of meshes: a directory comes in; names, classes and units of its meshes go out.
 
-`find_meshes` lists the files of a directory, `drakegrasp.mesh.loading` reads one; the object
-that Drake simulates is made of it in `drakegrasp.objects.model`.
+`find_meshes` lists the files of a directory and `load_source` reads one;
+`drakegrasp.objects.model` makes the object that Drake simulates.
 
 File names and `objects.yaml`: a mesh called `<number>_<class>_<rest>.ext` belongs to
-`<class>`, which may itself contain underscores: the number goes, and so does the last
+`<class>`, which may itself contain underscores: the number is dropped, and so is the last
 part if at least two parts remain (24_mug_final and 1_mug are mugs, 30_fruit_juicer_final
-is a fruit_juicer). A name without a number is its own class. A file `objects.yaml`
-beside the meshes overrides that, per set or per mesh, and tells lengths:
+is a fruit_juicer). A name without a number is its own class. A file `objects.yaml` beside the
+meshes overrides class, name and unit, for all meshes or for one:
 
     units: cm
     objects:
@@ -25,21 +25,23 @@ from typing import Literal
 
 import numpy as np
 import pydantic
+import trimesh
 import yaml
 
-from drakegrasp.errors import MeshError
-from drakegrasp.mesh.loading import SUFFIXES, one_line, read_bytes
+from drakegrasp.config import describe_mistake
+from drakegrasp.errors import MeshError, one_line
+from drakegrasp.mesh.loading import SUFFIXES, parse_mesh, read_bytes
 
 #: Metres per unit of length of a file.
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 MANIFEST_NAME = "objects.yaml"
-#: Longest name of an object [bytes]; file systems allow 255 with what is added to it.
+#: Longest name of an object [bytes]: file systems allow 255, and we append to it.
 MAX_NAME = 200
 
 
 @dataclass(frozen=True, kw_only=True)
 class MeshSource:
-    """A mesh file and what is known about it before it is opened.
+    """A mesh file and what is known about it before it is read.
 
     Attributes:
         name: Unique name of the object; the file's stem unless the manifest says otherwise.
@@ -55,7 +57,7 @@ class MeshSource:
 
     def __post_init__(self) -> None:
         for what, text in (("name", self.name), ("class", self.class_name)):
-            # Names become names of folders and files.
+            # Names are used as names of folders and files.
             bad = any(c in "/\\" or not c.isprintable() for c in text) or text.startswith(".")
             if not text.strip() or bad or len(text.encode()) > MAX_NAME:
                 raise MeshError(
@@ -91,6 +93,7 @@ class _Manifest(pydantic.BaseModel):
 
 
 def _read_manifest(path: Path) -> _Manifest:
+    """Return the content of an `objects.yaml`."""
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -98,23 +101,14 @@ def _read_manifest(path: Path) -> _Manifest:
     try:
         return _Manifest.model_validate({} if content is None else content)
     except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"]) or "the file"
-        legal = "; legal keys: " + (
-            "units, class, name" if first["loc"][:1] == ("objects",) else "units, objects"
-        )
-        must = {
-            "extra_forbidden": "a known key",
-            "model_type": "a mapping of keys to values",
-            "dict_type": "a mapping of names to their values",
-        }.get(first["type"], first["msg"].removeprefix("Input should be "))
-        raise MeshError(
-            f"{path}: {place}: must be {must}, got {first['input']!r}"
-            + (legal if first["type"] == "extra_forbidden" else "")
-        ) from error
+        mistake = error.errors()[0]
+        keys = "units, class, name" if mistake["loc"][:1] == ("objects",) else "units, objects"
+        line = describe_mistake(mistake, whole="the file", legal=f"a known key ({keys})")
+        raise MeshError(f"{path}: {line}") from error
 
 
 def _class_of(stem: str) -> str:
+    """Return the class that a file's stem names, as the module describes."""
     number, *parts = stem.split("_")
     if not (number.isdigit() and parts):
         return stem
@@ -136,6 +130,7 @@ def find_meshes(
     Raises:
         MeshError: If there is no mesh, two have the same name, or the manifest is wrong.
     """
+    # The mesh files.
     directory = Path(directory)
     _refuse_units(units)
     try:
@@ -153,9 +148,11 @@ def find_meshes(
             f"{directory}: must hold at least one mesh ({', '.join(SUFFIXES)}), got none"
         )
 
-    # Some file systems store é as two characters; the manifest's author typed one.
+    # Their stems; some file systems store é as two characters where the manifest has one.
     stems = {path: unicodedata.normalize("NFC", path.stem) for path in sorted(paths)}
     _refuse_twins(directory, stems)
+
+    # The manifest, which must speak of these files only.
     if manifest is None and (directory / MANIFEST_NAME).is_file():
         manifest = directory / MANIFEST_NAME
     table = _Manifest() if manifest is None else _read_manifest(Path(manifest))
@@ -189,6 +186,7 @@ def find_mesh(path: str | Path, *, units: str = "m") -> MeshSource:
 
 
 def _entries(table: _Manifest) -> dict[str, _Entry]:
+    """Return the manifest's entries by stem, spelled as `find_meshes` spells stems."""
     return {unicodedata.normalize("NFC", key): entry for key, entry in table.objects.items()}
 
 
@@ -218,11 +216,25 @@ def _refuse_twins(directory: Path, names: dict[Path, str]) -> None:
 
 
 def source_sha256(source: MeshSource) -> str:
-    """Return the hash of a mesh file's bytes and its scale, hexadecimal.
+    """Return the SHA-256 of a mesh file's bytes and its scale, hexadecimal.
 
     Raises:
         MeshError: If the file cannot be read.
     """
-    return hashlib.sha256(
-        read_bytes(source.path) + f"\nscale {source.scale!r}".encode()
-    ).hexdigest()
+    return _sha256(read_bytes(source.path), source.scale)
+
+
+def load_source(source: MeshSource) -> tuple[trimesh.Trimesh, str]:
+    """Return a mesh in the file's units and axes, and its digest as `source_sha256` gives it.
+
+    The file is read once, so the digest is surely that of these triangles.
+
+    Raises:
+        MeshError: If the file cannot be read or holds no finite triangles.
+    """
+    content = read_bytes(source.path)
+    return parse_mesh(source.path.name, content), _sha256(content, source.scale)
+
+
+def _sha256(content: bytes, scale: float) -> str:
+    return hashlib.sha256(content + f"\nscale {scale!r}".encode()).hexdigest()

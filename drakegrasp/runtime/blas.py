@@ -1,8 +1,8 @@
-"""One thread for linear algebra, because with another number its sums are other bits.
+"""The linear algebra of this process: one thread, and which kernel it runs.
 
-OpenBLAS divides large products among as many threads as there are cores, and adds up in
-another order for each number of them. What a worker computes, and what a caller's own process
-does, must be the same to the last bit on any machine of the same kind.
+OpenBLAS divides large products among its threads and adds up in another order for each number of
+them, so the last bits differ. With one thread, workers and callers' own processes compute the same
+bits on any number of cores.
 """
 
 from __future__ import annotations
@@ -11,15 +11,20 @@ from collections.abc import Callable
 from functools import cache, wraps
 from typing import ParamSpec, TypeVar
 
-import scipy.linalg  # noqa: F401  # brings a BLAS of its own, which must be there to be found
+import scipy.linalg  # noqa: F401  # loads SciPy's own BLAS, so that threadpoolctl finds it
 from threadpoolctl import ThreadpoolController
+
+from drakegrasp.runtime.kernels import chosen_kernel
+
+#: The selection counts as it was when the libraries were loaded; later changes have no effect.
+_CHOSEN = chosen_kernel()
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
 def one_thread(function: Callable[P, R]) -> Callable[P, R]:
-    """Return a function with its linear algebra done by one thread of the process."""
+    """Return a function whose linear algebra runs in one thread of the process."""
 
     @wraps(function)
     def limited(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -27,6 +32,18 @@ def one_thread(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **kwargs)
 
     return limited
+
+
+def running_kernel() -> str:
+    """Return the BLAS kernel of this process: the selected one, or the one that OpenBLAS chose.
+
+    Returns:
+        Its name, e.g. "Haswell"; "unknown" for a BLAS that does not tell.
+    """
+    if _CHOSEN is not None:
+        return _CHOSEN
+    libraries = _libraries().select(user_api="blas").info()
+    return "+".join(sorted({library.get("architecture", "unknown") for library in libraries}))
 
 
 @cache

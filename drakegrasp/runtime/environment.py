@@ -1,11 +1,10 @@
-"""The process: memory that is given back, and Drake's ban of the network.
+"""This process: its cores, its memory, and Drake's ban on the network.
 
-Diagrams and meshes are megabytes in C++ and NumPy: Python does not count the one, and the C
-library keeps what is freed of both for later, in the arenas of each of a worker's threads.
+Diagrams and meshes are megabytes of C++ and NumPy memory. Python's garbage collector does not see
+the C++ part, and the allocator keeps freed memory for later use, separately for each thread.
 
-`DRAKE_ALLOW_NETWORK=none`, as our workers run, is a ban that Drake (1.51 to 1.58) applies
-already when some objects are made, whether or not they would use a network: it is eased for the
-few things that need none.
+Workers run with `DRAKE_ALLOW_NETWORK=none`. Drake (1.51 to 1.58) then refuses to make some
+objects even if they would not use the network; `allow_network` eases the ban for these.
 """
 
 from __future__ import annotations
@@ -17,23 +16,33 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-#: Time between two returns of free memory [s]; one takes some 20 ms.
+from drakegrasp.runtime.allocator import has_jemalloc
+
+#: Least time between two returns of free memory [s]; one takes about 20 ms.
 TRIM_SECONDS = 5.0
+#: What jemalloc is told: forget what this thread keeps, and return the free pages of every arena
+#: (4096 is its MALLCTL_ARENAS_ALL).
+_PURGE = (b"thread.tcache.flush", b"arena.4096.purge")
 
 _trimmed = -TRIM_SECONDS
-
-
 _VARIABLE = "DRAKE_ALLOW_NETWORK"
 
 
+def available_cores() -> int:
+    """Return the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def release_memory() -> None:
-    """Collect what sits in reference cycles, and return what is free to the system."""
+    """Collect reference cycles, and return free memory to the system."""
     gc.collect()
     _trim()
 
 
 def trim_memory() -> None:
-    """Return what is free to the system, unless that was done a moment ago."""
+    """Return free memory to the system, unless that was done less than `TRIM_SECONDS` ago."""
     if time.monotonic() - _trimmed > TRIM_SECONDS:
         _trim()
 
@@ -41,14 +50,17 @@ def trim_memory() -> None:
 def _trim() -> None:
     global _trimmed
     _trimmed = time.monotonic()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:  # other C libraries decide for themselves
-        trim(0)
+    process = ctypes.CDLL(None)
+    if has_jemalloc():
+        for order in _PURGE:
+            process.mallctl(order, None, None, None, ctypes.c_size_t(0))
+    elif hasattr(process, "malloc_trim"):  # other C libraries decide for themselves
+        process.malloc_trim(0)
 
 
 @contextmanager
 def allow_network(kind: str) -> Iterator[None]:
-    """Allow one of Drake's kinds of network use, e.g. `package_map`, while the block runs."""
+    """Allow Drake one kind of network use, e.g. `package_map`, while the block runs."""
     allowed = os.environ.get(_VARIABLE)
     os.environ[_VARIABLE] = kind
     try:

@@ -1,8 +1,8 @@
-"""Faults on purpose: crashes and hangs at a chosen place, for the tests of their containment.
+"""Fault injection: crashes and hangs at a chosen place, to test that they are contained.
 
-In: the environment variable DRAKEGRASP_TEST_FAULT, which nothing but a test sets, as
-`KIND:OBJECT:CANDIDATE:STANDOFF` for an attempt and `KIND:OBJECT` for preparing an object;
-several are separated by blanks. Without it nothing happens.
+In: the environment variable DRAKEGRASP_TEST_FAULT, which only tests set:
+`KIND:OBJECT:CANDIDATE:STANDOFF` for an attempt, `KIND:OBJECT` for preparing an object, several
+separated by blanks. Without it nothing happens.
 """
 
 from __future__ import annotations
@@ -16,23 +16,26 @@ VARIABLE = "DRAKEGRASP_TEST_FAULT"
 
 
 def inject_fault(*place: str | int) -> None:
-    """Do what the environment asks for at a place: an object, or one of its attempts.
+    """Cause the fault that the environment asks for at a place, if any.
+
+    Args:
+        place: An object's name; for an attempt also its candidate and its standoff.
 
     Raises:
         MemoryError: For the kind `memory`.
         BlankImageError: For the kind `blank`.
     """
-    wanted = os.environ.get(VARIABLE)
-    if wanted is None:
+    faults = os.environ.get(VARIABLE)
+    if faults is None:
         return
-    here = ":".join(map(str, place))
-    for entry in wanted.split():
-        kind, _, there = entry.partition(":")
-        if there == here:
-            _do(kind)
+    label = ":".join(map(str, place))
+    for fault in faults.split():
+        kind, _, target = fault.partition(":")
+        if target == label:
+            _cause(kind)
 
 
-def _do(kind: str) -> None:
+def _cause(kind: str) -> None:
     if kind == "crash":
         ctypes.string_at(0)  # a segmentation fault
     elif kind == "abort":
@@ -40,13 +43,13 @@ def _do(kind: str) -> None:
     elif kind == "exit":
         os._exit(3)
     elif kind == "hang":
-        while True:  # in C, without the interpreter's lock, as a simulation
+        while True:  # in C, without the interpreter's lock, like a simulation
             ctypes.CDLL(None).pause()
     elif kind == "freeze":
         ctypes.PyDLL(None).pause()  # in C, with the interpreter's lock
     elif kind == "memory":
         raise MemoryError
     elif kind == "blank":
-        raise BlankImageError("blank on purpose")
+        raise BlankImageError("a blank image, by fault injection")
     else:
         raise ValueError(f"{VARIABLE}: must name a known kind of fault, got {kind!r}")

@@ -1,9 +1,8 @@
-"""Files that are whole or absent, and show any change of a single bit.
+"""Files that are complete or absent, and whose damage shows.
 
-A file is written under a temporary name in its own folder, closed, synced and renamed, so
-a reader never sees half of one and a crash leaves nothing but a temporary file. A seal, the
-SHA-256 of all other bytes in the user block that HDF5 leaves free at a file's start, shows any
-change.
+A file is written under a temporary name in its own folder, closed, synced and renamed. A reader
+never sees half a file, and a crash leaves only a temporary file. A seal shows any changed bit: it
+is the SHA-256 of all other bytes, in the user block that HDF5 leaves free at a file's start.
 """
 
 from __future__ import annotations
@@ -25,26 +24,24 @@ import h5py
 from drakegrasp.errors import DataError, DiskFullError
 from drakegrasp.runtime.processes import host_label, is_running
 
-#: Bytes of the user block at a shard's start that holds the seal; HDF5 wants a power of two.
+#: Size of the user block that holds the seal [B]; HDF5 demands a power of two.
 SEAL_SIZE = 512
-#: Suffix of a file that is being written; what is left of one after a crash may be deleted.
+#: Suffix of a file that is being written; after a crash such a file may be deleted.
 TEMPORARY_SUFFIX = ".tmp"
-#: How it ends: which process, of which machine, writes it.
+#: End of its name: the machine and the process that write it.
 _TEMPORARY = re.compile(r"\.(?P<host>[A-Za-z0-9-]+)~(?P<pid>\d+)~[0-9a-f]{12}\.tmp")
-#: Age after which another machine's temporary file is one of a dead process [s].
+#: Age after which another machine's temporary file counts as left by a dead process [s].
 STALE_SECONDS = 3600.0
-#: What the system says where there is no room: disk, quota, or a limit on a file's size.
+#: Error numbers of no room: on the disk, in the quota, or by a limit on a file's size.
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @contextmanager
-def atomic_hdf5(path: Path, *, sealed: bool = False) -> Iterator[h5py.File]:
-    """Open a new HDF5 file that appears at `path` only when the block ends well.
+def atomic_path(path: Path) -> Iterator[Path]:
+    """Give the block a temporary path to write; it becomes `path` when the block ends well.
 
     Args:
-        path: Of the file.
-        sealed: Whether to leave room for a seal and set it, see `seal`. Such a file is built in
-            memory: a full disk is then the error of one write, and leaves HDF5 sound.
+        path: Of the file. Its folder is made if it is missing; an older file is replaced.
 
     Raises:
         OSError: If the disk is full or the folder cannot be written; nothing is left behind.
@@ -52,6 +49,31 @@ def atomic_hdf5(path: Path, *, sealed: bool = False) -> Iterator[h5py.File]:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = temporary_name(path)
     try:
+        yield temporary
+        sync_and_rename(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_atomic(path: Path, content: bytes) -> None:
+    """Write a file of these bytes, see `atomic_path`."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+
+
+@contextmanager
+def atomic_hdf5(path: Path, *, sealed: bool = False) -> Iterator[h5py.File]:
+    """Open a new HDF5 file that appears at `path` when the block ends well, see `atomic_path`.
+
+    Args:
+        path: Of the file.
+        sealed: Whether to leave room for a seal and set it, see `seal`. Such a file is built in
+            memory: a full disk is then the error of one write, and HDF5 stays usable.
+
+    Raises:
+        OSError: If the disk is full or the folder cannot be written; nothing is left behind.
+    """
+    with atomic_path(path) as temporary:
         if sealed:
             content = BytesIO()
             with h5py.File(content, "w", userblock_size=SEAL_SIZE) as file:
@@ -61,13 +83,10 @@ def atomic_hdf5(path: Path, *, sealed: bool = False) -> Iterator[h5py.File]:
         else:
             with h5py.File(temporary, "w") as file:
                 yield file
-        sync_and_rename(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def seal(path: Path) -> None:
-    """Write the hash of a file's bytes behind the seal into the seal."""
+    """Write the hash of a file's bytes after the seal into the seal."""
     with path.open("r+b") as file:
         text = _seal_of(file)
         file.seek(0)
@@ -75,15 +94,19 @@ def seal(path: Path) -> None:
 
 
 def refuse_broken_seal(path: Path, what: str = "shard") -> None:
-    """Refuse a sealed file of which any bit has changed.
+    """Refuse a sealed file in which any bit has changed.
+
+    Args:
+        path: Of the file.
+        what: What the file is, for the error message.
 
     Raises:
-        DataError: If it has, or the file is missing.
+        DataError: If the file is damaged or missing.
     """
     try:
         with path.open("rb") as file:
-            found = file.read(SEAL_SIZE)
-            intact = found == _seal_of(file)
+            stored = file.read(SEAL_SIZE)
+            intact = stored == _seal_of(file)
     except OSError as error:
         raise DataError(f"{path}: must be a complete {what}, got none ({error.strerror})") from None
     if not intact:
@@ -97,7 +120,7 @@ def _seal_of(file: BufferedReader | BufferedRandom) -> bytes:
 
 
 def sync_and_rename(temporary: Path, path: Path) -> None:
-    """Make a finished temporary file durable and give it its name, in one step for readers."""
+    """Make a finished file durable and give it its name, in one step for readers."""
     _sync(temporary)
     temporary.replace(path)
     _sync(path.parent)
@@ -109,10 +132,21 @@ def temporary_name(path: Path) -> Path:
     return path.with_name(f".{path.name}.{writer}{TEMPORARY_SUFFIX}")
 
 
-def sweep_temporary(out: Path) -> list[Path]:
-    """Remove what dead processes left half-written in a dataset's directory; return its names.
+def probe_folder(folder: Path) -> None:
+    """Create a file in a folder and remove it again.
 
-    Another machine's processes cannot be asked: their files go when they are old.
+    Raises:
+        OSError: If the folder cannot be written.
+    """
+    probe = temporary_name(folder / "probe")
+    probe.touch()
+    probe.unlink()
+
+
+def sweep_temporary(out: Path) -> list[Path]:
+    """Remove temporary files of dead processes from a dataset's directory; return their paths.
+
+    Whether another machine's process still runs is unknown: its files are removed when old.
     """
     return [path for path in _temporary_files(out) if _is_stale(path) and _remove(path)]
 
@@ -127,9 +161,9 @@ def _temporary_files(out: Path) -> Iterator[Path]:
 
 
 def _is_stale(path: Path) -> bool:
-    found = _TEMPORARY.search(path.name)
-    if found is not None and found["host"] == host_label():
-        return not is_running(int(found["pid"]))
+    match = _TEMPORARY.search(path.name)
+    if match is not None and match["host"] == host_label():
+        return not is_running(int(match["pid"]))
     try:
         return time.time() - path.stat().st_mtime > STALE_SECONDS
     except FileNotFoundError:
@@ -146,7 +180,7 @@ def _remove(path: Path) -> bool:
 
 @contextmanager
 def disk_full_named(out: Path) -> Iterator[None]:
-    """Turn the system's word for a full disk, within the block, into one line.
+    """Turn the system's errors of a full disk, within the block, into one clear error.
 
     Raises:
         DiskFullError: If there is no room for what the block writes.
@@ -158,13 +192,13 @@ def disk_full_named(out: Path) -> Iterator[None]:
             raise
         _silence_repetitions()
         raise DiskFullError(
-            f"{out}: must have room for what is written, got a full disk or quota "
-            f"({os.strerror(_NO_ROOM[0])}); make room, and the same command goes on from here"
+            f"{out}: the disk or the quota is full ({os.strerror(_NO_ROOM[0])}); make room, and "
+            "the same command goes on from here"
         ) from None
 
 
 def _silence_repetitions() -> None:
-    """Drop what HDF5 says of a full disk again, whenever one of the file's handles is freed."""
+    """Drop HDF5's errors of a full disk that come again when the file's handles are freed."""
     before = sys.unraisablehook
 
     def hook(unraisable: sys.UnraisableHookArgs) -> None:
@@ -175,7 +209,7 @@ def _silence_repetitions() -> None:
 
 
 def _is_no_room(error: BaseException) -> bool:
-    # HDF5 passes the number on in its own text only.
+    # HDF5 gives the error number only within its own text.
     text = str(error)
     return getattr(error, "errno", None) in _NO_ROOM or any(
         f"errno = {number}," in text or os.strerror(number) in text for number in _NO_ROOM

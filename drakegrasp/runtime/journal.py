@@ -1,23 +1,23 @@
-"""A work unit's journal: which of its steps runs now, so that a death has a name.
+"""A work unit's journal: the step that runs now, so that we know in which step a process died.
 
-While a unit runs, a small file beside its shard says which step it is at: building the
-scene, an attempt, its images. Before each step one fixed-size record is overwritten. A
-native crash and a step that passes its time limit leave a mark behind the record, written
-by Python's `faulthandler` without the interpreter; SIGKILL leaves none. When the unit is
-done the file goes. One that is found at a unit's start is what an earlier run died of, and
-the step that it names is judged:
+While a unit runs, a small file beside its shard names the current step: building the scene, an
+attempt, rendering its images. Each step overwrites one record of fixed size. A native crash and a
+step that passes its time limit leave a mark behind the record, which Python's `faulthandler`
+writes without the interpreter; SIGKILL leaves none. The file is removed when the unit is done. A
+file that is there when a unit starts shows that an earlier run died, and in which step:
 
-* one that passed its time limit is not tried again;
-* one in which the process crashed `NATIVE_DEATHS` times in a row is not tried again;
-* an attempt in which the process vanished `SILENT_DEATHS` times in a row (the kernel's or
-  the nanny's answer to too little memory) is not tried again.
+* a step that passed its time limit is not tried again;
+* a step in which the process crashed `NATIVE_DEATHS` times in a row is not tried again;
+* an attempt in which the process vanished `SILENT_DEATHS` times in a row (the kernel or the nanny
+  kills a process that takes too much memory) is not tried again.
 
-Steps under suspicion run first, so a guilty one costs a start of the process and not the
-unit, and an innocent one is cleared by passing. Silent deaths must hit the very same step
-eight times in a row: a machine that is switched off, or a random SIGKILL, does not.
+Unresolved steps, in which a process died but not often enough, run first: a failing step then costs
+a start of the process and not the whole unit, and a step that passes is cleared. A process must
+vanish eight times in a row in the very same step: a machine that is switched off, or a random
+SIGKILL, does not do that.
 
-The file is text: a line of JSON with the unit's identity and the deaths before, the
-record, and what faulthandler wrote.
+The file is text: a line of JSON with the unit's identity and the deaths before, the record, and
+what faulthandler wrote.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ from typing import Any
 from drakegrasp.runtime.files import temporary_name
 from drakegrasp.runtime.processes import lock_file
 
-#: Crashes in a row of one step after which it is not tried again: one may be the machine's.
+#: Crashes in a row in one step after which it is not tried again: one may be the machine's fault.
 NATIVE_DEATHS = 2
-#: Unmarked deaths in a row of one step after which it is not tried again.
+#: Deaths without a mark in a row in one attempt after which it is not tried again.
 SILENT_DEATHS = 8
-#: Deaths of a unit since it last learned something, after which it is not tried again.
+#: Deaths of a unit since the last verdict after which it is in a crash loop.
 GIVE_UP_DEATHS = 20
 #: Bytes of the record.
 _RECORD_SIZE = 32
-#: What faulthandler writes first, by what happened.
+#: How the text of faulthandler begins, for a crash and for a passed time limit.
 _CRASH_MARK, _TIME_MARK = b"Fatal Python error", b"Timeout ("
-#: How the steps that are attempts begin.
+#: How the names of steps that are attempts begin.
 ATTEMPT = "try"
 
 
@@ -61,7 +61,13 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class Deaths:
-    """Deaths in a row of one step: crashes, unmarked ones, and whether it hung."""
+    """Deaths in a row in one step.
+
+    Attributes:
+        native: Number of crashes.
+        silent: Number of deaths without a mark.
+        hung: Whether the step passed its time limit.
+    """
 
     native: int = 0
     silent: int = 0
@@ -70,29 +76,40 @@ class Deaths:
 
 @dataclass
 class _History:
-    """What earlier runs of a unit died of: by step, and their number since the last verdict."""
+    """How earlier runs of a unit died.
+
+    Attributes:
+        deaths: By step.
+        crash_loop: Number of deaths since the last verdict.
+    """
 
     deaths: dict[str, Deaths] = field(default_factory=dict)
-    futile: int = 0
+    crash_loop: int = 0
 
     def verdict(self, step: str) -> Verdict | None:
-        found = self.deaths.get(step, Deaths())
-        if found.hung:
+        deaths = self.deaths.get(step, Deaths())
+        if deaths.hung:
             return Verdict.HUNG
-        if found.native >= NATIVE_DEATHS:
+        if deaths.native >= NATIVE_DEATHS:
             return Verdict.CRASHED
-        # Long steps would be hit by chance, and an object is not given up for that.
-        vanished = found.silent >= SILENT_DEATHS and step.startswith(ATTEMPT)
+        # A random SIGKILL hits long steps most often; an object is not given up for that.
+        vanished = deaths.silent >= SILENT_DEATHS and step.startswith(ATTEMPT)
         return Verdict.VANISHED if vanished else None
 
-    def suspects(self) -> list[str]:
+    def unresolved(self) -> list[str]:
         return [step for step in self.deaths if self.verdict(step) is None]
 
     def add(self, step: str, passed: int, marks: bytes) -> None:
-        """Take in that a run died at a step; bit i of `passed` clears the i-th suspect."""
-        for i, suspect in enumerate(self.suspects()):
+        """Add that a run died in a step.
+
+        Args:
+            step: The step.
+            passed: Bit i says that the i-th unresolved step ran well; it is cleared.
+            marks: What faulthandler wrote.
+        """
+        for i, cleared in enumerate(self.unresolved()):
             if passed >> i & 1:
-                del self.deaths[suspect]
+                del self.deaths[cleared]
         before = self.deaths.get(step, Deaths())
         if _TIME_MARK in marks:
             now = replace(before, hung=True)
@@ -101,7 +118,7 @@ class _History:
         else:
             now = replace(before, silent=before.silent + 1)
         self.deaths[step] = now
-        self.futile = 0 if self.verdict(step) else self.futile + 1
+        self.crash_loop = 0 if self.verdict(step) else self.crash_loop + 1
 
 
 class Journal:
@@ -112,14 +129,14 @@ class Journal:
         self._passed = 0
 
     @property
-    def suspects(self) -> list[str]:
-        """The steps to run first, in this order."""
-        return self._history.suspects()
+    def unresolved(self) -> list[str]:
+        """The steps in which a process died without a verdict yet; run these first, in order."""
+        return self._history.unresolved()
 
     @property
-    def is_futile(self) -> bool:
-        """Whether the unit died again and again and nothing was learned from it."""
-        return self._history.futile >= GIVE_UP_DEATHS
+    def in_crash_loop(self) -> bool:
+        """Whether the unit died again and again without a verdict on any step."""
+        return self._history.crash_loop >= GIVE_UP_DEATHS
 
     def verdict(self, step: str) -> Verdict | None:
         """Return why a step must not be tried again, or None if it may."""
@@ -127,63 +144,74 @@ class Journal:
 
     @contextmanager
     def step(self, name: str, seconds: float | None = None) -> Iterator[None]:
-        """Say that a step runs while the block does.
+        """Record that a step runs while the block runs.
 
         Args:
-            name: Of the step, up to 14 ASCII characters.
-            seconds: Of the wall clock after which this process ends itself, wherever it is,
-                or None for a step that cannot hang.
+            name: Name of the step, up to 14 ASCII characters.
+            seconds: Wall clock [s] after which this process ends itself, wherever it is; None
+                for a step that cannot hang.
         """
         if self._file is None:
             yield
             return
+
+        # Before the step: its record, and an alarm.
         os.pwrite(self._file.fileno(), _record(name, self._passed), self._start)
         if seconds is not None:
-            # A thread of C, so it also ends a process that never comes back to Python.
+            # The alarm is a thread of C: it also ends a process that never returns to Python.
             faulthandler.dump_traceback_later(seconds, exit=True, file=self._file)
         try:
             yield
         except MemoryError:
-            os._exit(1)  # as if the kernel had done it: a new process has what this one held
+            # End as if the kernel had killed it: a new process starts with free memory.
+            os._exit(1)
         finally:
             if seconds is not None:
                 faulthandler.cancel_dump_traceback_later()
-        if name in self.suspects:
-            self._passed |= 1 << self.suspects.index(name)
+
+        # The next record clears it.
+        if name in self.unresolved:
+            self._passed |= 1 << self.unresolved.index(name)
 
 
-#: The journal of a run in a process that nobody would start again: it keeps none.
+#: The journal of a process that is not started again when it dies: it records nothing.
 NO_JOURNAL = Journal(None, 0, _History())
 
 
 @contextmanager
 def open_journal(path: Path, identity: Mapping[str, Any]) -> Iterator[Journal]:
-    """Keep a journal while the block runs; judge what an earlier run of the same died of.
+    """Keep a journal while the block runs, with what is known of earlier runs that died.
 
-    It is removed when the block ends, by itself or by an exception: both come back to
-    whoever asked for the unit. Only a death leaves it.
+    It is removed when the block ends, also by an exception, because the caller then learns how
+    the unit ended. Only a death leaves the journal behind.
 
     Args:
         path: Of the journal.
-        identity: What the unit is of, as JSON types; a journal of anything else is ignored.
+        identity: Identifies the unit, as JSON types; a journal of another unit is ignored.
 
     Raises:
         OSError: If the file cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     history = _read_history(path, identity)
-    if history is None:  # another process is at this unit: both will write the same shard
+    if history is None:
+        # Another process runs this unit, too: both will write the same shard.
         yield NO_JOURNAL
         return
+
+    # The first line is what is known; the record and faulthandler's text follow.
     line = json.dumps(
         {
             "unit": dict(identity),
             "deaths": {step: asdict(deaths) for step, deaths in history.deaths.items()},
-            "futile": history.futile,
+            "crash_loop": history.crash_loop,
         },
         ensure_ascii=False,
     ).encode()
     start = len(line) + 1
+
+    # The file gets its name when it is complete and locked. Not `atomic_path`: it stays open and is
+    # not synced.
     temporary = temporary_name(path)
     try:
         temporary.write_bytes(line + b"\n" + _record("start", 0))
@@ -203,11 +231,11 @@ def _record(step: str, passed: int) -> bytes:
 
 
 def _read_history(path: Path, identity: Mapping[str, Any]) -> _History | None:
-    """Return what earlier runs died of, or None if one of them is still alive."""
+    """Return how earlier runs died, or None if one of them is still alive."""
     history = _History()
     try:
-        with path.open("r+b") as file:  # NFS locks only what may be written
-            # Where the file system knows no locks, nobody holds any.
+        with path.open("r+b") as file:  # NFS locks only files that are open for writing
+            # On a file system without locks (None) nobody is known to hold one.
             if lock_file(file) is False:
                 return None
             head, _, rest = file.read().partition(b"\n")
@@ -216,19 +244,19 @@ def _read_history(path: Path, identity: Mapping[str, Any]) -> _History | None:
             return _History()
         for step, deaths in content["deaths"].items():
             history.deaths[step] = Deaths(**deaths)
-        history.futile = int(content["futile"])
+        history.crash_loop = int(content["crash_loop"])
         passed, step = rest[:_RECORD_SIZE].decode("ascii").split(maxsplit=1)
         history.add(step.strip(), int(passed, 16), rest[_RECORD_SIZE:])
     except FileNotFoundError:
         return _History()
     except (KeyError, TypeError, ValueError):
-        return _History()  # nothing that this program wrote
+        return _History()  # this version did not write it
     return history
 
 
 @contextmanager
 def _crashes_marked(file: FileIO) -> Iterator[None]:
-    """Have native crashes of this process written to a file while the block runs."""
+    """Write native crashes of this process to a file while the block runs."""
     before = faulthandler.is_enabled()
     faulthandler.enable(file=file, all_threads=False)
     try:
@@ -236,5 +264,5 @@ def _crashes_marked(file: FileIO) -> Iterator[None]:
     finally:
         faulthandler.disable()
         if before and sys.__stderr__ is not None:
-            with suppress(OSError, ValueError):  # no file behind it
+            with suppress(OSError, ValueError):  # stderr may be no real file
                 faulthandler.enable(file=sys.__stderr__)

@@ -1,8 +1,12 @@
-"""Which process did something, and whether it still runs.
+"""The identity of a process, whether it still runs, and the kernel's lock on a file.
 
-A process is known by its machine, its number and when it began: a number alone is given
-again. Nothing here can tell of another machine's processes, but for the kernel's locks, where
-a network file system has them for all machines.
+A process is identified by its machine, the start of the machine, its number and its start: the
+kernel reuses numbers. Only the kernel's locks reach other machines, on network file systems that
+have them.
+
+psutil is no substitute: it computes the start of a process from the wall clock, which may be
+set, so a living process could look like another one. Linux's clock ticks since the machine's
+start never change.
 """
 
 from __future__ import annotations

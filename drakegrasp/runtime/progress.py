@@ -1,4 +1,4 @@
-"""Progress on standard error: what is done, how fast, and how long it will still take."""
+"""Progress on standard error: what is done, how fast, and the time left."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ from rich.progress import (
 from rich.table import Column
 from rich.text import Text
 
-#: Window in which the speed is taken [s]: a task may take a minute, and workers come and go.
+#: Window of the speed estimate [s]: a task may take a minute, and workers come and go.
 SPEED_SECONDS = 600.0
-#: Width from which the figures stand in one line with the rest [characters].
+#: Width of a terminal from which the figures fit on the same line [characters].
 ONE_LINE = 150
-#: Width of all but the bar, and the least width from which there is one [characters].
+#: Width of everything but the bar, and the least and the largest width of the bar [characters].
 _BESIDES_BAR, _LEAST_BAR, _MOST_BAR = 70, 6, 24
 
 
 class Report(Protocol):
-    """What long work calls as it goes on."""
+    """Called by long work to report its progress."""
 
     def __call__(self, done: int, total: int, *, found: int = 0, **figures: int) -> None:
-        """Say that `done` of `total` is done, with figures to show beside it.
+        """Report that `done` of `total` steps are done.
 
         Args:
-            done: How much is done.
-            total: How much there is to do.
-            found: How much of `done` was there before, and says nothing of the speed.
-            figures: More numbers, by what they count.
+            done: Number of steps that are done.
+            total: Number of all steps.
+            found: Number of those in `done` that were done before; they do not count as speed.
+            figures: More numbers to show, by what they count.
         """
 
 
@@ -60,7 +60,7 @@ class _Rate(ProgressColumn):
 
 
 class _Bar(Progress):
-    """A progress bar with the figures in a line of their own where one is too narrow."""
+    """A progress bar; on a narrow terminal the figures get a line of their own."""
 
     def __init__(self, unit: str, console: Console) -> None:
         self._wide = console.width >= ONE_LINE
@@ -81,7 +81,7 @@ class _Bar(Progress):
         )
 
     def get_renderables(self) -> Iterator[RenderableType]:
-        """Yield the lines to show; rich calls this."""
+        """Yield the lines to show; called by rich."""
         yield from super().get_renderables()
         if not self._wide:
             for task in self.tasks:
@@ -96,9 +96,9 @@ def _text(template: str) -> TextColumn:
 
 @contextmanager
 def progress_bar(title: str, unit: str, *, show: bool = True) -> Iterator[Report]:
-    """Show a progress bar on standard error while the block runs; yield what feeds it.
+    """Show a progress bar on standard error while the block runs; yield its `Report`.
 
-    Off a terminal only the last state is printed, so logs stay short.
+    Where standard error is no terminal only the last state is printed: logs stay short.
     """
     if not show:
         yield silent
@@ -110,9 +110,9 @@ def progress_bar(title: str, unit: str, *, show: bool = True) -> Iterator[Report
 
     def report(done: int, total: int, *, found: int = 0, **figures: int) -> None:
         nonlocal before
-        bar.start()  # only now, so that an error before the first report stands alone
+        bar.start()  # not before: an error before the first report is then the only output
         text = " ".join(f"{value} {name}" for name, value in figures.items())
-        if found > before:  # the clock begins when that is counted
+        if found > before:  # the clock starts again: these steps took no time
             bar.reset(task, total=total, completed=done, figures=text)
             before = found
         else:

@@ -1,13 +1,13 @@
-"""Stage "sample": palm poses about an object, and the attempts that follow from them.
+"""Stage "sample": palm poses around an object, and the attempts that follow from them.
 
-In: the object's box and mesh, and how it rests on the table. Out: up to
-`candidates.max` distinct palm poses X_OG and, for each, where its palm ray meets the
-object. The paper's method (`rotations`) multiplies a first palm pose with global and
-local rotations; `normals` is the baseline of its Figure 2.
+In: the object's box and mesh, and its resting pose. Out: up to `candidates.max` distinct palm poses
+X_OG and, for each, the distance along its palm ray to the object. The paper's method (`rotations`)
+multiplies a first palm pose with global and local rotations; `normals` is the baseline of its
+Figure 2.
 
-Nothing here needs Drake. Poses are the same bits on every machine: sums, products and square
-roots in a stated order (`arithmetic`), decisions that take in what lies on the edge by more than
-rounding, poses compared as rounded integers, draws from `seeding`.
+Nothing here needs Drake. Poses are the same bits on every machine: sums, products and square roots
+have a stated order (`arithmetic`), limits are inclusive by more than rounding, poses are compared
+as rounded integers, and random numbers come from `seeding`.
 """
 
 from __future__ import annotations
@@ -21,25 +21,21 @@ import trimesh
 
 from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos_deg
 from drakegrasp.config import CandidateConfig
+from drakegrasp.mesh.rays import first_hits
 from drakegrasp.mesh.surfaces import on_faces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key
 
 #: The first palm's axes in {O}: +Gz looks down onto the object, Gx = Ox.
 R_OG0 = np.diag([1.0, -1.0, -1.0])
-#: Poses that agree to this in every rotation entry, and in position relative to the
-#: object's size, are one pose: Euler products repeat themselves up to rounding.
+#: Poses that agree to this in every rotation entry, and in position relative to the object's size,
+#: are one pose: different Euler angles give equal rotations up to rounding.
 SAME_POSE = 1e-6
-#: A palm this far below the table, or a palm ray this far beside the bounding box, is still in [m]:
-#: far above rounding, far below what matters.
+#: A palm this far below the table, or a palm ray this far beside the bounding box, is still valid
+#: [m]: far above rounding, far below what matters.
 EDGE = 1e-6
-#: A palm ray this far beside a triangle still meets it, as a part of the triangle: no ray slips
-#: through an edge between two.
-RAY_EDGE = 1e-9
-#: Combinations whose poses are computed at a time; bounds the memory.
+#: Combinations whose poses are computed together; bounds the memory.
 CHUNK = 131_072
-#: Pairs of a ray and a triangle that are looked at together; few enough for a cache.
-PAIRS = 65_536
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,8 +47,8 @@ class Candidates:
         distance: (n,), from the palm's origin along +Gz to the object's surface [m]; NaN
             where the palm ray misses the object.
         combinations: Number of combinations of rotations (or surface samples).
-        valid: Those above the table whose palm ray meets the bounding box.
-        distinct: Different poses among them.
+        valid: Number of those above the table whose palm ray meets the bounding box.
+        distinct: Number of different poses among the valid ones.
     """
 
     X_OG: Array
@@ -66,29 +62,37 @@ class Candidates:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Attempt:
-    """One candidate at one stand-off: what a trial starts from.
+class Pregrasp:
+    """Palm pose and joint angles before the fingers close: the start of a trial.
+
+    Attributes:
+        X_OG: Pose of the palm (4, 4); the candidate's own where its ray misses.
+        spread: Angle of the spread joints [rad].
+        closing: Angles of the closing joints (k,) [rad] at the start; None is the open hand.
+        ray_hits: Whether the palm ray meets the object; true if no ray places the palm.
+    """
+
+    X_OG: Array
+    spread: float
+    closing: Array | None = None
+    ray_hits: bool = True
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Attempt(Pregrasp):
+    """One candidate at one stand-off, as a dataset counts it.
 
     Attributes:
         candidate: Index of the candidate of its object.
         standoff_index: Index into `candidates.standoffs`.
         standoff: Distance of the palm from the surface point along -Gz [m].
-        spread: Angle of the spread joints [rad].
-        X_OG: Pose of the palm (4, 4); the candidate's own where its ray misses.
-        ray_hits: Whether the palm ray meets the object.
-        seed: What `spread` was drawn from.
-        closing: Angles of the closing joints (k,) [rad] from which the fingers close; None is
-            the open hand.
+        seed: Seed from which `spread` was drawn.
     """
 
     candidate: int
     standoff_index: int
     standoff: float
-    spread: float
-    X_OG: Array
-    ray_hits: bool
     seed: int
-    closing: Array | None = None
 
 
 def sample_candidates(
@@ -132,8 +136,7 @@ def rotation_candidates(
 
     X_OG = R_global X_OG0 R_local with R = Rx Ry Rz each, and X_OG0 on +Oz at the distance
     of the box's corner from its centre, looking at it (Veres et al., equation 1). Valid:
-    the palm's origin is above the table and the ray along +Gz meets the box; what lies on the
-    edge is valid.
+    the palm's origin is above the table and the ray along +Gz meets the box, edges included.
 
     Args:
         half_extents: (3,), of the box about the origin of {O} [m].
@@ -145,6 +148,7 @@ def rotation_candidates(
         Poses (n, 4, 4), sorted by their rotation's entries, row by row, and then by position,
         as rounded integers; the number of combinations; of valid ones.
     """
+    # Keep the valid combinations, chunk by chunk.
     half = np.asarray(half_extents, dtype=float)
     radius = float(norm(half))
     rotations, positions, combinations = [], [], 0
@@ -158,9 +162,9 @@ def rotation_candidates(
         rotations.append(R_OG[hits])
         positions.append(p_OG[hits])
     R, p = np.concatenate(rotations), np.concatenate(positions)
-    key = np.rint(np.hstack([R.reshape(-1, 9), p / radius]) / SAME_POSE).astype(np.int64)
 
-    # Equal poses are neighbours in this order, the one that came first in front.
+    # Sort by rounded integers: equal poses become neighbours, and the first of them is kept.
+    key = np.rint(np.hstack([R.reshape(-1, 9), p / radius]) / SAME_POSE).astype(np.int64)
     order = np.lexsort(key.T[::-1])
     new = np.ones(len(order), dtype=np.bool_)
     new[1:] = (key[order[1:]] != key[order[:-1]]).any(axis=1)
@@ -171,16 +175,17 @@ def rotation_candidates(
 def normal_candidates(model: ObjectModel, count: int, stream: Stream) -> Array:
     """Return poses (n, 4, 4) that look at random surface points against their normals.
 
-    The points are spread evenly over the area, the roll about the normal is uniform, and
-    the palm starts two of the box's half diagonals away, outside of the object.
+    The points are uniform over the area, the roll about the normal is uniform, and the palm is two
+    half diagonals of the box away, outside of the object.
     """
+    # Random points of the surface, with the outward normals of their faces.
     vertices, faces = model.visual_vertices, model.visual_faces.astype(np.int64)
     points, picked = on_faces(vertices, faces, stream.uniform(3 * count).reshape(count, 3))
     a, b, c = np.moveaxis(vertices[faces[picked]], 1, 0)
     outward = np.cross(b - a, c - a)
     z = -outward / norm(outward)[:, None]
 
-    # Any direction that is not parallel to z serves to start the roll from.
+    # Roll from any direction that is not parallel to z.
     helper = np.where(np.abs(z[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     x = np.cross(helper, z)
     x /= norm(x)[:, None]
@@ -198,18 +203,19 @@ def _poses(R: Array, p: Array) -> Array:
 
 
 def above_table(p_OG: Array, X_TO: Array) -> npt.NDArray[np.bool_]:
-    """Return for points (n, 3) in {O} whether they lie above the table, or in it."""
+    """Return for points (n, 3) in {O} whether they lie above the table or on it."""
     return dot(p_OG, X_TO[2, :3]) + X_TO[2, 3] > -EDGE
 
 
 def ray_meets_box(p_OG: Array, z_O: Array, half: Array) -> npt.NDArray[np.bool_]:
     """Return for rays from (n, 3) along (n, 3) whether they meet the box of half extents (3,)."""
-    # A component that should be zero may be 1e-17: as an exact zero it divides to infinity,
-    # which is what the slab test wants.
+    # The slab test (Kay and Kajiya 1986) needs exact zeros: they divide to infinity. Rounding may
+    # leave 1e-17 instead.
     direction = np.where(np.abs(z_O) < 1e-12, 0.0, z_O)
     wide = half + EDGE
     with np.errstate(divide="ignore", invalid="ignore"):
         t1, t2 = (-wide - p_OG) / direction, (wide - p_OG) / direction
+
     # 0/0, a ray within a slab's face, constrains nothing: fmax and fmin skip the NaN.
     entry = np.fmax.reduce(np.minimum(t1, t2), axis=1)
     leave = np.fmin.reduce(np.maximum(t1, t2), axis=1)
@@ -217,49 +223,9 @@ def ray_meets_box(p_OG: Array, z_O: Array, half: Array) -> npt.NDArray[np.bool_]
 
 
 def palm_ray_distance(mesh: trimesh.Trimesh, X_OG: Array) -> Array:
-    """Return the distance (n,) [m] along +Gz to the mesh's surface; NaN where it is missed.
-
-    Our own rays, because embree casts single-precision ones, with kernels chosen by the CPU
-    (Möller and Trumbore 1997). A ray through an edge meets it.
-    """
-    a, b, c = np.moveaxis(np.asarray(mesh.triangles, dtype=float), 1, 0)
-    centre = (a + b + c) / 3.0
-    reach = np.sqrt(np.max([dot(q - centre, q - centre) for q in (a, b, c)], axis=0, initial=0.0))
-    distance = np.full(len(X_OG), np.inf)
-    step = max(1, PAIRS // max(1, len(a)))
-    for start in range(0, len(X_OG), step):
-        rays = X_OG[start : start + step]
-        near = _near_triangles(rays, centre, reach * (1.0 + RAY_EDGE) + EDGE)
-        ray, triangle = np.nonzero(near)
-        found = _ray_triangle(
-            rays[ray, :3, 3], rays[ray, :3, 2], a[triangle], b[triangle], c[triangle]
-        )
-        np.minimum.at(distance, start + ray, found)
+    """Return the distance (n,) [m] along +Gz to the mesh's surface; NaN where it is missed."""
+    distance = first_hits(np.asarray(mesh.triangles), X_OG[:, :3, 3], X_OG[:, :3, 2])
     return np.where(np.isfinite(distance), distance, np.nan)
-
-
-def _near_triangles(X_OG: Array, centre: Array, reach: Array) -> npt.NDArray[np.bool_]:
-    """Return (n, m), which rays pass spheres (m, 3) of radius (m,) within it, ahead of them."""
-    along, squared = np.zeros((len(X_OG), len(centre))), np.zeros((len(X_OG), len(centre)))
-    for axis in range(3):
-        apart = centre[:, axis] - X_OG[:, None, axis, 3]
-        along += apart * X_OG[:, None, axis, 2]
-        squared += apart * apart
-    # The difference of two squares rounds; EDGE in the reach is far above that.
-    return (squared - along * along <= reach * reach) & (along >= -reach)
-
-
-def _ray_triangle(p: Array, z: Array, a: Array, b: Array, c: Array) -> Array:
-    """Return the distance (n,) at which each ray meets its triangle; inf where it does not."""
-    ab, ac, ap = b - a, c - a, p - a
-    across, up = np.cross(z, ac), np.cross(ap, ab)
-    volume = dot(ab, across)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u, v, t = dot(ap, across) / volume, dot(z, up) / volume, dot(ac, up) / volume
-        meets = (u >= -RAY_EDGE) & (v >= -RAY_EDGE) & (u + v <= 1.0 + RAY_EDGE) & (t >= 0.0)
-    # Seen from its edge a triangle has no area: its neighbours are met.
-    flat = np.abs(volume) <= RAY_EDGE * norm(ab) * norm(ac)
-    return np.where(meets & ~flat, t, np.inf)
 
 
 def make_attempts(
@@ -270,19 +236,22 @@ def make_attempts(
     name: str,
     seed: int,
 ) -> Iterator[Attempt]:
-    """Yield the attempts of a range of an object's candidates, a row of the dataset each.
+    """Yield the attempts of a range of an object's candidates; each is a row of the dataset.
 
     Args:
         candidates: Of the object.
-        indices: Which of them.
+        indices: The range.
         config: Stand-offs and spreads.
         name: The object's name.
         seed: Of the dataset; with name and candidate it decides the spreads.
     """
     spreads = np.deg2rad(config.spreads_deg)
     for i in indices:
+        # Each candidate has its own stream, so ranges do not depend on each other.
         stream = Stream(seed, object_key(name), i)
         drawn = stream.integers(len(spreads), len(config.standoffs))
+
+        # Move the palm along its ray to each stand-off from the surface.
         distance = candidates.distance[i]
         for j, standoff in enumerate(config.standoffs):
             X_OG = candidates.X_OG[i].copy()

@@ -2,13 +2,13 @@
 
 In: an object, the physics configuration and, if wanted, a hand. Out: a `scene.Scene`.
 
-How the hand is held: world, three prismatic joints, then a frame whose rotation is set
-in the context and which is welded to the palm. The orientation is thus exact and
-constant, and the plant needs no rotational wrist joints (our own construction).
+The hand hangs on three prismatic joints from the world and on a frame that is welded to the palm.
+That frame's rotation is set in the context: the palm's orientation is exact and constant, and the
+plant needs no rotational wrist joints (our own construction).
 
-Traps of Drake 1.51.1 that shape this module: geometry on the world body crashes as soon
-as a joint is locked, so the table is a body of its own; `AddMultibodyPlantSceneGraph`
-leaks the plant; sampled output ports report the contacts of the step before.
+Three traps of Drake 1.51.1 shape this module. Geometry on the world body crashes as soon as a
+joint is locked, so the table is a body of its own. `AddMultibodyPlantSceneGraph` leaks the plant.
+Sampled output ports report the contacts of the step before.
 """
 
 from __future__ import annotations
@@ -59,23 +59,24 @@ from drakegrasp.config import PhysicsConfig
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.description import Hand, make_parser
 from drakegrasp.hand.files import MODELS
+from drakegrasp.hand.shapes import hull_corners
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import ObjectModel, object_colour
 from drakegrasp.simulation.scene import HandHandles, Scene
 
-#: Mass of each of the three bodies that carry the wrist [kg]; light beside the hand.
+#: Mass of each of the three bodies that carry the wrist [kg]; small compared to the hand's.
 WRIST_BODY_MASS = 0.02
-#: Wrist gains [N/m], [N s/m]: 2 kg sag by 0.02 mm.
+#: Wrist gains [N/m], [N s/m]: under 2 kg the wrist sags by 0.02 mm.
 WRIST_STIFFNESS, WRIST_DAMPING = 1e6, 1e4
-#: Damping of the velocity-controlled fingers [N m s/rad]: the torque limit is reached at a
-#: tenth of a radian per second of lag.
+#: Gain of the velocity-controlled fingers [N m s/rad]: a finger that is 0.1 rad/s too slow gets
+#: its full torque.
 FINGER_DAMPING = 20.0
-#: Drake demands a positive stiffness; this one adds less than a millionth of the torque.
+#: Drake requires a positive stiffness; this one adds less than a millionth of the torque.
 FINGER_STIFFNESS = 1e-6
-#: Resolution of the few hand parts that are cylinders [m]; boxes and meshes have none.
+#: Resolution hint for the few hand parts that are cylinders [m]; boxes and meshes ignore it.
 RESOLUTION_HINT = 0.005
-#: Pictures per simulated second where a scene is shown in Meshcat. Times of a power of two are
-#: exact, so none of them is rounded into the place of another.
+#: Frames per simulated second in Meshcat [Hz]. A power of two makes their times exact, so that
+#: rounding merges no two of them.
 MESHCAT_RATE = 32.0
 
 
@@ -88,24 +89,23 @@ def build_scene(
 ) -> Scene:
     """Return the scene of an object and the table, with the hand if one is given.
 
-    With a hand, the scene for the calm part of a lift is built when it is first asked for.
+    With a hand, `Scene.coarse_scene` builds the scene with coarse steps when it is first called.
 
-    The object is a rigid hydroelastic surface of its exact collision mesh; the table and
-    every part of the hand are compliant, so that each contact with the object is a
-    hydroelastic one.
+    The object is a rigid hydroelastic surface of its exact collision mesh. The table and every part
+    of the hand are compliant, so that each contact with the object is hydroelastic.
 
     Args:
         model: The object.
         physics: Materials, solver and time step.
         hand: The hand.
-        meshcat: Where to show the scene while it is simulated; that changes no bit of it.
+        meshcat: Where to show the scene while it is simulated; the results are the same bits.
     """
     scene = _build(model, physics, hand, meshcat)
-    if hand is None or physics.calm_steps == 1:
+    if hand is None or physics.coarse_steps == 1:
         return scene
-    longer = {"time_step": physics.calm_steps * physics.time_step}
-    make_calm = cache(partial(_build, model, physics.model_copy(update=longer), hand, meshcat))
-    return replace(scene, make_calm=make_calm)
+    time_step = physics.coarse_steps * physics.time_step
+    coarse = physics.model_copy(update={"time_step": time_step})
+    return replace(scene, coarse_scene=cache(partial(_build, model, coarse, hand, meshcat)))
 
 
 def _build(
@@ -113,12 +113,16 @@ def _build(
 ) -> Scene:
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(_plant_config(physics), builder)
+
+    # The free object and the table.
     object_body = _add_object(plant, model, physics)
     table = _add_table(plant, scene_graph, physics)
     if meshcat is not None:
         _add_visual(plant, object_body, model)
         rate = MeshcatVisualizerParams(publish_period=1.0 / MESHCAT_RATE)
         MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, rate)
+
+    # The hand on its wrist, which follows a trajectory.
     handles = None
     if hand is not None:
         trajectory = builder.AddSystem(
@@ -127,12 +131,16 @@ def _build(
         handles = _add_hand(plant, scene_graph, hand, trajectory)
         _make_compliant_hand(plant, scene_graph, handles, physics)
     plant.Finalize()
+
+    # What needs the finalized plant: collision filters and the wrist's input.
     if handles is not None:
         _filter_within_hand(plant, scene_graph, handles)
         builder.Connect(
             handles.wrist_trajectory.get_output_port(),
             plant.get_desired_state_input_port(handles.wrist_instance),
         )
+
+    # One simulator owns the one context; in it the fingers' command never changes.
     simulator = Simulator(builder.Build())
     scene = Scene(
         model=model,
@@ -162,7 +170,7 @@ def _plant_config(physics: PhysicsConfig) -> MultibodyPlantConfig:
 
 
 def _add_object(plant: MultibodyPlant, model: ObjectModel, physics: PhysicsConfig) -> RigidBody:
-    # Inertia.ReExpress and shifting are Drake's; the model gives it about Ocm, in O.
+    # Mass properties about Ocm in {O}; Drake shifts them to the origin of {O}.
     I = model.I_OOcm_O  # noqa: E741
     inertia = SpatialInertia.MakeFromCentralInertia(
         model.mass,
@@ -171,6 +179,8 @@ def _add_object(plant: MultibodyPlant, model: ObjectModel, physics: PhysicsConfi
     )
     instance = plant.AddModelInstance("object")
     body = plant.AddRigidBody("object", instance, inertia)
+
+    # The collision mesh as a rigid hydroelastic surface.
     text = obj_text(model.collision_vertices, model.collision_faces, normals=False)
     properties = ProximityProperties()
     AddRigidHydroelasticProperties(properties)
@@ -186,7 +196,7 @@ def _add_object(plant: MultibodyPlant, model: ObjectModel, physics: PhysicsConfi
 
 
 def _add_visual(plant: MultibodyPlant, body: RigidBody, model: ObjectModel) -> None:
-    # The surface that is simulated: its number of faces is bounded, that of the file is not.
+    # Show the collision surface: its number of faces is bounded, that of the file is not.
     text = obj_text(model.collision_vertices, model.collision_faces, normals=True)
     mesh = Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", model.name)))
     colour = np.array([*object_colour(model.name), 1.0])
@@ -207,8 +217,8 @@ def _add_table(plant: MultibodyPlant, scene_graph: SceneGraph, physics: PhysicsC
 def object_friction(physics: PhysicsConfig) -> float:
     """Return the object's own friction coefficient.
 
-    Drake combines two coefficients to 2 a b / (a + b). With the object at the larger of the
-    two effective values, both can be met by a positive coefficient of the partner.
+    Drake combines the coefficients a, b of a pair to 2 a b / (a + b). If the object has the larger
+    of the two effective values, a positive coefficient of each partner gives the effective value.
     """
     return max(physics.friction_hand, physics.friction_table)
 
@@ -241,6 +251,7 @@ def _assign_proximity(
 def _add_hand(
     plant: MultibodyPlant, scene_graph: SceneGraph, hand: Hand, trajectory: TrajectorySource
 ) -> HandHandles:
+    # Weld the palm to the wrist by frames whose poses are parameters of the context.
     wrist_instance = plant.AddModelInstance("wrist")
     joints = _add_wrist(plant, wrist_instance)
     (instance,) = make_parser(plant).AddModels(hand.sdf_path)
@@ -252,10 +263,12 @@ def _add_hand(
         FixedOffsetFrame("wrist", joints[-1].child_body().body_frame(), RigidTransform())
     )
     plant.WeldFrames(wrist, palm, RigidTransform())
+
     _add_actuation(plant, hand, instance)
-    # Gravity on the hand is carried by the arm that is not simulated.
+    # The arm, which is not simulated, carries the weight of the hand.
     for weightless in (instance, wrist_instance):
         plant.set_gravity_enabled(weightless, False)
+
     return HandHandles(
         hand=hand,
         instance=instance,
@@ -273,16 +286,13 @@ def _points_inside(
     plant: MultibodyPlant, scene_graph: SceneGraph, instance: ModelInstanceIndex
 ) -> tuple[tuple[GeometryId, Array], ...]:
     """Return each collision shape of a model with a point inside it, (3,) in its own frame [m]."""
-    inspector, found = scene_graph.model_inspector(), []
+    inspector, points = scene_graph.model_inspector(), []
     for index in plant.GetBodyIndices(instance):
         for geometry in plant.GetCollisionGeometriesForBody(plant.get_body(index)):
-            hull = inspector.GetConvexHull(geometry)
-            # A primitive has no hull, and its frame's origin is its centre.
-            vertices = (
-                [np.zeros(3)] if hull is None else map(hull.vertex, range(hull.num_vertices()))
-            )
-            found.append((geometry, np.mean(list(vertices), axis=0)))
-    return tuple(found)
+            corners = hull_corners(inspector, geometry)
+            # The origin of a primitive's frame is its centre.
+            points.append((geometry, np.zeros(3) if corners is None else corners.mean(axis=0)))
+    return tuple(points)
 
 
 def _add_wrist(plant: MultibodyPlant, instance: ModelInstanceIndex) -> tuple[PrismaticJoint, ...]:
@@ -324,6 +334,7 @@ def _closing_command(hand: Hand) -> Array:
 def _make_compliant_hand(
     plant: MultibodyPlant, scene_graph: SceneGraph, handles: HandHandles, physics: PhysicsConfig
 ) -> None:
+    """Give each link the stiffness of a fingertip or of another link, and the hand's friction."""
     tips = {body.index() for body in handles.fingertips}
     mu = partner_friction(physics.friction_hand, physics)
     for index in plant.GetBodyIndices(handles.instance):
@@ -339,8 +350,8 @@ def _filter_within_hand(
 ) -> None:
     """Let only fingertips of different fingers collide within the hand.
 
-    The other links' shapes overlap at their joints by design, and they cannot reach each
-    other before the fingertips do.
+    The shapes of the other links overlap at their joints by design, and the fingertips meet before
+    other links can.
     """
 
     def geometries(body: RigidBody) -> list[GeometryId]:
@@ -350,6 +361,8 @@ def _filter_within_hand(
     tips = {body.index() for body in handles.fingertips}
     others = GeometrySet([g for b in bodies if b.index() not in tips for g in geometries(b)])
     every_tip = GeometrySet([g for b in handles.fingertips for g in geometries(b)])
+
+    # Exclude all pairs but those of two fingertips.
     manager = scene_graph.collision_filter_manager()
     manager.Apply(CollisionFilterDeclaration().ExcludeWithin(others))
     manager.Apply(CollisionFilterDeclaration().ExcludeBetween(others, every_tip))

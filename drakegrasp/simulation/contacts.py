@@ -1,9 +1,9 @@
-"""Reading Drake's contact results as facts about a grasp, in the object's frame.
+"""Drake's contact results as the contacts of a grasp, in the object's frame.
 
-The contact of a fingertip is the union of all hydroelastic patches between its link and
-the object. Its point is the pressure-weighted centre of the patches, its normal the
-pressure-weighted mean of the face normals, pointing out of the object; both lie on the
-rigid object's surface because a rigid-compliant patch is a piece of the rigid surface.
+The contact of a fingertip is the union of all hydroelastic patches between its link and the object.
+Its point is the pressure-weighted centre of the patches. Its normal is the pressure-weighted mean
+of the face normals and points out of the object. Both belong to the rigid object's surface, because
+a patch of a rigid and a compliant body is a piece of the rigid surface.
 """
 
 from __future__ import annotations
@@ -24,17 +24,19 @@ from drakegrasp.simulation.scene import Scene
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Contacts:
-    """What touches what at one instant, for a hand of k fingers.
+    """The contacts at one instant, for a hand of k fingers.
 
     Attributes:
-        touching: (k,) bool, whether fingertip i touches the object with enough force.
+        touching: (k,) bool, whether fingertip i presses on the object with more force than
+            `physics.contact_force`.
         p_OQ: (k, 3), contact point of each fingertip in {O} [m]; NaN where not touching.
         nhat_Q_O: (k, 3), unit normal out of the object in {O}; NaN where not touching.
         f_Q_O: (k, 3), force of the fingertip on the object in {O} [N]; 0 where not touching.
-        area: (k,), area of the patches [m^2].
-        penetration: (k,), largest depth of the object's surface in the fingertip [m].
+        area: (k,), area of the patches [m^2]; 0 where not touching.
+        penetration: (k,), largest depth of the object's surface in the fingertip [m]; 0 where not
+            touching.
         other_links: Number of other links of the hand that touch the object.
-        hand_on_table, object_on_table: Whether they touch.
+        hand_on_table, object_on_table: Whether hand and object touch the table.
         table_force: (3,), force of the table on the object in {W} [N].
         point_contacts: Number of point contacts (not hydroelastic) that involve the object.
     """
@@ -65,33 +67,41 @@ def read_contacts(scene: Scene) -> Contacts:
 
 
 def bodies_on_object(scene: Scene) -> set[BodyIndex]:
-    """Return what touches the object now, of hand and table, as `read_contacts` would see it."""
+    """Return the bodies that touch the object now with more than `physics.contact_force`.
+
+    These are the contacts of `read_contacts`, without points, normals and areas.
+    """
     results = scene.plant.get_contact_results_output_port().Eval(scene.context)
-    ob = scene.object.index()
+    grasped = scene.object.index()
+
+    # Sum the forces of the patches between each body and the object.
     forces: dict[BodyIndex, Array] = {}
     for i in range(results.num_hydroelastic_contacts()):
         info = results.hydroelastic_contact_info(i)
         surface = info.contact_surface()
         M, N = _body_of(scene, surface.id_M()), _body_of(scene, surface.id_N())
-        if ob in (M, N):
-            other = N if ob == M else M
+        if grasped in (M, N):
+            other = N if grasped == M else M
             forces[other] = forces.get(other, np.zeros(3)) + info.F_Ac_W().translational()
+
     limit = scene.physics.contact_force
     return {body for body, force in forces.items() if float(norm(force)) > limit}
 
 
 def open_hand_collides(scene: Scene) -> bool:
-    """Return whether any part of the hand meets or is inside the object, or meets the table.
+    """Return whether a part of the hand intersects object or table, or is inside the object.
 
-    This is geometry only, nothing is solved. Surfaces that cross give contact surfaces; a
-    part that is wholly inside the object gives none, so a point inside each part is tested
-    against the object's volume as well.
+    This is a geometry query without a contact solve. Where surfaces intersect, Drake returns
+    contact surfaces. A part that is wholly inside the object has none, so a point inside each part
+    is tested against the object's volume as well.
     """
     handles = scene.handles
     if handles is None:
         return False
     query = scene.plant.get_geometry_query_input_port().Eval(scene.context)
     hand = hand_bodies(scene)
+
+    # Intersections of the hand with another body.
     surfaces, pairs = query.ComputeContactSurfacesWithFallback(
         HydroelasticContactRepresentation.kPolygon
     )
@@ -99,6 +109,8 @@ def open_hand_collides(scene: Scene) -> bool:
     meetings += [{_body_of(scene, p.id_A), _body_of(scene, p.id_B)} for p in pairs]
     if any(bodies & hand and not bodies <= hand for bodies in meetings):
         return True
+
+    # Parts that are wholly inside the object.
     points = [query.GetPoseInWorld(geometry) @ p for geometry, p in handles.parts]
     return is_inside(scene, np.array(points))
 
@@ -106,7 +118,7 @@ def open_hand_collides(scene: Scene) -> bool:
 def is_inside(scene: Scene, p_WP: Array) -> bool:
     """Return whether any of the points (n, 3) [m] is inside the object's volume.
 
-    Drake's own point distance refuses meshes with very sharp edges; a winding number does not.
+    Drake's point distance refuses meshes with very sharp edges; winding numbers work on them.
     """
     model = scene.model
     p_OP = transform_points(invert_pose(scene.pose(scene.object)), p_WP)
@@ -120,7 +132,7 @@ def is_inside(scene: Scene, p_WP: Array) -> bool:
 
 
 class _Reader:
-    """Sums the patches of each pair of bodies while the results are walked once."""
+    """Sums the patches of each pair of bodies in one pass over the results."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -137,20 +149,25 @@ class _Reader:
         self._point_contacts, self._hand_on_table = 0, False
 
     def add_patch(self, info: HydroelasticContactInfo) -> None:
+        """Add one hydroelastic patch to the sums of its pair of bodies."""
         scene, surface = self._scene, info.contact_surface()
         M, N = _body_of(scene, surface.id_M()), _body_of(scene, surface.id_N())
         force_on_M = np.array(info.F_Ac_W().translational())
-        ob, table = scene.object.index(), scene.table.index()
-        if ob not in (M, N):
+        grasped, table = scene.object.index(), scene.table.index()
+
+        # Patches without the object: only those of hand and table count.
+        if grasped not in (M, N):
             if table in (M, N) and self._hand & {M, N}:
                 self._hand_table_force += float(norm(force_on_M))
             return
-        other = N if ob == M else M
-        force_on_object = force_on_M if ob == M else -force_on_M
+
+        # Patches with the object: of the table, of a fingertip, or of another link.
+        other = N if grasped == M else M
+        force_on_object = force_on_M if grasped == M else -force_on_M
         if other == table:
             self._table_force += force_on_object
         elif other in self._tips:
-            self._add_tip_patch(self._tips.index(other), surface, force_on_object, ob == M)
+            self._add_tip_patch(self._tips.index(other), surface, force_on_object, grasped == M)
         else:
             magnitude = float(norm(force_on_object))
             self._other_force[other] = self._other_force.get(other, 0.0) + magnitude
@@ -170,6 +187,7 @@ class _Reader:
             self._penetration[i] = max(self._penetration[i], depth)
 
     def add_point_pair(self, bodies: set[BodyIndex]) -> None:
+        """Add a point contact of two bodies."""
         scene = self._scene
         if scene.object.index() in bodies:
             self._point_contacts += 1
@@ -177,11 +195,16 @@ class _Reader:
             self._hand_on_table = True
 
     def contacts(self) -> Contacts:
+        """Return the contacts of all patches and pairs that were added."""
+        # A fingertip touches where its patches press with enough force.
         limit = self._scene.physics.contact_force
         touching = (norm(self._force_W) > limit) & (self._weight > 0.0)
+
+        # Pressure-weighted means; NaN where nothing touches, or where opposite normals cancel.
         weight = np.where(touching, self._weight, np.nan)[:, None]
         length = norm(self._moment_n)[:, None]
         normal_W = self._moment_n / np.where(touching[:, None] & (length > 0), length, np.nan)
+
         return Contacts(
             touching=touching,
             p_OQ=transform_points(self._X_OW, self._moment_p / weight),
@@ -198,7 +221,7 @@ class _Reader:
 
 
 def hand_bodies(scene: Scene) -> set[BodyIndex]:
-    """Return the links of the scene's hand, if it has one."""
+    """Return the links of the scene's hand; none if it has no hand."""
     handles = scene.handles
     return set() if handles is None else set(scene.plant.GetBodyIndices(handles.instance))
 
@@ -207,10 +230,9 @@ def _faces(
     surface: ContactSurface, object_is_M: bool
 ) -> Iterator[tuple[float, Array, Array, float, float]]:
     """Yield area [m^2], centre W [m], normal W, pressure [Pa] and depth [m] of each face."""
-    field = surface.poly_e_MN()
-    # The fingertip's pressure falls to zero at its surface, so pressure over gradient is
-    # the depth of the face below it.
-    compliant_is_M = not object_is_M
+    # The fingertip's pressure is zero at its surface, so pressure over gradient is the depth of the
+    # face below it.
+    field, compliant_is_M = surface.poly_e_MN(), not object_is_M
     has_gradient = surface.HasGradE_M() if compliant_is_M else surface.HasGradE_N()
     gradient = surface.EvaluateGradE_M_W if compliant_is_M else surface.EvaluateGradE_N_W
     for face in range(surface.num_faces()):

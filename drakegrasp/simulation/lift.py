@@ -1,12 +1,12 @@
 """The lift of an attempt: the object is freed, and the wrist brings it to its target.
 
-In: a scene whose closed hand may lift, and the rules. Out: what touches what at the end, and where
-the object is. Two things keep a lift from costing more than it tells:
+In: a scene whose closed hand may lift, and the rules. Out: the contacts at the end, and where the
+object is then. Two things save time without changing the verdict:
 
-* While nothing moves in the hand, steps are `physics.calm_steps` times as long: a grasp at rest
-  needs no short ones. They are taken by a second diagram with the same state.
-* It ends where its end is known: nothing of the hand touches the object any more, or object and
-  fingers stand still with a fingertip well off the object.
+* While nothing moves in the hand, a step is `physics.coarse_steps` times as long: a grasp at rest
+  needs no fine steps. A second diagram takes the coarse steps; it takes over the state.
+* The lift ends early when the verdict is certain: nothing of the hand touches the object any more,
+  or object and fingers stand still and a fingertip has clearly lost the object.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.multibody.tree import BodyIndex
 
 from drakegrasp.arithmetic import multiply, norm
 from drakegrasp.config import Config
@@ -23,25 +22,26 @@ from drakegrasp.hand.finger_sweep import link_points
 from drakegrasp.simulation.contacts import Contacts, bodies_on_object, hand_bodies, read_contacts
 from drakegrasp.simulation.scene import (
     Scene,
+    WristMotion,
     closing_angles,
-    go_on_in,
     hand_positions,
     move_wrist,
     palm_pose,
     release,
+    transfer_state,
 )
 from drakegrasp.simulation.screen import extra_margin
-from drakegrasp.simulation.stepping import Clock
+from drakegrasp.simulation.stepping import TrialLimits
 from drakegrasp.simulation.trajectory import lift_duration
 
-#: An object that moved less than this in the hand since the last look is still held [m], [rad].
-STILL, STILL_ANGLE = 5e-4, np.deg2rad(0.5)
-#: A lift in which it moved less than this is calm [m], [rad].
-CALM, CALM_ANGLE = 1e-4, np.deg2rad(0.1)
-#: A fingertip this far from the object has lost it: one that still counts as standing creeps
-#: towards it by less than half of that until the end of a lift [m].
+#: An object that moved less than this in the hand since the last check is still held [m], [rad].
+HELD_SHIFT, HELD_ANGLE = 5e-4, np.deg2rad(0.5)
+#: Coarse steps are taken while the object moves less than this between checks [m], [rad].
+COARSE_SHIFT, COARSE_ANGLE = 1e-4, np.deg2rad(0.1)
+#: Beyond this distance a fingertip has lost the object for good: one that counts as standing still
+#: creeps back by less than half of it before the lift ends [m].
 LOST = 3e-3
-#: A part of a step, far above the rounding of times.
+#: A fraction of a step, far above the rounding of times.
 ROUNDING = 1e-6
 
 
@@ -50,7 +50,7 @@ class Lift:
     """How a lift ended.
 
     Attributes:
-        contacts: What touched what.
+        contacts: Contacts at the end.
         q: Positions of the hand's joints [rad], in the plant's order.
         duration: Simulated time [s].
         X_TO: Pose of the object, (4, 4).
@@ -66,94 +66,135 @@ class Lift:
     slip_angle: float
 
 
-def lift(scene: Scene, clock: Clock, config: Config) -> Lift:
-    """Free the object, bring the wrist to `lift.p_TG` and hold it there, and return what is left.
+def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
+    """Free the object, move the wrist to `lift.p_TG`, hold it there, and return how that ended.
 
     Args:
         scene: With the object in the closed hand.
-        clock: The attempt's limits.
+        limits: The attempt's limits.
         config: The rules.
 
     Raises:
-        LateError: See `Clock`.
-        StateError: See `Clock`.
+        TrialTimeout: See `TrialLimits.advance`.
+        StateError: See `TrialLimits.advance`.
     """
-    X_GO_before = X_GO = _object_in_hand(scene)
-    start = scene.time
-    target = X_WT[:3, 3] + config.lift.p_TG
-    duration = lift_duration(float(norm(target - palm_pose(scene)[:3, 3])), config)
-    duration = max(duration, config.physics.time_step)  # the palm may start at its target
+    X_GO_start, start = _object_in_hand(scene), scene.time
+
+    # Free object and wrist, and send the wrist to its target.
     release(scene)
-    motion = move_wrist(scene, target, duration)
-    now, end = start, start + duration + config.lift.hold_time
-    tips, angles = _fingertips(scene), closing_angles(scene)
-    # `scene` takes short steps, `current` those that it needs now. `held`: all fingertips have been
-    # seen on the object since anything moved, and need not be looked for again.
-    current, held, over = scene, False, False
-    while not over:
-        look = min(_next_look(now, config), end)
-        # Just before a step, so that rounding moves none from one look to another.
-        margin = ROUNDING * current.physics.time_step if look < end else 0.0
-        clock.advance(current, look - margin - current.time)
-        X_GO_seen, X_GO = X_GO, _object_in_hand(current)
-        angles_seen, angles = angles, closing_angles(current)
-        speed = float(np.abs(angles - angles_seen).max()) / (look - now)
-        now, standing = look, speed <= config.close.stop_speed
-        if _moved(X_GO_seen, X_GO, STILL, STILL_ANGLE):
-            held, over = False, not bodies_on_object(current) & hand_bodies(current)
-        elif not standing:
-            held = False
-        elif not held:
-            touching = bodies_on_object(current)
-            held = tips <= touching
-            over = current.table.index() not in touching and _has_lost_tip(current)
-        over = over or now >= end
-        calm = standing and not _moved(X_GO_seen, X_GO, CALM, CALM_ANGLE)
-        if not over and current is not (fitting := _scene_for(scene, calm)):
-            go_on_in(fitting, current, now, motion)
-            current = fitting
-    shift, angle = _motion(X_GO_before, X_GO)
+    motion = _start_motion(scene, config)
+    end = start + motion.duration + config.lift.hold_time
+
+    # Simulate from check to check until the target was held, or the verdict is certain. `scene`
+    # takes fine steps, `current` is the one that takes the steps that are needed now.
+    now, current, monitor, certain = start, scene, _Monitor(scene), False
+    while now < end and not certain:
+        check = min(_next_check(now, config), end)
+        # Stop just before a step, so that rounding moves no step across a check.
+        margin = ROUNDING * current.physics.time_step if check < end else 0.0
+        limits.advance(current, check - margin - current.time)
+        certain = monitor.update(current, check - now, config.close.stop_speed)
+        now = check
+
+        # Choose the step for what comes next; the state moves to the diagram that has it.
+        if now < end and not certain:
+            chosen = _scene_for(scene, monitor.at_rest)
+            if chosen is not current:
+                transfer_state(chosen, current, now, motion)
+            current = chosen
+
+    # Read what the hand holds now, and how far the object slipped in it.
+    slip, slip_angle = _motion(X_GO_start, _object_in_hand(current))
     return Lift(
         contacts=read_contacts(current),
         q=hand_positions(current),
         duration=now - start,
         X_TO=multiply(invert_pose(X_WT), current.pose(current.object)),
-        slip=shift,
-        slip_angle=angle,
+        slip=slip,
+        slip_angle=slip_angle,
     )
 
 
-def _next_look(now: float, config: Config) -> float:
-    """Return when to look again [s]: after the period, where a long step begins."""
-    step = config.physics.calm_steps * config.physics.time_step
+def _start_motion(scene: Scene, config: Config) -> WristMotion:
+    """Command the wrist to its target, as fast as the limits allow."""
+    target = X_WT[:3, 3] + config.lift.p_TG
+    duration = lift_duration(float(norm(target - palm_pose(scene)[:3, 3])), config)
+    # The palm may start at its target.
+    return move_wrist(scene, target, max(duration, config.physics.time_step))
+
+
+def _next_check(now: float, config: Config) -> float:
+    """Return the time of the next check [s]: after the period, where a coarse step begins."""
+    step = config.physics.coarse_steps * config.physics.time_step
     return float(np.ceil((now + config.lift.check_period) / step - ROUNDING) * step)
 
 
-def _scene_for(scene: Scene, calm: bool) -> Scene:
-    return scene.make_calm() if calm and scene.make_calm is not None else scene
+def _scene_for(scene: Scene, at_rest: bool) -> Scene:
+    return scene.coarse_scene() if at_rest and scene.coarse_scene is not None else scene
 
 
-def _fingertips(scene: Scene) -> set[BodyIndex]:
-    assert scene.handles is not None
-    return {body.index() for body in scene.handles.fingertips}
+class _Monitor:
+    """Compares a lift with its last check.
+
+    Attributes:
+        at_rest: Whether object and fingers stood still in the hand since the last check.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        assert scene.handles is not None
+        self._tips = {body.index() for body in scene.handles.fingertips}
+        self._X_GO, self._angles = _object_in_hand(scene), closing_angles(scene)
+        # Whether all fingertips touched the object at a check since which nothing moved: then
+        # contacts need not be computed again.
+        self._held = False
+        self.at_rest = False
+
+    def update(self, scene: Scene, elapsed: float, stop_speed: float) -> bool:
+        """Check the lift again and return whether its verdict is certain.
+
+        Args:
+            scene: The scene that was simulated since the last check.
+            elapsed: Simulated time since then [s].
+            stop_speed: Speed of a closing joint below which it stands [rad/s].
+        """
+        # Measure what moved since the last check.
+        X_GO, angles = _object_in_hand(scene), closing_angles(scene)
+        shift, angle = _motion(self._X_GO, X_GO)
+        standing = float(np.abs(angles - self._angles).max()) / elapsed <= stop_speed
+        self.at_rest = standing and not (shift > COARSE_SHIFT or angle > COARSE_ANGLE)
+        self._X_GO, self._angles = X_GO, angles
+
+        # An object that moves in the hand is lost once nothing of the hand touches it.
+        if shift > HELD_SHIFT or angle > HELD_ANGLE:
+            self._held = False
+            return not bodies_on_object(scene) & hand_bodies(scene)
+        if not standing:
+            self._held = False
+            return False
+
+        # One that stays has slipped where a fingertip has lost it; on the table that may change.
+        if self._held:
+            return False
+        touching = bodies_on_object(scene)
+        self._held = self._tips <= touching
+        return scene.table.index() not in touching and _has_lost_tip(scene)
 
 
 def _has_lost_tip(scene: Scene) -> bool:
-    """Return whether some fingertip is well off the object."""
+    """Return whether some fingertip has lost the object for good."""
     assert scene.handles is not None
-    points, X_OW = link_points(scene.handles.hand), invert_pose(scene.pose(scene.object))
-    field = scene.model.field
-    margin = LOST + extra_margin(field)
+    p_LP, field = link_points(scene.handles.hand), scene.model.field
+    X_OW = invert_pose(scene.pose(scene.object))
     for tip in scene.handles.fingertips:
-        p_OQ = transform_points(multiply(X_OW, scene.pose(tip)), points[tip.name()]).astype(
-            np.float32
-        )
-        if field.interpolate(*p_OQ.T).min() > margin:
+        p_OP = transform_points(multiply(X_OW, scene.pose(tip)), p_LP[tip.name()])
+        distance = field.interpolate(*p_OP.astype(np.float32).T)
+        if distance.min() > LOST + extra_margin(field):
             return True
     return False
 
 
 def _object_in_hand(scene: Scene) -> Array:
+    """Return the pose X_GO (4, 4) of the object in the palm frame."""
     return multiply(invert_pose(palm_pose(scene)), scene.pose(scene.object))
 
 
@@ -161,8 +202,3 @@ def _motion(X_GO_before: Array, X_GO: Array) -> tuple[float, float]:
     """Return by how much the object moved [m] and turned [rad] in the hand."""
     shift = float(norm(X_GO[:3, 3] - X_GO_before[:3, 3]))
     return shift, rotation_angle(multiply(invert_pose(X_GO_before), X_GO)[:3, :3])
-
-
-def _moved(X_GO_before: Array, X_GO: Array, limit: float, angle_limit: float) -> bool:
-    shift, angle = _motion(X_GO_before, X_GO)
-    return shift > limit or angle > angle_limit

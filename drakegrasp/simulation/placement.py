@@ -1,8 +1,8 @@
-"""An object where it rests on the table: what a grasp is verified against.
+"""An object at rest on the table, against which grasps are verified.
 
-In: a mesh file, a trimesh or an object that was prepared before. Out: the object and its
-resting pose. What stays the same however the object is turned or moved on the table is
-computed at one pose, `rest_pose`, so a verdict cannot depend on it.
+In: a mesh file, a trimesh or an object that was prepared before. Out: the object and its resting
+pose. Verification simulates at `canonical_pose`, so that no verdict depends on where on the table
+the object stands and how it is turned about the vertical.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from drakegrasp.objects.sources import UNITS, find_mesh
 from drakegrasp.runtime.blas import one_thread
 from drakegrasp.simulation.settle import settle
 
-#: A given pose may leave this much between the object's lowest point and the table [m].
+#: Largest distance of the object's lowest point from the table at a given pose [m].
 MAX_GAP = 0.005
 
 
 @runtime_checkable
 class Placed(Protocol):
-    """Anything with a model and its pose: a `PlacedObject`, or a dataset's prepared object."""
+    """An object with a pose: a `PlacedObject`, or a prepared object of a dataset."""
 
     @property
     def model(self) -> ObjectModel:
@@ -49,7 +49,7 @@ class PlacedObject:
     Attributes:
         model: Meshes and mass properties.
         X_TO: Pose in the table-top frame, (4, 4).
-        config: With which it was prepared and dropped; the preset `paper` if None.
+        config: The configuration with which it was prepared and dropped; default `paper`.
     """
 
     model: ObjectModel
@@ -86,13 +86,16 @@ def place_object(
         GraspError: If X_TO is no pose or does not stand on the table.
         ConfigError: If config is none, or an object was placed before with other values.
     """
+    # Check the arguments that do not depend on the kind of mesh.
     config = config_of(mesh) if config is None else config
     refuse_no_config(config)
     if units is not None and units not in UNITS:
         raise MeshError(f"units must be one of {', '.join(UNITS)}, got {units!r}")
+
+    # Prepare the object, unless that was done before.
     if isinstance(mesh, Placed):
         if units is not None:
-            raise MeshError(f"units must be None for an object that is prepared, got {units!r}")
+            raise MeshError(f"units must be None for a prepared object, got {units!r}")
         if isinstance(mesh, PlacedObject):
             refuse_other_objects(config, mesh.config, "as the object was placed with")
         model, known = mesh.model, np.asarray(mesh.X_TO)
@@ -105,6 +108,8 @@ def place_object(
             "mesh must be a mesh file, a trimesh.Trimesh or a placed object, "
             f"got {type(mesh).__name__}"
         )
+
+    # Take the given pose or the known one, or drop the object.
     if X_TO is not None:
         known = _standing(model, read_pose(X_TO, "X_TO"))
     X_TO = settle(model, config).X_TO if known is None else known
@@ -112,15 +117,15 @@ def place_object(
 
 
 def config_of(mesh: object) -> Config:
-    """Return the configuration that goes with a mesh: a placed object's own, else `paper`."""
+    """Return the configuration of a placed object, and the preset `paper` for any other mesh."""
     return mesh.config if isinstance(mesh, PlacedObject) else load_config()
 
 
 def refuse_no_config(config: object) -> None:
-    """Refuse what is not a configuration, such as a preset's name.
+    """Refuse anything but a `Config`, such as the name of a preset.
 
     Raises:
-        ConfigError: If so.
+        ConfigError: If `config` is not a `Config`.
     """
     if not isinstance(config, Config):
         raise ConfigError(
@@ -129,27 +134,31 @@ def refuse_no_config(config: object) -> None:
 
 
 def refuse_other_objects(config: Config, known: Config, must_be: str) -> None:
-    """Refuse a configuration that an object was not prepared and dropped with.
+    """Refuse a configuration that prepares and drops objects differently from a known one.
 
     Raises:
-        ConfigError: If it differs in that.
+        ConfigError: If its section `objects` or `settle` differs.
     """
     for name in ("objects", "settle"):
         if getattr(config, name) != getattr(known, name):
             raise ConfigError(f"{name} must be {must_be}, got other values; give the mesh instead")
 
 
-def rest_pose(X_TO: Array) -> Array:
-    """Return the pose (4, 4) over the table's centre that lies as X_TO does, without its yaw.
+def canonical_pose(X_TO: Array) -> Array:
+    """Return the pose (4, 4) that differs from X_TO by yaw and by a shift on the table only.
 
-    Of all rotations that agree with X_TO on which way is up in {O} it is the smallest one.
+    Its position is over the table's centre, and its rotation is the smallest one with the same up
+    direction in {O} as X_TO. In closed form: SciPy's `Rotation.align_vectors` calls LAPACK, whose
+    bits depend on the CPU, and has no defined answer upside down.
     """
     up = X_TO[2, :3]
     axis = np.cross(up, [0.0, 0.0, 1.0])
     x, y, z = axis
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    # Rodrigues' formula with sin = |axis|, cos = up_z and K K / (1 + cos), which is here without
-    # cancellation where cos is nearly -1; upside down it is half a turn about x.
+
+    # Rodrigues' formula R = 1 + K + K K / (1 + cos), with |axis| = sin and up_z = cos. Where cos is
+    # negative, 1 + cos = sin^2 / (1 - cos) avoids cancellation; upside down R is half a turn about
+    # x.
     upright = 1.0 + up[2] if up[2] > 0.0 else axis @ axis / (1.0 - up[2])
     R = np.eye(3) + K + K @ K / upright if upright > 1e-20 else np.diag([1.0, -1.0, -1.0])
     return make_pose(R, [0.0, 0.0, X_TO[2, 3]])

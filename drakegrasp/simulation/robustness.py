@@ -1,8 +1,8 @@
-"""How robust a grasp is: the same attempt again, a little otherwise and at half the step.
+"""How robust a grasp is: the attempt is repeated with noise, and with less friction.
 
-In: an attempt that succeeded. Out: a `Certificate`: the share of repeats with noise on palm
-pose, friction and mass that hold, and the least friction at which it holds without noise. What
-is drawn depends on the attempt's own seed alone.
+In: an attempt that succeeded. Out: a `Certificate`: the share of repeats that hold with noise on
+palm pose, friction and mass, and the least friction at which the grasp holds without noise. All
+are simulated at half the time step. The noise depends on the attempt's own seed alone.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.screen import Prediction, predict
 from drakegrasp.simulation.trial import run_attempt
 
-#: The step of these simulations, in calm lifts too, over the short one of the trial: an artefact
-#: of the step does not hold.
+#: Time step of these simulations over the trial's, throughout the lift: a grasp that is an artefact
+#: of the step fails.
 STEP_RATIO = 0.5
 
 
@@ -35,19 +35,20 @@ class Certificate:
     """How robust one grasp is.
 
     Attributes:
-        share: Of the repeats that hold, 0..1; NaN if no repeat came to a verdict.
+        share: Share of the repeats that hold, 0..1; NaN if every repeat was inconclusive.
         friction: Least coefficient of hand and object at which it holds, to within
             `physics.friction_hand` / 2^`certify.friction_steps`; inf if it does not hold at
-            `physics.friction_hand` at half the step, NaN if a simulation came to no verdict.
+            `physics.friction_hand` at half the step, NaN if a simulation was inconclusive.
     """
 
     share: float
     friction: float
 
 
-#: Drawn factors are multiples of this: the C library's exponential may differ by far less.
+#: Random factors are rounded to multiples of this: the exponential of two C libraries differs by
+#: far less.
 FACTOR_GRID = 2.0**-32
-#: Of a grasp about which nothing is known.
+#: The certificate of a grasp whose simulations were inconclusive.
 UNKNOWN = Certificate(share=np.nan, friction=np.nan)
 
 
@@ -58,32 +59,37 @@ def certify(model: ObjectModel, X_TO: Array, attempt: Attempt, config: Config) -
         model: The object.
         X_TO: Its resting pose, (4, 4).
         attempt: One that succeeds under the configuration.
-        config: The rules; `certify` says how often and with how much noise.
+        config: The rules; `certify` has the number of repeats and the noise.
     """
+    # Repeat the attempt with noise; inconclusive repeats do not count.
     stream = Stream(attempt.seed, attempt.standoff_index)
-    held = list(_repeats(stream, model, X_TO, attempt, config))
-    judged = [one for one in held if one is not None]
+    repeats = _repeats(stream, model, X_TO, attempt, config)
+    conclusive = [holds for holds in repeats if holds is not None]
+
+    # Search for the least friction; what geometry decides does not depend on friction.
     (prediction,) = predict(model, load_hand(config.hand), X_TO, [attempt], config.screen)
 
     def holds(friction: float) -> bool | None:
         return _holds(model, X_TO, attempt, prediction, config, friction)
 
     return Certificate(
-        share=float(np.mean(judged)) if judged else np.nan,
+        share=float(np.mean(conclusive)) if conclusive else np.nan,
         friction=least_friction(holds, config.physics.friction_hand, config.certify.friction_steps),
     )
 
 
 def least_friction(holds: Callable[[float], bool | None], highest: float, steps: int) -> float:
-    """Return the least friction that holds by bisection: what holds is taken to hold above, too.
+    """Return the least friction that holds, by bisection.
+
+    It assumes that a grasp that holds at one coefficient holds at every higher one.
 
     Args:
-        holds: Whether a coefficient does, or None if that was not found out.
-        highest: The coefficient from which it goes down.
-        steps: How often the interval is halved.
+        holds: Returns whether a grasp holds at a coefficient, None if inconclusive.
+        highest: The highest coefficient.
+        steps: Number of times that the interval is halved.
 
     Returns:
-        The coefficient; inf if the highest does not hold, NaN if one that was asked is unknown.
+        The coefficient; inf if the highest does not hold, NaN if `holds` was inconclusive.
     """
     low, high = 0.0, highest
     answer = holds(high)
@@ -101,15 +107,18 @@ def least_friction(holds: Callable[[float], bool | None], highest: float, steps:
 def _repeats(
     stream: Stream, model: ObjectModel, X_TO: Array, attempt: Attempt, config: Config
 ) -> Iterator[bool | None]:
+    """Yield for each repeat with noise whether it holds, None if inconclusive."""
     rules, mu = config.certify, config.physics.friction_hand
     for _ in range(rules.repeats):
-        other = replace(attempt, X_OG=multiply(attempt.X_OG, _palm_noise(stream, rules)))
+        # The order of the draws is part of the seed's meaning: palm, friction, mass.
+        noisy = replace(attempt, X_OG=multiply(attempt.X_OG, _palm_noise(stream, rules)))
         friction = mu * _noise_factor(stream, rules.friction_noise)
         factor = _noise_factor(stream, rules.mass_noise)
-        heavy = replace(model, mass=factor * model.mass, I_OOcm_O=factor * model.I_OOcm_O)
-        # The shape is the same, and so is what geometry says.
-        (prediction,) = predict(model, load_hand(config.hand), X_TO, [other], config.screen)
-        yield _holds(heavy, X_TO, other, prediction, config, friction)
+        scaled = replace(model, mass=factor * model.mass, I_OOcm_O=factor * model.I_OOcm_O)
+
+        # `model` has the same shape as `scaled`, and its distance field is already computed.
+        (prediction,) = predict(model, load_hand(config.hand), X_TO, [noisy], config.screen)
+        yield _holds(scaled, X_TO, noisy, prediction, config, friction)
 
 
 def _noise_factor(stream: Stream, deviation: float) -> float:
@@ -118,7 +127,7 @@ def _noise_factor(stream: Stream, deviation: float) -> float:
 
 
 def _palm_noise(stream: Stream, rules: CertifyConfig) -> Array:
-    """Return a pose (4, 4) of the palm in the one that was meant."""
+    """Return the random pose (4, 4) of the palm in its nominal frame."""
     shift = rules.palm_noise * stream.normal(3)
     turn = np.deg2rad(rules.palm_noise_deg) * stream.normal(3)
     angle = float(norm(turn))
@@ -134,15 +143,16 @@ def _holds(
     config: Config,
     friction: float,
 ) -> bool | None:
-    """Return whether an attempt succeeds, or None if that was not found out."""
-    changed = {
+    """Return whether an attempt succeeds, or None if that is inconclusive."""
+    changes = {
         "friction_hand": friction,
         "time_step": STEP_RATIO * config.physics.time_step,
-        "calm_steps": 1,
+        "coarse_steps": 1,
     }
-    physics = config.physics.model_copy(update=changed)
+    physics = config.physics.model_copy(update=changes)
     config = config.model_copy(update={"physics": physics})
-    # A scene has its friction and its masses from when it was built.
+
+    # Friction and masses are fixed when a scene is built.
     scene = build_scene(model, physics, load_hand(config.hand))
     outcome = run_attempt(scene, X_TO, attempt, config, prediction).outcome
-    return None if outcome.says_nothing else outcome is Outcome.SUCCESS
+    return None if outcome.inconclusive else outcome is Outcome.SUCCESS

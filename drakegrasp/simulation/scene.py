@@ -1,8 +1,8 @@
-"""The Drake diagram of one object, the table and, if given, one hand: its state.
+"""The state of a scene: one object, the table and, if given, one hand in a Drake diagram.
 
-A scene is built once per object (`construction.build_scene`) and reset for each attempt:
-building costs more than simulating, and a reset context gives the same bits as a new one.
-It takes no decisions; `settle` and `trial` drive it.
+A scene is built once per object (`construction.build_scene`) and reset for each attempt: building
+costs more than simulating, and a reset context gives the same bits as a new one. A scene makes no
+decisions; `settle` and `trial` do.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from drakegrasp.objects.model import ObjectModel
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HandHandles:
-    """Where the hand is in a scene's plant."""
+    """The parts of a scene's plant that belong to the hand."""
 
     hand: Hand
     instance: ModelInstanceIndex
@@ -59,10 +59,10 @@ class Scene:
         simulator: Owns the diagram's context.
         plant, scene_graph: The two systems of the diagram.
         object, table: The bodies.
-        handles: The hand's part, or None in a scene without a hand.
+        handles: The parts of the hand, or None in a scene without a hand.
         physics: The configuration that it was built with.
-        make_calm: Returns the same scene with `calm_steps` steps in one, always the same; None
-            where there is none.
+        coarse_scene: Returns the scene whose step is `physics.coarse_steps` times as long; every
+            call returns the same one. None where there is no such scene.
     """
 
     model: ObjectModel
@@ -73,7 +73,7 @@ class Scene:
     table: RigidBody
     handles: HandHandles | None
     physics: PhysicsConfig
-    make_calm: Callable[[], Scene] | None = None
+    coarse_scene: Callable[[], Scene] | None = None
 
     @property
     def context(self) -> Context:
@@ -91,7 +91,7 @@ class Scene:
 
 
 def reset_object(scene: Scene, X_WO: npt.ArrayLike) -> None:
-    """Put the clock to zero and the object, free and at rest, at X_WO (4, 4)."""
+    """Set the time to zero, and put the object at X_WO (4, 4), free and at rest."""
     scene.simulator.get_mutable_context().SetTime(0.0)
     scene.object.Unlock(scene.context)
     scene.plant.SetFreeBodyPose(scene.context, scene.object, RigidTransform(np.asarray(X_WO)))
@@ -107,7 +107,7 @@ def reset_attempt(
     spread: float,
     closing: npt.ArrayLike | None = None,
 ) -> None:
-    """Put hand and object at the start of an attempt; wrist and object static.
+    """Put hand and object at the start of an attempt; wrist, spread and object are locked.
 
     Args:
         scene: A scene with a hand.
@@ -116,23 +116,29 @@ def reset_attempt(
         spread: Angle of the spread joints [rad].
         closing: Angle of each finger's closing joint (k,) [rad]; None is the open hand.
     """
+    # Unlock the wrist before positions are set, then place the object.
     handles = _handles(scene)
     context, plant = scene.context, scene.plant
     for joint in handles.wrist_joints:
         joint.Unlock(context)
     reset_object(scene, X_WO)
+
+    # Orientation of the palm, by its frame; joints of the fingers; position of the palm.
     X = np.asarray(X_WG, dtype=float)
     R_WG = RotationMatrix(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]))
     handles.wrist_frame.SetPoseInParentFrame(context, RigidTransform(R_WG, np.zeros(3)))
-    opened = np.zeros(handles.hand.num_fingers) if closing is None else closing
-    for name, angle in joint_positions(handles.hand, spread, opened).items():
+    angles = np.zeros(handles.hand.num_fingers) if closing is None else closing
+    for name, angle in joint_positions(handles.hand, spread, angles).items():
         plant.GetJointByName(name, handles.instance).set_angle(context, angle)
     for joint, p in zip(handles.wrist_joints, X[:3, 3], strict=True):
         joint.set_translation(context, float(p))
         joint.Lock(context)
-    # The spread stays where it is put: one motor drives it, and the released code locks it too.
+
+    # The spread keeps its angle: one motor drives it, and the released code locks it too.
     for name in handles.hand.spread.joints:
         plant.GetJointByName(name, handles.instance).Lock(context)
+
+    # Only the fingers move while the hand closes.
     scene.object.Lock(context)
     _let_object_meet_table(scene, False)
     handles.wrist_trajectory.UpdateTrajectory(PiecewisePolynomial(X[:3, 3:4]))
@@ -148,10 +154,10 @@ def release(scene: Scene) -> None:
 
 
 def _let_object_meet_table(scene: Scene, meet: bool) -> None:
-    """Look for contacts between object and table, or do not.
+    """Include contacts between object and table in the simulation, or exclude them.
 
-    While both are static such a contact changes nothing, and finding it at each step costs
-    more than anything else that happens before a finger touches.
+    While both are static such a contact changes nothing, but computing it at each step costs more
+    than anything else before a finger touches.
     """
     manager = scene.scene_graph.collision_filter_manager(
         scene.scene_graph.GetMyMutableContextFromRoot(scene.simulator.get_mutable_context())
@@ -166,11 +172,11 @@ def _let_object_meet_table(scene: Scene, meet: bool) -> None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WristMotion:
-    """A straight minimum-jerk motion of the palm's origin; it stays at the end.
+    """A straight minimum-jerk motion of the palm's origin, which then stays at the end.
 
     Attributes:
-        p_start, p_end: Where it begins and ends in {W}, (3,) [m].
-        begin: When it begins [s].
+        p_start, p_end: Start and end in {W}, (3,) [m].
+        begin: Time at which it begins [s].
         duration: Of the motion [s].
     """
 
@@ -181,11 +187,11 @@ class WristMotion:
 
 
 def move_wrist(scene: Scene, p_WG_target: npt.ArrayLike, duration: float) -> WristMotion:
-    """Command a straight minimum-jerk motion of the wrist from where it is, starting now.
+    """Command a straight minimum-jerk motion of the wrist that starts here and now.
 
     Args:
         scene: A scene with a hand.
-        p_WG_target: Where the palm's origin goes, (3,) [m]; it stays there afterwards.
+        p_WG_target: Target of the palm's origin, (3,) [m]; it stays there afterwards.
         duration: Of the motion [s].
 
     Raises:
@@ -206,36 +212,40 @@ def _follow(scene: Scene, motion: WristMotion) -> None:
     # A quintic Bezier curve with threefold ends starts and stops with zero speed and
     # acceleration: the minimum-jerk motion (Flash and Hogan, 1985).
     points = np.column_stack([motion.p_start] * 3 + [motion.p_end] * 3)
-    # What is commanded at the begin of a step is where its end comes to be: said a step ahead,
-    # the wrist lags behind in no scene, whatever its step.
+    # Drake reaches a command at the end of the step, so we command one step ahead; the wrist then
+    # has no lag at any step size.
     begin = motion.begin - scene.physics.time_step
     curve = BezierCurve(begin, begin + motion.duration, points)
     _handles(scene).wrist_trajectory.UpdateTrajectory(curve)
 
 
-def go_on_in(scene: Scene, before: Scene, time: float, motion: WristMotion) -> None:
-    """Give a scene the state that another one of the same systems has reached in its lift.
+def transfer_state(scene: Scene, before: Scene, time: float, motion: WristMotion) -> None:
+    """Continue a lift in another scene, from the state that the scene before has reached.
 
     Args:
-        scene: The scene that goes on.
-        before: The scene whose state, orientation and wrist's motion it takes over.
-        time: Of the state [s], at which a step of both begins.
+        scene: The scene that continues; it differs from the one before in its time step alone.
+        before: The scene whose state and palm orientation it takes over.
+        time: Of the state [s]; a step of both scenes begins there.
         motion: Of the wrist.
 
     Raises:
         ValueError: If one of them has no hand.
     """
-    theirs, ours = _handles(before), _handles(scene)
+    # Drake steps at whole multiples of the step: a time just before one would skip a step.
     step = scene.physics.time_step
-    # Drake begins steps at whole multiples: one a rounding before `time` would be left out.
     scene.simulator.get_mutable_context().SetTime(round(time / step) * step)
-    # Not the context as a whole: that of a plant knows the shapes of its own diagram.
-    X = theirs.wrist_frame.GetPoseInParentFrame(before.context)
-    ours.wrist_frame.SetPoseInParentFrame(scene.context, X)
+
+    # Copy the palm's orientation and the state. A plant's context cannot be copied as a whole: it
+    # refers to the geometries of its own diagram.
+    source, target = _handles(before), _handles(scene)
+    X = source.wrist_frame.GetPoseInParentFrame(before.context)
+    target.wrist_frame.SetPoseInParentFrame(scene.context, X)
     state = before.plant.GetPositionsAndVelocities(before.context)
     scene.plant.SetPositionsAndVelocities(scene.context, state)
-    for name in ours.hand.spread.joints:
-        scene.plant.GetJointByName(name, ours.instance).Lock(scene.context)
+
+    # Lock the spread, and follow the same path of the wrist.
+    for name in target.hand.spread.joints:
+        scene.plant.GetJointByName(name, target.instance).Lock(scene.context)
     _follow(scene, motion)
     scene.simulator.Initialize()
 

@@ -1,55 +1,94 @@
-"""The scenes that a process keeps, because building one costs as much as simulating.
+"""The diagrams that a process keeps: building one costs as much as simulating an attempt.
 
-A scene that is reset gives the same bits as a new one, so who used it before does not matter.
+In: an object, and what to simulate or draw it with. Out: its scene or its renderer, built now or
+kept from before. Diagrams are known by a digest of what they hold, so a copy of an object shares
+its diagrams. A scene that is reset gives the same bits as a new one, so earlier use changes
+nothing.
 """
 
 from __future__ import annotations
 
+import atexit
+import ctypes
 import gc
 import hashlib
 import threading
+from collections.abc import Callable, Hashable
+from typing import TypeVar, cast
 
 import numpy as np
+import numpy.typing as npt
 
-from drakegrasp.config import PhysicsConfig
+from drakegrasp.config import CameraConfig, PhysicsConfig
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.scene import Scene
+from drakegrasp.vision.rendering import Renderer, build_renderer
 
-#: How many are kept: the same object with the hand and without, twice.
+#: How many diagrams are kept: a build needs the scene and the renderer of two objects, verification
+#: the scenes of two objects with the hand and without.
 KEPT = 4
 
-_scenes: dict[tuple[str, PhysicsConfig, str | None], Scene] = {}
-_one_at_a_time = threading.Lock()
+_Diagram = TypeVar("_Diagram", Scene, Renderer)
+
+#: The last in order is the last used.
+_kept: dict[Hashable, Scene | Renderer] = {}
+_lock = threading.Lock()
 
 
-def scene_of(model: ObjectModel, physics: PhysicsConfig, hand: str | None) -> Scene:
-    """Return the scene of an object, built now or kept, with a hand by name or without one."""
-    key = (_simulated(model), physics, hand)
-    with _one_at_a_time:
-        scene = _scenes.pop(key, None)
-        if scene is None:
-            while len(_scenes) >= KEPT:
-                del _scenes[next(iter(_scenes))]
-                # Diagrams sit in reference cycles and own memory that Python does not count.
-                gc.collect()
-            scene = build_scene(model, physics, None if hand is None else load_hand(hand))
-        _scenes[key] = scene  # the last in order is the last used
-        return scene
+def cached_scene(model: ObjectModel, physics: PhysicsConfig, hand_name: str | None) -> Scene:
+    """Return the scene of an object, with a hand by its name or YAML file, or without one."""
+    # A hand whose files have changed is loaded anew, and is then another key.
+    hand = None if hand_name is None else load_hand(hand_name)
+    shape = (model.collision_vertices, model.collision_faces, model.half_extents)
+    mass = (model.p_OOcm, model.I_OOcm_O, np.float64(model.mass))
+    key = "scene", _digest(model.name, *shape, *mass), physics, hand
+    return _cached(key, lambda: build_scene(model, physics, hand))
+
+
+def cached_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
+    """Return the renderer of an object; use it in the thread that asked for it first."""
+    key = "renderer", _digest(model.name, model.visual_vertices, model.visual_faces), config
+    return _cached(key, lambda: build_renderer(model, config))
 
 
 def forget_scenes() -> None:
     """Drop every scene: one in which Drake failed must not be used again."""
-    with _one_at_a_time:
-        _scenes.clear()
+    with _lock:
+        for key in [key for key, diagram in _kept.items() if isinstance(diagram, Scene)]:
+            del _kept[key]
         gc.collect()
 
 
-def _simulated(model: ObjectModel) -> str:
-    """Return a digest of what of an object is simulated: a copy of it is the same object."""
-    digest = hashlib.sha256(model.name.encode())
-    parts = (model.collision_vertices, model.collision_faces, model.p_OOcm, model.I_OOcm_O)
-    for part in (*parts, np.float64(model.mass)):
-        digest.update(part.tobytes())
+def _cached(key: Hashable, build: Callable[[], _Diagram]) -> _Diagram:
+    with _lock:
+        diagram = _kept.pop(key, None)
+        if diagram is None:
+            while len(_kept) >= KEPT:
+                del _kept[next(iter(_kept))]
+                # Diagrams sit in reference cycles and own memory that Python does not count.
+                gc.collect()
+            diagram = build()
+        _kept[key] = diagram
+        return cast(_Diagram, diagram)
+
+
+def _digest(name: str, *arrays: npt.NDArray[np.generic] | np.float64) -> str:
+    """Return a digest of an object: its name, from which its colour follows, and arrays."""
+    digest = hashlib.sha256(name.encode())
+    for array in arrays:
+        digest.update(array.tobytes())
     return digest.hexdigest()
+
+
+@atexit.register
+def _leave_renderers_to_the_system() -> None:
+    """Keep the renderers from being destroyed when the process ends.
+
+    That would happen in another thread than the one that made them, which VTK answers with a
+    page of warnings. A reference that is never returned keeps them until the process is gone.
+    """
+    for diagram in _kept.values():
+        if isinstance(diagram, Renderer):
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(diagram))

@@ -1,12 +1,13 @@
-"""Stage "screen": what geometry says about attempts before anything is simulated.
+"""Stage "screen": what geometry decides about attempts before anything is simulated.
 
-In: attempts at an object on the table. Out: a `Prediction` for each. Points on the hand's
-surface are looked up in the object's distance field: with the hand open at the start pose, and
-while each finger closes by itself. Closing has the object and the wrist static and every
-finger has one freedom, so which link meets the object first, and where, is geometry, but for
-the compliance of the contact, the grid's spacing and the spacing of the points: `margin`.
+In: attempts at an object on the table. Out: a `Prediction` for each. Points on the hand's surface
+are looked up in the object's distance field: with the hand open at the start pose, and while each
+finger closes by itself. While the hand closes, object and wrist are static and each finger has one
+degree of freedom. Geometry therefore decides which link meets the object first, and where. It errs
+by the compliance of the contact, the spacing of the grid and that of the points; the margins of
+`ScreenConfig` cover these errors.
 
-An attempt is called lost only where it is lost by more than the margin. Everything is done point by
+An attempt is called lost only where it is lost by more than the margin. Every step works point by
 point, so a prediction depends on its attempt alone, not on those that are predicted with it.
 """
 
@@ -26,30 +27,31 @@ from drakegrasp.hand.finger_sweep import GAP_STRIDE, FingerPath, HandPaths, Poin
 from drakegrasp.mesh.distance_field import DistanceField
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.candidates import Pregrasp
 
 Counts = npt.NDArray[np.int64]
 
-#: Attempts that are looked at together: few enough for a cache to hold their points; for closing
-#: fingers, whose attempts end one after the other, enough for each look to be worth its call.
+#: Attempts that are evaluated together. For the open hand few, so that a CPU's cache holds their
+#: points; for closing fingers many, since attempts drop out and each call has its overhead.
 START_CHUNK, SWEEP_CHUNK = 8, 128
-#: Of the open hand's points every so many are looked at first.
+#: A first test of the open hand takes every so many-th point.
 START_STRIDE = 8
-#: Half of the largest spacing for which the margins stand as they are [m].
+#: Field blur up to which the configured margins hold as they are [m].
 COVERED = 1.25e-3
-#: Fingertips nearer to each other than this while they would be skipped forward may meet [m].
+#: Fingertips that come nearer to each other than this may meet [m].
 FINGER_GAP = 0.01
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Prediction:
-    """What geometry says about one attempt of a hand with k fingers.
+    """What geometry decides about one attempt of a hand with k fingers.
 
     Attributes:
-        outcome: `start_collision` or `screened` where the attempt is lost for certain, else None.
+        outcome: `start_collision` or `screened` where the attempt is certainly lost, else None.
         clear: Whether the open hand is farther from object and table than the margin.
-        closing: (k,), closing angles up to which nothing is met [rad]; empty with an outcome.
-        last: (k,), closing angles beyond which a fingertip meets the object no more [rad];
+        closing: (k,), closing angles up to which the fingers meet nothing [rad]; empty with an
+            outcome.
+        last: (k,), closing angles beyond which a fingertip cannot meet the object any more [rad];
             empty with an outcome.
     """
 
@@ -63,13 +65,13 @@ def predict(
     model: ObjectModel,
     hand: Hand,
     X_TO: npt.ArrayLike,
-    attempts: Sequence[Attempt],
+    attempts: Sequence[Pregrasp],
     config: ScreenConfig,
 ) -> list[Prediction | None]:
-    """Return what geometry says about attempts; None where it is not asked.
+    """Return what geometry decides about attempts; None for an attempt that is not screened.
 
-    It is not asked where the palm ray misses, where the attempt begins with closed fingers,
-    for hands of which `finger_sweep` knows nothing, and if the mode is off.
+    Not screened are attempts whose palm ray misses or whose fingers start closed, hands that
+    `finger_sweep` cannot describe, and all attempts if `config.mode` is off.
 
     Args:
         model: The object.
@@ -78,121 +80,142 @@ def predict(
         attempts: Of the object.
         config: The margins.
     """
-    found: list[Prediction | None] = [None] * len(attempts)
+    predictions: list[Prediction | None] = [None] * len(attempts)
     if config.mode == "off":
-        return found
-    rows: dict[float, list[int]] = {}
+        return predictions
+
+    # The paths of the fingers depend on the spread: attempts of one spread are screened together.
+    rows_by_spread: dict[float, list[int]] = {}
     for row, attempt in enumerate(attempts):
         if attempt.ray_hits and attempt.closing is None:
-            rows.setdefault(attempt.spread, []).append(row)
-    for spread, group in rows.items():
+            rows_by_spread.setdefault(attempt.spread, []).append(row)
+    for spread, rows in rows_by_spread.items():
         paths = hand_paths(hand, spread)
         if paths is None:
             continue
-        poses = np.stack([attempts[row].X_OG for row in group])
-        view = _View(model.field, np.asarray(X_TO, dtype=float), poses)
-        margins = _widened(config, model.field)
-        for row, prediction in zip(group, _predict(view, paths, margins), strict=True):
-            found[row] = prediction
-    return found
+        X_OG = np.stack([attempts[row].X_OG for row in rows])
+        lookup = _PointLookup(model.field, np.asarray(X_TO, dtype=float), X_OG)
+        screened = _screen(lookup, paths, _widened(config, model.field))
+        for row, prediction in zip(rows, screened, strict=True):
+            predictions[row] = prediction
+    return predictions
 
 
 def extra_margin(field: DistanceField) -> float:
-    """Return what a margin [m] must be wider by, where a field's grid is coarse."""
+    """Return by how much a coarse field widens each margin [m]."""
     return max(0.0, field.blur - COVERED)
 
 
 def _widened(config: ScreenConfig, field: DistanceField) -> ScreenConfig:
-    """Return the margins for a field whose grid is coarser than those they were measured on."""
-    more = extra_margin(field)
+    """Return the margins that cover the errors of this field, too."""
+    extra = extra_margin(field)
     names = ("start_margin", "reach_margin", "block_margin", "clearance")
-    return config.model_copy(update={name: getattr(config, name) + more for name in names})
+    return config.model_copy(update={name: getattr(config, name) + extra for name in names})
 
 
-class _View:
-    """Looks up points of the palm's frame for a chunk of attempts."""
+class _PointLookup:
+    """Looks up points of the palm frame for n attempts at once."""
 
     def __init__(self, field: DistanceField, X_TO: Array, X_OG: Array) -> None:
-        self.field = field
+        self._field = field
         self._X_OG = X_OG.astype(np.float32)
-        self._up = multiply(X_TO, X_OG)[:, 2].astype(np.float32)
+        self._up_G = multiply(X_TO, X_OG)[:, 2].astype(np.float32)
 
     def __len__(self) -> int:
         return len(self._X_OG)
 
     def heights(self, rows: Counts, p_GQ: Points) -> Points:
         """Return the heights above the table (a, n) [m] of points (a, n, 3) or (n, 3)."""
-        return _affine(self._up[rows], p_GQ)
+        return _affine(self._up_G[rows], p_GQ)
 
     def distances(self, rows: Counts, p_GQ: Points, below: float) -> Points:
         """Return the distances (a, n) [m] of points (a, n, 3) or (n, 3) from the object.
 
-        They are too small by up to twice the grid's error, but for the least of a row where that
-        is below a limit [m].
+        They are lower bounds, too small by at most twice the grid's error. The least of each row is
+        interpolated where it is below a limit [m].
         """
-        field, X = self.field, self._X_OG[rows]
-        x, y, z = (_affine(X[:, axis], p_GQ) for axis in range(3))
+        # Transform the points into {O} and read the nearest grid points.
+        field, X_OG = self._field, self._X_OG[rows]
+        x, y, z = (_affine(X_OG[:, axis], p_GQ) for axis in range(3))
         error = np.float32(field.error)
-        found = field.nearest(x, y, z)
-        found -= error
-        least = found.min(axis=1)
+        distances = field.nearest(x, y, z)
+        distances -= error
+
+        # Only points that may be the nearest of a row need the exact value.
+        least = distances.min(axis=1)
         close = np.flatnonzero(least <= np.float32(below))
         if len(close):
-            at, point = np.nonzero(found[close] <= (least[close] + 2 * error)[:, None])
+            at, point = np.nonzero(distances[close] <= (least[close] + 2 * error)[:, None])
             row = close[at]
-            found[row, point] = field.interpolate(x[row, point], y[row, point], z[row, point])
-        return found
+            distances[row, point] = field.interpolate(x[row, point], y[row, point], z[row, point])
+        return distances
 
 
 def _affine(row: Points, p: Points) -> Points:
     """Return a.p + b (a, n) for rows [a, b] (a, 4) and points (a, n, 3) or (n, 3)."""
     r = row[:, :, None]
-    # In place, which costs a tenth less of a screen than fresh arrays do.
-    found = r[:, 0] * p[..., 0]
-    part = r[:, 1] * p[..., 1]
-    found += part
-    np.multiply(r[:, 2], p[..., 2], out=part)
-    found += part
-    found += r[:, 3]
-    return np.asarray(found)
+    # In place: a screen is a tenth faster than with fresh arrays.
+    values = r[:, 0] * p[..., 0]
+    term = r[:, 1] * p[..., 1]
+    values += term
+    np.multiply(r[:, 2], p[..., 2], out=term)
+    values += term
+    values += r[:, 3]
+    return np.asarray(values)
 
 
-def _predict(view: _View, paths: HandPaths, config: ScreenConfig) -> list[Prediction]:
-    every, margin = np.arange(len(view)), config.start_margin
+def _screen(lookup: _PointLookup, paths: HandPaths, config: ScreenConfig) -> list[Prediction]:
+    """Return the predictions for attempts of one spread."""
+    # Drop attempts whose open hand is certainly in collision. A subset of the points suffices to
+    # reject: the full minimum can only be smaller.
+    margin = config.start_margin
     opened = np.concatenate([paths.still, *(path.points[0] for path in paths.fingers)])
-    # What some of the points decide, all of them would: the nearest of all is no farther.
-    nearest = _open_distance(view, every, opened[::START_STRIDE], margin)
-    alive = np.flatnonzero(nearest >= -margin)
-    nearest[alive] = _open_distance(view, alive, opened, margin)
-    alive = alive[nearest[alive] >= -margin]
-    predictions = [
-        Prediction(outcome=Outcome.START_COLLISION, clear=False, closing=_NOTHING, last=_NOTHING)
-    ] * len(view)
+    distance = _open_distance(lookup, np.arange(len(lookup)), opened[::START_STRIDE], margin)
+    alive = np.flatnonzero(distance >= -margin)
+    distance[alive] = _open_distance(lookup, alive, opened, margin)
+    alive = alive[distance[alive] >= -margin]
+    collision = Prediction(
+        outcome=Outcome.START_COLLISION, clear=False, closing=_NO_ANGLES, last=_NO_ANGLES
+    )
+    predictions = [collision] * len(lookup)
+
+    # Close the fingers of the others.
     for rows in _chunks(alive, SWEEP_CHUNK):
-        # A finger that does not arrive decides, and the others need not be looked at.
-        left, sweeps = rows, []
-        for path in paths.fingers:
-            sweeps.append(_Sweep(view, path, left, config))
-            left = left[sweeps[-1].arrives]
-        among = [np.searchsorted(sweep.rows, left) for sweep in sweeps]
-        starts = np.stack([s.start[i] for s, i in zip(sweeps, among, strict=True)], axis=1)
-        lasts = np.stack([s.last[i] for s, i in zip(sweeps, among, strict=True)], axis=1)
-        angles = {
-            int(row): (_angles(paths, start), _angles(paths, last))
-            for row, start, last in zip(left, _clear_starts(paths, starts), lasts, strict=True)
-        }
+        angles = _closing_angles(lookup, paths, rows, config)
         for row in rows.tolist():
-            closing, last = angles.get(row, (_NOTHING, _NOTHING))
+            closing, last = angles.get(row, (_NO_ANGLES, _NO_ANGLES))
             predictions[row] = Prediction(
                 outcome=None if row in angles else Outcome.SCREENED,
-                clear=bool(nearest[row] > margin),
+                clear=bool(distance[row] > margin),
                 closing=closing,
                 last=last,
             )
     return predictions
 
 
-_NOTHING = np.zeros(0)
+_NO_ANGLES = np.zeros(0)
+
+
+def _closing_angles(
+    lookup: _PointLookup, paths: HandPaths, rows: Counts, config: ScreenConfig
+) -> dict[int, tuple[Array, Array]]:
+    """Return `Prediction.closing` and `last` by attempt, where all fingertips may arrive."""
+    # One finger that does not arrive decides, so the next finger skips these attempts.
+    sweeps = []
+    for path in paths.fingers:
+        sweeps.append(_sweep_finger(lookup, path, rows, config))
+        rows = rows[sweeps[-1].arrives]
+
+    # Collect the fingers of each attempt that is left, as indices (n, k) into their paths.
+    places = [np.searchsorted(sweep.rows, rows) for sweep in sweeps]
+    pairs = list(zip(sweeps, places, strict=True))
+    starts = np.stack([sweep.start[place] for sweep, place in pairs], axis=1)
+    lasts = np.stack([sweep.last[place] for sweep, place in pairs], axis=1)
+    starts = _clear_starts(paths, starts)
+    return {
+        int(row): (_angles(paths, start), _angles(paths, last))
+        for row, start, last in zip(rows, starts, lasts, strict=True)
+    }
 
 
 def _chunks(rows: Counts, size: int) -> list[Counts]:
@@ -203,73 +226,100 @@ def _angles(paths: HandPaths, indices: Counts) -> Array:
     return np.array([path.angles[k] for path, k in zip(paths.fingers, indices, strict=True)])
 
 
-def _open_distance(view: _View, rows: Counts, opened: Points, margin: float) -> Points:
-    """Return the distance (a,) of the open hand from object and table, where it is small."""
-    found = np.zeros(len(rows), dtype=np.float32)
+def _open_distance(lookup: _PointLookup, rows: Counts, opened: Points, margin: float) -> Points:
+    """Return the distance (a,) of the open hand from object and table, exact below the margin."""
+    distance = np.zeros(len(rows), dtype=np.float32)
     for at in _chunks(np.arange(len(rows)), START_CHUNK):
-        to_object = view.distances(rows[at], opened, margin).min(axis=1)
-        found[at] = np.minimum(to_object, view.heights(rows[at], opened).min(axis=1))
-    return found
+        to_object = lookup.distances(rows[at], opened, margin).min(axis=1)
+        distance[at] = np.minimum(to_object, lookup.heights(rows[at], opened).min(axis=1))
+    return distance
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _Sweep:
-    """One finger closing, for many attempts: indices into the angles of its path.
-
-    At each angle the finger may close on by as many angles as no point of it can come to a
-    threshold in, as a point moves by at most its `travel` from one angle to the next.
+    """One finger closing, for a attempts; angles are indices into those of its path.
 
     Attributes:
-        rows: The attempts, ascending.
-        start: Last angle that was looked at with everything farther away than the clearance.
-        arrives: Whether the fingertip comes within reach of the object before the finger
-            is blocked.
-        last: Last angle that was looked at with the fingertip within reach.
+        rows: (a,), the attempts, ascending.
+        start: (a,), last evaluated angle up to which the finger keeps its clearance.
+        arrives: (a,), whether the fingertip comes within reach of the object before the finger is
+            blocked.
+        last: (a,), last evaluated angle with the fingertip within reach.
     """
 
-    def __init__(self, view: _View, path: FingerPath, rows: Counts, config: ScreenConfig) -> None:
-        self.rows = rows
-        count, end = len(rows), len(path.angles) - 1
-        self.start = np.zeros(count, dtype=np.int64)
-        self.last = np.full(count, end)
-        self.arrives = np.zeros(count, dtype=np.bool_)
-        starting = np.ones(count, dtype=np.bool_)
-        k, active = np.zeros(count, dtype=np.int64), np.arange(count)
-        clearance, reach = np.float32(config.clearance), np.float32(config.reach_margin)
-        block = np.float32(config.block_margin)
-        pace, tip_pace = 1.0 / path.travel, 1.0 / path.travel[: path.tip]
-        while len(active):
-            at, points = rows[active], path.points[k[active]]
-            to_object = view.distances(at, points, config.clearance)
-            tip = to_object[:, : path.tip]
-            meets = np.minimum(to_object, view.heights(at, points))
-            least = meets.min(axis=1)
-            far = starting[active] & (least > clearance)
-            self.start[active[far]] = k[active[far]]
-            starting[active] = far
-            here = tip.min(axis=1) <= reach
-            self.arrives[active[here]] = True
-            self.last[active[here]] = k[active[here]]
-            room = ((meets + block) * pace).min(axis=1)
-            np.minimum(room, np.where(here, 0, ((tip - reach) * tip_pace).min(axis=1)), out=room)
-            if far.any():
-                room[far] = np.minimum(room[far], ((meets[far] - clearance) * pace).min(axis=1))
-            done = (least < -block) | (k[active] == end)
-            step = np.maximum(1, np.floor(room)).astype(np.int64)
-            k[active] = np.minimum(k[active] + step, end)
-            active = active[~done]
+    rows: Counts
+    start: Counts
+    arrives: npt.NDArray[np.bool_]
+    last: Counts
+
+
+def _sweep_finger(
+    lookup: _PointLookup, path: FingerPath, rows: Counts, config: ScreenConfig
+) -> _Sweep:
+    """Close one finger from the open hand until it is blocked or at its limit.
+
+    A point moves by at most its `travel` from one angle to the next. From its distance to a
+    threshold follows by how many angles the finger may advance before any point can cross it;
+    the angles between need no evaluation (sphere tracing; Hart 1996).
+    """
+    count, end = len(rows), len(path.angles) - 1
+    start, last = np.zeros(count, dtype=np.int64), np.full(count, end)
+    arrives = np.zeros(count, dtype=np.bool_)
+
+    # All attempts start from the open hand, with everything at its clearance.
+    k, active = np.zeros(count, dtype=np.int64), np.arange(count)
+    starting = np.ones(count, dtype=np.bool_)
+    clearance, reach = np.float32(config.clearance), np.float32(config.reach_margin)
+    block = np.float32(config.block_margin)
+    rate, tip_rate = 1.0 / path.travel, 1.0 / path.travel[: path.tip]
+    while len(active):
+        # Where the finger's points are now: from the object, and from object and table.
+        points = path.points[k[active]]
+        to_object = lookup.distances(rows[active], points, config.clearance)
+        to_tip = to_object[:, : path.tip]
+        to_any = np.minimum(to_object, lookup.heights(rows[active], points))
+        least = to_any.min(axis=1)
+
+        # As long as everything stays beyond the clearance, the simulation can start later.
+        far = starting[active] & (least > clearance)
+        start[active[far]] = k[active[far]]
+        starting[active] = far
+
+        # The fingertip is within reach of the object.
+        within = to_tip.min(axis=1) <= reach
+        arrives[active[within]] = True
+        last[active[within]] = k[active[within]]
+
+        # Advance until a point may be blocked, the fingertip within reach, or the start found.
+        room = ((to_any + block) * rate).min(axis=1)
+        to_reach = np.where(within, 0, ((to_tip - reach) * tip_rate).min(axis=1))
+        np.minimum(room, to_reach, out=room)
+        if far.any():
+            room[far] = np.minimum(room[far], ((to_any[far] - clearance) * rate).min(axis=1))
+        step = np.maximum(1, np.floor(room)).astype(np.int64)
+
+        # Attempts that are blocked or at the finger's limit are done.
+        done = (least < -block) | (k[active] == end)
+        k[active] = np.minimum(k[active] + step, end)
+        active = active[~done]
+    return _Sweep(rows=rows, start=start, arrives=arrives, last=last)
 
 
 def _clear_starts(paths: HandPaths, starts: Counts) -> Counts:
     """Return start angles (n, k) cut back to before two fingertips may meet on the way.
 
-    All fingers close at the same speed; one that is at its start angle waits there.
+    All fingers close at the same speed; a finger waits at its start angle for the others.
     """
     if not starts.size:
         return starts
+
+    # Let all fingers close together and test the gaps of each pair of fingertips.
     time = np.arange(0, int(starts.max()) + GAP_STRIDE, GAP_STRIDE)
-    way = np.minimum(time[None, :, None], starts[:, None, :]) // GAP_STRIDE
-    clear = np.ones(way.shape[:2], dtype=np.bool_)
+    index = np.minimum(time[None, :, None], starts[:, None, :]) // GAP_STRIDE
+    clear = np.ones(index.shape[:2], dtype=np.bool_)
     for (a, b), gap in paths.gaps.items():
-        clear &= gap[way[..., a], way[..., b]] > FINGER_GAP
+        clear &= gap[index[..., a], index[..., b]] > FINGER_GAP
+
+    # Start one test before the first gap that is too small.
     first = np.where(clear.all(axis=1), len(time), np.argmin(clear, axis=1))
     return np.minimum(starts, np.maximum(0, GAP_STRIDE * (first - 1))[:, None])

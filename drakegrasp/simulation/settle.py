@@ -1,7 +1,7 @@
 """Stage "settle": drop the object on the table and wait until it rests.
 
-In: a prepared object. Out: its resting pose X_TO, moved in x and y only so that
-p_TO = (0, 0, z) (Veres et al., "Initial Object and hand configurations").
+In: a prepared object. Out: its resting pose X_TO, moved in x and y so that p_TO = (0, 0, z)
+(Veres et al., "Initial Object and hand configurations").
 """
 
 from __future__ import annotations
@@ -13,21 +13,22 @@ from pydrake.math import RotationMatrix
 
 from drakegrasp.arithmetic import multiply, norm
 from drakegrasp.config import Config
-from drakegrasp.errors import MeshError
+from drakegrasp.errors import MeshError, first_line
 from drakegrasp.frames import X_WT, Array, invert_pose, make_pose
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.contacts import read_contacts
 from drakegrasp.simulation.scene import Scene, advance, reset_object
 
-#: Simulated time between two looks at the object's speed [s].
-LOOK_PERIOD = 0.05
-#: Drake's gravity [m/s^2], and by how much the table's force at rest may miss the weight.
+#: Simulated time between two checks of the object's speed [s].
+CHECK_PERIOD = 0.05
+#: Drake's gravity [m/s^2], and the largest relative error of the table's force at rest.
 GRAVITY, MAX_FORCE_ERROR = 9.81, 0.01
 #: A resting pose is snapped to multiples of this, in p_TO [m] and in the quaternion of R_TO: about
-#: a micrometre and a microradian. Drake's last bits depend on the CPU, and the palm poses on it.
+#: a micrometre and a microradian. Drake's last bits depend on the CPU, and the palm poses depend on
+#: the resting pose.
 POSE_GRID = 2.0**-20
-#: When a rolling object is stopped by hand, as a share of the longest time; see `settle`.
+#: Share of the longest time after which an object that still rolls is stopped; see `settle`.
 STOP_FRACTION = 0.6
 
 
@@ -39,7 +40,7 @@ class Resting:
         X_TO: Pose in the table-top frame, (4, 4); p_TO = (0, 0, z).
         seconds: Simulated time until it rested [s].
         table_force: Upward force of the table at rest [N].
-        stopped: Whether it had to be stopped because it would have rolled on.
+        stopped: Whether it was stopped because it was still rolling.
     """
 
     X_TO: Array
@@ -51,9 +52,9 @@ class Resting:
 def settle(model: ObjectModel, config: Config) -> Resting:
     """Return the resting pose of an object dropped with {O} aligned to {W}.
 
-    Hydroelastic contact has no rolling resistance, so a round object may roll for very
-    long. After `STOP_FRACTION` of `settle.max_time` its velocity is therefore set to zero
-    once at every look, as the released code froze whatever still moved.
+    Hydroelastic contact has no rolling resistance, so a round object may roll for very long. After
+    `STOP_FRACTION` of `settle.max_time` each check therefore sets the velocity of an object that
+    still moves to zero; the released code froze it.
 
     Raises:
         MeshError: If the object leaves the table, never comes to rest, or Drake cannot
@@ -63,17 +64,20 @@ def settle(model: ObjectModel, config: Config) -> Resting:
         return _settle(model, config)
     # A failed assertion within Drake arrives as SystemExit.
     except (RuntimeError, SystemExit) as error:
-        lines = str(error).strip().splitlines() or [type(error).__name__]
-        raise MeshError(f"{model.name}: Drake must be able to drop it, got: {lines[0]}") from None
+        reason = first_line(error)
+        raise MeshError(f"{model.name}: Drake failed while dropping it: {reason}") from None
 
 
 def _settle(model: ObjectModel, config: Config) -> Resting:
+    # Hold the object over the table, aligned to {W}, and let it go.
     rules = config.settle
     scene = build_scene(model, config.physics.model_copy(update={"time_step": rules.time_step}))
     lowest = float(model.collision_vertices[:, 2].min())
     X_WO = multiply(X_WT, make_pose(np.eye(3), [0.0, 0.0, rules.drop_height - lowest]))
     reset_object(scene, X_WO)
     scene.simulator.Initialize()
+
+    # Simulate until it has been slow for long enough.
     resting_for, stopped, linear, angular = 0.0, False, 0.0, 0.0
     while resting_for < rules.rest_time:
         if scene.time >= rules.max_time:
@@ -81,19 +85,26 @@ def _settle(model: ObjectModel, config: Config) -> Resting:
                 f"{model.name}: must come to rest on the table within {rules.max_time:g} s of "
                 f"simulation, got {linear:.3g} m/s and {angular:.3g} rad/s"
             )
-        advance(scene, LOOK_PERIOD)
+        advance(scene, CHECK_PERIOD)
         linear, angular = _speeds(scene)
         if not np.isfinite(linear) or linear > config.physics.max_speed:
-            raise MeshError(f"{model.name}: must fall calmly, got a speed of {linear:.3g} m/s")
+            raise MeshError(
+                f"{model.name}: its speed must stay below {config.physics.max_speed:g} m/s while "
+                f"it settles, got {linear:.3g} m/s"
+            )
         slow = linear < rules.max_linear_speed and angular < rules.max_angular_speed
-        resting_for = resting_for + LOOK_PERIOD if slow else 0.0
+        resting_for = resting_for + CHECK_PERIOD if slow else 0.0
         if not slow and scene.time > STOP_FRACTION * rules.max_time:
             scene.plant.SetVelocities(scene.context, np.zeros(scene.plant.num_velocities()))
             stopped = True
+
+    # The pose over the table's centre, on the grid.
     X_TO = multiply(invert_pose(X_WT), scene.pose(scene.object))
     if X_TO[2, 3] < 0.0:
         raise MeshError(f"{model.name}: must come to rest on the table, got an object that left it")
     X_TO = snapped(X_TO)
+
+    # At rest the table carries the weight: a check of the contact itself.
     force = float(read_contacts(scene).table_force[2])
     weight = model.mass * GRAVITY
     if abs(force - weight) > MAX_FORCE_ERROR * weight:
@@ -104,15 +115,17 @@ def _settle(model: ObjectModel, config: Config) -> Resting:
 
 
 def snapped(X_TO: Array) -> Array:
-    """Return a resting pose (4, 4) moved to p_TO = (0, 0, z) and to the next point of a fine grid.
+    """Return a resting pose (4, 4) with p_TO = (0, 0, z), rounded to a fine grid.
 
-    The same pose but for rounding gives the same bits, unless it lies between two points of the
-    grid: of a rounding error e that is one pose in POSE_GRID / e.
+    Poses that differ by rounding become the same bits, unless they lie halfway between two points
+    of the grid: with a rounding error e that happens to one pose in POSE_GRID / e.
     """
     wxyz = RotationMatrix(X_TO[:3, :3]).ToQuaternion().wxyz()
-    # A quaternion and its negative are one rotation: the largest entry is positive.
+    # A quaternion and its negative are one rotation: make the largest entry positive.
     wxyz = np.rint(wxyz * np.sign(wxyz[np.argmax(np.abs(wxyz))]) / POSE_GRID)
     w, x, y, z = wxyz / norm(wxyz)
+
+    # Written out, since the bits of SciPy's or Drake's conversion may depend on the CPU.
     R_TO = np.array(
         [
             [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],

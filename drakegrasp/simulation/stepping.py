@@ -1,6 +1,6 @@
-"""Simulating an attempt piece by piece, for as long as its state means anything.
+"""Stepping a simulation within an attempt's limits: wall-clock time and the object's speed.
 
-Both ways to stop are exceptions within an attempt, which `trial.run_attempt` turns into outcomes.
+Both ways to stop are exceptions, which `trial.run_attempt` turns into outcomes.
 """
 
 from __future__ import annotations
@@ -15,32 +15,37 @@ from drakegrasp.simulation.scene import Scene, advance, hand_positions
 
 
 class StateError(Exception):
-    """The state left the range in which it means anything."""
+    """The simulated state is no longer physical."""
 
 
-class LateError(Exception):
-    """The attempt's wall-clock limit passed."""
+class TrialTimeout(Exception):  # noqa: N818 - named as the outcome that it becomes
+    """The attempt ran longer than its wall-clock limit."""
 
 
 @dataclass(frozen=True)
-class Clock:
-    """The limits of an attempt: of the wall clock [s], and of the object's speed [m/s]."""
+class TrialLimits:
+    """When an attempt is stopped.
 
-    end: float
+    Attributes:
+        deadline: Reading of `time.monotonic` at which it times out [s].
+        max_speed: Speed of the object above which the state has exploded [m/s].
+    """
+
+    deadline: float
     max_speed: float
 
     def advance(self, scene: Scene, duration: float) -> None:
-        """Simulate for a duration [s].
+        """Simulate for a duration [s], then check the limits.
 
         Raises:
-            LateError: If the wall clock has passed its limit.
+            TrialTimeout: If the deadline has passed.
             StateError: If the state has exploded.
         """
         advance(scene, duration)
-        if time.monotonic() > self.end:
-            raise LateError
+        if time.monotonic() > self.deadline:
+            raise TrialTimeout
         if not np.isfinite(hand_positions(scene)).all():
-            raise StateError("the hand's joints must have finite positions, got others")
+            raise StateError("the positions of the hand's joints became infinite or NaN")
         velocity = scene.plant.EvalBodySpatialVelocityInWorld(scene.context, scene.object)
         speed = float(np.linalg.norm(velocity.translational()))
         if not speed <= self.max_speed:
@@ -49,6 +54,6 @@ class Clock:
             )
 
 
-def start_clock(config: Config) -> Clock:
-    """Return the clock of an attempt that begins now."""
-    return Clock(time.monotonic() + config.attempt_seconds, config.physics.max_speed)
+def start_limits(config: Config) -> TrialLimits:
+    """Return the limits of an attempt that starts now."""
+    return TrialLimits(time.monotonic() + config.attempt_seconds, config.physics.max_speed)

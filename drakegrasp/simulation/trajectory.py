@@ -1,7 +1,7 @@
-"""The path along which forces lift an object, and the wrenches that it takes.
+"""The path of a lift, and the wrenches on an object that follows it.
 
-In: a resting pose. Out: a `LiftPath` of the object's origin, a straight minimum-jerk motion
-(Flash and Hogan, 1985) with the orientation kept, within the limits of the palm's lift.
+In: a resting pose. Out: a `LiftPath` of the object's origin: a straight minimum-jerk motion (Flash
+and Hogan, 1985) at constant orientation, within the speed and acceleration limits of the palm.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ PEAK_ACCELERATION = 10.0 / np.sqrt(3.0)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LiftPath:
-    """A straight motion of an object that keeps its orientation.
+    """A straight motion of an object at constant orientation.
 
     Attributes:
         X_WO: Pose at the start, (4, 4).
@@ -45,27 +45,27 @@ class LiftPath:
         """Return position [m], velocity [m/s] and acceleration [m/s^2] of {O} at a time [s]."""
         s = min(time / self.duration, 1.0)
         start = self.X_WO[:3, 3]
-        way = self.p_WO_end - start
+        shift = self.p_WO_end - start
         return (
-            start + way * s**3 * (10.0 - 15.0 * s + 6.0 * s**2),
-            way * 30.0 * s**2 * (1.0 - s) ** 2 / self.duration,
-            way * 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s) / self.duration**2,
+            start + shift * s**3 * (10.0 - 15.0 * s + 6.0 * s**2),
+            shift * 30.0 * s**2 * (1.0 - s) ** 2 / self.duration,
+            shift * 60.0 * s * (1.0 - s) * (1.0 - 2.0 * s) / self.duration**2,
         )
 
     def wrenches(self, model: ObjectModel) -> Array:
         """Return the wrenches (2, 6) at the two peaks of acceleration, about Ocm in {O}.
 
-        Each is [torque; force] on the object [N m, N]. The orientation is kept, so there is
-        no torque, and every wrench of the motion lies between these two.
+        Each is [torque; force] on the object [N m, N]. The orientation is constant, so there is no
+        torque, and every wrench of the motion lies between these two.
         """
-        way = self.p_WO_end - self.X_WO[:3, 3]
-        peak = PEAK_ACCELERATION * way / self.duration**2
+        shift = self.p_WO_end - self.X_WO[:3, 3]
+        peak = PEAK_ACCELERATION * shift / self.duration**2
         forces_W = [carrying_force(model, peak), carrying_force(model, -peak)]
         return np.hstack([np.zeros((2, 3)), forces_W @ self.R_WO])
 
 
 def carrying_force(model: ObjectModel, acceleration: npt.ArrayLike) -> Array:
-    """Return the force (3,) in {W} [N] that accelerates an object (3,) [m/s^2] in the air."""
+    """Return the force (3,) in {W} [N] that gives a free object an acceleration (3,) [m/s^2]."""
     against_gravity = np.array([0.0, 0.0, GRAVITY])
     return model.mass * (np.asarray(acceleration, dtype=float) + against_gravity)
 
@@ -73,7 +73,7 @@ def carrying_force(model: ObjectModel, acceleration: npt.ArrayLike) -> Array:
 def lift_path(X_TO: npt.ArrayLike, config: Config) -> LiftPath:
     """Return the path from a resting pose (4, 4) to p_TO = `lift.p_TG`.
 
-    The target of the palm is that of the object's origin here: there is no palm.
+    Without a hand, the object's origin goes to the target of the palm.
     """
     X_WO = X_WT @ np.asarray(X_TO, dtype=float)
     p_WO_end = X_WT[:3, 3] + config.lift.p_TG
@@ -86,14 +86,14 @@ def lift_path(X_TO: npt.ArrayLike, config: Config) -> LiftPath:
 def lifted_palm(X_TG: Array, time: float, config: Config) -> Array:
     """Return X_WG (4, 4) at a time [s] of the lift of a trial whose palm begins at X_TG (4, 4).
 
-    A lift whose end is known ends early. The palm's motion is that of an object lifted by
-    forces: to the same place, in the same way.
+    The trial itself may have ended earlier (`lift.lift`). The palm moves like an object that is
+    lifted by forces: to the same target, by the same path.
     """
     return make_pose(X_TG[:3, :3], lift_path(X_TG, config).at(time)[0])
 
 
 def lift_duration(distance: float, config: Config) -> float:
-    """Return how long a minimum-jerk motion over a distance [m] takes within the limits [s]."""
+    """Return the shortest duration [s] of a minimum-jerk motion over a distance [m]."""
     at_speed_limit = PEAK_SPEED * distance / config.lift.max_speed
     at_acceleration_limit = np.sqrt(PEAK_ACCELERATION * distance / config.lift.max_acceleration)
     return float(max(at_speed_limit, at_acceleration_limit))

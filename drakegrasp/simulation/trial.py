@@ -1,9 +1,8 @@
-"""One attempt, from its start pose to its verdict.
+"""The trial of one attempt, from its start pose to its verdict.
 
-This is the one function that build, verify and replay all call. In: a scene, the object's
-resting pose and an attempt. Out: a `TrialRecord` with the outcome and everything that was
-measured on the way. Failures of the physics are values; the one place where an error of
-Drake becomes an outcome is `run_attempt`.
+`run_attempt` is the experiment; builds, verification and replays all call it. In: a scene, the
+object's resting pose and an attempt. Out: a `TrialRecord` with the outcome and all measurements.
+A failure of the physics is an outcome, not an exception, and so is an error within Drake.
 """
 
 from __future__ import annotations
@@ -15,9 +14,10 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
+from drakegrasp.errors import first_line
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import Contacts, open_hand_collides, read_contacts
 from drakegrasp.simulation.lift import lift
 from drakegrasp.simulation.scene import (
@@ -28,28 +28,31 @@ from drakegrasp.simulation.scene import (
     reset_attempt,
 )
 from drakegrasp.simulation.screen import Prediction, predict
-from drakegrasp.simulation.stepping import Clock, LateError, start_clock
+from drakegrasp.simulation.stepping import TrialLimits, TrialTimeout, start_limits
+from drakegrasp.simulation.verdict import judge_closed, judge_lifted
 
 #: Far below a time step, far above the rounding of a sum of them [s].
 ROUNDING = 1e-9
-#: A finger that is farther than this beyond where it can meet the object has missed it [rad].
+#: A finger that closed this far beyond the last angle at which it can meet the object has missed
+#: it [rad].
 BEYOND = np.deg2rad(2.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrialRecord:
-    """The result of one attempt. What a stage did not reach is None.
+    """The result of one attempt; measurements of a stage that was not reached are None.
 
     Attributes:
         outcome: The verdict.
         X_TO, X_OG: Resting pose of the object and start pose of the palm, (4, 4).
         closed, lifted: Contacts after closing and after the lift.
-        q_closed, q_lifted: Positions of the hand's joints then [rad], in the plant's order.
-        time_close, time_lift: Simulated seconds of the two stages.
+        q_closed, q_lifted: Positions of the hand's joints at these times [rad], in the plant's
+            order.
+        time_close, time_lift: Simulated time of the two stages [s].
         X_TO_lifted: Pose of the object after the lift, (4, 4).
         slip: Distance that {O} moved in {G} during the lift [m].
         slip_angle: Angle that it turned in {G} [rad].
-        message: Text of the error for `solver_error`, else empty.
+        message: First line of the error for `solver_error`, else empty.
     """
 
     outcome: Outcome
@@ -70,136 +73,112 @@ class TrialRecord:
 def run_attempt(
     scene: Scene,
     X_TO: npt.ArrayLike,
-    attempt: Attempt,
+    attempt: Pregrasp,
     config: Config,
     prediction: Prediction | None = None,
 ) -> TrialRecord:
-    """Return what happens when the hand tries one attempt.
+    """Simulate one attempt to grasp and lift the object, and return its record.
 
-    The palm is placed, the fingers close on the static object, the contacts are judged,
-    the object is freed and lifted to `lift.p_TG`, and the contacts are judged again. What
-    geometry has decided is not simulated (`screen`), and the fingers begin to close where
-    they are about to meet something. The same scene, attempt and configuration give the same
-    bits, whatever ran before.
+    The same scene, attempt and configuration give the same bits, whatever ran before.
 
     Args:
         scene: Of the object, with the hand.
         X_TO: Resting pose of the object in the table-top frame, (4, 4).
         attempt: What to try.
         config: The rules.
-        prediction: What `predict` says of the attempt, where it was asked before; the result
-            is the same without.
+        prediction: What `predict` returns for the attempt, where the caller has it already; the
+            record is the same without.
+
+    Raises:
+        MemoryError: If the machine runs out of memory.
+        OSError: If a file of the hand cannot be read.
     """
     X_TO = np.asarray(X_TO, dtype=float)
-    record = TrialRecord(outcome=Outcome.RAY_MISS, X_TO=X_TO, X_OG=attempt.X_OG)
-    if not attempt.ray_hits:
-        return record
-    if multiply(X_TO, attempt.X_OG)[2, 3] <= 0.0:
-        return replace(record, outcome=Outcome.BELOW_TABLE)
+    start = TrialRecord(outcome=Outcome.RAY_MISS, X_TO=X_TO, X_OG=attempt.X_OG)
+    X_WO = multiply(X_WT, X_TO)
+    X_WG = multiply(X_WO, attempt.X_OG)
     try:
+        # Screen: do not simulate an attempt that geometry alone decides.
+        if not attempt.ray_hits:
+            return start
+        if multiply(X_TO, attempt.X_OG)[2, 3] <= 0.0:
+            return replace(start, outcome=Outcome.BELOW_TABLE)
         if prediction is None:
             prediction = _predict(scene, X_TO, attempt, config)
-        return _simulate(scene, record, attempt, config, prediction)
-    except LateError:
-        return TrialRecord(outcome=Outcome.TIMEOUT, X_TO=X_TO, X_OG=attempt.X_OG)
+        screened = None if prediction is None else prediction.outcome
+        # Where the open hand comes near to a collision, Drake decides below whether it is one.
+        near = prediction is not None and not prediction.clear
+        if screened is Outcome.START_COLLISION or (screened is not None and not near):
+            return replace(start, outcome=screened)
+
+        # Place: object and palm stand still, the fingers are where the attempt starts them.
+        limits = start_limits(config)
+        reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=attempt.closing)
+        if open_hand_collides(scene):
+            return replace(start, outcome=Outcome.START_COLLISION)
+        if screened is not None:
+            return replace(start, outcome=screened)
+
+        # Close: from just before the fingers meet something, where geometry knows that.
+        if prediction is not None:
+            reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=prediction.closing)
+        _close(scene, limits, config, prediction)
+        closed = read_contacts(scene)
+        record = replace(
+            start, closed=closed, q_closed=hand_positions(scene), time_close=scene.time
+        )
+
+        # Judge the closed hand: it lifts only what it holds with all fingertips and nothing else.
+        verdict = judge_closed(closed.touching, closed.other_links, closed.hand_on_table)
+        if verdict != Outcome.SUCCESS:
+            return replace(record, outcome=Outcome(int(verdict)))
+
+        # Lift: object and wrist are free, and the wrist moves to its target.
+        end = lift(scene, limits, config)
+
+        # Judge the lifted object: all fingertips must still hold it, clear of the table.
+        lifted = end.contacts
+        verdict = judge_lifted(lifted.touching, lifted.other_links, lifted.object_on_table)
+        return replace(
+            record,
+            outcome=Outcome(int(verdict)),
+            lifted=lifted,
+            q_lifted=end.q,
+            time_lift=end.duration,
+            X_TO_lifted=end.X_TO,
+            slip=end.slip,
+            slip_angle=end.slip_angle,
+        )
+    except TrialTimeout:
+        return replace(start, outcome=Outcome.TIMEOUT)
     except (MemoryError, OSError):
-        raise  # the machine's, not the attempt's
+        raise  # the machine's failure, not the attempt's
     # A failed assertion within Drake arrives as SystemExit, everything else as RuntimeError.
     except (Exception, SystemExit) as error:
-        lines = str(error).strip().splitlines() or [type(error).__name__]
-        failed = TrialRecord(outcome=Outcome.SOLVER_ERROR, X_TO=X_TO, X_OG=attempt.X_OG)
-        return replace(failed, message=lines[0])
+        return replace(start, outcome=Outcome.SOLVER_ERROR, message=first_line(error))
 
 
-def _predict(scene: Scene, X_TO: Array, attempt: Attempt, config: Config) -> Prediction | None:
+def _predict(scene: Scene, X_TO: Array, attempt: Pregrasp, config: Config) -> Prediction | None:
     if scene.handles is None:
         return None
-    (found,) = predict(scene.model, scene.handles.hand, X_TO, [attempt], config.screen)
-    return found
-
-
-def _simulate(
-    scene: Scene,
-    record: TrialRecord,
-    attempt: Attempt,
-    config: Config,
-    prediction: Prediction | None,
-) -> TrialRecord:
-    lost = None if prediction is None else prediction.outcome
-    # Near a collision Drake has the last word on whether it is one.
-    if lost is Outcome.START_COLLISION or (lost is not None and prediction and prediction.clear):
-        return replace(record, outcome=lost)
-    X_WO = multiply(X_WT, record.X_TO)
-    clock = start_clock(config)
-    X_WG = multiply(X_WO, attempt.X_OG)
-    reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=attempt.closing)
-    if open_hand_collides(scene):
-        return replace(record, outcome=Outcome.START_COLLISION)
-    if lost is not None:
-        return replace(record, outcome=lost)
-    if prediction is not None:
-        reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=prediction.closing)
-    record = _close(scene, clock, record, config, prediction)
-    assert record.closed is not None
-    verdict = judge_closed(record.closed)
-    if verdict is not None:
-        return replace(record, outcome=verdict)
-    end = lift(scene, clock, config)
-    return replace(
-        record,
-        outcome=judge_lifted(end.contacts),
-        lifted=end.contacts,
-        q_lifted=end.q,
-        time_lift=end.duration,
-        X_TO_lifted=end.X_TO,
-        slip=end.slip,
-        slip_angle=end.slip_angle,
-    )
-
-
-def judge_closed(contacts: Contacts) -> Outcome | None:
-    """Return why a closed hand may not lift the object, or None if it may."""
-    if not contacts.touching.all():
-        return Outcome.MISSING_FINGERTIP
-    if contacts.other_links:
-        return Outcome.HAND_CONTACT
-    if contacts.hand_on_table:
-        return Outcome.TABLE_CONTACT
-    return None
-
-
-def judge_lifted(contacts: Contacts) -> Outcome:
-    """Return the verdict after the lift."""
-    if not contacts.touching.any() and not contacts.other_links:
-        return Outcome.DROPPED
-    if not contacts.touching.all():
-        return Outcome.SLIPPED
-    if contacts.object_on_table:
-        return Outcome.TABLE_CONTACT
-    return Outcome.SUCCESS
+    (prediction,) = predict(scene.model, scene.handles.hand, X_TO, [attempt], config.screen)
+    return prediction
 
 
 def _close(
-    scene: Scene,
-    clock: Clock,
-    record: TrialRecord,
-    config: Config,
-    prediction: Prediction | None,
-) -> TrialRecord:
-    rules = config.close
-    end, limit = rules.max_time, np.inf
+    scene: Scene, limits: TrialLimits, config: Config, prediction: Prediction | None
+) -> None:
+    """Close the fingers on the static object until they stop, or one has missed it."""
+    # Closing that geometry skipped counts as time, and an angle beyond its last contact as a miss.
+    end, last = config.close.max_time, np.inf
     if prediction is not None:
         assert scene.handles is not None
         end -= float(prediction.closing.min()) / scene.handles.hand.closing_speed
-        limit = prediction.last + BEYOND
-    # The last look may fall short of the end by rounding, never by a step.
+        last = prediction.last + BEYOND
+
+    # The last check may fall short of the end by rounding, never by a step.
     while end - scene.time > ROUNDING:
-        clock.advance(scene, min(rules.check_period, end - scene.time))
-        if finger_speed(scene) < rules.stop_speed or np.any(closing_angles(scene) > limit):
+        limits.advance(scene, min(config.close.check_period, end - scene.time))
+        stopped = finger_speed(scene) < config.close.stop_speed
+        if stopped or np.any(closing_angles(scene) > last):
             break
-    return replace(
-        record,
-        closed=read_contacts(scene),
-        q_closed=hand_positions(scene),
-        time_close=scene.time,
-    )

@@ -1,4 +1,7 @@
-"""Recordings of what was verified: a lift by forces, or a grasp that was not simulated."""
+"""Recordings of verifications: a trial, a lift by forces, or a grasp that was not simulated.
+
+In: a `Verification`. Out: an HTML file, see `visualization.recording`.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.construction import build_scene
-from drakegrasp.simulation.placement import rest_pose
+from drakegrasp.simulation.placement import canonical_pose
 from drakegrasp.simulation.scene import Scene
 from drakegrasp.verification.forces.lift import ForceLift, lift_by_forces
 from drakegrasp.verification.wrist.solver import WristFit
@@ -36,8 +39,7 @@ from drakegrasp.visualization.style import REACHED
 if TYPE_CHECKING:
     from drakegrasp.verification.result import Verification
 
-
-#: Length of an arrow for a force as large as a fingertip's limit [m].
+#: Length of the arrow of a force as large as a fingertip's limit [m].
 LARGEST_FORCE = 0.08
 
 
@@ -49,16 +51,16 @@ def record_lift(
     config: Config,
     path: Path,
 ) -> ForceLift:
-    """Lift an object as `lift.lift_by_forces` does, and write what is seen of it.
+    """Return the result of `lift.lift_by_forces`, and write a recording of it.
 
-    The contacts are drawn on the object, and the forces as they are applied.
+    The recording shows the contacts on the object, and the forces as they are applied.
 
     Args:
         model: The object.
-        X_TO: Its resting pose in the table-top frame, (4, 4).
+        X_TO: (4, 4), its resting pose in the table-top frame.
         p_OQ: (k, 3), contacts in {O} [m].
-        nhat_Q_O: (k, 3), their outward unit normals.
-        config: Hand (for the limit of its forces) and rules.
+        nhat_Q_O: (k, 3), their outward unit normals in {O}.
+        config: Hand (for the limit of its forces), physics, lift and limits.
         path: The HTML file.
 
     Raises:
@@ -68,14 +70,14 @@ def record_lift(
 
     def run(meshcat: Meshcat) -> ForceLift:
         scene = build_scene(model, config.physics, meshcat=meshcat)
-        # A lift that fails before it is simulated is seen where it would have begun.
+        # A lift that fails before it is simulated is shown at its start.
         show_start(meshcat, scene, X_TO, config)
-        # The scene is this function's own, so nobody else meets the monitor.
+        # The scene belongs to this function, so the monitor disturbs nobody else.
         scene.simulator.set_monitor(_ForceArrows(meshcat, scene, limit).record)
         try:
             lift = lift_by_forces(scene, X_TO, p_OQ, nhat_Q_O, force_limit=limit, config=config)
         finally:
-            # It holds the scene that holds it, which the garbage collector cannot see.
+            # Scene and monitor refer to each other in a way that the garbage collector cannot see.
             scene.simulator.clear_monitor()
         draw_predicted(meshcat, p_OQ, nhat_Q_O)
         return lift
@@ -84,23 +86,23 @@ def record_lift(
 
 
 def record_verification(verified: Verification, path: Path) -> None:
-    """Write what is seen of a verification, which is run again for it.
+    """Write a recording of a verification, which is simulated again for it.
 
-    A grasp that was not simulated is shown as it would have begun: with the hand where it
-    comes closest, if a pose of the palm was looked for.
+    A grasp that was not simulated is shown at rest, with the hand at the palm pose that comes
+    closest to the contacts, if there is one.
 
     Args:
-        verified: The result.
+        verified: The verdict.
         path: The HTML file.
 
     Raises:
         OSError: If the file cannot be written.
     """
-    model, X_TO = verified.placed.model, rest_pose(verified.placed.X_TO)
+    model, X_TO = verified.placed.model, canonical_pose(verified.placed.X_TO)
     config = verified.config
     p_OQ, nhat_Q_O = verified.p_OQ, verified.nhat_Q_O
-    if verified.attempt is not None:
-        record_attempt(model, X_TO, verified.attempt, config, path, p_OQ=p_OQ, nhat_Q_O=nhat_Q_O)
+    if verified.pregrasp is not None:
+        record_attempt(model, X_TO, verified.pregrasp, config, path, p_OQ=p_OQ, nhat_Q_O=nhat_Q_O)
     elif verified.lift is not None:
         record_lift(model, X_TO, p_OQ, nhat_Q_O, config, path)
     else:
@@ -116,7 +118,7 @@ def _record_still(
     config: Config,
     path: Path,
 ) -> None:
-    """Write how object, predicted contacts and, if there is a fit, the hand would have stood."""
+    """Write a recording of the object, the predicted contacts and the hand of a fit, at rest."""
 
     def run(meshcat: Meshcat) -> None:
         hand = None if fit is None else load_hand(config.hand)
@@ -131,7 +133,7 @@ def _record_still(
 
 
 class _ForceArrows:
-    """An arrow per force on the object, its tip at the contact, drawn at every step."""
+    """Draws the forces on the object at every step: arrows whose tips are at the contacts."""
 
     def __init__(self, meshcat: Meshcat, scene: Scene, force_limit: float) -> None:
         self._meshcat, self._scene = meshcat, scene
@@ -139,7 +141,7 @@ class _ForceArrows:
         self._made = 0
 
     def record(self, root_context: Context) -> None:
-        """Record the forces that are applied now; a monitor of the simulator."""
+        """Record the forces that are applied now; the simulator's monitor."""
         scene, time = self._scene, root_context.get_time()
         forces = scene.plant.get_applied_spatial_force_input_port().Eval(scene.context)
         R_OW = scene.pose(scene.object)[:3, :3].T
@@ -155,7 +157,7 @@ class _ForceArrows:
             self._meshcat.SetProperty(path, "scale", scale, time)
 
     def _make(self, count: int) -> None:
-        """Add arrows of length 1 until there are so many."""
+        """Add arrows of length 1 until there are `count`."""
         colour = rgba(REACHED)
         for i in range(self._made, count):
             path = f"{OBJECT_PATH}/forces/{i + 1}/arrow"

@@ -1,4 +1,4 @@
-"""The result of verifying one grasp: a verdict, how it came about, and by what margin."""
+"""The result of verifying one grasp: the verdict, what was simulated, and the margin."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from drakegrasp.config import Config
 from drakegrasp.frames import Array
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.trial import TrialRecord
@@ -24,26 +24,26 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Verification:
-    """What became of a grasp of k contacts. What a method or stage did not reach is None or NaN.
+    """The verdict on a grasp of k contacts. Stages that were not reached are None or NaN.
 
     Attributes:
         method: "hand" or "forces".
         outcome: The verdict; as in a dataset, or `unreachable` or `off_surface`.
-        reason: One sentence that says why.
+        reason: Why, in one sentence without a full stop.
         placed: The object and its pose on the table.
-        config: The rules that it was verified by.
+        config: Hand, physics, lift and limits of the verification.
         p_OQ, nhat_Q_O: (k, 3), the predicted contact points [m] and unit normals in {O}.
         surface_distance: (k,), of the points from the object's surface [m].
-        fit: The wrist pose and joints that were tried last or held, with SLSQP's status.
-        tries: Number of wrist poses that were simulated.
-        attempt: What the trial began from.
+        fit: Palm pose and joints of the reported trial, or of the best fit if none was simulated.
+        tries: Number of palm poses that were simulated.
+        pregrasp: Palm and opened fingers that the trial started from.
         trial: What happened in the simulator.
         contact_error: (k,), distance of each contact after closing from its prediction [m].
         lift: What happened to the object under forces alone.
-        epsilon: Ferrari-Canny measure of the predicted contacts, 0 without force closure.
-        smallest_friction: Least friction coefficient at which forces at the predicted
-            contacts within the hand's limit hold the object; infinite if none does.
-        seconds: Wall clock by stage [s].
+        epsilon: Ferrari-Canny measure of the predicted contacts; 0 without force closure.
+        smallest_friction: Smallest friction coefficient at which forces within the hand's limit
+            hold the object at the predicted contacts; inf if none does.
+        seconds: Wall-clock time by stage [s].
     """
 
     method: str
@@ -56,7 +56,7 @@ class Verification:
     surface_distance: Array
     fit: WristFit | None = None
     tries: int = 0
-    attempt: Attempt | None = None
+    pregrasp: Pregrasp | None = None
     trial: TrialRecord | None = None
     contact_error: Array | None = None
     lift: ForceLift | None = None
@@ -115,9 +115,12 @@ class Verification:
         return None if self.trial is None else self.trial.q_lifted
 
     def save_html(self, path: str | Path) -> None:
-        """Write what was simulated as a recording to turn about in a browser, in one file.
+        """Write an HTML file that plays the simulation in a browser, from any side.
 
-        It is simulated again, which gives the same bits.
+        The grasp is simulated again for it, which gives the same bits.
+
+        Args:
+            path: The file to write.
 
         Raises:
             OSError: If the file cannot be written.
@@ -133,34 +136,40 @@ class Verification:
         return verification_figure(self)
 
     def explain(self) -> str:
-        """Return the verdict in two or three sentences for a person."""
+        """Return the verdict, and why, in two or three sentences."""
+        # The verdict.
         verdict = "holds" if self.success else f"fails ({self.outcome.label})"
         sentences = [f"The grasp of {self.placed.model.name} {verdict}: {self.reason}."]
+
+        # How well the hand makes the predicted contacts.
         if self.fit is not None:
+            angle = np.rad2deg(self.fit.normal_error).max()
             sentences.append(
-                f"Before closing the fingertips are within {_mm(self.fit.residual)} of the "
-                f"predicted points and {np.rad2deg(self.fit.normal_error).max():.0f}° of their "
-                "normals"
-                + (
-                    f"; they touch within {_mm(self.contact_error)} of them."
-                    if self.contact_error is not None
-                    else "."
-                )
+                f"Before closing, the fingertips are within {_mm(self.fit.residual)} of the "
+                f"predicted points, and the pads within {angle:.0f}° of the predicted normals."
             )
+        if self.contact_error is not None:
+            sentences.append(
+                "After closing, they touch the object within "
+                f"{_mm(self.contact_error)} of the predicted points."
+            )
+
+        # What forces at the contacts alone can do.
         if not np.isnan(self.smallest_friction):
             sentences.append(self._explain_margin())
         return " ".join(sentences)
 
     def _explain_margin(self) -> str:
+        """Return the sentence on the friction that the contacts alone need."""
         simulated = self.config.physics.friction_hand
         if np.isfinite(self.smallest_friction):
-            needed = f"need a friction of {self.smallest_friction:.2f}"
+            needed = f"need a friction coefficient of {self.smallest_friction:.2f}"
         else:
             needed = "are not enough at any friction"
-        text = f"Forces at these points alone {needed}; {simulated:.2f} is simulated"
+        text = f"Forces at these points alone {needed}; the simulation has {simulated:.2f}"
         if self.success and self.method == "hand" and self.smallest_friction > simulated:
-            # A point has no area and does not resist twisting.
-            text += ", and the hand also holds by the areas of contact and by its other parts"
+            # A point does not resist twisting; an area of contact does.
+            text += ", but the hand's contacts are areas, and its other parts may help"
         return f"{text} (epsilon {self.epsilon:.3f})."
 
     def __repr__(self) -> str:
@@ -168,4 +177,5 @@ class Verification:
 
 
 def _mm(values: Array) -> str:
+    """Return the largest of lengths [m] as text in millimetres."""
     return f"{1e3 * float(np.nanmax(values)):.1f} mm"

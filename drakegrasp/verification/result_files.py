@@ -1,8 +1,8 @@
-"""Results of verification in files: lines of JSON, and HDF5.
+"""Files of verification results: JSON lines and HDF5.
 
-In: `Verification`s in the order of the caller's grasps. Out: an object of strict JSON per
-line, or an HDF5 file whose fields are `schema.VERIFICATION_FIELDS`. Equal results give an
-equal HDF5 file: the seconds of the wall clock are in the JSON only.
+In: `Verification`s in the order of the caller's grasps. Out: a file with one object of strict JSON
+per line, and an HDF5 file with the fields `schema.VERIFICATION_FIELDS`. Equal results give equal
+HDF5 files, because wall-clock times are in the JSON only.
 """
 
 from __future__ import annotations
@@ -20,41 +20,48 @@ import numpy as np
 from drakegrasp.config import Config
 from drakegrasp.dataset.hdf5 import AnyArray, write_field
 from drakegrasp.dataset.manifest import installed_versions, write_origin
-from drakegrasp.dataset.schema import VERIFICATION_FIELDS, Field, sizes
+from drakegrasp.dataset.schema import CONTACT_NAMES, VERIFICATION_FIELDS, Field, sizes
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, pack_pose
 from drakegrasp.hand.description import load_hand
-from drakegrasp.runtime.files import atomic_hdf5, sync_and_rename, temporary_name
+from drakegrasp.runtime.files import atomic_hdf5, probe_folder, sync_and_rename
 from drakegrasp.simulation.contacts import Contacts
-from drakegrasp.simulation.placement import rest_pose
+from drakegrasp.simulation.placement import canonical_pose
 from drakegrasp.verification.result import Verification
 
 #: Group of the HDF5 file that holds the fields.
 GROUP = "grasps"
-#: Suffixes of the two files, and what else may stand for them in the name that a caller gives.
+#: Suffixes of the two files, and those that a caller may append to their common name.
 JSON_SUFFIX, HDF5_SUFFIX = ".jsonl", ".h5"
 _KNOWN_SUFFIXES = (JSON_SUFFIX, HDF5_SUFFIX, ".hdf5", ".json")
-#: Digits of the numbers in JSON: a micrometre in a metre.
+#: Significant digits of the numbers in JSON: a micrometre in a metre.
 DIGITS = 6
 
 
 def result_paths(out: Path) -> tuple[Path, Path]:
-    """Return the paths of the JSON lines and of the HDF5 file that a name stands for."""
+    """Return the paths of the JSON lines and of the HDF5 file for a common name."""
     stem = out.with_suffix("") if out.suffix.lower() in _KNOWN_SUFFIXES else out
     return stem.with_name(stem.name + JSON_SUFFIX), stem.with_name(stem.name + HDF5_SUFFIX)
 
 
 def refuse_unwritable(out: Path) -> None:
-    """Refuse a name under which nothing can be written, without writing anything.
+    """Refuse a common name under which the files cannot be written; nothing is left behind.
+
+    Args:
+        out: The name, see `result_paths`.
 
     Raises:
-        DataError: If its folder, or the first above it that exists, cannot be written.
+        DataError: If a folder has the name of a file, or if the folder, or the first existing one
+            above it, cannot be written.
     """
+    # Folders in the place of files.
     if out.is_dir():
         raise DataError(f"{out}: must be a name for files, got a folder; choose another --out")
     for path in (*result_paths(out), part_path(out)):
         if path.is_dir():
             raise DataError(f"{path}: must be a file, got a folder; choose another --out")
+
+    # The first folder above that exists.
     folder = out.absolute().parent
     while not os.path.lexists(folder):
         folder = folder.parent
@@ -65,10 +72,9 @@ def refuse_unwritable(out: Path) -> None:
 
 
 def _is_writable(folder: Path) -> bool:
-    probe = temporary_name(folder / "probe")
+    """Return whether a file can be made in a folder."""
     try:
-        probe.touch()
-        probe.unlink()
+        probe_folder(folder)
     except OSError:
         return False
     return True
@@ -79,13 +85,13 @@ def _is_writable(folder: Path) -> bool:
 
 @contextmanager
 def json_lines(out: Path) -> Iterator[Callable[[int, Verification], None]]:
-    """Give the block a function that writes the next JSON line of a name.
+    """Yield a function that writes the next JSON line.
 
-    The lines are whole at the end of the block. Until then they are in NAME.part.jsonl, and
-    stay there if something stops the block; nothing is made before the first.
+    Until the block ends, the lines are in NAME.part.jsonl; they stay there if the block raises. No
+    file is made before the first line.
 
     Args:
-        out: The name, see `result_paths`.
+        out: The common name of the files, see `result_paths`.
 
     Raises:
         OSError: If the disk is full or the folder cannot be written.
@@ -103,25 +109,39 @@ def json_lines(out: Path) -> Iterator[Callable[[int, Verification], None]]:
 
         yield write
     if stream is not None:
+        # Not `atomic_path`: the lines of a run that is stopped must stay.
         sync_and_rename(part, lines)
 
 
 def part_path(out: Path) -> Path:
-    """Return the path of the JSON lines of a name that are not all there yet."""
+    """Return the path of the JSON lines until they are complete, for a common name."""
     lines, _ = result_paths(out)
     return lines.with_suffix(f".part{JSON_SUFFIX}")
 
 
 def write_json_line(index: int, result: Verification, stream: TextIO) -> None:
-    """Write a line of strict JSON for a result, at once; what is NaN or infinite is null."""
+    """Write a result as a line of strict JSON, and flush it; NaN and infinity become null.
+
+    Args:
+        index: Of the grasp.
+        result: Its verdict.
+        stream: Where to write.
+    """
     text = json.dumps(_plain(as_dict(index, result)), ensure_ascii=False, allow_nan=False)
     stream.write(text + "\n")
     stream.flush()
 
 
 def as_dict(index: int, result: Verification) -> dict[str, Any]:
-    """Return what a line says of one result; keys that are fields mean what those mean."""
+    """Return the JSON object of a result; keys that are HDF5 fields have the same meaning.
+
+    Args:
+        index: Of the grasp.
+        result: Its verdict.
+    """
+    # In the order in which a person reads them: verdict, contacts, hand, lift, margin.
     trial, fit, lift = result.trial, result.fit, result.lift
+
     return {
         "index": index,
         "object": result.placed.model.name,
@@ -149,7 +169,7 @@ def as_dict(index: int, result: Verification) -> dict[str, Any]:
         "slip": None if trial is None else trial.slip,
         "epsilon": result.epsilon,
         "smallest_friction": result.smallest_friction,
-        # Null above may be infinity, or that it was not asked.
+        # A null above is either infinity or not computed; this tells which.
         "friction_can_hold": None
         if math.isnan(result.smallest_friction)
         else math.isfinite(result.smallest_friction),
@@ -167,6 +187,7 @@ def as_dict(index: int, result: Verification) -> dict[str, Any]:
 
 
 def _contacts_as_dict(contacts: Contacts | None, q: Array | None) -> dict[str, Any] | None:
+    """Return the JSON object of contacts with joint positions q [rad]; None without contacts."""
     if contacts is None:
         return None
     names = ("touching", "p_OQ", "nhat_Q_O", "f_Q_O", "other_links", "hand_on_table")
@@ -174,7 +195,7 @@ def _contacts_as_dict(contacts: Contacts | None, q: Array | None) -> dict[str, A
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as types of strict JSON."""
+    """Return a value in types of strict JSON."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
@@ -191,12 +212,12 @@ def _plain(value: Any) -> Any:
 
 
 def write_results(results: Sequence[Verification], path: Path, config: Config) -> None:
-    """Write results to an HDF5 file that appears whole or not at all.
+    """Write results to an HDF5 file, which appears whole or not at all.
 
     Args:
         results: In the order of the grasps.
-        path: Of the file.
-        config: With which they were verified.
+        path: The file.
+        config: Configuration of the verification.
 
     Raises:
         OSError: If the disk is full or the folder cannot be written.
@@ -212,6 +233,7 @@ def write_results(results: Sequence[Verification], path: Path, config: Config) -
 
 
 def _column(field: Field, rows: Sequence[dict[str, Any]], shape: dict[str, int]) -> AnyArray:
+    """Return the values of a field for all rows; missing ones have the field's empty value."""
     if field.dtype == "str":
         return np.array([row[field.name] for row in rows], dtype=object)
     column = field.empty(len(rows), shape)
@@ -222,15 +244,16 @@ def _column(field: Field, rows: Sequence[dict[str, Any]], shape: dict[str, int])
 
 
 def _row(result: Verification) -> dict[str, Any]:
-    """Return the values of one result by field; what was not reached is left out, or None."""
-    fit, attempt, trial, lift = result.fit, result.attempt, result.trial, result.lift
+    """Return the values of a result by field; those of stages not reached are missing or None."""
+    # What every result has.
+    fit, trial, lift = result.fit, result.trial, result.lift
     row: dict[str, Any] = {
         "object": result.placed.model.name,
         "method": result.method,
         "outcome": result.outcome,
         "reason": result.reason,
         "X_TO": pack_pose(result.placed.X_TO),
-        "X_TO_simulated": pack_pose(rest_pose(result.placed.X_TO)),
+        "X_TO_simulated": pack_pose(canonical_pose(result.placed.X_TO)),
         "p_OQ": result.p_OQ,
         "nhat_Q_O": result.nhat_Q_O,
         "surface_distance": result.surface_distance,
@@ -240,12 +263,14 @@ def _row(result: Verification) -> dict[str, Any]:
         "tries": result.tries,
         "contact_error": result.contact_error,
     }
+
+    # The palm pose and its trial.
     if fit is not None:
         row |= {name: getattr(fit, name) for name in ("spread", "closing", "residual")}
         row |= {"X_OG": pack_pose(fit.X_OG), "normal_error": fit.normal_error}
         row |= {"solver_status": fit.status, "solver_iterations": fit.iterations}
-    if attempt is not None:
-        row["closing_start"] = attempt.closing
+    if result.pregrasp is not None:
+        row["closing_start"] = result.pregrasp.closing
     if trial is not None and trial.closed is not None:
         row |= {"time_close": trial.time_close, "closed_q": trial.q_closed}
         row |= _contact_values("closed", trial.closed)
@@ -253,16 +278,19 @@ def _row(result: Verification) -> dict[str, Any]:
         row |= {"time_lift": trial.time_lift, "lifted_q": trial.q_lifted}
         row |= _contact_values("lifted", trial.lifted)
         row |= {"slip": trial.slip, "slip_angle": trial.slip_angle}
+
+    # The lift by forces.
     if lift is not None:
         names = ("planned_force", "applied_force", "position_error", "angle_error")
         row |= {name: getattr(lift, name) for name in names}
-    for reached in (trial, lift):
-        if reached is not None and reached.X_TO_lifted is not None:
-            row["X_TO_lifted"] = pack_pose(reached.X_TO_lifted)
+
+    # One of the two lifted the object.
+    for record in (trial, lift):
+        if record is not None and record.X_TO_lifted is not None:
+            row["X_TO_lifted"] = pack_pose(record.X_TO_lifted)
     return row
 
 
 def _contact_values(prefix: str, contacts: Contacts) -> dict[str, Any]:
-    names = [f.name for f in VERIFICATION_FIELDS if f.name.startswith(f"{prefix}_")]
-    known = {name: name.removeprefix(f"{prefix}_") for name in names if name != f"{prefix}_q"}
-    return {name: getattr(contacts, attribute) for name, attribute in known.items()}
+    """Return the values of the contact fields with a prefix, "closed" or "lifted"."""
+    return {f"{prefix}_{name}": getattr(contacts, name) for name in CONTACT_NAMES}

@@ -1,9 +1,9 @@
-"""Where the two cameras are and how they map points to pixels; NumPy only.
+"""The poses of the two cameras and the projection of points to pixels; NumPy only.
 
-Both stand 0.25 m behind the palm and look along +Gz (Veres et al., "Vision sensors").
-`oto` (one-to-one) is rolled with the palm; `otm` (one-to-many) keeps world up at the top
-of the image. Camera axes are Drake's and OpenCV's; pixel centres have integer
-coordinates, as in Drake's `CameraInfo`.
+Both cameras are 0.25 m behind the palm and look along +Gz (Veres et al., "Vision sensors"). `oto`
+(one-to-one) rolls with the palm; `otm` (one-to-many) keeps world up at the top of the image. Camera
+axes are those of Drake and OpenCV; pixel centres have integer coordinates, as in Drake's
+`CameraInfo`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos_deg
 from drakegrasp.config import CameraConfig
 from drakegrasp.frames import invert_pose, make_pose, transform_points
 
-#: Below this sine of the angle between view and vertical, up is taken from +Ty (0.06 degree).
+#: Sine of the angle between view and vertical below which +Ty is up in the image (0.06 degrees).
 LOOKS_VERTICALLY = 1e-3
 
 
@@ -30,7 +30,7 @@ def intrinsics(config: CameraConfig) -> Array:
 
 
 def camera_pose_oto(X_TG: npt.ArrayLike, config: CameraConfig) -> Array:
-    """Return X_TC (4, 4) of the camera that is rolled with the palm: R_GC is the identity."""
+    """Return X_TC (4, 4) of the camera that rolls with the palm: R_GC is the identity."""
     return multiply(X_TG, make_pose(np.eye(3), [0.0, 0.0, -config.distance]))
 
 
@@ -64,10 +64,10 @@ def unproject(K: npt.ArrayLike, pixels: npt.ArrayLike, depth: npt.ArrayLike) -> 
 
 
 def image_frame(K: npt.ArrayLike, mask: npt.ArrayLike, depth: npt.ArrayLike) -> Array:
-    """Return X_CI (4, 4), the object's frame as one image shows it.
+    """Return X_CI (4, 4), a frame of the object that follows from one image.
 
-    The origin is the mask's centroid unprojected with the depth there (of the object pixel
-    nearest to the centroid). Iz is the first principal axis of the mask's pixels, Iy the
+    The origin is the mask's centroid, unprojected with the depth of the object pixel nearest to the
+    centroid. Iz is the first principal axis of the mask's pixels, Iy the
     second, both unprojected at that depth, so they lie in a plane parallel to the image.
     Signs: Iz points to the image's right (straight down if it is vertical), and Ix = Iy x Iz
     points away from the camera (+Cz). A mask of one pixel has Iz along +Cx.
@@ -83,13 +83,18 @@ def image_frame(K: npt.ArrayLike, mask: npt.ArrayLike, depth: npt.ArrayLike) -> 
     rows, columns = np.nonzero(np.asarray(mask))
     if len(rows) == 0:
         raise ValueError("the mask must have at least one object pixel, got none")
+
+    # The mask's centroid and its depth.
     pixels = np.column_stack([columns, rows]).astype(float)
     centroid = pixels.mean(axis=0)
     nearest = np.argmin(np.sum((pixels - centroid) ** 2, axis=1))
     z = float(np.asarray(depth)[rows[nearest], columns[nearest]])
+
+    # The first principal axis, pointing right.
     first = _principal_axis(pixels - centroid)
     if first[0] < -1e-9 or (abs(first[0]) <= 1e-9 and first[1] < 0.0):
         first = -first
+
     # Square pixels at one depth: a direction in pixels is a direction in Cx, Cy.
     Iz = np.array([first[0], first[1], 0.0])
     Ix = np.array([0.0, 0.0, 1.0])
@@ -98,14 +103,15 @@ def image_frame(K: npt.ArrayLike, mask: npt.ArrayLike, depth: npt.ArrayLike) -> 
 
 
 def _principal_axis(centred: Array) -> Array:
-    """Return the direction (2,) in which points (n, 2) about their mean spread most.
+    """Return the unit direction (2,) of largest variance of points (n, 2) about their mean.
 
-    In closed form: LAPACK's last bits depend on the CPU. Without any direction it is +u.
+    In closed form, because LAPACK's last bits depend on the CPU. It is +u where no direction is
+    larger than others.
     """
     (uu, vv), uv = (centred**2).sum(axis=0), (centred[:, 0] * centred[:, 1]).sum()
     half = (uu - vv) / 2.0
     length = np.sqrt(half * half + uv * uv)
-    # Of the two rows of (C - smallest eigenvalue) the longer one.
+    # The longer row of C minus its smallest eigenvalue is parallel to the first eigenvector.
     axis = np.array([half + length, uv] if half >= 0.0 else [uv, length - half])
     size = norm(axis)
     return np.asarray(axis / size) if size > 0.0 else np.array([1.0, 0.0])
@@ -126,5 +132,5 @@ class Picture:
     X_WC: Array
 
     def pixels(self, p_WA: npt.ArrayLike) -> Array:
-        """Return where points (n, 3) of the world are in the image, (n, 2) [px]."""
+        """Return the pixel coordinates (n, 2) [px] of points (n, 3) of the world [m]."""
         return project(self.K, transform_points(invert_pose(self.X_WC), p_WA))

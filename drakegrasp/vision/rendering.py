@@ -1,11 +1,10 @@
-"""Stage "look": RGB, depth and mask of the resting object, from a pose of the camera.
+"""Rendering: RGB, depth and mask of the resting object from a camera pose.
 
-In: an object and its resting pose. Out: images of object and table; the hand is never
-drawn, because the renderer's diagram, apart from the physics, does not hold one.
+In: an object, its resting pose and a camera pose. Out: images of object and table. The hand is
+never drawn: the renderer has its own diagram, without physics and without a hand.
 
-A renderer must be made and used in one thread: Drake's first rendering thread owns the GL
-context, and any other thread gets a blank image without an error. A blank image is an
-error here, never data.
+A renderer must be made and used in one thread. Drake's first rendering thread owns the OpenGL
+context, and any other thread silently gets a blank image; a blank image is an error here.
 """
 
 from __future__ import annotations
@@ -44,28 +43,29 @@ from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import ObjectModel, object_colour
 from drakegrasp.vision.camera import intrinsics
 
-#: Colour of what lies beyond the table.
+#: Colour of pixels beyond the table.
 BACKGROUND = np.array([0.86, 0.90, 0.94])
-#: A lamp at the camera, and daylight from above at a slant: with the lamp alone the table is
-#: black where the camera looks along it.
+#: A light at the camera, and one from above at a slant: without it the table is black where the
+#: camera looks along it.
 LIGHTS = (
     LightParameter(type="directional", frame="camera", direction=[0.0, 0.0, 1.0], intensity=0.6),
     LightParameter(type="directional", frame="world", direction=[0.3, 0.4, -1.0], intensity=0.7),
 )
-#: What is said of a blank image.
+#: Message of the error about a blank image.
 BLANK = (
     "the rendered image must not be blank, got all zeros: OpenGL works in one thread of a "
     "process only, and needs EGL (run `drakegrasp doctor`)"
 )
-_ENGINE = "vtk"
+#: Name of the render engine in a diagram.
+ENGINE = "vtk"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Look:
-    """What one camera sees.
+class RenderedView:
+    """The images of one camera.
 
     Attributes:
-        image: (4, S, S) float32, R, G, B in 0..1 and depth [m], `far` where nothing is near.
+        image: (4, S, S) float32, R, G, B in 0..1 and depth [m], `far` where nothing is nearer.
         mask: (S, S) uint8, 1 where the object is seen.
     """
 
@@ -75,7 +75,7 @@ class Look:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Renderer:
-    """A diagram of one object and the table that can be looked at."""
+    """A diagram that renders one object and the table."""
 
     diagram: Diagram
     context: Context
@@ -88,19 +88,11 @@ def build_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
     """Return a renderer of an object's full mesh on the table."""
     # Software OpenGL would start threads of its own beside the one process per core.
     os.environ.setdefault("LP_NUM_THREADS", "0")
+
+    # The object, and the table of the simulation.
     builder = DiagramBuilder()
-    plant, scene_graph = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.0), builder)
-    parameters = RenderEngineVtkParams(default_clear_color=BACKGROUND, lights=list(LIGHTS))
-    scene_graph.AddRenderer(_ENGINE, MakeRenderEngineVtk(parameters))
-    body = plant.AddRigidBody("object", SpatialInertia.SolidSphereWithMass(1.0, 1.0))
-    text = obj_text(model.visual_vertices, model.visual_faces, normals=True)
-    plant.RegisterVisualGeometry(
-        body,
-        RigidTransform(),
-        Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", model.name))),
-        "surface",
-        np.array([*object_colour(model.name), 1.0]),
-    )
+    lights = RenderEngineVtkParams(default_clear_color=BACKGROUND, lights=list(LIGHTS))
+    plant, body = add_drawn_object(builder, model, lights)
     (table,) = make_parser(plant).AddModels(MODELS / "table.sdf")
     plant.WeldFrames(
         plant.world_frame(), plant.GetFrameByName("table", table), RigidTransform(X_WT)
@@ -116,35 +108,67 @@ def build_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
     )
 
 
-def look(renderer: Renderer, X_TO: npt.ArrayLike, X_TC: npt.ArrayLike) -> Look:
-    """Return what a camera at X_TC (4, 4) sees of an object at X_TO (4, 4).
+def add_drawn_object(
+    builder: DiagramBuilder, model: ObjectModel, engine: RenderEngineVtkParams
+) -> tuple[MultibodyPlant, RigidBody]:
+    """Add a plant that is drawn, not simulated, with an object's full mesh.
+
+    Args:
+        builder: Of the diagram.
+        model: The object.
+        engine: Background and lights of the render engine `ENGINE`.
+
+    Returns:
+        The plant, not finalized, and the object's body.
+    """
+    plant, scene_graph = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.0), builder)
+    scene_graph.AddRenderer(ENGINE, MakeRenderEngineVtk(engine))
+
+    # The mass properties are arbitrary: nothing moves by itself.
+    body = plant.AddRigidBody("object", SpatialInertia.SolidSphereWithMass(1.0, 1.0))
+    text = obj_text(model.visual_vertices, model.visual_faces, normals=True)
+    mesh = Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", model.name)))
+    colour = np.array([*object_colour(model.name), 1.0])
+    plant.RegisterVisualGeometry(body, RigidTransform(), mesh, "surface", colour)
+    return plant, body
+
+
+def render(renderer: Renderer, X_TO: npt.ArrayLike, X_TC: npt.ArrayLike) -> RenderedView:
+    """Return the images of an object at X_TO (4, 4) from a camera at X_TC (4, 4).
 
     Raises:
         BlankImageError: If the image is blank, which means that OpenGL failed.
     """
+    # Place the object.
     plant, config = renderer.plant, renderer.config
     plant_context = plant.GetMyMutableContextFromRoot(renderer.context)
     plant.SetFreeBodyPose(plant_context, renderer.object, RigidTransform(multiply(X_WT, X_TO)))
+
+    # The camera; it is given by its pose in the world.
     X_WC = RigidTransform(multiply(X_WT, X_TC))
     K = intrinsics(config)
     core = RenderCameraCore(
-        _ENGINE,
+        ENGINE,
         # The engine measures the principal point from the corner of pixel (0, 0), not its centre.
         CameraInfo(config.size, config.size, K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5),
         ClippingRange(config.near, config.far),
         RigidTransform(),
     )
-    query = plant.get_geometry_query_input_port().Eval(plant_context)
-    world = plant.GetBodyFrameIdOrThrow(plant.world_body().index())
     depth_camera = DepthRenderCamera(core, DepthRange(config.near, config.far))
     colour_camera = ColorRenderCamera(core, False)
+
+    # Render depth, labels and colour.
+    query = plant.get_geometry_query_input_port().Eval(plant_context)
+    world = plant.GetBodyFrameIdOrThrow(plant.world_body().index())
     depth = query.RenderDepthImage(depth_camera, world, X_WC).data[:, :, 0]
     labels = query.RenderLabelImage(colour_camera, world, X_WC).data[:, :, 0]
     rgb = query.RenderColorImage(colour_camera, world, X_WC).data[:, :, :3]
     if not rgb.any() or not depth.any():
         raise BlankImageError(BLANK)
+
+    # Pack them as files hold them.
     image = np.empty_like(rgb, shape=(4, config.size, config.size), dtype=np.float32)
     image[:3] = np.moveaxis(rgb, 2, 0) / np.float32(255.0)
     # Drake gives 0 for too near and infinity for too far.
     image[3] = np.clip(depth, config.near, config.far)
-    return Look(image=image, mask=(labels == int(renderer.object.index())).astype(np.uint8))
+    return RenderedView(image=image, mask=(labels == int(renderer.object.index())).astype(np.uint8))

@@ -1,6 +1,6 @@
-"""The contact sheet of a data file, drawn by matplotlib; no Drake.
+"""The contact sheet of a data file: a page of its samples. Needs matplotlib, not Drake.
 
-In: a data file. Out: a PNG file of its samples.
+In: a data file. Out: a PNG file.
 """
 
 from __future__ import annotations
@@ -26,32 +26,34 @@ from drakegrasp.visualization.style import (
     save_figure,
 )
 
-#: Samples side by side in a contact sheet, and an image's edge in it [inch].
+#: Samples per line of a contact sheet, and the edge of each of its images [inch].
 ACROSS, EDGE = 3, 1.12
 
 
 def contact_sheet(path: Path, png: Path, *, rows: int = 8, split: str | None = None) -> int:
     """Draw samples of a data file: colour, depth and mask of each, with its contacts.
 
-    Different objects come first, so that the sheet shows as many as it can; the choice is
-    the same every time.
+    The sheet shows as many different objects as it can. The same file gives the same sheet.
 
     Args:
         path: `grasping_oto.hdf5` or `grasping_otm.hdf5`.
         png: The file to write.
-        rows: Lines of samples at most.
-        split: Of which split; of all if None.
+        rows: Most lines of samples.
+        split: The split to draw from; all of them if None.
 
     Returns:
         The number of samples drawn.
 
     Raises:
-        DataError: If the file is no data file or holds no sample.
+        DataError: If the file is not a data file or holds no sample.
     """
+    # All samples of the file.
     parts = [GraspDataset(path, split=name) for name in (SPLITS if split is None else (split,))]
     places = [(part, row) for part in parts for row in range(len(part))]
     if not places:
         raise DataError(f"{path}: must hold at least one sample to draw, got none")
+
+    # Choose some of them, and draw.
     names = [str(name) for part in parts for name in part.column("object_props/object_name")]
     chosen = spread_over_objects(names, rows * ACROSS)
     samples = [places[i][0][places[i][1]] for i in chosen]
@@ -61,11 +63,16 @@ def contact_sheet(path: Path, png: Path, *, rows: int = 8, split: str | None = N
 
 
 def spread_over_objects(names: Sequence[str], count: int) -> list[int]:
-    """Return indices of at most `count` samples, over as many objects as possible.
+    """Return the indices of at most `count` samples, spread over as many objects as possible.
 
-    Objects are in the order of their numbers; where there are more of them than places,
-    every so manyth is taken. Of an object with many samples the first come first.
+    Objects are in the order of their numbers. If there are more objects than places, evenly
+    spaced ones are taken. Of each object the first samples are taken.
+
+    Args:
+        names: Name of the object of each sample.
+        count: Most samples to choose.
     """
+    # Turn t holds the t-th sample of every object that has so many.
     order = sorted(range(len(names)), key=lambda i: (_natural(names[i]), i))
     turns: list[list[int]] = []
     for _, group in groupby(order, key=lambda i: names[i]):
@@ -73,11 +80,15 @@ def spread_over_objects(names: Sequence[str], count: int) -> list[int]:
             if turn == len(turns):
                 turns.append([])
             turns[turn].append(i)
+
+    # Fill the places turn by turn.
     chosen: list[int] = []
     for turn_indices in turns:
         room = min(count - len(chosen), len(turn_indices))
         picks = np.linspace(0, len(turn_indices) - 1, room).round().astype(int)
         chosen += [turn_indices[k] for k in picks]
+
+    # Samples of an object stand side by side.
     place = {i: k for k, i in enumerate(order)}
     return sorted(chosen, key=place.__getitem__)
 
@@ -85,18 +96,25 @@ def spread_over_objects(names: Sequence[str], count: int) -> list[int]:
 def draw_sheet(samples: Sequence[Sample], K: Array, *, far: float) -> Figure:
     """Return the contact sheet of samples as a figure.
 
-    Its axes come in threes: colour, depth and mask of each sample, then the colour bar.
+    Its axes are colour, depth and mask of each sample in turn, then the colour bar.
+
+    Args:
+        samples: What to draw, at least one.
+        K: (3, 3), camera matrix [px].
+        far: Far plane of the camera [m].
     """
+    # The page: blocks of three images, below a head with legend and colour bar.
     across = min(ACROSS, len(samples))
     lines = -(-len(samples) // across)
     gap, between, caption, margin = 0.035, 0.22, 0.21, 0.16
-    # One sample alone is too narrow for the legend and the colour bar side by side.
+    # A single sample is too narrow for legend and colour bar side by side.
     head = 0.42 if across > 1 else 0.62
     block = 3 * EDGE + 2 * gap
     width = across * block + (across - 1) * between + 2 * margin
     height = lines * (EDGE + caption) + head + margin
     figure = Figure(figsize=(width, height), facecolor="white")
 
+    # The samples, all with the same scale of depths.
     nearest = min(float(sample.image[3].min()) for sample in samples)
     for i, sample in enumerate(samples):
         line, column = divmod(i, across)
@@ -110,6 +128,8 @@ def draw_sheet(samples: Sequence[Sample], K: Array, *, far: float) -> Figure:
             1.0, 1.05, f"trial {sample.trial_id}", transform=axes[2].transAxes,
             fontsize=6.0, color="#888888", ha="right",
         )  # fmt: skip
+
+    # The head.
     bar_width = min(1.6, block / 2.2)
     bar = add_axes(figure, width - margin - bar_width, head - 0.29, bar_width, 0.09)
     draw_colour_bar(figure, bar, nearest, far, size=6.5)
@@ -120,5 +140,6 @@ def draw_sheet(samples: Sequence[Sample], K: Array, *, far: float) -> Figure:
 
 
 def _natural(name: str) -> tuple[int, str]:
+    """Return the sorting key of a name: its leading number, then the rest."""
     number, _, rest = name.partition("_")
     return (int(number), rest) if number.isdecimal() else (10**9, name)

@@ -1,8 +1,8 @@
-"""Recordings: an attempt as one HTML file that any browser plays.
+"""Recordings: an attempt as a single HTML file that any browser plays.
 
-In: what is to be run. Out: the file, which needs nothing else, no network either, and the
-result of the run: the same bits as without a recording, because the same code runs. Where
-there was nothing to run, the file shows how things would have stood.
+In: a function that runs a simulation. Out: its result, the same to the last bit as without a
+recording because the same code runs, and an HTML file that needs neither other files nor the
+network. An attempt that ends before it is simulated is shown at its start.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.runtime.environment import allow_network
-from drakegrasp.runtime.files import sync_and_rename, temporary_name
-from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.runtime.files import write_atomic
+from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.construction import MESHCAT_RATE, build_scene
 from drakegrasp.simulation.scene import Scene, reset_attempt, reset_object
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
@@ -32,38 +32,39 @@ from drakegrasp.visualization.style import PREDICTED
 
 Result = TypeVar("Result")
 
-#: Where Meshcat has the object; what is put below moves with it.
+#: Meshcat's path of the object; everything below it moves with the object.
 OBJECT_PATH = "visualizer/object/object"
 #: Radius of a contact's dot, length and radius of the arrow along its normal [m].
 DOT, ARROW, SHAFT = 0.004, 0.03, 0.0012
 #: Length and radius of an arrow's head [m].
 HEAD, HEAD_RADIUS = 0.009, 0.0035
-#: The camera looks from this far around the palm's side, about the vertical, and from above [rad].
+#: Direction of the camera: azimuth from the palm's side, about the vertical, and elevation [rad].
 AZIMUTH, ELEVATION = np.deg2rad(50.0), np.deg2rad(20.0)
-#: Its distance in radii of a ball about all that happens, and what the hand adds to that [m].
+#: Distance of the camera in radii of a ball around the whole lift; what the hand adds to that
+#: radius [m].
 DISTANCE, HAND_RADIUS = 1.15, 0.1
 
 
 def record_attempt(
     model: ObjectModel,
     X_TO: npt.ArrayLike,
-    attempt: Attempt,
+    attempt: Pregrasp,
     config: Config,
     path: Path,
     *,
     p_OQ: Array | None = None,
     nhat_Q_O: Array | None = None,
 ) -> TrialRecord:
-    """Run an attempt as `trial.run_attempt` does, and write what is seen of it.
+    """Return the result of `trial.run_attempt`, and write a recording of it.
 
     Args:
         model: The object.
-        X_TO: Its resting pose in the table-top frame, (4, 4).
+        X_TO: (4, 4), its resting pose in the table-top frame.
         attempt: What to try.
-        config: Hand and rules.
+        config: Hand, physics, lift and limits.
         path: The HTML file.
-        p_OQ: (k, 3), predicted contacts in {O}, drawn on the object [m].
-        nhat_Q_O: (k, 3), their outward unit normals.
+        p_OQ: (k, 3), predicted contacts to draw on the object, in {O} [m].
+        nhat_Q_O: (k, 3), their outward unit normals in {O}.
 
     Raises:
         OSError: If the file cannot be written.
@@ -71,7 +72,7 @@ def record_attempt(
 
     def run(meshcat: Meshcat) -> TrialRecord:
         scene = build_scene(model, config.physics, load_hand(config.hand), meshcat=meshcat)
-        # An attempt that fails before it is simulated is seen where it would have begun.
+        # An attempt that fails before it is simulated is shown at its start.
         show_start(meshcat, scene, X_TO, config, attempt.X_OG, attempt.spread, attempt.closing)
         record = run_attempt(scene, X_TO, attempt, config)
         draw_predicted(meshcat, p_OQ, nhat_Q_O)
@@ -89,7 +90,18 @@ def show_start(
     spread: float = 0.0,
     closing: Array | None = None,
 ) -> None:
-    """Show the object, and the hand if a pose of it is given, before anything moves."""
+    """Show the object, and the hand if its pose is given, at the start, and aim the camera.
+
+    Args:
+        meshcat: Where to show them.
+        scene: Of the object, with a hand if X_OG is given.
+        X_TO: (4, 4), resting pose of the object in the table-top frame.
+        config: With the target of the lift.
+        X_OG: (4, 4), pose of the palm.
+        spread: Angle of the spread joints [rad].
+        closing: (k,), closing angles [rad]; the open hand if None.
+    """
+    # Publish the start.
     X_WO = X_WT @ np.asarray(X_TO, dtype=float)
     if X_OG is None:
         reset_object(scene, X_WO)
@@ -98,6 +110,8 @@ def show_start(
     else:
         reset_attempt(scene, X_WO, X_WO @ X_OG, spread=spread, closing=closing)
         side_W = X_WO[:3, :3] @ X_OG[:3, 3]
+
+    # Look from beside the palm, from far enough to see the whole lift.
     way = X_WT[:3, 3] + config.lift.p_TG - X_WO[:3, 3]
     radius = np.linalg.norm(way) / 2.0 + np.linalg.norm(scene.model.half_extents) + HAND_RADIUS
     azimuth = np.arctan2(side_W[1], side_W[0]) + AZIMUTH
@@ -107,7 +121,15 @@ def show_start(
 
 
 def record_html(run: Callable[[Meshcat], Result], path: Path) -> Result:
-    """Return what `run` does, and write what is seen of it when it ends well."""
+    """Return the result of `run`, and write what it published; nothing is written if it raises.
+
+    Args:
+        run: Runs a simulation that publishes to the Meshcat it is given.
+        path: The HTML file.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
     meshcat = _make_meshcat()
     try:
         for part in ("/Grid", "/Axes"):
@@ -116,9 +138,9 @@ def record_html(run: Callable[[Meshcat], Result], path: Path) -> Result:
         result = run(meshcat)
         meshcat.StopRecording()
         meshcat.PublishRecording()
-        _write(path, meshcat.StaticHtml())
+        write_atomic(path, meshcat.StaticHtml().encode())
     finally:
-        # Diagrams sit in reference cycles; when the one of `run` is gone, the port is closed.
+        # The diagram of `run` is in a reference cycle; Meshcat's port closes when it is collected.
         del meshcat
         gc.collect()
     return result
@@ -127,34 +149,30 @@ def record_html(run: Callable[[Meshcat], Result], path: Path) -> Result:
 def _make_meshcat() -> Meshcat:
     """Return a Meshcat that only this machine can reach.
 
-    Meshcat is a server from the moment it is made, and there is no other way to its HTML.
-    Under `DRAKE_ALLOW_NETWORK=none`, as our workers run, making one raises, so the ban is
-    eased meanwhile; nothing leaves the machine. Nobody is to open the address that Drake
-    announces, so that is not said.
+    A Meshcat always starts a server, and only it can write the HTML. Under
+    `DRAKE_ALLOW_NETWORK=none`, which our workers set, its constructor raises; it is allowed here,
+    and nothing leaves the machine. Drake's announcement of the address is suppressed, because
+    nobody needs to open it.
     """
     logger = logging.getLogger("drake")
     level = logger.level
     logger.setLevel(logging.WARNING)
     try:
         with allow_network("meshcat"):
-            # Port 0 is any that is free, so any number of recordings can be made at once.
+            # Port 0 means any free port, so that several recordings can be made at once.
             return Meshcat(MeshcatParams(host="localhost", port=0, show_stats_plot=False))
     finally:
         logger.setLevel(level)
 
 
-def _write(path: Path, text: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = temporary_name(path)
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        sync_and_rename(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
 def draw_predicted(meshcat: Meshcat, p_OQ: Array | None, nhat_Q_O: Array | None) -> None:
-    """Draw a dot per contact on the object, with an arrow along its normal."""
+    """Draw a dot per contact on the object, with an arrow along its normal.
+
+    Args:
+        meshcat: Where to draw.
+        p_OQ: (k, 3), contacts in {O} [m]; nothing is drawn if None.
+        nhat_Q_O: (k, 3), their outward unit normals in {O}.
+    """
     if p_OQ is None or nhat_Q_O is None:
         return
     colour = rgba(PREDICTED)
@@ -164,17 +182,17 @@ def draw_predicted(meshcat: Meshcat, p_OQ: Array | None, nhat_Q_O: Array | None)
         meshcat.SetObject(f"{path}/dot", Sphere(DOT), colour)
         meshcat.SetObject(f"{path}/shaft", Cylinder(SHAFT, ARROW - HEAD), colour)
         meshcat.SetTransform(f"{path}/shaft", RigidTransform([0.0, 0.0, (ARROW - HEAD) / 2.0]))
-        # A cone opens along its +z from its apex, here the arrow's tip.
+        # A Meshcat cone opens along its +z from its apex, which is the arrow's tip here.
         meshcat.SetObject(f"{path}/head", MeshcatCone(HEAD, HEAD_RADIUS, HEAD_RADIUS), colour)
         tip = RigidTransform(RotationMatrix.MakeXRotation(np.pi), [0.0, 0.0, ARROW])
         meshcat.SetTransform(f"{path}/head", tip)
 
 
 def pose_along(p_OQ: Array, v_O: Array) -> RigidTransform:
-    """Return the pose in {O} of a frame at a point whose z axis is along a vector."""
+    """Return the pose in {O} of a frame at a point p_OQ (3,) whose z axis is along v_O (3,)."""
     return RigidTransform(RotationMatrix.MakeFromOneVector(v_O, 2), p_OQ)
 
 
 def rgba(colour: str) -> Rgba:
-    """Return a colour #rrggbb as Drake's."""
+    """Return a colour "#rrggbb" as Drake's type."""
     return Rgba(*(int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5)))

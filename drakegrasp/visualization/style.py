@@ -1,7 +1,7 @@
-"""What figures have in common: colours, axes, and how a sample is drawn.
+"""What all figures share: colours, axes, legends, and how to draw a sample.
 
-Contacts are drawn where the camera matrix projects them: a dot per finger with a short arrow
-along the outward normal; a dot is hollow where the object hides it.
+A contact is drawn where the camera matrix projects it: a dot in its finger's colour and a
+short arrow along the outward normal. The dot is hollow if the object hides the contact.
 """
 
 from __future__ import annotations
@@ -24,42 +24,64 @@ from drakegrasp.frames import Array
 from drakegrasp.grasp import unpack_grasp
 from drakegrasp.vision.camera import project
 
-#: Colours of what was predicted and of what was reached, told apart by the colour-blind too.
+#: Colours of predicted and of reached contacts (Okabe and Ito: safe for the colour-blind).
 PREDICTED, REACHED = "#0072B2", "#D55E00"
-#: Colours of the fingers in grasp order, told apart by the colour-blind too (Okabe and Ito).
+#: Colours of the fingers in grasp order (Okabe and Ito: safe for the colour-blind).
 FINGER_COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00")
 #: Length of the arrows along the normals [m].
 ARROW = 0.03
-#: A contact this much behind what the depth image shows is hidden [m]; fingertips give way
-#: by less.
+#: A contact farther than this behind the depth image counts as hidden [m]; fingertips are
+#: compressed by less.
 HIDDEN = 0.006
+#: Colour of text and lines.
 INK = "#333333"
 
 
 def draw_sample(
     axes: Sequence[Axes], sample: Sample, K: Array, *, near: float, far: float, scale: float = 1.0
 ) -> None:
-    """Draw colour, depth and mask of a sample into three axes, contacts and all."""
+    """Draw colour, depth and mask of a sample, each with its contacts.
+
+    Args:
+        axes: Three, for the three images.
+        sample: What to draw.
+        K: (3, 3), camera matrix [px].
+        near: Depth of the brightest end of the colour scale [m].
+        far: Far plane; pixels beyond it have no depth [m].
+        scale: Size of dots and lines; 1 suits images of about two inches.
+    """
     colour, depth, mask = axes
     colour.imshow(np.moveaxis(sample.image[:3], 0, 2), interpolation="nearest")
     shown = np.ma.masked_greater_equal(sample.image[3], far)
     depth.imshow(shown, cmap=_depth_colours(), vmin=near, vmax=far, interpolation="nearest")
     mask.imshow(sample.mask, cmap="gray", vmin=-0.25, vmax=1.1, interpolation="nearest")
-    for one in axes:
-        draw_contacts(one, sample, K, scale=scale)
-        hide_ticks(one)
+    for panel in axes:
+        draw_contacts(panel, sample, K, scale=scale)
+        hide_ticks(panel)
 
 
 def draw_contacts(axes: Axes, sample: Sample, K: Array, *, scale: float = 1.0) -> None:
-    """Draw the contacts of a sample into its image: one dot, with an arrow, per finger."""
+    """Draw the contacts of a sample over its image: a dot with an arrow per finger.
+
+    Args:
+        axes: That show the image.
+        sample: With its grasp in {C}.
+        K: (3, 3), camera matrix [px].
+        scale: Size of dots and lines.
+    """
+    # Project the contacts and the tips of their normals.
     p_CQ, nhat_Q_C = unpack_grasp(sample.grasp)
     dots = project(K, p_CQ)
     ends = project(K, p_CQ + ARROW * nhat_Q_C)
     size = np.array(sample.mask.shape[::-1])
+
     for i, (dot, end) in enumerate(zip(dots, ends, strict=True)):
         colour = FINGER_COLOURS[i % len(FINGER_COLOURS)]
+        # Something nearer than the contact, at its pixel, hides it.
         column, row = np.clip(np.rint(dot), 0, size - 1).astype(int)
         hidden = p_CQ[i, 2] > sample.image[3, row, column] + HIDDEN
+
+        # The arrow along the normal, then the dot over its tail.
         white = [withStroke(linewidth=3.0 * scale, foreground="white")]
         axes.plot(
             *np.column_stack([dot, end]), color=colour, linewidth=1.6 * scale,
@@ -72,6 +94,8 @@ def draw_contacts(axes: Axes, sample: Sample, K: Array, *, scale: float = 1.0) -
             linestyle="none", zorder=4, gid=f"contact {i}",
             path_effects=[withStroke(linewidth=1.6 * scale, foreground="white")] if hidden else [],
         )  # fmt: skip
+
+    # Contacts outside the image must not change what the axes show.
     axes.set_xlim(-0.5, size[0] - 0.5)
     axes.set_ylim(size[1] - 0.5, -0.5)
 
@@ -83,12 +107,13 @@ def read_far(path: Path) -> float:
 
 
 def _depth_colours() -> Colormap:
-    # What is beyond the far plane has no depth.
+    """Return the colours of depths; that of pixels without depth is a light grey."""
+    # Pixels beyond the far plane are masked: they have no depth.
     return mpl.colormaps["viridis_r"].with_extremes(bad="#E3E6EA")
 
 
 def draw_colour_bar(figure: Figure, axes: Axes, near: float, far: float, *, size: float) -> None:
-    """Draw the bar of the depths, with text of a size [points]."""
+    """Draw the colour bar of depths from near to far [m], with text of a size [points]."""
     scale = mpl.cm.ScalarMappable(mpl.colors.Normalize(near, far), _depth_colours())
     bar = figure.colorbar(scale, cax=axes, orientation="horizontal")
     bar.outline.set_visible(False)
@@ -99,7 +124,14 @@ def draw_colour_bar(figure: Figure, axes: Axes, near: float, far: float, *, size
 def draw_finger_legend(
     figure: Figure, fingers: int, corner: tuple[float, float], size: float
 ) -> None:
-    """Write which colour is which finger, right of a corner (0..1), text of a size [points]."""
+    """Draw the legend of the fingers' colours.
+
+    Args:
+        figure: Where to draw.
+        fingers: Their number.
+        corner: Upper left corner of the legend, as shares of the figure's width and height.
+        size: Of the text [points].
+    """
 
     def mark(colour: str, inside: str, edge: str, label: str) -> Line2D:
         return Line2D([], [], marker="o", linestyle="none", markersize=0.75 * size, color=colour,
@@ -118,14 +150,14 @@ def draw_finger_legend(
 
 
 def add_axes(figure: Figure, left: float, top: float, wide: float, high: float) -> Axes:
-    """Add axes, measured in inches from the upper left corner of the figure."""
+    """Add axes of a size to a figure, placed from its upper left corner [inch]."""
     width, height = figure.get_size_inches()
     box = (left / width, 1.0 - (top + high) / height, wide / width, high / height)
     return figure.add_axes(box)
 
 
 def hide_ticks(axes: Axes) -> None:
-    """Take away the ticks and the frame of axes."""
+    """Remove the ticks and the frame of axes."""
     axes.set_xticks([])
     axes.set_yticks([])
     for spine in axes.spines.values():
@@ -133,6 +165,6 @@ def hide_ticks(axes: Axes) -> None:
 
 
 def save_figure(figure: Figure, png: Path, *, dpi: int) -> None:
-    """Write a figure as PNG."""
-    # No version in the file: the same figure gives the same bytes.
+    """Write a figure as PNG, at a resolution [pixels per inch]."""
+    # Without the writing software's version the same figure gives the same bytes.
     figure.savefig(png, dpi=dpi, metadata={"Software": None})

@@ -1,10 +1,10 @@
-"""The theatre: an object, a hand and a table in a diagram that is only looked at.
+"""Third-person pictures of an object, a hand and a table; nothing is simulated.
 
-In: an object's model and a hand, and a `Moment` to show. Out: pictures with their cameras,
-so that frames can be drawn into them. The camera is chosen by itself: of a ring of
-viewpoints, the one that sees most of the fingertip it sees least of.
+In: an object's model, a hand, and a `Snapshot` of their poses. Out: pictures with their
+cameras, so that frames and contacts can be drawn over them. `choose_view` tries a ring of
+viewpoints and takes the one whose least visible fingertip covers the most pixels.
 
-As for `vision.rendering`: a theatre must be made and used in one thread.
+As in `vision.rendering`, a scene must be made and used in one thread.
 """
 
 from __future__ import annotations
@@ -14,51 +14,46 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from pydrake.common import MemoryFile
 from pydrake.geometry import (
     Box,
     ClippingRange,
     ColorRenderCamera,
     FrameId,
-    InMemoryMesh,
     LightParameter,
-    MakeRenderEngineVtk,
-    Mesh,
     QueryObject,
     RenderCameraCore,
     RenderEngineVtkParams,
 )
 from pydrake.math import RigidTransform
-from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import FixedOffsetFrame, ModelInstanceIndex, RigidBody, SpatialInertia
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import FixedOffsetFrame, ModelInstanceIndex, RigidBody
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
 from drakegrasp.errors import MachineError
 from drakegrasp.frames import X_WT, Array, make_pose, transform_points
 from drakegrasp.hand.description import Hand, make_parser
-from drakegrasp.mesh.wavefront import obj_text
-from drakegrasp.objects.model import ObjectModel, object_colour
+from drakegrasp.objects.model import ObjectModel
 from drakegrasp.vision.camera import Picture
-from drakegrasp.vision.rendering import BLANK
+from drakegrasp.vision.rendering import BLANK, ENGINE, add_drawn_object
 
-#: Vertical field of view [deg]: narrow, so that nothing is distorted.
+#: Vertical field of view [deg]: narrow, so that perspective distorts little.
 FOV_Y_DEG = 26.0
-#: Viewpoints that are tried: around the vertical, and above the horizontal [deg].
+#: Viewpoints that `choose_view` tries: azimuths, and elevations above the horizontal [deg].
 AZIMUTHS_DEG, ELEVATIONS_DEG = range(0, 360, 20), (19.0, 28.0)
-#: Height of the pictures among which the viewpoint is chosen [px].
+#: Edge of the label images by which viewpoints are compared [px].
 TRIAL_SIZE = 120
-#: Pictures are drawn this many times larger and averaged: VTK alone leaves jagged edges.
+#: Pictures are rendered this many times larger and averaged: VTK alone leaves jagged edges.
 OVERSAMPLING = 2
-#: What the hand needs around the origins of its links [m].
+#: Space around the origins of the hand's links that the hand fills [m].
 MARGIN = 0.035
 BACKGROUND = np.array([0.95, 0.96, 0.97])
 TABLE_COLOUR = np.array([0.74, 0.70, 0.64, 1.0])
 TABLE_SIZE, TABLE_THICKNESS = 1.6, 0.1
-#: Edge of the map that the shadows are looked up in [px].
+#: Edge of the shadow map [px].
 SHADOW_MAP = 4096
-#: For pictures of hand and object together. Camera axes: +X right, +Y down. Point lights cast
-#: no shadow in VTK; the spot does.
+#: Lights for pictures of hand and object together. Camera axes: +X right, +Y down. In VTK spot
+#: lights cast shadows, point lights do not.
 LIGHTS = (
     LightParameter(type="point", frame="camera", position=[0.3, -0.3, -0.5], intensity=0.5),
     LightParameter(type="point", frame="world", position=[0.0, 0.0, 4.0], intensity=0.25),
@@ -71,12 +66,17 @@ LIGHTS = (
         cone_angle=26.0,
     ),
 )
-_ENGINE = "vtk"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Moment:
-    """Where everything is at one instant: palm X_WG, object X_WO (4, 4), joints q [rad]."""
+class Snapshot:
+    """Poses of hand and object at one instant.
+
+    Attributes:
+        X_WG: (4, 4), pose of the palm.
+        X_WO: (4, 4), pose of the object.
+        q: (n,), positions of the hand's joints, in the order of `RenderScene.joint_names` [rad].
+    """
 
     X_WG: Array
     X_WO: Array
@@ -84,8 +84,18 @@ class Moment:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Theatre:
-    """A diagram of the object, the hand and the table that is only looked at."""
+class RenderScene:
+    """A diagram of object, hand and table that is rendered, never simulated.
+
+    Attributes:
+        diagram: The diagram.
+        context: Its context, with the poses of the last `Snapshot`.
+        plant: The bodies.
+        object: The object's body.
+        hand: Description of the hand.
+        hand_instance: The hand in the plant.
+        wrist: Frame that the palm is welded to; its pose is a parameter of the context.
+    """
 
     diagram: Diagram
     context: Context
@@ -97,55 +107,62 @@ class Theatre:
 
     @property
     def joint_names(self) -> list[str]:
-        """Names of the hand's joints in the order of `Moment.q`."""
+        """Names of the hand's joints, in the order of `Snapshot.q`."""
         names = self.plant.GetPositionNames(
             self.hand_instance, add_model_instance_prefix=False, always_add_suffix=False
         )
         return list(names)
 
     def pose(self, link: str) -> Array:
-        """Return the pose X_WL (4, 4) of a link of the hand now."""
+        """Return the current pose X_WL (4, 4) of a link of the hand."""
         body = self.plant.GetBodyByName(link, self.hand_instance)
         context = self.plant.GetMyContextFromRoot(self.context)
         return self.plant.EvalBodyPoseInWorld(context, body).GetAsMatrix4()
 
 
-def build_theatre(
+def build_render_scene(
     model: ObjectModel,
     hand: Hand,
     *,
     table_size: float = TABLE_SIZE,
     lights: Sequence[LightParameter] = LIGHTS,
-) -> Theatre:
-    """Return a diagram of an object, a hand and a square table of an edge [m], lit by lights."""
+) -> RenderScene:
+    """Return a diagram of an object, a hand and a square table.
+
+    Args:
+        model: The object.
+        hand: The hand.
+        table_size: Edge of the table [m].
+        lights: What lights it.
+    """
+    # The object, rendered by VTK.
     builder = DiagramBuilder()
-    plant, scene_graph = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.0), builder)
     parameters = RenderEngineVtkParams(
         default_clear_color=BACKGROUND,
         lights=list(lights),
         cast_shadows=True,
         shadow_map_size=SHADOW_MAP,
     )
-    scene_graph.AddRenderer(_ENGINE, MakeRenderEngineVtk(parameters))
-    body = plant.AddRigidBody("object", SpatialInertia.SolidSphereWithMass(1.0, 1.0))
-    text = obj_text(model.visual_vertices, model.visual_faces, normals=True)
-    mesh = Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", model.name)))
-    colour = np.array([*object_colour(model.name), 1.0])
-    plant.RegisterVisualGeometry(body, RigidTransform(), mesh, "surface", colour)
+    plant, body = add_drawn_object(builder, model, parameters)
+
+    # The table, with its top at {T}.
     X_WB = RigidTransform(X_WT @ make_pose(np.eye(3), [0.0, 0.0, -TABLE_THICKNESS / 2.0]))
     slab = Box(table_size, table_size, TABLE_THICKNESS)
     plant.RegisterVisualGeometry(plant.world_body(), X_WB, slab, "table", TABLE_COLOUR)
+
+    # The hand, welded by its palm to a frame whose pose is a parameter of the context: the palm
+    # can be put anywhere without a joint.
     (instance,) = make_parser(plant).AddModels(hand.sdf_path)
     base = plant.GetBodyByName(hand.palm_link, instance)
     palm = plant.AddFrame(
         FixedOffsetFrame("palm", base.body_frame(), RigidTransform(hand.X_BG), instance)
     )
-    # Its pose is a parameter of the context: the palm can be put anywhere without a joint.
     wrist = plant.AddFrame(FixedOffsetFrame("wrist", plant.world_frame(), RigidTransform()))
     plant.WeldFrames(wrist, palm)
     plant.Finalize()
+
     diagram = builder.Build()
-    return Theatre(
+    return RenderScene(
         diagram=diagram,
         context=diagram.CreateDefaultContext(),
         plant=plant,
@@ -156,67 +173,94 @@ def build_theatre(
     )
 
 
-def show(theatre: Theatre, moment: Moment) -> None:
-    """Put hand and object where they are at a moment."""
-    plant = theatre.plant
-    context = plant.GetMyMutableContextFromRoot(theatre.context)
-    plant.SetFreeBodyPose(context, theatre.object, RigidTransform(moment.X_WO))
-    theatre.wrist.SetPoseInParentFrame(context, RigidTransform(moment.X_WG))
-    plant.SetPositions(context, theatre.hand_instance, moment.q)
+def set_snapshot(scene: RenderScene, snapshot: Snapshot) -> None:
+    """Move hand and object to the poses of a snapshot."""
+    plant = scene.plant
+    context = plant.GetMyMutableContextFromRoot(scene.context)
+    plant.SetFreeBodyPose(context, scene.object, RigidTransform(snapshot.X_WO))
+    scene.wrist.SetPoseInParentFrame(context, RigidTransform(snapshot.X_WG))
+    plant.SetPositions(context, scene.hand_instance, snapshot.q)
 
 
-def take(theatre: Theatre, X_WC: Array, size: tuple[int, int]) -> Picture:
-    """Return what a camera at X_WC (4, 4) sees, `size` = (width, height) [px].
+def render_view(scene: RenderScene, X_WC: Array, size: tuple[int, int]) -> Picture:
+    """Return the picture of a camera.
+
+    Args:
+        scene: In the poses of `set_snapshot`.
+        X_WC: (4, 4), pose of the camera.
+        size: Width and height of the picture [px].
 
     Raises:
         MachineError: If the picture is blank, which means that OpenGL failed.
     """
-    query, camera, world = _camera(theatre, (OVERSAMPLING * size[0], OVERSAMPLING * size[1]))
+    # Render larger, then average blocks of pixels.
+    query, camera, world = _camera(scene, (OVERSAMPLING * size[0], OVERSAMPLING * size[1]))
     large = query.RenderColorImage(camera, world, RigidTransform(X_WC)).data[:, :, :3]
     if not large.any():
         raise MachineError(BLANK)
     blocks = large.reshape(size[1], OVERSAMPLING, size[0], OVERSAMPLING, 3)
     image = np.rint(blocks.mean(axis=(1, 3))).astype(np.uint8)
+
+    # The camera matrix of the averaged picture.
     focal = size[1] / (2.0 * np.tan(np.deg2rad(FOV_Y_DEG) / 2.0))
     K = np.array([[focal, 0.0, (size[0] - 1) / 2], [0.0, focal, (size[1] - 1) / 2], [0, 0, 1.0]])
     return Picture(image=image, K=K, X_WC=X_WC)
 
 
-def labels(theatre: Theatre, X_WC: Array, size: tuple[int, int]) -> npt.NDArray[np.int16]:
-    """Return the body index (height, width) that each pixel shows."""
-    query, camera, world = _camera(theatre, size)
+def render_labels(scene: RenderScene, X_WC: Array, size: tuple[int, int]) -> npt.NDArray[np.int16]:
+    """Return the index of the body that each pixel shows, (height, width).
+
+    Args:
+        scene: In the poses of `set_snapshot`.
+        X_WC: (4, 4), pose of the camera.
+        size: Width and height of the image [px].
+    """
+    query, camera, world = _camera(scene, size)
     return query.RenderLabelImage(camera, world, RigidTransform(X_WC)).data[:, :, 0].copy()
 
 
-def choose_view(theatre: Theatre, p_WA: Array, *, fill: float = 1.0) -> Array:
-    """Return X_WC of a camera that has points p_WA (n, 3) in view and all fingertips in sight.
+def choose_view(scene: RenderScene, p_WA: Array, *, fill: float = 1.0) -> Array:
+    """Return the pose X_WC (4, 4) of a camera that sees given points and all fingertips.
 
     Args:
-        theatre: As it is to be seen.
-        p_WA: What must be in the picture [m].
-        fill: The camera's distance is divided by it.
+        scene: In the poses of `set_snapshot`.
+        p_WA: (n, 3), points that must be in the picture [m].
+        fill: The camera's distance is divided by it; above 1 the points fill more of the picture.
     """
     tips = [
-        int(theatre.plant.GetBodyByName(name, theatre.hand_instance).index())
-        for name in theatre.hand.fingertip_links
+        int(scene.plant.GetBodyByName(name, scene.hand_instance).index())
+        for name in scene.hand.fingertip_links
     ]
+
+    # The best view is the one whose least visible fingertip covers the most pixels; among equals
+    # the one with the most pixels of fingertips and object.
     best, most = np.eye(4), (-1, -1)
     for elevation in np.deg2rad(ELEVATIONS_DEG):
         for azimuth in np.deg2rad(AZIMUTHS_DEG):
-            X_WC = view(p_WA, azimuth, elevation, fill=fill)
-            seen = labels(theatre, X_WC, (TRIAL_SIZE, TRIAL_SIZE))
+            X_WC = camera_pose(p_WA, azimuth, elevation, fill=fill)
+            seen = render_labels(scene, X_WC, (TRIAL_SIZE, TRIAL_SIZE))
             counts = [int(np.sum(seen == tip)) for tip in tips]
-            score = min(counts), sum(counts) + int(np.sum(seen == int(theatre.object.index())))
+            score = min(counts), sum(counts) + int(np.sum(seen == int(scene.object.index())))
             if score > most:
                 best, most = X_WC, score
     return best
 
 
-def view(p_WA: Array, azimuth: float, elevation: float, *, fill: float = 1.0) -> Array:
-    """Return X_WC (4, 4) of a camera that looks at the middle of points from two angles [rad]."""
+def camera_pose(p_WA: Array, azimuth: float, elevation: float, *, fill: float = 1.0) -> Array:
+    """Return the pose X_WC (4, 4) of a camera that looks at the middle of points.
+
+    Args:
+        p_WA: (n, 3), points that must be in the picture [m].
+        azimuth: Direction of the camera about the vertical, from +x of {W} [rad].
+        elevation: Height of the camera above the horizontal [rad].
+        fill: The camera's distance is divided by it; above 1 the points fill more of the picture.
+    """
+    # Far enough away for a ball around the points to fit into the field of view.
     middle = (p_WA.min(axis=0) + p_WA.max(axis=0)) / 2.0
     radius = np.linalg.norm(p_WA - middle, axis=1).max() + MARGIN
     distance = radius / np.sin(np.deg2rad(FOV_Y_DEG) / 2.0) / fill
+
+    # The camera's axes: +Z towards the points, +X horizontal to the right, +Y down.
     z = -np.array(
         [
             np.cos(elevation) * np.cos(azimuth),
@@ -229,30 +273,40 @@ def view(p_WA: Array, azimuth: float, elevation: float, *, fill: float = 1.0) ->
     return make_pose(np.column_stack([x, np.cross(z, x), z]), middle - distance * z)
 
 
-def outline(theatre: Theatre, moment: Moment, half_extents: Array) -> Array:
-    """Return points (n, 3) that span what is shown: links of the hand, corners of the box."""
-    show(theatre, moment)
-    plant = theatre.plant
-    links = [plant.get_body(i).name() for i in plant.GetBodyIndices(theatre.hand_instance)]
+def outline_points(scene: RenderScene, snapshot: Snapshot, half_extents: Array) -> Array:
+    """Move the scene to a snapshot and return the points that a picture of it must contain.
+
+    Args:
+        scene: Of the hand and the object.
+        snapshot: The poses.
+        half_extents: (3,), of the object's bounding box [m].
+
+    Returns:
+        (n, 3) in {W}: the origins of the hand's links and the corners of the object's box [m].
+    """
+    set_snapshot(scene, snapshot)
+    plant = scene.plant
+    links = [plant.get_body(i).name() for i in plant.GetBodyIndices(scene.hand_instance)]
     corners = half_extents * np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T
     return np.vstack(
         [
-            transform_points(moment.X_WO, corners),
-            *(theatre.pose(link)[None, :3, 3] for link in links),
+            transform_points(snapshot.X_WO, corners),
+            *(scene.pose(link)[None, :3, 3] for link in links),
         ]
     )
 
 
 def _camera(
-    theatre: Theatre, size: tuple[int, int]
+    scene: RenderScene, size: tuple[int, int]
 ) -> tuple[QueryObject, ColorRenderCamera, FrameId]:
-    plant = theatre.plant
+    """Return the query object, a camera of a size (width, height) [px], and the world's frame."""
+    plant = scene.plant
     core = RenderCameraCore(
-        _ENGINE,
+        ENGINE,
         CameraInfo(*size, np.deg2rad(FOV_Y_DEG)),
         ClippingRange(0.05, 20.0),
         RigidTransform(),
     )
-    query = plant.get_geometry_query_input_port().Eval(plant.GetMyContextFromRoot(theatre.context))
+    query = plant.get_geometry_query_input_port().Eval(plant.GetMyContextFromRoot(scene.context))
     world = plant.GetBodyFrameIdOrThrow(plant.world_body().index())
     return query, ColorRenderCamera(core, False), world

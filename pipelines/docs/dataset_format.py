@@ -21,7 +21,7 @@ from drakegrasp.dataset.schema import (
     Field,
 )
 
-_HEAD = f"""<!-- Made by `make docs` from drakegrasp/schema.py: change that, not this. -->
+_HEAD = f"""<!-- Made by `make docs` from drakegrasp/dataset/schema.py: change that, not this. -->
 
 # The dataset's format
 
@@ -57,7 +57,7 @@ may round differently. The exceptions are the outcomes `timeout` and `crashed`: 
 takes longer than `attempt_seconds` (60 s, where a usual one takes about one), or ends its process
 again and again, says more about the machine than about the grasp, and may end otherwise elsewhere.
 `screened` is an attempt that geometry has decided: it was not simulated, and would have been a
-`missing_fingertip`, see `performance.md`.
+`missing_fingertip`, see [screening](../explanation/screening.md).
 
 Shards and the files in `objects/` are sealed: a changed bit in one of them is found when it is
 used, and by `drakegrasp check`. The three main files have no seal: `check` finds what breaks an
@@ -114,7 +114,7 @@ _SHARDS = """
 
 
 def format_page() -> str:
-    """Return the page."""
+    """Return the page as Markdown."""
     return "\n".join(
         [
             _HEAD,
@@ -140,10 +140,11 @@ def format_page() -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Write the page, or with --check return 1 if it is out of date."""
+    """Write the page, or with --check return 1 if the file differs from it."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     check = "--check" in arguments
     (target,) = (Path(a) for a in arguments if a != "--check")
+
     page = format_page()
     if not check:
         target.write_text(page, encoding="utf-8")
@@ -155,12 +156,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _fields(fields: Sequence[Field], *, stages: bool = False) -> str:
+    """Return the table of some fields, with the stage from which they have values if asked for."""
     heads: tuple[str, ...] = ("field", "shape", "type", "unit", "frame", "meaning")
     rows = []
     for field in fields:
-        shape = (
-            "(" + ", ".join(["N", *map(str, field.shape)]) + ("," if not field.shape else "") + ")"
-        )
+        # As NumPy writes it: (N,), (N, 3).
+        axes = ", ".join(["N", *map(str, field.axes)])
+        shape = f"({axes})" if field.axes else f"({axes},)"
         cells = [f"`{field.name}`", shape, field.dtype, field.unit, field.frame, field.meaning]
         if stages:
             cells.insert(5, field.stage.name.lower())
@@ -171,6 +173,7 @@ def _fields(fields: Sequence[Field], *, stages: bool = False) -> str:
 
 
 def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table."""
     lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
     lines += ["| " + " | ".join(row) + " |" for row in rows]
     return "\n".join(lines) + "\n"

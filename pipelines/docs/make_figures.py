@@ -1,7 +1,7 @@
-"""Draw the pictures of the README and the docs from a dataset of built-in objects.
+"""Draw the figures of the README and the docs from a dataset of built-in objects.
 
-Writes trial.png (one grasp, start to lift, with what the cameras saw), frames.png (the
-frames) and candidates.png (palm poses by surface normals and by rotations, on a mug).
+Writes trial.png (one grasp from start to lift, with the images of both cameras), frames.png
+(all frames) and candidates.png (palm poses by surface normals and by rotations, on a mug).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from doc_figures import candidates_figure, frames_figure, hero_figure
-from trial_pictures import frames_panels, trial_snapshots
+from trial_pictures import frames_panels, render_trial
 
 from drakegrasp.build.prepare import prepare
 from drakegrasp.config import load_config
@@ -35,16 +35,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("dataset", type=Path, help="directory of a finished dataset")
-    parser.add_argument("--trial", type=int, required=True, help="a success that is a sample")
+    parser.add_argument("--trial", type=int, required=True, help="a trial that became a sample")
     parser.add_argument("--images", type=Path, default=Path("docs/images"), help="where to write")
     parser.add_argument("--rays", type=int, default=220, help="palm poses drawn per method")
     arguments = parser.parse_args(argv)
+
+    # One trial, and its frames.
     out, images = arguments.dataset, arguments.images
     images.mkdir(parents=True, exist_ok=True)
-    pictures = trial_snapshots(out, arguments.trial)
+    pictures = render_trial(out, arguments.trial)
     oto, otm = out / DATA_FILES["oto"], out / DATA_FILES["otm"]
     hero_figure(oto, otm, arguments.trial, pictures, images / "trial.png")
     frames_figure(frames_panels(out, arguments.trial), images / "frames.png")
+
+    # Candidates of a built-in mug.
     with tempfile.TemporaryDirectory() as folder:
         export_builtin(folder, [MUG])
         mug = prepare(find_meshes(Path(folder))[0], load_config(None, ["candidates.max=1"]))
@@ -55,12 +59,21 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def palm_rays(prepared: PreparedObject, method: str, count: int) -> Array:
-    """Return (count, 2, 3), from the palm at its largest stand-off to the surface, in {O}."""
+    """Return the approach rays of palm poses, from the largest stand-off to the surface.
+
+    Args:
+        prepared: The object.
+        method: "normals" or "rotations".
+        count: Most rays to return.
+
+    Returns:
+        (n, 2, 3) in {O}: the palm's origin and the point on the surface [m].
+    """
     config = load_config(None, [f"candidates.method={method}", f"candidates.max={10 * count}"])
-    found = sample_candidates(prepared.model, prepared.X_TO, config.candidates, config.seed)
-    hits = np.flatnonzero(np.isfinite(found.distance))[:count]
-    z_O = found.X_OG[hits, :3, 2]
-    p_OS = found.X_OG[hits, :3, 3] + found.distance[hits, None] * z_O
+    candidates = sample_candidates(prepared.model, prepared.X_TO, config.candidates, config.seed)
+    hits = np.flatnonzero(np.isfinite(candidates.distance))[:count]
+    z_O = candidates.X_OG[hits, :3, 2]
+    p_OS = candidates.X_OG[hits, :3, 3] + candidates.distance[hits, None] * z_O
     return np.stack([p_OS - max(config.candidates.standoffs) * z_O, p_OS], axis=1)
 
 

@@ -1,8 +1,8 @@
-"""Third-person pictures of a trial, hand and all, for the README and the docs.
+"""Third-person pictures of a trial with hand and object, for the README and the docs.
 
-In: a dataset's directory and the number of a trial. Out: pictures of its moments, drawn
-from the poses and joint positions in trials.hdf5, and the panels of the figure of all
-frames; nothing is simulated.
+In: a dataset's directory and the number of a trial. Out: pictures of its stages, rendered from
+the poses and joint positions in trials.hdf5, and the panels of the figure of all frames.
+Nothing is simulated.
 """
 
 from __future__ import annotations
@@ -28,52 +28,59 @@ from drakegrasp.vision.camera import Picture, unproject
 from drakegrasp.visualization.style import ARROW
 from drakegrasp.visualization.third_person import (
     TABLE_SIZE,
-    Moment,
-    Theatre,
-    build_theatre,
+    RenderScene,
+    Snapshot,
+    build_render_scene,
+    camera_pose,
     choose_view,
-    outline,
-    show,
-    take,
-    view,
+    outline_points,
+    render_view,
+    set_snapshot,
 )
 
 #: Edge of the table where the world's origin below it must be seen [m].
 SMALL_TABLE = 0.36
-#: From where a camera's line of sight is looked at, about the vertical [rad].
+#: Azimuth between a camera's line of sight and the view that shows it from the side [rad].
 SIDE_VIEW = np.deg2rad(62.0)
-#: The camera follows the lift by this part of the way, and from this much further off.
+#: For the picture of the lift the camera rises by this share of the lift, and moves back by this
+#: share of its distance.
 FOLLOW, BACK = 0.85, 0.3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class StagedTrial:
-    """The three moments of a trial, and the theatre to show them in.
+class TrialSnapshots:
+    """A trial at its three stages, and the scene to render them in.
 
     Attributes:
-        theatre: Of the trial's object and hand.
+        scene: Of the trial's object and hand.
         place, close, lift: At the start, after closing, after the lift.
-        p_OQ, nhat_Q_O: Contacts after closing (k, 3), in {O}.
+        p_OQ, nhat_Q_O: (k, 3), contacts after closing [m] and outward unit normals, in {O}.
         model: The object.
         config: Of the dataset.
     """
 
-    theatre: Theatre
-    place: Moment
-    close: Moment
-    lift: Moment
+    scene: RenderScene
+    place: Snapshot
+    close: Snapshot
+    lift: Snapshot
     p_OQ: Array
     nhat_Q_O: Array
     model: ObjectModel
     config: Config
 
 
-def stage_trial(out: Path, trial_id: int, *, table_size: float = TABLE_SIZE) -> StagedTrial:
-    """Return a trial that came as far as the lift, ready to be shown.
+def load_trial(out: Path, trial_id: int, *, table_size: float = TABLE_SIZE) -> TrialSnapshots:
+    """Return a trial that was lifted, ready to be rendered.
+
+    Args:
+        out: Directory of the dataset.
+        trial_id: Row of trials.hdf5.
+        table_size: Edge of the table [m].
 
     Raises:
-        DataError: If the trial is not there, or ended before the lift.
+        DataError: If the trial does not exist, or ended before the lift.
     """
+    # Read the trial.
     config = read_manifest(out).config
     path = out / TRIALS_FILE
     try:
@@ -90,22 +97,26 @@ def stage_trial(out: Path, trial_id: int, *, table_size: float = TABLE_SIZE) -> 
     outcome = Outcome(int(row["outcome"]))
     if outcome.stage is not Stage.LIFTED:
         raise DataError(f"{path}: trial {trial_id} must have been lifted, got {outcome.label}")
+
+    # Poses of palm and object at the start, and after the lift.
     X_WO = X_WT @ unpack_pose(row["X_TO"])
     X_WG = X_WO @ unpack_pose(row["X_OG"])
     X_TG = unpack_pose(row["X_TO"]) @ unpack_pose(row["X_OG"])
     X_WG_lifted = lifted_palm(X_TG, float(row["time_lift"]), config)
     X_WO_lifted = X_WT @ unpack_pose(row["X_TO_lifted"])
+
+    # The scene, and the open hand's joints in its order.
     hand = load_hand(config.hand)
     model = load_prepared(out, name, config).model
-    theatre = build_theatre(model, hand, table_size=table_size)
+    scene = build_render_scene(model, hand, table_size=table_size)
     open_q = np.array(
-        [row["spread"] if joint in hand.spread.joints else 0.0 for joint in theatre.joint_names]
+        [row["spread"] if joint in hand.spread.joints else 0.0 for joint in scene.joint_names]
     )
-    return StagedTrial(
-        theatre=theatre,
-        place=Moment(X_WG=X_WG, X_WO=X_WO, q=open_q),
-        close=Moment(X_WG=X_WG, X_WO=X_WO, q=row["closed_q"]),
-        lift=Moment(X_WG=X_WG_lifted, X_WO=X_WO_lifted, q=row["lifted_q"]),
+    return TrialSnapshots(
+        scene=scene,
+        place=Snapshot(X_WG=X_WG, X_WO=X_WO, q=open_q),
+        close=Snapshot(X_WG=X_WG, X_WO=X_WO, q=row["closed_q"]),
+        lift=Snapshot(X_WG=X_WG_lifted, X_WO=X_WO_lifted, q=row["lifted_q"]),
         p_OQ=row["closed_p_OQ"],
         nhat_Q_O=row["closed_nhat_Q_O"],
         model=model,
@@ -113,41 +124,53 @@ def stage_trial(out: Path, trial_id: int, *, table_size: float = TABLE_SIZE) -> 
     )
 
 
-def trial_snapshots(
-    out: Path, trial_id: int, *, size: tuple[int, int] = (480, 480)
-) -> list[Picture]:
-    """Return pictures of a trial as it is placed, closed and lifted, from one side.
+def render_trial(out: Path, trial_id: int, *, size: tuple[int, int] = (480, 480)) -> list[Picture]:
+    """Return three pictures of a trial from the same side: placed, closed, lifted.
+
+    Args:
+        out: Directory of the dataset.
+        trial_id: Row of trials.hdf5.
+        size: Width and height of a picture [px].
 
     Raises:
-        DataError: If the trial is not there, or ended before the lift.
+        DataError: If the trial does not exist, or ended before the lift.
     """
-    trial = stage_trial(out, trial_id)
-    theatre, half = trial.theatre, trial.model.half_extents
-    around = np.vstack([outline(theatre, m, half) for m in (trial.place, trial.close)])
-    X_WC = choose_view(theatre, around)
+    # One view for the first two.
+    trial = load_trial(out, trial_id)
+    scene, half = trial.scene, trial.model.half_extents
+    around = np.vstack([outline_points(scene, m, half) for m in (trial.place, trial.close)])
+    X_WC = choose_view(scene, around)
     pictures = []
-    for moment in (trial.place, trial.close):
-        show(theatre, moment)
-        pictures.append(take(theatre, X_WC, size))
-    # So the table stays in view, and one sees that there is air below the object.
+    for snapshot in (trial.place, trial.close):
+        set_snapshot(scene, snapshot)
+        pictures.append(render_view(scene, X_WC, size))
+
+    # For the lift the camera follows part of the way, so that the table stays in view and the gap
+    # below the object is seen.
     rise = trial.lift.X_WG[:3, 3] - trial.close.X_WG[:3, 3]
     distance = float(np.linalg.norm(X_WC[:3, 3] - trial.close.X_WO[:3, 3]))
     back = make_pose(np.eye(3), [0.0, 0.0, -BACK * distance])
-    show(theatre, trial.lift)
-    pictures.append(take(theatre, make_pose(np.eye(3), FOLLOW * rise) @ X_WC @ back, size))
+    set_snapshot(scene, trial.lift)
+    pictures.append(render_view(scene, make_pose(np.eye(3), FOLLOW * rise) @ X_WC @ back, size))
     return pictures
 
 
 def frames_panels(out: Path, trial_id: int) -> list[Panel]:
-    """Return the panels of the figure of all frames: from afar, from near, through the camera.
+    """Return the panels of the figure of all frames: overview, close-up, camera image.
+
+    Args:
+        out: Directory of the dataset.
+        trial_id: Row of trials.hdf5.
 
     Raises:
-        DataError: If the trial is no sample.
+        DataError: If the trial is not a sample.
     """
+    # The frames of the sample's files, and those of the trial in the world.
     sample, K = find_sample(out / DATA_FILES["otm"], trial_id)
     X_WC = X_WT @ unpack_pose(sample.props["frame_work2cam_otm"])
     X_WI = X_WC @ unpack_pose(sample.props["frame_cam2img_otm"])
-    trial = stage_trial(out, trial_id)
+    trial = load_trial(out, trial_id)
+    scene = trial.scene
     X_WO, X_WG = trial.close.X_WO, trial.close.X_WG
     p_WQ = transform_points(X_WO, trial.p_OQ)
     normals = rotate_vectors(X_WO, trial.nhat_Q_O)
@@ -155,14 +178,17 @@ def frames_panels(out: Path, trial_id: int) -> list[Panel]:
     contacts = {f"Q{i + 1}": ends for i, ends in enumerate(tips)}
     half = trial.model.half_extents
 
-    small = build_theatre(trial.model, trial.theatre.hand, table_size=SMALL_TABLE)
-    around = np.vstack([np.zeros((1, 3)), outline(small, trial.close, half), X_WC[None, :3, 3]])
-    # Almost from the side of the camera's line of sight, so that its length is seen.
+    # The overview, on a small table that does not hide the world's origin below it.
+    small = build_render_scene(trial.model, scene.hand, table_size=SMALL_TABLE)
+    around = np.vstack(
+        [np.zeros((1, 3)), outline_points(small, trial.close, half), X_WC[None, :3, 3]]
+    )
+    # Look at the camera's line of sight almost from the side, so that its length is seen.
     azimuth = float(np.arctan2(X_WC[1, 2], X_WC[0, 2])) + SIDE_VIEW
     lines = [np.vstack([np.zeros(3), X_WT[:3, 3]]), np.vstack([X_WG[:3, 3], X_WC[:3, 3]])]
     afar = Panel(
         title="world, table, palm, camera",
-        picture=take(small, view(around, azimuth, np.deg2rad(12.0)), (520, 900)),
+        picture=render_view(small, camera_pose(around, azimuth, np.deg2rad(12.0)), (520, 900)),
         triads=[
             Triad(label="W", X_WA=np.eye(4), length=0.15),
             Triad(label="T", X_WA=X_WT, length=0.1),
@@ -171,22 +197,26 @@ def frames_panels(out: Path, trial_id: int) -> list[Panel]:
         ],
         lines=[*lines, *_frustum(X_WC, K, sample.mask.shape[0], depth=0.12)],
     )
-    body = outline(trial.theatre, trial.close, half)
+
+    # The close-up.
+    body = outline_points(scene, trial.close, half)
     near = Panel(
         title="object, hand, contacts",
-        picture=take(trial.theatre, choose_view(trial.theatre, body), (900, 900)),
+        picture=render_view(scene, choose_view(scene, body), (900, 900)),
         triads=[
             Triad(label="O", X_WA=X_WO, length=0.04),
             Triad(label="T", X_WA=X_WT, length=0.04),
             Triad(label="G", X_WA=X_WG, length=0.04),
             *(
-                Triad(label=f"F{i + 1}", X_WA=trial.theatre.pose(link), length=0.022)
-                for i, link in enumerate(trial.theatre.hand.fingertip_links)
+                Triad(label=f"F{i + 1}", X_WA=scene.pose(link), length=0.022)
+                for i, link in enumerate(scene.hand.fingertip_links)
             ),
         ],
         points={"Ocm": transform_points(X_WO, trial.model.p_OOcm[None])[0]},
         arrows=contacts,
     )
+
+    # What the dataset's camera saw.
     rgb = np.rint(255.0 * np.moveaxis(sample.image[:3], 0, 2)).astype(np.uint8)
     seen = Panel(
         title="image (otm): pixels, image frame",
@@ -198,7 +228,7 @@ def frames_panels(out: Path, trial_id: int) -> list[Panel]:
 
 
 def _frustum(X_WC: Array, K: Array, size: int, depth: float) -> list[Array]:
-    """Return polylines (n, 3) of what a camera sees, up to a depth [m]."""
+    """Return polylines (n, 3) in {W} around a camera's field of view, up to a depth [m]."""
     edge = size - 0.5
     pixels = np.array([[-0.5, -0.5], [edge, -0.5], [edge, edge], [-0.5, edge]])
     corners = transform_points(X_WC, unproject(K, pixels, np.full(4, depth)))

@@ -20,7 +20,7 @@ from drakegrasp.build.work_unit import UnitSummary, WorkUnit
 from drakegrasp.cluster.connect import connect
 from drakegrasp.cluster.executor import DaskExecutor
 from drakegrasp.config import Config
-from drakegrasp.dataset.manifest import Manifest
+from drakegrasp.dataset.manifest import Manifest, ObjectEntry
 from drakegrasp.outcomes import Outcome
 
 #: Units that run first, so that Dask has allocated what it allocates once.
@@ -40,13 +40,25 @@ def units(count: int) -> Iterator[WorkUnit]:
     config = Config()
     per_object = config.candidates.max // config.unit_candidates
     objects = tuple(
-        {"name": f"{i}_object", "mesh_sha256": "0" * 64, "candidates": config.candidates.max}
+        ObjectEntry(
+            name=f"{i}_object",
+            class_name="object",
+            mesh_sha256="0" * 64,
+            mass=1.0,
+            X_TO=(0.0,) * 12,
+            rolled=False,
+            candidates=config.candidates.max,
+            combinations=config.candidates.max,
+            valid=config.candidates.max,
+            distinct=config.candidates.max,
+            notes=(),
+        )
         for i in range(-(-count // per_object))
     )
     manifest = Manifest(config=config, objects=objects, versions={})
     values = config.to_dict()
     for _, header in zip(range(count), manifest.headers(), strict=False):
-        yield WorkUnit(out="/nowhere", header=header, config=values, expendable=True)
+        yield WorkUnit(out="/nowhere", header=header, config=values, restartable=True)
 
 
 def memory() -> float:

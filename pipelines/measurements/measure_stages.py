@@ -5,7 +5,7 @@
     drakegrasp build --objects MESH_DIR ... --plan --times times.json
 
 The script builds a small dataset in this process alone, so that no other worker disturbs the
-clock. The defaults of `drakegrasp.build.estimate` were measured with it.
+clock. The defaults of `drakegrasp.build.stage_times` were measured with it.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -19,14 +19,17 @@ from pathlib import Path
 from typing import Any
 
 import click
+import h5py
 
-from drakegrasp.build.estimate import StageTimes, measure_storage
 from drakegrasp.build.pipeline import build
+from drakegrasp.build.stage_times import StageTimes
 from drakegrasp.build.work_unit import UnitSummary
 from drakegrasp.cli.options import manifest_option, set_option, units_option
 from drakegrasp.config import load_config
 from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.statistics import count_splits
+from drakegrasp.errors import DataError
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 
@@ -106,18 +109,10 @@ def stage_times(clock: Clock, core: float, *, assembled: float, out: Path) -> St
     samples = sum(split.samples for split in count_splits(out))
     objects = len(read_manifest(out).objects)
 
-    # How unequal objects are: the time of each over the mean.
-    by_object: dict[str, float] = {}
-    for unit in clock.units:
-        name = unit.header.object_name
-        by_object[name] = by_object.get(name, 0.0) + core * unit.seconds["try"]
-    mean = seconds["try"] / objects
-
     return StageTimes(
         prepare=core * sum(clock.prepare) / len(clock.prepare),
         scene=seconds["build"] / objects,
-        attempt=(seconds["try"] + seconds["write"]) / attempts,
-        shares=tuple(sorted(spent / mean for spent in by_object.values())),
+        attempt=(seconds["try"] + seconds["measure"] + seconds["write"]) / attempts,
         look=seconds["look"] / max(1, successes),
         assemble=core * assembled / attempts,
         successes=successes / attempts,
@@ -125,6 +120,41 @@ def stage_times(clock: Clock, core: float, *, assembled: float, out: Path) -> St
         **measure_storage(out),
         source=f"measured on {objects} objects, {attempts} attempts",
     )
+
+
+def measure_storage(out: Path) -> dict[str, float]:
+    """Return the sizes that `StageTimes` has, of a finished dataset [B].
+
+    Raises:
+        DataError: If there is none.
+    """
+    try:
+        with h5py.File(out / TRIALS_FILE, "r") as file:
+            attempts, successes = len(file["trials/outcome"]), len(file["successes/trial_id"])
+            objects = len(file["objects/name"])
+        with h5py.File(out / DATA_FILES["oto"], "r") as file:
+            samples = sum(len(split["grasps"]) for split in file.values() if "grasps" in split)
+        trials = (out / TRIALS_FILE).stat().st_size
+        data = sum((out / name).stat().st_size for name in DATA_FILES.values())
+    except (OSError, KeyError) as error:
+        raise DataError(f"{out}: must be a finished dataset, got none ({error})") from None
+    shards = list((out / "shards").rglob("*.h5"))
+    rows = sum(_stored_bytes(path, "trials") for path in shards)
+    looks = sum(_stored_bytes(path, "looks") for path in shards)
+    rest = sum(path.stat().st_size for path in shards) - rows - looks
+    kept = sum(path.stat().st_size for path in (out / "objects").iterdir())
+    return {
+        "unit_bytes": rest / len(shards),
+        "attempt_bytes": (trials + rows) / attempts,
+        "success_bytes": looks / max(1, successes),
+        "sample_bytes": data / max(1, samples),
+        "object_bytes": kept / objects,
+    }
+
+
+def _stored_bytes(path: Path, group: str) -> int:
+    with h5py.File(path, "r") as file:
+        return sum(int(column.id.get_storage_size()) for column in file[group].values())
 
 
 if __name__ == "__main__":

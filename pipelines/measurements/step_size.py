@@ -45,17 +45,19 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     # Every step of the other configuration is equally long, in a lift too.
     config = read_manifest(arguments.dataset).config
-    other = override_config(config, [f"physics.time_step={arguments.step}", "physics.calm_steps=1"])
+    other = override_config(
+        config, [f"physics.time_step={arguments.step}", "physics.coarse_steps=1"]
+    )
 
     # Pairs of outcomes: with the dataset's step, with the other.
     pairs: Counter[tuple[Outcome, Outcome]] = Counter()
     for entry in read_manifest(arguments.dataset).objects:
-        if arguments.objects and entry["name"] not in arguments.objects:
+        if arguments.objects and entry.name not in arguments.objects:
             continue
-        prepared = load_prepared(arguments.dataset, entry["name"], config)
+        prepared = load_prepared(arguments.dataset, entry.name, config)
         count = range(len(prepared.candidates))
         made = make_attempts(
-            prepared.candidates, count, config.candidates, name=entry["name"], seed=config.seed
+            prepared.candidates, count, config.candidates, name=entry.name, seed=config.seed
         )
         attempts = [a for a in made if a.ray_hits][: arguments.attempts]
         pairs.update(

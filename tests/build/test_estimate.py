@@ -8,27 +8,18 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from helpers.scripts import load_script
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drakegrasp.build import attempts
-from drakegrasp.build.estimate import (
-    CERTIFY_SECONDS,
-    KEPT_OBJECTS,
-    MEASURED,
-    START_SECONDS,
-    logged_times,
-    measure_storage,
-    plan_build,
-    plan_lines,
-    read_times,
-)
+from drakegrasp.build.estimate import CERTIFY_SECONDS, START_SECONDS, plan_build, plan_lines
+from drakegrasp.build.stage_times import MEASURED, logged_times, read_times
 from drakegrasp.cli.main import main
 from drakegrasp.config import load_config, override_config
 from drakegrasp.dataset.log import BuildLog
 from drakegrasp.errors import ConfigError, DataError
 
-EVEN = replace(MEASURED, prepare=2.0, scene=0.0, attempt=0.1, shares=(1.0,), look=0.0, assemble=0.0)
+EVEN = replace(MEASURED, prepare=2.0, scene=0.0, attempt=0.1, look=0.0, assemble=0.0)
 SMALL = load_config(overrides=["candidates.max=100", "unit_candidates=50"])
 
 
@@ -38,7 +29,6 @@ def test_one_worker_does_one_thing_after_another() -> None:
     assert plan.stages["prepare"] == pytest.approx(6.0)
     assert plan.stages["simulate"] == pytest.approx(90.0)
     assert plan.seconds == pytest.approx(START_SECONDS + 96.0)
-    assert plan.busy == pytest.approx(1.0)
     assert plan.core_hours == pytest.approx(plan.hours)
 
 
@@ -47,7 +37,6 @@ def test_workers_wait_where_work_does_not_divide() -> None:
     plan = plan_build(3, SMALL, 4, EVEN)
     assert plan.stages["prepare"] == pytest.approx(2.0, abs=0.1)
     assert plan.stages["simulate"] == pytest.approx(30.0, abs=0.1)
-    assert plan.busy == pytest.approx(96.0 / (4 * 32.0), abs=0.01)
     assert plan.core_hours == pytest.approx(4 * plan.hours)
 
 
@@ -59,23 +48,22 @@ def test_certificates_cost_their_trials() -> None:
     assert seconds[1] - seconds[0] == pytest.approx(2 * (2 + 5) * CERTIFY_SECONDS)
 
 
-def test_scenes_are_built_once_per_worker_and_object() -> None:
-    plan = plan_build(1, SMALL, 1, replace(EVEN, scene=7.0))
-    assert plan.stages["simulate"] == pytest.approx(30.0 + 7.0)
-    assert KEPT_OBJECTS == attempts.KEPT_OBJECTS
+@pytest.mark.parametrize(("workers", "scenes"), [(1, 2), (2, 2), (4, 1)])
+def test_every_worker_builds_the_scenes_of_its_units(workers: int, scenes: int) -> None:
+    """Two objects of two units each: two workers share the units of both, four those of one."""
+    plan = plan_build(2, SMALL, workers, replace(EVEN, scene=7.0))
+    units = -(-4 // workers)
+    assert plan.stages["simulate"] == pytest.approx(15.0 * units + 7.0 * scenes)
 
 
 @given(objects=st.integers(1, 40), workers=st.integers(1, 200), candidates=st.integers(1, 500))
-def test_schedule_keeps_the_bounds_of_any_schedule(
-    objects: int, workers: int, candidates: int
-) -> None:
+def test_plan_keeps_the_bounds_of_any_schedule(objects: int, workers: int, candidates: int) -> None:
     """No faster than the work shared evenly, no slower than that and one longest unit."""
     config = load_config(overrides=[f"candidates.max={candidates}"])
     plan = plan_build(objects, config, workers, EVEN)
     work, longest = 0.1 * plan.attempts, 0.1 * 3 * min(50, candidates)
     assert work / workers <= plan.stages["simulate"] + 1e-6
     assert plan.stages["simulate"] <= work / workers + longest + 0.003 * plan.units
-    assert 0.0 < plan.busy <= 1.0 + 1e-9
 
 
 def test_a_million_attempts_on_a_thousand_workers() -> None:
@@ -119,7 +107,7 @@ def _log_unit(log: BuildLog, name: str, seconds: float, successes: int) -> None:
 
 
 def test_plan_goes_by_the_log_of_the_build(tmp_path: Path) -> None:
-    """Attempts of 0.2 s on average, of one object three times as long as of the other."""
+    """Attempts of 0.2 s on average over two objects."""
     assert logged_times(tmp_path, SMALL) is None
     log = BuildLog(tmp_path)
     log("started", config_hash="another")
@@ -134,7 +122,6 @@ def test_plan_goes_by_the_log_of_the_build(tmp_path: Path) -> None:
     times = logged_times(tmp_path, SMALL)
     assert times is not None
     assert times.attempt == pytest.approx(0.2 + 0.1)
-    assert times.shares == pytest.approx((0.5, 1.5))
     assert times.look == pytest.approx(0.1)
     assert times.successes == pytest.approx(0.1)
     assert times.prepare == MEASURED.prepare
@@ -149,7 +136,7 @@ def test_lines_name_the_source() -> None:
 @pytest.mark.slow
 def test_storage_adds_up_to_the_directory(small_dataset: Path) -> None:
     """The sizes by row, put together again, are the size of the dataset."""
-    sizes = measure_storage(small_dataset)
+    sizes = load_script("measurements/measure_stages").measure_storage(small_dataset)
     assert all(size > 0.0 for size in sizes.values())
     config = load_config(overrides=["candidates.max=40", "unit_candidates=10"])
     plan = plan_build(3, config, 1, replace(MEASURED, successes=0.0, **sizes))

@@ -24,9 +24,9 @@ import trimesh
 from distributed import Client, LocalCluster, get_worker
 from helpers.assertions import assert_same_dataset
 
-from drakegrasp.build import columns
+from drakegrasp.build import attempts
 from drakegrasp.build.pipeline import build
-from drakegrasp.cluster import executor as crew
+from drakegrasp.cluster import executor as tasks
 from drakegrasp.cluster.connect import connect
 from drakegrasp.cluster.executor import DaskExecutor
 from drakegrasp.config import Config, load_config
@@ -272,9 +272,9 @@ def test_fault_costs_what_is_guilty_and_nothing_else(
     # Long enough for the innocent on a busy machine.
     limit = ("--set", "attempt_seconds=8")
     said, errors = finish(start_build(more, out, 2, *limit, fault=faults))
-    assert "refused: 3_box_c: 3_box_c: must be fit to prepare, got one that crashed" in said
+    assert "refused: 3_box_c: 3_box_c: preparing it crashed its process" in said
     assert errors == ""
-    guilty = {
+    failing = {
         (0, 3, 1): Outcome.CRASHED,
         (0, 5, 0): Outcome.TIMEOUT,
         (1, 4, 2): Outcome.TIMEOUT,
@@ -282,12 +282,12 @@ def test_fault_costs_what_is_guilty_and_nothing_else(
     with h5py.File(undisturbed / "trials.hdf5") as a, h5py.File(out / "trials.hdf5") as b:
         names = ("object", "candidate", "standoff_index")
         places = list(zip(*(a["trials"][n][:].tolist() for n in names), strict=True))
-        innocent = np.array([place not in guilty for place in places])
+        innocent = np.array([place not in failing for place in places])
         assert innocent.sum() == len(places) - 3
         for name in a["trials"]:
             one, two = a["trials"][name][:], b["trials"][name][:]
             assert one[innocent].tobytes() == two[innocent].tobytes(), name
-        for place, outcome in guilty.items():
+        for place, outcome in failing.items():
             assert b["trials/outcome"][places.index(place)] == outcome
             assert np.isnan(b["trials/closed_q"][places.index(place)]).all()
     assert_clean(out)
@@ -354,7 +354,7 @@ def test_full_disk_stops_and_goes_on(meshes: Path, undisturbed: Path, tmp_path: 
     process = start_build(meshes, out, workers=1, largest_file=size)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 1
-    assert "must have room for what is written" in errors.splitlines()[-1]
+    assert "the disk or the quota is full" in errors.splitlines()[-1]
     assert "Traceback" not in errors, errors
     # A unit that was begun meanwhile, and dropped, keeps its journal for its next run.
     assert_clean(out, ".*.tmp", "build.lock")
@@ -369,8 +369,8 @@ def test_full_disk_of_the_client_is_one_error(
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("drakegrasp.dataset.manifest.sync_and_rename", full)
-    with pytest.raises(DiskFullError, match=r"must have room .* goes on from here"):
+    monkeypatch.setattr("drakegrasp.dataset.manifest.write_atomic", full)
+    with pytest.raises(DiskFullError, match=r"the disk or the quota is full .* goes on from here"):
         build(find_meshes(meshes), tmp_path / "out", config, run_here, show=False)
     assert not (tmp_path / "out").exists()
 
@@ -380,7 +380,7 @@ def test_full_disk_of_the_client_is_one_error(
 def test_blank_image_never_becomes_data(
     meshes: Path, undisturbed: Path, config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def blank(*_: object) -> rendering.Look:
+    def blank(*_: object) -> rendering.RenderedView:
         raise BlankImageError(rendering.BLANK)
 
     out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
@@ -391,7 +391,7 @@ def test_blank_image_never_becomes_data(
     shard = out / "shards" / name / f"{start:07d}-{start + 1:07d}.h5"
     shard.unlink()
     with monkeypatch.context() as patch:
-        patch.setattr(columns, "look", blank)
+        patch.setattr(attempts, "render", blank)
         with pytest.raises(BlankImageError, match="must not be blank"):
             build(find_meshes(meshes), out, config, run_here, show=False)
     assert not shard.exists()
@@ -474,7 +474,7 @@ def test_items_are_taken_as_there_is_room(client: Client) -> None:
 
     results = DaskExecutor(client)(abs, items())
     for done, _ in enumerate(results):
-        assert taken <= done + 1 + 2 * 2 * crew.LARGEST
+        assert taken <= done + 1 + 2 * 2 * tasks.LARGEST
     assert taken == 1000
 
 
@@ -489,9 +489,9 @@ def test_quick_items_go_together_and_slow_ones_alone(client: Client) -> None:
     execute = DaskExecutor(client)
     together = list(execute(_task_of, [0.0] * 400))
     assert len(together) == 400
-    assert len(set(together)) < 2 * 400 / crew.LARGEST
-    assert max(Counter(together).values()) <= crew.LARGEST
-    alone = list(execute(_task_of, [1.5 * crew.TASK_SECONDS] * 40))
+    assert len(set(together)) < 2 * 400 / tasks.LARGEST
+    assert max(Counter(together).values()) <= tasks.LARGEST
+    alone = list(execute(_task_of, [1.5 * tasks.TASK_SECONDS] * 40))
     assert len(set(alone)) == 40
 
 
@@ -499,16 +499,16 @@ def test_error_costs_no_results_of_the_items_before_it() -> None:
     def invert(value: float) -> float:
         return 1.0 / value
 
-    assert crew._run_items(invert, [1.0, 2.0, 0.0, 4.0]).results == [1.0, 0.5]
+    assert tasks._run_items(invert, [1.0, 2.0, 0.0, 4.0]).results == [1.0, 0.5]
     with pytest.raises(ZeroDivisionError):
-        crew._run_items(invert, [0.0, 4.0])
+        tasks._run_items(invert, [0.0, 4.0])
 
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(crew, "COUNT_SECONDS", 0.1)
-    monkeypatch.setattr(crew, "SAY_SECONDS", 0.2)
-    monkeypatch.setattr(crew, "LOST_SECONDS", 0.5)
+    monkeypatch.setattr(tasks, "COUNT_SECONDS", 0.1)
+    monkeypatch.setattr(tasks, "SAY_SECONDS", 0.2)
+    monkeypatch.setattr(tasks, "LOST_SECONDS", 0.5)
 
 
 @pytest.fixture
@@ -526,11 +526,11 @@ def test_where_no_worker_comes_back_it_says_so(cluster: LocalCluster) -> None:
     with Client(cluster) as client:
         execute = DaskExecutor(client)
         changes: list[tuple[int, int]] = []
-        execute.crew.on_change = lambda joined, left: changes.append((len(joined), len(left)))
+        execute.pool.on_change = lambda joined, left: changes.append((len(joined), len(left)))
         results = execute(time.sleep, [0.0, 5.0])
         assert next(results) is None
         cluster.scale(0)
-        with pytest.raises(MachineError, match=r"must be a worker, got none for 0\.5 s; the same"):
+        with pytest.raises(MachineError, match=r"no worker for 0\.5 s; the same"):
             next(results)
         assert changes == [(1, 0), (0, 1)]
 
@@ -546,7 +546,7 @@ def test_where_workers_may_come_the_work_waits(cluster: LocalCluster) -> None:
             nonlocal said
             said += 1
 
-        execute.crew.on_none = say
+        execute.pool.on_none = say
         results = execute(str, [1, 2, 3, 4])
         found = [next(results)]
         cluster.scale(0)
@@ -578,7 +578,7 @@ def test_lost_scheduler_is_one_error(tmp_path: Path) -> None:
             results = DaskExecutor(client)(time.sleep, [0.0, 0.0, 600.0, 600.0])
             assert [next(results), next(results)] == [None, None]
             scheduler.kill()
-            with pytest.raises(MachineError, match=r"the scheduler must stay, got: .*; the same"):
+            with pytest.raises(MachineError, match=r"the scheduler was lost: .*; the same"):
                 next(results)
     finally:
         for process in (worker, scheduler):

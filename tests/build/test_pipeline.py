@@ -204,8 +204,8 @@ def test_refused_meshes_are_listed_and_the_others_go_on(tmp_path: Path) -> None:
     config = load_config(overrides=["candidates.max=2"])
     report = build(find_meshes(meshes), out, config, run_here, show=False)
     assert report.objects == 1
-    assert [entry["name"] for entry in report.refused] == ["2_house_a", "3_text_a"]
-    assert "--units" in report.refused[0]["reason"]
+    assert [entry.name for entry in report.refused] == ["2_house_a", "3_text_a"]
+    assert "--units" in report.refused[0].reason
     again = build(find_meshes(meshes), out, config, _nothing_runs, show=False)
     assert again.refused == report.refused
 
@@ -227,7 +227,7 @@ def test_directory_with_bad_meshes_only_leaves_nothing_behind(tmp_path: Path) ->
     meshes = tmp_path / "meshes"
     meshes.mkdir()
     (meshes / "1_text_a.obj").write_text("no mesh at all\n")
-    with pytest.raises(DataError, match="at least one mesh must be fit to simulate"):
+    with pytest.raises(DataError, match="no mesh can be simulated: "):
         build(find_meshes(meshes), tmp_path / "out", load_config(), run_here, show=False)
     assert not (tmp_path / "out").exists()
 

@@ -30,7 +30,7 @@ def test_healthy_machine_lacks_nothing(tmp_path: Path) -> None:
     assert [f for f in findings if not f.ok] == []
     assert {f.remedy for f in findings} == {""}
     assert all(f.what for f in findings)
-    names = "Python, glibc, Drake, EGL, test image, embree, writing, disk, cores, memory"
+    names = "Python, glibc, Drake, allocator, EGL, test image, writing, disk, cores, memory"
     assert [f.name for f in findings] == names.split(", ")
     assert list(tmp_path.iterdir()) == []
 
@@ -88,7 +88,8 @@ def test_drake_that_crashes_or_is_too_old_is_told(
 ) -> None:
     monkeypatch.setattr(doctor.metadata, "version", lambda package: version)
     mend = "" if ok else "pip install 'drake>=1.51.1,!=1.52.0'"
-    assert doctor.check_drake() == Finding(name="Drake", ok=ok, what=version, remedy=mend)
+    finding = doctor.check_drake()
+    assert (finding.ok, finding.what.partition(":")[0], finding.remedy) == (ok, version, mend)
 
 
 def test_missing_drake_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -157,21 +158,6 @@ def test_child_does_not_import_what_lies_in_the_current_directory(
     assert doctor.check_image().ok
 
 
-def test_missing_embree_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    from trimesh import ray
-
-    monkeypatch.setattr(ray, "has_embree", False)
-    finding = doctor.check_embree()
-    assert (finding.ok, finding.remedy) == (False, "pip install embreex")
-
-
-def test_missing_trimesh_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "trimesh", None)
-    finding = doctor.check_embree()
-    assert (finding.ok, finding.remedy) == (False, "pip install trimesh")
-    assert finding.what.startswith("ModuleNotFoundError")
-
-
 @pytest.mark.usefixtures("no_image")
 def test_directory_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     """A file is in the way: that stops even root."""
@@ -209,7 +195,7 @@ def test_memory_is_the_machines_or_the_containers_whichever_is_less(
     limit.write_text("max\n")
     monkeypatch.setattr(doctor, "MEMINFO", meminfo)
     monkeypatch.setattr(doctor, "CGROUP_LIMITS", (limit, tmp_path / "none"))
-    monkeypatch.setattr(doctor, "_cores", lambda: 6)
+    monkeypatch.setattr(doctor, "available_cores", lambda: 6)
     assert doctor.check_memory() == Finding(name="memory", ok=True, what="8.2 GB for 6 cores")
     limit.write_text("3000000000\n")
     finding = doctor.check_memory()
@@ -240,4 +226,4 @@ def test_doctor_works_where_drake_and_all_else_are_missing(tmp_path: Path) -> No
     child = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=True
     )
-    assert set(child.stdout.strip().split(",")) >= {"test image", "embree"}
+    assert child.stdout.strip().split(",") == ["test image"]

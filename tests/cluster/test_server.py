@@ -21,7 +21,7 @@ from server.ssh import running_sshd
 
 from drakegrasp.build.pipeline import build
 from drakegrasp.cluster import launch
-from drakegrasp.cluster.admission import WORKER_ENVIRONMENT
+from drakegrasp.cluster.admission import worker_environment
 from drakegrasp.cluster.launch import start_cluster
 from drakegrasp.cluster.request import ClusterRequest
 from drakegrasp.config import load_config
@@ -86,6 +86,7 @@ def submit(env: dict[str, str], meshes: Path, out: Path, *arguments: str) -> Non
 
 def settings(client: Client) -> dict[str, dict[str, Any]]:
     """Return what matters of each worker, as it is there."""
+    names = list(worker_environment())
 
     # Workers cannot import this module, so what they run is defined here.
     def look(dask_worker: Any) -> dict[str, Any]:
@@ -95,7 +96,7 @@ def settings(client: Client) -> dict[str, dict[str, Any]]:
 
         get = dask.config.get
         return {
-            "environment": {k: os.environ.get(k) for k in WORKER_ENVIRONMENT},
+            "environment": {k: os.environ.get(k) for k in names},
             "start": get("distributed.worker.multiprocessing-method"),
             "profile": get("distributed.worker.profile.enabled"),
             "threads": dask_worker.state.nthreads,
@@ -111,7 +112,7 @@ def check_settings(client: Client, count: int, scheme: str) -> None:
     found = settings(client)
     assert len(found) == count
     for worker in found.values():
-        assert worker["environment"] == WORKER_ENVIRONMENT
+        assert worker["environment"] == worker_environment()
         assert (worker["start"], worker["profile"], worker["threads"]) == ("spawn", False, 1)
         assert worker["address"].startswith(f"{scheme}://127.0.0.1:")
 
@@ -203,7 +204,7 @@ def test_slurm_refuses_a_job_in_one_line(
     )
     assert result.returncode == 1
     (line,) = result.stderr.splitlines()
-    assert line.startswith("error: SLURM must accept the job, got: ")
+    assert line.startswith("error: SLURM does not accept the job: ")
     assert not (tmp_path / "out").exists()
 
 
@@ -220,7 +221,7 @@ def test_ssh_workers_have_their_settings(
     ssh: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HOME", ssh["HOME"])
-    for name in WORKER_ENVIRONMENT:
+    for name in worker_environment():
         monkeypatch.delenv(name, raising=False)
     request = ClusterRequest(kind="ssh", where=("127.0.0.1", "127.0.0.1"), workers=2, tls=True)
     with start_cluster(request, tmp_path) as client:
@@ -238,5 +239,5 @@ def test_ssh_host_that_is_not_there_is_one_line(
     result = subprocess.run([*command, *options], env=ssh, capture_output=True, text=True)
     assert result.returncode == 1
     (line,) = result.stderr.splitlines()
-    assert line.startswith("error: the workers must start, got: ")
+    assert line.startswith("error: the workers did not start: ")
     assert not (tmp_path / "out").exists()

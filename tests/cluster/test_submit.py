@@ -24,9 +24,9 @@ from helpers.scripts import PIPELINES, load_script
 import drakegrasp
 from drakegrasp.build.pipeline import build
 from drakegrasp.cluster import connect as connecting
-from drakegrasp.cluster.admission import WORKER_ENVIRONMENT, admitted_workers
+from drakegrasp.cluster.admission import admitted_workers, worker_environment
 from drakegrasp.cluster.certificates import make_certificates, private_directory
-from drakegrasp.cluster.connect import DASK_SETTINGS, connect
+from drakegrasp.cluster.connect import connect, dask_settings
 from drakegrasp.cluster.launch import _exports, start_cluster
 from drakegrasp.cluster.request import ClusterRequest, walltime_seconds
 from drakegrasp.config import load_config
@@ -95,7 +95,7 @@ def test_open_port_is_warned_of(tmp_path: Path) -> None:
         (["--cluster", "ssh", "a", "b", "--workers", "3"], "must be a multiple of"),
         (
             ["--cluster", "ssh", "a", "b", "--cores", "4", "--workers", "9"],
-            "--workers must be --cores on each of 2 hosts, 8, or not be given, got 9",
+            "--workers must be --cores times the number of hosts, 8, or not be given, got 9",
         ),
         (["--cluster", "pbs"], "error: Invalid value for '--cluster': 'pbs' is not one of"),
         (["--cluster", "ssh", "a", "--cores", "2"], "--interface NAME or --host ADDRESS must be"),
@@ -146,13 +146,13 @@ def test_other_walltimes_are_refused(text: str) -> None:
 
 def test_settings_survive_a_job_script() -> None:
     """A shell that runs the lines of the script gives Dask the same settings."""
-    probe = f"import dask, json; print([dask.config.get(k) for k in {list(DASK_SETTINGS)!r}])"
+    probe = f"import dask, json; print([dask.config.get(k) for k in {list(dask_settings())!r}])"
     script = "\n".join([*_exports(), f"exec '{sys.executable}' -c \"$0\""])
     result = subprocess.run(
         ["bash", "-c", script, probe], capture_output=True, text=True, env={}, check=True
     )
     found = ast.literal_eval(result.stdout)
-    for (key, wanted), got in zip(DASK_SETTINGS.items(), found, strict=True):
+    for (key, wanted), got in zip(dask_settings().items(), found, strict=True):
         assert (got | wanted if isinstance(wanted, dict) else wanted) == got, key
 
 
@@ -254,12 +254,14 @@ def test_running_scheduler_and_its_workers_are_set_up(tmp_path: Path) -> None:
     def saturation(dask_scheduler: Any) -> float:
         return float(dask_scheduler.WORKER_SATURATION)
 
+    names = list(worker_environment())
+
     def environment() -> dict[str, str | None]:
-        return {name: os.environ.get(name) for name in WORKER_ENVIRONMENT}
+        return {name: os.environ.get(name) for name in names}
 
     command = [sys.executable, "-m"]
     file = tmp_path / "scheduler.json"
-    plain = {k: v for k, v in os.environ.items() if k not in WORKER_ENVIRONMENT}
+    plain = {k: v for k, v in os.environ.items() if k not in worker_environment()}
     flags = ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
     scheduler = subprocess.Popen(
         [*command, "distributed.cli.dask_scheduler", *flags, "--scheduler-file", str(file)],
@@ -278,7 +280,7 @@ def test_running_scheduler_and_its_workers_are_set_up(tmp_path: Path) -> None:
             with admitted_workers(client, load_config()):
                 assert client.run_on_scheduler(saturation) == 1.0
                 ((address, found),) = client.run(environment).items()
-                assert found == WORKER_ENVIRONMENT
+                assert found == worker_environment()
                 late = [*join, "--nthreads", "2"]
                 refused = subprocess.run(late, env=plain, stderr=subprocess.PIPE, timeout=120)
                 assert b"drakegrasp-unfit" in refused.stderr

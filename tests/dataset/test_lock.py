@@ -79,10 +79,19 @@ def test_lock_file_without_content_is_nobodys(tmp_path: Path) -> None:
         assert dead is None
 
 
-def test_steps_of_a_build_have_what_it_holds(tmp_path: Path) -> None:
-    with build_lock(tmp_path), build_lock(tmp_path / "." / "x" / ".."):
+def test_lock_file_names_its_holder_and_goes_with_the_block(tmp_path: Path) -> None:
+    with build_lock(tmp_path):
         assert json.loads((tmp_path / FILE_NAME).read_text())["process"]["pid"] == os.getpid()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_lock_is_not_taken_twice_in_one_process(tmp_path: Path) -> None:
+    """Of two threads, too, only one may build."""
+    with build_lock(tmp_path):
+        message = f"got process {os.getpid()} on"
+        with pytest.raises(DataError, match=message), build_lock(tmp_path / "."):
+            raise AssertionError
+        assert (tmp_path / FILE_NAME).exists()
 
 
 def test_directory_in_which_nothing_was_made_goes_again(tmp_path: Path) -> None:

@@ -7,15 +7,10 @@ import pytest
 from helpers.hands import write_pincer
 
 from drakegrasp.frames import transform_points
-from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.finger_sweep import hand_paths
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses, link_poses
 from drakegrasp.hand.shapes import link_shapes
-
-
-@pytest.fixture(scope="module")
-def hand() -> Hand:
-    return load_hand()
 
 
 def test_paths_run_from_the_open_hand_to_the_limit_in_small_steps(hand):

@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 
 from drakegrasp.frames import Array
-from drakegrasp.hand.description import Hand, load_hand, make_parser
+from drakegrasp.hand.description import Hand, make_parser
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses, joint_positions
 
 #: The palm's surface above the base [m]; the table below is given from there.
@@ -44,11 +44,6 @@ TABLE = """
 90 100 F2 0.0091 0.0000 0.0608 0.0188 0.0000 0.0586 -0.157 0.000 -0.988
 90 100 F3 0.0000 -0.0159 0.0608 0.0000 -0.0062 0.0586 0.000 -0.157 -0.988
 """
-
-
-@pytest.fixture(scope="module")
-def hand() -> Hand:
-    return load_hand()
 
 
 def parsed_plant(hand: Hand) -> MultibodyPlant:

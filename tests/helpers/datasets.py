@@ -184,10 +184,9 @@ def make_dataset(out: Path, meshes: Path, *overrides: str) -> Path:
         trimesh.creation.box(extents).export(path)
         model = prepare_object(MeshSource(name=name, class_name=class_name, path=path))
         X_TO = make_pose(np.eye(3), [0.0, 0.0, model.half_extents[2]])
-        save_prepared(resting(model, X_TO), out, config)
-        numbers = {"candidates": 4, "combinations": 4, "valid": 4, "distinct": 4}
-        entry = {"name": name, "class": class_name, "mesh_sha256": model.mesh_sha256}
-        entries.append({**entry, **numbers, "X_TO": pack_pose(X_TO).tolist()})
+        prepared = resting(model, X_TO)
+        save_prepared(prepared, out, config)
+        entries.append(prepared.entry())
         models.append((model, X_TO))
     manifest = Manifest(config=config, objects=tuple(entries), versions=installed_versions(config))
     write_manifest(manifest, out)

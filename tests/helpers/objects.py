@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import trimesh
 
+from drakegrasp.config import Config
 from drakegrasp.frames import make_pose
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource
-from drakegrasp.simulation.candidates import R_OG0, Attempt
+from drakegrasp.simulation.candidates import (
+    R_OG0,
+    Attempt,
+    make_attempts,
+    sample_candidates,
+)
 
 #: Edge of the cube that the hand can grasp from above [m].
 CUBE = 0.07
+#: Stand-off at which the pads meet the cube's sides a little above its middle [m].
+STANDOFF = 0.06
 
 
 def model_of(mesh: trimesh.Trimesh, folder: Path, name: str = "1_thing_a") -> ObjectModel:
@@ -33,6 +42,15 @@ def box_model(folder: Path, extents: npt.ArrayLike, name: str = "1_box_a") -> Ob
 def standing(model: ObjectModel) -> npt.NDArray[np.float64]:
     """Return X_TO of an object that stands on the table as its mesh file has it."""
     return make_pose(np.eye(3), [0.0, 0.0, float(model.half_extents[2])])
+
+
+def drawn_attempts(
+    model: ObjectModel, X_TO: npt.NDArray[np.float64], config: Config, seed: int
+) -> Iterator[Attempt]:
+    """Yield all attempts that a build draws for an object: a test takes as many as it needs."""
+    candidates = sample_candidates(model, X_TO, config.candidates, seed)
+    every = range(len(candidates))
+    return make_attempts(candidates, every, config.candidates, name=model.name, seed=seed)
 
 
 def from_above(model: ObjectModel, standoff: float, *, spread: float = 0.0) -> Attempt:

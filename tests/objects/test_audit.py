@@ -18,8 +18,12 @@ def test_audit_tells_what_is_wrong(tmp_path):
         (tmp_path / f"{name}_final.obj").symlink_to(G3DB / f"{name}_final.obj")
     rows = {row.class_name: row for row in audit(tmp_path, units="cm")}
     assert {name: row.status for name, row in rows.items()} == {
-        "book": "mended", "watertap": "mended", "bunny": "mended", "mug": "fit", "comb": "mended",
-    }  # fmt: skip
+        "book": "repaired",
+        "watertap": "repaired",
+        "bunny": "repaired",
+        "mug": "fit",
+        "comb": "repaired",
+    }
     assert rows["bunny"].notes[0] == "the surface was inside out and was turned"
     assert rows["bunny"].volume == pytest.approx(427e-6, rel=0.01)
     assert "50 bodies" in rows["comb"].notes[0]
@@ -30,7 +34,7 @@ def test_audit_tells_what_is_wrong(tmp_path):
 
 
 @needs_g3db
-def test_toaster_is_mended_and_the_rest_is_told():
+def test_toaster_is_repaired_and_the_rest_is_noted():
     # Its slots are dents deeper than its wall is thick: a part of the volume stays mixed up.
     (source,) = (s for s in find_meshes(G3DB, units="cm") if "toaster" in s.name)
     (note,) = (n for n in prepare_object(source).notes if "still passes through itself" in n)

@@ -14,7 +14,7 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from drakegrasp.errors import MeshError
-from drakegrasp.objects.builtin import hollow_shapes, solid_shapes
+from drakegrasp.objects.builtin import hollow_shapes, revolved_shapes, solid_shapes
 from drakegrasp.objects.builtin.catalog import (
     BUILTIN_OBJECTS,
     BuiltinObject,
@@ -99,7 +99,7 @@ def test_box_volume_is_exact() -> None:
 
 
 def test_can_volume_is_that_of_a_cylinder() -> None:
-    mesh = solid_shapes.can(radius=0.033, height=0.12)
+    mesh = revolved_shapes.can(radius=0.033, height=0.12)
     assert mesh.volume == pytest.approx(np.pi * 0.033**2 * 0.12, rel=0.02)
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import pytest
 from helpers.meshes import G3DB, assert_sound, box, needs_g3db, write
 
 from drakegrasp.errors import MeshError
 from drakegrasp.objects.model import prepare_object
-from drakegrasp.objects.sources import find_mesh, find_meshes
+from drakegrasp.objects.sources import find_mesh, find_meshes, load_source, source_sha256
 
 
 @pytest.mark.parametrize(
@@ -66,12 +69,16 @@ def test_units_and_manifest_precedence(tmp_path):
     ("text", "message"),
     [
         ("units: inch", r"units: .*'m', 'cm' or 'mm'.*got 'inch'"),
-        ("unit: cm", r"unit: .*legal keys: units, objects"),
-        ("objects: {a: {unit: cm}}", r"objects\.a\.unit: .*legal keys: units, class, name"),
+        ("unit: cm", r"unit: must be a known key \(units, objects\), got an unknown one"),
+        (
+            "objects: {a: {unit: cm}}",
+            r"objects\.a\.unit: must be a known key \(units, class, name\), got",
+        ),
         ("objects: {b: {units: cm}}", r"must be names of meshes in .*: a; got b"),
         ("objects: {a: {name: ''}}", "name must be printable"),
         ("objects: {a: {name: x/y}}", "without slashes"),
-        ("- a", "the file: "),
+        ("- a", "the file: must be a mapping of keys to values, got "),
+        ("objects: {a: 3}", r"objects\.a: must be a mapping of keys to values, got 3"),
         ("units: [", "readable YAML"),
     ],
 )
@@ -126,3 +133,16 @@ def test_boots_are_in_metres(tmp_path):
     manifest.write_text("units: cm\nobjects: {95_boots_final: {units: m}}\n")
     (source,) = (s for s in find_meshes(G3DB, manifest=manifest) if "boots" in s.name)
     assert_sound(prepare_object(source))
+
+
+def test_triangles_and_digest_are_of_one_read(tmp_path, monkeypatch):
+    write(tmp_path / "a.obj", box())
+    (source,) = find_meshes(tmp_path, units="cm")
+    digest = source_sha256(source)
+    reads, read_bytes = [], Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda path: reads.append(path) or read_bytes(path))
+    model = prepare_object(replace(source, scale=1.0))
+    mesh, loaded = load_source(source)
+    assert reads == [source.path] * 2  # one each
+    assert len(mesh.faces) == 12
+    assert loaded == digest != model.mesh_sha256

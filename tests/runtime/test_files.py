@@ -11,7 +11,7 @@ from helpers.shards import some_shard
 
 from drakegrasp.dataset.shards import write_shard
 from drakegrasp.runtime import files
-from drakegrasp.runtime.files import atomic_hdf5
+from drakegrasp.runtime.files import atomic_hdf5, atomic_path, probe_folder, write_atomic
 
 
 def everything_in(folder: Path) -> list[Path]:
@@ -44,6 +44,31 @@ def test_file_appears_only_when_it_is_whole(tmp_path: Path) -> None:
         file["some"] = np.zeros(3)
         assert not path.exists()
     assert everything_in(tmp_path) == [path]
+
+
+def test_bytes_replace_an_older_file(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "file.txt"
+    for content in (b"one", b"two\r\n"):
+        write_atomic(path, content)
+        assert path.read_bytes() == content
+    assert everything_in(tmp_path) == [path]
+
+
+def test_block_that_fails_keeps_the_older_file(tmp_path: Path) -> None:
+    path = tmp_path / "file.txt"
+    write_atomic(path, b"old")
+    with pytest.raises(ValueError, match="half"), atomic_path(path) as temporary:
+        temporary.write_bytes(b"ne")
+        raise ValueError("half")
+    assert path.read_bytes() == b"old"
+    assert everything_in(tmp_path) == [path]
+
+
+def test_probe_leaves_nothing_and_needs_a_folder(tmp_path: Path) -> None:
+    probe_folder(tmp_path)
+    assert everything_in(tmp_path) == []
+    with pytest.raises(FileNotFoundError):
+        probe_folder(tmp_path / "missing")
 
 
 def test_failed_rename_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,13 +26,13 @@ UNIT = {"name": "mug", "start": 0, "stop": 10}
 RUN = """
 import sys, time
 from pathlib import Path
-from drakegrasp.runtime.fault_injection import _do
+from drakegrasp.runtime.fault_injection import _cause
 from drakegrasp.runtime.journal import open_journal
 
 faults = dict(reversed(argument.split(":")) for argument in sys.argv[2:])
 with open_journal(Path(sys.argv[1]), {"name": "mug", "start": 0, "stop": 10}) as journal:
     steps = [f"try {i}" for i in range(10)]
-    for step in sorted(steps, key=lambda step: step not in journal.suspects):
+    for step in sorted(steps, key=lambda step: step not in journal.unresolved):
         verdict = journal.verdict(step)
         if verdict is not None:
             print(step, verdict.name, flush=True)
@@ -40,7 +40,7 @@ with open_journal(Path(sys.argv[1]), {"name": "mug", "start": 0, "stop": 10}) as
         with journal.step(step, 0.5):
             print(step, "runs", flush=True)
             if step in faults:
-                _do(faults[step])
+                _cause(faults[step])
 """
 
 
@@ -70,7 +70,7 @@ def deaths_until_done(journal: Path, *faults: str) -> tuple[int, list[str]]:
         ("freeze", 1, Verdict.HUNG),
     ],
 )
-def test_guilty_step_is_found_and_the_others_run(
+def test_failing_step_is_found_and_the_others_run(
     tmp_path: Path, kind: str, deaths: int, verdict: Verdict
 ) -> None:
     found, lines = deaths_until_done(tmp_path / "journal", f"{kind}:try 4")
@@ -85,8 +85,8 @@ def test_several_guilty_steps_are_found_one_by_one(tmp_path: Path) -> None:
         tmp_path / "journal", "crash:try 0", "hang:try 3", "crash:try 9"
     )
     assert found == 2 * NATIVE_DEATHS + 1
-    guilty = [line for line in lines if not line.endswith("runs")]
-    assert guilty == ["try 0 CRASHED", "try 3 HUNG", "try 9 CRASHED"]
+    failing = [line for line in lines if not line.endswith("runs")]
+    assert failing == ["try 0 CRASHED", "try 3 HUNG", "try 9 CRASHED"]
 
 
 def test_suspect_runs_first_and_is_cleared_by_passing(tmp_path: Path) -> None:
@@ -127,7 +127,7 @@ def test_journal_of_another_unit_is_ignored(tmp_path: Path) -> None:
         run(path, "crash:try 4")
     with open_journal(path, {**UNIT, "name": "cup"}) as journal:
         assert journal.verdict("try 4") is None
-        assert journal.suspects == []
+        assert journal.unresolved == []
 
 
 def test_unit_that_another_process_is_at_is_not_a_dead_one(tmp_path: Path) -> None:
@@ -155,7 +155,7 @@ def test_kill_leaves_a_journal_without_a_mark(tmp_path: Path) -> None:
     process.kill()
     process.communicate()
     with open_journal(path, UNIT) as journal:
-        assert journal.suspects == ["try 4"]
+        assert journal.unresolved == ["try 4"]
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -165,24 +165,24 @@ def test_random_kills_convict_nobody(seed: int) -> None:
     lengths = rng.gamma(0.5, 1.0, 30)  # a few long attempts have most of the time
     history = _History()
     for _ in range(200):
-        order = sorted(range(30), key=lambda i: f"try {i}" not in history.suspects())
+        order = sorted(range(30), key=lambda i: f"try {i}" not in history.unresolved())
         ends = np.cumsum(lengths[order])
         moment = rng.exponential(2.0 * lengths.sum())
         if moment > ends[-1]:
             history = _History()  # the unit was done; the next begins
             continue
         at = int(np.searchsorted(ends, moment))
-        suspects = history.suspects()
+        unresolved = history.unresolved()
         done = {f"try {i}" for i in order[:at]}
-        passed = sum(1 << k for k, step in enumerate(suspects) if step in done)
+        passed = sum(1 << k for k, step in enumerate(unresolved) if step in done)
         history.add(f"try {order[at]}", passed, b"")
         assert not any(history.verdict(step) for step in history.deaths)
 
 
 def test_unit_that_dies_for_nothing_is_given_up(tmp_path: Path) -> None:
-    """As when there is not even the memory to build its scene: no attempt is guilty."""
+    """As when there is not even the memory to build its scene: no attempt is at fault."""
     history = _History()
     for _ in range(GIVE_UP_DEATHS):
         history.add("build", 0, b"")
         assert history.verdict("build") is None
-    assert history.futile == GIVE_UP_DEATHS
+    assert history.crash_loop == GIVE_UP_DEATHS

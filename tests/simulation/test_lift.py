@@ -1,4 +1,4 @@
-"""Lifts end as they would with short steps throughout, and no later than their end is known."""
+"""Lifts end as they would with fine steps throughout, and no later than their end is known."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from helpers.objects import CUBE, box_model, from_above, standing
+from helpers.objects import CUBE, STANDOFF, from_above, standing
 
-from drakegrasp.config import Config, load_config, override_config
+from drakegrasp.config import override_config
 from drakegrasp.frames import X_WT
-from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation import lift as lifting
@@ -21,40 +20,18 @@ from drakegrasp.simulation.lift import lift
 from drakegrasp.simulation.scene import (
     Scene,
     advance,
-    go_on_in,
     hand_positions,
     move_wrist,
     palm_pose,
     release,
     reset_attempt,
+    transfer_state,
 )
-from drakegrasp.simulation.stepping import start_clock
+from drakegrasp.simulation.stepping import start_limits
 from drakegrasp.simulation.trajectory import lift_duration
 from drakegrasp.simulation.trial import run_attempt
 
 pytestmark = pytest.mark.sim
-
-STANDOFF = 0.06
-
-
-@pytest.fixture(scope="module")
-def config() -> Config:
-    return load_config()
-
-
-@pytest.fixture(scope="module")
-def hand() -> Hand:
-    return load_hand()
-
-
-@pytest.fixture(scope="module")
-def cube(tmp_path_factory) -> ObjectModel:
-    return box_model(tmp_path_factory.mktemp("cube"), [CUBE] * 3)
-
-
-@pytest.fixture(scope="module")
-def scene(cube, config, hand) -> Scene:
-    return build_scene(cube, config.physics, hand)
 
 
 def close(scene: Scene, cube: ObjectModel) -> None:
@@ -63,11 +40,11 @@ def close(scene: Scene, cube: ObjectModel) -> None:
     advance(scene, 2.4)
 
 
-def test_calm_lift_ends_as_one_of_short_steps_does(scene, cube, config, hand, monkeypatch):
-    # A cube that is pinched creeps a little all the time: here that counts as calm.
+def test_lift_with_coarse_steps_ends_as_one_without(scene, cube, config, hand, monkeypatch):
+    # A cube that is pinched creeps a little all the time: here that counts as rest.
     config = override_config(config, ["close.stop_speed=0.1"])
-    monkeypatch.setattr(lifting, "CALM", 2e-3)
-    monkeypatch.setattr(lifting, "CALM_ANGLE", np.deg2rad(2.0))
+    monkeypatch.setattr(lifting, "COARSE_SHIFT", 2e-3)
+    monkeypatch.setattr(lifting, "COARSE_ANGLE", np.deg2rad(2.0))
     simulated = Counter()
     simulate = stepping.advance
 
@@ -77,18 +54,18 @@ def test_calm_lift_ends_as_one_of_short_steps_does(scene, cube, config, hand, mo
 
     monkeypatch.setattr(stepping, "advance", count)
     attempt = from_above(cube, STANDOFF)
-    by_calm = run_attempt(scene, standing(cube), attempt, config)
-    long = config.physics.calm_steps * config.physics.time_step
-    assert simulated[long] > 0.4 * by_calm.time_lift
-    short = override_config(config, ["physics.calm_steps=1"])
-    throughout = build_scene(cube, short.physics, hand)
-    assert throughout.make_calm is None
-    by_short = run_attempt(throughout, standing(cube), attempt, short)
-    assert by_calm.outcome is by_short.outcome is Outcome.SUCCESS
-    assert by_calm.time_lift == pytest.approx(by_short.time_lift, abs=1e-9)
-    assert np.allclose(by_calm.X_TO_lifted[:3, 3], by_short.X_TO_lifted[:3, 3], atol=1e-3)
-    assert np.allclose(by_calm.X_TO_lifted[:3, :3], by_short.X_TO_lifted[:3, :3], atol=0.02)
-    assert np.allclose(by_calm.lifted.f_Q_O, by_short.lifted.f_Q_O, atol=1.0)
+    by_coarse = run_attempt(scene, standing(cube), attempt, config)
+    long = config.physics.coarse_steps * config.physics.time_step
+    assert simulated[long] > 0.4 * by_coarse.time_lift
+    fine = override_config(config, ["physics.coarse_steps=1"])
+    throughout = build_scene(cube, fine.physics, hand)
+    assert throughout.coarse_scene is None
+    by_fine = run_attempt(throughout, standing(cube), attempt, fine)
+    assert by_coarse.outcome is by_fine.outcome is Outcome.SUCCESS
+    assert by_coarse.time_lift == pytest.approx(by_fine.time_lift, abs=1e-9)
+    assert np.allclose(by_coarse.X_TO_lifted[:3, 3], by_fine.X_TO_lifted[:3, 3], atol=1e-3)
+    assert np.allclose(by_coarse.X_TO_lifted[:3, :3], by_fine.X_TO_lifted[:3, :3], atol=0.02)
+    assert np.allclose(by_coarse.lifted.f_Q_O, by_fine.lifted.f_Q_O, atol=1.0)
 
 
 @pytest.mark.parametrize("back", [False, True])
@@ -98,16 +75,16 @@ def test_another_diagram_goes_on_where_one_stopped(scene, cube, config, back):
     release(scene)
     target = X_WT[:3, 3] + config.lift.p_TG
     motion = move_wrist(scene, target, 1.0)
-    calm = scene.make_calm()
-    long = calm.physics.time_step
+    coarse = scene.coarse_scene()
+    long = coarse.physics.time_step
     when = 125 * long
     advance(scene, when - 1e-6 - scene.time)
-    before, after = scene, calm
-    go_on_in(after, before, when, motion)
+    before, after = scene, coarse
+    transfer_state(after, before, when, motion)
     if back:
-        advance(calm, 2 * long - 1e-6)
-        before, after, when = calm, scene, when + 2 * long
-        go_on_in(after, before, when, motion)
+        advance(coarse, 2 * long - 1e-6)
+        before, after, when = coarse, scene, when + 2 * long
+        transfer_state(after, before, when, motion)
     assert after.time == pytest.approx(when, abs=1e-12)
     assert np.array_equal(palm_pose(after), palm_pose(before))
     assert np.array_equal(after.pose(after.object), before.pose(before.object))
@@ -143,7 +120,7 @@ def test_lift_ends_where_a_fingertip_stays_off(scene, cube, config, monkeypatch,
     close(scene, cube)
     distance = np.linalg.norm(X_WT[:3, 3] + config.lift.p_TG - palm_pose(scene)[:3, 3])
     whole = lift_duration(float(distance), config) + config.lift.hold_time
-    found = lift(scene, start_clock(config), config)
+    found = lift(scene, start_limits(config), config)
     if where == "off":
         assert found.duration < 0.9 * whole
     else:

@@ -17,7 +17,13 @@ from scipy.spatial.transform import Rotation
 from drakegrasp.config import load_config
 from drakegrasp.errors import GraspError, MeshError
 from drakegrasp.frames import Array, make_pose, pack_pose
-from drakegrasp.simulation.placement import MAX_GAP, Placed, PlacedObject, place_object, rest_pose
+from drakegrasp.simulation.placement import (
+    MAX_GAP,
+    Placed,
+    PlacedObject,
+    canonical_pose,
+    place_object,
+)
 from drakegrasp.simulation.settle import settle
 
 EXTENTS = np.array([0.06, 0.08, 0.1])
@@ -251,11 +257,11 @@ def pose_of(yaw: float, tilt: float, about: float, x: float = 0.0, y: float = 0.
 
 
 @given(angles, st.floats(0.0, np.pi), angles, st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
-def test_rest_pose_keeps_up_and_height_and_forgets_the_rest(
+def test_canonical_pose_keeps_up_and_height_and_forgets_the_rest(
     yaw: float, tilt: float, about: float, x: float, y: float
 ) -> None:
     X = pose_of(yaw, tilt, about, x, y)
-    rest = rest_pose(X)
+    rest = canonical_pose(X)
     np.testing.assert_allclose(rest[2], X[2], atol=1e-9)
     np.testing.assert_array_equal(rest[:2, 3], 0.0)
     np.testing.assert_array_equal(rest[3], [0.0, 0.0, 0.0, 1.0])
@@ -266,30 +272,30 @@ def test_rest_pose_keeps_up_and_height_and_forgets_the_rest(
 
 # Nearly upside down every small tilt has its own direction, so rounding decides.
 @given(angles, st.floats(0.0, np.pi - 1e-3), angles, angles, st.floats(-1.0, 1.0))
-def test_rest_pose_does_not_depend_on_yaw_or_place(
+def test_canonical_pose_does_not_depend_on_yaw_or_place(
     yaw: float, tilt: float, about: float, other: float, x: float
 ) -> None:
-    rest = rest_pose(pose_of(yaw, tilt, about))
-    np.testing.assert_allclose(rest_pose(pose_of(other, tilt, about, x, -x)), rest, atol=1e-9)
+    rest = canonical_pose(pose_of(yaw, tilt, about))
+    np.testing.assert_allclose(canonical_pose(pose_of(other, tilt, about, x, -x)), rest, atol=1e-9)
     # Of all yaws it has the one that turns the least: by the tilt alone.
     np.testing.assert_allclose(rest, pose_of(0.0, tilt, about), atol=1e-9)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.5, 3.0])
 @pytest.mark.parametrize("slant", [0.0, 1e-12, 1e-9, 1e-7, 1e-5, 1e-4])
-def test_rest_pose_works_upside_down(yaw: float, slant: float) -> None:
+def test_canonical_pose_works_upside_down(yaw: float, slant: float) -> None:
     X = pose_of(yaw, np.pi - slant, 0.7)
-    rest = rest_pose(X)
+    rest = canonical_pose(X)
     np.testing.assert_allclose(rest[2], X[2], atol=1e-9)
     R = rest[:3, :3]
     np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-12)
     assert np.linalg.det(R) == pytest.approx(1.0)
 
 
-def test_rest_pose_of_an_upright_object_is_the_identity() -> None:
-    np.testing.assert_array_equal(rest_pose(X_TO), make_pose(np.eye(3), [0.0, 0.0, 0.05]))
-    again = rest_pose(pose_of(1.0, 0.3, 0.2))
-    np.testing.assert_allclose(rest_pose(again), again, atol=1e-12)
+def test_canonical_pose_of_an_upright_object_is_the_identity() -> None:
+    np.testing.assert_array_equal(canonical_pose(X_TO), make_pose(np.eye(3), [0.0, 0.0, 0.05]))
+    again = canonical_pose(pose_of(1.0, 0.3, 0.2))
+    np.testing.assert_allclose(canonical_pose(again), again, atol=1e-12)
 
 
 def test_placed_object_says_what_it_is_in_a_line(tmp_path: Path) -> None:

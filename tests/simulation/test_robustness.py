@@ -4,24 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.objects import CUBE, box_model, from_above, standing
+from helpers.objects import STANDOFF, from_above, standing
 
 from drakegrasp.config import Config, load_config, override_config
 from drakegrasp.hand.description import load_hand
-from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.robustness import certify, least_friction
 from drakegrasp.simulation.trial import run_attempt
 
 pytestmark = pytest.mark.sim
-
-STANDOFF = 0.06
-
-
-@pytest.fixture(scope="module")
-def cube(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
-    return box_model(tmp_path_factory.mktemp("cube"), [CUBE, CUBE, CUBE])
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +39,7 @@ def test_least_friction_holds_and_less_does_not(cube, config):
         changed = [
             f"physics.friction_hand={friction}",
             f"physics.time_step={half}",
-            "physics.calm_steps=1",
+            "physics.coarse_steps=1",
         ]
         other = override_config(config, changed)
         scene = build_scene(cube, other.physics, load_hand(other.hand))

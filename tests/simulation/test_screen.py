@@ -3,49 +3,34 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import pytest
 import trimesh
 from helpers.hands import write_pincer
-from helpers.objects import CUBE, box_model, from_above, model_of, standing
+from helpers.objects import (
+    STANDOFF,
+    box_model,
+    drawn_attempts,
+    from_above,
+    model_of,
+    standing,
+)
 
-from drakegrasp.config import Config, ScreenConfig, load_config
+from drakegrasp.config import ScreenConfig, load_config
 from drakegrasp.frames import make_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.finger_sweep import hand_paths
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation import screen
-from drakegrasp.simulation.candidates import make_attempts, sample_candidates
+from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.construction import build_scene
-from drakegrasp.simulation.scene import Scene
 from drakegrasp.simulation.screen import Prediction, predict
 from drakegrasp.simulation.trial import run_attempt
 
-#: Stand-off at which the pads meet the cube's sides a little above its middle [m].
-STANDOFF = 0.06
 OFF = load_config(overrides=["screen.mode=off"])
-
-
-@pytest.fixture(scope="module")
-def config() -> Config:
-    return load_config()
-
-
-@pytest.fixture(scope="module")
-def hand() -> Hand:
-    return load_hand()
-
-
-@pytest.fixture(scope="module")
-def cube(tmp_path_factory) -> ObjectModel:
-    return box_model(tmp_path_factory.mktemp("cube"), [CUBE] * 3)
-
-
-@pytest.fixture(scope="module")
-def scene(cube, config, hand) -> Scene:
-    return build_scene(cube, config.physics, hand)
 
 
 def ask(cube: ObjectModel, hand: Hand, attempt, **margins: float) -> Prediction | None:
@@ -121,10 +106,11 @@ def test_attempt_that_says_where_its_fingers_start_is_never_screened(cube, confi
 
 
 def test_prediction_depends_on_the_attempt_alone(cube, hand, config):
-    candidates = sample_candidates(cube, standing(cube), config.candidates, 0)
-    made = list(make_attempts(candidates, range(40), config.candidates, name=cube.name, seed=0))
-    together = predict(cube, hand, standing(cube), made, config.screen)
-    assert sum(found is not None and found.outcome is None for found in together) >= 3
+    drawn, made, together = drawn_attempts(cube, standing(cube), config, 0), [], []
+    while sum(found is not None and found.outcome is None for found in together) < 3:
+        assert len(made) < 2000, "three of the attempts must be simulated"
+        made += islice(drawn, 100)
+        together = predict(cube, hand, standing(cube), made, config.screen)
     for row, attempt in enumerate(made):
         alone = ask(cube, hand, attempt)
         found = together[row]
@@ -148,21 +134,20 @@ def test_given_prediction_changes_no_bit(cube, hand, config, scene):
 def test_nothing_that_is_screened_would_have_been_lifted(tmp_path, hand, config):
     model = box_model(tmp_path, [0.05, 0.07, 0.15], name="1_box_tall")
     X_TO = standing(model)
-    candidates = sample_candidates(model, X_TO, config.candidates, 1)
-    made = [
-        attempt
-        for attempt in make_attempts(
-            candidates, range(30), config.candidates, name=model.name, seed=1
-        )
-        if attempt.ray_hits and (X_TO @ attempt.X_OG)[2, 3] > 0.0
-    ]
     scene = build_scene(model, config.physics, hand)
-    found = predict(model, hand, X_TO, made, config.screen)
-    losers = [a for a, p in zip(made, found, strict=True) if p and p.outcome is not None]
-    lost = [a for a, p in zip(made, found, strict=True) if p and p.outcome is Outcome.SCREENED]
-    assert len(losers) > 10
-    assert len(lost) >= 3
-    outcomes = {run_attempt(scene, X_TO, attempt, OFF).outcome for attempt in losers}
+
+    # Take attempts from the draw until ten of either kind are lost.
+    losers: dict[Outcome, list[Attempt]] = {Outcome.START_COLLISION: [], Outcome.SCREENED: []}
+    for attempt in drawn_attempts(model, X_TO, config, 1):
+        (found,) = predict(model, hand, X_TO, [attempt], config.screen)
+        above = (X_TO @ attempt.X_OG)[2, 3] > 0.0
+        if above and found is not None and found.outcome is not None:
+            losers[found.outcome].append(attempt)
+        if min(map(len, losers.values())) >= 10:
+            break
+    lost = [attempt for attempts in losers.values() for attempt in attempts[:10]]
+    assert len(lost) == 20
+    outcomes = {run_attempt(scene, X_TO, attempt, OFF).outcome for attempt in lost}
     assert outcomes <= {Outcome.START_COLLISION, Outcome.MISSING_FINGERTIP}
 
 

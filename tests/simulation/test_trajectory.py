@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.objects import CUBE, box_model, standing
+from helpers.objects import CUBE, standing
 from scipy.spatial.transform import Rotation
 
 from drakegrasp.config import load_config
 from drakegrasp.frames import X_WT, make_pose
 from drakegrasp.hand.description import load_hand
-from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.trajectory import LiftPath, carrying_force, lift_path
 from drakegrasp.verification.forces.quality import force_margin
 
@@ -19,11 +18,6 @@ HALF = CUBE / 2.0
 #: Two contacts on one face of the cube, one in the middle of the opposite face.
 P = np.array([[0.02, HALF, 0.0], [-0.02, HALF, 0.0], [0.0, -HALF, 0.0]])
 N = np.array([[0.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
-
-
-@pytest.fixture(scope="module")
-def cube(tmp_path_factory) -> ObjectModel:
-    return box_model(tmp_path_factory.mktemp("cube"), [CUBE] * 3)
 
 
 @pytest.fixture

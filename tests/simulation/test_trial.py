@@ -7,20 +7,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from helpers.objects import CUBE, box_model, from_above, model_of, standing
+from helpers.objects import (
+    CUBE,
+    STANDOFF,
+    box_model,
+    drawn_attempts,
+    from_above,
+    model_of,
+    standing,
+)
 
-from drakegrasp.config import Config, load_config, override_config
+from drakegrasp.config import load_config, override_config
 from drakegrasp.frames import X_WT, invert_pose, make_pose
-from drakegrasp.hand.description import Hand, load_hand
-from drakegrasp.objects.model import ObjectModel, prepare_object
+from drakegrasp.objects.model import prepare_object
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.simulation import stepping
-from drakegrasp.simulation.candidates import Attempt, make_attempts, sample_candidates
+from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.construction import build_scene, object_friction, partner_friction
 from drakegrasp.simulation.contacts import is_inside
 from drakegrasp.simulation.scene import (
-    Scene,
     advance,
     move_wrist,
     palm_pose,
@@ -30,34 +36,12 @@ from drakegrasp.simulation.scene import (
 )
 from drakegrasp.simulation.settle import settle
 from drakegrasp.simulation.trajectory import lift_duration
-from drakegrasp.simulation.trial import TrialRecord, judge_closed, judge_lifted, run_attempt
+from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.vision.camera import camera_pose_oto
 
 pytestmark = pytest.mark.sim
 
 GRAVITY = 9.81
-#: Stand-off at which the pads meet the cube's sides a little above its middle [m].
-STANDOFF = 0.06
-
-
-@pytest.fixture(scope="module")
-def config() -> Config:
-    return load_config()
-
-
-@pytest.fixture(scope="module")
-def hand() -> Hand:
-    return load_hand()
-
-
-@pytest.fixture(scope="module")
-def cube(tmp_path_factory) -> ObjectModel:
-    return box_model(tmp_path_factory.mktemp("cube"), [CUBE] * 3)
-
-
-@pytest.fixture(scope="module")
-def scene(cube, config, hand) -> Scene:
-    return build_scene(cube, config.physics, hand)
 
 
 @pytest.fixture(scope="module")
@@ -226,8 +210,8 @@ def test_attempt_that_takes_too_long_is_a_timeout(scene, cube):
 
 def test_exploded_state_is_no_verdict_on_the_grasp(scene, cube, hand):
     """The lift itself is already faster than this limit."""
-    calm = load_config(overrides=["physics.max_speed=0.05"])
-    record = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), calm)
+    slow = load_config(overrides=["physics.max_speed=0.05"])
+    record = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), slow)
     assert record.outcome is Outcome.SOLVER_ERROR
     assert "speed" in record.message
 
@@ -279,19 +263,6 @@ def test_lift_keeps_its_speed_and_acceleration_limits(scene, cube, config):
     assert heights[-1] == pytest.approx(target[2], abs=1e-4)
 
 
-def test_judgements_follow_the_rules(held):
-    closed, lifted = held.closed, held.lifted
-    assert judge_closed(closed) is None
-    one_off = replace(closed, touching=np.array([True, False, True]))
-    assert judge_closed(one_off) is Outcome.MISSING_FINGERTIP
-    assert judge_closed(replace(closed, other_links=1)) is Outcome.HAND_CONTACT
-    assert judge_closed(replace(closed, hand_on_table=True)) is Outcome.TABLE_CONTACT
-    assert judge_lifted(lifted) is Outcome.SUCCESS
-    assert judge_lifted(replace(lifted, touching=one_off.touching)) is Outcome.SLIPPED
-    assert judge_lifted(replace(lifted, touching=np.zeros(3, bool))) is Outcome.DROPPED
-    assert judge_lifted(replace(lifted, object_on_table=True)) is Outcome.TABLE_CONTACT
-
-
 def test_friction_is_the_effective_one_on_both_pairs(tmp_path, hand):
     """Drake combines coefficients to 2ab/(a+b): both pairs must come out as configured."""
     physics = load_config("released").physics
@@ -335,22 +306,25 @@ def test_smaller_step_gives_the_same_verdicts(tmp_path, config, hand, step):
     """At the default of 8 ms, or at 4 ms, 95 % of what is simulated ends as at 1 ms."""
     model = box_model(tmp_path, [0.05, 0.07, 0.15], name="1_box_tall")
     X_TO = standing(model)
-    candidates = sample_candidates(model, X_TO, config.candidates, 0)
-    made = make_attempts(candidates, range(40), config.candidates, name=model.name, seed=0)
-    attempts = [attempt for attempt in made if attempt.ray_hits]
     coarse = override_config(config, ["screen.mode=off", f"physics.time_step={step}"])
     fine = override_config(
-        config, ["screen.mode=off", "physics.time_step=0.001", "physics.calm_steps=1"]
+        config, ["screen.mode=off", "physics.time_step=0.001", "physics.coarse_steps=1"]
     )
     coarse_scene = build_scene(model, coarse.physics, hand)
     fine_scene = build_scene(model, fine.physics, hand)
-    records = [run_attempt(coarse_scene, X_TO, a, coarse) for a in attempts]
-    simulated = [i for i, record in enumerate(records) if record.closed is not None]
-    again = [run_attempt(fine_scene, X_TO, attempts[i], fine) for i in simulated]
-    alike = [records[i].outcome is b.outcome for i, b in zip(simulated, again, strict=True)]
-    assert len(alike) >= 20
-    assert sum(records[i].outcome is Outcome.SUCCESS for i in simulated) >= 3
-    assert np.mean(alike) >= 0.95
+    # Take attempts from the draw until there are 20 to compare, and three successes among them.
+    verdicts: list[tuple[Outcome, Outcome]] = []
+    for attempt in drawn_attempts(model, X_TO, config, 0):
+        record = run_attempt(coarse_scene, X_TO, attempt, coarse)
+        if record.closed is not None:
+            again = run_attempt(fine_scene, X_TO, attempt, fine)
+            verdicts.append((record.outcome, again.outcome))
+        successes = sum(outcome is Outcome.SUCCESS for outcome, _ in verdicts)
+        if len(verdicts) >= 20 and successes >= 3:
+            break
+    assert len(verdicts) >= 20
+    assert successes >= 3
+    assert np.mean([outcome is again for outcome, again in verdicts]) >= 0.95
 
 
 def test_object_rests_on_the_table_after_an_attempt_that_ended_early(scene, cube, config):

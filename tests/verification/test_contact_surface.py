@@ -11,7 +11,7 @@ from helpers.objects import box_model, model_of
 
 from drakegrasp.frames import Array
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.verification.verify import WALL, face_distances, points_outward
+from drakegrasp.verification.contact_surface import WALL, face_distances, points_outward
 
 EXTENTS = np.array([0.06, 0.08, 0.1])
 #: Outer and inner half edge of the open box below [m]: walls of 2 mm.

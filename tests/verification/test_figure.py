@@ -63,7 +63,7 @@ def verified(cube: ObjectModel) -> Callable[..., SimpleNamespace]:
             "outcome": Outcome.OFF_SURFACE, "reason": "so it is",
             "placed": SimpleNamespace(model=cube, X_TO=standing(cube)),
             "p_OQ": P_OQ, "nhat_Q_O": NHAT_Q_O,
-            "fit": None, "attempt": None, "trial": None, "lift": None,
+            "fit": None, "pregrasp": None, "trial": None, "lift": None,
             "config": load_config(),
         }  # fmt: skip
         return SimpleNamespace(**result | values)
@@ -161,9 +161,9 @@ def test_palm_is_where_the_lift_ended(cube: ObjectModel, config: Config, frictio
     record = run_attempt(scene, standing(cube), from_above(cube, 0.06), slick)
     assert record.lifted is not None
     assert record.lifted.touching.any() == (friction > 0.5)
-    # The calm part of a lift has a scene of its own.
-    assert scene.make_calm is not None
-    X_WG = palm_pose(max(scene, scene.make_calm(), key=lambda stage: stage.time))
+    # The coarse steps of a lift have a scene of their own.
+    assert scene.coarse_scene is not None
+    X_WG = palm_pose(max(scene, scene.coarse_scene(), key=lambda stage: stage.time))
     X_TG = record.X_TO @ record.X_OG
     np.testing.assert_allclose(lifted_palm(X_TG, record.time_lift, slick), X_WG, atol=2e-4)
     if friction < 0.5:

@@ -128,7 +128,7 @@ def test_the_three_frames_agree(single: bool, cameras: int) -> None:
     given: npt.ArrayLike = X_TC[0] if cameras == 1 else X_TC
     if single:
         given = pack_pose(given).astype(np.float32)
-    X = read_pose(given, "X")
+    X = read_pose(given, "X_TC")
     # The poses that were handed in, after rounding, are the true ones.
     each = np.broadcast_to(X, (4, 4, 4))
     grasps = {
@@ -144,7 +144,7 @@ def test_the_three_frames_agree(single: bool, cameras: int) -> None:
         p_OQ, nhat_Q_O = to_object_frame(
             *read_grasps(values, 3),
             frame=frame,
-            X=X if frame == "camera" else None,
+            X_TC=X if frame == "camera" else None,
             X_TO=X_TO,
         )
         np.testing.assert_allclose(p_OQ, expected[0], atol=1e-12)
@@ -157,7 +157,7 @@ def test_the_three_frames_agree(single: bool, cameras: int) -> None:
 def test_no_grasps_have_no_contacts_in_any_frame(frame: str) -> None:
     points, normals = read_grasps(np.zeros((0, 18)), 3)
     for X in [np.eye(4), np.zeros((0, 4, 4))] if frame == "camera" else [None]:
-        p, n = to_object_frame(points, normals, frame=frame, X=X, X_TO=np.eye(4))
+        p, n = to_object_frame(points, normals, frame=frame, X_TC=X, X_TO=np.eye(4))
         assert p.shape == n.shape == (0, 3, 3)
 
 
@@ -167,24 +167,24 @@ def test_no_grasps_have_no_contacts_in_any_frame(frame: str) -> None:
         ("world", None, "frame must be one of object, camera, workspace, got 'world'"),
         ("", None, "frame must be one of object, camera, workspace, got ''"),
         (None, None, "frame must be one of object, camera, workspace, got None"),
-        ("camera", None, "X must be the camera's pose in the table-top frame"),
-        ("object", np.eye(4), "X must be None where frame is object, got a pose"),
-        ("workspace", np.eye(4), "X must be None where frame is workspace, got a pose"),
+        ("camera", None, "X_TC must be the camera's pose in the table-top frame"),
+        ("object", np.eye(4), "X_TC must be None if frame is object, got a pose"),
+        ("workspace", np.eye(4), "X_TC must be None if frame is workspace, got a pose"),
         (
             "camera",
             np.tile(np.eye(4), (3, 1, 1)),
-            "X must be one pose, or one per grasp (2), got 3",
+            "X_TC must be one pose, or one per grasp (2), got 3",
         ),
         (
             "camera",
             np.tile(np.eye(4), (1, 1, 1)),
-            "X must be one pose, or one per grasp (2), got 1",
+            "X_TC must be one pose, or one per grasp (2), got 1",
         ),
     ],
 )
 def test_a_frame_out_of_place_is_refused(frame: Any, X: Array | None, message: str) -> None:
     points, normals = read_grasps([one_grasp(0), one_grasp(1)], 3)
-    text = refused(to_object_frame, points, normals, frame=frame, X=X, X_TO=np.eye(4))
+    text = refused(to_object_frame, points, normals, frame=frame, X_TC=X, X_TO=np.eye(4))
     assert text.startswith(message)
 
 

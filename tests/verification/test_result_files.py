@@ -21,7 +21,7 @@ from drakegrasp.errors import DataError
 from drakegrasp.frames import make_pose, pack_pose
 from drakegrasp.objects.model import make_object
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.trial import TrialRecord
@@ -90,16 +90,7 @@ def results() -> list[Verification]:
         iterations=12,
         evaluations=15,
     )
-    attempt = Attempt(
-        candidate=0,
-        standoff_index=0,
-        standoff=0.0,
-        spread=0.25,
-        X_OG=X_OG,
-        ray_hits=True,
-        seed=0,
-        closing=np.array([0.1, 0.2, 0.3]),
-    )
+    pregrasp = Pregrasp(X_OG=X_OG, spread=0.25, closing=np.array([0.1, 0.2, 0.3]))
     trial = TrialRecord(
         outcome=Outcome.SUCCESS,
         X_TO=placed.X_TO,
@@ -131,7 +122,7 @@ def results() -> list[Verification]:
         reason="every fingertip holds it",
         fit=fit,
         tries=2,
-        attempt=attempt,
+        pregrasp=pregrasp,
         trial=trial,
         contact_error=np.array([0.001, 0.002, 0.003]),
     )

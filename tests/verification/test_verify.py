@@ -17,11 +17,10 @@ from drakegrasp.errors import GraspError, OffSurfaceError
 from drakegrasp.frames import X_WT, invert_pose, make_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.candidates import R_OG0, Attempt
+from drakegrasp.simulation.candidates import R_OG0, Pregrasp
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
-from drakegrasp.verification.tasks import VerifyTask, plan_verification, run_task
 from drakegrasp.verification.verify import verify_contacts
 
 pytestmark = pytest.mark.sim
@@ -39,16 +38,8 @@ def cube(tmp_path_factory: pytest.TempPathFactory) -> PlacedObject:
 def grasp(cube: PlacedObject) -> tuple[np.ndarray, np.ndarray]:
     """Contacts of a simulated grasp that held, across two faces of the cube, from above."""
     scene = build_scene(cube.model, CONFIG.physics, load_hand(CONFIG.hand))
-    attempt = Attempt(
-        candidate=0,
-        standoff_index=0,
-        standoff=0.06,
-        spread=0.0,
-        X_OG=make_pose(R_OG0, [0.0, 0.0, CUBE / 2.0 + 0.06]),
-        ray_hits=True,
-        seed=0,
-    )
-    record = run_attempt(scene, cube.X_TO, attempt, CONFIG)
+    pregrasp = Pregrasp(X_OG=make_pose(R_OG0, [0.0, 0.0, CUBE / 2.0 + 0.06]), spread=0.0)
+    record = run_attempt(scene, cube.X_TO, pregrasp, CONFIG)
     assert record.outcome is Outcome.SUCCESS and record.closed is not None
     return record.closed.p_OQ, record.closed.nhat_Q_O
 
@@ -117,7 +108,7 @@ def test_the_camera_frame_is_the_one_of_its_pose(
     X_TC = make_pose(Rotation.from_euler("xyz", [2.0, 0.4, -1.0]).as_matrix(), [0.1, 0.3, 0.4])
     X_CO = invert_pose(X_TC) @ cube.X_TO
     seen = dg.transform_grasp(X_CO, dg.pack_grasp(*grasp))
-    found = dg.verify_grasp(seen, cube, frame="camera", X=X_TC)
+    found = dg.verify_grasp(seen, cube, frame="camera", X_TC=X_TC)
     assert found.outcome is held.outcome
     np.testing.assert_allclose(found.p_OQ, held.p_OQ, atol=1e-12)
 
@@ -160,7 +151,7 @@ def test_contacts_that_no_hand_spans_are_unreachable(tmp_path: Path) -> None:
     n = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
     found = verify(PlacedObject(model=model, X_TO=standing(model)), p, n)
     assert found.outcome is Outcome.UNREACHABLE
-    assert "no pose of the palm" in found.reason and found.tries == 0
+    assert "no palm pose was found" in found.reason and found.tries == 0
 
 
 def test_a_finger_that_touches_elsewhere_does_not_make_the_grasp(
@@ -170,7 +161,7 @@ def test_a_finger_that_touches_elsewhere_does_not_make_the_grasp(
     p, n = grasp
     found = verify_contacts(cube, p, n, method="hand", config=strict)
     assert found.outcome is Outcome.UNREACHABLE and held.success
-    assert "closing fingertip" in found.reason
+    assert "closes on the object" in found.reason
 
 
 def test_at_little_friction_neither_method_holds(
@@ -192,7 +183,7 @@ def test_a_drake_error_is_a_value_and_the_next_grasp_is_untouched(
     with monkeypatch.context() as patch:
         patch.setattr("drakegrasp.simulation.trial.finger_speed", _fail)
         found = verify(cube, p, n)
-    assert found.outcome is Outcome.SOLVER_ERROR and found.outcome.says_nothing
+    assert found.outcome is Outcome.SOLVER_ERROR and found.outcome.inconclusive
     assert "says nothing about the grasp" in found.reason and "broken" in found.reason
     again = verify(cube, p, n)
     assert again.closed is not None and held.closed is not None
@@ -232,17 +223,11 @@ def test_number_of_threads_changes_no_bit(
     fits = []
     for threads in (1, 4):
         with threadpool_limits(threads):
-            (task,) = plan_of(cube, grasp)
-            _, (found,) = run_task(task)
+            found = verify(cube, *grasp)
         assert found.fit is not None
         fits.append(found.fit)
     np.testing.assert_array_equal(fits[0].X_OG, fits[1].X_OG)
     np.testing.assert_array_equal(fits[0].closing, fits[1].closing)
-
-
-def plan_of(cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]) -> list[VerifyTask]:
-    nothing = dict.fromkeys(("frame", "X", "X_TO", "units", "hand", "config", "dataset", "rows"))
-    return plan_verification(dg.pack_grasp(*grasp), cube, method="hand", **nothing)
 
 
 def _fail(scene: object) -> float:
@@ -267,8 +252,8 @@ def test_results_know_what_they_were_asked(held: dg.Verification, cube: PlacedOb
     assert held.placed is cube and held.method == "hand"
     assert np.isnan(replace(held, fit=None).spread)
     assert repr(held).startswith("Verification(hand, success")
-    assert held.attempt is not None and held.attempt.closing is not None
+    assert held.pregrasp is not None and held.pregrasp.closing is not None
     assert held.closing is not None
     # The fingers were opened before they closed.
-    assert np.all(held.attempt.closing < held.closing)
-    assert (X_WT @ cube.X_TO @ held.attempt.X_OG)[2, 3] > 0.65
+    assert np.all(held.pregrasp.closing < held.closing)
+    assert (X_WT @ cube.X_TO @ held.pregrasp.X_OG)[2, 3] > 0.65

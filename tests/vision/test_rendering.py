@@ -16,7 +16,7 @@ from drakegrasp.frames import Array, invert_pose, make_pose, transform_points
 from drakegrasp.objects.model import ObjectModel, object_colour, prepare_object
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.vision.camera import intrinsics, project, unproject
-from drakegrasp.vision.rendering import Look, Renderer, build_renderer, look
+from drakegrasp.vision.rendering import RenderedView, Renderer, build_renderer, render
 
 
 def has_egl() -> bool:
@@ -85,7 +85,7 @@ def oblique() -> Array:
     return make_pose(np.column_stack([x, np.cross(z, x), z]), p_TC)
 
 
-def object_points(seen: Look, X_TC: Array) -> Array:
+def object_points(seen: RenderedView, X_TC: Array) -> Array:
     """Return p_OQ (n, 3) of the mask's pixels, unprojected with their depth."""
     rows, columns = np.nonzero(seen.mask)
     p_CQ = unproject(K, np.column_stack([columns, rows]), seen.image[3][rows, columns])
@@ -103,7 +103,7 @@ def test_depth_of_a_face_is_its_distance_along_the_axis(
     renderer: Renderer, distance: float
 ) -> None:
     """Depth is z, not range: it is the same all over a face that the camera sees squarely."""
-    seen = look(renderer, X_TO, facing_x(distance))
+    seen = render(renderer, X_TO, facing_x(distance))
     np.testing.assert_allclose(seen.image[3, 63:65, 63:65], distance, atol=1e-4)
     rows, columns = np.nonzero(seen.mask)
     np.testing.assert_allclose(seen.image[3][rows, columns], distance, atol=1e-4)
@@ -111,7 +111,7 @@ def test_depth_of_a_face_is_its_distance_along_the_axis(
 
 def test_depth_from_above_is_that_of_the_lid_and_of_the_table(renderer: Renderer) -> None:
     X_TC = make_pose(R_FROM_ABOVE, [0.0, 0.0, 0.5])
-    seen = look(renderer, X_TO, X_TC)
+    seen = render(renderer, X_TO, X_TC)
     on_object = seen.mask.astype(bool)
     # The camera sees the lid only: the sides are hidden behind its edge.
     np.testing.assert_allclose(seen.image[3][on_object], 0.5 - EXTENTS[2], atol=1e-4)
@@ -121,7 +121,7 @@ def test_depth_from_above_is_that_of_the_lid_and_of_the_table(renderer: Renderer
 @pytest.mark.parametrize("distance", [0.15, 0.25, 0.5])
 def test_mask_of_a_face_covers_its_projection(renderer: Renderer, distance: float) -> None:
     """Edges of f w / d pixels, to a pixel, centred: y to the right, z up."""
-    mask = look(renderer, X_TO, facing_x(distance)).mask
+    mask = render(renderer, X_TO, facing_x(distance)).mask
     rows, columns = np.nonzero(mask)
     for pixels, edge in ((columns, EXTENTS[1]), (rows, EXTENTS[2])):
         assert abs((pixels.max() - pixels.min() + 1) - K[0, 0] * edge / distance) <= 1.0
@@ -136,7 +136,7 @@ def test_mask_has_no_bias(renderer: Renderer) -> None:
     for k in range(20):
         X_TC = facing_x(0.25)
         X_TC[1:3, 3] += np.array([2e-4, 2.6e-4]) * k
-        rows, columns = np.nonzero(look(renderer, X_TO, X_TC).mask)
+        rows, columns = np.nonzero(render(renderer, X_TO, X_TC).mask)
         middle = [(columns.min() + columns.max()) / 2.0, (rows.min() + rows.max()) / 2.0]
         errors.append(middle - project(K, [[-2e-4 * k, 2.6e-4 * k, 0.25]])[0])
     np.testing.assert_allclose(np.mean(errors, axis=0), 0.0, atol=0.15)
@@ -147,7 +147,7 @@ def test_image_axes_are_not_mirrored(renderer: Renderer) -> None:
     X_TC = facing_x(0.25)
     X_TC[1, 3] -= 0.03
     X_TC[2, 3] += 0.02
-    seen = look(renderer, X_TO, X_TC)
+    seen = render(renderer, X_TO, X_TC)
     rows, columns = np.nonzero(seen.mask)
     ((u, v),) = project(K, [[0.03, 0.02, 0.25]])
     middle = [(columns.min() + columns.max()) / 2.0, (rows.min() + rows.max()) / 2.0]
@@ -158,7 +158,7 @@ def test_image_axes_are_not_mirrored(renderer: Renderer) -> None:
 
 def test_pixels_beyond_the_table_hold_far(renderer: Renderer) -> None:
     """Level with the table there is no table above the horizon: exactly `far`, in float32."""
-    seen = look(renderer, X_TO, facing_x(0.25))
+    seen = render(renderer, X_TO, facing_x(0.25))
     background = seen.image[3][:20]
     np.testing.assert_array_equal(background, np.float32(CONFIG.far))
     assert not seen.mask[:20].any()
@@ -166,7 +166,7 @@ def test_pixels_beyond_the_table_hold_far(renderer: Renderer) -> None:
 
 
 def test_object_beyond_far_is_not_in_mask_or_depth(renderer: Renderer) -> None:
-    seen = look(renderer, X_TO, facing_x(0.8))
+    seen = render(renderer, X_TO, facing_x(0.8))
     assert not seen.mask.any()
     np.testing.assert_array_equal(seen.image[3, 63:65, 63:65], np.float32(CONFIG.far))
 
@@ -174,10 +174,10 @@ def test_object_beyond_far_is_not_in_mask_or_depth(renderer: Renderer) -> None:
 def test_mask_and_depth_agree(renderer: Renderer) -> None:
     """Pixels of the mask, unprojected, lie on the box; all others lie off it."""
     X_TC = oblique()
-    seen = look(renderer, X_TO, X_TC)
+    seen = render(renderer, X_TO, X_TC)
     assert 500 < seen.mask.sum() < 128 * 128 / 2
     assert np.abs(box_distance(object_points(seen, X_TC))).max() < 1e-6
-    inverted = Look(image=seen.image, mask=1 - seen.mask)
+    inverted = RenderedView(image=seen.image, mask=1 - seen.mask)
     # The table's pixels at the foot of the box come near to it.
     assert np.median(box_distance(object_points(inverted, X_TC))) > 0.02
     assert box_distance(object_points(inverted, X_TC)).min() > -1e-6
@@ -186,7 +186,7 @@ def test_mask_and_depth_agree(renderer: Renderer) -> None:
 def test_all_that_is_drawn_is_object_table_or_nothing(renderer: Renderer) -> None:
     """The hand is never in an image, wherever the palm is: nothing else has a depth."""
     X_TC = oblique()
-    seen = look(renderer, X_TO, X_TC)
+    seen = render(renderer, X_TO, X_TC)
     rows, columns = np.nonzero((seen.mask == 0) & (seen.image[3] < np.float32(CONFIG.far)))
     p_CQ = unproject(K, np.column_stack([columns, rows]), seen.image[3][rows, columns])
     assert len(rows) > 1000
@@ -194,7 +194,7 @@ def test_all_that_is_drawn_is_object_table_or_nothing(renderer: Renderer) -> Non
 
 
 def test_types_and_ranges_are_those_of_the_files(renderer: Renderer) -> None:
-    seen = look(renderer, X_TO, oblique())
+    seen = render(renderer, X_TO, oblique())
     assert (seen.image.shape, seen.image.dtype) == ((4, 128, 128), np.float32)
     assert (seen.mask.shape, seen.mask.dtype) == ((128, 128), np.uint8)
     assert set(np.unique(seen.mask)) == {0, 1}
@@ -205,21 +205,21 @@ def test_types_and_ranges_are_those_of_the_files(renderer: Renderer) -> None:
 
 def test_object_has_its_names_colour(renderer: Renderer) -> None:
     """Shading scales a colour and keeps its hue: the channels keep their order."""
-    seen = look(renderer, X_TO, oblique())
+    seen = render(renderer, X_TO, oblique())
     colour: npt.NDArray[np.float32] = np.median(seen.image[:3][:, seen.mask == 1], axis=1)
     np.testing.assert_array_equal(np.argsort(colour), np.argsort(object_colour("box")))
 
 
-def pixels(seen: Look) -> tuple[bytes, bytes]:
+def pixels(seen: RenderedView) -> tuple[bytes, bytes]:
     return seen.image.tobytes(), seen.mask.tobytes()
 
 
 def test_same_view_gives_the_same_bits(renderer: Renderer, box: ObjectModel) -> None:
     """Whatever was looked at before, and in another renderer of the same process too."""
-    first = pixels(look(renderer, X_TO, oblique()))
-    look(renderer, X_TO, facing_x(0.1))
-    assert pixels(look(renderer, X_TO, oblique())) == first
-    assert pixels(look(build_renderer(box, CONFIG), X_TO, oblique())) == first
+    first = pixels(render(renderer, X_TO, oblique()))
+    render(renderer, X_TO, facing_x(0.1))
+    assert pixels(render(renderer, X_TO, oblique())) == first
+    assert pixels(render(build_renderer(box, CONFIG), X_TO, oblique())) == first
 
 
 def test_image_follows_the_object(renderer: Renderer) -> None:
@@ -228,6 +228,6 @@ def test_image_follows_the_object(renderer: Renderer) -> None:
     moved[1, 3] = 0.03
     middles = []
     for X in (X_TO, moved):
-        _, columns = np.nonzero(look(renderer, X, facing_x(0.25)).mask)
+        _, columns = np.nonzero(render(renderer, X, facing_x(0.25)).mask)
         middles.append((columns.min() + columns.max()) / 2.0)
     assert middles[1] - middles[0] == pytest.approx(K[0, 0] * 0.03 / 0.25, abs=1.0)

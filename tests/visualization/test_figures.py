@@ -152,7 +152,7 @@ def test_sample_of_an_unknown_trial_is_refused(tmp_path: Path) -> None:
 def test_examples_of_the_docs_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    text = (DOCS / "frames-and-units.md").read_text(encoding="utf-8")
+    text = (DOCS / "reference" / "frames-and-units.md").read_text(encoding="utf-8")
     (tmp_path / "OUT").mkdir()
     write_data_file(tmp_path / "OUT" / "grasping_oto.hdf5", ["1_mug"])
     monkeypatch.chdir(tmp_path)
@@ -183,7 +183,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     prepared = prepare(find_meshes(folder / "meshes")[0], config)
     save_prepared(prepared, out, config)
     write_manifest(
-        Manifest(config=config, objects=(prepared.summary(),), versions=installed_versions(config)),
+        Manifest(config=config, objects=(prepared.entry(),), versions=installed_versions(config)),
         out,
     )
     palm = prepared.model.half_extents[2] + 0.08
@@ -221,9 +221,9 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.sim
 @needs_egl
 def test_snapshots_show_the_hand_and_the_object(dataset: Path, tmp_path: Path) -> None:
-    from trial_pictures import trial_snapshots
+    from trial_pictures import render_trial
 
-    pictures = trial_snapshots(dataset, 0, size=(160, 120))
+    pictures = render_trial(dataset, 0, size=(160, 120))
     assert [p.image.shape for p in pictures] == [(120, 160, 3)] * 3
     for picture in pictures:
         assert picture.image.std() > 5.0
@@ -258,32 +258,38 @@ def test_figure_of_the_frames_has_them_all(dataset: Path, tmp_path: Path) -> Non
 @pytest.mark.sim
 @needs_egl
 def test_chosen_view_sees_every_fingertip(dataset: Path) -> None:
-    from trial_pictures import stage_trial
+    from trial_pictures import load_trial
 
     from drakegrasp.frames import X_WT
     from drakegrasp.hand.description import load_hand
     from drakegrasp.simulation.construction import build_scene
     from drakegrasp.simulation.scene import hand_joint_names
-    from drakegrasp.visualization.third_person import choose_view, labels, outline, show, take
+    from drakegrasp.visualization.third_person import (
+        choose_view,
+        outline_points,
+        render_labels,
+        render_view,
+        set_snapshot,
+    )
 
-    trial = stage_trial(dataset, 0)
-    theatre, plant = trial.theatre, trial.theatre.plant
+    trial = load_trial(dataset, 0)
+    render_scene, plant = trial.scene, trial.scene.plant
     scene = build_scene(trial.model, trial.config.physics, load_hand(trial.config.hand))
     # What trials.hdf5 holds is in the order of the simulated scene.
-    assert theatre.joint_names == hand_joint_names(scene)
+    assert render_scene.joint_names == hand_joint_names(scene)
     assert trial.place.q.tolist().count(0.2) == 2
-    body = outline(theatre, trial.close, trial.model.half_extents)
-    show(theatre, trial.close)
-    X_WC = choose_view(theatre, body)
-    seen = labels(theatre, X_WC, (128, 128))
-    for link in theatre.hand.fingertip_links:
-        index = int(plant.GetBodyByName(link, theatre.hand_instance).index())
+    body = outline_points(render_scene, trial.close, trial.model.half_extents)
+    set_snapshot(render_scene, trial.close)
+    X_WC = choose_view(render_scene, body)
+    seen = render_labels(render_scene, X_WC, (128, 128))
+    for link in render_scene.hand.fingertip_links:
+        index = int(plant.GetBodyByName(link, render_scene.hand_instance).index())
         assert np.sum(seen == index) > 30
     # What is shown is in the picture, and the object where its frame projects to.
-    picture = take(theatre, X_WC, (128, 128))
+    picture = render_view(render_scene, X_WC, (128, 128))
     uv = picture.pixels(body)
     assert np.all((uv >= 0.0) & (uv <= 127.0))
-    rows, columns = np.nonzero(seen == int(theatre.object.index()))
+    rows, columns = np.nonzero(seen == int(render_scene.object.index()))
     top = trial.close.X_WO[:3, 3] + [0.0, 0.0, trial.model.half_extents[2]]
     assert abs(picture.pixels(top[None])[0, 1] - rows.min()) < 6.0
     assert abs(picture.pixels(X_WT[None, :3, 3])[0, 0] - columns.mean()) < 6.0
@@ -291,12 +297,12 @@ def test_chosen_view_sees_every_fingertip(dataset: Path) -> None:
 
 @pytest.mark.sim
 def test_only_lifted_trials_can_be_shown(dataset: Path) -> None:
-    from trial_pictures import stage_trial
+    from trial_pictures import load_trial
 
     with pytest.raises(DataError, match="ray_miss"):
-        stage_trial(dataset, 1)
+        load_trial(dataset, 1)
     with pytest.raises(DataError, match="0 to 1"):
-        stage_trial(dataset, 2)
+        load_trial(dataset, 2)
 
 
 def test_figures_import_no_drake() -> None:

@@ -142,7 +142,7 @@ def test_verification_without_a_trial_shows_what_there_is(
     fit = SimpleNamespace(X_OG=X_OG, spread=0.3, closing=np.full(3, 0.8)) if fitted else None
     verified = SimpleNamespace(
         placed=SimpleNamespace(model=cube, X_TO=standing(cube)),
-        p_OQ=P_OQ, nhat_Q_O=NHAT_Q_O, fit=fit, attempt=None, lift=None, config=config,
+        p_OQ=P_OQ, nhat_Q_O=NHAT_Q_O, fit=fit, pregrasp=None, lift=None, config=config,
     )  # fmt: skip
     record_verification(verified, tmp_path / "still.html")
     everything = b"".join(commands_of(tmp_path / "still.html"))

@@ -1,8 +1,7 @@
-"""What must hold between the rows and the files of a dataset.
+"""Rules between the rows and the files of a dataset: splits, successes, objects, configurations.
 
-In: open files of a dataset, and its manifest. Out: a `Violation` for all that does not fit
-together: splits, successes, objects, configurations. Only columns of numbers and names are
-read here, whole.
+In: open files of a dataset, and its manifest. Out: a `Violation` for each contradiction. Columns
+of numbers and names are read whole; images are not read.
 """
 
 from __future__ import annotations
@@ -20,7 +19,8 @@ from drakegrasp.dataset.schema import OBJECT_FIELDS, SPLITS
 
 
 def splits(data: OpenFile) -> Iterator[Violation]:
-    """A trial is one sample, and a tested object or a class left out is nowhere else."""
+    """A trial is one sample; a tested object, or a class left out, is in no other split."""
+    # Each trial once; meanwhile gather the objects and their classes by split.
     seen: dict[int, str] = {}
     objects: dict[str, dict[str, str]] = {}
     for split, group in data.groups.items():
@@ -34,6 +34,8 @@ def splits(data: OpenFile) -> Iterator[Violation]:
             group[f"object_props/{key}"].asstr()[:] for key in ("object_name", "class_name")
         )
         objects[split] = dict(zip(names.tolist(), classes.tolist(), strict=True))
+
+    # Outside of the test split: no tested object, and only the classes to train on.
     tested = objects.pop("test", {})
     allowed = data.config.split.train_classes if data.config else None
     for split, members in objects.items():
@@ -44,6 +46,8 @@ def splits(data: OpenFile) -> Iterator[Violation]:
             if allowed is not None and class_name not in allowed:
                 what = "a class must be one of split.train_classes"
                 yield of_file(data.name, what, class_name, f"/{split}")
+
+    # A class to train on has exactly one tested object.
     trained = {c for members in objects.values() for c in members.values()}
     if len(data.groups) == len(SPLITS):
         for class_name in sorted(trained):
@@ -54,13 +58,21 @@ def splits(data: OpenFile) -> Iterator[Violation]:
 
 
 def successes(trials: OpenFile, expected: AnyArray) -> Iterator[Violation]:
-    """Every success is in /successes, in order, with a legal reason of removal."""
+    """Every success is in /successes, in order, with a legal reason of removal and certificate.
+
+    Args:
+        trials: The file of the trials.
+        expected: (n,), ids of the trials that are successes.
+    """
+    # The same trials in the same order.
     group = trials.groups["successes"]
     ids, removal = group["trial_id"][:], group["removal"][:]
     if not np.array_equal(ids, expected):
-        odd = sorted(set(ids.tolist()) ^ set(expected.tolist()))
-        got = f"differences at trials {odd[:5]}" if odd else "another order"
+        different = sorted(set(ids.tolist()) ^ set(expected.tolist()))
+        got = f"differences at trials {different[:5]}" if different else "another order"
         yield of_file(trials.name, "trial_id must list the successes of /trials", got, "/successes")
+
+    # Legal values.
     for row in np.flatnonzero(~np.isin(removal, [r.value for r in Removal])).tolist():
         yield Violation(
             file=trials.name,
@@ -89,16 +101,16 @@ def kept_are_samples(data: OpenFile, trials: OpenFile) -> Iterator[Violation]:
     group = trials.groups["successes"]
     kept = set(group["trial_id"][:][group["removal"][:] == Removal.KEPT].tolist())
     ids = {i for split in data.groups.values() for i in split["trial_id"][:].tolist()}
-    for what, odd in (
+    for what, others in (
         (f"every success that /successes of {trials.name} keeps must be a sample", kept - ids),
         (f"every sample must be a success that /successes of {trials.name} keeps", ids - kept),
     ):
-        if odd:
-            yield of_file(data.name, what, f"{len(odd)} otherwise: trials {sorted(odd)[:5]}")
+        if others:
+            yield of_file(data.name, what, f"{len(others)} otherwise: trials {sorted(others)[:5]}")
 
 
 def same_objects(trials: OpenFile, manifest: Manifest) -> Iterator[Violation]:
-    """/objects says the same as the manifest."""
+    """/objects agrees with the manifest."""
     if "objects" not in trials.groups:
         return
     if trials.count("objects") != len(manifest.objects):
@@ -107,10 +119,10 @@ def same_objects(trials: OpenFile, manifest: Manifest) -> Iterator[Violation]:
         return
     for f in OBJECT_FIELDS:
         values = column(trials.groups["objects"][f.name], f)[:].tolist()
-        key = {"class_name": "class"}.get(f.name, f.name)
         for row, (value, entry) in enumerate(zip(values, manifest.objects, strict=True)):
-            if value != entry[key]:
-                what = f"{f.name} must be that of {FILE_NAME}, {entry[key]!r}"
+            expected = getattr(entry, f.name)
+            if value != expected:
+                what = f"{f.name} must be that of {FILE_NAME}, {expected!r}"
                 yield Violation(
                     file=trials.name, group="/objects", row=row, what=what, got=repr(value)
                 )
@@ -122,10 +134,10 @@ def same_configuration(files: Iterable[OpenFile], manifest: Manifest) -> Iterato
     for file in files:
         if file.config is None:
             continue
-        found = file.config.simulation_hash()
-        if found != expected:
+        own = file.config.simulation_hash()
+        if own != expected:
             what = f"configuration must be that of {FILE_NAME}, {expected}"
-            yield of_file(file.name, what, found)
+            yield of_file(file.name, what, own)
         elif file.config != manifest.config:
             what = f"filters, split and limits must be those of {FILE_NAME}"
             yield of_file(file.name, what, "others; run `drakegrasp assemble` again")

@@ -1,9 +1,8 @@
-"""What is wrong in a file: violations, and the rows in which they are looked for.
+"""Violations, the batches of rows in which rules look for them, and their collection.
 
-In: some columns of a group of a file, as a `Batch`, and for each of its rows whether it is
-bad. Out: `Violation`s, one line each with file, row and figure, gathered by `Findings`. What
-is bad is for the rules to say (`layout`, `samples`, `images`, `trials`, `consistency`); here are
-only the tools and the tolerances that more than one of them uses.
+In: rows of a group of a file, as a `Batch`, and for each whether it is bad. Out: `Violation`s,
+one line each with file, row and figure, collected by `Findings`. The rules themselves are in
+`layout`, `samples`, `images`, `trials` and `consistency`; here is what more than one of them uses.
 """
 
 from __future__ import annotations
@@ -18,11 +17,11 @@ import numpy.typing as npt
 from drakegrasp.frames import X_WT, Array, invert_pose, unpack_pose
 
 AnyArray = npt.NDArray[Any]
-#: Unit vectors and rotations as float32 are good to 2e-7; this leaves room for products.
+#: float32 rounds unit vectors and rotations by 2e-7; this leaves room for products.
 UNIT_TOLERANCE = 1e-5
-#: Points within a metre or two as float32 are good to 1e-7 m; likewise.
+#: float32 rounds points within a metre or two by 1e-7 m; this leaves room for products.
 POSITION_TOLERANCE = 1e-5  # [m]
-#: Rows that one broken invariant lists for a group of a file before it only counts them.
+#: Rows listed per broken invariant and group; further rows are only counted.
 MAX_LISTED = 20
 
 
@@ -35,7 +34,7 @@ class Violation:
         group: Group or split within the file, e.g. `/train`; empty for the whole file.
         row: Row of the group; None for all of it.
         what: The invariant in words, with its unit.
-        got: The figure that breaks it.
+        got: The value that breaks it.
     """
 
     file: str
@@ -60,9 +59,10 @@ class Batch:
     """Some rows of one group.
 
     Attributes:
-        file, group: Where they are from.
-        rows: (n,) their numbers.
-        columns: Values by field, each (n, ...).
+        file: Path within the dataset's directory.
+        group: Group of the file, e.g. `/train`.
+        rows: (n,), numbers of the rows in the group.
+        columns: Values by field, (n, ...) each.
     """
 
     file: str
@@ -77,7 +77,7 @@ class Batch:
         return self.columns[name]
 
     def pose(self, name: str) -> Array:
-        """Return the poses (n, 4, 4) of a field."""
+        """Return the poses (n, 4, 4) in a field."""
         return unpack_pose(self.columns[name])
 
     def frame(self, name: str) -> Array:
@@ -89,12 +89,12 @@ class Batch:
         return self.frame(f"cam2work_{camera}") @ invert_pose(X_WT) @ self.frame("world2obj")
 
     def contacts(self) -> tuple[Array, Array]:
-        """Return points and normals of the grasps, (n, k, 3) each, in the camera frame."""
+        """Return p_CQ [m] and nhat_Q_C of the grasps, (n, k, 3) each."""
         vectors = self.columns["grasps"].astype(float).reshape(len(self), 2, -1, 3)
         return vectors[:, 0], vectors[:, 1]
 
     def without(self, rows: set[int]) -> Batch:
-        """Return the batch without some rows, given by their numbers."""
+        """Return the batch without rows of these numbers."""
         keep = ~np.isin(self.rows, sorted(rows))
         return Batch(
             file=self.file,
@@ -106,7 +106,13 @@ class Batch:
     def broken(
         self, what: str, bad: AnyArray, got: Callable[[int], str] | AnyArray
     ) -> Iterator[Violation]:
-        """Yield a violation of each row where `bad` (n,) is true."""
+        """Yield a violation for each row where `bad` (n,) is true.
+
+        Args:
+            what: The invariant in words.
+            bad: (n,) bool.
+            got: The values (n,) that break it, or their text by index into the batch.
+        """
         for i in np.flatnonzero(bad).tolist():
             figure = got(i) if callable(got) else f"{got[i].item():.6g}"
             yield Violation(
@@ -116,13 +122,13 @@ class Batch:
 
 @dataclass
 class Findings:
-    """Violations as they are found, each invariant's up to a limit for a group of a file."""
+    """The violations of a check, up to MAX_LISTED per invariant and group of a file."""
 
     _listed: dict[tuple[str, str, str], list[Violation]] = field(default_factory=dict)
     _more: dict[tuple[str, str, str], int] = field(default_factory=dict)
 
     def add(self, violations: Iterable[Violation]) -> set[int]:
-        """Take violations and return the rows that they are in."""
+        """Collect violations; return the rows that they are in."""
         rows = set()
         for violation in violations:
             key = (violation.file, violation.group, violation.what)
@@ -136,7 +142,7 @@ class Findings:
         return rows
 
     def violations(self) -> list[Violation]:
-        """Return what was listed, with a line for what was only counted."""
+        """Return the listed violations, with a line for those that were only counted."""
         result = []
         for key, listed in self._listed.items():
             result += listed
@@ -148,12 +154,12 @@ class Findings:
 
 
 def all_per_row(values: AnyArray) -> AnyArray:
-    """Return for each row (n,) whether all of (n, ...) is true."""
+    """Return for each row (n,) whether all of its values (n, ...) are true."""
     return np.asarray(values.all(axis=tuple(range(1, values.ndim))))
 
 
 def unit_length(batch: Batch, lengths: Array, what: str) -> Iterator[Violation]:
-    """Lengths (n, k), by finger, are one."""
+    """Lengths (n, k) by finger are one."""
     for k in range(lengths.shape[1]):
         yield from batch.broken(
             f"{what} {k + 1} must have length 1 within {UNIT_TOLERANCE:g}",
@@ -165,7 +171,7 @@ def unit_length(batch: Batch, lengths: Array, what: str) -> Iterator[Violation]:
 def rotation(batch: Batch, name: str) -> Iterator[Violation]:
     """The pose of that name has an orthonormal rotation with determinant +1."""
     R = batch.pose(name)[:, :3, :3]
-    # A pose that is due to be NaN is not a pose: `trials.stages` looks after those.
+    # Poses that are NaN are none: `trials.stages` says where they must be.
     R = np.where(np.isfinite(R).all(axis=(1, 2), keepdims=True), R, np.eye(3))
     skew = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
     determinant = np.linalg.det(R)

@@ -1,8 +1,7 @@
-"""What must hold in the images of a sample: what is seen is the object and the table.
+"""Rules of the images of a sample: they show the object and the table.
 
-In: a `Batch` of samples of one data file and the `Lens` it was taken with, for what is seen
-of the object its mesh too. Out: a `Violation` for every row and figure that is wrong. No
-file is read.
+In: a `Batch` of samples of one data file, the `Lens` of its camera, and for some rules the mesh of
+the object. Out: a `Violation` for every row that is wrong. No file is read.
 """
 
 from __future__ import annotations
@@ -18,19 +17,20 @@ from drakegrasp.frames import Array, invert_pose, transform_points
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.vision.camera import intrinsics, project, unproject
 
-#: Depth images reproduce the table and the mesh to 1e-6 m when the lens is right. Half a pixel
-#: of error moves them by 1 to 3 mm, so this tells the two apart.
+#: With the right lens, depth images reproduce the table and the mesh to 1e-6 m. An error of half a
+#: pixel moves them by 1 to 3 mm.
 DEPTH_TOLERANCE = 3e-4  # [m]
-#: A contact on the object's outline falls beside the mask by rounding, and a contact point may
-#: be off the full mesh by what the collision mesh and `filters.max_surface_distance` allow.
+#: A contact on the object's outline may be rounded to a pixel beside the mask, and the collision
+#: mesh and `filters.max_surface_distance` allow it to be off the full mesh.
 MASK_TOLERANCE = 2.0  # [px]
-#: A contact is on the surface that is seen or behind it; at outlines the depth image jumps, so
-#: the nearest surface within this many pixels counts, and the same 2 mm and a slope are allowed.
+#: A contact is on the visible surface or behind it. At outlines the depth image jumps, so the
+#: nearest surface within this many pixels counts. BEFORE_SURFACE is the 2 mm of
+#: `filters.max_surface_distance` and the slope of the surface within those pixels.
 SILHOUETTE = 2  # [px]
 BEFORE_SURFACE = 5e-3  # [m]
-#: The image frame's origin is the mask's centroid itself, unprojected.
+#: The image frame's origin is the unprojected centroid of the mask: only rounding separates them.
 CENTROID_TOLERANCE = 0.05  # [px]
-#: Mask pixels per image whose distance from the mesh is measured; the box test takes all.
+#: Mask pixels per image whose distance from the mesh is measured; all are tested against the box.
 MEASURED_PIXELS = 16
 #: The table's slab (models/table.sdf): half edges and centre in {T} [m].
 TABLE_HALF = np.array([0.8, 0.8, 0.05])
@@ -39,7 +39,13 @@ P_TTABLE = np.array([0.0, 0.0, -0.05])
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Lens:
-    """The camera of a data file: its name, matrix K (3, 3) [px] and range [m]."""
+    """The camera of a data file.
+
+    Attributes:
+        camera: `oto` or `otm`.
+        K: Camera matrix (3, 3) [px].
+        near, far: Range of the depth image [m].
+    """
 
     camera: str
     K: Array
@@ -48,7 +54,7 @@ class Lens:
 
     @classmethod
     def of(cls, camera: str, config: CameraConfig) -> Lens:
-        """Return the lens of a configuration; images hold its range rounded to float32."""
+        """Return the lens of a configuration; its range is rounded to float32, as images are."""
         return cls(
             camera=camera,
             K=intrinsics(config),
@@ -58,7 +64,7 @@ class Lens:
 
 
 def image_values(batch: Batch, lens: Lens) -> Iterator[Violation]:
-    """Colours are within 0..1, depths within near..far."""
+    """Colours are within 0..1 and depths within near..far."""
     colour, depth = batch["images"][:, :3], batch["images"][:, 3]
     for what, values, low, high in (
         ("colours must be within 0..1", colour, 0.0, 1.0),
@@ -74,7 +80,7 @@ def image_values(batch: Batch, lens: Lens) -> Iterator[Violation]:
 
 
 def mask_values(batch: Batch) -> Iterator[Violation]:
-    """A mask holds nothing but 0 and 1, and at least one 1."""
+    """A mask holds only 0 and 1, and at least one 1."""
     largest = batch["masks"].reshape(len(batch), -1).max(axis=1)
     yield from batch.broken("mask must hold 0 and 1 only", largest > 1, largest)
     yield from batch.broken(
@@ -83,7 +89,8 @@ def mask_values(batch: Batch) -> Iterator[Violation]:
 
 
 def image_frames(batch: Batch, lens: Lens) -> Iterator[Violation]:
-    """The image frame is before the camera, faces away, and in otm starts at the centroid."""
+    """The image frame is before the camera, faces away from it, and in otm is at the centroid."""
+    # Place and direction.
     X_CI = batch.frame("cam2img_otm")
     yield from batch.broken(
         "frame_cam2img_otm must start before the camera [m]", X_CI[:, 2, 3] <= 0.0, X_CI[:, 2, 3]
@@ -94,6 +101,8 @@ def image_frames(batch: Batch, lens: Lens) -> Iterator[Violation]:
         turned > UNIT_TOLERANCE,
         lambda i: np.array2string(X_CI[i, :3, 0], precision=4),
     )
+
+    # The frame was estimated from the otm mask, so only that file can confirm its origin.
     if lens.camera == "otm":
         ahead = X_CI[:, 2, 3] > 0.0
         off = np.zeros(len(batch))
@@ -107,13 +116,14 @@ def image_frames(batch: Batch, lens: Lens) -> Iterator[Violation]:
         )
 
 
-# What is seen
+# What the images show
 
 
 def contacts_in_image(batch: Batch, lens: Lens) -> Iterator[Violation]:
-    """Contacts project onto the mask, and lie on the surface that is seen or behind it."""
+    """Contacts project onto the mask, and lie on the visible surface or behind it."""
     p_CQ, _ = batch.contacts()
     for finger in range(p_CQ.shape[1]):
+        # How far each contact is beside the mask [px], and before the surface there [m].
         z = p_CQ[:, finger, 2]
         beside, before = np.zeros(len(batch)), np.zeros(len(batch))
         for i in np.flatnonzero(z > 0.0):
@@ -122,6 +132,7 @@ def contacts_in_image(batch: Batch, lens: Lens) -> Iterator[Violation]:
             beside[i] = np.hypot(u - pixel[0], v - pixel[1]).min()
             if beside[i] <= MASK_TOLERANCE:
                 before[i] = _nearest_depth(batch["images"][i, 3], pixel) - z[i]
+
         yield from batch.broken(
             f"contact of finger {finger + 1} must be before the camera [m]", z <= 0.0, z
         )
@@ -139,16 +150,19 @@ def contacts_in_image(batch: Batch, lens: Lens) -> Iterator[Violation]:
 
 
 def table_pixels(batch: Batch, lens: Lens) -> Iterator[Violation]:
-    """What is seen beside the object, nearer than far, is the table."""
+    """Pixels beside the mask, nearer than far, show the table."""
     X_TC = invert_pose(batch.frame(f"cam2work_{lens.camera}"))
     off = np.zeros(len(batch))
     for i in range(len(batch)):
         depth = batch["images"][i, 3]
-        p_TQ = _seen_points(X_TC[i], lens, depth, (batch["masks"][i] == 0) & (depth < lens.far))
+        p_TQ = _points(X_TC[i], lens, depth, (batch["masks"][i] == 0) & (depth < lens.far))
+
+        # Distance from the surface of the slab, from outside and from inside.
         outside = np.abs(p_TQ - P_TTABLE) - TABLE_HALF
         distance = np.linalg.norm(np.maximum(outside, 0.0), axis=1)
         distance += np.abs(np.minimum(outside.max(axis=1, initial=-np.inf), 0.0))
         off[i] = distance.max(initial=0.0)
+
     yield from batch.broken(
         f"points beside the mask must be on the table within {DEPTH_TOLERANCE:g} m",
         off > DEPTH_TOLERANCE,
@@ -157,11 +171,12 @@ def table_pixels(batch: Batch, lens: Lens) -> Iterator[Violation]:
 
 
 def object_pixels(batch: Batch, lens: Lens, model: ObjectModel) -> Iterator[Violation]:
-    """What is seen in the mask is the object: in its bounding box, and on its surface."""
+    """Pixels in the mask show the object: all are in its box, and some are on its mesh."""
+    # All pixels against the box, which is cheap; keep some for the mesh.
     X_OC = invert_pose(batch.object_in_camera(lens.camera))
     beyond, chosen = np.zeros(len(batch)), []
     for i in range(len(batch)):
-        p_OQ = _seen_points(X_OC[i], lens, batch["images"][i, 3], batch["masks"][i] == 1)
+        p_OQ = _points(X_OC[i], lens, batch["images"][i, 3], batch["masks"][i] == 1)
         beyond[i] = (np.abs(p_OQ) - model.half_extents).max()
         chosen.append(p_OQ[np.linspace(0, len(p_OQ) - 1, MEASURED_PIXELS).astype(int)])
     yield from batch.broken(
@@ -169,6 +184,8 @@ def object_pixels(batch: Batch, lens: Lens, model: ObjectModel) -> Iterator[Viol
         beyond > DEPTH_TOLERANCE,
         beyond,
     )
+
+    # The chosen pixels against the mesh.
     _, distance, _ = model.visual.nearest.on_surface(np.concatenate(chosen))
     off = distance.reshape(len(batch), -1).max(axis=1)
     yield from batch.broken(
@@ -179,14 +196,14 @@ def object_pixels(batch: Batch, lens: Lens, model: ObjectModel) -> Iterator[Viol
 
 
 def _nearest_depth(depth: AnyArray, pixel: Array) -> float:
-    """Return the least depth [m] around a pixel, clipped into the image."""
+    """Return the least depth [m] around a pixel (2,), which is clipped into the image."""
     size = len(depth)
     u, v = np.clip(np.rint(pixel), 0, size - 1).astype(int)
     low = np.maximum([v - SILHOUETTE, u - SILHOUETTE], 0)
     return float(depth[low[0] : v + SILHOUETTE + 1, low[1] : u + SILHOUETTE + 1].min())
 
 
-def _seen_points(X_AC: Array, lens: Lens, depth: AnyArray, chosen: AnyArray) -> Array:
+def _points(X_AC: Array, lens: Lens, depth: AnyArray, chosen: AnyArray) -> Array:
     """Return the points p_AQ (m, 3) of the pixels where `chosen` (S, S) is true."""
     v, u = np.nonzero(chosen)
     return transform_points(X_AC, unproject(lens.K, np.column_stack([u, v]), depth[v, u]))

@@ -1,8 +1,7 @@
 """An HDF5 file of a dataset while it is checked.
 
-In: a file, whatever is in it. Out: batches of its rows, of the groups whose layout is sound.
-A row that broke a rule, or that cannot be read, is remembered, so that no other rule is
-asked about it.
+In: a file with any content. Out: batches of the rows of those groups whose layout is sound. Rows
+that break a rule, or cannot be read, are remembered, so that no further rule judges them.
 """
 
 from __future__ import annotations
@@ -25,6 +24,7 @@ from drakegrasp.dataset.schema import (
     TRIAL_FIELDS,
     Field,
 )
+from drakegrasp.errors import first_line
 
 Rule = Callable[[Batch], Iterator[Violation]]
 
@@ -34,12 +34,12 @@ class OpenFile:
     """An open file.
 
     Attributes:
-        name: Of the file, for the violations.
+        name: Name of the file, for the violations.
         file: The file.
-        config: That it holds, if it is sound.
-        fields: Of each group, by its name.
-        groups: By name, without those whose layout is broken.
-        bad_rows: Of each group, those that broke a rule or cannot be read.
+        config: Its configuration, if it is sound.
+        fields: Fields of each group, by the group's name.
+        groups: Groups by name, without those whose layout is broken.
+        bad_rows: Rows of each group that break a rule or cannot be read.
     """
 
     name: str
@@ -50,24 +50,33 @@ class OpenFile:
     bad_rows: dict[str, set[int]] = field(default_factory=dict)
 
     def count(self, group: str) -> int:
-        """Return the number of rows of a group."""
+        """Return the number of rows of a group; 0 if it is missing or broken."""
         return len(self.groups[group][self.fields[group][0].name]) if group in self.groups else 0
 
     def bad(self, group: str) -> list[int]:
-        """Return the rows of a group that broke a rule or cannot be read."""
+        """Return the rows of a group that break a rule or cannot be read."""
         return sorted(self.bad_rows.get(group, ()))
 
     def read(self, group: str, rows: AnyArray, names: Sequence[str] | None = None) -> Batch:
-        """Return some rows, in rising order, of a group; of all fields unless some are named."""
+        """Return some rows of a group.
+
+        Args:
+            group: Name of the group.
+            rows: (n,), numbers of the rows, rising.
+            names: Fields to read; all if None.
+
+        Raises:
+            OSError, UnicodeDecodeError: If the file is damaged there.
+        """
         fields = [f for f in self.fields[group] if names is None or f.name in names]
-        # A slice is read far faster than the same rows as a list.
+        # HDF5 reads a slice far faster than the same rows as a list.
         dense = len(rows) > 0 and rows[-1] - rows[0] + 1 == len(rows)
         choice = slice(int(rows[0]), int(rows[-1]) + 1) if dense else rows
         columns = {f.name: column(self.groups[group][f.name], f)[choice] for f in fields}
         return Batch(file=self.name, group=f"/{group}", rows=rows, columns=columns)
 
     def batches(self, group: str, size: int, findings: Findings) -> Iterator[Batch]:
-        """Yield all rows of a group; rows that cannot be read are a finding."""
+        """Yield all rows of a group, `size` at a time; rows that cannot be read are a finding."""
         for start in range(0, self.count(group), size):
             rows = np.arange(start, min(start + size, self.count(group)))
             try:
@@ -78,7 +87,7 @@ class OpenFile:
                 self.bad_rows.setdefault(group, set()).update(rows.tolist())
 
     def judge(self, batch: Batch, findings: Findings, *rules: Rule) -> Batch:
-        """Apply rules that do not build on each other; return the rows that hold."""
+        """Apply rules that do not build on each other; return the rows that break none."""
         if not len(batch):
             return batch
         rows: set[int] = set()
@@ -89,16 +98,19 @@ class OpenFile:
 
 
 def open_file(name: str, file: h5py.File, camera: str, findings: Findings) -> OpenFile:
-    """Return a file, once it is checked what it says of itself and how it is laid out.
+    """Check the attributes and the layout of a file, and return it for the rules of its rows.
 
     Args:
-        name: Of the file, for the violations.
+        name: Name of the file, for the violations.
         file: The file.
         camera: `oto` or `otm`; empty for the trials.
         findings: Where violations go.
     """
+    # Its attributes.
     config, broken = layout_rules.read_config(name, file)
     findings.add([*broken, *layout_rules.attributes(name, file, config, camera)])
+
+    # Its layout: a group with a broken dataset is not read.
     fields = (
         {split: DATA_FIELDS for split in SPLITS}
         if camera
@@ -115,10 +127,5 @@ def open_file(name: str, file: h5py.File, camera: str, findings: Findings) -> Op
 
 
 def column(dataset: h5py.Dataset, field: Field) -> Any:
-    """Return a dataset as it is indexed for values: text for a field of text."""
+    """Return a dataset whose rows read as values of the field: text as str."""
     return dataset.asstr() if field.dtype == "str" else dataset
-
-
-def first_line(error: Exception) -> str:
-    """Return what an exception says, in a line."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]

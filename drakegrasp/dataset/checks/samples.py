@@ -1,9 +1,9 @@
-"""What must hold in the numbers of a sample: its grasp, frames and mass properties.
+"""Rules of the numbers of a sample: its grasp, frames and mass properties.
 
-In: a `Batch` of samples of one data file, and what it is compared with: the object's model,
-its trials, the other data file. Out: a `Violation` for every row and figure that is wrong.
-A rule may rely on those that `check` applies before it, because it is given no row that
-broke one of them. No file is read.
+In: a `Batch` of samples of one data file, and the object's model, the trials or the samples of the
+other data file to compare with. Out: a `Violation` for every row that is wrong. A rule relies on
+those that `data_file` applies before it: it is given no row that breaks one of them. No file is
+read.
 """
 
 from __future__ import annotations
@@ -53,13 +53,13 @@ def normals(batch: Batch) -> Iterator[Violation]:
 
 
 def frames(batch: Batch) -> Iterator[Violation]:
-    """Every frame's rotation is orthonormal with determinant +1."""
+    """The rotation of every frame is orthonormal with determinant +1."""
     for name in FRAMES:
         yield from rotation(batch, name)
 
 
 def work_frame(batch: Batch) -> Iterator[Violation]:
-    """The table-top frame is where it always is."""
+    """The table-top frame is at P_WT."""
     off = np.abs(batch.frame("world2work") - X_WT).max(axis=(1, 2))
     yield from batch.broken(
         f"frame_world2work must be the identity at {P_WT.tolist()} m",
@@ -69,7 +69,10 @@ def work_frame(batch: Batch) -> Iterator[Violation]:
 
 
 def mass_properties(batch: Batch) -> Iterator[Violation]:
-    """Masses are positive; inertias are symmetric and those of a real body."""
+    """Masses are positive; inertias are symmetric and possible for a body.
+
+    The principal moments of a body are positive, and none is more than the sum of the others.
+    """
     mass = batch["object_props/work2mass"][:, 0].astype(float)
     yield from batch.broken("work2mass must be positive [kg]", mass <= 0.0, mass)
     inertia = batch["object_props/work2inertia"].astype(float).reshape(-1, 3, 3)
@@ -85,11 +88,11 @@ def mass_properties(batch: Batch) -> Iterator[Violation]:
     )
 
 
-# How the frames of a sample belong together
+# The frames of a sample among each other
 
 
 def inverse_frames(batch: Batch) -> Iterator[Violation]:
-    """work2cam and cam2work are each other's inverse."""
+    """work2cam and cam2work are inverse to each other."""
     for camera in CAMERAS:
         product = batch.frame(f"work2cam_{camera}") @ batch.frame(f"cam2work_{camera}")
         off = np.abs(product - np.eye(4)).max(axis=(1, 2))
@@ -101,7 +104,7 @@ def inverse_frames(batch: Batch) -> Iterator[Violation]:
 
 
 def camera_pair(batch: Batch) -> Iterator[Violation]:
-    """Both cameras stand at one point and look the same way; otm has world up at the top."""
+    """Both cameras have one place and one view direction; otm has world up at the top."""
     oto, otm = (batch.frame(f"work2cam_{camera}") for camera in CAMERAS)
     off = np.abs(oto[:, :3, 2:] - otm[:, :3, 2:]).max(axis=(1, 2))
     yield from batch.broken(
@@ -125,9 +128,16 @@ def contacts_on_mesh(
 ) -> Iterator[Violation]:
     """Contacts are on the mesh, and their normals point out of it.
 
-    A normal counts as outward if it agrees with the face that is nearest to the contact, or
-    to a point that far ahead of it: in a thin wall, the wrong side may be the nearest.
+    A normal counts as outward if it agrees with the face nearest to the contact, or with the face
+    nearest to the point `max_distance` ahead of it: on a thin wall the wrong side may be nearer.
+
+    Args:
+        batch: Samples of one object.
+        camera: `oto` or `otm`, the camera of their grasps.
+        model: The object.
+        max_distance: Largest distance of a contact from the mesh [m].
     """
+    # Contacts, distances and faces in {O}.
     X_OC = invert_pose(batch.object_in_camera(camera))
     p_CQ, n_C = batch.contacts()
     p_OQ, n_O = _move(X_OC, p_CQ), _rotate(X_OC, n_C)
@@ -136,9 +146,12 @@ def contacts_on_mesh(
     _, distance, face = nearest.on_surface(p_OQ.reshape(-1, 3))
     _, _, ahead = nearest.on_surface((p_OQ + max_distance * n_O).reshape(-1, 3))
     off = distance.reshape(shape)
+
+    # The smaller angle between a normal and the normals of the two faces.
     flat = n_O.reshape(-1, 3)
     cosine = np.maximum((flat * face_normals[face]).sum(1), (flat * face_normals[ahead]).sum(1))
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).reshape(shape)
+
     limit = max_distance + POSITION_TOLERANCE
     for k in range(shape[1]):
         yield from batch.broken(
@@ -155,6 +168,7 @@ def contacts_on_mesh(
 
 def object_values(batch: Batch, model: ObjectModel) -> Iterator[Violation]:
     """Class and mass properties are those of the object at rest."""
+    # Mass properties in {T}.
     X_TO = invert_pose(X_WT) @ batch.frame("world2obj")
     R_TO = X_TO[:, :3, :3]
     com = R_TO @ model.p_OOcm + X_TO[:, :3, 3]
@@ -170,11 +184,12 @@ def object_values(batch: Batch, model: ObjectModel) -> Iterator[Violation]:
             off > tolerance,
             lambda i, off=off: f"a difference of {off[i]:.4g}",  # type: ignore[misc]
         )
-    found = batch["object_props/class_name"]
+
+    class_names = batch["object_props/class_name"]
     yield from batch.broken(
         f"class_name of {model.name} must be {model.class_name!r}",
-        found != model.class_name,
-        lambda i: repr(found[i]),
+        class_names != model.class_name,
+        lambda i: repr(class_names[i]),
     )
 
 
@@ -184,7 +199,15 @@ def object_values(batch: Batch, model: ObjectModel) -> Iterator[Violation]:
 def same_as_trial(
     batch: Batch, trials: Mapping[str, AnyArray], camera: str, config: CameraConfig
 ) -> Iterator[Violation]:
-    """Pose, cameras and contacts of a sample are those of its trial, given row by row."""
+    """Pose, cameras and contacts of a sample follow from its trial.
+
+    Args:
+        batch: The samples.
+        trials: Columns of their trials, a row per sample.
+        camera: `oto` or `otm`, the camera of their grasps.
+        config: The camera.
+    """
+    # The object's pose and both cameras' poses.
     X_TO, X_OG = unpack_pose(trials["X_TO"]), unpack_pose(trials["X_OG"])
     poses = {"frame_world2obj": X_WT @ X_TO}
     for name, pose in zip(CAMERAS, (camera_pose_oto, camera_pose_otm), strict=True):
@@ -198,6 +221,8 @@ def same_as_trial(
             off > POSITION_TOLERANCE,
             lambda i, off=off: f"a pose that is off by {off[i]:.4g}",  # type: ignore[misc]
         )
+
+    # The contacts, in the camera frame.
     X_CO = batch.frame(f"cam2work_{camera}") @ X_TO
     p_CQ, n_C = _move(X_CO, trials["closed_p_OQ"]), _rotate(X_CO, trials["closed_nhat_Q_O"])
     points, normals = batch.contacts()
@@ -223,10 +248,10 @@ def same_properties(batch: Batch, other: Batch) -> Iterator[Violation]:
 
 
 def _move(X_AB: Array, p_BQ: Array) -> Array:
-    """Return points (n, k, 3), moved by the pose (n, 4, 4) of their row."""
+    """Return points p_AQ (n, k, 3), given the pose (n, 4, 4) of each row."""
     return _rotate(X_AB, p_BQ) + X_AB[:, None, :3, 3]
 
 
 def _rotate(X_AB: Array, v_B: Array) -> Array:
-    """Return vectors (n, k, 3), rotated by the pose (n, 4, 4) of their row."""
+    """Return vectors v_A (n, k, 3), given the pose (n, 4, 4) of each row."""
     return np.asarray(np.einsum("nij,nkj->nki", X_AB[:, :3, :3], v_B))

@@ -1,8 +1,8 @@
-"""What must hold in the rows of trials.hdf5: numbers, stages, contacts, poses, the verdict.
+"""Rules of the rows of trials.hdf5: numbers, stages, contacts, poses, the verdict.
 
-In: a `Batch` of rows of `/trials`. Out: a `Violation` for every row and figure that is wrong.
-A rule may rely on those that `check` applies before it, because it is given no row that
-broke one of them. No file is read.
+In: a `Batch` of rows of `/trials`. Out: a `Violation` for every row that is wrong. A rule relies
+on those that `trials_file` applies before it: it is given no row that breaks one of them. No file
+is read.
 """
 
 from __future__ import annotations
@@ -22,41 +22,47 @@ from drakegrasp.dataset.checks.findings import (
 )
 from drakegrasp.dataset.schema import TRIAL_FIELDS
 from drakegrasp.outcomes import Outcome, Stage
+from drakegrasp.simulation.verdict import judge_closed, judge_lifted
 
-#: A patch's mean normal and its force are two averages: where a fingertip is just losing the
-#: object they may disagree by as much as the force from which on a contact counts [N].
+#: Largest outward force of a fingertip on the object [N]. The mean normal and the force of a patch
+#: are separate averages: where a fingertip is about to lose the object they may disagree, by no
+#: more than the force from which on a contact counts.
 PULL = 0.05
 
 
 def numbers(
     batch: Batch, objects: int, candidates: Sequence[int] | None, standoffs: int | None
 ) -> Iterator[Violation]:
-    """Numbers of a trial are legal: its own row, outcome, object, candidate, stand-off.
+    """The numbers of a trial are legal: its id, outcome, object, candidate and stand-off.
 
     Args:
         batch: Rows of `/trials`.
         objects: Number of objects.
-        candidates: Number of candidates by object, if they are known.
-        standoffs: Number of stand-offs, if it is known.
+        candidates: Number of candidates by object, if known.
+        standoffs: Number of stand-offs, if known.
     """
+    # The trial itself.
     yield from batch.broken(
         "trial_id must be the row's number", batch["trial_id"] != batch.rows, batch["trial_id"]
     )
-    outcome, known = batch["outcome"], [o.value for o in Outcome if not o.only_verified]
+    outcome, known = batch["outcome"], [o.value for o in Outcome if not o.verification_only]
     yield from batch.broken(f"outcome must be 0..{max(known)}", ~np.isin(outcome, known), outcome)
+
+    # Its object, and its candidate among the object's.
     index, candidate = batch["object"], batch["candidate"]
-    wild = (index < 0) | (index >= objects)
-    yield from batch.broken(f"object must be a row of /objects, 0..{objects - 1}", wild, index)
+    unknown = (index < 0) | (index >= objects)
+    yield from batch.broken(f"object must be a row of /objects, 0..{objects - 1}", unknown, index)
     limit = np.full(objects, np.iinfo(np.int64).max)
     if candidates is not None and len(candidates) == objects:
         limit = np.array(candidates, dtype=np.int64)
-    # An index out of range is found above; any object's limit will do for it.
-    above = candidate >= np.take(limit, index, mode="clip") if objects else np.zeros_like(wild)
+    # An unknown object is a finding already; any object's limit will do.
+    above = candidate >= np.take(limit, index, mode="clip") if objects else np.zeros_like(unknown)
     yield from batch.broken(
         "candidate must be one of its object's candidates",
-        ~wild & ((candidate < 0) | above),
+        ~unknown & ((candidate < 0) | above),
         candidate,
     )
+
     if standoffs is not None:
         number = batch["standoff_index"]
         yield from batch.broken(
@@ -65,20 +71,20 @@ def numbers(
 
 
 def stages(batch: Batch) -> Iterator[Violation]:
-    """A stage's fields have values where the attempt came that far and nowhere else."""
+    """The fields of a stage have values if the attempt reached it, and none otherwise."""
     stage = _stages(batch)
     for f in TRIAL_FIELDS:
         values = batch[f.name]
-        came = stage >= f.stage
+        reached = stage >= f.stage
         if np.dtype(f.dtype).kind != "f":
-            bad = ~came & ~all_per_row(values == 0)
+            bad = ~reached & ~all_per_row(values == 0)
             what = f"{f.name} must be 0 before the stage {f.stage.name.lower()}"
         elif f.per_finger:
-            touching = came[:, None] & batch[f"{f.name.split('_')[0]}_touching"]
+            touching = reached[:, None] & batch[f"{f.name.split('_')[0]}_touching"]
             bad = ~all_per_row(_as_due(values, touching[:, :, None]))
             what = f"{f.name} must be finite where the finger touches and NaN elsewhere"
         else:
-            due = came.reshape(-1, *(1,) * (values.ndim - 1))
+            due = reached.reshape(-1, *(1,) * (values.ndim - 1))
             bad = ~all_per_row(_as_due(values, due))
             what = f"{f.name} must be finite from the stage {f.stage.name.lower()} on"
             what += "" if f.stage is Stage.PLACED else " and NaN before"
@@ -86,27 +92,14 @@ def stages(batch: Batch) -> Iterator[Violation]:
 
 
 def verdicts(batch: Batch) -> Iterator[Violation]:
-    """The outcome is what follows from the contacts that were recorded (`trial.judge_*`)."""
-    lifted = batch["lifted_touching"]
-    expected = np.select(
-        [
-            ~batch["closed_touching"].all(axis=1),
-            batch["closed_other_links"] > 0,
-            batch["closed_hand_on_table"],
-            ~lifted.any(axis=1) & (batch["lifted_other_links"] == 0),
-            ~lifted.all(axis=1),
-            batch["lifted_object_on_table"],
-        ],
-        [
-            Outcome.MISSING_FINGERTIP.value,
-            Outcome.HAND_CONTACT.value,
-            Outcome.TABLE_CONTACT.value,
-            Outcome.DROPPED.value,
-            Outcome.SLIPPED.value,
-            Outcome.TABLE_CONTACT.value,
-        ],
-        Outcome.SUCCESS.value,
+    """The outcome is what follows from the recorded contacts (`simulation.verdict`)."""
+    closed = judge_closed(
+        batch["closed_touching"], batch["closed_other_links"], batch["closed_hand_on_table"]
     )
+    lifted = judge_lifted(
+        batch["lifted_touching"], batch["lifted_other_links"], batch["lifted_object_on_table"]
+    )
+    expected = np.where(closed != Outcome.SUCCESS, closed, lifted)
     judged = _stages(batch) >= Stage.CLOSED
     yield from batch.broken(
         "outcome must follow from the contacts",
@@ -119,10 +112,10 @@ def verdicts(batch: Batch) -> Iterator[Violation]:
 
 
 def contacts(batch: Batch) -> Iterator[Violation]:
-    """Fingertips that touch have a patch, a unit normal, and push into an object that is held.
+    """Fingertips that touch have a patch and a unit normal, and push into an object that is held.
 
-    Where an object slides through the hand a patch may lie across a rim, with faces that look in
-    opposite directions: their mean normal then says nothing of the force.
+    Where an object slides through the hand, a patch may span a rim with faces in opposite
+    directions: their mean normal then does not tell the direction of the force.
     """
     success = batch["outcome"] == Outcome.SUCCESS.value
     for stage, held in (("closed", True), ("lifted", success)):
@@ -130,6 +123,8 @@ def contacts(batch: Batch) -> Iterator[Violation]:
         normals, forces = batch[f"{stage}_nhat_Q_O"], batch[f"{stage}_f_Q_O"]
         lengths = np.where(touching, np.linalg.norm(normals, axis=2), 1.0)
         yield from unit_length(batch, lengths, f"{stage}_nhat_Q_O of finger")
+
+        # Forces, areas and depths, finger by finger.
         push = (normals * forces).sum(axis=2)
         area, depth = batch[f"{stage}_area"], batch[f"{stage}_penetration"]
         for k in range(touching.shape[1]):
@@ -152,13 +147,13 @@ def contacts(batch: Batch) -> Iterator[Violation]:
 
 
 def poses(batch: Batch) -> Iterator[Violation]:
-    """Poses of trials are rotations and positions."""
+    """The rotations of a trial's poses are orthonormal with determinant +1."""
     for name in ("X_TO", "X_OG", "X_TO_lifted"):
         yield from rotation(batch, name)
 
 
 def resting_poses(batch: Batch, X_TO: Sequence[Sequence[float]]) -> Iterator[Violation]:
-    """Every attempt starts from its object's resting pose, given by object as (12,)."""
+    """Every attempt starts from its object's resting pose X_TO (12,), given by object."""
     expected = np.array(X_TO, dtype=float).reshape(-1, 12)[batch["object"].astype(int)]
     off = np.abs(batch["X_TO"] - expected).max(axis=1)
     yield from batch.broken(
@@ -169,11 +164,12 @@ def resting_poses(batch: Batch, X_TO: Sequence[Sequence[float]]) -> Iterator[Vio
 
 
 def _as_due(values: AnyArray, due: AnyArray) -> AnyArray:
-    """Return where values are finite and should be, or NaN and should be."""
+    """Return where values are finite if they are due, and NaN if they are not."""
     return np.asarray(np.where(due, np.isfinite(values), np.isnan(values)))
 
 
 def _stages(batch: Batch) -> AnyArray:
+    """Return the stage (n,) that each attempt reached."""
     table = np.zeros(max(Outcome) + 1, dtype=int)
     table[[o.value for o in Outcome]] = [o.stage.value for o in Outcome]
     # The table can be touched by the hand at closing, or by the object after the lift.

@@ -1,8 +1,8 @@
 """The built-in objects: a table of everyday things, so that a dataset needs no meshes.
 
-Each row of `BUILTIN_OBJECTS` is one object: a class, a variant and a function of
-`solid_shapes` or `hollow_shapes` with its sizes. Nothing is built before `build()` is called. Every
-class has at least two variants, so that a split by class has something on both sides.
+Each row of `BUILTIN_OBJECTS` is one object: a class, a variant and a function of `solid_shapes`,
+`revolved_shapes` or `hollow_shapes` with its sizes. Nothing is built before `build()` is called.
+Every class has at least two variants, so that a split by class has something on both sides.
 `export_builtin` writes the meshes as Wavefront files, the same bytes every time.
 
 Sizes are our own, chosen for a hand of the Barrett's size: it spans 0.24 m and its pads
@@ -21,8 +21,9 @@ from typing import Any
 import trimesh
 
 from drakegrasp.errors import MeshError
-from drakegrasp.objects.builtin import hollow_shapes, solid_shapes
+from drakegrasp.objects.builtin import hollow_shapes, revolved_shapes, solid_shapes
 from drakegrasp.objects.builtin.modelling import DECIMALS
+from drakegrasp.runtime.files import write_atomic
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +51,7 @@ _CLASSES: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, dict[str, Any]]]
         },
     ),
     (
-        solid_shapes.bottle,
+        revolved_shapes.bottle,
         {
             "slim": dict(radius=0.030, height=0.200, neck_radius=0.012),
             "stout": dict(radius=0.040, height=0.160, neck_radius=0.016),
@@ -92,7 +93,7 @@ _CLASSES: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, dict[str, Any]]]
         },
     ),
     (
-        solid_shapes.can,
+        revolved_shapes.can,
         {
             "short": dict(radius=0.037, height=0.075),
             "tall": dict(radius=0.033, height=0.120),
@@ -106,7 +107,7 @@ _CLASSES: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, dict[str, Any]]]
         },
     ),
     (
-        solid_shapes.candlestick,
+        revolved_shapes.candlestick,
         {
             "short": dict(foot_radius=0.045, stem_radius=0.010, height=0.120),
             "tall": dict(foot_radius=0.050, stem_radius=0.012, height=0.190),
@@ -133,7 +134,7 @@ _CLASSES: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, dict[str, Any]]]
         },
     ),
     (
-        solid_shapes.flashlight,
+        revolved_shapes.flashlight,
         {
             "small": dict(head_radius=0.026, body_radius=0.015, height=0.120, head_height=0.028),
             "large": dict(head_radius=0.034, body_radius=0.020, height=0.170, head_height=0.036),
@@ -147,7 +148,7 @@ _CLASSES: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, dict[str, Any]]]
         },
     ),
     (
-        solid_shapes.jar,
+        revolved_shapes.jar,
         {
             "small": dict(radius=0.034, height=0.080, lid_radius=0.030, lid_height=0.014),
             "large": dict(radius=0.042, height=0.125, lid_radius=0.038, lid_height=0.018),
@@ -222,14 +223,14 @@ _CLASSES: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, dict[str, Any]]]
         },
     ),
     (
-        solid_shapes.apple,
+        revolved_shapes.apple,
         {
             "small": dict(radius=0.034, height=0.060),
             "large": dict(radius=0.042, height=0.070),
         },
     ),
     (
-        solid_shapes.pear,
+        revolved_shapes.pear,
         {
             "round": dict(radius=0.037, neck_radius=0.020, height=0.085),
             "long": dict(radius=0.036, neck_radius=0.017, height=0.105),
@@ -263,7 +264,7 @@ def builtin_object(name: str) -> BuiltinObject:
     """Return the built-in object of this name.
 
     Raises:
-        MeshError: If there is none; the message lists the names there are.
+        MeshError: If there is none; the message lists the known names.
     """
     for item in BUILTIN_OBJECTS:
         if item.name == name:
@@ -286,24 +287,21 @@ def export_builtin(
     Raises:
         MeshError: If a name is unknown; nothing is written then.
     """
+    # Look up all names before anything is written.
     chosen = BUILTIN_OBJECTS if names is None else [builtin_object(name) for name in names]
     folder = Path(directory)
     folder.mkdir(parents=True, exist_ok=True)
+
     paths = []
     for item in chosen:
         path = folder / f"{item.name}.obj"
-        temporary = folder / f".{item.name}.{os.getpid()}.tmp"
-        try:
-            temporary.write_bytes(_wavefront(item.build()))
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        write_atomic(path, _wavefront(item.build()))
         paths.append(path)
     return paths
 
 
 def _wavefront(mesh: trimesh.Trimesh) -> bytes:
-    """Return a mesh as Wavefront text; we write it ourselves, so that a release changes nothing."""
+    """Return a mesh as Wavefront text; not trimesh's, which may change by release."""
     d = DECIMALS
     lines = [f"v {x:.{d}f} {y:.{d}f} {z:.{d}f}" for x, y, z in mesh.vertices.tolist()]
     lines += [f"f {a} {b} {c}" for a, b, c in (mesh.faces + 1).tolist()]

@@ -1,4 +1,4 @@
-"""Hollow things, one function per class: sizes in metres come in, watertight meshes go out.
+"""Hollow shapes, one function per class: sizes in metres come in, watertight meshes go out.
 
 Every mesh stands on the plane z = 0 as it would on a table, z up;
 `drakegrasp.objects.builtin.catalog` holds the table of sizes.
@@ -116,6 +116,7 @@ def wineglass(
 
     All lengths are in [m].
     """
+    # The cup, outside and inside.
     cup_height = height - stem_height
     outer = smooth(
         [
@@ -128,6 +129,8 @@ def wineglass(
     )
     floor = stem_height + 0.012
     inner = spread_evenly(inset(outer, wall, floor=floor), COARSE * EDGE)[::-1]
+
+    # Foot and stem.
     foot = resample([(0.0, 0.0), (foot_radius, 0.0), (foot_radius, 0.005)], EDGE)
     stem = smooth(
         [
@@ -138,6 +141,8 @@ def wineglass(
         ],
         EDGE,
     )
+
+    # One outline, with longer edges inside.
     bottom = resample([inner[-1], (0.0, floor)], COARSE * EDGE)[1:]
     profile = np.vstack([foot, stem[1:], outer[1:], inner, bottom])
     edges = np.full(len(profile), EDGE)
@@ -294,7 +299,7 @@ def loop_handle(
     """
     angles = np.linspace(0.0, np.pi, 200)
     middle, half = (top + bottom) / 2.0, (top - bottom) / 2.0
-    # A power below one squares the half ellipse, as a hand likes it.
+    # A power below one makes the half ellipse squarer, like a real handle.
     curve = np.column_stack(
         [
             x + reach * np.sin(angles) ** 0.7,

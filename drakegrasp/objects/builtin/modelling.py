@@ -1,9 +1,9 @@
-"""Tools for solids: curves in metres come in, watertight meshes go out.
+"""Modelling of solids: curves in metres come in, watertight meshes go out.
 
-Why not `trimesh.creation` alone: its `revolve` puts the same number of vertices on every
-ring, so that a stem gets slivers where a rim gets good triangles, and its `extrude_polygon`
-needs Shapely. Here each ring has as many vertices as its circumference asks for.
-Booleans are Manifold's, by trimesh. No function draws random numbers.
+`trimesh.creation` is not enough: its `revolve` puts the same number of vertices on every ring, so
+that a stem gets slivers where a rim gets good triangles, and its `extrude_polygon` needs Shapely.
+Here the number of vertices of a ring depends on its circumference. Boolean operations are
+manifold3d's, through trimesh. Nothing is random.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from drakegrasp.frames import Array
 from drakegrasp.mesh.surfaces import Faces
 from drakegrasp.objects.builtin.profiles import EDGE, arc_length, ring_angles, ring_size
 
-#: Vertices are rounded to this many decimals [m], which also removes what rounding errors
-#: could make differ between machines. Files keep the same number.
+#: Vertices are rounded to this many decimals [m], in files too. This also hides the rounding
+#: errors by which machines differ.
 DECIMALS = 7
 
-#: Triangles lower than this [m] are mended after a boolean: contact normals mean little there.
+#: Triangles lower than this [m] are removed after a Boolean operation: their normals mean little.
 SLIVER = 0.0005
 
-#: Bound on those mends; a seam needs some dozens.
+#: Largest number of those repairs; a seam needs some dozens.
 MAX_REPAIRS = 1000
 
 #: A point nearer to the axis than this lies on it, and no edge is shorter [m].
@@ -62,13 +62,13 @@ def solid(vertices: npt.ArrayLike, faces: npt.ArrayLike) -> trimesh.Trimesh:
 def revolve(
     profile: npt.ArrayLike, *, edge: float | npt.ArrayLike = EDGE, closed: bool = False
 ) -> trimesh.Trimesh:
-    """Return the solid of a profile (n, 2) of points (r, z) [m] turned about z.
+    """Return the solid of revolution about z of a profile (n, 2) of points (r, z) [m].
 
     Args:
         profile: Outline from one point of the axis to another, or, if `closed`, a loop
             off the axis. Its points become rings: see `resample` and `smooth`.
         edge: Wanted edge length along a ring [m], one for all or one per point.
-        closed: Whether the last ring joins the first.
+        closed: Whether the last ring is joined to the first.
     """
     points = np.asarray(profile, dtype=float)
     edges = np.broadcast_to(np.asarray(edge, dtype=float), len(points))
@@ -181,7 +181,14 @@ def grid_box(extents: npt.ArrayLike, *, centre: npt.ArrayLike, edge: float) -> t
 
 
 def skin(rings: list[Array], *, closed: bool) -> trimesh.Trimesh:
-    """Return the surface through rings (n_i, 3) that start alike; one point is a tip."""
+    """Return the surface through rings (n_i, 3) of vertices [m].
+
+    Rings begin at the same angle; a ring of one point is a tip.
+
+    Args:
+        rings: In order.
+        closed: Whether the last ring is joined to the first.
+    """
     starts = np.cumsum([0, *(len(ring) for ring in rings)])
     faces: list[tuple[int, int, int]] = []
     pairs = [(k, k + 1) for k in range(len(rings) - 1)]
@@ -230,10 +237,12 @@ def stand(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 def _from_boolean(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """Return the result of a boolean without the slivers along its seams."""
-    # Another order first: the mending below depends on it.
+    # A canonical order first, because the repairs below depend on the order.
     tidy = solid(mesh.vertices, mesh.faces)
     points, faces = tidy.vertices.copy(), tidy.faces.copy()
     refused: set[tuple[int, ...]] = set()
+
+    # The lowest sliver first: collapse its shortest edge if that is short, else flip its longest.
     for _ in range(MAX_REPAIRS):
         lengths, heights = _edge_lengths(points, faces), _heights(points, faces)
         slivers = [
@@ -246,16 +255,16 @@ def _from_boolean(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         if lengths[k].min() < 2.0 * SLIVER:
             short = int(lengths[k].argmin())
             a, b = sliver[short], sliver[(short + 1) % 3]
-            mended = _collapse(faces, a, b)
-            if mended is not None:
+            repaired = _collapse(faces, a, b)
+            if repaired is not None:
                 points[a] = (points[a] + points[b]) / 2.0
         else:
             long = int(lengths[k].argmax())
-            mended = _flip(points, faces, sliver[long], sliver[(long + 1) % 3])
-        if mended is None:
+            repaired = _flip(points, faces, sliver[long], sliver[(long + 1) % 3])
+        if repaired is None:
             refused.add(sliver)
         else:
-            faces = mended
+            faces = repaired
     return solid(points, faces)
 
 
@@ -283,7 +292,7 @@ def _collapse(faces: Faces, a: int, b: int) -> Faces | None:
 
 
 def _flip(points: Array, faces: Faces, a: int, b: int) -> Faces | None:
-    """Return the faces with the edge from `a` to `b` turned, None if that mends nothing."""
+    """Return the faces with the edge from `a` to `b` turned, None if that does not help."""
     pair = np.flatnonzero((faces == a).any(axis=1) & (faces == b).any(axis=1))
     left, right = (
         next(

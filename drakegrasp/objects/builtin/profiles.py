@@ -1,4 +1,4 @@
-"""Curves in the plane: corners and sizes in metres come in, points of even spacing go out.
+"""Curves in the plane: corners and sizes in metres come in, evenly spaced points go out.
 
 A curve is a polyline. It is a profile (r, z) that `drakegrasp.objects.builtin.modelling` turns
 about z, or an outline (x, y) that it moves along a path.
@@ -17,10 +17,10 @@ from drakegrasp.frames import Array
 #: Usual edge length where fingers touch [m]: below the width of a fingertip.
 EDGE = 0.006
 
-#: Edges inside a cavity or below a foot are this much longer: no finger goes there.
+#: Edges inside a cavity or below a foot are longer by this factor: no finger goes there.
 COARSE = 1.7
 
-#: Sizes of a ring. A short ladder, so that neighbouring rings mostly agree and zip up evenly.
+#: Possible numbers of points of a ring: few, so that neighbouring rings mostly have the same.
 RING_SIZES = np.array([8, 12, 16, 24, 32, 48, 64])
 
 #: How far from its ends an inset profile starts to follow the given one [m].

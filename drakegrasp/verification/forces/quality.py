@@ -1,8 +1,8 @@
-"""What forces at a grasp's contact points can do to the object, by linear algebra alone.
+"""Grasp quality: the epsilon of Ferrari and Canny, and the least friction that holds an object.
 
-In: contact points, outward normals, a friction coefficient. Out: the epsilon of Ferrari and
-Canny, and the least friction that holds the object. Contacts are points with Coulomb friction: a
-finger pushes along the inward normal and along the surface, it neither pulls nor twists.
+In: contact points, outward normals, a friction coefficient. Out: measures of what forces at the
+contacts can do; nothing is simulated. Contacts are points with Coulomb friction: a finger pushes
+along the inward normal and along the surface, but neither pulls nor twists.
 
 A wrench here is [torque about Ocm; force], (6,), in axes of {O} [N m, N], in the order of
 Drake's spatial forces.
@@ -27,22 +27,24 @@ from drakegrasp.verification.forces.contact_forces import (
     largest_normal_force,
 )
 
-#: Edges of the pyramid that stands in for a friction cone, inscribed in it. With 16, epsilon
-#: is about 2 % too small and changes by as much with the frame, and the hull takes 15 ms.
+#: Edges of the pyramid that approximates a friction cone from inside. With 16, epsilon is about
+#: 2 % too small and varies by as much with the frame; the hull takes 15 ms.
 FRICTION_EDGES = 16
-#: An epsilon below this is the rounding of an origin on the hull's surface.
+#: An epsilon below this is rounding: the origin is on the surface of the hull.
 ROUNDING = 1e-9
-
-
-#: Friction coefficients above this are not looked for, and to what the smallest is found.
+#: Largest friction coefficient that is tried, and the tolerance of the smallest one.
 MAX_FRICTION, FRICTION_TOLERANCE = 10.0, 1e-4
 
 
 def characteristic_length(vertices: npt.ArrayLike, p_OOcm: npt.ArrayLike) -> float:
-    """Return the largest distance of a vertex (n, 3) in {O} from the centre of mass [m].
+    """Return the largest distance of a surface from the centre of mass [m].
 
-    No contact on the surface has a longer arm, so torques divided by it are comparable with
-    the forces that cause them.
+    No contact has a longer arm, so torques divided by it are comparable with the forces that
+    cause them.
+
+    Args:
+        vertices: (n, 3), of the surface in {O} [m].
+        p_OOcm: (3,), the centre of mass in {O} [m].
     """
     arms = np.asarray(vertices, dtype=float) - np.asarray(p_OOcm, dtype=float)
     return float(np.linalg.norm(arms, axis=1).max())
@@ -60,20 +62,21 @@ def ferrari_canny(
 
     The L1 version of C. Ferrari and J. Canny, "Planning optimal grasps", ICRA 1992: the
     distance of the origin from the surface of the convex hull of all contacts' friction
-    cones with a unit normal force, that is, for normal forces that sum to one. Each cone is
-    linearised with `FRICTION_EDGES` edges.
+    cones with unit normal forces, that is, for normal forces that sum to one. Each cone is
+    approximated by a pyramid of `FRICTION_EDGES` edges.
 
     Args:
         p_OQ: (k, 3), contact points in {O} [m].
         nhat_Q_O: (k, 3), normals out of the object in {O}.
         p_OOcm: (3,), the centre of mass in {O} [m].
         friction: Coulomb coefficient.
-        length: What torques are divided by [m], see `characteristic_length`.
+        length: Length by which torques are divided [m], see `characteristic_length`.
 
     Returns:
-        Epsilon, without unit; 0 where the origin is not inside of the hull, or the hull is
-        flat, or a number is not finite.
+        Epsilon, without unit; 0 if the origin is not inside the hull, the hull is flat, or a
+        number is not finite.
     """
+    # Wrenches of the edges of all pyramids.
     angles = 2.0 * np.pi * np.arange(FRICTION_EDGES) / FRICTION_EDGES
     pyramid = np.stack(
         [np.ones(FRICTION_EDGES), friction * np.cos(angles), friction * np.sin(angles)]
@@ -84,25 +87,27 @@ def ferrari_canny(
     wrenches[:, :3] /= length
     if not np.isfinite(wrenches).all():
         return 0.0
+
+    # Distance of the origin from their hull.
     try:
         hull = ConvexHull(wrenches)
     except QhullError:
-        return 0.0  # flat or too few points: some wrench cannot be resisted at all
-    # Rows are unit outward normal and offset, negative where the origin is inside.
+        return 0.0  # flat, or too few points: some wrench cannot be resisted at all
+    # A row is a unit outward normal and an offset, which is negative if the origin is inside.
     epsilon = -float(hull.equations[:, -1].max())
     return epsilon if epsilon > ROUNDING else 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class ForceMargin:
-    """How far a grasp is from not holding.
+    """By what margin forces at the contacts hold the object.
 
     Attributes:
-        smallest_friction: Coefficient at which the forces of the lift would just be within
-            the limit of the hand's fingertips; inf if none is enough.
-        epsilon: Of Ferrari and Canny at the friction of the configuration, torques divided
-            by the largest distance of the object's surface from its centre of mass; 0
-            without force closure.
+        smallest_friction: Smallest coefficient at which forces within the limit of the hand's
+            fingertips carry the lift; inf if none is enough.
+        epsilon: Of Ferrari and Canny at the configured friction, with torques divided by the
+            largest distance of the object's surface from its centre of mass; 0 without force
+            closure.
     """
 
     smallest_friction: float
@@ -116,11 +121,11 @@ def force_margin(
     nhat_Q_O: npt.ArrayLike,
     config: Config,
 ) -> ForceMargin:
-    """Return the margin of a grasp for the lift that `force_lift` simulates.
+    """Return the margin of a grasp for the lift of `lift.lift_by_forces`.
 
     Args:
         model: The object.
-        X_TO: Its resting pose, (4, 4).
+        X_TO: (4, 4), its resting pose.
         p_OQ: (k, 3), contact points in {O} [m].
         nhat_Q_O: (k, 3), normals out of the object in {O}.
         config: Hand, friction and lift.
@@ -150,17 +155,20 @@ def smallest_friction(
     wrenches_O: npt.ArrayLike,
     force_limit: float,
 ) -> float:
-    """Return the smallest friction coefficient at which all wrenches (n, 6) can be given.
+    """Return the smallest friction coefficient at which all wrenches can be applied.
 
-    More friction never needs more force, so it is found by bisection, rounded up by at most
-    `FRICTION_TOLERANCE`. It is inf where `MAX_FRICTION` is not enough.
+    The force that is needed never grows with friction, so bisection finds the coefficient.
 
     Args:
         p_OQ: (k, 3), contact points in {O} [m].
         nhat_Q_O: (k, 3), normals out of the object in {O}.
         p_OOcm: (3,), centre of mass in {O} [m].
         wrenches_O: (n, 6), each torque about Ocm and force on the object in {O} [N m, N].
-        force_limit: Of each normal force [N].
+        force_limit: Largest normal force of a contact [N].
+
+    Returns:
+        The coefficient, rounded up by at most `FRICTION_TOLERANCE`; inf if `MAX_FRICTION` is not
+        enough.
     """
 
     def holds(friction: float) -> bool:

@@ -1,9 +1,9 @@
-"""Where to start the wrist problem: a table of hand postures, searched by shape of contacts.
+"""Initial guesses for the wrist problem, from a table of hand postures.
 
-In: a hand, k contact points and outward normals. Out: a few palm poses with joints whose
-nominal fingertip contacts come closest to them. Distances and angles among contacts and
-normals do not depend on the frame, so postures with the right ones are found in a tree
-first, and only those are laid over the contacts (own construction).
+In: a hand, k contact points and outward normals. Out: a few palm poses with joints whose nominal
+fingertip contacts are close to the given ones. Distances and angles among contacts and normals do
+not depend on the frame, so a tree finds the postures in which they are similar, and only those are
+aligned with the contacts (our own construction).
 """
 
 from __future__ import annotations
@@ -18,26 +18,33 @@ from scipy.spatial import KDTree
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses
-from drakegrasp.verification.wrist.pads import touch
-from drakegrasp.verification.wrist.problem import hand_constants
+from drakegrasp.verification.wrist.hand_constants import hand_constants
+from drakegrasp.verification.wrist.pads import signed_distance
 
-#: Steps of the table's angles [rad]; closing steps are longer where fingers are many.
+#: Steps of the table's angles [rad]; closing steps are longer for hands with many fingers.
 SPREAD_STEP, CLOSING_STEP = np.deg2rad(11.25), np.deg2rad(8.0)
-#: Closing postures of the table at most.
+#: Most closing postures in the table.
 MAX_CLOSINGS = 5000
-#: The table ends where fingers are almost in the fist, and where spread fingers look sideways.
+#: Largest angles in the table [rad]: spread fingers point sideways, closed fingers make almost a
+#: fist.
 MAX_SPREAD, MAX_CLOSING = np.deg2rad(45.0), np.deg2rad(112.0)
-#: What a right angle counts as when contacts are compared [m].
+#: Lever by which normals are weighed against points when contacts are compared [m].
 LEVER = 0.02
-#: Postures that are laid over the contacts.
+#: Number of postures that are aligned with the contacts.
 NEAREST = 96
-#: Starts differ in some joint by more than this [rad]: contacts alone leave postures open.
+#: Any two starts differ in some joint by more than this [rad], because contacts leave a family of
+#: postures open.
 DIFFERENT = np.deg2rad(14.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Start:
-    """A palm pose (4, 4) and coordinates (1 + k,) [rad] to start from."""
+    """A start for the wrist problem.
+
+    Attributes:
+        X_OG: (4, 4), palm pose.
+        coordinates: (1 + k,), spread and closing angles [rad].
+    """
 
     X_OG: Array
     coordinates: Array
@@ -48,10 +55,10 @@ class Postures:
     """N postures of a hand.
 
     Attributes:
-        coordinates: (N, 1 + k) [rad].
-        p_GP: (N, k, 3), nominal contact points [m].
-        n_G: (N, k, 3), outward pad normals there.
-        tree: Of their features.
+        coordinates: (N, 1 + k), spread and closing angles [rad].
+        p_GP: (N, k, 3), nominal contact points in {G} [m].
+        n_G: (N, k, 3), outward pad normals there, in {G}.
+        tree: Of their features, see `_features`.
     """
 
     coordinates: Array
@@ -62,7 +69,8 @@ class Postures:
 
 @lru_cache(maxsize=4)
 def make_postures(hand: Hand) -> Postures:
-    """Return the postures of a hand."""
+    """Return the table of a hand's postures."""
+    # A grid of coordinates.
     constants = hand_constants(hand)
     lower, upper = coordinate_limits(hand).T
     most = np.r_[MAX_SPREAD, np.full(hand.num_fingers, MAX_CLOSING)]
@@ -73,8 +81,10 @@ def make_postures(hand: Hand) -> Postures:
         for low, high, limit, s in zip(lower, upper, most, step, strict=True)
     ]
     c = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 1 + hand.num_fingers)
+
+    # The contacts of each posture: the points of the pads next to the pad points.
     X_GF = fingertip_poses(hand, spread=c[:, 0], closing=c[:, 1:])
-    contact = touch(constants.pads, constants.pad_points)
+    contact = signed_distance(constants.pads, constants.pad_points)
     on_pad = constants.pad_points - contact.distance[:, None] * contact.normal
     p_GP = np.einsum("nkab,kb->nka", X_GF[..., :3, :3], on_pad) + X_GF[..., :3, 3]
     n_G = np.einsum("nkab,kb->nka", X_GF[..., :3, :3], contact.normal)
@@ -82,13 +92,23 @@ def make_postures(hand: Hand) -> Postures:
 
 
 def find_starts(postures: Postures, p_OQ: Array, nhat_Q_O: Array, count: int) -> list[Start]:
-    """Return up to `count` different starts for contacts (k, 3) [m], (k, 3), best first."""
+    """Return up to `count` different starts, the best first.
+
+    Args:
+        postures: Of the hand.
+        p_OQ: (k, 3), contact points [m].
+        nhat_Q_O: (k, 3), outward unit normals.
+        count: Most starts to return.
+    """
+    # The postures with the most similar features, aligned; pads face against the normals.
     nearest = min(NEAREST, len(postures.coordinates))
-    _, found = postures.tree.query(_features(p_OQ, -nhat_Q_O), k=np.arange(1, nearest + 1))
-    X_OG, misfit = _lay_over(postures.p_GP[found], postures.n_G[found], p_OQ, -nhat_Q_O)
+    _, rows = postures.tree.query(_features(p_OQ, -nhat_Q_O), k=np.arange(1, nearest + 1))
+    X_OG, misfit = _align(postures.p_GP[rows], postures.n_G[rows], p_OQ, -nhat_Q_O)
+
+    # The best of them that differ enough.
     starts: list[Start] = []
     for i in np.argsort(misfit, kind="stable"):
-        c = postures.coordinates[found[i]]
+        c = postures.coordinates[rows[i]]
         if all(np.abs(start.coordinates - c).max() > DIFFERENT for start in starts):
             starts.append(Start(X_OG=X_OG[i], coordinates=c))
         if len(starts) == count:
@@ -97,7 +117,13 @@ def find_starts(postures: Postures, p_OQ: Array, nhat_Q_O: Array, count: int) ->
 
 
 def _features(p: Array, n: Array) -> Array:
-    """Return lengths (..., f) [m] that tell how points and normals (..., k, 3) are arranged."""
+    """Return features (..., f) [m] of contacts that do not depend on their frame.
+
+    Args:
+        p: (..., k, 3), points [m].
+        n: (..., k, 3), unit normals.
+    """
+    # Distances, and angles of the normals to each other and to the line between the points.
     values = [np.zeros(p.shape[:-2])]
     for i, j in combinations(range(p.shape[-2]), 2):
         d = p[..., i, :] - p[..., j, :]
@@ -110,18 +136,28 @@ def _features(p: Array, n: Array) -> Array:
             LEVER * np.sum(away * n[..., j, :], axis=-1),
         ]
     if p.shape[-2] >= 3:
-        # Lengths and angles do not know left from right; the side of the triangle does.
+        # Distances and angles are the same for mirror images; the side of the triangle is not.
         across = np.cross(p[..., 1, :] - p[..., 0, :], p[..., 2, :] - p[..., 0, :])
         across /= np.maximum(np.linalg.norm(across, axis=-1), 1e-9)[..., None]
         values += [LEVER * np.sum(across * n[..., i, :], axis=-1) for i in range(p.shape[-2])]
     return np.stack(values, axis=-1)
 
 
-def _lay_over(p_GP: Array, n_G: Array, p_OQ: Array, n_O: Array) -> tuple[Array, Array]:
-    """Return the poses (N, 4, 4) that bring N sets of contacts closest to one, and the misfits.
+def _align(p_GP: Array, n_G: Array, p_OQ: Array, n_O: Array) -> tuple[Array, Array]:
+    """Return the palm poses that bring N sets of contacts closest to the given ones.
 
-    Kabsch (1976) on the points and on points `LEVER` along the normals.
+    Kabsch (1976), on the points and on points `LEVER` along the normals.
+
+    Args:
+        p_GP: (N, k, 3), points of the postures in {G} [m].
+        n_G: (N, k, 3), normals of the pads in {G}.
+        p_OQ: (k, 3), points to meet in {O} [m].
+        n_O: (k, 3), normals that the pads should have in {O}.
+
+    Returns:
+        Poses X_OG (N, 4, 4), and the sums of squared distances (N,) [m^2].
     """
+    # Rotations between the centred sets, without mirror images.
     A = np.concatenate([p_GP, p_GP + LEVER * n_G], axis=-2)
     B = np.concatenate([p_OQ, p_OQ + LEVER * n_O], axis=-2)
     centre_A, centre_B = A.mean(axis=-2, keepdims=True), B.mean(axis=-2)
@@ -130,6 +166,8 @@ def _lay_over(p_GP: Array, n_G: Array, p_OQ: Array, n_O: Array) -> tuple[Array, 
     V = np.swapaxes(Vt, -1, -2)
     V[mirrored, :, 2] *= -1.0
     R = V @ np.swapaxes(U, -1, -2)
+
+    # Translations, and what distance remains.
     p = centre_B - np.einsum("nab,nb->na", R, centre_A[:, 0])
     misfit = np.sum((A @ np.swapaxes(R, -1, -2) + p[:, None] - B) ** 2, axis=(-1, -2))
     X = np.tile(np.eye(4), (len(R), 1, 1))

@@ -1,11 +1,11 @@
-"""The fingertips' surfaces as smooth functions of a point.
+"""The surfaces of the fingertips as smooth signed distances.
 
-In: the corners of k convex fingertips. Out: how far points lie outside of them, which way
-the surface there faces, and how that turns from point to point: what an optimiser needs to
-bring a fingertip to a contact with exact gradients.
+In: the corners of k convex fingertips. Out: the distances of points from them, the normals there,
+and the derivatives of both: what an optimiser needs to bring a fingertip to a contact with exact
+gradients.
 
 The distance of p from a convex body with face planes n_j . p = d_j is at least the largest
-of n_j . p - d_j, and equal to it before a face. Here the largest is replaced by the smooth
+of n_j . p - d_j, and equal to it in front of a face. Here the largest is replaced by the smooth
 maximum s log sum exp((n_j . p - d_j) / s) (Boyd and Vandenberghe, "Convex Optimization",
 3.1.5), which rounds edges with a radius of about s.
 """
@@ -21,15 +21,15 @@ from scipy.spatial import ConvexHull
 
 from drakegrasp.frames import Array
 
-#: Radius of the rounding [m]: the pads' own unevenness.
+#: Rounding s of the edges [m]: about the unevenness of the pads themselves.
 ROUNDING = 0.7e-3
-#: Face normals that agree to this many digits are one plane.
+#: Faces whose normals and offsets agree to this many decimals are one plane.
 SAME_PLANE = 6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pads:
-    """The surfaces of k fingertips, each with m planes (padded with ones that never matter).
+    """The surfaces of k fingertips, each with m planes (padded with planes at infinity).
 
     Attributes:
         normals: (k, m, 3), unit, outward, in each fingertip's frame.
@@ -44,64 +44,86 @@ class Pads:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PadContact:
-    """Where k points stand to k pads, one each.
+    """Distances and normals of k pads at k points, one each.
 
     Attributes:
-        distance: (k,), smooth distance outside of the pad, negative inside [m].
-        normal: (k, 3), unit outward normal of the pad nearest to the point.
-        gradient: (k, 3), of `distance` by the point; along `normal`, shorter at edges.
-        normal_slope: (k, 3, 3), derivative of `normal` by the point [1/m].
+        distance: (k,), smooth signed distance from the pad, negative inside [m].
+        normal: (k, 3), unit outward normal of the pad next to the point.
+        gradient: (k, 3), derivative of `distance` by the point; along `normal`, shorter than one at
+            edges.
+        normal_jacobian: (k, 3, 3), derivative of `normal` by the point [1/m].
     """
 
     distance: Array
     normal: Array
     gradient: Array
-    normal_slope: Array
+    normal_jacobian: Array
 
 
 def make_pads(corners: Sequence[Array]) -> Pads:
     """Return the pads of k fingertips, each the convex hull of corners (n, 3) [m]."""
+    # The planes of each hull; a row of equations is a unit normal and minus the offset.
     hulls = [ConvexHull(points) for points in corners]
-    # A row of equations is a unit normal and minus the offset.
     planes = [np.unique(np.round(hull.equations, SAME_PLANE), axis=0) for hull in hulls]
+
+    # Stack them; a plane at infinity never has the largest n . p - d.
     most = max(map(len, planes))
     normals = np.zeros((len(planes), most, 3))
     offsets = np.full((len(planes), most), np.inf)
-    for i, found in enumerate(planes):
-        normals[i, : len(found)] = found[:, :3]
-        offsets[i, : len(found)] = -found[:, 3]
+    for i, equations in enumerate(planes):
+        normals[i, : len(equations)] = equations[:, :3]
+        offsets[i, : len(equations)] = -equations[:, 3]
+
     triangles = tuple(hull.points[hull.simplices] for hull in hulls)
     return Pads(normals=normals, offsets=offsets, triangles=triangles)
 
 
 def nearest_on_pads(pads: Pads, p_FiQ: Array) -> Array:
-    """Return the points (k, 3) [m] of the pads, without rounding, nearest to points (k, 3)."""
-    found = []
+    """Return the point of each pad, without rounding, that is nearest to a point.
+
+    Args:
+        pads: Of k fingertips.
+        p_FiQ: (k, 3), a point in each fingertip's frame [m].
+
+    Returns:
+        (k, 3), in the fingertips' frames [m].
+    """
+    nearest = []
     for triangles, point in zip(pads.triangles, p_FiQ, strict=True):
         near = trimesh.triangles.closest_point(triangles, np.tile(point, (len(triangles), 1)))
-        found.append(near[np.argmin(np.sum((near - point) ** 2, axis=1))])
-    return np.array(found)
+        nearest.append(near[np.argmin(np.sum((near - point) ** 2, axis=1))])
+    return np.array(nearest)
 
 
-def touch(pads: Pads, p_FiQ: Array) -> PadContact:
-    """Return how points (k, 3) [m], each in its fingertip's frame, stand to the pads."""
+def signed_distance(pads: Pads, p_FiQ: Array) -> PadContact:
+    """Return the smooth signed distance of each point from its pad, with derivatives.
+
+    Args:
+        pads: Of k fingertips.
+        p_FiQ: (k, 3), a point in each fingertip's frame [m].
+    """
+    # The smooth maximum of the heights over the planes, and the weights of the planes.
     height = (np.matmul(pads.normals, p_FiQ[:, :, None])[..., 0] - pads.offsets) / ROUNDING
     highest = height.max(axis=1)
     weight = np.exp(height - highest[:, None])
     total = weight.sum(axis=1)
     weight /= total[:, None]
+
+    # First and second derivatives by the point.
     gradient = np.matmul(weight[:, None, :], pads.normals)[:, 0]
     weighted = pads.normals * weight[:, :, None]
     outer = gradient[:, :, None] * gradient[:, None, :]
     hessian = (np.matmul(weighted.transpose(0, 2, 1), pads.normals) - outer) / ROUNDING
+
+    # The normal m = g / |g|; its derivative is (1 - m m') H / |g|.
     length = np.sqrt((gradient * gradient).sum(axis=1))
     normal = gradient / length[:, None]
-    # The derivative of g/|g| is (1 - n n') H / |g|.
     along = np.matmul(normal[:, None, :], hessian)
-    slope = (hessian - normal[:, :, None] * along) / length[:, None, None]
+    normal_jacobian = (hessian - normal[:, :, None] * along) / length[:, None, None]
+
     return PadContact(
         distance=ROUNDING * (highest + np.log(total)),
         normal=normal,
         gradient=gradient,
-        normal_slope=slope,
+        normal_jacobian=normal_jacobian,
     )

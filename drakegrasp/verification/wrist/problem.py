@@ -1,99 +1,57 @@
 """The wrist problem: which palm pose and joints bring the fingertips to given contacts?
 
-In: a hand, k contact points with outward normals in {O}, and where the table is. Out: a
-sum of squares to minimise, with exact gradients, and what must not be negative. Nothing is
-solved here; `solver` does that.
+In: a hand, k contact points with outward normals in {O}, and the height of the table. Out: the
+residuals whose sum of squares is to be minimised and the clearances that must not be negative,
+with exact derivatives. `solver` minimises.
 
 The objective is that of Veres et al. (2017), appendix, sum |C_i - Y_i|^2 over the rotations
 and translations of X_OG, with the hand's joints as further unknowns. Y_i is the predicted
-point and C_i the point of fingertip i that is nearest to it: a real contact may lie anywhere
-on a fingertip. Terms with small weights tell apart what the points leave open (own): each
-pad should face the predicted normal, the fingers should close against it, contacts should
-be near the hand file's pad points, and the joints near those of the start.
-
-Unknowns x = (alpha, beta, gamma, t, c), n = 7 + k: with a start X_OS the palm is at
-X_OG = X_OS X(Rx(alpha) Ry(beta) Rz(gamma), t), and c are the hand's coordinates (spread,
-closing 1..k). Everything is computed in {G}, where the fingers are.
+point and C_i the nearest point of fingertip i, because a real contact may lie anywhere on a
+fingertip. Terms with small weights (our own) decide what the points leave open: each pad should
+face the predicted normal, each finger should close against it, the contacts should be near
+the hand file's pad points, and the joints near those of the start. `evaluate` has the formulas.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
-from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, make_pose
-from drakegrasp.hand.description import Hand
-from drakegrasp.hand.kinematics import coordinate_limits
-from drakegrasp.hand.shapes import link_shapes
-from drakegrasp.verification.wrist.pads import PadContact, Pads, make_pads, touch
+from drakegrasp.verification.wrist.hand_constants import HandConstants, skew
+from drakegrasp.verification.wrist.pads import PadContact, signed_distance
 
-#: Number of unknowns of the palm's pose: three rotations and three translations.
+#: Number of unknowns of the palm's pose: three angles and three translations.
 POSE = 6
-#: What a small angle of one radian between a pad and the predicted normal counts as [m]. Like
-#: the next weights it is the size of what simulated grasps show: half a millimetre between
-#: point and pad goes with 7 degrees here, 24 degrees, 5 mm and 7 degrees there.
+#: Weight w_n of the angle between a pad and the predicted normal [m/rad]. The weights are the
+#: ratios that simulated grasps show: half a millimetre between point and pad goes with 7 degrees of
+#: this angle, 24 degrees of the closing motion, 5 mm along the pad, and 7 degrees of a joint.
 NORMAL_WEIGHT = 0.004
-#: The same between a finger's closing motion and the predicted normal [m].
+#: Weight w_v of the angle between a finger's closing motion and the predicted normal [m/rad].
 CLOSING_WEIGHT = 0.0012
-#: What a metre between contact and pad point counts as [m].
+#: Weight w_p of the distance between contact and pad point, without unit.
 PAD_WEIGHT = 0.1
-#: What a radian between a joint and its place in the start counts as [m].
+#: Weight w_c of the angle between a joint and its value in the start [m/rad].
 POSTURE_WEIGHT = 0.004
-#: Rounding of the smooth minimum over a part's corners [m].
+#: Rounding of the smooth minimum over the corners of a link [m].
 CLEARANCE_ROUNDING = 0.5e-3
+#: Indices of the two other axes, in the order of a cross product.
 _NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
-#: Vector times this, as 3 x 3, is the matrix of its cross product.
-_SKEW = np.array([np.cross(e, np.eye(3)).T for e in np.eye(3)]).reshape(3, 9)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class HandConstants:
-    """A hand of k fingers with chains of m joints as stacked arrays; shorter chains are padded.
-
-    Attributes:
-        X_PJ: (m, k, 4, 4), of each joint in the turning frame before it; the first in {G}.
-        axis: (m, k, 3), unit, in the joint's frame.
-        cross, cross2: (m, k, 4, 4), the axis' cross product matrix and its square.
-        gain: (m, k, 1 + k), angles per coordinate.
-        finger_gain: (k, m, 1 + k), the same by finger.
-        closing_gain: (m, k), angles per closing of the own finger.
-        X_JFi: (k, 4, 4), fingertip links in the last joint's turning frame.
-        pads: The fingertips' surfaces.
-        pad_points: (k, 3), nominal contact points in {Fi} [m].
-        limits: (1 + k, 2), of the coordinates [rad].
-        fingertips: (k, n, 3), corners of the fingertips in {Fi} [m].
-        palm: (n, 3), corners of the palm link in {G} [m].
-    """
-
-    X_PJ: Array
-    axis: Array
-    cross: Array
-    cross2: Array
-    gain: Array
-    finger_gain: Array
-    closing_gain: Array
-    X_JFi: Array
-    pads: Pads
-    pad_points: Array
-    limits: Array
-    fingertips: Array
-    palm: Array
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WristProblem:
-    """Contacts to reach from a start; see the module.
+    """Contacts to reach, and a start to reach them from.
 
     Attributes:
         constants: Of the hand.
         p_OQ, nhat_Q_O: (k, 3), predicted points [m] and outward unit normals in {O}.
         up_O: (3,), the table's upward normal in {O}.
-        height: Of the origin of {O} above the table [m].
-        X_OS: (4, 4), the palm's pose at x = 0.
-        posture: (1 + k,), the coordinates to stay near to where contacts do not tell [rad].
+        height: Height of the origin of {O} above the table [m].
+        X_OS: (4, 4), palm pose of the start: that of zero angles and translations.
+        posture: (1 + k,), coordinates of the start, which the solution stays near to where the
+            contacts leave them open [rad].
     """
 
     constants: HandConstants
@@ -107,20 +65,20 @@ class WristProblem:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Evaluation:
-    """The problem at one x of n = 7 + k unknowns.
+    """The problem at one point x of its n = 7 + k unknowns; see `evaluate`.
 
     Attributes:
         X_OG: (4, 4), palm pose.
         p_FiQ: (k, 3), the predicted points in the fingertips' frames [m].
-        contact: Where they stand to the pads.
+        contact: Their distances from the pads, and the pads' normals.
         pad_normals_O: (k, 3), outward normals of the pads there, in {O}.
         residuals: (r,), weighted misfits [m]; the objective is their sum of squares. Those of
             normals and closing directions are vectors expressed in {G}.
-        jacobian: (r, n), their derivatives. Where the residual is a vector in {G} it is the
-            derivative seen from {O}: not that of its three numbers, as {G} turns with x.
-            The slope of the objective is exactly 2 residuals @ jacobian.
+        jacobian: (r, n), their derivatives. For a residual that is a vector expressed in {G} this
+            is the derivative as seen from {O}, not that of its three components, because {G}
+            turns with x. The gradient of the objective is exactly 2 residuals @ jacobian.
         clearance: (1 + k,), heights of palm and fingertips above the table [m].
-        clearance_jacobian: (1 + k, n).
+        clearance_jacobian: (1 + k, n), their derivatives.
     """
 
     X_OG: Array
@@ -133,60 +91,31 @@ class Evaluation:
     clearance_jacobian: Array
 
 
-@lru_cache(maxsize=4)
-def hand_constants(hand: Hand) -> HandConstants:
-    """Return the constants of a hand.
-
-    Raises:
-        HandError: If its palm or a fingertip has no shape, or one that is not convex.
-    """
-    shapes = link_shapes(hand)
-    for link in (hand.palm_link, *hand.fingertip_links):
-        if not shapes[link]:
-            raise HandError(f"{hand.sdf_path}: link {link!r} must have a collision shape, got none")
-    corners = [np.concatenate(shapes[finger.fingertip]) for finger in hand.fingers]
-    most = max(map(len, corners))
-    # Repeated corners lower a smooth minimum by up to its rounding times the log of their number.
-    padded = np.stack([np.pad(c, ((0, most - len(c)), (0, 0)), mode="edge") for c in corners])
-    X_GB = np.linalg.inv(hand.X_BG)
-    palm = np.concatenate(shapes[hand.palm_link]) @ X_GB[:3, :3].T + X_GB[:3, 3]
-    chains = _stack_chains(hand)
-    return HandConstants(
-        **chains,
-        pads=make_pads(corners),
-        pad_points=np.array([finger.p_FiP for finger in hand.fingers]),
-        limits=coordinate_limits(hand),
-        fingertips=padded,
-        palm=palm,
-    )
-
-
-def _stack_chains(hand: Hand) -> dict[str, Array]:
-    m = max(len(chain.axis) for chain in hand.chains)
-    X_PJ, axis, gain = [], [], []
-    for chain in hand.chains:
-        # A padding joint comes last, does not move and has no effect.
-        missing = m - len(chain.axis)
-        X_PJ.append(np.concatenate([chain.X_PJ, np.tile(np.eye(4), (missing, 1, 1))]))
-        axis.append(np.concatenate([chain.axis, np.tile([0.0, 0.0, 1.0], (missing, 1))]))
-        gain.append(np.pad(chain.gain, ((0, missing), (0, 0))))
-    a, k = np.stack(axis, axis=1), len(hand.chains)
-    cross = np.zeros((m, k, 4, 4))
-    cross[..., :3, :3] = _skew(a)
-    return {
-        "X_PJ": np.stack(X_PJ, axis=1),
-        "axis": a,
-        "cross": cross,
-        "cross2": cross @ cross,
-        "gain": np.stack(gain, axis=1),
-        "finger_gain": np.stack(gain),
-        "closing_gain": np.stack(gain, axis=1)[:, range(k), 1 + np.arange(k)],
-        "X_JFi": np.stack([chain.X_JFi for chain in hand.chains]),
-    }
-
-
 def evaluate(problem: WristProblem, x: Array) -> Evaluation:
-    """Return residuals, clearances and their exact derivatives at x (n,)."""
+    """Return residuals, clearances and their exact derivatives.
+
+    The unknowns are x = (alpha, beta, gamma, t, c), n = 7 + k. With the start X_OS the palm is at
+
+        X_OG = X_OS X(Rx(alpha) Ry(beta) Rz(gamma), t),
+
+    and c = (spread, closing 1..k) are the hand's coordinates. The objective is
+
+        sum_i  phi_i^2 + w_n^2 |m_i + n_i|^2 + w_v^2 |v_i + n_i|^2 + w_p^2 |p_FiQi - p_FiP|^2
+        + w_c^2 |c - c_S|^2
+
+    with phi_i the distance of the predicted point Q_i from the surface of fingertip i, m_i the
+    pad's outward normal there (`pads.signed_distance`), n_i the predicted outward normal, v_i the
+    unit direction in which fingertip i moves at Q_i when its finger closes, p_FiP the hand file's
+    pad point, and c_S the coordinates of the start. The weights are `NORMAL_WEIGHT` (w_n),
+    `CLOSING_WEIGHT` (w_v), `PAD_WEIGHT` (w_p) and `POSTURE_WEIGHT` (w_c). The residuals are the
+    terms in this order, unsquared. The constraints are that the clearances, the smooth minima of
+    the heights of palm and fingertips over the table, are not negative.
+
+    Args:
+        problem: The contacts and the start.
+        x: (n,), angles [rad], translation [m], coordinates [rad].
+    """
+    # The palm, the contacts in {G}, and the fingers.
     constants, coordinates = problem.constants, x[POSE:]
     k, n = len(problem.p_OQ), len(x)
     R_SG, spin_G = _rotation(x[:3])
@@ -197,26 +126,30 @@ def evaluate(problem: WristProblem, x: Array) -> Evaluation:
     R_GF = X_GF[:, :3, :3]
     R_FG = R_GF.transpose(0, 2, 1)
 
-    # By each unknown: angular velocity of the fingers, and velocity of their material
-    # points at Q, seen from {O} and expressed in {G}.
+    # Per unknown: angular velocity of the fingertips, and velocity of their material points at
+    # Q, seen from {O} and expressed in {G}.
     arms = _cross(axes, p_GQ - origins)  # (m, k, 3)
     spin, velocity = np.zeros((k, 3, n)), np.empty((k, 3, n))
     spin[:, :, :3] = spin_G
     spin[:, :, POSE:] = np.matmul(axes.transpose(1, 2, 0), constants.finger_gain)
-    velocity[:, :, :3] = -np.matmul(_skew(p_GQ), spin_G)
+    velocity[:, :, :3] = -np.matmul(skew(p_GQ), spin_G)
     velocity[:, :, 3:POSE] = R_SG.T
     velocity[:, :, POSE:] = np.matmul(arms.transpose(1, 2, 0), constants.finger_gain)
 
+    # Distance phi of each point from its pad, and the pad's normal m. {O} sees the pad turn with
+    # the palm and the finger, while the predicted normal does not turn.
     p_FQ = np.matmul(R_FG, (p_GQ - X_GF[:, :3, 3])[:, :, None])[..., 0]
     dp_F = -np.matmul(R_FG, velocity)
-    contact = touch(constants.pads, p_FQ)
+    contact = signed_distance(constants.pads, p_FQ)
     pad_G = np.matmul(R_GF, contact.normal[:, :, None])[..., 0]
-    # Seen from {O} pad and closing direction turn with the palm, the prediction does not.
-    dpad_G = np.matmul(np.matmul(R_GF, contact.normal_slope), dp_F)
-    dpad_G -= np.matmul(_skew(pad_G), spin)
-    closing, dclosing = _closing_direction(constants, p_GQ, axes, arms, velocity)
-    dclosing[:, :, :3] -= np.matmul(_skew(closing), spin_G)
+    dpad_G = np.matmul(np.matmul(R_GF, contact.normal_jacobian), dp_F)
+    dpad_G -= np.matmul(skew(pad_G), spin)
 
+    # Closing direction v, which also turns with the palm.
+    closing, dclosing = _closing_direction(constants, p_GQ, axes, arms, velocity)
+    dclosing[:, :, :3] -= np.matmul(skew(closing), spin_G)
+
+    # The residuals and their derivatives, term by term.
     residuals = np.concatenate(
         [
             contact.distance,
@@ -232,7 +165,10 @@ def evaluate(problem: WristProblem, x: Array) -> Evaluation:
     jacobian[4 * k : 7 * k] = CLOSING_WEIGHT * dclosing.reshape(-1, n)
     jacobian[7 * k : 10 * k] = PAD_WEIGHT * dp_F.reshape(-1, n)
     jacobian[10 * k :, POSE:] = POSTURE_WEIGHT * np.eye(n - POSE)
+
+    # The heights over the table.
     clearance, clearance_jacobian = _clearance(problem, X_OG, R_SG, spin_G, X_GF, axes, origins)
+
     return Evaluation(
         X_OG=X_OG,
         p_FiQ=p_FQ,
@@ -246,20 +182,15 @@ def evaluate(problem: WristProblem, x: Array) -> Evaluation:
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Return a x b of (..., 3); NumPy's own costs five times as much on a few vectors."""
+    """Return a x b of (..., 3); for a few vectors five times as fast as NumPy's."""
     return np.asarray(
         a.take(_NEXT, axis=-1) * b.take(_LAST, axis=-1)
         - a.take(_LAST, axis=-1) * b.take(_NEXT, axis=-1)
     )
 
 
-def _skew(a: Array) -> Array:
-    """Return the matrices (..., 3, 3) whose product with a vector b is a x b."""
-    return np.asarray((a @ _SKEW).reshape(*a.shape, 3))
-
-
 def _rotation(angles: Array) -> tuple[Array, Array]:
-    """Return R_SG = Rx Ry Rz, and as columns its angular velocity in {G} per angle."""
+    """Return R_SG = Rx Ry Rz, and its angular velocities in {G} per angle, as columns (3, 3)."""
     (ca, cb, cg), (sa, sb, sg) = np.cos(angles).tolist(), np.sin(angles).tolist()
     Ryz = np.array([[cb * cg, -cb * sg, sb], [sg, cg, 0.0], [-sb * cg, sb * sg, cb]])
     Rx = np.array([[1.0, 0.0, 0.0], [0.0, ca, -sa], [0.0, sa, ca]])
@@ -268,10 +199,13 @@ def _rotation(angles: Array) -> tuple[Array, Array]:
 
 
 def _forward(constants: HandConstants, coordinates: Array) -> tuple[Array, Array, Array]:
-    """Return X_GFi (k, 4, 4), and of each joint its axis and origin (m, k, 3) in {G}."""
+    """Return X_GFi (k, 4, 4), and the axis and the origin (m, k, 3) of each joint in {G}."""
+    # Rodrigues' formula R = 1 + sin(q) K + (1 - cos(q)) K K, as poses. `frames.rotation_about` has
+    # one axis for all angles; here each joint has its own, and K K is computed once per hand.
     angles = (constants.gain @ coordinates)[..., None, None]  # (m, k, 1, 1)
-    # Rodrigues: R = 1 + sin(q) K + (1 - cos(q)) K K, here with room for positions.
     turn = np.eye(4) + np.sin(angles) * constants.cross + (1.0 - np.cos(angles)) * constants.cross2
+
+    # From the palm outwards, all fingers at once.
     before = np.empty_like(constants.X_PJ)
     X = np.eye(4)
     for j, X_PJ in enumerate(constants.X_PJ):
@@ -286,20 +220,33 @@ def _closing_direction(
 ) -> tuple[Array, Array]:
     """Return the unit direction in which each fingertip moves at Q when its finger closes.
 
-    Directions (k, 3) in {G}, and their derivatives (k, 3, n) seen from {G}.
+    Args:
+        constants: Of the hand.
+        p_GQ: (k, 3), the predicted points in {G} [m].
+        axes: (m, k, 3), of the joints in {G}.
+        arms: (m, k, 3), velocity at Q per angle of each joint, in {G} [m/rad].
+        velocity: (k, 3, n), of the fingertips' material points at Q per unknown, in {G}.
+
+    Returns:
+        Directions (k, 3) in {G}, and their derivatives (k, 3, n) as seen from {G}.
     """
+    # Screw of each fingertip per closing angle: the sum over the joints of its finger.
     own = constants.closing_gain[..., None]  # (m, k, 1)
-    turning, motion = own * axes, own * arms  # what each joint adds when the finger closes
+    turning, motion = own * axes, own * arms
     total_turning, total_motion = turning.sum(axis=0), motion.sum(axis=0)
+
+    # By the palm's pose: Q is fixed in {O}, so {G} sees it move against the palm's motion.
     derivative = np.empty(velocity.shape)
-    # Q is fixed in {O}: from a moving palm it is seen to move the other way.
-    derivative[:, :, :POSE] = -np.matmul(_skew(total_turning), velocity[:, :, :POSE])
-    # Joint j carries the screws of all later ones: a field v turned about an axis a changes
-    # at a fixed point by a x v - (dv/dp) (a x arm).
+    derivative[:, :, :POSE] = -np.matmul(skew(total_turning), velocity[:, :, :POSE])
+
+    # By the coordinates: joint j carries the screws of all later joints. A velocity field v that
+    # turns about an axis a changes at a fixed point by a x v - (dv/dp) (a x arm).
     later_turning = total_turning - turning.cumsum(axis=0)
     later_motion = total_motion - motion.cumsum(axis=0)
     carried = _cross(axes, later_motion) - _cross(later_turning, arms)
     derivative[:, :, POSE:] = np.matmul(carried.transpose(1, 2, 0), constants.finger_gain)
+
+    # From the velocity to its direction.
     speed = np.sqrt((total_motion * total_motion).sum(axis=1))[:, None]
     direction = total_motion / speed
     along = np.matmul(direction[:, None, :], derivative)
@@ -316,7 +263,21 @@ def _clearance(
     axes: Array,
     origins: Array,
 ) -> tuple[Array, Array]:
-    """Return smooth heights (1 + k,) of palm and fingertips over the table [m], and derivatives."""
+    """Return the smooth heights (1 + k,) of palm and fingertips over the table [m].
+
+    Args:
+        problem: With the table.
+        X_OG: (4, 4), pose of the palm.
+        R_SG: (3, 3), its rotation from the start.
+        spin_G: (3, 3), angular velocities per angle, as columns.
+        X_GF: (k, 4, 4), poses of the fingertips.
+        axes: (m, k, 3), of the joints in {G}.
+        origins: (m, k, 3), of the joints in {G} [m].
+
+    Returns:
+        The heights, and their derivatives (1 + k, n).
+    """
+    # Heights of the lowest corners.
     constants = problem.constants
     up_G = problem.up_O @ X_OG[:3, :3]
     base = problem.height + problem.up_O @ X_OG[:3, 3]
@@ -325,6 +286,8 @@ def _clearance(
     corners = constants.fingertips
     tips, p_F = _lowest(np.matmul(corners, up_F[:, :, None])[..., 0], corners)
     p_tips = np.matmul(X_GF[:, :3, :3], p_F[:, :, None])[..., 0] + X_GF[:, :3, 3]
+
+    # Derivatives of the corners' heights, weighted as in the smooth minimum.
     jacobian = np.zeros((1 + len(tips), POSE + len(tips) + 1))
     jacobian[:, :3] = _cross(np.concatenate([p_palm, p_tips]), up_G) @ spin_G
     jacobian[:, 3:POSE] = R_SG @ up_G
@@ -334,7 +297,10 @@ def _clearance(
 
 
 def _lowest(heights: Array, points: Array) -> tuple[Array, Array]:
-    """Return the smooth minimum of heights (g, n), and the points (g, 3) that it weighs."""
+    """Return the smooth minima (g,) of heights (g, n) [m], and weighted means (g, 3) of the points.
+
+    The minimum is -s log sum exp(-h / s), and the weights are its derivatives by the heights.
+    """
     scaled = heights / -CLEARANCE_ROUNDING
     highest = scaled.max(axis=1)
     weight = np.exp(scaled - highest[:, None])

@@ -1,8 +1,8 @@
 """Solving the wrist problem: SciPy's SLSQP from several starts.
 
-In: a hand and k contacts in {O}. Out: palm poses with joints, the best first. Contacts
-leave a family of poses open, so the solutions from different starts are different ways to
-make the same grasp.
+In: a hand and k contacts in {O}. Out: palm poses with joints, the best first. Contacts leave a
+family of palm poses open, so solutions from different starts are different ways to make the same
+grasp.
 """
 
 from __future__ import annotations
@@ -14,28 +14,27 @@ from scipy.optimize import minimize
 
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import Hand
+from drakegrasp.verification.wrist.hand_constants import hand_constants
 from drakegrasp.verification.wrist.initial_guesses import find_starts, make_postures
 from drakegrasp.verification.wrist.pads import nearest_on_pads
-from drakegrasp.verification.wrist.problem import (
-    POSE,
-    Evaluation,
-    WristProblem,
-    evaluate,
-    hand_constants,
-)
+from drakegrasp.verification.wrist.problem import POSE, Evaluation, WristProblem, evaluate
 
-#: Starts, and so solutions.
+#: Number of starts, and so of solutions.
 STARTS = 5
-#: Unit of the objective [m^2]: misfits of a few millimetres are of order one.
+#: Unit of the objective [m^2]: residuals of a few millimetres give values of order one.
 UNIT = 0.005**2
 #: Unit of the clearance over the table [m].
 CLEARANCE_UNIT = 0.01
-#: Share of the identity in the scaling matrix; it keeps steps short where contacts say little.
+#: Share of the identity in the scaling matrix; it keeps steps short along directions that the
+#: contacts hardly determine.
 DAMPING = 3e-4
-#: SLSQP stops after so many iterations, or when the objective changes by less than this.
+#: SLSQP stops after so many iterations, or when the scaled objective changes by less than this.
 MAX_ITERATIONS, TOLERANCE = 50, 1e-3
 #: Steps of Newton's method that bring each pad onto its point.
 REFINEMENTS = 3
+#: A closing angle is refined only if the distance changes with it by more than this [m/rad]: a pad
+#: that slides along its point cannot be brought nearer by closing.
+MIN_SLOPE = 0.01
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,14 +43,15 @@ class WristFit:
 
     Attributes:
         X_OG: (4, 4), palm pose.
-        spread: [rad]
+        spread: Angle of the spread joints [rad].
         closing: (k,), closing angles at which the pads meet the points [rad].
-        objective: Sum of squared weighted misfits where SLSQP ended, before each finger was
-            brought onto its point [m^2].
+        objective: Sum of squared residuals where SLSQP ended, before each finger was brought onto
+            its point [m^2].
         residual: (k,), distance of each predicted point from its fingertip's surface [m].
         normal_error: (k,), angle between each pad's inward and the predicted normal [rad].
-        status, message: SLSQP's exit mode, 0 for success, and its text.
-        iterations, evaluations: Of SLSQP.
+        status: SLSQP's exit mode; 0 is success.
+        message: SLSQP's text for it.
+        iterations, evaluations: Numbers of SLSQP's iterations and of evaluations of the problem.
     """
 
     X_OG: Array
@@ -76,7 +76,7 @@ def fit_wrist(
         p_OQ: (k, 3), contact points [m].
         nhat_Q_O: (k, 3), outward unit normals.
         up_O: (3,), the table's upward normal in {O}.
-        height: Of the origin of {O} above the table [m].
+        height: Height of the origin of {O} above the table [m].
     """
     constants, fits = hand_constants(hand), []
     for start in find_starts(make_postures(hand), p_OQ, nhat_Q_O, STARTS):
@@ -94,27 +94,33 @@ def fit_wrist(
 
 
 def solve(problem: WristProblem) -> WristFit:
-    """Return what SLSQP finds from the problem's start, with each finger refined."""
-    scaled = _Scaled(problem)
+    """Return SLSQP's solution from the problem's start, with each finger brought onto its point."""
+    # Minimise the sum of squares.
+    scaled = _ScaledProblem(problem)
     result = minimize(
         scaled.objective,
         np.zeros(POSE + len(problem.posture)),
         jac=True,
         method="SLSQP",
-        constraints=[{"type": "ineq", "fun": scaled.slack, "jac": scaled.slack_slope}],
+        constraints=[
+            {"type": "ineq", "fun": scaled.constraints, "jac": scaled.constraint_jacobian}
+        ],
         options={"maxiter": MAX_ITERATIONS, "ftol": TOLERANCE},
     )
-    found = scaled.at(result.x)
+    solution = scaled.at(result.x)
     evaluations = scaled.evaluations
-    problem = replace(problem, X_OS=found.X_OG)
+
+    # Refine the fingers at the palm pose of the solution.
+    problem = replace(problem, X_OS=solution.X_OG)
     refined, c = _refine(problem, scaled.x(result.x)[POSE:])
     p_FiQ = refined.p_FiQ
+
     facing = -np.sum(refined.pad_normals_O * problem.nhat_Q_O, axis=1)
     return WristFit(
-        X_OG=found.X_OG,
+        X_OG=solution.X_OG,
         spread=float(c[0]),
         closing=c[1:],
-        objective=float(found.residuals @ found.residuals),
+        objective=float(solution.residuals @ solution.residuals),
         residual=np.linalg.norm(nearest_on_pads(problem.constants.pads, p_FiQ) - p_FiQ, axis=1),
         normal_error=np.arccos(np.clip(facing, -1.0, 1.0)),
         status=int(result.status),
@@ -125,21 +131,30 @@ def solve(problem: WristProblem) -> WristFit:
 
 
 def _refine(problem: WristProblem, coordinates: Array) -> tuple[Evaluation, Array]:
-    """Close or open each finger until its pad meets its point, with the palm where it is.
+    """Close or open each finger until its pad meets its point; the palm does not move.
 
-    Newton's method on each finger's own distance by its own closing angle.
+    Newton's method on the distance of each finger from its point, by its own closing angle.
+
+    Args:
+        problem: With its start at the palm's pose.
+        coordinates: (1 + k,), spread and closing angles to begin with [rad].
+
+    Returns:
+        The problem at the refined coordinates, and these.
     """
     lower, upper = problem.constants.limits.T
     pose, own = np.zeros(POSE), np.arange(len(problem.p_OQ))
     c = np.clip(coordinates, lower, upper)
     best = evaluate(problem, np.concatenate([pose, c]))
     for _ in range(REFINEMENTS):
+        # A step of each closing angle, within the limits.
         distance = best.contact.distance
         slope = best.jacobian[own, POSE + 1 + own]
-        # A pad that slides along its point cannot be brought nearer by closing.
-        moves = np.abs(slope) > 0.01
+        moves = np.abs(slope) > MIN_SLOPE
         step = np.where(moves, distance / np.where(moves, slope, 1.0), 0.0)
         trial = np.clip(c - np.concatenate([[0.0], step]), lower, upper)
+
+        # Stop when it brings the fingers no nearer.
         after = evaluate(problem, np.concatenate([pose, trial]))
         if not np.abs(after.contact.distance).sum() < np.abs(distance).sum():
             break
@@ -147,12 +162,12 @@ def _refine(problem: WristProblem, coordinates: Array) -> tuple[Evaluation, Arra
     return best, c
 
 
-class _Scaled:
-    """The problem in scaled unknowns y with x = S y, as SLSQP asks for it.
+class _ScaledProblem:
+    """The problem in scaled unknowns y with x = x_S + S y, as SLSQP needs it.
 
-    S is the inverse square root of the Gauss-Newton matrix at the start, so that SLSQP's
-    first step, which it takes with an identity Hessian, is the Gauss-Newton step. The last
-    evaluation is kept: objective and constraints are asked for at the same point.
+    S is the inverse square root of the Gauss-Newton matrix at the start x_S. SLSQP's first step
+    assumes an identity Hessian, so in y it is the Gauss-Newton step. The last evaluation is kept,
+    because SLSQP asks for objective and constraints at the same point.
     """
 
     def __init__(self, problem: WristProblem) -> None:
@@ -167,29 +182,29 @@ class _Scaled:
         self._y = np.zeros(len(H))
 
     def x(self, y: Array) -> Array:
-        """Return the unknowns of the problem."""
+        """Return the unknowns x (n,) of scaled unknowns y (n,)."""
         return self._start + self._S @ y
 
     def at(self, y: Array) -> Evaluation:
-        """Return the problem at y."""
+        """Return the evaluation of the problem at y (n,)."""
         if not np.array_equal(y, self._y):
             self._y, self._last = y.copy(), evaluate(self._problem, self.x(y))
             self.evaluations += 1
         return self._last
 
     def objective(self, y: Array) -> tuple[float, Array]:
-        """Return the sum of squares in units and its slope."""
+        """Return the sum of squares, in units of `UNIT`, and its gradient (n,) by y."""
         e = self.at(y)
         slope = 2.0 * (e.residuals @ e.jacobian) @ self._S / UNIT
         return float(e.residuals @ e.residuals) / UNIT, slope
 
-    def slack(self, y: Array) -> Array:
-        """Return what must not be negative: room to the joints' limits and over the table."""
+    def constraints(self, y: Array) -> Array:
+        """Return what must not be negative: distances to the joints' limits and to the table."""
         c, (lower, upper) = self.x(y)[POSE:], self._problem.constants.limits.T
         return np.concatenate([c - lower, upper - c, self.at(y).clearance / CLEARANCE_UNIT])
 
-    def slack_slope(self, y: Array) -> Array:
-        """Return the derivative of `slack`."""
+    def constraint_jacobian(self, y: Array) -> Array:
+        """Return the derivative of `constraints` by y."""
         joints = self._S[POSE:]
         over_table = self.at(y).clearance_jacobian @ self._S / CLEARANCE_UNIT
         return np.concatenate([joints, -joints, over_table])

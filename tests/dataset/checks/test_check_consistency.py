@@ -5,14 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 
 import h5py
-from helpers.datasets import BOTH, MISSING, OTM, OTO, TRIALS, change, found, moved, must_find
+import numpy as np
+from helpers.datasets import BOTH, OTM, OTO, TRIALS, change, found, moved, must_find
+
+from drakegrasp.outcomes import Outcome
 
 
 def test_a_sample_of_another_trial_is_found(out: Path) -> None:
-    with h5py.File(out / OTO, "r+") as file:
-        number = int(file["test/trial_id"][0])
-        file["test/trial_id"][0] = MISSING
-    assert number != MISSING
+    with h5py.File(out / OTO, "r+") as file, h5py.File(out / TRIALS) as trials:
+        # A failure of the same object, whichever object the split has drawn.
+        sample_of = trials["trials/object"][file["test/trial_id"][0]]
+        failed = trials["trials/outcome"][:] == Outcome.MISSING_FINGERTIP
+        same = trials["trials/object"][:] == sample_of
+        file["test/trial_id"][0] = np.flatnonzero(failed & same)[0]
     must_find(
         out,
         (OTO, "/test", 0, "a sample's trial must be a success"),
@@ -62,12 +67,13 @@ def test_classes_are_checked(out: Path) -> None:
 def test_both_data_files_must_agree(out: Path) -> None:
     (out / TRIALS).unlink()
     change(out, OTM, "train/trial_id", 1, lambda i: i + 1000)
-    change(out, OTM, "test/object_props/class_name", 0, lambda _: "box")
+    change(out, OTM, "test/object_props/class_name", 0, lambda _: "ball")
     change(out, OTM, "test/object_props/frame_cam2img_otm", 1, moved(0, 0, 1e-4))
     must_find(
         out,
         (TRIALS, "", None, "the file must be there and readable"),
         (OTM, "/train", 1, "trial_id must be that of grasping_oto.hdf5"),
+        (OTM, "/test", 0, "class_name of "),
         (OTO, "/test", 1, "object_props/frame_cam2img_otm must be equal to that of"),
     )
 

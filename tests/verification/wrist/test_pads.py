@@ -16,7 +16,13 @@ from drakegrasp.errors import HandError
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import Hand, load_hand, make_parser
 from drakegrasp.hand.shapes import link_shapes
-from drakegrasp.verification.wrist.pads import ROUNDING, Pads, make_pads, nearest_on_pads, touch
+from drakegrasp.verification.wrist.pads import (
+    ROUNDING,
+    Pads,
+    make_pads,
+    nearest_on_pads,
+    signed_distance,
+)
 
 #: Half edges of the box among the bodies below [m].
 HALF = np.array([0.012, 0.01, 0.03])
@@ -54,7 +60,7 @@ def highest_plane(hull: trimesh.Trimesh, p: Array) -> float:
     return float(np.einsum("ij,ij->i", p - hull.triangles[:, 0], hull.face_normals).max())
 
 
-def signed_distance(hull: trimesh.Trimesh, p: Array) -> float:
+def hull_distance(hull: trimesh.Trimesh, p: Array) -> float:
     """Return trimesh's distance outside of the hull, negative inside."""
     return -float(trimesh.proximity.signed_distance(hull, p[None])[0])
 
@@ -64,7 +70,7 @@ def test_smooth_distance_is_over_the_planes_by_its_rounding_at_most(
     pads: Pads, hulls: list[trimesh.Trimesh], seed: int
 ) -> None:
     p = points_about(hulls, seed)
-    distance = touch(pads, p).distance
+    distance = signed_distance(pads, p).distance
     exact = np.array([highest_plane(hull, q) for hull, q in zip(hulls, p, strict=True)])
     planes = np.isfinite(pads.offsets).sum(axis=1)
     assert np.all(distance >= exact - MERGED)
@@ -84,13 +90,13 @@ def test_before_the_middle_of_a_face_the_distance_is_the_exact_one(
             for side in (-1.0, 1.0):
                 p = np.zeros((1, 3))
                 p[0, axis] = side * (HALF[axis] + height)
-                contact = touch(box, p)
+                contact = signed_distance(box, p)
                 # Five other faces at least 1 cm - 1 mm farther away: e^-12 each.
                 assert contact.distance[0] == pytest.approx(height, abs=1e-8)
                 np.testing.assert_allclose(contact.normal[0], side * np.eye(3)[axis], atol=1e-4)
     # The same with padding: body 0 of three has fewer planes than the others.
     p = np.tile([0.0, HALF[1] + 0.004, 0.0], (3, 1))
-    assert touch(pads, p).distance[0] == pytest.approx(0.004, abs=1e-8)
+    assert signed_distance(pads, p).distance[0] == pytest.approx(0.004, abs=1e-8)
     assert not np.isfinite(pads.offsets[0]).all()
 
 
@@ -99,19 +105,19 @@ def test_derivatives_are_those_of_finite_differences(
     pads: Pads, hulls: list[trimesh.Trimesh], seed: int
 ) -> None:
     p, h = points_about(hulls, 100 + seed), 1e-6
-    contact = touch(pads, p)
+    contact = signed_distance(pads, p)
     for axis in np.eye(3):
-        after, before = touch(pads, p + h * axis), touch(pads, p - h * axis)
+        after, before = signed_distance(pads, p + h * axis), signed_distance(pads, p - h * axis)
         slope = (after.distance - before.distance) / (2.0 * h)
         np.testing.assert_allclose(contact.gradient @ axis, slope, atol=1e-6)
         turn = (after.normal - before.normal) / (2.0 * h)
         # A pad turns by at most about a radian per rounding, 1/m.
-        np.testing.assert_allclose(contact.normal_slope @ axis, turn, atol=1e-5 / ROUNDING)
+        np.testing.assert_allclose(contact.normal_jacobian @ axis, turn, atol=1e-5 / ROUNDING)
 
 
 def test_normals_are_unit_vectors_along_the_gradient_which_is_shorter_at_edges(pads: Pads) -> None:
     p = np.array([HALF, [0.03, 0.02, 0.04], [0.1, 0.0, 0.0]])
-    contact = touch(pads, p)
+    contact = signed_distance(pads, p)
     np.testing.assert_allclose(np.linalg.norm(contact.normal, axis=1), 1.0, atol=1e-12)
     length = np.linalg.norm(contact.gradient, axis=1)
     np.testing.assert_allclose(contact.gradient, length[:, None] * contact.normal, atol=1e-12)
@@ -123,8 +129,8 @@ def test_normals_are_unit_vectors_along_the_gradient_which_is_shorter_at_edges(p
 
 def test_far_from_the_pad_nothing_overflows(pads: Pads) -> None:
     for p in np.random.default_rng(0).normal(size=(5, 3, 3)):
-        contact = touch(pads, 1e3 * p)
-        for values in (contact.distance, contact.normal, contact.gradient, contact.normal_slope):
+        contact = signed_distance(pads, 1e3 * p)
+        for values in (contact.distance, contact.normal, contact.gradient, contact.normal_jacobian):
             assert np.isfinite(values).all()
 
 
@@ -138,7 +144,7 @@ def test_nearest_point_is_trimeshs_own(pads: Pads, hulls: list[trimesh.Trimesh],
         # Of inside a body two faces may be equally near; then only the distance is given.
         if not hull.contains(q[None])[0]:
             np.testing.assert_allclose(found, expected[0], atol=1e-9)
-        assert abs(signed_distance(hull, found)) < 1e-9
+        assert abs(hull_distance(hull, found)) < 1e-9
 
 
 def test_nearest_point_has_no_rounding() -> None:

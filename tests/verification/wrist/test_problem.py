@@ -15,7 +15,8 @@ from drakegrasp.frames import Array, invert_pose, make_pose, rotate_vectors, tra
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses
 from drakegrasp.hand.shapes import link_shapes
-from drakegrasp.verification.wrist.pads import touch
+from drakegrasp.verification.wrist.hand_constants import hand_constants
+from drakegrasp.verification.wrist.pads import signed_distance
 from drakegrasp.verification.wrist.problem import (
     CLEARANCE_ROUNDING,
     CLOSING_WEIGHT,
@@ -23,7 +24,6 @@ from drakegrasp.verification.wrist.problem import (
     POSE,
     WristProblem,
     evaluate,
-    hand_constants,
 )
 
 SEEDS = range(12)
@@ -91,7 +91,7 @@ def test_palm_and_fingertips_are_where_kinematics_puts_them(name: str, seed: int
         [transform_points(X, p[None])[0] for X, p in zip(X_FO, problem.p_OQ, strict=True)]
     )
     np.testing.assert_allclose(at.p_FiQ, p_FQ, atol=1e-12)
-    contact = touch(problem.constants.pads, p_FQ)
+    contact = signed_distance(problem.constants.pads, p_FQ)
     np.testing.assert_allclose(at.contact.distance, contact.distance, atol=1e-12)
     normals = np.einsum("kba,kb->ka", X_FO[:, :3, :3], contact.normal)
     np.testing.assert_allclose(at.pad_normals_O, normals, atol=1e-9)
@@ -221,7 +221,7 @@ def test_a_finger_closed_against_its_contact_leaves_little(name: str) -> None:
     hand, constants = hand_of(name), hand_constants(hand_of(name))
     c = coordinate_limits(hand).mean(axis=1) * [0.2, *[0.8] * hand.num_fingers]
     X_GF = fingertip_poses(hand, spread=c[0], closing=c[1:])
-    contact = touch(constants.pads, constants.pad_points)
+    contact = signed_distance(constants.pads, constants.pad_points)
     on_pad = constants.pad_points - contact.distance[:, None] * contact.normal
     turn = partial(np.einsum, "kab,kb->ka", X_GF[:, :3, :3])
     problem = WristProblem(

@@ -16,14 +16,14 @@ from drakegrasp.frames import Array, invert_pose, make_pose, rotate_vectors, tra
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses
 from drakegrasp.hand.shapes import link_shapes
+from drakegrasp.verification.wrist.hand_constants import hand_constants
 from drakegrasp.verification.wrist.initial_guesses import (
     DIFFERENT,
     LEVER,
     find_starts,
     make_postures,
 )
-from drakegrasp.verification.wrist.pads import nearest_on_pads, touch
-from drakegrasp.verification.wrist.problem import hand_constants
+from drakegrasp.verification.wrist.pads import nearest_on_pads, signed_distance
 from drakegrasp.verification.wrist.solver import WristFit, fit_wrist
 
 SEEDS = range(25)
@@ -67,11 +67,12 @@ def touched(
     p_FQ = nearest_on_pads(constants.pads, p_FQ)
     X_OG = make_pose(Rotation.random(random_state=rng).as_matrix(), rng.uniform(-0.2, 0.2, 3))
     X_OF = X_OG @ fingertip_poses(hand, spread=c[0], closing=c[1:])
+    contact = signed_distance(constants.pads, p_FQ)
     return Touch(
         X_OG=X_OG,
         coordinates=c,
         p_OQ=np.einsum("kab,kb->ka", X_OF[:, :3, :3], p_FQ) + X_OF[:, :3, 3],
-        nhat_Q_O=-np.einsum("kab,kb->ka", X_OF[:, :3, :3], touch(constants.pads, p_FQ).normal),
+        nhat_Q_O=-np.einsum("kab,kb->ka", X_OF[:, :3, :3], contact.normal),
     )
 
 
@@ -146,7 +147,9 @@ def test_a_fit_is_as_good_as_it_says(seed: int) -> None:
         p_FQ = np.einsum("kab,kb->ka", X_FO[:, :3, :3], made.p_OQ) + X_FO[:, :3, 3]
         residual = np.linalg.norm(nearest_on_pads(constants.pads, p_FQ) - p_FQ, axis=1)
         np.testing.assert_allclose(found.residual, residual, atol=1e-9)
-        inward = -np.einsum("kab,kb->ka", X_OF[:, :3, :3], touch(constants.pads, p_FQ).normal)
+        inward = -np.einsum(
+            "kab,kb->ka", X_OF[:, :3, :3], signed_distance(constants.pads, p_FQ).normal
+        )
         cosine = np.clip(np.sum(inward * made.nhat_Q_O, axis=1), -1.0, 1.0)
         np.testing.assert_allclose(np.cos(found.normal_error), cosine, atol=1e-9)
         R = found.X_OG[:3, :3]
@@ -295,7 +298,7 @@ def test_postures_are_within_the_limits_and_where_kinematics_puts_them(pincer: s
         constants = hand_constants(hand_of(name))
         for p in p_FP[:: len(p_FP) // 7]:
             # On the pad but for its rounding.
-            assert np.abs(touch(constants.pads, p).distance).max() < 5e-4
+            assert np.abs(signed_distance(constants.pads, p).distance).max() < 5e-4
             np.testing.assert_allclose(p, p_FP[0], atol=1e-12)
 
 
@@ -303,7 +306,7 @@ def misfit(name: str, X_OG: Array, c: Array, made: Touch) -> float:
     """Return what is left between a posture's contacts, as arrows of length `LEVER`, and others."""
     hand, constants = hand_of(name), hand_constants(hand_of(name))
     X_OF = X_OG @ fingertip_poses(hand, spread=c[0], closing=c[1:])
-    contact = touch(constants.pads, constants.pad_points)
+    contact = signed_distance(constants.pads, constants.pad_points)
     on_pad = constants.pad_points - contact.distance[:, None] * contact.normal
     p = np.einsum("kab,kb->ka", X_OF[:, :3, :3], on_pad) + X_OF[:, :3, 3] - made.p_OQ
     n = np.einsum("kab,kb->ka", X_OF[:, :3, :3], contact.normal) + made.nhat_Q_O

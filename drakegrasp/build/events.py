@@ -1,0 +1,111 @@
+"""What a build says in its log, and what it learns from the log of an earlier build.
+
+In: what happens. Out: lines of `log.jsonl`, see `drakegrasp.dataset.log`.
+"""
+
+from __future__ import annotations
+
+import socket
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from drakegrasp.build.work_unit import UnitSummary
+from drakegrasp.dataset.log import BuildLog, read_log
+from drakegrasp.dataset.manifest import Manifest, ObjectEntry, RefusedMesh
+from drakegrasp.runtime.blas import running_kernel
+from drakegrasp.runtime.executor import WorkerPool
+
+
+class BuildEvents:
+    """Writes the events of one build to its log."""
+
+    def __init__(self, out: Path, pool: WorkerPool | None, *, show: bool) -> None:
+        """Open the log.
+
+        Args:
+            out: Directory of the dataset.
+            pool: The workers; None if this process does the work.
+            show: Whether to tell the user on standard error that the build waits for workers.
+        """
+        self._out, self._pool, self._show = out, pool, show
+        self._log = BuildLog(out)
+
+    def kernel(self) -> str | None:
+        """Return the BLAS kernel of the processes that do the work; None if they differ."""
+        return running_kernel() if self._pool is None else self._pool.kernel
+
+    def kernel_notice(self) -> list[str]:
+        """Return a notice if the last build in the directory ran another BLAS kernel."""
+        started = [event for event in read_log(self._out) if event.get("event") == "started"]
+        if not started or "kernel" not in started[-1]:
+            return []
+        before, now = started[-1]["kernel"], self.kernel()
+        if before == now:
+            return []
+        return [
+            f"begun with BLAS kernel {before or 'several'}, goes on with {now or 'several'}: "
+            "last bits of simulated values may differ"
+        ]
+
+    def started(self, manifest: Manifest, notices: Sequence[str]) -> None:
+        """Log who builds what, and listen to the workers."""
+        self._log(
+            "started",
+            command=sys.argv,
+            host=socket.gethostname(),
+            config_hash=manifest.config.simulation_hash(),
+            seed=manifest.config.seed,
+            kernel=self.kernel(),
+            versions=manifest.versions,
+        )
+        for notice in notices:
+            self._log("notice", text=notice)
+        if self._pool is not None:
+            self._pool.on_change = self.workers_changed
+            self._pool.on_none = self.no_worker
+
+    def workers_changed(self, joined: set[str], left: set[str]) -> None:
+        """Log the addresses of workers that joined and of those that left."""
+        assert self._pool is not None
+        for event, addresses in (("worker joined", joined), ("worker lost", left)):
+            for address in sorted(addresses):
+                self._log(event, address=address, workers=self._pool.size)
+
+    def no_worker(self) -> None:
+        """Log that there has been no worker for long."""
+        self._log("no worker")
+        if self._show:
+            sys.stderr.write("there is no worker: waiting for one\n")
+
+    def mesh_done(self, entry: ObjectEntry | RefusedMesh) -> None:
+        """Log a mesh that was prepared or refused, by its entry in the manifest."""
+        if isinstance(entry, RefusedMesh):
+            self._log("mesh refused", name=entry.name, reason=entry.reason)
+        else:
+            self._log("mesh prepared", name=entry.name, candidates=entry.candidates)
+
+    def unit_done(self, summary: UnitSummary) -> None:
+        """Log what a work unit returned."""
+        header = summary.header
+        self._log(
+            "unit done",
+            object=header.object_name,
+            start=header.start,
+            stop=header.stop,
+            outcomes={outcome.label: count for outcome, count in summary.outcomes.items()},
+            seconds={stage: round(seconds, 4) for stage, seconds in summary.seconds.items()},
+            errors=summary.errors,
+        )
+
+    def damaged_shard(self, error: Exception) -> None:
+        """Log why a shard is run again."""
+        self._log("damaged shard", reason=str(error))
+
+    def finished(self, *, simulated: int, reused: int, seconds: float) -> None:
+        """Log the end of the build: numbers of work units, and its duration [s]."""
+        self._log("finished", simulated=simulated, reused=reused, seconds=round(seconds, 3))
+
+    def stopped(self, error: BaseException) -> None:
+        """Log what stopped the build."""
+        self._log("stopped", reason=f"{type(error).__name__}: {error}")

@@ -1,0 +1,120 @@
+"""How long the stages of a build take: measured once, measured by the user, or by the log.
+
+Out: `StageTimes`, from which `drakegrasp.build.estimate` makes a plan.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from drakegrasp.config import Config
+from drakegrasp.dataset.log import FILE_NAME, read_log
+from drakegrasp.errors import DataError
+from drakegrasp.outcomes import Outcome
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageTimes:
+    """How long the stages take on one core on average, and what they leave on the disk.
+
+    Attributes:
+        prepare: Repairing, settling and sampling an object [s].
+        scene: Building an object's scene and distance field, on each worker that needs it [s].
+        attempt: An attempt, over all outcomes [s].
+        look: Both images of a success [s].
+        assemble: Filters and files, per attempt, on one core [s].
+        successes: Share of the attempts that succeed.
+        samples: Share of the successes that the filters keep.
+        unit_bytes: Of a shard without rows [B].
+        attempt_bytes: Of a row of a failed attempt, in its shard and in trials.hdf5 [B].
+        success_bytes: What a success adds to its shard [B].
+        sample_bytes: Of a row, in grasping_oto.hdf5 and grasping_otm.hdf5 together [B].
+        object_bytes: Of an object's own files [B].
+        source: Where the figures are from, for the reader.
+    """
+
+    prepare: float
+    scene: float
+    attempt: float
+    look: float
+    assemble: float
+    successes: float
+    samples: float
+    unit_bytes: float
+    attempt_bytes: float
+    success_bytes: float
+    sample_bytes: float
+    object_bytes: float
+    source: str
+
+
+#: By the log and the files of thirty G3DB meshes with 300 palm poses each (27,000 attempts, preset
+#: `paper`, Drake 1.51.1) on two workers; preparing and assembling by
+#: `pipelines/measurements/measure_stages.py`.
+MEASURED = StageTimes(
+    prepare=3.2,
+    scene=0.3,
+    attempt=0.011,
+    look=0.029,
+    assemble=0.0005,
+    successes=0.0087,
+    samples=0.88,
+    unit_bytes=136e3,
+    attempt_bytes=260.0,
+    success_bytes=67e3,
+    sample_bytes=82e3,
+    object_bytes=124e3,
+    source="measured on 30 G3DB meshes, preset paper; --times for those of your own",
+)
+
+
+def read_times(path: Path) -> StageTimes:
+    """Return the stage times that `pipelines/measurements/measure_stages.py` printed to a file.
+
+    Raises:
+        DataError: If it holds anything else.
+    """
+    try:
+        return StageTimes(**json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, TypeError, ValueError) as error:
+        raise DataError(
+            f"{path}: must be the output of pipelines/measurements/measure_stages.py, "
+            f"got other ({error})"
+        ) from None
+
+
+def logged_times(out: Path, config: Config) -> StageTimes | None:
+    """Return the mean times of a build's units so far, by its log, or None if none is done.
+
+    What a log does not tell, e.g. the sizes of files, is as in `MEASURED`. The log has wall-clock
+    times: other work of the machines is in them.
+
+    Args:
+        out: Directory of the dataset.
+        config: Only units of this configuration count.
+    """
+    seconds: Counter[str] = Counter()
+    outcomes: Counter[str] = Counter()
+    objects = set()
+    ours = False
+    for event in read_log(out):
+        if event["event"] == "started":
+            ours = event["config_hash"] == config.simulation_hash()
+        # A unit that was done before has no seconds.
+        elif ours and event["event"] == "unit done" and event["seconds"]:
+            seconds.update(event["seconds"])
+            outcomes.update(event["outcomes"])
+            objects.add(event["object"])
+    attempts, successes = outcomes.total(), outcomes[Outcome.SUCCESS.label]
+    if not attempts:
+        return None
+    return replace(
+        MEASURED,
+        attempt=(seconds["try"] + seconds["measure"] + seconds["write"]) / attempts,
+        look=seconds["look"] / successes if successes else MEASURED.look,
+        successes=successes / attempts,
+        source=f"{attempts:,} attempts of {len(objects)} objects in {out / FILE_NAME}",
+    )

@@ -1,0 +1,60 @@
+"""The order of the rules for trials.hdf5.
+
+In: an open trials.hdf5 and, if there is one, the dataset around it. Out: its violations, in the
+findings of the context.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from drakegrasp.dataset.checks import consistency
+from drakegrasp.dataset.checks import trials as trial_rules
+from drakegrasp.dataset.checks.context import Context
+from drakegrasp.dataset.checks.open_file import OpenFile, Rule
+from drakegrasp.outcomes import Outcome
+
+#: Trials in a batch: some 10 MB.
+TRIAL_ROWS = 8192
+
+
+def check_trials_file(trials: OpenFile, context: Context) -> None:
+    """Apply every rule to the objects, trials and successes of a file.
+
+    Args:
+        trials: The file.
+        context: Takes the violations. Its manifest, if it has one, says which objects and
+            candidates there are.
+    """
+    findings, dataset = context.findings, context.dataset
+    if dataset is not None:
+        context.add(trials, consistency.same_objects(trials, dataset.manifest))
+    if not {"objects", "trials"} <= set(trials.groups):
+        return  # a broken layout, which is a finding already; trials need their objects
+
+    # The rules whose limits depend on the dataset.
+    objects = dataset.manifest.objects if dataset else None
+    numbers = partial(
+        trial_rules.numbers,
+        objects=trials.count("objects"),
+        candidates=None if objects is None else [entry.candidates for entry in objects],
+        standoffs=len(trials.config.candidates.standoffs) if trials.config else None,
+    )
+    last: list[Rule] = [trial_rules.verdicts, trial_rules.contacts, trial_rules.poses]
+    if objects is not None and trials.count("objects") == len(objects):
+        last.append(partial(trial_rules.resting_poses, X_TO=[entry.X_TO for entry in objects]))
+
+    # Numbers, then stages, which need a legal outcome, then what needs finite values.
+    successes = []
+    for whole in trials.batches("trials", TRIAL_ROWS, findings):
+        successes.append(whole["trial_id"][whole["outcome"] == Outcome.SUCCESS])
+        batch = trials.judge(whole, findings, numbers)
+        batch = trials.judge(batch, findings, trial_rules.stages)
+        trials.judge(batch, findings, *last)
+        context.advance(len(whole))
+
+    if "successes" in trials.groups:
+        expected = np.concatenate([np.zeros(0, dtype=np.int64), *successes])
+        context.add(trials, consistency.successes(trials, expected))

@@ -1,0 +1,288 @@
+"""The views of a verified grasp: pictures, and the contacts to draw over them.
+
+In: a verification. Out: the object from two sides with its contacts, then the last state that was
+reached, with the hand, or without it if forces lifted the object. `figure` draws them.
+
+The pictures come from `visualization.third_person`, so they need OpenGL and a single thread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+from pydrake.geometry import LightParameter
+
+from drakegrasp.frames import X_WT, Array, invert_pose, make_pose, transform_points
+from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.kinematics import joint_positions
+from drakegrasp.mesh.rays import first_hits
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.simulation.contacts import Contacts
+from drakegrasp.simulation.placement import canonical_pose
+from drakegrasp.simulation.trajectory import lifted_palm
+from drakegrasp.vision.camera import Picture
+from drakegrasp.visualization.style import ARROW, HIDDEN, PREDICTED, REACHED
+from drakegrasp.visualization.third_person import (
+    AZIMUTHS_DEG,
+    Snapshot,
+    build_render_scene,
+    camera_pose,
+    choose_view,
+    outline_points,
+    render_view,
+    set_snapshot,
+)
+
+if TYPE_CHECKING:
+    from drakegrasp.verification.result import Verification
+
+#: Lights beside the camera and above the table, without shadows: contacts are on all sides of an
+#: object, and none should be in the dark.
+LIGHTS = (
+    LightParameter(type="point", frame="camera", position=[-0.25, -0.15, 0.0], intensity=0.85),
+    LightParameter(type="point", frame="camera", position=[0.4, 0.0, 0.0], intensity=0.4),
+    LightParameter(type="point", frame="world", position=[0.0, 0.0, 4.0], intensity=0.4),
+)
+#: Pose of the hand in pictures of the object alone: out of view.
+AWAY = make_pose(np.eye(3), [0.0, 0.0, -100.0])
+#: Elevation of the camera in pictures of the object alone [rad].
+ELEVATION = np.deg2rad(24.0)
+#: A contact faces the camera if the cosine between its normal and the line of sight is above this.
+FACING = 0.1
+#: Edge of a picture [px].
+PIXELS = 560
+#: Length of the arrow of the largest force [m].
+LARGEST_FORCE = 0.05
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Marks:
+    """Contacts of one kind to draw: a dot and an arrow each.
+
+    Attributes:
+        kind: Name of the kind in the ids of the figure's elements.
+        colour: Of dots and arrows.
+        size: Diameter of the dots; the arrows scale with it [points].
+        p_OQ: (n, 3), points in {O} [m].
+        nhat_Q_O: (n, 3), outward unit normals in {O}.
+        tail_O, tip_O: (n, 3), ends of the arrows in {O} [m].
+        names: Text at the tip of each arrow.
+    """
+
+    kind: str
+    colour: str
+    size: float
+    p_OQ: Array
+    nhat_Q_O: Array
+    tail_O: Array
+    tip_O: Array
+    names: Sequence[str]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class View:
+    """A picture, and the contacts to draw over it.
+
+    Attributes:
+        title: Text above the picture.
+        picture: The picture.
+        X_WO: (4, 4), pose of the object.
+        marks: The contacts.
+    """
+
+    title: str
+    picture: Picture
+    X_WO: Array
+    marks: Sequence[Marks]
+
+
+def render_views(verified: Verification) -> list[View]:
+    """Return the views of a verified grasp.
+
+    Args:
+        verified: The verdict.
+
+    Raises:
+        MachineError: If a picture is blank, which means that OpenGL failed.
+    """
+    # The contacts: predicted ones, and those after closing.
+    renderer = _Renderer(verified.placed.model, load_hand(verified.config.hand))
+    X_WO = X_WT @ canonical_pose(verified.placed.X_TO)
+    closed = None if verified.trial is None else verified.trial.closed
+    marks = [_predicted(verified), *_reached(closed, _force_scale(verified))]
+
+    # The object from two sides, then the last state that was reached.
+    first, second = _two_sides(renderer.model, X_WO, marks)
+    return [
+        renderer.object_view("contacts", X_WO, marks, first),
+        renderer.object_view("from another side", X_WO, marks, second),
+        *_last_view(renderer, verified, marks, first),
+    ]
+
+
+def _last_view(
+    renderer: _Renderer, verified: Verification, marks: Sequence[Marks], azimuth: float
+) -> list[View]:
+    """Return the view of the last state that was reached; no view if nothing was tried.
+
+    The azimuth [rad] is that of the camera where the object is shown alone.
+    """
+    X_WO = X_WT @ canonical_pose(verified.placed.X_TO)
+    trial, lift, fit = verified.trial, verified.lift, verified.fit
+
+    # After the lift, by forces or by the hand.
+    if lift is not None and lift.X_TO_lifted is not None:
+        return [renderer.object_view("end of the lift", X_WT @ lift.X_TO_lifted, marks, azimuth)]
+    if trial is not None and trial.X_TO_lifted is not None and trial.q_lifted is not None:
+        X_WG = lifted_palm(trial.X_TO @ trial.X_OG, trial.time_lift, verified.config)
+        X_WO = X_WT @ trial.X_TO_lifted
+        snapshot = Snapshot(X_WG=X_WG, X_WO=X_WO, q=trial.q_lifted)
+        reached = _reached(trial.lifted, _force_scale(verified))
+        return [renderer.hand_view("end of the lift", snapshot, reached)]
+
+    # Before it: the closed hand, or the palm pose that comes closest.
+    if trial is not None and trial.q_closed is not None:
+        snapshot = Snapshot(X_WG=X_WO @ trial.X_OG, X_WO=X_WO, q=trial.q_closed)
+        return [renderer.hand_view("after closing", snapshot, marks)]
+    if fit is not None:
+        q = renderer.positions(fit.spread, fit.closing)
+        snapshot = Snapshot(X_WG=X_WO @ fit.X_OG, X_WO=X_WO, q=q)
+        return [renderer.hand_view("the hand where it comes closest", snapshot, marks)]
+    return []
+
+
+class _Renderer:
+    """Renders the views of one object and one hand."""
+
+    def __init__(self, model: ObjectModel, hand: Hand) -> None:
+        self.model = model
+        self._scene = build_render_scene(model, hand, lights=LIGHTS)
+
+    def object_view(self, title: str, X_WO: Array, marks: Sequence[Marks], azimuth: float) -> View:
+        """Return a view of the object alone, at X_WO (4, 4), from an azimuth [rad]."""
+        q = self.positions(0.0, np.zeros(self._scene.hand.num_fingers))
+        X_WC = _camera(self.model, X_WO, marks, azimuth)
+        return self._view(title, Snapshot(X_WG=AWAY, X_WO=X_WO, q=q), X_WC, marks)
+
+    def hand_view(self, title: str, snapshot: Snapshot, marks: Sequence[Marks]) -> View:
+        """Return a view of hand and object, from where most of both is visible."""
+        around = outline_points(self._scene, snapshot, self.model.half_extents)
+        return self._view(title, snapshot, choose_view(self._scene, around), marks)
+
+    def positions(self, spread: float, closing: Array) -> Array:
+        """Return the positions of the hand's joints [rad], in the order of `Snapshot.q`."""
+        angles = joint_positions(self._scene.hand, spread, closing)
+        return np.array([angles[name] for name in self._scene.joint_names])
+
+    def _view(self, title: str, snapshot: Snapshot, X_WC: Array, marks: Sequence[Marks]) -> View:
+        set_snapshot(self._scene, snapshot)
+        picture = render_view(self._scene, X_WC, (PIXELS, PIXELS))
+        return View(title=title, picture=picture, X_WO=snapshot.X_WO, marks=marks)
+
+
+def _predicted(verified: Verification) -> Marks:
+    """Return the predicted contacts, with arrows along their normals."""
+    p, n = verified.p_OQ, verified.nhat_Q_O
+    names = [str(i + 1) for i in range(len(p))]
+    tip = p + ARROW * n
+    return Marks(
+        kind="predicted",
+        colour=PREDICTED,
+        size=9.0,
+        p_OQ=p,
+        nhat_Q_O=n,
+        tail_O=p,
+        tip_O=tip,
+        names=names,
+    )
+
+
+def _reached(contacts: Contacts | None, scale: float) -> list[Marks]:
+    """Return the contacts of touching fingertips, if any, with their forces as arrows.
+
+    The arrow of a force ends at its contact; its length per force is `scale` [m/N].
+    """
+    if contacts is None or not contacts.touching.any():
+        return []
+    p, n, f = (
+        values[contacts.touching] for values in (contacts.p_OQ, contacts.nhat_Q_O, contacts.f_Q_O)
+    )
+    tail = p - scale * f
+    names = [""] * len(p)
+    return [
+        Marks(
+            kind="reached",
+            colour=REACHED,
+            size=5.0,
+            p_OQ=p,
+            nhat_Q_O=n,
+            tail_O=tail,
+            tip_O=p,
+            names=names,
+        )
+    ]
+
+
+def largest_force(verified: Verification) -> float:
+    """Return the largest force on a fingertip that is drawn [N]; inf if there is none."""
+    trial = verified.trial
+    stages = [] if trial is None else [trial.closed, trial.lifted]
+    forces = [float(np.linalg.norm(c.f_Q_O, axis=1).max()) for c in stages if c is not None]
+    return max(forces, default=0.0) or np.inf
+
+
+def _force_scale(verified: Verification) -> float:
+    """Return the length of an arrow per force [m/N]."""
+    return LARGEST_FORCE / largest_force(verified)
+
+
+def _two_sides(model: ObjectModel, X_WO: Array, marks: Sequence[Marks]) -> tuple[float, float]:
+    """Return two azimuths [rad] that together show as many predicted contacts as possible.
+
+    The first shows the most; the second shows the most of those that the first does not.
+    """
+    # Which contacts each camera sees, and which of them face it.
+    azimuths = np.deg2rad(AZIMUTHS_DEG)
+    cameras = [_camera(model, X_WO, marks, azimuth)[:3, 3] for azimuth in azimuths]
+    seen = np.array([is_seen(model, X_WO, marks[0], p_WC) for p_WC in cameras])
+    towards = np.array([_towards(marks[0], X_WO, p_WC) for p_WC in cameras])
+    normals = np.broadcast_to(marks[0].nhat_Q_O, towards.shape)
+    facing = np.sum(towards * normals, axis=2) > FACING
+
+    # An arrow that points at the camera shows little, so one across the line of sight counts more.
+    across = np.linalg.norm(np.cross(towards, normals), axis=2)
+    worth = (seen & facing) * (1.0 + 0.5 * across)
+
+    # Among equal second views take the one opposite to the first.
+    first = int(np.argmax(worth.sum(axis=1)))
+    opposite = 1e-3 * np.cos(azimuths - azimuths[first])
+    second = int(np.argmax((worth * (worth[first] == 0.0)).sum(axis=1) - opposite))
+    return float(azimuths[first]), float(azimuths[second])
+
+
+def _camera(
+    model: ObjectModel, X_WO: Array, marks: Sequence[Marks], azimuth: float, fill: float = 1.3
+) -> Array:
+    """Return the pose X_WC (4, 4) of a camera that has the object and its marks in view."""
+    half = model.half_extents
+    corners = half * np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T
+    around = np.vstack([corners, *(m.tail_O for m in marks), *(m.tip_O for m in marks)])
+    return camera_pose(transform_points(X_WO, around), azimuth, ELEVATION, fill=fill)
+
+
+def _towards(marks: Marks, X_WO: Array, p_WC: Array) -> Array:
+    """Return the unit vectors (n, 3) in {O} from contacts to a camera at p_WC (3,)."""
+    p_OC = transform_points(invert_pose(X_WO), p_WC[None])[0]
+    away = p_OC - marks.p_OQ
+    return away / np.linalg.norm(away, axis=1, keepdims=True)
+
+
+def is_seen(model: ObjectModel, X_WO: Array, marks: Marks, p_WC: Array) -> npt.NDArray[np.bool_]:
+    """Return (n,), whether a camera at p_WC (3,) sees each contact past the object."""
+    start = marks.p_OQ + HIDDEN * marks.nhat_Q_O
+    hits = first_hits(np.asarray(model.visual.triangles), start, _towards(marks, X_WO, p_WC))
+    return ~np.isfinite(hits)

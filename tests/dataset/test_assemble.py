@@ -1,0 +1,80 @@
+"""Assembling the files from the shards."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from helpers.datasets import OTM, OTO, TRIALS, make_dataset
+
+from drakegrasp.dataset import shards
+from drakegrasp.dataset.assemble import assemble, assemble_locked, summarise
+from drakegrasp.dataset.filters import Removal
+from drakegrasp.dataset.lock import FILE_NAME, build_lock
+from drakegrasp.errors import DataError
+from drakegrasp.runtime.files import refuse_broken_seal
+
+FILES = (OTO, OTM, TRIALS)
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    (tmp_path / "meshes").mkdir()
+    return make_dataset(tmp_path / "out", tmp_path / "meshes")
+
+
+def test_each_seal_is_verified_once(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though the second pass reads the shards with samples again."""
+    verified: Counter[Path] = Counter()
+
+    def count(path: Path, what: str = "shard") -> None:
+        verified[path] += 1
+        refuse_broken_seal(path, what)
+
+    monkeypatch.setattr(shards, "refuse_broken_seal", count)
+    assert assemble(out).removed == {Removal.KEPT: 9}
+    assert verified == Counter(out.glob("shards/*/*.h5"))
+    assert len(verified) == 6
+
+
+def test_assembling_again_gives_the_same_bytes(out: Path) -> None:
+    before = [(out / name).read_bytes() for name in FILES]
+    for name in FILES:
+        (out / name).unlink()
+    assemble(out)
+    assert [(out / name).read_bytes() for name in FILES] == before
+
+
+def test_holder_of_the_lock_assembles_in_it(out: Path) -> None:
+    with build_lock(out):
+        assert assemble_locked(out) == summarise(out)
+        assert (out / FILE_NAME).exists()
+
+
+def test_rejected_trials_become_no_samples(out: Path) -> None:
+    assembly = assemble(out, rejected=[0, 12])
+    assert assembly.removed == {Removal.KEPT: 7, Removal.REJECTED: 2}
+    assert sum(assembly.samples.values()) == 7
+
+
+def test_rejected_failure_is_refused_and_changes_nothing(out: Path) -> None:
+    before = [(out / name).read_bytes() for name in FILES]
+    with pytest.raises(DataError, match="rejected trials must be successes, got trial 1"):
+        assemble(out, rejected=[0, 1])
+    assert [(out / name).read_bytes() for name in FILES] == before
+
+
+def test_damaged_shard_is_refused_and_changes_nothing(out: Path) -> None:
+    before = [(out / name).read_bytes() for name in FILES]
+    path = sorted(out.glob("shards/*/*.h5"))[-1]
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(DataError, match="damaged or cut off"):
+        assemble(out)
+    assert [(out / name).read_bytes() for name in FILES] == before
+
+
+def test_directory_without_a_dataset_is_left_alone(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"without manifest\.json"):
+        assemble(tmp_path / "missing")
+    assert list(tmp_path.iterdir()) == []

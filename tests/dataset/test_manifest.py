@@ -1,0 +1,147 @@
+"""The manifest: equal content gives equal bytes, and a broken one is refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drakegrasp.config import load_config
+from drakegrasp.dataset.manifest import (
+    Manifest,
+    ObjectEntry,
+    RefusedMesh,
+    change_postprocessing,
+    read_manifest,
+    write_manifest,
+)
+from drakegrasp.dataset.paths import FILE_NAME
+from drakegrasp.errors import DataError
+
+#: The end of a manifest as builds have always written it.
+ENTRIES = """ "objects": [
+  {
+   "name": "1_mug_é",
+   "class": "mug",
+   "mesh_sha256": "ab",
+   "mass": 0.1,
+   "X_TO": [
+    1.0,
+    0.0,
+    0.0,
+    0.30000000000000004,
+    0.0,
+    1.0,
+    0.0,
+    -0.0,
+    0.0,
+    0.0,
+    1.0,
+    1e-17
+   ],
+   "rolled": true,
+   "candidates": 7,
+   "combinations": 40,
+   "valid": 20,
+   "distinct": 10,
+   "notes": [
+    "2 holes closed"
+   ]
+  }
+ ],
+ "refused": [
+  {
+   "name": "2_sheet",
+   "mesh_sha256": "cd",
+   "reason": "must be closed"
+  }
+ ]
+}
+"""
+
+MUG = ObjectEntry(
+    name="1_mug_é",
+    class_name="mug",
+    mesh_sha256="ab",
+    mass=0.1,
+    X_TO=(1.0, 0.0, 0.0, 0.1 + 0.2, 0.0, 1.0, 0.0, -0.0, 0.0, 0.0, 1.0, 1e-17),
+    rolled=True,
+    candidates=7,
+    combinations=40,
+    valid=20,
+    distinct=10,
+    notes=("2 holes closed",),
+)
+SHEET = RefusedMesh(name="2_sheet", mesh_sha256="cd", reason="must be closed")
+
+
+@pytest.fixture
+def manifest() -> Manifest:
+    config = load_config(overrides=["unit_candidates=3"])
+    return Manifest(config=config, objects=(MUG,), refused=(SHEET,), versions={"drake": "1"})
+
+
+def test_entries_are_written_as_ever(tmp_path: Path, manifest: Manifest) -> None:
+    write_manifest(manifest, tmp_path)
+    assert (tmp_path / FILE_NAME).read_text(encoding="utf-8").endswith(ENTRIES)
+
+
+def test_manifest_that_is_read_and_written_keeps_its_bytes(
+    tmp_path: Path, manifest: Manifest
+) -> None:
+    write_manifest(manifest, tmp_path)
+    before = (tmp_path / FILE_NAME).read_bytes()
+    again = read_manifest(tmp_path)
+    assert again == manifest
+    write_manifest(again, tmp_path)
+    assert (tmp_path / FILE_NAME).read_bytes() == before
+
+
+def test_units_cover_the_candidates_of_each_object(manifest: Manifest) -> None:
+    manifest = replace(manifest, objects=(MUG, replace(MUG, name="3_cup", candidates=3)))
+    ranges = [(h.object_name, h.start, h.stop) for h in manifest.headers()]
+    assert ranges == [("1_mug_é", 0, 3), ("1_mug_é", 3, 6), ("1_mug_é", 6, 7), ("3_cup", 0, 3)]
+    assert manifest.units == len(ranges)
+
+
+def _drop(key: str) -> Any:
+    return lambda content: content["objects"][0].pop(key)
+
+
+@pytest.mark.parametrize(
+    "harm",
+    [
+        _drop("class"),
+        _drop("candidates"),
+        lambda content: content["objects"][0].update(colour="red"),
+        lambda content: content.update(objects=["1_mug"]),
+        lambda content: content["refused"][0].pop("reason"),
+        lambda content: content.pop("config"),
+    ],
+)
+def test_broken_entry_is_refused(tmp_path: Path, manifest: Manifest, harm: Any) -> None:
+    write_manifest(manifest, tmp_path)
+    content = json.loads((tmp_path / FILE_NAME).read_text(encoding="utf-8"))
+    harm(content)
+    (tmp_path / FILE_NAME).write_text(json.dumps(content), encoding="utf-8")
+    with pytest.raises(DataError, match=r"manifest\.json: must be a readable manifest"):
+        read_manifest(tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff", b"[]"])
+def test_file_that_is_no_manifest_is_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / FILE_NAME).write_bytes(content)
+    with pytest.raises(DataError, match=r"manifest\.json: must be a readable manifest"):
+        read_manifest(tmp_path)
+
+
+def test_filters_may_change_but_not_the_physics(tmp_path: Path, manifest: Manifest) -> None:
+    write_manifest(manifest, tmp_path)
+    change_postprocessing(tmp_path, ["split.valid_fraction=0.2"])
+    assert read_manifest(tmp_path).config.split.valid_fraction == 0.2
+    with pytest.raises(ValueError, match=r"physics\.time_step \(0\.008 there, 0\.004 here\)"):
+        change_postprocessing(tmp_path, ["physics.time_step=0.004"])
+    assert read_manifest(tmp_path).objects == (MUG,)

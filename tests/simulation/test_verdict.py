@@ -1,0 +1,61 @@
+"""The verdict's rules, one attempt at a time and many at once."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from drakegrasp.outcomes import Outcome
+from drakegrasp.simulation.verdict import judge_closed, judge_lifted
+
+ALL, ONE_OFF, NONE = [True, True, True], [True, False, True], [False, False, False]
+
+
+@pytest.mark.parametrize(
+    ("touching", "other_links", "on_table", "outcome"),
+    [
+        (ALL, 0, False, Outcome.SUCCESS),
+        (ONE_OFF, 0, False, Outcome.MISSING_FINGERTIP),
+        (NONE, 0, False, Outcome.MISSING_FINGERTIP),
+        (ALL, 1, False, Outcome.HAND_CONTACT),
+        (ALL, 0, True, Outcome.TABLE_CONTACT),
+        # The first rule decides.
+        (ONE_OFF, 1, True, Outcome.MISSING_FINGERTIP),
+        (ALL, 1, True, Outcome.HAND_CONTACT),
+    ],
+)
+def test_closed_hand_lifts_what_its_fingertips_alone_touch(
+    touching: list[bool], other_links: int, on_table: bool, outcome: Outcome
+) -> None:
+    assert judge_closed(touching, other_links, on_table) == outcome
+
+
+@pytest.mark.parametrize(
+    ("touching", "other_links", "on_table", "outcome"),
+    [
+        (ALL, 0, False, Outcome.SUCCESS),
+        # The palm may touch a lifted object that the fingertips hold.
+        (ALL, 1, False, Outcome.SUCCESS),
+        (ONE_OFF, 0, False, Outcome.SLIPPED),
+        (NONE, 1, False, Outcome.SLIPPED),
+        (NONE, 0, False, Outcome.DROPPED),
+        (ALL, 0, True, Outcome.TABLE_CONTACT),
+        # The first rule decides.
+        (NONE, 0, True, Outcome.DROPPED),
+        (ONE_OFF, 0, True, Outcome.SLIPPED),
+    ],
+)
+def test_lifted_object_is_held_by_all_fingertips_clear_of_the_table(
+    touching: list[bool], other_links: int, on_table: bool, outcome: Outcome
+) -> None:
+    assert judge_lifted(touching, other_links, on_table) == outcome
+
+
+@pytest.mark.parametrize("judge", [judge_closed, judge_lifted])
+def test_many_attempts_are_judged_as_each_of_them(judge) -> None:
+    cases = list(product([ALL, ONE_OFF, NONE], [0, 2], [False, True]))
+    touching, other_links, on_table = (np.array(column) for column in zip(*cases, strict=True))
+    together = judge(touching, other_links, on_table)
+    assert together.tolist() == [int(judge(*case)) for case in cases]

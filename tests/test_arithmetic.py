@@ -1,0 +1,169 @@
+"""Products bit by bit as loops over floats give them; sines against the C library's."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos, sin_cos_deg
+
+#: Largest error of a sine or cosine in [-1, 1].
+TOLERANCE = 1e-15
+
+
+def numbers(*shape: int) -> Array:
+    return np.random.default_rng(sum(shape)).uniform(-1.0, 1.0, shape)
+
+
+def summed(terms: list[float]) -> float:
+    """Return the sum of terms, each rounded, in their order."""
+    total = terms[0]
+    for term in terms[1:]:
+        total += term
+    return total
+
+
+@pytest.mark.parametrize("k", [1, 2, 3, 4, 7])
+def test_product_adds_its_terms_in_order(k: int) -> None:
+    A, B = numbers(5, k), numbers(k, 6)
+    loops = [
+        [summed([A[i, n].item() * B[n, j].item() for n in range(k)]) for j in range(6)]
+        for i in range(5)
+    ]
+    np.testing.assert_array_equal(multiply(A, B), loops)
+    np.testing.assert_allclose(multiply(A, B), A @ B, atol=1e-15)
+
+
+def test_order_of_terms_is_that_of_the_arguments() -> None:
+    """In another order nothing would cancel: 1 is lost in 1e16 + 1."""
+    ones = [1.0, 1.0, 1.0]
+    for product in (dot, lambda a, b: multiply([a], b)[0]):
+        assert product([1e16, 1.0, -1e16], ones) == 0.0
+        assert product([1e16, -1e16, 1.0], ones) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("left", "right"),
+    [
+        ((4, 4), (4, 4)),
+        ((8, 4, 4), (4, 4)),
+        ((4, 4), (8, 4, 4)),
+        ((2, 1, 3, 3), (5, 3, 7)),
+        ((0, 4, 4), (4, 4)),
+        ((6, 4, 3), (3,)),
+        ((4, 3), (3,)),
+    ],
+)
+def test_product_has_the_shape_of_matmul(left: tuple[int, ...], right: tuple[int, ...]) -> None:
+    A, B = numbers(*left), numbers(*right)
+    product = multiply(A, B)
+    assert product.shape == (A @ B).shape and product.dtype == np.float64
+    np.testing.assert_allclose(product, A @ B, atol=1e-15)
+
+
+def test_many_products_have_the_bits_of_each() -> None:
+    A, B = numbers(50, 4, 4), numbers(50, 4, 4)
+    together = multiply(A, B)
+    alone = [multiply(a, b) for a, b in zip(A, B, strict=True)]
+    np.testing.assert_array_equal(together, alone)
+    np.testing.assert_array_equal(multiply(np.asfortranarray(A), B), alone)
+
+
+@pytest.mark.parametrize("k", [3, 20])
+def test_dot_and_norm_are_those_of_loops(k: int) -> None:
+    a, b = numbers(9, k), numbers(8, 9, k)
+    loops = [
+        [
+            summed([x * y for x, y in zip(p, q, strict=True)])
+            for p, q in zip(a.tolist(), row, strict=True)
+        ]
+        for row in b.tolist()
+    ]
+    np.testing.assert_array_equal(dot(a, b), loops)
+    np.testing.assert_array_equal(
+        norm(a), [math.sqrt(summed([x * x for x in p])) for p in a.tolist()]
+    )
+
+
+def test_norm_of_one_vector_and_of_none() -> None:
+    assert norm([3.0, 4.0]) == 5.0 and norm([3, 4]).shape == ()
+    assert norm(np.zeros((0, 3))).shape == (0,)
+
+
+def test_integers_are_taken_for_real_numbers() -> None:
+    assert multiply([[1, 2]], [[3], [4]]).tolist() == [[11.0]]
+    assert dot([2**40, 1], [2**40, 1]) == 2.0**80 + 1.0
+
+
+@pytest.mark.parametrize("largest", [np.pi / 4, 2.0 * np.pi, 100.0, 1e4, 2e6 * np.pi])
+def test_sine_and_cosine_agree_with_the_c_library(largest: float) -> None:
+    angles = np.random.default_rng(0).uniform(-largest, largest, 20_000)
+    sine, cosine = sin_cos(angles)
+    np.testing.assert_allclose(sine, [math.sin(x) for x in angles.tolist()], rtol=0, atol=TOLERANCE)
+    np.testing.assert_allclose(
+        cosine, [math.cos(x) for x in angles.tolist()], rtol=0, atol=TOLERANCE
+    )
+
+
+@pytest.mark.parametrize("turns", [0, 1, -1, 250_000, 999_999])
+def test_angles_near_quarter_turns_keep_their_digits(turns: int) -> None:
+    """Where sine or cosine vanishes the error must, too: it is of the reduced angle."""
+    quarters = 4 * turns + np.arange(4)
+    angles = quarters * (np.pi / 2.0) + np.array([[0.0], [1e-9], [-1e-3], [np.pi / 4]])
+    for ours, exact in zip(sin_cos(angles), (math.sin, math.cos), strict=True):
+        reference = [[exact(x) for x in row] for row in angles.tolist()]
+        np.testing.assert_allclose(ours, reference, rtol=0, atol=TOLERANCE)
+
+
+def test_degrees_agree_with_the_c_library() -> None:
+    angles = np.random.default_rng(1).uniform(-720.0, 720.0, 20_000)
+    for ours, exact in zip(sin_cos_deg(angles), (math.sin, math.cos), strict=True):
+        # Whole turns are taken off exactly; pi / 180 is rounded, by up to half a digit of 2 pi.
+        reference = [exact(math.radians(math.fmod(x, 360.0))) for x in angles.tolist()]
+        np.testing.assert_allclose(ours, reference, rtol=0, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("turns", [0, 1, -1, -7, 1_000_000])
+def test_degrees_are_exact_at_quarter_turns(turns: int) -> None:
+    sine, cosine = sin_cos_deg(360.0 * turns + np.array([0.0, 90.0, 180.0, 270.0]))
+    assert sine.tolist() == [0.0, 1.0, 0.0, -1.0]
+    assert cosine.tolist() == [1.0, 0.0, -1.0, 0.0]
+
+
+@pytest.mark.parametrize("function", [sin_cos, sin_cos_deg])
+def test_sine_is_odd_and_cosine_even(function: Callable[[Array], tuple[Array, Array]]) -> None:
+    angles = np.linspace(0.0, 800.0, 4001)
+    (sine, cosine), (minus, plus) = function(angles), function(-angles)
+    np.testing.assert_array_equal(minus, -sine)
+    np.testing.assert_array_equal(plus, cosine)
+    np.testing.assert_allclose(sine**2 + cosine**2, 1.0, rtol=0, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("function", [sin_cos, sin_cos_deg])
+@pytest.mark.parametrize("shape", [(), (0,), (5,), (2, 3), (2, 0, 4)])
+def test_sines_keep_the_shape(
+    function: Callable[[Array], tuple[Array, Array]], shape: tuple[int, ...]
+) -> None:
+    angles = numbers(*shape)
+    for result in function(angles):
+        assert result.shape == shape and result.dtype == np.float64
+    alone = [function(x) for x in angles.ravel()]
+    np.testing.assert_array_equal(np.reshape([s for s, _ in alone], shape), function(angles)[0])
+
+
+def test_bits_are_frozen() -> None:
+    """A change here changes every dataset; NumPy's and the C library's sines have other bits."""
+    bits = [float(x).hex() for x in (*sin_cos(1.0), *sin_cos_deg(30.0))]
+    assert bits == [
+        "0x1.aed548f090ceep-1",
+        "0x1.14a280fb5068cp-1",
+        "0x1.fffffffffffffp-2",
+        "0x1.bb67ae8584cabp-1",
+    ]
+    angles = np.arange(-5000, 5001) / 64.0
+    many = np.array([*sin_cos(angles), *sin_cos_deg(angles)])
+    assert hashlib.sha256(many.tobytes()).hexdigest()[:16] == "e688c8d9b86423d3"

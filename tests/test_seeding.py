@@ -1,0 +1,143 @@
+"""Random streams: frozen numbers, and the distributions that they promise."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drakegrasp.seeding import Stream, object_key
+
+#: What Stream(7, 1, 2) draws first; a change here changes every dataset.
+WORDS = [0x7A98DF51990736C9, 0x24258EE255688DBA, 0xEEDA9BD217E77A5A]
+KEY = 0x92668AAC79223093
+NORMAL = ["-0x1.b193614000000p-5", "-0x1.13300f3a00000p+0", "0x1.7faa44d700000p+0"]
+
+LARGEST = 2**64 - 1
+
+seeds = st.integers(0, 2**63)
+places = st.lists(st.integers(0, 2**32 - 1), max_size=4)
+
+
+def stream() -> Stream:
+    return Stream(7, 1, 2)
+
+
+def drawing(monkeypatch: pytest.MonkeyPatch, words: list[int]) -> Stream:
+    """Return a stream that draws the given words."""
+
+    def given_words(self: Stream, count: int) -> npt.NDArray[np.uint64]:
+        assert count == len(words)
+        return np.array(words, dtype=np.uint64)
+
+    monkeypatch.setattr(Stream, "words", given_words)
+    return stream()
+
+
+def test_words_are_frozen() -> None:
+    words = stream().words(3)
+    assert words.tolist() == WORDS
+    assert words.dtype == np.uint64
+
+
+def test_words_without_a_place_are_those_of_the_reference_implementation() -> None:
+    """The first lines of NumPy's own test vector for PCG64."""
+    assert Stream(0xDEADBEAF).words(2).tolist() == [0x60D24054E17A0698, 0xD5E79D89856E4F12]
+
+
+def test_draws_follow_from_the_words_as_stated() -> None:
+    assert stream().uniform(3).tolist() == [(word >> 11) / 2**53 for word in WORDS]
+    assert stream().integers(1000, 3).tolist() == [word % 1000 for word in WORDS]
+    assert stream().permutation(3).tolist() == [1, 0, 2]
+    assert [x.hex() for x in stream().normal(3).tolist()] == NORMAL
+
+
+def test_drawing_goes_on_where_it_stopped() -> None:
+    parts = stream()
+    np.testing.assert_array_equal(np.r_[parts.words(3), parts.words(4)], stream().words(7))
+    assert stream().words(0).size == stream().normal(0).size == 0
+
+
+def test_key_is_frozen_and_does_not_change_with_drawing() -> None:
+    drawn = stream()
+    before = drawn.key
+    drawn.words(5)
+    assert before == drawn.key == KEY
+
+
+def test_streams_of_other_seeds_and_places_differ() -> None:
+    streams = [
+        Stream(seed, *place)
+        for seed in (0, 1, 2, 12)
+        for place in ((), (0,), (1,), (2,), (12,), (0, 0), (1, 0), (0, 1), (1, 2), (2, 1))
+    ]
+    assert len({s.key for s in streams}) == len(streams)
+    firsts = [s.words(100) for s in streams]
+    assert len(np.unique(firsts)) == 100 * len(streams)
+    # Unlike neighbours of a counter, they are uncorrelated: about half of all bits differ.
+    shares = [np.unpackbits((a ^ b).view(np.uint8)).mean() for a, b in itertools.pairwise(firsts)]
+    assert min(shares) > 0.47 and max(shares) < 0.53
+
+
+@given(seeds, places, st.integers(0, 50))
+def test_permutation_holds_every_number_once(seed: int, place: list[int], count: int) -> None:
+    order = Stream(seed, *place).permutation(count)
+    assert sorted(order.tolist()) == list(range(count))
+    assert order.dtype == np.int64
+
+
+def test_permutation_keeps_the_order_of_equal_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert drawing(monkeypatch, [5, 3] * 20).permutation(40).tolist() == [
+        *range(1, 40, 2),
+        *range(0, 40, 2),
+    ]
+
+
+@given(seeds, places, st.integers(1, 2**32), st.integers(0, 50))
+def test_integers_are_within_their_bound(
+    seed: int, place: list[int], bound: int, count: int
+) -> None:
+    drawn = Stream(seed, *place).integers(bound, count)
+    assert drawn.shape == (count,) and drawn.dtype == np.int64
+    assert not len(drawn) or 0 <= drawn.min() <= drawn.max() < bound
+
+
+def test_every_integer_is_drawn_equally_often() -> None:
+    counts = np.bincount(Stream(0).integers(7, 70_000), minlength=7)
+    # 9,900 to 10,100 is one standard deviation.
+    assert len(counts) == 7
+    assert np.abs(counts - 10_000).max() < 400
+
+
+def test_uniform_covers_its_interval() -> None:
+    drawn = Stream(0).uniform(100_000)
+    assert drawn.min() >= 0.0 and drawn.max() < 1.0
+    assert np.abs(np.sort(drawn) - np.linspace(0.0, 1.0, 100_000)).max() < 0.006
+    assert (drawn * 2.0**53 % 1.0 == 0.0).all()
+
+
+def test_uniform_and_normal_have_values_at_the_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    ends = drawing(monkeypatch, [0, LARGEST])
+    assert ends.uniform(2).tolist() == [0.0, 1.0 - 2.0**-53]
+    low, high = ends.normal(2).tolist()
+    assert low == pytest.approx(-8.29, abs=0.01)
+    assert high == pytest.approx(8.21, abs=0.01)
+
+
+def test_normal_has_its_moments_and_its_grid() -> None:
+    drawn = Stream(0).normal(40_000)
+    assert drawn.mean() == pytest.approx(0.0, abs=0.02)  # four standard errors
+    assert drawn.std() == pytest.approx(1.0, abs=0.015)
+    shares = [(drawn < x).mean() for x in (-2.0, -1.0, 0.0, 1.0, 2.0)]
+    assert shares == pytest.approx([0.02275, 0.15866, 0.5, 0.84134, 0.97725], abs=0.01)
+    assert (drawn * 2.0**32 % 1.0 == 0.0).all()
+
+
+def test_object_key_is_frozen() -> None:
+    """The first four bytes of the name's SHA-256, most significant first."""
+    assert object_key("24_mug_final") == 727958515
+    assert object_key("é") == 1251562878
