@@ -43,10 +43,15 @@ def multiply(A: npt.ArrayLike, B: npt.ArrayLike) -> Array:
     Args:
         A: (..., n, k).
         B: (..., k, m), or one vector (k,); the result is (..., n, m), or (..., n).
+
+    Raises:
+        ValueError: If the two k differ.
     """
     left, right = np.asarray(A, dtype=float), np.asarray(B, dtype=float)
     if right.ndim == 1:
         return multiply(left, right[:, None])[..., 0]
+    if left.shape[-1] != right.shape[-2]:
+        raise ValueError(f"shapes must fit a product, got {left.shape} and {right.shape}")
     total = left[..., :, 0, None] * right[..., None, 0, :]
     for k in range(1, left.shape[-1]):
         total = total + left[..., :, k, None] * right[..., None, k, :]
@@ -54,8 +59,14 @@ def multiply(A: npt.ArrayLike, B: npt.ArrayLike) -> Array:
 
 
 def dot(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
-    """Return the dot products (...) of vectors (..., k); terms are added in their order."""
+    """Return the dot products (...) of vectors (..., k); terms are added in their order.
+
+    Raises:
+        ValueError: If the two k differ.
+    """
     left, right = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    if left.shape[-1] != right.shape[-1]:
+        raise ValueError(f"vectors must be of one length, got {left.shape} and {right.shape}")
     total = left[..., 0] * right[..., 0]
     for k in range(1, left.shape[-1]):
         total = total + left[..., k] * right[..., k]

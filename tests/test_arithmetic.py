@@ -167,3 +167,11 @@ def test_bits_are_frozen() -> None:
     angles = np.arange(-5000, 5001) / 64.0
     many = np.array([*sin_cos(angles), *sin_cos_deg(angles)])
     assert hashlib.sha256(many.tobytes()).hexdigest()[:16] == "e688c8d9b86423d3"
+
+
+def test_lengths_that_do_not_fit_are_refused() -> None:
+    for right in (np.ones((4, 3)), np.ones(4)):
+        with pytest.raises(ValueError, match="shapes must fit a product"):
+            multiply(np.eye(3), right)
+    with pytest.raises(ValueError, match="must be of one length"):
+        dot(np.ones(3), np.ones(4))

@@ -237,11 +237,17 @@ def _prepare_all(
 
     # What the manifest says of an unchanged mesh still holds.
     for source in sources:
-        entry = _known_entry(source, out, manifest)
+        digest = source_sha256(source)
+        entry = _known_entry(source, digest, out, manifest)
         if entry is None:
-            restartable = job.pool is not None
             tasks.append(
-                PrepareTask(source=source, out=str(out), config=config, restartable=restartable)
+                PrepareTask(
+                    source=source,
+                    mesh_sha256=digest,
+                    out=str(out),
+                    config=config,
+                    restartable=job.pool is not None,
+                )
             )
         else:
             entries[source.name] = entry
@@ -263,10 +269,9 @@ def _prepare_all(
 
 
 def _known_entry(
-    source: MeshSource, out: Path, manifest: Manifest
+    source: MeshSource, digest: str, out: Path, manifest: Manifest
 ) -> ObjectEntry | RefusedMesh | None:
     """Return a mesh's entry in the manifest if it still holds, else None."""
-    digest = source_sha256(source)
     for refusal in manifest.refused:
         if (refusal.name, refusal.mesh_sha256) == (source.name, digest):
             return refusal

@@ -16,7 +16,7 @@ from drakegrasp.dataset.paths import model_path
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared, save_prepared
 from drakegrasp.errors import DrakegraspError, MachineError, MeshError
 from drakegrasp.objects.model import prepare_object
-from drakegrasp.objects.sources import MeshSource, source_sha256
+from drakegrasp.objects.sources import MeshSource
 from drakegrasp.runtime.blas import one_thread
 from drakegrasp.runtime.environment import release_memory
 from drakegrasp.runtime.fault_injection import inject_fault
@@ -35,6 +35,7 @@ class PrepareTask:
 
     Attributes:
         source: The mesh.
+        mesh_sha256: Its digest, `source_sha256`.
         out: Directory of the dataset, visible to every worker.
         config: `Config.to_dict()`.
         restartable: Whether the process that runs it is started again when it dies. If so, a
@@ -42,6 +43,7 @@ class PrepareTask:
     """
 
     source: MeshSource
+    mesh_sha256: str
     out: str
     config: dict[str, Any]
     restartable: bool
@@ -58,46 +60,43 @@ def prepare_one(task: PrepareTask) -> tuple[str, ObjectEntry | RefusedMesh]:
         MachineError: If something other than the mesh kills the process again and again.
     """
     out, source, config = Path(task.out), task.source, parse_config(task.config)
-    digest = source_sha256(source)
     with disk_full_named(out):
         # The worker or the client may have died before the manifest named the object.
-        entry = _entry_there(source, digest, out, config)
+        entry = _entry_there(task, config)
         if entry is not None:
             return source.name, entry
 
         if not task.restartable:
-            return source.name, _prepared_entry(task, digest)
+            return source.name, _prepared_entry(task)
 
         # With a journal, a mesh that kills its process is found and refused.
         release_memory()
         identity = {
             "name": source.name,
-            "mesh_sha256": digest,
+            "mesh_sha256": task.mesh_sha256,
             "config_hash": config.simulation_hash(),
         }
         path = model_path(out, source.name).with_suffix(".journal")
         with open_journal(path, identity) as journal:
-            return source.name, _prepared_or_refused(task, digest, journal)
+            return source.name, _prepared_or_refused(task, journal)
 
 
-def _entry_there(source: MeshSource, digest: str, out: Path, config: Config) -> ObjectEntry | None:
+def _entry_there(task: PrepareTask, config: Config) -> ObjectEntry | None:
     """Return the entry of an object whose files are complete, or None."""
     try:
-        prepared = load_prepared(out, source.name, config)
+        prepared = load_prepared(Path(task.out), task.source.name, config)
     except DrakegraspError:
         return None
     model = prepared.model
-    same = (model.class_name, model.mesh_sha256) == (source.class_name, digest)
+    same = (model.class_name, model.mesh_sha256) == (task.source.class_name, task.mesh_sha256)
     return prepared.entry() if same else None
 
 
-def _prepared_or_refused(
-    task: PrepareTask, digest: str, journal: Journal
-) -> ObjectEntry | RefusedMesh:
+def _prepared_or_refused(task: PrepareTask, journal: Journal) -> ObjectEntry | RefusedMesh:
     name = task.source.name
     verdict = journal.verdict("prepare")
     if verdict is not None:
-        return _refused(task.source, digest, f"{name}: preparing it {verdict.value}")
+        return _refused(task, f"{name}: preparing it {verdict.value}")
     if journal.in_crash_loop:
         raise MachineError(
             f"{name}: the worker died {GIVE_UP_DEATHS} times in a row while preparing it; is "
@@ -105,21 +104,25 @@ def _prepared_or_refused(
         )
     with journal.step("prepare", PREPARE_SECONDS):
         inject_fault(name)
-        return _prepared_entry(task, digest)
+        return _prepared_entry(task)
 
 
-def _prepared_entry(task: PrepareTask, digest: str) -> ObjectEntry | RefusedMesh:
+def _prepared_entry(task: PrepareTask) -> ObjectEntry | RefusedMesh:
     config = parse_config(task.config)
     try:
         prepared = prepare(task.source, config)
     except MeshError as error:
-        return _refused(task.source, digest, str(error))
+        return _refused(task, str(error))
+
+    # The digest was taken from another read of the file.
+    if prepared.model.mesh_sha256 != task.mesh_sha256:
+        return _refused(task, f"{task.source.name}: the mesh file changed during the build")
     save_prepared(prepared, Path(task.out), config)
     return prepared.entry()
 
 
-def _refused(source: MeshSource, digest: str, reason: str) -> RefusedMesh:
-    return RefusedMesh(name=source.name, mesh_sha256=digest, reason=reason)
+def _refused(task: PrepareTask, reason: str) -> RefusedMesh:
+    return RefusedMesh(name=task.source.name, mesh_sha256=task.mesh_sha256, reason=reason)
 
 
 def prepare(source: MeshSource, config: Config) -> PreparedObject:

@@ -58,6 +58,8 @@ class KernelSetting(NannyPlugin):
 
     def __init__(self, kernel: str) -> None:
         self._kernel = kernel
+        #: What the nanny's two environments said before; nothing where they were left alone.
+        self._before: list[str | None] = []
 
     def setup(self, nanny: Nanny) -> None:
         """Set the kernel in a nanny; a CPU that does not support it gets its own fastest."""
@@ -67,8 +69,18 @@ class KernelSetting(NannyPlugin):
         if kernel in (None, _kernel_of(nanny)):
             return
         # The worker is a new process that loads NumPy before it sees `env`.
-        nanny.env[kernels.VARIABLE] = nanny.pre_spawn_env[kernels.VARIABLE] = kernel
+        environments = (nanny.env, nanny.pre_spawn_env)
+        self._before = [environment.get(kernels.VARIABLE) for environment in environments]
+        for environment in environments:
+            environment[kernels.VARIABLE] = kernel
         self.restart = True  # Dask reads this after the setup
+
+    def teardown(self, nanny: Nanny) -> None:
+        """Take the kernel back; a nanny that was started by hand outlives the build."""
+        for environment, value in zip((nanny.env, nanny.pre_spawn_env), self._before, strict=False):
+            environment.pop(kernels.VARIABLE, None)
+            if value is not None:
+                environment[kernels.VARIABLE] = value
 
 
 def _kernel_of(nanny: Nanny) -> str:

@@ -34,7 +34,8 @@ SAME_POSE = 1e-6
 #: A palm this far below the table, or a palm ray this far beside the bounding box, is still valid
 #: [m]: far above rounding, far below what matters.
 EDGE = 1e-6
-#: Combinations whose poses are computed together; bounds the memory.
+#: Combinations whose poses are computed together: bounds the memory. With `jitter_deg` it also
+#: decides which word of the stream jitters which angle, so another number is another draw.
 CHUNK = 131_072
 
 

@@ -120,9 +120,8 @@ def snapped(X_TO: Array) -> Array:
     Poses that differ by rounding become the same bits, unless they lie halfway between two points
     of the grid: with a rounding error e that happens to one pose in POSE_GRID / e.
     """
-    wxyz = RotationMatrix(X_TO[:3, :3]).ToQuaternion().wxyz()
-    # A quaternion and its negative are one rotation: make the largest entry positive.
-    wxyz = np.rint(wxyz * np.sign(wxyz[np.argmax(np.abs(wxyz))]) / POSE_GRID)
+    # A quaternion and its negative give the same bits below: each term has two of its entries.
+    wxyz = np.rint(RotationMatrix(X_TO[:3, :3]).ToQuaternion().wxyz() / POSE_GRID)
     w, x, y, z = wxyz / norm(wxyz)
 
     # Written out, since the bits of SciPy's or Drake's conversion may depend on the CPU.

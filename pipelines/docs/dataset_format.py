@@ -5,6 +5,7 @@ Usage: python pipelines/docs/dataset_format.py [--check] FILE
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -141,12 +142,13 @@ def format_page() -> str:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Write the page, or with --check return 1 if the file differs from it."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    check = "--check" in arguments
-    (target,) = (Path(a) for a in arguments if a != "--check")
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("target", type=Path, help="the page")
+    parser.add_argument("--check", action="store_true", help="compare, and write nothing")
+    arguments = parser.parse_args(argv)
 
-    page = format_page()
-    if not check:
+    target, page = arguments.target, format_page()
+    if not arguments.check:
         target.write_text(page, encoding="utf-8")
         return 0
     if target.exists() and target.read_text(encoding="utf-8") == page:

@@ -26,7 +26,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.builtin.catalog import export_builtin
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.seeding import Stream
-from drakegrasp.simulation.candidates import make_attempts, normal_candidates
+from drakegrasp.simulation.candidates import make_attempts, normal_candidates, rotation_candidates
 from drakegrasp.simulation.robustness import _noise_factor, _palm_noise
 from drakegrasp.simulation.screen import predict
 
@@ -99,6 +99,12 @@ def main(meshes: Path | None) -> dict[str, object]:
         for source in objects(folder, meshes):
             for what, value in object_draws(source):
                 found[f"{source.name}: {what}"] = value
+    jittered = load_config("released", overrides=["candidates.max=1000"]).candidates
+    half = np.array([0.03, 0.04, 0.05])
+    X_TO = np.eye(4)
+    X_TO[2, 3] = half[2]
+    poses, *_ = rotation_candidates(half, X_TO, jittered, Stream(7, 3))
+    found["jittered palm poses"] = digest(poses)
     split = split_samples(
         np.repeat(np.arange(12, dtype=np.int32), 40),
         [f"{i}_thing" for i in range(12)],

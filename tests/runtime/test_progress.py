@@ -40,6 +40,7 @@ def test_what_was_there_before_says_nothing_of_the_speed(monkeypatch: pytest.Mon
     bars: list[_Bar] = []
     monkeypatch.setattr("rich.console.monotonic", lambda: now)
     monkeypatch.setattr(_Bar, "start", lambda bar: None)
+    monkeypatch.setattr("rich.live.Live.is_started", True)
     monkeypatch.setattr(_Bar, "stop", lambda bar: bars.append(bar))
     with progress_bar("simulate", "attempts") as report:
         report(500, 2000, found=500)
