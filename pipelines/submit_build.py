@@ -47,7 +47,7 @@ from drakegrasp.errors import ConfigError
 @click.argument("where", nargs=-1, metavar="[HOST...|ADDRESS|PATH]")
 @build_options
 @click.option(
-    "--workers", type=int, metavar="N", help="Processes in all.  [default: local: one per core]"
+    "--workers", type=int, metavar="N", help="Processes in all.  [default with local: one per core]"
 )
 @click.option(
     "--cores", type=int, metavar="N", help="Cores of each SSH host or SLURM job, a worker on each."

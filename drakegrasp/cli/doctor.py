@@ -1,8 +1,8 @@
-"""What this machine lacks: every need of drakegrasp, measured, with the line that mends it.
+"""Checks whether this machine meets every need of drakegrasp, and says how to meet it.
 
-Nothing is imported that might be missing: a library that cannot be loaded is a finding,
-not an error. The test image is rendered in a child process, because a broken OpenGL kills
-its process, and because the first thread of a process that renders owns its GL context.
+This module imports no library that might be missing: a library that cannot be loaded is a
+finding, not an error. A child process renders the test image, because a broken OpenGL kills
+its process, and because the first thread that renders in a process owns its GL context.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ DRAKE_REQUIREMENT = "drake>=1.51.1,!=1.52.0"
 EGL_LIBRARY = "libEGL.so.1"
 EGL_PACKAGES = "apt-get install libegl1 libgl1-mesa-dri"
 JEMALLOC_PACKAGE = "apt-get install libjemalloc2"
-#: The first image may compile shaders on a slow file system [s].
+#: Time for the test image [s]: the first one may compile shaders on a slow file system.
 IMAGE_SECONDS = 60.0
-#: About 3,500 successes: two views of 128 x 128 pixels and 17 bytes, before compression.
+#: Room for about 3,500 successes: two images of 128 x 128 pixels of 17 bytes, uncompressed [B].
 FREE_BYTES = 2e9
-#: A worker holds the scenes of a few objects.
+#: Memory of a worker, which holds the scenes of a few objects [B].
 BYTES_PER_CORE = 1e9
-#: Limits of the control group, version 2 and 1; absent outside of containers.
+#: Memory limits of the control group, version 2 and 1; containers have one of them.
 CGROUP_LIMITS = (
     Path("/sys/fs/cgroup/memory.max"),
     Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
@@ -58,24 +58,24 @@ class Finding:
     """One need of drakegrasp and whether this machine meets it.
 
     Attributes:
-        name: Of the need.
+        name: Name of the need.
         ok: Whether it is met.
         what: What was measured.
-        mend: The line that mends it; empty if it is met.
+        remedy: How to meet it; empty if it is met.
     """
 
     name: str
     ok: bool
     what: str
-    mend: str = ""
+    remedy: str = ""
 
 
 def diagnose(directory: Path | None = None) -> list[Finding]:
-    """Return all findings about this machine, met needs too.
+    """Return a finding on every need, met or not.
 
     Args:
-        directory: Where datasets will be written; None is the current one. It need not
-            exist: then its nearest existing parent is tried.
+        directory: Where datasets will be written; the current directory if None. If it does
+            not exist, its nearest existing parent is checked.
     """
     place = _existing(Path.cwd() if directory is None else Path(directory))
     return [
@@ -116,7 +116,7 @@ def check_glibc() -> Finding:
 
 
 def check_drake() -> Finding:
-    """Return whether a Drake is installed that works."""
+    """Return whether a Drake that works is installed."""
     try:
         version = metadata.version("drake")
     except metadata.PackageNotFoundError:
@@ -140,7 +140,7 @@ def check_allocator() -> Finding:
 
 
 def check_egl() -> Finding:
-    """Return whether the library that Drake renders with, without a display, can be loaded."""
+    """Return whether EGL, with which Drake renders without a display, can be loaded."""
     if sys.platform != "linux":
         return Finding(name="EGL", ok=True, what=f"not needed on {sys.platform}")
     try:
@@ -151,8 +151,8 @@ def check_egl() -> Finding:
 
 
 def check_image() -> Finding:
-    """Return whether a box that is rendered in a child process shows up in its image."""
-    # The child finds what this process finds, and nothing that merely lies in its directory.
+    """Return whether a child process can render a box."""
+    # The child imports from the same paths, but not from its working directory.
     paths = os.pathsep.join(str(Path(p).resolve()) for p in sys.path if p)
     try:
         child = subprocess.run(
@@ -168,6 +168,8 @@ def check_image() -> Finding:
         return _bad_image(f"no image within {IMAGE_SECONDS:g} s")
     except OSError as error:
         return _bad_image(f"no child process: {error}")
+
+    # A signal, an error and unexpected output have remedies of their own.
     if child.returncode < 0:
         return _bad_image(f"the renderer crashed with {_signal_name(-child.returncode)}")
     lines = (child.stderr if child.returncode else child.stdout).strip().splitlines()
@@ -178,9 +180,10 @@ def check_image() -> Finding:
     match = re.fullmatch(r"(\d+) (\d+)", last)
     if match is None:
         return _bad_image(f"the renderer must print two numbers, got {last!r}")
+
+    # An edge of the mask may be off by a pixel at either end.
     seen, expected = int(match[1]), int(match[2])
     what = f"{seen} pixels of a box that has {expected}"
-    # An edge of the mask may be off by a pixel at either end.
     if not 0.9 * expected <= seen <= 1.1 * expected:
         return _bad_image(what if seen else f"blank image: {what}")
     return Finding(name="test image", ok=True, what=what)
@@ -195,7 +198,7 @@ def check_writing(directory: Path) -> Finding:
             os.fsync(file.fileno())
     except OSError as error:
         what = f"{directory}: {error.strerror or error}"
-        return _finding("writing", False, what, "choose another --out, or mend its permissions")
+        return _finding("writing", False, what, "choose another --out, or change its permissions")
     return Finding(name="writing", ok=True, what=str(directory))
 
 
@@ -233,7 +236,7 @@ def check_memory() -> Finding:
 
 
 def render_test_image() -> tuple[int, int]:
-    """Return the object's pixels in an image of a box seen squarely, and how many it has.
+    """Render a box from above; return how many pixels show it, and how many should.
 
     Call it in a process of its own: it needs Drake and may crash.
     """
@@ -246,6 +249,7 @@ def render_test_image() -> tuple[int, int]:
     from drakegrasp.vision.camera import intrinsics
     from drakegrasp.vision.rendering import build_renderer, render
 
+    # A cube of 1 kg.
     config = CameraConfig()
     box = trimesh.creation.box((BOX_EDGE,) * 3)
     model = ObjectModel(
@@ -261,6 +265,8 @@ def render_test_image() -> tuple[int, int]:
         I_OOcm_O=np.eye(3) * BOX_EDGE**2 / 6.0,
         collision_error=0.0,
     )
+
+    # It stands on the table, and the camera looks straight down on it.
     X_TO = make_pose(np.eye(3), [0.0, 0.0, BOX_EDGE / 2.0])
     X_TC = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, BOX_EDGE + BOX_DISTANCE])
     seen = render(build_renderer(model, config), X_TO, X_TC)
@@ -268,16 +274,16 @@ def render_test_image() -> tuple[int, int]:
     return int(seen.mask.sum()), round(edge**2)
 
 
-def _finding(name: str, ok: bool, what: str, mend: str) -> Finding:
-    return Finding(name=name, ok=ok, what=what, mend="" if ok else mend)
+def _finding(name: str, ok: bool, what: str, remedy: str) -> Finding:
+    return Finding(name=name, ok=ok, what=what, remedy="" if ok else remedy)
 
 
-def _bad_image(what: str, mend: str = "") -> Finding:
-    return _finding("test image", False, what, mend or EGL_PACKAGES)
+def _bad_image(what: str, remedy: str = "") -> Finding:
+    return _finding("test image", False, what, remedy or EGL_PACKAGES)
 
 
 def _existing(directory: Path) -> Path:
-    """Return a directory or its nearest parent that exists; a file in the way is returned."""
+    """Return the path itself or its nearest parent that exists, which may be a file."""
     path = directory.absolute()
     while not os.path.lexists(path) and path != path.parent:
         path = path.parent

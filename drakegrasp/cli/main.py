@@ -43,7 +43,7 @@ def doctor(directory: Path) -> None:
         )
         click.echo(f"{mark}  {finding.name:<18} {finding.what}")
         if not finding.ok:
-            click.echo(f"         -> {finding.mend}")
+            click.echo(f"         -> {finding.remedy}")
     if not all(finding.ok for finding in findings):
         sys.exit(1)
 

@@ -1,7 +1,7 @@
-"""What `drakegrasp verify` is asked: files and options in, placed grasps out; no simulation.
+"""Turns files and options of `drakegrasp verify` into placed grasps. Nothing is simulated.
 
-All that may be wrong with what was asked is a `GraspError`, `MeshError`, `ConfigError` or
-`HandError`: wrong usage.
+Whatever is wrong with the files or the options is a `GraspError`, `MeshError`, `ConfigError` or
+`HandError`, that is wrong usage.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from drakegrasp.verification.placed_grasp import PlacedGrasp, VerifyArguments, p
 from drakegrasp.verification.prediction import HDF5_SUFFIXES, read_numbers, read_predictions
 from drakegrasp.verification.result_files import refuse_unwritable
 
-#: The split that is meant where a dataset is given and none is named.
+#: The split of a dataset if none is named.
 DEFAULT_SPLIT = "test"
 
 
 @dataclass(frozen=True, kw_only=True)
 class VerifyRequest:
-    """The options of the command, see its help; None where one was not given."""
+    """The options of the command, see its help; None for those that were not given."""
 
     grasps: Path
     mesh: Path | None = None
@@ -43,7 +43,7 @@ def place_requested(request: VerifyRequest) -> list[PlacedGrasp]:
     """Return the grasps of a request on their objects, at least one.
 
     Raises:
-        GraspError, MeshError, ConfigError, HandError: If something cannot be used.
+        GraspError, MeshError, ConfigError, HandError: If a file or an option cannot be used.
     """
     try:
         return _place(request)
@@ -52,13 +52,17 @@ def place_requested(request: VerifyRequest) -> list[PlacedGrasp]:
 
 
 def _place(request: VerifyRequest) -> list[PlacedGrasp]:
+    # Refuse results that could not be written, and options without effect.
     if request.out is not None:
         refuse_unwritable(request.out)
     path = _dataset_path(request)
     _refuse_idle(request, path)
+
+    # A dataset has a default split. An HDF5 file of grasps may have no groups at all.
     split = request.split if path is None else request.split or DEFAULT_SPLIT
     data = None if path is None else GraspDataset(path, split=split or DEFAULT_SPLIT)
     predicted = read_predictions(request.grasps, split=split)
+
     arguments = VerifyArguments(
         mesh=request.mesh,
         frame=request.frame,
@@ -74,7 +78,7 @@ def _place(request: VerifyRequest) -> list[PlacedGrasp]:
 
 
 def _dataset_path(request: VerifyRequest) -> Path | None:
-    """Return the data file whose objects are meant; grasps that are in one are its own."""
+    """Return the data file whose rows give the objects: --dataset, or GRASPS itself."""
     if request.mesh is not None and request.dataset is not None:
         raise GraspError("--object or --dataset must be given, got both")
     if request.mesh is not None or request.dataset is not None:
@@ -90,7 +94,7 @@ def _dataset_path(request: VerifyRequest) -> Path | None:
 
 
 def _refuse_idle(request: VerifyRequest, dataset: Path | None) -> None:
-    """Refuse options that would do nothing, and the lack of a camera where one is needed."""
+    """Refuse options without effect, and a missing camera."""
     if dataset is not None and request.units is not None:
         raise GraspError(f"--units must be given with --object only, got {request.units}")
     grouped = request.grasps.suffix.lower() in HDF5_SUFFIXES
@@ -109,7 +113,7 @@ def _refuse_idle(request: VerifyRequest, dataset: Path | None) -> None:
 
 
 def _config(request: VerifyRequest, dataset: Path | None) -> Config:
-    """Return the configuration: the one given, or the dataset's, with overrides on top."""
+    """Return the given configuration or that of the dataset, with the overrides."""
     if dataset is None or request.config is not None:
         return load_config(request.config, request.overrides)
     return override_config(read_manifest(dataset.parent).config, request.overrides)

@@ -28,7 +28,7 @@ def no_image(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_healthy_machine_lacks_nothing(tmp_path: Path) -> None:
     findings = diagnose(tmp_path)
     assert [f for f in findings if not f.ok] == []
-    assert {f.mend for f in findings} == {""}
+    assert {f.remedy for f in findings} == {""}
     assert all(f.what for f in findings)
     names = "Python, glibc, Drake, allocator, EGL, test image, writing, disk, cores, memory"
     assert [f.name for f in findings] == names.split(", ")
@@ -46,7 +46,7 @@ def test_old_python_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "version_info", (3, 10, 12, "final", 0))
     finding = doctor.check_python()
     assert not finding.ok
-    assert "3.11 or newer" in finding.mend
+    assert "3.11 or newer" in finding.remedy
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_old_or_other_c_library_is_told(
     monkeypatch.setattr(doctor.platform, "libc_ver", lambda: libc)
     finding = doctor.check_glibc()
     assert (finding.ok, finding.what) == (ok, what)
-    assert ("container" in finding.mend) is not ok
+    assert ("container" in finding.remedy) is not ok
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_drake_that_crashes_or_is_too_old_is_told(
     monkeypatch.setattr(doctor.metadata, "version", lambda package: version)
     mend = "" if ok else "pip install 'drake>=1.51.1,!=1.52.0'"
     finding = doctor.check_drake()
-    assert (finding.ok, finding.what.partition(":")[0], finding.mend) == (ok, version, mend)
+    assert (finding.ok, finding.what.partition(":")[0], finding.remedy) == (ok, version, mend)
 
 
 def test_missing_drake_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -99,7 +99,7 @@ def test_missing_drake_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor.metadata, "version", missing)
     finding = doctor.check_drake()
     assert (finding.ok, finding.what) == (False, "not installed")
-    assert finding.mend.startswith("pip install 'drake")
+    assert finding.remedy.startswith("pip install 'drake")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="EGL is Linux's")
@@ -108,7 +108,7 @@ def test_missing_egl_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     finding = doctor.check_egl()
     assert not finding.ok
     assert "libEGL-none.so.1" in finding.what
-    assert finding.mend == "apt-get install libegl1 libgl1-mesa-dri"
+    assert finding.remedy == "apt-get install libegl1 libgl1-mesa-dri"
 
 
 @pytest.mark.parametrize(
@@ -131,7 +131,7 @@ def test_image_that_fails_is_told_and_kills_nobody(
     monkeypatch.setattr(doctor, "IMAGE_SECONDS", 1.0 if "sleep" in child else 60.0)
     finding = doctor.check_image()
     assert (finding.ok, finding.what) == (False, what)
-    assert finding.mend == "apt-get install libegl1 libgl1-mesa-dri"
+    assert finding.remedy == "apt-get install libegl1 libgl1-mesa-dri"
 
 
 def test_image_that_lacks_a_library_is_mended_by_installing_it(
@@ -140,7 +140,7 @@ def test_image_that_lacks_a_library_is_mended_by_installing_it(
     monkeypatch.setattr(doctor, "_CHILD", "import no_such_library")
     finding = doctor.check_image()
     assert finding.what == "ModuleNotFoundError: No module named 'no_such_library'"
-    assert finding.mend.startswith("pip install")
+    assert finding.remedy.startswith("pip install")
 
 
 def test_last_line_counts_so_that_warnings_do_no_harm(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -165,7 +165,7 @@ def test_directory_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     (writing,) = (f for f in diagnose(tmp_path / "file" / "out") if f.name == "writing")
     assert not writing.ok
     assert writing.what == f"{tmp_path / 'file'}: Not a directory"
-    assert "--out" in writing.mend
+    assert "--out" in writing.remedy
 
 
 @pytest.mark.usefixtures("no_image")
@@ -181,7 +181,7 @@ def test_full_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(doctor.shutil, "disk_usage", lambda path: usage(1e12, 1e12, 3e8))
     finding = doctor.check_disk(tmp_path)
     assert (finding.ok, finding.what) == (False, "0.3 GB free")
-    assert "free 2 GB" in finding.mend
+    assert "free 2 GB" in finding.remedy
     monkeypatch.undo()
     assert not doctor.check_disk(tmp_path / "none").ok
 
@@ -200,7 +200,7 @@ def test_memory_is_the_machines_or_the_containers_whichever_is_less(
     limit.write_text("3000000000\n")
     finding = doctor.check_memory()
     assert (finding.ok, finding.what) == (False, "3.0 GB for 6 cores")
-    assert finding.mend.endswith("--workers 3")
+    assert finding.remedy.endswith("--workers 3")
     limit.write_text(f"{2**63 - 4096}\n")
     assert doctor.check_memory().what == "8.2 GB for 6 cores"
     limit.unlink()
