@@ -28,7 +28,7 @@ GLIBC = (2, 34)
 DRAKE = (1, 51, 1)
 #: Segfaults when it makes a renderer on Linux (RobotLocomotion/drake#24421).
 BROKEN_DRAKE = (1, 52, 0)
-#: With the last Drake for Python 3.11, which is 1.51.1, attempts take a fifth longer.
+#: With the last Drake for Python 3.11, which is 1.51.1, attempts take up to a tenth longer.
 FAST_DRAKE, FAST_PYTHON = (1, 58, 0), (3, 12)
 DRAKE_REQUIREMENT = "drake>=1.51.1,!=1.52.0"
 EGL_LIBRARY = "libEGL.so.1"
@@ -125,7 +125,7 @@ def check_drake() -> Finding:
     what = version
     if ok and _numbers(version) < FAST_DRAKE:
         newer = f"{_dotted(FAST_DRAKE)} on Python {_dotted(FAST_PYTHON)} or newer"
-        what += f": works; attempts take a fifth longer than with {newer}"
+        what += f": works; attempts take up to a tenth longer than with {newer}"
     return _finding("Drake", ok, what, f"pip install '{DRAKE_REQUIREMENT}'")
 
 
