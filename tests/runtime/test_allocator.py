@@ -218,7 +218,7 @@ def test_doctor_tells_what_an_older_drake_costs(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(doctor.metadata, "version", lambda name: "1.51.1")
     finding = doctor.check_drake()
     assert finding.ok
-    assert "a fifth longer" in finding.what
+    assert "a tenth longer" in finding.what
     monkeypatch.setattr(doctor.metadata, "version", lambda name: "1.58.0")
     assert doctor.check_drake().what == "1.58.0"
 
