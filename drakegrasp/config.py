@@ -146,6 +146,8 @@ class CloseConfig(_Section):
 class LiftConfig(_Section):
     """Freeing the object and moving the wrist to the target."""
 
+    drive: Literal["worm", "torque", "locked"] | None = None  # of the fingers; None: the hand's own
+    release_time: NonNegative = 0.2  # [s], the object is free before the wrist moves
     p_TG: Annotated[tuple[Number, ...], Field(min_length=3, max_length=3)] = (
         0.0,
         0.0,

@@ -13,9 +13,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, with_config
 from pydrake.math import RollPitchYaw
@@ -35,6 +36,10 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Name = Annotated[str, Field(min_length=1)]
 Vector = tuple[Finite, Finite, Finite]
+#: Normal and offset (nx, ny, nz, d) of the points p with n.p >= d; the normal need not be unit.
+HalfSpace = tuple[Finite, Finite, Finite, Finite]
+#: What a closing joint does when it is pushed open; see docs/explanation/physics.md, "Drive".
+Drive = Literal["worm", "torque", "locked"]
 _STRICT = ConfigDict(frozen=True, extra="forbid")
 
 
@@ -62,13 +67,23 @@ class Finger:
     torque_limit: Positive  # at the closing joint [N m]
     rotor_inertia: NonNegative = 0.0  # of the motor [kg m^2]
     gear_ratio: Positive = 1.0  # motor angle / closing angle
+    holding_torque: Positive | None = None  # what a stalled worm holds at the closing joint [N m]
     coupled: tuple[Coupling, ...] = ()
+    pad_region: tuple[HalfSpace, ...] = ()  # in Fi [m]; only there a contact is a fingertip's
     pad_point: Vector  # usual contact point, in Fi [m]
 
     @property
     def p_FiP(self) -> Array:
         """Usual contact point (3,) in the fingertip link's frame [m]."""
         return np.array(self.pad_point)
+
+    def on_pad(self, p_FiQ: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Return (...,) whether points (..., 3) of the fingertip link [m] belong to the pad."""
+        points = np.asarray(p_FiQ, dtype=float)
+        inside = np.ones(points.shape[:-1], dtype=np.bool_)
+        for nx, ny, nz, d in self.pad_region:
+            inside &= nx * points[..., 0] + ny * points[..., 1] + nz * points[..., 2] >= d
+        return inside
 
 
 @with_config(_STRICT)
@@ -102,6 +117,7 @@ class Hand:
     palm_link: str  # frame B
     X_BG: Array  # (4, 4), palm frame, +Gz out of the palm
     fingers: tuple[Finger, ...]  # in grasp order
+    drive: Drive  # of the closing joints
     spread: Spread
     closing_speed: float  # of the closing joints [rad/s]
     fingertip_force_limit: float  # [N]
@@ -136,6 +152,7 @@ class _Description(BaseModel):
     model: Name  # the SDFormat file, relative to the YAML file
     palm: _Palm
     fingers: Annotated[tuple[Finger, ...], Field(min_length=1)]
+    drive: Literal["worm", "torque"] = "torque"
     spread: Spread = Spread()
     closing_speed_deg: Positive  # [deg/s]
     fingertip_force_limit: Positive  # [N]
@@ -233,6 +250,7 @@ def _build_hand(name: str, description: _Description, sdf_path: Path) -> Hand:
         palm_link=palm.link,
         X_BG=X_BG,
         fingers=description.fingers,
+        drive=description.drive,
         spread=description.spread,
         closing_speed=float(np.deg2rad(description.closing_speed_deg)),
         fingertip_force_limit=description.fingertip_force_limit,

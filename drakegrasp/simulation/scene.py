@@ -117,7 +117,7 @@ def reset_attempt(
         closing: Angle of each finger's closing joint (k,) [rad]; None is the open hand.
     """
     # Unlock the wrist before positions are set, then place the object.
-    handles = _handles(scene)
+    handles = hand_handles(scene)
     context, plant = scene.context, scene.plant
     for joint in handles.wrist_joints:
         joint.Unlock(context)
@@ -147,7 +147,7 @@ def reset_attempt(
 
 def release(scene: Scene) -> None:
     """Free the object and the wrist for the lift."""
-    for joint in _handles(scene).wrist_joints:
+    for joint in hand_handles(scene).wrist_joints:
         joint.Unlock(scene.context)
     scene.object.Unlock(scene.context)
     _let_object_meet_table(scene, True)
@@ -197,7 +197,7 @@ def move_wrist(scene: Scene, p_WG_target: npt.ArrayLike, duration: float) -> Wri
     Raises:
         ValueError: If the scene has no hand.
     """
-    joints = _handles(scene).wrist_joints
+    joints = hand_handles(scene).wrist_joints
     motion = WristMotion(
         p_start=np.array([joint.get_translation(scene.context) for joint in joints]),
         p_end=np.asarray(p_WG_target, dtype=float),
@@ -216,7 +216,7 @@ def _follow(scene: Scene, motion: WristMotion) -> None:
     # has no lag at any step size.
     begin = motion.begin - scene.physics.time_step
     curve = BezierCurve(begin, begin + motion.duration, points)
-    _handles(scene).wrist_trajectory.UpdateTrajectory(curve)
+    hand_handles(scene).wrist_trajectory.UpdateTrajectory(curve)
 
 
 def transfer_state(scene: Scene, before: Scene, time: float, motion: WristMotion) -> None:
@@ -237,7 +237,7 @@ def transfer_state(scene: Scene, before: Scene, time: float, motion: WristMotion
 
     # Copy the palm's orientation and the state. A plant's context cannot be copied as a whole: it
     # refers to the geometries of its own diagram.
-    source, target = _handles(before), _handles(scene)
+    source, target = hand_handles(before), hand_handles(scene)
     X = source.wrist_frame.GetPoseInParentFrame(before.context)
     target.wrist_frame.SetPoseInParentFrame(scene.context, X)
     state = before.plant.GetPositionsAndVelocities(before.context)
@@ -255,38 +255,48 @@ def advance(scene: Scene, duration: float) -> None:
     scene.simulator.AdvanceTo(scene.time + duration, interruptible=False)
 
 
+def closing_rates(scene: Scene) -> Array:
+    """Return the speed of each finger's closing joint (k,) [rad/s]; positive closes."""
+    joints = hand_handles(scene).closing_joints
+    return np.array([joint.get_angular_rate(scene.context) for joint in joints])
+
+
 def finger_speed(scene: Scene) -> float:
     """Return the largest speed of a closing joint [rad/s]."""
-    rates = (joint.get_angular_rate(scene.context) for joint in _handles(scene).closing_joints)
-    return max(abs(float(rate)) for rate in rates)
+    return float(np.abs(closing_rates(scene)).max())
 
 
 def closing_angles(scene: Scene) -> Array:
     """Return the angle of each finger's closing joint (k,) [rad]."""
-    return np.array([joint.get_angle(scene.context) for joint in _handles(scene).closing_joints])
+    return np.array([joint.get_angle(scene.context) for joint in hand_handles(scene).closing_joints])
 
 
 def hand_positions(scene: Scene) -> Array:
     """Return the positions of all joints of the hand in the plant's order [rad]."""
-    return scene.plant.GetPositions(scene.context, _handles(scene).instance)
+    return scene.plant.GetPositions(scene.context, hand_handles(scene).instance)
 
 
 def hand_joint_names(scene: Scene) -> list[str]:
     """Return the joints' names in the order of `hand_positions`."""
     names = scene.plant.GetPositionNames(
-        _handles(scene).instance, add_model_instance_prefix=False, always_add_suffix=False
+        hand_handles(scene).instance, add_model_instance_prefix=False, always_add_suffix=False
     )
     return list(names)
 
 
 def palm_pose(scene: Scene) -> Array:
     """Return the pose X_WG (4, 4) of the palm now."""
-    handles = _handles(scene)
+    handles = hand_handles(scene)
     base = scene.plant.GetBodyByName(handles.hand.palm_link, handles.instance)
     return multiply(scene.pose(base), handles.hand.X_BG)
 
 
-def _handles(scene: Scene) -> HandHandles:
+def hand_handles(scene: Scene) -> HandHandles:
+    """Return the parts of the scene's hand.
+
+    Raises:
+        ValueError: If the scene has no hand.
+    """
     if scene.handles is None:
         raise ValueError("the scene must have a hand, got one without")
     return scene.handles
