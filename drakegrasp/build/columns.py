@@ -93,7 +93,7 @@ def _trial_values(
     if record.lifted is not None and record.X_TO_lifted is not None:
         values |= {"time_lift": record.time_lift, "lifted_q": record.q_lifted}
         values |= _contact_values("lifted", record.lifted)
-        values |= {"slip": record.slip, "slip_angle": record.slip_angle}
+        values |= {"slip": record.slip, "turn": record.turn}
         values["X_TO_lifted"] = pack_pose(record.X_TO_lifted)
     if surface_distance is not None:
         values["surface_distance"] = surface_distance

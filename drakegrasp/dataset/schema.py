@@ -147,7 +147,7 @@ _TIME_LIFT = Field(
 _SLIP = (
     Field("slip", "", "float64", "m", "G",
           "distance that the object moved in the hand during the lift"),
-    Field("slip_angle", "", "float64", "rad", "G",
+    Field("turn", "", "float64", "rad", "G",
           "angle that the object turned in the hand during the lift"),
 )
 

@@ -55,7 +55,7 @@ class Lift:
         duration: Simulated time [s].
         X_TO: Pose of the object, (4, 4).
         slip: Distance that {O} moved in {G} during the lift [m].
-        slip_angle: Angle that it turned in {G} [rad].
+        turn: Angle that it turned in {G} [rad].
     """
 
     contacts: Contacts
@@ -63,7 +63,7 @@ class Lift:
     duration: float
     X_TO: Array
     slip: float
-    slip_angle: float
+    turn: float
 
 
 def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
@@ -104,14 +104,14 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
             current = chosen
 
     # Read what the hand holds now, and how far the object slipped in it.
-    slip, slip_angle = _motion(X_GO_start, _object_in_hand(current))
+    slip, turn = _motion(X_GO_start, _object_in_hand(current))
     return Lift(
         contacts=read_contacts(current),
         q=hand_positions(current),
         duration=now - start,
         X_TO=multiply(invert_pose(X_WT), current.pose(current.object)),
         slip=slip,
-        slip_angle=slip_angle,
+        turn=turn,
     )
 
 

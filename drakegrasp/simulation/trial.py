@@ -51,7 +51,7 @@ class TrialRecord:
         time_close, time_lift: Simulated time of the two stages [s].
         X_TO_lifted: Pose of the object after the lift, (4, 4).
         slip: Distance that {O} moved in {G} during the lift [m].
-        slip_angle: Angle that it turned in {G} [rad].
+        turn: Angle that it turned in {G} [rad].
         message: First line of the error for `solver_error`, else empty.
     """
 
@@ -66,7 +66,7 @@ class TrialRecord:
     time_lift: float = 0.0
     X_TO_lifted: Array | None = None
     slip: float = np.nan
-    slip_angle: float = np.nan
+    turn: float = np.nan
     message: str = field(default="")
 
 
@@ -147,7 +147,7 @@ def run_attempt(
             time_lift=end.duration,
             X_TO_lifted=end.X_TO,
             slip=end.slip,
-            slip_angle=end.slip_angle,
+            turn=end.turn,
         )
     except TrialTimeout:
         return replace(start, outcome=Outcome.TIMEOUT)

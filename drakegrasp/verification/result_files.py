@@ -277,7 +277,7 @@ def _row(result: Verification) -> dict[str, Any]:
     if trial is not None and trial.lifted is not None:
         row |= {"time_lift": trial.time_lift, "lifted_q": trial.q_lifted}
         row |= _contact_values("lifted", trial.lifted)
-        row |= {"slip": trial.slip, "slip_angle": trial.slip_angle}
+        row |= {"slip": trial.slip, "turn": trial.turn}
 
     # The lift by forces.
     if lift is not None:

@@ -128,7 +128,7 @@ def trial_row(model: ObjectModel, number: int, X_TO: Array) -> dict[str, Any]:
         touch[0] &= outcome is not Outcome.SLIPPED
         row |= {f"lifted_{k}": v for k, v in contacts(model, touch).items()}
         row |= {"time_lift": 1.0, "lifted_object_on_table": after_lift, "slip": 0.0}
-        row |= {"slip_angle": 0.0, "surface_distance": np.zeros(3), "X_TO_lifted": pack_pose(X_TO)}
+        row |= {"turn": 0.0, "surface_distance": np.zeros(3), "X_TO_lifted": pack_pose(X_TO)}
     return row
 
 

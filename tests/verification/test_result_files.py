@@ -103,7 +103,7 @@ def results() -> list[Verification]:
         time_lift=2.5,
         X_TO_lifted=make_pose(np.eye(3), [0.0, 0.0, 0.5]),
         slip=0.002,
-        slip_angle=0.01,
+        turn=0.01,
     )
     lift = ForceLift(
         end=LiftEnd.HELD,

@@ -81,7 +81,7 @@ def test_recording_a_trial_changes_no_bit_of_it(
         cube, standing(cube), attempt, config, path, p_OQ=P_OQ, nhat_Q_O=NHAT_Q_O
     )
     assert plain.outcome is recorded.outcome is Outcome.SUCCESS
-    for name in ("q_closed", "q_lifted", "X_TO_lifted", "slip", "slip_angle", "time_close"):
+    for name in ("q_closed", "q_lifted", "X_TO_lifted", "slip", "turn", "time_close"):
         assert np.array_equal(getattr(plain, name), getattr(recorded, name)), name
     for one, other in ((plain.closed, recorded.closed), (plain.lifted, recorded.lifted)):
         assert one is not None
