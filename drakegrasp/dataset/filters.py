@@ -122,7 +122,8 @@ def breaks_hold(
     Args:
         config: The limits.
         other_links: (n,), number of other links that touch the object after the lift.
-        slip, turn: (n,), how far the object moved [m] and turned [rad] in the hand.
+        slip: (n,), how far the object moved in the hand during the lift [m].
+        turn: (n,), how far it turned in the hand [rad].
     """
     if config.require == "held":
         return []
@@ -131,7 +132,7 @@ def breaks_hold(
         (Removal.SLID, np.asarray(slip), config.max_slip),
         (Removal.TURNED, np.degrees(turn), config.max_turn_deg),
     )
-    return [(reason, values > limit) for reason, values, limit in rules if limit is not None]
+    return [(reason, ~(values <= limit)) for reason, values, limit in rules if limit is not None]
 
 
 def breaks_surface(
@@ -148,7 +149,7 @@ def breaks_surface(
         (Removal.OFF_SURFACE, np.asarray(surface_distance), config.max_surface_distance),
         (Removal.NORMAL_OFF, np.degrees(normal_angle), config.max_normal_angle_deg),
     )
-    return [(reason, values > limit) for reason, values, limit in rules if limit is not None]
+    return [(reason, ~(values <= limit)) for reason, values, limit in rules if limit is not None]
 
 
 def is_outlier(values: Array, sigma: float) -> npt.NDArray[np.bool_]:
