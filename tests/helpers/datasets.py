@@ -48,7 +48,7 @@ OUTCOMES = [
 
 
 #: Rows of /trials whose outcome is known, see OUTCOMES.
-SUCCESS, MISSING, BELOW, SLIPPED, AFTER_LIFT = 0, 1, 2, 4, 10
+SUCCESS, MISSING, BELOW, SLIPPED, HAND, AFTER_LIFT = 0, 1, 2, 4, 6, 10
 
 
 #: By how much every lifted object moved in the hand [m].
@@ -85,14 +85,14 @@ def see(
     return image, mask
 
 
-def contacts(model: ObjectModel, touching: np.ndarray) -> dict[str, Any]:
-    """Return contacts of three fingertips in the middle of three sides."""
+def contacts(model: ObjectModel, touching: np.ndarray, z: float = 0.0) -> dict[str, Any]:
+    """Return contacts of three fingertips in the middle of three sides, or above it [m]."""
     x, y, _ = model.half_extents
     n = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0]])
     gone = ~touching[:, None]
     return {
         "touching": touching,
-        "p_OQ": np.where(gone, np.nan, n * [[x], [x], [y]]),
+        "p_OQ": np.where(gone, np.nan, n * [[x], [x], [y]] + [0.0, 0.0, z]),
         "nhat_Q_O": np.where(gone, np.nan, n),
         "f_Q_O": np.where(gone, 0.0, -10.0 * n),
         "area": np.where(touching, 1e-5, 0.0),
@@ -144,7 +144,8 @@ def trial_row(model: ObjectModel, number: int, X_TO: Array) -> dict[str, Any]:
     if stage >= Stage.LIFTED:
         touch = touch & (outcome is not Outcome.DROPPED)
         touch[0] &= outcome is not Outcome.SLIPPED
-        row |= {f"lifted_{k}": v for k, v in contacts(model, touch).items()}
+        row |= {f"lifted_{k}": v for k, v in contacts(model, touch, SLIP).items()}
+        row["lifted_q"] = np.full(4, 0.6)
         row |= {"time_lift": 1.0, "lifted_object_on_table": after_lift}
         row |= {"X_TO_lifted": pack_pose(X_TO), "surface_distance": np.zeros(3)}
         row |= {"normal_angle": np.zeros(3), **hold(row)}
