@@ -85,7 +85,7 @@ def test_object_under_one_finger_only_is_screened(cube, hand):
 
 def test_back_of_a_fingertip_that_meets_the_object_is_no_contact(cube, hand):
     """The cube is between the pads: where the other side counts instead, no finger arrives."""
-    backs = tuple(replace(f, pad_region=((0.0, -1.0, 0.0, 0.003),)) for f in hand.fingers)
+    backs = tuple(replace(f, pad_region=((0.0, -1.0, 0.0, 0.006),)) for f in hand.fingers)
     assert ask(cube, hand, from_above(cube, STANDOFF)).outcome is None
     found = ask(cube, replace(hand, fingers=backs), from_above(cube, STANDOFF))
     assert found.outcome is Outcome.SCREENED
