@@ -83,9 +83,9 @@ def test_object_under_one_finger_only_is_screened(cube, hand):
     assert ask(cube, hand, aside).outcome in (Outcome.SCREENED, Outcome.START_COLLISION)
 
 
-def test_back_of_a_fingertip_that_meets_the_object_is_no_contact(cube, hand):
-    """The cube is between the pads: where the other side counts instead, no finger arrives."""
-    backs = tuple(replace(f, pad_region=((0.0, -1.0, 0.0, 0.006),)) for f in hand.fingers)
+def test_fingertip_that_meets_the_object_beside_its_pad_is_screened(cube, hand):
+    """The cube is between the ends of the fingertips: their first 5 mm do not come to it."""
+    backs = tuple(replace(f, pad_region=((-1.0, 0.0, 0.0, -0.005),)) for f in hand.fingers)
     assert ask(cube, hand, from_above(cube, STANDOFF)).outcome is None
     found = ask(cube, replace(hand, fingers=backs), from_above(cube, STANDOFF))
     assert found.outcome is Outcome.SCREENED
