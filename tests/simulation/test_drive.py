@@ -57,13 +57,13 @@ def test_worm_needs_a_holding_torque(config: Config, tmp_path: Path) -> None:
 
 @pytest.mark.sim
 def test_attempt_with_an_impossible_drive_is_refused(
-    cube: ObjectModel, config: Config, tmp_path: Path
+    cube: ObjectModel, config: Config, hand: Hand
 ) -> None:
     """It is the caller's mistake, not an outcome."""
-    scene = build_scene(cube, config.physics, load_hand(write_pincer(tmp_path)))
-    worm = override_config(config, ["lift.drive=worm"])
+    weak = tuple(replace(finger, holding_torque=None) for finger in hand.fingers)
+    scene = build_scene(cube, config.physics, replace(hand, fingers=weak))
     with pytest.raises(ConfigError, match="holding_torque"):
-        run_attempt(scene, standing(cube), from_above(cube, STANDOFF), worm)
+        run_attempt(scene, standing(cube), from_above(cube, STANDOFF), config)
 
 
 @pytest.fixture(scope="module")
