@@ -120,7 +120,6 @@ class Hand:
     drive: Drive  # of the closing joints
     spread: Spread
     closing_speed: float  # of the closing joints [rad/s]
-    fingertip_force_limit: float  # [N]
     joint_names: tuple[str, ...]  # the n revolute joints
     joint_gain: Array  # (n, 1 + k), angles per coordinate; one non-zero in each row
     joint_limits: Array  # (n, 2), lower and upper [rad]
@@ -155,7 +154,6 @@ class _Description(BaseModel):
     drive: Literal["worm", "torque"] = "torque"
     spread: Spread = Spread()
     closing_speed_deg: Positive  # [deg/s]
-    fingertip_force_limit: Positive  # [N]
 
 
 def make_parser(plant: MultibodyPlant) -> Parser:
@@ -253,7 +251,6 @@ def _build_hand(name: str, description: _Description, sdf_path: Path) -> Hand:
         drive=description.drive,
         spread=description.spread,
         closing_speed=float(np.deg2rad(description.closing_speed_deg)),
-        fingertip_force_limit=description.fingertip_force_limit,
         joint_names=tuple(revolute),
         joint_gain=np.array([gains[joint] for joint in revolute]),
         joint_limits=np.array(

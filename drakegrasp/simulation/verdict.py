@@ -1,7 +1,8 @@
-"""The verdict on an attempt: what follows from its contacts.
+"""The verdict on an attempt: what follows from its contacts, and how well it holds.
 
-In: contacts of one attempt, or of many with leading axes. Out: values of `Outcome`. Trials and the
-check of a dataset both decide by these two functions. Does not import Drake.
+In: contacts of one attempt, or of many with leading axes. Out: values of `Outcome`, and whether a
+grasp is a precision grasp and a stable one. Trials, builds and the check of a dataset all decide by
+these functions. Does not import Drake.
 """
 
 from __future__ import annotations
@@ -12,6 +13,10 @@ import numpy.typing as npt
 from drakegrasp.outcomes import Outcome
 
 Outcomes = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+#: In a stable grasp the object moves and turns in the hand by less than this [m], [rad]; own choice.
+STABLE_SLIP, STABLE_TURN = 5e-3, float(np.deg2rad(5.0))
 
 
 def judge_closed(
@@ -52,6 +57,35 @@ def judge_lifted(
         (~touching.all(axis=-1), Outcome.SLIPPED),
         (object_on_table, Outcome.TABLE_CONTACT),
     )
+
+
+def is_precision(outcome: npt.ArrayLike, other_links: npt.ArrayLike) -> Flags:
+    """Return (...,) whether a grasp holds with the fingertips alone.
+
+    Args:
+        outcome: (...,), values of `Outcome`.
+        other_links: (...,), number of other links of the hand that touch the object after the lift.
+    """
+    return np.asarray(
+        (np.asarray(outcome) == Outcome.SUCCESS.value) & (np.asarray(other_links) == 0)
+    )
+
+
+def is_stable(
+    outcome: npt.ArrayLike,
+    other_links: npt.ArrayLike,
+    slip: npt.ArrayLike,
+    turn: npt.ArrayLike,
+) -> Flags:
+    """Return (...,) whether a precision grasp also keeps the object as it was grasped.
+
+    Args:
+        outcome, other_links: See `is_precision`.
+        slip: (...,), distance that the object moved in the hand during the lift [m].
+        turn: (...,), angle that it turned in the hand [rad].
+    """
+    still = (np.asarray(slip) < STABLE_SLIP) & (np.asarray(turn) < STABLE_TURN)
+    return is_precision(outcome, other_links) & still
 
 
 def _first(*rules: tuple[npt.ArrayLike, Outcome]) -> Outcomes:

@@ -140,7 +140,9 @@ def test_last_panel_shows_the_last_instant(
     closed = replace(held, lifted=None, q_lifted=None, X_TO_lifted=None)
     fit = SimpleNamespace(X_OG=held.X_OG, spread=0.0, closing=np.full(3, 1.0))
     X_TO_lifted = make_pose(np.eye(3), [0.0, 0.0, 0.6])
-    lift = ForceLift(end=LiftEnd.HELD, planned_force=1.0, X_TO_lifted=X_TO_lifted)
+    lift = ForceLift(
+        end=LiftEnd.HELD, planned_force=1.0, planned_share=0.1, X_TO_lifted=X_TO_lifted
+    )
     for values, title in (
         ({"trial": closed, "fit": fit}, "after closing"),
         ({"fit": fit}, "the hand where it comes closest"),
@@ -148,7 +150,7 @@ def test_last_panel_shows_the_last_instant(
     ):
         figure = verification_figure(verified(**values))
         assert figure.axes[2].get_title(loc="left") == title
-    refused = ForceLift(end=LiftEnd.INFEASIBLE, planned_force=np.inf)
+    refused = ForceLift(end=LiftEnd.INFEASIBLE, planned_force=np.inf, planned_share=np.inf)
     assert len(verification_figure(verified(lift=refused)).axes) == 2
 
 
