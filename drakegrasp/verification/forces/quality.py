@@ -160,15 +160,18 @@ def force_margin(
         nhat_Q_O: (k, 3), normals out of the object in {O}.
         config: Hand, its drive, friction and lift.
     """
+    # What the hand's fingertips can do.
     hand = load_hand(config.hand)
+    limits = fingertip_forces(hand, drive_of(hand, config.lift))
     radius = patch_torsion_radius(hand.num_fingers)
+
     return ForceMargin(
         smallest_friction=smallest_friction(
             p_OQ,
             nhat_Q_O,
             model.p_OOcm,
             lift_path(X_TO, config).wrenches(model),
-            fingertip_forces(hand, drive_of(hand, config.lift)),
+            limits,
             torsion_radius=radius,
         ),
         epsilon=ferrari_canny(
