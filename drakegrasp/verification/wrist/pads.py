@@ -103,7 +103,8 @@ def make_pads(
     for i, region in enumerate(regions):
         for j, (*normal, offset) in enumerate(region):
             length = np.linalg.norm(normal)
-            region_normals[i, j], region_offsets[i, j] = normal / length, offset / length
+            region_normals[i, j] = np.array(normal) / length
+            region_offsets[i, j] = offset / length
 
     return Pads(
         normals=normals,
