@@ -187,12 +187,23 @@ class CameraConfig(_Section):
 
 
 class FilterConfig(_Section):
-    """The paper's postprocessing, applied when the files are assembled."""
+    """Which successes become samples, decided when the files are assembled.
 
+    Null switches a limit off. Limits of the hold are own choices; docs/reference/outcomes.md.
+    """
+
+    # "held" switches max_slip, max_turn_deg and other_links off: every success that the filters
+    # of images and contacts keep.
+    require: Literal["held", "limits"] = "limits"
+    max_slip: Positive | None = 0.010  # [m], of the object in the hand during the lift
+    max_turn_deg: Positive | None = 10.0  # of the object in the hand during the lift
+    other_links: NonNegativeCount | None = 0  # that touch the object after the lift, at most
     min_depth_variance: NonNegative = 1e-3  # [m^2], flatter otm depth images are removed
     min_camera_height: Number = 0.01  # [m] above the table; lower cameras see the table edge-on
     outlier_sigma: NonNegative = 4.0  # per object and component of the grasp; 0 switches it off
     max_surface_distance: Positive = 2e-3  # [m], of a contact point from the object's surface
+    # Between a contact's mean normal and the object's nearest face; the paper removed by eye.
+    max_normal_angle_deg: Positive | None = 30.0
 
 
 class SplitConfig(_Section):

@@ -96,6 +96,11 @@ filters:
   min_camera_height: 0.02
   outlier_sigma: 3.0
   max_surface_distance: 0.003
+  require: held
+  max_slip: 0.02
+  max_turn_deg: 20.0
+  other_links: 1
+  max_normal_angle_deg: 20.0
 split:
   valid_fraction: 0.2
   train_classes: [mug, bottle]
@@ -126,6 +131,10 @@ RELEASED = {
     "lift.p_TG": [0.0, 0.0, 0.50],
     "lift.max_speed": 0.2,
     "lift.max_acceleration": 0.05,
+    # Its decoder demands fingertips alone after the lift, which is the default too.
+    "filters.max_slip": None,
+    "filters.max_turn_deg": None,
+    "filters.max_normal_angle_deg": None,
     "camera.distance": 0.30,
     "camera.far": 0.70,
 }

@@ -1,8 +1,8 @@
 """One object's trial setup in this process, and the steps of a trial on it.
 
 In: a prepared object of a dataset, and attempts. Out: what geometry predicts of them, the records
-of their trials, the distances of contacts from the surface, and the views of a success. Nothing
-is written here, see `drakegrasp.build.columns`.
+of their trials, how contacts lie on the surface, and the views of a success. Nothing is written
+here, see `drakegrasp.build.columns`.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
+from drakegrasp.objects.contact_fit import ContactFit, fit_contacts
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import release_memory
 from drakegrasp.simulation.candidates import Attempt
@@ -118,16 +119,15 @@ def try_attempt(
     return record
 
 
-def surface_distance(setup: TrialSetup, record: TrialRecord) -> Array | None:
-    """Return how far the contacts after closing are from the object's mesh, (k,) [m].
+def measure_contacts(setup: TrialSetup, record: TrialRecord) -> ContactFit | None:
+    """Return how the contacts after closing lie on the object's mesh, a row per finger.
 
     Returns:
-        A distance per finger; None if the hand lifted nothing.
+        Distances and angles; None if the hand lifted nothing.
     """
     if record.closed is None or record.lifted is None:
         return None
-    _, distance, _ = setup.prepared.model.visual.nearest.on_surface(record.closed.p_OQ)
-    return np.asarray(distance)
+    return fit_contacts(setup.prepared.model, record.closed.p_OQ, record.closed.nhat_Q_O)
 
 
 def render_views(setup: TrialSetup, record: TrialRecord) -> dict[str, View]:

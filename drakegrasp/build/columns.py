@@ -13,18 +13,22 @@ from drakegrasp.build.attempts import TrialSetup, View
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.schema import CONTACT_NAMES, LOOK_FIELDS, sizes
 from drakegrasp.dataset.shards import trial_columns
-from drakegrasp.frames import Array, pack_pose
+from drakegrasp.frames import pack_pose
+from drakegrasp.objects.contact_fit import ContactFit
 from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.scene import hand_joint_names
 from drakegrasp.simulation.trial import TrialRecord
+from drakegrasp.simulation.verdict import is_precision, is_stable
+
+_FIELD_NAMES = frozenset(field.name for field in trial_columns())
 
 
 def trial_rows(
     setup: TrialSetup,
     attempts: Sequence[Attempt],
     records: Sequence[TrialRecord],
-    distances: Sequence[Array | None],
+    fits: Sequence[ContactFit | None],
 ) -> dict[str, AnyArray]:
     """Return the columns of `/trials`.
 
@@ -32,14 +36,12 @@ def trial_rows(
         setup: Says how many fingers, joints and pixels there are.
         attempts: What was tried, in the order of the rows.
         records: The result of each attempt.
-        distances: `surface_distance` of each record.
+        fits: How the contacts of each record lie on the surface, if the hand lifted something.
     """
     shape = array_sizes(setup)
     columns = {f.name: f.empty(len(records), shape) for f in trial_columns()}
-    for row, (attempt, record, distance) in enumerate(
-        zip(attempts, records, distances, strict=True)
-    ):
-        for name, value in _trial_values(attempt, record, distance).items():
+    for row, (attempt, record, fit) in enumerate(zip(attempts, records, fits, strict=True)):
+        for name, value in _trial_values(attempt, record, fit).items():
             columns[name][row] = value
     return columns
 
@@ -72,9 +74,7 @@ def array_sizes(setup: TrialSetup) -> dict[str, int]:
     )
 
 
-def _trial_values(
-    attempt: Attempt, record: TrialRecord, surface_distance: Array | None
-) -> dict[str, Any]:
+def _trial_values(attempt: Attempt, record: TrialRecord, fit: ContactFit | None) -> dict[str, Any]:
     # Every attempt has its start.
     values: dict[str, Any] = {
         "candidate": attempt.candidate,
@@ -93,12 +93,26 @@ def _trial_values(
     if record.lifted is not None and record.X_TO_lifted is not None:
         values |= {"time_lift": record.time_lift, "lifted_q": record.q_lifted}
         values |= _contact_values("lifted", record.lifted)
-        values |= {"slip": record.slip, "turn": record.turn}
+        values |= _hold_values(record, record.lifted)
         values["X_TO_lifted"] = pack_pose(record.X_TO_lifted)
-    if surface_distance is not None:
-        values["surface_distance"] = surface_distance
+        if record.X_OG_lifted is not None:
+            values["X_OG_lifted"] = pack_pose(record.X_OG_lifted)
+    if fit is not None:
+        values |= {"surface_distance": fit.distance, "normal_angle": fit.normal_angle}
     return values
 
 
+def _hold_values(record: TrialRecord, lifted: Contacts) -> dict[str, Any]:
+    """Return how the object moved in the hand, and the words that follow from it."""
+    motion = {
+        name: getattr(record, name) for name in ("slip", "turn", "slip_released", "turn_released")
+    }
+    return motion | {
+        "precision": is_precision(record.outcome, lifted.other_links),
+        "stable": is_stable(record.outcome, lifted.other_links, record.slip, record.turn),
+    }
+
+
 def _contact_values(prefix: str, contacts: Contacts) -> dict[str, Any]:
-    return {f"{prefix}_{name}": getattr(contacts, name) for name in CONTACT_NAMES}
+    names = {f"{prefix}_{name}": name for name in CONTACT_NAMES}
+    return {key: getattr(contacts, name) for key, name in names.items() if key in _FIELD_NAMES}

@@ -8,7 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from drakegrasp.build.attempts import TrialSetup, surface_distance, try_attempt
+from drakegrasp.build.attempts import TrialSetup, measure_contacts, try_attempt
 from drakegrasp.build.columns import trial_rows
 from drakegrasp.build.work_unit import unit_attempts
 from drakegrasp.dataset.manifest import Manifest, installed_versions, read_manifest
@@ -67,7 +67,7 @@ def replay_trial(out: str | Path, trial_id: int) -> Replay:
     scene = build_scene(prepared.model, config.physics, load_hand(config.hand))
     setup = TrialSetup(prepared=prepared, config=config, scene=scene)
     record = try_attempt(setup, stored.attempt)
-    row = trial_rows(setup, [stored.attempt], [record], [surface_distance(setup, record)])
+    row = trial_rows(setup, [stored.attempt], [record], [measure_contacts(setup, record)])
 
     # Compare bit for bit; other versions may explain a difference.
     now = installed_versions(config)

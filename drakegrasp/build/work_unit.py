@@ -19,9 +19,9 @@ import numpy as np
 
 from drakegrasp.build.attempts import (
     TrialSetup,
+    measure_contacts,
     predict_attempts,
     render_views,
-    surface_distance,
     trial_setup,
     try_attempt,
 )
@@ -149,9 +149,9 @@ def _run_experiment(unit: WorkUnit, journal: Journal) -> UnitSummary:
         predictions = predict_attempts(setup, attempts)
         records = _try_all(setup, attempts, predictions, journal)
 
-    # Measure how far the contacts of each lift are from the object's true surface.
+    # Measure how the contacts of each lift lie on the object's true surface.
     with _stage(journal, "measure", header, seconds):
-        distances = [surface_distance(setup, record) for record in records]
+        fits = [measure_contacts(setup, record) for record in records]
 
     # Render both cameras' images of each success.
     with timed(seconds, "look"):
@@ -164,7 +164,7 @@ def _run_experiment(unit: WorkUnit, journal: Journal) -> UnitSummary:
 
     # Write the shard: all of it or nothing.
     with _stage(journal, "write", header, seconds):
-        trials = trial_rows(setup, attempts, records, distances)
+        trials = trial_rows(setup, attempts, records, fits)
         write_shard(out, Shard(header=header, trials=trials, looks=looks))
 
     return UnitSummary(

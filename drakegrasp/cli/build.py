@@ -114,6 +114,7 @@ def _print_stats(out: Path) -> None:
     from drakegrasp.cli.tables import (
         WIDTH,
         funnel_table,
+        hold_table,
         make_console,
         split_table,
         unfinished_line,
@@ -128,6 +129,7 @@ def _print_stats(out: Path) -> None:
     if natural > console.width:
         table = funnel_table(funnel, compact=True)
     console.print(table)
+    console.print(hold_table(funnel))
     if unfinished is None:
         console.print(split_table(count_splits(out)))
     else:

@@ -80,6 +80,37 @@ def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
     return table
 
 
+def hold_table(funnel: Funnel) -> Table:
+    """Return how well the successes hold, a row per object and one of all."""
+    table = _table("How well the hand holds")
+    table.add_column("object", no_wrap=True, overflow="ellipsis", max_width=24)
+    for head in ("attempts", "held", "precision", "stable", "stable\nof held", "samples"):
+        table.add_column(head, justify="right", no_wrap=True)
+
+    # A column per count, with the sum of all objects below.
+    columns = (
+        funnel.outcomes.sum(axis=1),
+        funnel.outcomes[:, Outcome.SUCCESS],
+        funnel.precision,
+        funnel.stable,
+        funnel.removals[:, Removal.KEPT],
+    )
+    rows = [(escape(name), [int(c[i]) for c in columns]) for i, name in enumerate(funnel.names)]
+    rows.append(("all", [int(c.sum()) for c in columns]))
+    for i, (name, (attempts, held, precision, stable, samples)) in enumerate(rows):
+        if i == len(rows) - 1:
+            table.add_section()
+        share = f"{stable / held:.0%}" if held else "-"
+        counts = [f"{n:,}" for n in (attempts, held, precision, stable)]
+        table.add_row(name, *counts, share, f"{samples:,}")
+    table.caption = (
+        "held: the outcome success; precision: with the fingertips alone; stable: of these, moved "
+        "by less than 5 mm and 5° in the hand"
+    )
+    table.caption_justify = "left"
+    return table
+
+
 def split_table(counts: Sequence[SplitCount]) -> Table:
     """Return the paper's Table III with a column of objects."""
     table = _table("Samples by split")

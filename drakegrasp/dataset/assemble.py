@@ -261,12 +261,16 @@ def _successes(shard_slice: ShardSlice, shard: Shard, K: Array) -> Successes:
         trial_id=shard_slice.first + rows.astype(np.int64),
         object=np.full(len(rows), shard_slice.object, dtype=np.int32),
         grasp_T=np.array(grasps).reshape(-1, length),
+        other_links=trials["lifted_other_links"],
+        slip=trials["slip"],
+        turn=trials["turn"],
         seen=np.all([looks[f"mask_{c}"].any(axis=(1, 2)) for c in CAMERAS], axis=0),
         in_view=np.array(in_view, dtype=bool),
         # Both cameras are at the same point.
         camera_height=unpack_pose(looks["X_TC_otm"])[:, 2, 3],
         depth_variance=looks["image_otm"][:, 3].astype(float).var(axis=(1, 2)),
         surface_distance=trials["surface_distance"].max(axis=1, initial=0.0),
+        normal_angle=trials["normal_angle"].max(axis=1, initial=0.0),
         **{field.name: looks[field.name] for field in CERTIFICATE_FIELDS},
     )
 

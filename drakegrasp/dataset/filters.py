@@ -1,8 +1,8 @@
-"""The paper's postprocessing: which successes become samples, and in which split.
+"""Postprocessing: which successes become samples, and in which split.
 
 Pure functions of arrays. A filter removes a grasp from the two data files, never from
-trials.hdf5. A removal has one reason: the first filter that applies (Veres et al.,
-"Postprocessing").
+trials.hdf5. A removal has one reason: the first filter that applies. The filters of images and
+contacts are the paper's (Veres et al., "Postprocessing"); those of the hold are our own.
 """
 
 from __future__ import annotations
@@ -23,13 +23,17 @@ class Removal(IntEnum):
     """Why a success is not a sample, in the order of the filters."""
 
     KEPT = 0
-    NOT_SEEN = 1  # the object is missing in an image
-    OUT_OF_VIEW = 2  # a contact point lies outside of an image
-    BISECTS_TABLE = 3  # the camera is at the table's height or below
-    FLAT_DEPTH = 4  # the otm depth image varies too little
-    OFF_SURFACE = 5  # a contact's centre is off the surface: its patches span an edge
-    OUTLIER = 6  # a component of the grasp is too far from the mean of its object's grasps
-    REJECTED = 7  # an inspection rejected it
+    OTHER_LINKS = 1  # after the lift more than fingertips touch the object
+    SLID = 2  # the object moved too far in the hand
+    TURNED = 3  # the object turned too far in the hand
+    NOT_SEEN = 4  # the object is missing in an image
+    OUT_OF_VIEW = 5  # a contact point lies outside of an image
+    BISECTS_TABLE = 6  # the camera is at the table's height or below
+    FLAT_DEPTH = 7  # the otm depth image varies too little
+    OFF_SURFACE = 8  # a contact's centre is off the surface: its patches span an edge
+    NORMAL_OFF = 9  # a contact's mean normal is not that of the surface: its patches span an edge
+    OUTLIER = 10  # a component of the grasp is too far from the mean of its object's grasps
+    REJECTED = 11  # an inspection rejected it
 
     @property
     def label(self) -> str:
@@ -45,22 +49,29 @@ class Successes:
         trial_id: (n,) int64, row of /trials.
         object: (n,) int32, row of /objects.
         grasp_T: (n, 6k), grasps in the table-top frame [m, -].
+        other_links: (n,), number of other links that touch the object after the lift.
+        slip, turn: (n,), how far the object moved [m] and turned [rad] in the hand.
         seen: (n,) bool, whether both masks have object pixels.
         in_view: (n,) bool, whether all contacts project into both images.
         camera_height: (n,), of the cameras above the table [m].
         depth_variance: (n,), of the otm depth image [m^2].
         surface_distance: (n,), largest of the contacts' distances from the surface [m].
+        normal_angle: (n,), largest angle of the contacts' normals from those of the surface [rad].
         certified_share, certified_friction: (n,), see the schema; no filter uses them.
     """
 
     trial_id: npt.NDArray[np.int64]
     object: npt.NDArray[np.int32]
     grasp_T: Array
+    other_links: npt.NDArray[np.integer]
+    slip: Array
+    turn: Array
     seen: npt.NDArray[np.bool_]
     in_view: npt.NDArray[np.bool_]
     camera_height: Array
     depth_variance: Array
     surface_distance: Array
+    normal_angle: Array
     certified_share: Array
     certified_friction: Array
 
@@ -78,13 +89,14 @@ def judge_successes(
     # Filters that judge a grasp alone.
     removal = np.full(len(successes.trial_id), Removal.KEPT, dtype=np.uint8)
     for reason, bad in (
+        *breaks_hold(config, successes.other_links, successes.slip, successes.turn),
         (Removal.NOT_SEEN, ~successes.seen),
         (Removal.OUT_OF_VIEW, ~successes.in_view),
         (Removal.BISECTS_TABLE, successes.camera_height < config.min_camera_height),
         (Removal.FLAT_DEPTH, successes.depth_variance < config.min_depth_variance),
         # The mean normal of opposed patches has length zero: normalised it is NaN.
         (Removal.OFF_SURFACE, ~np.isfinite(successes.grasp_T).all(axis=1)),
-        (Removal.OFF_SURFACE, successes.surface_distance > config.max_surface_distance),
+        *breaks_surface(config, successes.surface_distance, successes.normal_angle),
     ):
         removal[bad & (removal == Removal.KEPT)] = reason
 
@@ -100,6 +112,44 @@ def judge_successes(
     listed = np.isin(successes.trial_id, np.asarray(rejected, dtype=np.int64))
     removal[listed & (removal == Removal.KEPT)] = Removal.REJECTED
     return removal
+
+
+def breaks_hold(
+    config: FilterConfig, other_links: npt.ArrayLike, slip: npt.ArrayLike, turn: npt.ArrayLike
+) -> list[tuple[Removal, npt.NDArray[np.bool_]]]:
+    """Return which successes (n,) break each limit of the hold that is on, in the filters' order.
+
+    Args:
+        config: The limits.
+        other_links: (n,), number of other links that touch the object after the lift.
+        slip: (n,), how far the object moved in the hand during the lift [m].
+        turn: (n,), how far it turned in the hand [rad].
+    """
+    if config.require == "held":
+        return []
+    rules = (
+        (Removal.OTHER_LINKS, np.asarray(other_links), config.other_links),
+        (Removal.SLID, np.asarray(slip), config.max_slip),
+        (Removal.TURNED, np.degrees(turn), config.max_turn_deg),
+    )
+    return [(reason, ~(values <= limit)) for reason, values, limit in rules if limit is not None]
+
+
+def breaks_surface(
+    config: FilterConfig, surface_distance: npt.ArrayLike, normal_angle: npt.ArrayLike
+) -> list[tuple[Removal, npt.NDArray[np.bool_]]]:
+    """Return which successes (n,) break each limit of the contacts that is on.
+
+    Args:
+        config: The limits.
+        surface_distance: (n,), largest of the contacts' distances from the surface [m].
+        normal_angle: (n,), largest angle of the contacts' normals from those of the surface [rad].
+    """
+    rules = (
+        (Removal.OFF_SURFACE, np.asarray(surface_distance), config.max_surface_distance),
+        (Removal.NORMAL_OFF, np.degrees(normal_angle), config.max_normal_angle_deg),
+    )
+    return [(reason, ~(values <= limit)) for reason, values, limit in rules if limit is not None]
 
 
 def is_outlier(values: Array, sigma: float) -> npt.NDArray[np.bool_]:

@@ -20,7 +20,7 @@ import h5py
 from drakegrasp.config import POSTPROCESSING_KEYS, Config, override_config, parse_config
 from drakegrasp.dataset import log as build_log
 from drakegrasp.dataset.paths import FILE_NAME, OWN_FILES, OWN_FOLDERS
-from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION
+from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, refuse_other_schema
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.hand.files import hand_digest
@@ -180,16 +180,13 @@ def read_manifest(out: Path) -> Manifest:
     """Return the manifest of a dataset's directory.
 
     Raises:
-        DataError: If there is none, or it cannot be read.
+        DataError: If there is none, it cannot be read, or it is of another schema.
     """
     path = out / FILE_NAME
     try:
         # The version first: another schema may have other keys.
         content = json.loads(path.read_text(encoding="utf-8"))
-        if content["schema_version"] != SCHEMA_VERSION:
-            raise DataError(
-                f"{path}: schema must be {SCHEMA_VERSION}, got {content['schema_version']}"
-            )
+        refuse_other_schema(path, content["schema_version"])
 
         return Manifest(
             config=parse_config(content["config"]),

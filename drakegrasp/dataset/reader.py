@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.schema import DATA_FIELDS, SCHEMA_VERSION, SPLITS
+from drakegrasp.dataset.schema import DATA_FIELDS, SPLITS, refuse_other_schema
 from drakegrasp.errors import DataError
 
 
@@ -29,15 +29,21 @@ class Sample:
     Attributes:
         image: (4, S, S) float32: R, G, B in 0..1 and depth [m].
         mask: (S, S) uint8, 1 where the object is seen.
-        grasp: (6k,) float32, contact points [m], then outward unit normals, in the camera frame.
+        grasp: (6k,) float32, contact points [m], then outward unit normals, in the camera frame,
+            after closing.
+        grasp_held: (6k,) float32, the same where the fingertips hold the object after the lift, on
+            the object in its resting pose.
         trial_id: Row of /trials in trials.hdf5.
+        grasp_props: Fields of `grasp_props` by name: how well it holds, forces, palm, joints.
         props: Fields of `object_props` by name: names, mass properties, frames.
     """
 
     image: npt.NDArray[np.float32]
     mask: npt.NDArray[np.uint8]
     grasp: npt.NDArray[np.float32]
+    grasp_held: npt.NDArray[np.float32]
     trial_id: int
+    grasp_props: dict[str, Any]
     props: dict[str, Any]
 
 
@@ -68,7 +74,8 @@ class GraspDataset:
         self._process = -1
         try:
             with h5py.File(self.path, "r") as file:
-                version = int(file.attrs["schema_version"])
+                # The version first: another schema may have other fields.
+                refuse_other_schema(self.path, file.attrs["schema_version"])
                 self._length = len(file[split]["grasps"])
                 self.K = np.array(file.attrs["K"])
                 self.camera = str(file.attrs["camera"])
@@ -76,8 +83,6 @@ class GraspDataset:
             raise DataError(
                 f"{self.path}: must be a data file of drakegrasp, got none ({error})"
             ) from None
-        if version != SCHEMA_VERSION:
-            raise DataError(f"{self.path}: schema must be {SCHEMA_VERSION}, got {version}")
 
     def __len__(self) -> int:
         return self._length
@@ -91,20 +96,21 @@ class GraspDataset:
         group = self._open()[self.split]
         row = index % self._length
         values = {f.name: _value(group[f.name], row, f.dtype) for f in DATA_FIELDS}
-        prefix = "object_props/"
         return Sample(
             image=values["images"],
             mask=values["masks"],
             grasp=values["grasps"],
+            grasp_held=values["grasps_held"],
             trial_id=int(values["trial_id"]),
-            props={k.removeprefix(prefix): v for k, v in values.items() if k.startswith(prefix)},
+            grasp_props=_group(values, "grasp_props/"),
+            props=_group(values, "object_props/"),
         )
 
     def __iter__(self) -> Iterator[Sample]:
         return (self[i] for i in range(len(self)))
 
     def column(self, name: str) -> npt.NDArray[Any]:
-        """Return all rows (n, ...) of a field, e.g. `grasps` or `object_props/work2com`.
+        """Return all rows (n, ...) of a field, e.g. `grasps` or `grasp_props/stable`.
 
         Raises:
             DataError: If there is no such field.
@@ -129,6 +135,11 @@ class GraspDataset:
             self._file = h5py.File(self.path, "r")
             self._process = os.getpid()
         return self._file
+
+
+def _group(values: dict[str, Any], prefix: str) -> dict[str, Any]:
+    """Return the values whose names begin with a prefix, without it."""
+    return {k.removeprefix(prefix): v for k, v in values.items() if k.startswith(prefix)}
 
 
 def _value(dataset: h5py.Dataset, row: int, dtype: str) -> Any:

@@ -21,7 +21,15 @@ from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import model_path
 from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS, SPLITS, sizes
 from drakegrasp.dataset.shards import Shard, ShardHeader, read_shard, trial_columns
-from drakegrasp.frames import X_WT, invert_pose, pack_pose, transform_points, unpack_pose
+from drakegrasp.frames import (
+    X_WT,
+    Array,
+    invert_pose,
+    pack_pose,
+    rotate_vectors,
+    transform_points,
+    unpack_pose,
+)
 from drakegrasp.grasp import pack_grasp, transform_grasp
 from drakegrasp.objects.model import ObjectModel, load_object
 from drakegrasp.outcomes import Outcome
@@ -159,10 +167,10 @@ def _sample(model: ObjectModel, shard: Shard, row: int, k: int, camera: str) -> 
     """
     trials, looks = shard.trials, shard.looks
 
-    # The poses of this sample, and its grasp in {O}.
+    # The poses of this sample.
     X_TO = unpack_pose(trials["X_TO"][row])
     X_TC = {c: unpack_pose(looks[f"X_TC_{c}"][k]) for c in CAMERAS}
-    grasp_O = pack_grasp(trials["closed_p_OQ"][row], trials["closed_nhat_Q_O"][row])
+    X_CO = multiply(invert_pose(X_TC[camera]), X_TO)
 
     # What does not depend on the camera of the file.
     R_TO = X_TO[:3, :3]
@@ -181,10 +189,38 @@ def _sample(model: ObjectModel, shard: Shard, row: int, k: int, camera: str) -> 
         "frame_world2work": pack_pose(X_WT),
     }
 
-    # Image, mask, and the grasp in the frame of the file's camera.
+    # Image, mask, and the grasps in the frame of the file's camera.
+    trial = {name: values[row] for name, values in trials.items()}
     return {
         "images": looks[f"image_{camera}"][k],
         "masks": looks[f"mask_{camera}"][k],
-        "grasps": transform_grasp(multiply(invert_pose(X_TC[camera]), X_TO), grasp_O),
+        "grasps": _grasp(X_CO, trial, "closed"),
+        "grasps_held": _grasp(X_CO, trial, "lifted"),
+        **{f"grasp_props/{name}": value for name, value in _grasp_props(X_CO, trial).items()},
         **{f"object_props/{name}": value for name, value in properties.items()},
+    }
+
+
+def _grasp(X_CO: Array, trial: Mapping[str, Any], when: str) -> Array:
+    """Return a trial's grasp (6k,) in a camera's frame, when `closed` or `lifted`."""
+    return transform_grasp(X_CO, pack_grasp(trial[f"{when}_p_OQ"], trial[f"{when}_nhat_Q_O"]))
+
+
+def _grasp_props(X_CO: Array, trial: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of `grasp_props` of a trial, in the frame of a camera.
+
+    What is held is put in place with the object: both go through its resting pose.
+    """
+    names = ("precision", "stable", "slip", "turn", "slip_released", "turn_released")
+    return {
+        **{name: trial[name] for name in names},
+        "other_links_held": trial["lifted_other_links"],
+        "X_CG": pack_pose(multiply(X_CO, unpack_pose(trial["X_OG"]))),
+        "X_CG_held": pack_pose(multiply(X_CO, unpack_pose(trial["X_OG_lifted"]))),
+        "q": trial["closed_q"],
+        "q_held": trial["lifted_q"],
+        "f_Q_C": rotate_vectors(X_CO, trial["closed_f_Q_O"]),
+        "f_Q_C_held": rotate_vectors(X_CO, trial["lifted_f_Q_O"]),
+        "area": trial["closed_area"],
+        "area_held": trial["lifted_area"],
     }

@@ -8,14 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome, Stage
 
 #: Goes up with every change of the table that an older reader cannot read.
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+#: What to do with a file of another version: its labels mean something else.
+OTHER_SCHEMA = "build the dataset again with this version of drakegrasp, in another directory"
 
 SPLITS = ("train", "valid", "test")
 CAMERAS = ("oto", "otm")
@@ -33,8 +37,10 @@ CONVENTIONS = {
     "images": "channels R, G, B in 0..1, then depth in metres; row 0 is the top",
     "grasps": "[p_1 .. p_k, n_1 .. n_k]: contact points, then unit normals out of the object, "
     "in finger order of the hand file",
-    "contacts": "pressure-weighted centre and mean normal of the hydroelastic patches between a "
-    "fingertip and the object",
+    "contacts": "pressure-weighted centre and mean normal of the hydroelastic patches between the "
+    "pad of a fingertip and the object; a fingertip's link beside its pad counts as another link",
+    "held": "of the end of the lift, seen on the object in its resting pose: what moved with the "
+    "object is moved back with it",
     "oto": "one-to-one: the camera is rolled with the palm",
     "otm": "one-to-many: image up is world up",
 }
@@ -88,6 +94,21 @@ class Field:
         return np.full((count, *self.row_shape(sizes)), fill, dtype=self.dtype)
 
 
+def refuse_other_schema(path: Path, version: object) -> None:
+    """Refuse a file of another version of the schema.
+
+    Args:
+        path: Of the file, for the message.
+        version: Its attribute or key `schema_version`; None if it has none.
+
+    Raises:
+        DataError: If the version is another.
+    """
+    if version != SCHEMA_VERSION:
+        got = "none" if version is None else str(version)
+        raise DataError(f"{path}: schema must be {SCHEMA_VERSION}, got {got}; {OTHER_SCHEMA}")
+
+
 def sizes(*, fingers: int, joints: int, image: int) -> dict[str, int]:
     """Return the lengths of the letters in the shapes."""
     return {"k": fingers, "6k": 6 * fingers, "j": joints, "S": image}
@@ -137,10 +158,17 @@ _CONTACTS: tuple[Field, ...] = (
 #: The contact fields by the names of `simulation.contacts.Contacts`, without their prefix.
 CONTACT_NAMES = tuple(field.name for field in _CONTACTS)
 
+# While the hand closes the object is fixed in its place, so nothing shows whether it stands on the
+# table.
+_CLOSED = tuple(field for field in _contacts("closed", "when closing ended")
+                if field.name != "closed_object_on_table")
+_LIFTED = _contacts("lifted", "after the lift")
+
 # Fields of several tables.
 _SPREAD = Field("spread", "", "float64", "rad", "-", "angle of the spread joints")
 _X_TO = Field("X_TO", "12", "float64", "m, -", "T", "resting pose of the object")
-_TIME_CLOSE = Field("time_close", "", "float64", "s", "-", "simulated time of closing")
+_TIME_CLOSE = Field("time_close", "", "float64", "s", "-",
+                    "simulated time at which closing ended")
 _TIME_LIFT = Field(
     "time_lift", "", "float64", "s", "-",
     "simulated time of the lift with its hold; shorter where its end was known before")
@@ -149,6 +177,18 @@ _SLIP = (
           "distance that the object moved in the hand during the lift"),
     Field("turn", "", "float64", "rad", "G",
           "angle that the object turned in the hand during the lift"),
+)
+_RELEASED = (
+    Field("slip_released", "", "float64", "m", "G",
+          "distance that the object moved in the hand before the wrist moved"),
+    Field("turn_released", "", "float64", "rad", "G",
+          "angle that the object turned in the hand before the wrist moved"),
+)
+_WORDS = (
+    Field("precision", "", "bool", "-", "-",
+          "whether it is a success that the fingertips alone hold after the lift"),
+    Field("stable", "", "bool", "-", "-",
+          "whether it is a precision grasp with slip below 5 mm and turn below 5 deg"),
 )
 
 #: A row per grasp, in `/train`, `/valid` and `/test` of both data files.
@@ -159,7 +199,31 @@ DATA_FIELDS: tuple[Field, ...] = (
           "1 where the object is seen, 0 everywhere else", sample=True),
     Field("grasps", "6k", "float32", "m, -", "C",
           "contact points, then outward unit normals, after closing, in this file's camera"),
+    Field("grasps_held", "6k", "float32", "m, -", "C",
+          "the same where the fingertips hold the object after the lift, on the resting object"),
     Field("trial_id", "", "int64", "-", "-", "row of trials.hdf5"),
+    *(replace(field, name=f"grasp_props/{field.name}") for field in _WORDS),
+    *(replace(field, name=f"grasp_props/{field.name}", dtype="float32")
+      for field in (*_SLIP, *_RELEASED)),
+    Field("grasp_props/other_links_held", "", "uint8", "-", "-",
+          "number of other links of the hand that touch the object after the lift"),
+    Field("grasp_props/X_CG", "12", "float32", "m, -", "C",
+          "pose of the palm at the start and while closing, in this file's camera"),
+    Field("grasp_props/X_CG_held", "12", "float32", "m, -", "C",
+          "pose of the palm after the lift, relative to the resting object"),
+    Field("grasp_props/q", "j", "float32", "rad", "-",
+          "positions of the hand's joints after closing"),
+    Field("grasp_props/q_held", "j", "float32", "rad", "-",
+          "positions of the hand's joints after the lift"),
+    Field("grasp_props/f_Q_C", "k 3", "float32", "N", "C",
+          "forces of the fingertips on the object after closing"),
+    Field("grasp_props/f_Q_C_held", "k 3", "float32", "N", "C",
+          "forces of the fingertips on the object after the lift, turned with it to its resting "
+          "pose"),
+    Field("grasp_props/area", "k", "float32", "m^2", "-",
+          "areas of the contact patches after closing"),
+    Field("grasp_props/area_held", "k", "float32", "m^2", "-",
+          "areas of the contact patches after the lift"),
     Field("object_props/object_name", "", "str", "-", "-", "name of the object"),
     Field("object_props/class_name", "", "str", "-", "-", "name of the object's class"),
     Field("object_props/work2com", "3", "float32", "m", "T",
@@ -181,6 +245,11 @@ DATA_FIELDS: tuple[Field, ...] = (
     Field("object_props/frame_world2work", "12", "float32", "m, -", "W", "X_WT, the table top"),
 )
 
+#: The fields of samples that are the same in both data files, whatever their camera.
+SHARED_FIELDS: tuple[Field, ...] = tuple(
+    field for field in DATA_FIELDS if not field.sample and field.frame != "C"
+)
+
 #: A row per attempt, whatever its outcome, in `/trials` of trials.hdf5 and of every shard.
 TRIAL_FIELDS: tuple[Field, ...] = (
     Field("trial_id", "", "int64", "-", "-", "the row's own number"),
@@ -196,15 +265,21 @@ TRIAL_FIELDS: tuple[Field, ...] = (
     _X_TO,
     Field("X_OG", "12", "float64", "m, -", "O",
           "pose of the palm at the start; the candidate's where the palm ray misses"),
-    *_since(Stage.CLOSED, _TIME_CLOSE, *_contacts("closed", "after closing")),
+    *_since(Stage.CLOSED, _TIME_CLOSE, *_CLOSED),
     *_since(
         Stage.LIFTED,
         Field("surface_distance", "k", "float64", "m", "-",
               "distance of the contact points after closing from the full mesh's surface"),
+        Field("normal_angle", "k", "float64", "rad", "-",
+              "angle of the normals after closing from the full mesh's nearest face, or from that "
+              "ahead if it agrees better"),
         _TIME_LIFT,
-        *_contacts("lifted", "after the lift"),
+        *_LIFTED,
         Field("X_TO_lifted", "12", "float64", "m, -", "T", "pose of the object after the lift"),
+        Field("X_OG_lifted", "12", "float64", "m, -", "O", "pose of the palm after the lift"),
         *_SLIP,
+        *_RELEASED,
+        *_WORDS,
     ),
 )
 
@@ -242,8 +317,9 @@ LOOK_FIELDS: tuple[Field, ...] = (
 SUCCESS_FIELDS: tuple[Field, ...] = (
     Field("trial_id", "", "int64", "-", "-", "row of /trials"),
     Field("removal", "", "uint8", "-", "-",
-          "why it is no sample: 0 kept, 1 not_seen, 2 out_of_view, 3 bisects_table, 4 flat_depth, "
-          "5 off_surface, 6 outlier, 7 rejected"),
+          "why it is no sample: 0 kept, 1 other_links, 2 slid, 3 turned, 4 not_seen, "
+          "5 out_of_view, 6 bisects_table, 7 flat_depth, 8 off_surface, 9 normal_off, 10 outlier, "
+          "11 rejected"),
     *CERTIFICATE_FIELDS,
 )
 
@@ -295,14 +371,14 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
     *_since(
         Stage.CLOSED,
         _TIME_CLOSE,
-        *_contacts("closed", "after closing"),
+        *_CLOSED,
         Field("contact_error", "k", "float64", "m", "-",
               "distance of the contact points after closing from the predicted ones"),
     ),
     *_since(
         Stage.LIFTED,
         _TIME_LIFT,
-        *_contacts("lifted", "after the lift"),
+        *_LIFTED,
         Field("X_TO_lifted", "12", "float64", "m, -", "T",
               "pose of the object after the lift, which began at X_TO_simulated"),
         *_SLIP,

@@ -6,7 +6,7 @@ any change of a single bit.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,7 +16,13 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.hdf5 import AnyArray, write_field
-from drakegrasp.dataset.schema import LOOK_FIELDS, SCHEMA_VERSION, TRIAL_FIELDS, Field
+from drakegrasp.dataset.schema import (
+    LOOK_FIELDS,
+    SCHEMA_VERSION,
+    TRIAL_FIELDS,
+    Field,
+    refuse_other_schema,
+)
 from drakegrasp.errors import DataError
 from drakegrasp.runtime.files import atomic_hdf5, refuse_broken_seal
 
@@ -120,18 +126,30 @@ def read_shard(path: Path, header: ShardHeader | None = None, *, verify_seal: bo
 def read_outcomes(
     path: Path, header: ShardHeader, *, verify_seal: bool = True
 ) -> npt.NDArray[np.uint8]:
-    """Return the `Outcome` (n,) of each attempt of a shard, without its other columns.
+    """Return the `Outcome` (n,) of each attempt of a shard, see `read_trials`.
+
+    Raises:
+        DataError: See `read_shard`.
+    """
+    return read_trials(path, header, ("outcome",), verify_seal=verify_seal)["outcome"]
+
+
+def read_trials(
+    path: Path, header: ShardHeader, names: Sequence[str], *, verify_seal: bool = True
+) -> dict[str, AnyArray]:
+    """Return some columns of a shard's `/trials`, by their names.
 
     Args:
         path: Of the file.
         header: Identity that the shard must have.
+        names: Of the columns.
         verify_seal: Whether to verify the seal, which reads the whole file.
 
     Raises:
         DataError: See `read_shard`.
     """
     with _open_shard(path, header, verify_seal=verify_seal) as (file, _):
-        return np.asarray(file["trials/outcome"][:])
+        return {name: np.asarray(file["trials"][name][:]) for name in names}
 
 
 @contextmanager
@@ -144,9 +162,7 @@ def _open_shard(
     try:
         with h5py.File(path, "r") as file:
             # The version first: another schema may have other attributes.
-            version = int(file.attrs["schema_version"])
-            if version != SCHEMA_VERSION:
-                raise DataError(f"{path}: schema must be {SCHEMA_VERSION}, got {version}")
+            refuse_other_schema(path, file.attrs["schema_version"])
 
             # Then its identity: a file may have been copied to the path of another unit.
             own_header = ShardHeader(

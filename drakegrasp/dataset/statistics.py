@@ -16,10 +16,13 @@ from drakegrasp.dataset.assemble import is_assembled
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, FILE_NAME, TRIALS_FILE
-from drakegrasp.dataset.schema import SPLITS
-from drakegrasp.dataset.shards import read_outcomes
+from drakegrasp.dataset.schema import SPLITS, refuse_other_schema
+from drakegrasp.dataset.shards import read_trials
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome
+
+#: The columns that say how well a success holds.
+WORDS = ("precision", "stable")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,6 +35,7 @@ class Funnel:
         distinct: (m,), different palm poses among the valid ones.
         valid: (m,), combinations of rotations above the table whose palm ray meets the object.
         outcomes: (m, 1 + max(Outcome)), attempts by object and outcome.
+        precision, stable: (m,), successes that are precision grasps, and stable ones of these.
         removals: (m, 1 + max(Removal)), successes by object and reason of removal.
     """
 
@@ -41,6 +45,8 @@ class Funnel:
     distinct: npt.NDArray[np.int64]
     valid: npt.NDArray[np.int64]
     outcomes: npt.NDArray[np.int64]
+    precision: npt.NDArray[np.int64]
+    stable: npt.NDArray[np.int64]
     removals: npt.NDArray[np.int64]
 
 
@@ -79,17 +85,21 @@ def count_unfinished(out: Path) -> Unfinished | None:
     if not (out / FILE_NAME).exists() or is_assembled(out):
         return None
 
-    # Add up the outcomes of the shards that exist.
+    # Add up the outcomes and words of the shards that exist.
     manifest = read_manifest(out)
     names = [entry.name for entry in manifest.objects]
     rows = {name: i for i, name in enumerate(names)}
     outcomes, done = np.zeros((len(names), 1 + max(Outcome)), dtype=np.int64), 0
+    words = {word: np.zeros(len(names), dtype=np.int64) for word in WORDS}
     for header in manifest.headers():
         try:
-            unit = read_outcomes(header.path(out), header, verify_seal=False)
+            unit = read_trials(header.path(out), header, ("outcome", *WORDS), verify_seal=False)
         except DataError:
             continue
-        outcomes[rows[header.object_name]] += np.bincount(unit, minlength=1 + max(Outcome))
+        row = rows[header.object_name]
+        outcomes[row] += np.bincount(unit["outcome"], minlength=1 + max(Outcome))
+        for word in WORDS:
+            words[word][row] += np.count_nonzero(unit[word])
         done += 1
 
     funnel = Funnel(
@@ -99,6 +109,8 @@ def count_unfinished(out: Path) -> Unfinished | None:
         distinct=np.array([entry.distinct for entry in manifest.objects], dtype=np.int64),
         valid=np.array([entry.valid for entry in manifest.objects], dtype=np.int64),
         outcomes=outcomes,
+        precision=words["precision"],
+        stable=words["stable"],
         removals=np.zeros((len(names), 1 + max(Removal)), dtype=np.int64),
     )
     return Unfinished(funnel=funnel, done=done, total=manifest.units)
@@ -113,9 +125,11 @@ def count_funnel(out: Path) -> Funnel:
     # The columns that are counted, whole: a few bytes per trial.
     try:
         with h5py.File(out / TRIALS_FILE, "r") as file:
+            refuse_other_schema(out / TRIALS_FILE, file.attrs["schema_version"])
             objects = {name: values[:] for name, values in file["objects"].items()}
             index = file["trials/object"][:]
             outcome = file["trials/outcome"][:]
+            words = {word: file[f"trials/{word}"][:] for word in WORDS}
             success = file["successes/trial_id"][:]
             removal = file["successes/removal"][:]
     except (OSError, KeyError) as error:
@@ -129,6 +143,8 @@ def count_funnel(out: Path) -> Funnel:
         distinct=objects["distinct"],
         valid=objects["valid"],
         outcomes=_count_pairs(index, outcome, count, 1 + max(Outcome)),
+        precision=np.bincount(index[words["precision"]], minlength=count),
+        stable=np.bincount(index[words["stable"]], minlength=count),
         removals=_count_pairs(index[success], removal, count, 1 + max(Removal)),
     )
 
@@ -142,6 +158,7 @@ def count_splits(out: Path) -> list[SplitCount]:
     path = out / DATA_FILES["oto"]
     try:
         with h5py.File(path, "r") as file:
+            refuse_other_schema(path, file.attrs["schema_version"])
             return [
                 SplitCount(
                     split=split,

@@ -15,7 +15,7 @@ from drakegrasp.outcomes import Outcome
 Outcomes = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
-#: In a stable grasp the object moves and turns in the hand by less than this [m], [rad]; own choice.
+#: In a stable grasp the object moves and turns in the hand by less [m], [rad]; own choice.
 STABLE_SLIP, STABLE_TURN = 5e-3, float(np.deg2rad(5.0))
 
 
@@ -80,7 +80,8 @@ def is_stable(
     """Return (...,) whether a precision grasp also keeps the object as it was grasped.
 
     Args:
-        outcome, other_links: See `is_precision`.
+        outcome: (...,), values of `Outcome`.
+        other_links: (...,), number of other links of the hand that touch the object after the lift.
         slip: (...,), distance that the object moved in the hand during the lift [m].
         turn: (...,), angle that it turned in the hand [rad].
     """

@@ -26,11 +26,15 @@ def good(count: int) -> Successes:
         trial_id=np.arange(count, dtype=np.int64) * 3,
         object=np.zeros(count, dtype=np.int32),
         grasp_T=rng.normal(size=(count, 18)),
+        other_links=np.zeros(count, dtype=np.uint8),
+        slip=np.full(count, 0.010),
+        turn=np.full(count, np.deg2rad(9.9)),
         seen=np.ones(count, dtype=bool),
         in_view=np.ones(count, dtype=bool),
         camera_height=np.full(count, 0.3),
         depth_variance=np.full(count, 0.01),
         surface_distance=np.full(count, 1e-4),
+        normal_angle=np.full(count, np.deg2rad(29.0)),
         certified_share=np.full(count, np.nan),
         certified_friction=np.full(count, np.nan),
     )
@@ -49,6 +53,10 @@ def test_good_ones_are_kept() -> None:
         ("camera_height", -0.2, Removal.BISECTS_TABLE),
         ("depth_variance", 0.99e-3, Removal.FLAT_DEPTH),
         ("surface_distance", 2.1e-3, Removal.OFF_SURFACE),
+        ("normal_angle", np.deg2rad(31.0), Removal.NORMAL_OFF),
+        ("other_links", 1, Removal.OTHER_LINKS),
+        ("slip", 0.0101, Removal.SLID),
+        ("turn", np.deg2rad(10.1), Removal.TURNED),
     ],
 )
 def test_each_filter_removes_its_own(field: str, value: float, reason: Removal) -> None:
@@ -63,10 +71,53 @@ def test_each_filter_removes_its_own(field: str, value: float, reason: Removal) 
 def test_first_reason_counts() -> None:
     bad = replace(good(3), seen=np.zeros(3, bool), depth_variance=np.zeros(3))
     assert np.all(judge_successes(bad, FilterConfig(), rejected=[0, 3, 6]) == Removal.NOT_SEEN)
+    worse = replace(bad, slip=np.ones(3), turn=np.ones(3), normal_angle=np.ones(3))
+    assert np.all(judge_successes(worse, FilterConfig()) == Removal.SLID)
+    worst = replace(worse, other_links=np.ones(3, np.uint8))
+    assert np.all(judge_successes(worst, FilterConfig()) == Removal.OTHER_LINKS)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "limit"),
+    [
+        ("other_links", 5, "other_links"),
+        ("slip", 0.5, "max_slip"),
+        ("turn", 3.0, "max_turn_deg"),
+        ("normal_angle", 3.0, "max_normal_angle_deg"),
+    ],
+)
+def test_null_switches_a_limit_off(field: str, value: float, limit: str) -> None:
+    successes = replace(good(3), **{field: np.full(3, value)})
+    off = FilterConfig.model_validate({limit: None})
+    assert np.all(judge_successes(successes, FilterConfig()) != Removal.KEPT)
+    assert np.all(judge_successes(successes, off) == Removal.KEPT)
+
+
+def test_held_asks_nothing_of_the_hold_and_the_same_of_the_contacts() -> None:
+    held = FilterConfig(require="held")
+    bad = replace(
+        good(3), other_links=np.full(3, 4, np.uint8), slip=np.ones(3), turn=np.full(3, 3.0)
+    )
+    assert np.all(judge_successes(bad, held) == Removal.KEPT)
+    off = replace(bad, normal_angle=np.ones(3))
+    assert np.all(judge_successes(off, held) == Removal.NORMAL_OFF)
+
+
+def test_other_links_may_be_allowed_up_to_a_number() -> None:
+    successes = replace(good(3), other_links=np.array([0, 1, 2], np.uint8))
+    removal = judge_successes(successes, FilterConfig(other_links=1))
+    assert removal.tolist() == [Removal.KEPT, Removal.KEPT, Removal.OTHER_LINKS]
+
+
+def test_motion_that_is_unknown_is_no_sample() -> None:
+    successes = replace(good(2), slip=np.array([np.nan, 0.0]))
+    assert judge_successes(successes, FilterConfig()).tolist() == [Removal.SLID, Removal.KEPT]
 
 
 def test_rejected_trials_are_found_by_id() -> None:
-    assert judge_successes(good(4), FilterConfig(), rejected=[6]).tolist() == [0, 0, 7, 0]
+    assert judge_successes(good(4), FilterConfig(), rejected=[6]).tolist() == [
+        *(0, 0, Removal.REJECTED, 0)
+    ]
 
 
 def test_outlier_is_judged_by_its_own_objects_population() -> None:

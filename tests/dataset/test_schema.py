@@ -3,11 +3,34 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.datasets import OTM, OTO, TRIALS, edit_file, make_dataset
 
-from drakegrasp.dataset.schema import CONTACT_NAMES, TRIAL_FIELDS, VERIFICATION_FIELDS, Field, sizes
+from drakegrasp.build.replay import replay_trial
+from drakegrasp.config import Config
+from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.filters import Removal
+from drakegrasp.dataset.manifest import change_postprocessing, claim_directory
+from drakegrasp.dataset.paths import FILE_NAME
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.schema import (
+    CONTACT_NAMES,
+    SCHEMA_VERSION,
+    SUCCESS_FIELDS,
+    TRIAL_FIELDS,
+    VERIFICATION_FIELDS,
+    Field,
+    sizes,
+)
+from drakegrasp.dataset.statistics import count_funnel, count_splits, count_unfinished
+from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Stage
 from drakegrasp.simulation.contacts import Contacts
 
@@ -51,4 +74,52 @@ def test_contact_fields_are_those_that_the_simulation_reads() -> None:
 def test_contacts_have_values_from_their_stage_on(table: tuple[Field, ...]) -> None:
     stages = {field.name: field.stage for field in table}
     for prefix, stage in (("closed", Stage.CLOSED), ("lifted", Stage.LIFTED)):
-        assert {stages[f"{prefix}_{name}"] for name in ("q", *CONTACT_NAMES)} == {stage}
+        # A hand that closes on a fixed object takes nothing off the table.
+        names = {f"{prefix}_{name}" for name in ("q", *CONTACT_NAMES)} - {"closed_object_on_table"}
+        assert {stages[name] for name in names} == {stage}
+    assert "closed_object_on_table" not in stages
+
+
+def test_reasons_of_removal_are_those_of_the_filters() -> None:
+    (meaning,) = (field.meaning for field in SUCCESS_FIELDS if field.name == "removal")
+    assert meaning.endswith(", ".join(f"{reason.value} {reason.label}" for reason in Removal))
+
+
+@pytest.fixture(scope="module")
+def old(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset whose files say that they are of version 1."""
+    out = make_dataset(tmp_path_factory.mktemp("old"), tmp_path_factory.mktemp("meshes"))
+    manifest = json.loads((out / FILE_NAME).read_text())
+    (out / FILE_NAME).write_text(json.dumps({**manifest, "schema_version": 1}))
+    for name in (OTO, OTM, TRIALS):
+        edit_file(out / name, lambda f: f.attrs.update(schema_version=1))
+    return out
+
+
+@pytest.mark.parametrize(
+    ("opens", "name"),
+    [
+        (GraspDataset, OTO),
+        (check_dataset, OTM),
+        (check_dataset, TRIALS),
+        (check_dataset, FILE_NAME),
+        (assemble, FILE_NAME),
+        (count_unfinished, FILE_NAME),
+        (count_funnel, TRIALS),
+        (count_splits, OTO),
+        (partial(claim_directory, config=Config()), FILE_NAME),
+        (partial(change_postprocessing, overrides=[]), FILE_NAME),
+        (partial(replay_trial, trial_id=0), FILE_NAME),
+    ],
+)
+def test_dataset_of_another_version_gets_one_line(
+    old: Path, opens: Callable[[Path], object], name: str
+) -> None:
+    """Which file, what it must be, what it is, and what to do."""
+    alone = opens in (GraspDataset, check_dataset) and name != FILE_NAME
+    with pytest.raises(DataError) as error:
+        opens(old / name if alone else old)
+    assert str(error.value) == (
+        f"{old / name}: schema must be {SCHEMA_VERSION}, got 1; build the dataset again with this "
+        "version of drakegrasp, in another directory"
+    )

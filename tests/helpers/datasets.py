@@ -17,7 +17,7 @@ from drakegrasp.dataset.manifest import Manifest, installed_versions, write_mani
 from drakegrasp.dataset.prepared_objects import PreparedObject, save_prepared
 from drakegrasp.dataset.schema import CAMERAS, LOOK_FIELDS, sizes
 from drakegrasp.dataset.shards import Shard, ShardHeader, trial_columns, write_shard
-from drakegrasp.frames import Array, invert_pose, make_pose, pack_pose, unpack_pose
+from drakegrasp.frames import Array, invert_pose, make_pose, pack_pose, rotation_about, unpack_pose
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.outcomes import Outcome, Stage
@@ -48,7 +48,11 @@ OUTCOMES = [
 
 
 #: Rows of /trials whose outcome is known, see OUTCOMES.
-SUCCESS, MISSING, BELOW, SLIPPED, AFTER_LIFT = 0, 1, 2, 4, 10
+SUCCESS, MISSING, BELOW, SLIPPED, HAND, AFTER_LIFT = 0, 1, 2, 4, 6, 10
+
+
+#: By how much every lifted object moved in the hand [m].
+SLIP = 2e-3
 
 
 SIZES = sizes(fingers=3, joints=4, image=32)
@@ -81,19 +85,34 @@ def see(
     return image, mask
 
 
-def contacts(model: ObjectModel, touching: np.ndarray) -> dict[str, Any]:
-    """Return contacts of three fingertips in the middle of three sides."""
+def contacts(model: ObjectModel, touching: np.ndarray, z: float = 0.0) -> dict[str, Any]:
+    """Return contacts of three fingertips in the middle of three sides, or above it [m]."""
     x, y, _ = model.half_extents
     n = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0]])
     gone = ~touching[:, None]
     return {
         "touching": touching,
-        "p_OQ": np.where(gone, np.nan, n * [[x], [x], [y]]),
+        "p_OQ": np.where(gone, np.nan, n * [[x], [x], [y]] + [0.0, 0.0, z]),
         "nhat_Q_O": np.where(gone, np.nan, n),
         "f_Q_O": np.where(gone, 0.0, -10.0 * n),
         "area": np.where(touching, 1e-5, 0.0),
         "penetration": np.where(touching, 1e-4, 0.0),
         "q": np.full(4, 0.5),
+    }
+
+
+def hold(row: dict[str, Any]) -> dict[str, Any]:
+    """Return how an attempt holds: the object slides along the palm and turns about its axis."""
+    turn = make_pose(rotation_about([0, 0, 1], np.deg2rad(1.0)), [0.0, 0.0, SLIP])
+    success = row["outcome"] is Outcome.SUCCESS
+    return {
+        "X_OG_lifted": pack_pose(unpack_pose(row["X_OG"]) @ invert_pose(turn)),
+        "slip": SLIP,
+        "turn": np.deg2rad(1.0),
+        "slip_released": SLIP / 2,
+        "turn_released": np.deg2rad(0.5),
+        "precision": success,
+        "stable": success,
     }
 
 
@@ -122,13 +141,14 @@ def trial_row(model: ObjectModel, number: int, X_TO: Array) -> dict[str, Any]:
         row |= {f"closed_{k}": v for k, v in contacts(model, touch).items()}
         row |= {"time_close": 1.0, "closed_other_links": outcome is Outcome.HAND_CONTACT}
         row["closed_hand_on_table"] = outcome is Outcome.TABLE_CONTACT and not after_lift
-        row["closed_object_on_table"] = True
     if stage >= Stage.LIFTED:
         touch = touch & (outcome is not Outcome.DROPPED)
         touch[0] &= outcome is not Outcome.SLIPPED
-        row |= {f"lifted_{k}": v for k, v in contacts(model, touch).items()}
-        row |= {"time_lift": 1.0, "lifted_object_on_table": after_lift, "slip": 0.0}
-        row |= {"turn": 0.0, "surface_distance": np.zeros(3), "X_TO_lifted": pack_pose(X_TO)}
+        row |= {f"lifted_{k}": v for k, v in contacts(model, touch, SLIP).items()}
+        row["lifted_q"] = np.full(4, 0.6)
+        row |= {"time_lift": 1.0, "lifted_object_on_table": after_lift}
+        row |= {"X_TO_lifted": pack_pose(X_TO), "surface_distance": np.zeros(3)}
+        row |= {"normal_angle": np.zeros(3), **hold(row)}
     return row
 
 

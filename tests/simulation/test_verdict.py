@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.verdict import judge_closed, judge_lifted
+from drakegrasp.simulation.verdict import (
+    STABLE_SLIP,
+    STABLE_TURN,
+    is_precision,
+    is_stable,
+    judge_closed,
+    judge_lifted,
+)
 
 ALL, ONE_OFF, NONE = [True, True, True], [True, False, True], [False, False, False]
 
@@ -59,3 +66,31 @@ def test_many_attempts_are_judged_as_each_of_them(judge) -> None:
     touching, other_links, on_table = (np.array(column) for column in zip(*cases, strict=True))
     together = judge(touching, other_links, on_table)
     assert together.tolist() == [int(judge(*case)) for case in cases]
+
+
+@pytest.mark.parametrize(
+    ("outcome", "other_links", "slip", "turn", "precision", "stable"),
+    [
+        (Outcome.SUCCESS, 0, 0.0, 0.0, True, True),
+        (Outcome.SUCCESS, 0, 4.9e-3, np.deg2rad(4.9), True, True),
+        # The limits themselves are beyond.
+        (Outcome.SUCCESS, 0, 5e-3, 0.0, True, False),
+        (Outcome.SUCCESS, 0, 0.0, STABLE_TURN, True, False),
+        # On the palm nothing is stable.
+        (Outcome.SUCCESS, 1, 0.0, 0.0, False, False),
+        (Outcome.SLIPPED, 0, 0.0, 0.0, False, False),
+        # Before the lift the motion is NaN.
+        (Outcome.MISSING_FINGERTIP, 0, np.nan, np.nan, False, False),
+    ],
+)
+def test_stable_is_a_precision_grasp_that_stays(
+    outcome: Outcome,
+    other_links: int,
+    slip: float,
+    turn: float,
+    precision: bool,
+    stable: bool,
+) -> None:
+    assert is_precision(outcome, other_links) == precision
+    assert is_stable(outcome, other_links, slip, turn) == stable
+    assert STABLE_SLIP == 5e-3

@@ -12,6 +12,7 @@ from functools import partial
 import numpy as np
 
 from drakegrasp.dataset.checks import consistency
+from drakegrasp.dataset.checks import hold as hold_rules
 from drakegrasp.dataset.checks import images as image_rules
 from drakegrasp.dataset.checks import samples as sample_rules
 from drakegrasp.dataset.checks.context import Context, Dataset
@@ -19,7 +20,7 @@ from drakegrasp.dataset.checks.findings import AnyArray, Batch, Findings, Violat
 from drakegrasp.dataset.checks.images import Lens
 from drakegrasp.dataset.checks.open_file import OpenFile
 from drakegrasp.dataset.paths import TRIALS_FILE
-from drakegrasp.dataset.schema import DATA_FIELDS, SPLITS
+from drakegrasp.dataset.schema import SHARED_FIELDS, SPLITS
 from drakegrasp.outcomes import Outcome
 
 #: Samples in a batch: some 20 MB of images.
@@ -27,7 +28,11 @@ SAMPLE_ROWS = 64
 #: Samples in a batch without images.
 PAIR_ROWS = 8192
 #: Fields of a trial with which a sample is compared.
-COMPARED = ("object", "outcome", "X_TO", "X_OG", "closed_p_OQ", "closed_nhat_Q_O")
+COMPARED = (
+    *("object", "outcome", "X_TO", "X_OG", "X_OG_lifted", "surface_distance", "normal_angle"),
+    *(f"{when}_{name}" for when in ("closed", "lifted") for name in ("p_OQ", "nhat_Q_O", "f_Q_O")),
+    *hold_rules.COPIES.values(),
+)
 
 
 def check_data_file(data: OpenFile, camera: str, context: Context) -> None:
@@ -41,7 +46,7 @@ def check_data_file(data: OpenFile, camera: str, context: Context) -> None:
     """
     if data.config is None:
         return  # a finding already; without a lens no image can be judged
-    findings, dataset = context.findings, context.dataset
+    findings, dataset, filters = context.findings, context.dataset, data.config.filters
     lens = Lens.of(camera, data.config.camera)
     context.add(data, consistency.splits(data))
     for split in data.groups:
@@ -57,6 +62,10 @@ def check_data_file(data: OpenFile, camera: str, context: Context) -> None:
                 sample_rules.frames,
                 sample_rules.work_frame,
                 sample_rules.mass_properties,
+                hold_rules.poses,
+            )
+            batch = data.judge(
+                batch, findings, hold_rules.words, partial(hold_rules.limits, filters=filters)
             )
 
             # The frames of a sample, and its trial.
@@ -84,7 +93,7 @@ def check_data_file(data: OpenFile, camera: str, context: Context) -> None:
 
 def check_pair(oto: OpenFile, otm: OpenFile, findings: Findings) -> None:
     """Compare the samples of both data files; rows that are a finding already are left out."""
-    names = [f.name for f in DATA_FIELDS if not f.sample]
+    names = [f.name for f in SHARED_FIELDS]
     for split in [s for s in SPLITS if s in oto.groups and s in otm.groups]:
         count = oto.count(split)
         if otm.count(split) != count:
@@ -126,13 +135,14 @@ def _judge_by_trial(
         judged, findings, partial(_is_success_of, outcomes=columns["outcome"], names=names)
     )
     still = np.isin(judged.rows, agreeing.rows)
-    same_as_trial = partial(
-        sample_rules.same_as_trial,
-        trials=_select(columns, still),
-        camera=camera,
-        config=data.config.camera,
+    own = _select(columns, still)
+    agreeing = data.judge(
+        agreeing,
+        findings,
+        partial(sample_rules.same_as_trial, trials=own, camera=camera, config=data.config.camera),
+        partial(hold_rules.same_as_trial, trials=own, camera=camera),
+        partial(hold_rules.surface_limits, trials=own, filters=data.config.filters),
     )
-    agreeing = data.judge(agreeing, findings, same_as_trial)
     return batch.without(set(judged.rows.tolist()) - set(agreeing.rows.tolist()))
 
 

@@ -88,9 +88,9 @@ class Batch:
         """Return X_CO (n, 4, 4) of the object in a camera's frame."""
         return self.frame(f"cam2work_{camera}") @ invert_pose(X_WT) @ self.frame("world2obj")
 
-    def contacts(self) -> tuple[Array, Array]:
-        """Return p_CQ [m] and nhat_Q_C of the grasps, (n, k, 3) each."""
-        vectors = self.columns["grasps"].astype(float).reshape(len(self), 2, -1, 3)
+    def contacts(self, name: str = "grasps") -> tuple[Array, Array]:
+        """Return p_CQ [m] and nhat_Q_C of `grasps` or `grasps_held`, (n, k, 3) each."""
+        vectors = self.columns[name].astype(float).reshape(len(self), 2, -1, 3)
         return vectors[:, 0], vectors[:, 1]
 
     def without(self, rows: set[int]) -> Batch:

@@ -14,7 +14,14 @@ import numpy as np
 
 from drakegrasp.config import Config, parse_config
 from drakegrasp.dataset.checks.findings import Violation
-from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, SPLITS, Field, sizes
+from drakegrasp.dataset.schema import (
+    CONVENTIONS,
+    OTHER_SCHEMA,
+    SCHEMA_VERSION,
+    SPLITS,
+    Field,
+    sizes,
+)
 from drakegrasp.errors import ConfigError, first_line
 from drakegrasp.vision.camera import intrinsics
 
@@ -22,7 +29,9 @@ from drakegrasp.vision.camera import intrinsics
 CAMERA_TOLERANCE = 1e-9
 #: Datasets whose second axis has the length of a letter of the shapes, and its factor there.
 WIDTHS = (
-    *((f"{split}/grasps", "k", 6) for split in SPLITS),
+    *((f"{split}/{name}", "k", 6) for split in SPLITS for name in ("grasps", "grasps_held")),
+    *((f"{split}/grasp_props/{name}", "k", 1) for split in SPLITS for name in ("area", "f_Q_C")),
+    *((f"{split}/grasp_props/{name}", "j", 1) for split in SPLITS for name in ("q", "q_held")),
     *((f"trials/{name}", "k", 1) for name in ("closed_touching", "closed_area", "lifted_area")),
     *((f"trials/{name}", "j", 1) for name in ("closed_q", "lifted_q")),
 )
@@ -38,6 +47,14 @@ def read_config(name: str, file: h5py.File) -> tuple[Config | None, list[Violati
         got = f"another ({first_line(error)})"
     what = "attribute config must be a configuration of drakegrasp as JSON"
     return None, [Violation(file=name, what=what, got=got)]
+
+
+def version(name: str, file: h5py.File) -> Iterator[Violation]:
+    """The file is of this version of the schema."""
+    got = file.attrs.get("schema_version", "none")
+    if got != SCHEMA_VERSION:
+        what = f"attribute schema_version must be {SCHEMA_VERSION}"
+        yield Violation(file=name, what=what, got=f"{got}; {OTHER_SCHEMA}")
 
 
 def attributes(
@@ -63,9 +80,7 @@ def attributes(
             yield broken(f"{key} must be there", "none")
 
     # Values that are known.
-    expected: dict[str, object] = {"schema_version": SCHEMA_VERSION}
-    if camera:
-        expected["camera"] = camera
+    expected: dict[str, object] = {"camera": camera} if camera else {}
     if config is not None:
         expected |= {"config_hash": config.simulation_hash(), "seed": config.seed}
     for key, value in expected.items():

@@ -106,16 +106,22 @@ def open_file(name: str, file: h5py.File, camera: str, findings: Findings) -> Op
         camera: `oto` or `otm`; empty for the trials.
         findings: Where violations go.
     """
-    # Its attributes.
-    config, broken = layout_rules.read_config(name, file)
-    findings.add([*broken, *layout_rules.attributes(name, file, config, camera)])
-
-    # Its layout: a group with a broken dataset is not read.
+    # Another version has another layout: its version is all that is told.
     fields = (
         {split: DATA_FIELDS for split in SPLITS}
         if camera
         else {"objects": OBJECT_FIELDS, "trials": TRIAL_FIELDS, "successes": SUCCESS_FIELDS}
     )
+    other = list(layout_rules.version(name, file))
+    if other:
+        findings.add(other)
+        return OpenFile(name, file, None, fields)
+
+    # Its attributes.
+    config, broken = layout_rules.read_config(name, file)
+    findings.add([*broken, *layout_rules.attributes(name, file, config, camera)])
+
+    # Its layout: a group with a broken dataset is not read.
     opened = OpenFile(name, file, config, fields)
     broken_groups = set()
     for violation in layout_rules.structure(name, file, fields, config):

@@ -24,7 +24,7 @@ from drakegrasp.dataset.checks.open_file import OpenFile, open_file
 from drakegrasp.dataset.checks.trials_file import check_trials_file
 from drakegrasp.dataset.manifest import Manifest, read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE, refuse_changed_object
-from drakegrasp.dataset.schema import CAMERAS
+from drakegrasp.dataset.schema import CAMERAS, refuse_other_schema
 from drakegrasp.dataset.shards import read_shard
 from drakegrasp.errors import DataError, first_line
 from drakegrasp.outcomes import Outcome
@@ -42,8 +42,8 @@ def check_dataset(path: str | Path, *, progress: Report | None = None) -> list[V
         progress: Called with the number of rows and shards that are done and to do.
 
     Raises:
-        DataError: If the path is neither, or the file cannot be read. In a directory a file that
-            cannot be read is a violation, and the others are still checked.
+        DataError: If the path is neither, cannot be read, or is of another schema. In a directory
+            a file that cannot be read is a violation, and the others are still checked.
     """
     path, findings, report = Path(path), Findings(), progress or silent
     with ExitStack() as stack:
@@ -70,6 +70,7 @@ def _check_file(path: Path, stack: ExitStack, findings: Findings, report: Report
         raise DataError(
             f"{path}: must be a data file or the trials of a dataset, got another HDF5 file"
         )
+    refuse_other_schema(path, file.attrs.get("schema_version"))
     opened = open_file(path.name, file, camera if camera in CAMERAS else "", findings)
     context = Context(findings=findings, report=report, total=_rows(opened))
     if camera in CAMERAS:

@@ -23,8 +23,9 @@ from drakegrasp.dataset.checks.findings import (
     rotation,
     unit_length,
 )
-from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS
+from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS, SHARED_FIELDS
 from drakegrasp.frames import P_WT, X_WT, Array, invert_pose, unpack_pose
+from drakegrasp.objects.contact_fit import fit_contacts
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.vision.camera import LOOKS_VERTICALLY, camera_pose_otm, camera_pose_oto
 
@@ -128,8 +129,7 @@ def contacts_on_mesh(
 ) -> Iterator[Violation]:
     """Contacts are on the mesh, and their normals point out of it.
 
-    A normal counts as outward if it agrees with the face nearest to the contact, or with the face
-    nearest to the point `max_distance` ahead of it: on a thin wall the wrong side may be nearer.
+    A normal counts as outward if it agrees with either face of `ContactFit.normal_angle`.
 
     Args:
         batch: Samples of one object.
@@ -137,20 +137,13 @@ def contacts_on_mesh(
         model: The object.
         max_distance: Largest distance of a contact from the mesh [m].
     """
-    # Contacts, distances and faces in {O}.
+    # Contacts in {O}, and how they lie there.
     X_OC = invert_pose(batch.object_in_camera(camera))
     p_CQ, n_C = batch.contacts()
     p_OQ, n_O = _move(X_OC, p_CQ), _rotate(X_OC, n_C)
-    nearest, face_normals = model.visual.nearest, model.visual.face_normals
     shape = p_OQ.shape[:2]
-    _, distance, face = nearest.on_surface(p_OQ.reshape(-1, 3))
-    _, _, ahead = nearest.on_surface((p_OQ + max_distance * n_O).reshape(-1, 3))
-    off = distance.reshape(shape)
-
-    # The smaller angle between a normal and the normals of the two faces.
-    flat = n_O.reshape(-1, 3)
-    cosine = np.maximum((flat * face_normals[face]).sum(1), (flat * face_normals[ahead]).sum(1))
-    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).reshape(shape)
+    fit = fit_contacts(model, p_OQ.reshape(-1, 3), n_O.reshape(-1, 3))
+    off, angle = fit.distance.reshape(shape), np.degrees(fit.normal_angle).reshape(shape)
 
     limit = max_distance + POSITION_TOLERANCE
     for k in range(shape[1]):
@@ -240,7 +233,7 @@ def same_properties(batch: Batch, other: Batch) -> Iterator[Violation]:
     yield from other.broken(
         f"trial_id must be that of {batch.file}", ~same_trial, other["trial_id"]
     )
-    for name in (f.name for f in DATA_FIELDS if f.name.startswith("object_props/")):
+    for name in (f.name for f in SHARED_FIELDS if f.name != "trial_id"):
         differs = same_trial & ~all_per_row(batch[name] == other[name])
         yield from batch.broken(
             f"{name} must be equal to that of {other.file}", differs, lambda i: "another value"

@@ -1,4 +1,4 @@
-"""Rules of the rows of trials.hdf5: numbers, stages, contacts, poses, the verdict.
+"""Rules of the rows of trials.hdf5: numbers, stages, contacts, poses, the verdict, the hold.
 
 In: a `Batch` of rows of `/trials`. Out: a `Violation` for every row that is wrong. A rule relies
 on those that `trials_file` applies before it: it is given no row that breaks one of them. No file
@@ -21,9 +21,13 @@ from drakegrasp.dataset.checks.findings import (
     unit_length,
 )
 from drakegrasp.dataset.schema import TRIAL_FIELDS
+from drakegrasp.frames import invert_pose
 from drakegrasp.outcomes import Outcome, Stage
-from drakegrasp.simulation.verdict import judge_closed, judge_lifted
+from drakegrasp.simulation.verdict import is_precision, is_stable, judge_closed, judge_lifted
 
+#: Slip [m] and turn [rad] are as exact as the poses that they follow from; the angle of a rotation
+#: close to none is less exact than its matrix.
+MOTION_TOLERANCE = 1e-4
 #: Largest outward force of a fingertip on the object [N]. The mean normal and the force of a patch
 #: are separate averages: where a fingertip is about to lose the object they may disagree, by no
 #: more than the force from which on a contact counts.
@@ -114,11 +118,11 @@ def verdicts(batch: Batch) -> Iterator[Violation]:
 def contacts(batch: Batch) -> Iterator[Violation]:
     """Fingertips that touch have a patch and a unit normal, and push into an object that is held.
 
-    Where an object slides through the hand, a patch may span a rim with faces in opposite
-    directions: their mean normal then does not tell the direction of the force.
+    A patch may span a thin rim, with faces in opposite directions: their mean normal then does not
+    tell the direction of the force. So that rule is for successes only.
     """
     success = batch["outcome"] == Outcome.SUCCESS.value
-    for stage, held in (("closed", True), ("lifted", success)):
+    for stage in ("closed", "lifted"):
         touching = batch[f"{stage}_touching"]
         normals, forces = batch[f"{stage}_nhat_Q_O"], batch[f"{stage}_f_Q_O"]
         lengths = np.where(touching, np.linalg.norm(normals, axis=2), 1.0)
@@ -131,7 +135,7 @@ def contacts(batch: Batch) -> Iterator[Violation]:
             touches = touching[:, k]
             yield from batch.broken(
                 f"{stage}_f_Q_O of finger {k + 1} must push into the object [N]",
-                held & touches & ~(push[:, k] < PULL),
+                success & touches & ~(push[:, k] < PULL),
                 push[:, k],
             )
             yield from batch.broken(
@@ -148,8 +152,45 @@ def contacts(batch: Batch) -> Iterator[Violation]:
 
 def poses(batch: Batch) -> Iterator[Violation]:
     """The rotations of a trial's poses are orthonormal with determinant +1."""
-    for name in ("X_TO", "X_OG", "X_TO_lifted"):
+    for name in ("X_TO", "X_OG", "X_TO_lifted", "X_OG_lifted"):
         yield from rotation(batch, name)
+
+
+def words(batch: Batch) -> Iterator[Violation]:
+    """`precision` and `stable` follow from outcome, other links and the motion in the hand."""
+    outcome, other_links = batch["outcome"], batch["lifted_other_links"]
+    expected = {
+        "precision": is_precision(outcome, other_links),
+        "stable": is_stable(outcome, other_links, batch["slip"], batch["turn"]),
+    }
+    for name, due in expected.items():
+        yield from batch.broken(
+            f"{name} must follow from the outcome, lifted_other_links, slip and turn",
+            batch[name] != due,
+            batch[name],
+        )
+
+
+def motion(batch: Batch) -> Iterator[Violation]:
+    """How the object moved in the hand is possible, and follows from the palm's two poses."""
+    for name in ("slip", "slip_released", "turn", "turn_released"):
+        values, largest = batch[name], np.inf if name.startswith("slip") else np.pi
+        yield from batch.broken(
+            f"{name} must be 0..{largest:.4g}", (values < 0.0) | (values > largest), values
+        )
+
+    # X_GO before and after the lift.
+    before, after = (invert_pose(batch.pose(name)) for name in ("X_OG", "X_OG_lifted"))
+    slip = np.linalg.norm(after[:, :3, 3] - before[:, :3, 3], axis=1)
+    cosine = (np.einsum("nij,nij->n", before[:, :3, :3], after[:, :3, :3]) - 1.0) / 2.0
+    turn = np.arccos(np.clip(cosine, -1.0, 1.0))
+    for name, due in (("slip", slip), ("turn", turn)):
+        off = np.abs(batch[name] - due)
+        yield from batch.broken(
+            f"{name} must follow from X_OG and X_OG_lifted",
+            off > MOTION_TOLERANCE,
+            lambda i, off=off: f"one that is off by {off[i]:.4g}",  # type: ignore[misc]
+        )
 
 
 def resting_poses(batch: Batch, X_TO: Sequence[Sequence[float]]) -> Iterator[Violation]:

@@ -42,17 +42,24 @@ def check_trials_file(trials: OpenFile, context: Context) -> None:
         candidates=None if objects is None else [entry.candidates for entry in objects],
         standoffs=len(trials.config.candidates.standoffs) if trials.config else None,
     )
-    last: list[Rule] = [trial_rules.verdicts, trial_rules.contacts, trial_rules.poses]
+    last: list[Rule] = [
+        trial_rules.verdicts,
+        trial_rules.words,
+        trial_rules.contacts,
+        trial_rules.poses,
+    ]
     if objects is not None and trials.count("objects") == len(objects):
         last.append(partial(trial_rules.resting_poses, X_TO=[entry.X_TO for entry in objects]))
 
-    # Numbers, then stages, which need a legal outcome, then what needs finite values.
+    # Numbers, then stages, which need a legal outcome, then what needs finite values, then what
+    # needs sound poses.
     successes = []
     for whole in trials.batches("trials", TRIAL_ROWS, findings):
         successes.append(whole["trial_id"][whole["outcome"] == Outcome.SUCCESS])
         batch = trials.judge(whole, findings, numbers)
         batch = trials.judge(batch, findings, trial_rules.stages)
-        trials.judge(batch, findings, *last)
+        batch = trials.judge(batch, findings, *last)
+        trials.judge(batch, findings, trial_rules.motion)
         context.advance(len(whole))
 
     if "successes" in trials.groups:

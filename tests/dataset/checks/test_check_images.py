@@ -86,6 +86,7 @@ def change_contact(out: Path, edit_p: Edit, edit_n: Edit) -> tuple[str, int]:
             file["test/grasps"][0] = np.concatenate(
                 [(p @ X_CO[:3, :3].T + X_CO[:3, 3]).ravel(), (n @ X_CO[:3, :3].T).ravel()]
             )
+            file["test/grasp_props/f_Q_C"][0] = f @ X_CO[:3, :3].T
     return "/test", 0
 
 

@@ -5,11 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
-from helpers.datasets import OTM, OTO, Edit, change, found, mirrored, moved, set_at, turned
+from helpers.datasets import (
+    OTM,
+    OTO,
+    TRIALS,
+    Edit,
+    change,
+    found,
+    mirrored,
+    moved,
+    must_find,
+    set_at,
+    turned,
+)
 
 PROPS = "object_props/"
+GRASP = "grasp_props/"
 SAMPLE_CASES: Mapping[str, tuple[str, str, Edit, str]] = {
     # where it is, how it is broken, what is found
     "nan": (OTO, "images", set_at(1, 3, 3, to=np.nan), "images must be finite"),
@@ -66,6 +80,24 @@ SAMPLE_CASES: Mapping[str, tuple[str, str, Edit, str]] = {
         "frame_world2obj must follow from its trial",
     ),
     "grasp": (OTM, "grasps", lambda g: g + np.eye(18)[2] * 1e-4, "grasp must be its trial's"),
+    "held grasp": (
+        OTO,
+        "grasps_held",
+        lambda g: g + np.eye(18)[4] * 1e-4,
+        "grasps_held must follow from its trial",
+    ),
+    "held normal": (OTM, "grasps_held", set_at(slice(9, 12), to=0.0), "normal held by finger 1"),
+    "palm": (OTO, GRASP + "X_CG", moved(0, 1e-4, 0), "X_CG must follow from its trial"),
+    "palm's side": (OTO, GRASP + "X_CG", mirrored, GRASP + "X_CG must have an orthonormal"),
+    "held palm": (OTM, GRASP + "X_CG_held", moved(0, 0, 1e-4), "X_CG_held must follow from"),
+    "force": (OTO, GRASP + "f_Q_C", set_at(1, 2, to=3.0), "f_Q_C must follow from its trial"),
+    "held force": (OTM, GRASP + "f_Q_C_held", lambda f: -f, "f_Q_C_held must follow from its"),
+    "joint": (OTO, GRASP + "q_held", set_at(3, to=0.5), "q_held must follow from its trial"),
+    "patch": (OTM, GRASP + "area", lambda a: 1.1 * a, "area must follow from its trial"),
+    "slip": (OTO, GRASP + "slip", lambda s: s + 1e-4, "slip must follow from its trial"),
+    "released": (OTO, GRASP + "turn_released", lambda _: 0.0, "turn_released must follow from"),
+    "precision": (OTO, GRASP + "precision", lambda _: False, "precision must follow from other"),
+    "stable": (OTM, GRASP + "stable", lambda _: False, "stable must follow from other_links_held"),
     "beside": (
         OTO,
         "images",
@@ -86,3 +118,35 @@ def test_a_wrong_value_of_a_sample_is_found(out: Path, case: str) -> None:
     assert {h[:3] for h in hits} == {(name, "/train", 1)}
     assert len(hits) == 1
     assert all(h[3].startswith(what) for h in hits), hits
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "reason"), [("slip", 0.0101, "slid"), ("turn", 0.18, "turned")]
+)
+def test_a_sample_that_moved_too_far_in_the_hand_is_found(
+    out: Path, name: str, value: float, reason: str
+) -> None:
+    change(out, OTO, f"train/{GRASP}{name}", 1, lambda _: value)
+    change(out, OTO, f"train/{GRASP}stable", 1, lambda _: False)
+    must_find(out / OTO, (OTO, "/train", 1, f"a sample must pass the filter {reason}"))
+
+
+def test_a_sample_on_the_palm_is_found(out: Path) -> None:
+    change(out, OTO, f"train/{GRASP}other_links_held", 1, lambda _: 1)
+    for name in ("precision", "stable"):
+        change(out, OTO, f"train/{GRASP}{name}", 1, lambda _: False)
+    must_find(out / OTO, (OTO, "/train", 1, "a sample must pass the filter other_links"))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "reason"),
+    [("surface_distance", 2.1e-3, "off_surface"), ("normal_angle", 0.6, "normal_off")],
+)
+def test_a_sample_with_a_contact_off_the_surface_is_found(
+    out: Path, name: str, value: float, reason: str
+) -> None:
+    with h5py.File(out / OTO) as file:
+        number = int(file["train/trial_id"][1])
+    change(out, TRIALS, f"trials/{name}", number, set_at(2, to=value))
+    what = f"a sample must pass the filter {reason}"
+    must_find(out, *((name, "/train", 1, what) for name in (OTO, OTM)))

@@ -11,6 +11,7 @@ from helpers.datasets import (
     AFTER_LIFT,
     BELOW,
     BOTH,
+    HAND,
     MISSING,
     SLIPPED,
     SUCCESS,
@@ -51,6 +52,12 @@ TRIAL_CASES: Mapping[str, tuple[str, int, Edit, str]] = {
         set_at(1, to=[-10, 0, 0]),
         "lifted_f_Q_O of finger 2 must push",
     ),
+    "pull when closed": (
+        "closed_f_Q_O",
+        SUCCESS,
+        set_at(1, to=[-10, 0, 0]),
+        "closed_f_Q_O of finger 2 must push",
+    ),
     "area": ("closed_area", SUCCESS, set_at(0, to=0), "closed_area of finger 1 must be positive"),
     "depth": (
         "closed_penetration",
@@ -59,6 +66,14 @@ TRIAL_CASES: Mapping[str, tuple[str, int, Edit, str]] = {
         "closed_penetration of finger 2 must not be negative",
     ),
     "pose": ("X_OG", BELOW, lambda p: 1.1 * p, "X_OG must have an orthonormal rotation"),
+    "palm after the lift": ("X_OG_lifted", SUCCESS, mirrored, "X_OG_lifted must have an orthon"),
+    "slip": ("slip", SUCCESS, lambda s: s + 1e-3, "slip must follow from X_OG and X_OG_lifted"),
+    "turn": ("turn", SLIPPED, lambda t: t + 1e-2, "turn must follow from X_OG and X_OG_lifted"),
+    "slip back": ("slip_released", SUCCESS, lambda s: -s, "slip_released must be 0..inf"),
+    "turn too far": ("turn_released", SUCCESS, lambda _: 4.0, "turn_released must be 0..3.142"),
+    "precision": ("precision", SUCCESS, lambda _: False, "precision must follow from the outcome"),
+    "stable": ("stable", SLIPPED, lambda _: True, "stable must follow from the outcome"),
+    "early word": ("stable", MISSING, lambda _: True, "stable must be 0 before the stage lifted"),
     "lifted pose": ("X_TO_lifted", SUCCESS, mirrored, "X_TO_lifted must have an orthonormal"),
     "resting": ("X_TO", SUCCESS, moved(0.001, 0, 0), "X_TO must be the object's resting pose"),
     "on table": ("lifted_object_on_table", SUCCESS, lambda _: True, "outcome must follow"),
@@ -78,6 +93,11 @@ def test_contact_that_slides_may_be_pressed_from_any_side(out: Path) -> None:
     must_find(out)
 
 
+def test_contact_on_a_rim_of_a_failed_attempt_may_be_pressed_from_any_side(out: Path) -> None:
+    change(out, TRIALS, "trials/closed_f_Q_O", HAND, set_at(0, to=[6.5, 0, 0]))
+    must_find(out)
+
+
 def test_successes_and_removals_are_checked(out: Path) -> None:
     change(out, TRIALS, "successes/removal", 2, lambda _: 4)
     what = "every sample must be a success that /successes"
@@ -85,7 +105,7 @@ def test_successes_and_removals_are_checked(out: Path) -> None:
     change(out, TRIALS, "successes/removal", 2, lambda _: 77)
     must_find(
         out / TRIALS,
-        (TRIALS, "/successes", 2, "removal must be 0..7"),
+        (TRIALS, "/successes", 2, "removal must be 0..11"),
     )
     change(out, TRIALS, "successes/trial_id", 0, lambda i: i + 1)
     assert (TRIALS, "/successes", None, "trial_id must list the successes of /trials") in found(
