@@ -45,7 +45,7 @@ POINT_DIGITS, NORMAL_DIGITS = 4, 3
 MARGINS = (1.0, 0.5)
 #: The reason that a person reads, by the outcome of the trial.
 _REASONS = {
-    Outcome.SUCCESS: "every fingertip holds it at the end of the lift",
+    Outcome.SUCCESS: "every fingertip touches it at the end of the lift, clear of the table",
     Outcome.BELOW_TABLE: "the palm would be below the table",
     Outcome.START_COLLISION: "the opened hand would be inside the object or the table",
     Outcome.MISSING_FINGERTIP: "a fingertip closes without touching the object",
