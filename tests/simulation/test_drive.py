@@ -147,8 +147,8 @@ def test_worm_yields_beyond_its_strength_and_holds_again(
     # Once the load is gone the motors close the fingers, with their own torque again.
     stood = _pushed(scene, 0.0, steps=20)
     assert np.diff(stood[2:, :2], axis=0).min() > -STILL
-    limits = [motor.effort_limit() for motor in scene.handles.motors]
-    assert limits == [finger.torque_limit for finger in weak.fingers]
+    limits = [motor.effort_limit() for motor in scene.handles.motors[:2]]
+    assert limits == [finger.torque_limit for finger in weak.fingers[:2]]
     disengage(scene)
 
 
