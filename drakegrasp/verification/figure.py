@@ -28,8 +28,8 @@ EDGE = 3.3
 NUMBER = 7.0
 #: Shorter arrows are not drawn [px].
 SHORTEST = 8.0
-#: Colours of the verdict.
-HOLDS, FAILS = "#1B7F3B", "#B3261E"
+#: Colours of the verdict: stable, held but not stable, not held.
+STABLE, HELD, FAILS = "#1B7F3B", "#8A5A00", "#B3261E"
 
 
 def verification_figure(verified: Verification) -> Figure:
@@ -63,8 +63,9 @@ def _draw_figure(verified: Verification, model: ObjectModel, views: Sequence[Vie
 
     # The verdict, its reason, and what happened in the hand.
     left, height = margin / width, EDGE + head + foot
+    colour = STABLE if verified.stable else HELD if verified.held else FAILS
     figure.text(left, 1.0 - 0.1 / height, f"{model.name}  {verified.words}", fontsize=12.5,
-                va="top", weight="bold", color=HOLDS if verified.held else FAILS)  # fmt: skip
+                va="top", weight="bold", color=colour)  # fmt: skip
     lines = (verified.reason, _lift_line(verified))
     figure.text(left, 1.0 - 0.36 / height, "\n".join(filter(None, lines)), fontsize=9.5, va="top",
                 color=INK, linespacing=1.35)  # fmt: skip
@@ -134,7 +135,7 @@ def _draw_legend(figure: Figure, verified: Verification, corner: tuple[float, fl
         text = f"after closing, with the finger's force (longest: {force:.1f} N)"
         handles.append(dot(REACHED, REACHED, text))
     if verified.lifted is not None and verified.lifted.touching.any():
-        handles.append(dot(LIFTED, LIFTED, "after the lift"))
+        handles.append(dot(LIFTED, LIFTED, "after the lift, and how far it slid"))
     handles.append(dot(INK, "white", "behind the object"))
     figure.legend(handles=handles, loc="upper left", bbox_to_anchor=corner, ncols=len(handles),
                   fontsize=9.0, frameon=False, handletextpad=0.2, columnspacing=1.5,

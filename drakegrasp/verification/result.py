@@ -234,9 +234,11 @@ class Verification:
         else:
             needed = "are not enough at any friction"
         text = f"Forces at these points alone {needed}; the simulation has {simulated:.2f}"
-        if self.success and self.method == "hand" and self.smallest_friction > simulated:
-            # A point does not resist twisting; an area of contact does.
-            text += ", but the hand's contacts are areas, and its other parts may help"
+        if self.held and self.method == "hand" and self.smallest_friction > simulated:
+            # A point does not resist twisting, an area of contact does; and what slips is held
+            # elsewhere.
+            text += ", but the hand's contacts are areas"
+            text += "" if self.stable else ", and the object is not held where they were"
         return f"{text} (epsilon {self.epsilon:.3f})."
 
     def __repr__(self) -> str:

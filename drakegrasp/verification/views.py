@@ -23,7 +23,6 @@ from drakegrasp.mesh.rays import first_hits
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.placement import canonical_pose
-from drakegrasp.simulation.trajectory import lifted_palm
 from drakegrasp.simulation.trial import TrialRecord
 from drakegrasp.vision.camera import Picture
 from drakegrasp.visualization.style import ARROW, HIDDEN, LIFTED, PREDICTED, REACHED
@@ -142,10 +141,14 @@ def _last_view(
     # After the lift, by forces or by the hand.
     if lift is not None and lift.X_TO_lifted is not None:
         return [renderer.object_view("end of the lift", X_WT @ lift.X_TO_lifted, marks, azimuth)]
-    if trial is not None and trial.X_TO_lifted is not None and trial.q_lifted is not None:
-        X_WG = lifted_palm(trial.X_TO @ trial.X_OG, trial.time_lift, verified.config)
+    if (
+        trial is not None
+        and trial.X_TO_lifted is not None
+        and trial.X_OG_lifted is not None
+        and trial.q_lifted is not None
+    ):
         X_WO = X_WT @ trial.X_TO_lifted
-        snapshot = Snapshot(X_WG=X_WG, X_WO=X_WO, q=trial.q_lifted)
+        snapshot = Snapshot(X_WG=X_WO @ trial.X_OG_lifted, X_WO=X_WO, q=trial.q_lifted)
         reached = _reached(trial.lifted, _force_scale(verified), kind="lifted", colour=LIFTED)
         return [renderer.hand_view("end of the lift", snapshot, reached)]
 
@@ -249,7 +252,7 @@ def _moved(trial: TrialRecord | None) -> list[Marks]:
         Marks(
             kind="lifted",
             colour=LIFTED,
-            size=5.0,
+            size=4.0,
             p_OQ=p,
             nhat_Q_O=n,
             tail_O=trial.closed.p_OQ[both],

@@ -15,14 +15,13 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from drakegrasp.config import Config, load_config
-from drakegrasp.frames import make_pose
+from drakegrasp.frames import X_WT, make_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.scene import Scene, palm_pose
-from drakegrasp.simulation.trajectory import lifted_palm
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.verification.figure import verification_figure
 from drakegrasp.verification.forces.lift import ForceLift, LiftEnd
@@ -170,11 +169,13 @@ def test_palm_is_where_the_lift_ended(cube: ObjectModel, config: Config, frictio
     scene = build_scene(cube, physics, load_hand(config.hand))
     record = run_attempt(scene, standing(cube), from_above(cube, 0.06), slick)
     assert record.lifted is not None
+    assert record.X_TO_lifted is not None
+    assert record.X_OG_lifted is not None
     assert record.lifted.touching.any() == (friction > 0.5)
     # The coarse steps of a lift have a scene of their own.
     assert scene.coarse_scene is not None
     X_WG = palm_pose(max(scene, scene.coarse_scene(), key=lambda stage: stage.time))
-    X_TG = record.X_TO @ record.X_OG
-    np.testing.assert_allclose(lifted_palm(X_TG, record.time_lift, slick), X_WG, atol=2e-4)
+    X_WO = X_WT @ record.X_TO_lifted
+    np.testing.assert_allclose(X_WO @ record.X_OG_lifted, X_WG, atol=1e-9)
     if friction < 0.5:
         assert X_WG[2, 3] < 0.65 + config.lift.p_TG[2] - 0.1
