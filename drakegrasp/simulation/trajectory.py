@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import Config
-from drakegrasp.frames import X_WT, Array, make_pose
+from drakegrasp.frames import X_WT, Array
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.settle import GRAVITY
 
