@@ -55,6 +55,17 @@ def test_worm_needs_a_holding_torque(config: Config, tmp_path: Path) -> None:
         drive_of(pincer, override_config(config, ["lift.drive=worm"]).lift)
 
 
+@pytest.mark.sim
+def test_attempt_with_an_impossible_drive_is_refused(
+    cube: ObjectModel, config: Config, hand: Hand
+) -> None:
+    """It is the caller's mistake, not an outcome."""
+    weak = tuple(replace(finger, holding_torque=None) for finger in hand.fingers)
+    scene = build_scene(cube, config.physics, replace(hand, fingers=weak))
+    with pytest.raises(ConfigError, match="holding_torque"):
+        run_attempt(scene, standing(cube), from_above(cube, STANDOFF), config)
+
+
 @pytest.fixture(scope="module")
 def carton(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
     return box_model(tmp_path_factory.mktemp("carton"), [0.06, 0.06, 0.10])
