@@ -34,7 +34,10 @@ def g3db() -> Path:
 
 
 #: Palm poses per object of the small dataset; enough for samples to train and to test on.
-SMALL = ["candidates.max=40", "unit_candidates=10", "filters.outlier_sigma=0"]
+SMALL = [
+    *("candidates.max=40", "unit_candidates=10"),
+    *("filters.outlier_sigma=0", "filters.require=held", "filters.max_normal_angle_deg=null"),
+]
 
 
 @pytest.fixture(scope="session")

@@ -44,7 +44,7 @@ def fit_contacts(model: ObjectModel, p_OQ: Array, nhat_Q_O: Array) -> ContactFit
         nhat_Q_O: (n, 3), unit normals out of the object.
     """
     mesh = model.visual
-    known = np.isfinite(nhat_Q_O).all(axis=1)
+    known = np.asarray(np.isfinite(nhat_Q_O).all(axis=1))
     ahead = p_OQ + AHEAD * np.where(known[:, None], nhat_Q_O, 0.0)
 
     # The faces nearest to the points, and to those ahead of them.

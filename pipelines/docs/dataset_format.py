@@ -60,6 +60,26 @@ again and again, says more about the machine than about the grasp, and may end o
 `screened` is an attempt that geometry has decided: it was not simulated, and would have been a
 `missing_fingertip`, see [screening](../explanation/screening.md).
 
+## Where closing ends
+
+`time_close` and all that begins with `closed_` are of the moment at which closing ended. Mostly all
+fingers stand still then. Closing ends before that as soon as one finger has passed the last angle
+at which it can meet the object: the verdict is `missing_fingertip` then, whatever the others do. So
+in rows of `missing_fingertip` other fingers may still be on their way, and `closed_q` is no closed
+hand.
+
+While the hand closes the object is fixed in its place. So no column says whether it stands on the
+table then, and the forces of the fingertips need not balance.
+
+## Versions of the schema
+
+A file is read only if its `schema_version` is the one above. Every command and the reader refuse
+another one with a line that names the file and both versions: build the dataset again, in another
+directory. Version 1 had other labels: fingers that the object pushed open, and contacts anywhere on
+a fingertip's link.
+
+## Seals
+
 Shards and the files in `objects/` are sealed: a changed bit in one of them is found when it is
 used, and by `drakegrasp check`. The three main files have no seal: `check` finds what breaks an
 invariant, not every changed bit of an image. `drakegrasp assemble` makes them again from the
@@ -87,6 +107,12 @@ _DATA = """## grasping_oto.hdf5 and grasping_otm.hdf5
 
 Groups `/train`, `/valid` and `/test` have the same fields; images and masks are stored in one
 chunk per sample, gzip 1 with shuffle. Successes only, after the filters.
+
+A sample has two grasps. `grasps` are the contacts where closing ended, on the object before it is
+freed. `grasps_held` are those at the end of the lift, where the object may have moved in the hand;
+they are drawn on the object in its resting pose, as if hand and object were put back together. All
+names that end in `_held` are of that instant, in that way. `grasp_props/` says how well the hand
+holds; its words are explained in [outcomes](outcomes.md#held-precision-stable).
 """
 
 _VERIFICATION = """

@@ -213,6 +213,7 @@ def test_check_stats_and_replay_speak_of_a_dataset(small_dataset: Path, tmp_path
     assert "no broken invariants" in run("check", small_dataset).stdout
     stats = run("stats", small_dataset).stdout
     assert "8_wineglass_flute" in stats
+    assert "How well the hand holds" in stats
     assert "Samples by split" in stats
     page = tmp_path / "trial.html"
     again = run("replay", small_dataset, "--trial", "0", "--html", page)
