@@ -10,12 +10,14 @@ from helpers.objects import CUBE, box_model, from_above, standing
 
 from drakegrasp.config import Config, load_config, override_config
 from drakegrasp.frames import make_pose
+from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 
 pytest.importorskip("mujoco")
 pytest.importorskip("coacd")
 
+from drakegrasp.bench import mujoco_baseline
 from drakegrasp.bench.mujoco_baseline import MujocoBaseline
 
 pytestmark = pytest.mark.sim
@@ -43,8 +45,10 @@ def test_cube_is_one_part_and_is_held_across_its_faces(
 ) -> None:
     assert baseline.parts == 1
     attempt = from_above(cube, STANDOFF)
-    assert baseline.run(attempt) is Outcome.SUCCESS
-    assert baseline.run(attempt) is Outcome.SUCCESS  # nothing is left of the first run
+    first, again = baseline.run(attempt), baseline.run(attempt)
+    assert first.outcome is Outcome.SUCCESS
+    assert first.lifted
+    assert again == first  # nothing is left of the first run
 
 
 @pytest.mark.parametrize(
@@ -54,25 +58,100 @@ def test_cube_is_one_part_and_is_held_across_its_faces(
 def test_attempts_fail_where_they_should(
     baseline: MujocoBaseline, cube: ObjectModel, standoff: float, outcome: Outcome
 ) -> None:
-    assert baseline.run(from_above(cube, standoff)) is outcome
+    trial = baseline.run(from_above(cube, standoff))
+    assert (trial.outcome, trial.lifted) == (outcome, False)
 
 
 def test_what_geometry_decides_is_not_simulated(
     baseline: MujocoBaseline, cube: ObjectModel
 ) -> None:
     attempt = from_above(cube, STANDOFF)
-    assert baseline.run(replace(attempt, ray_hits=False)) is Outcome.RAY_MISS
+    assert baseline.run(replace(attempt, ray_hits=False)).outcome is Outcome.RAY_MISS
     below = attempt.X_OG @ make_pose(np.eye(3), [0.0, 0.0, 0.3])
-    assert baseline.run(replace(attempt, X_OG=below)) is Outcome.BELOW_TABLE
+    assert baseline.run(replace(attempt, X_OG=below)).outcome is Outcome.BELOW_TABLE
 
 
 def test_slippery_cube_is_not_held(cube: ObjectModel, config: Config) -> None:
     slick = override_config(config, ["physics.friction_hand=0.05"])
-    outcome = MujocoBaseline(cube, standing(cube), slick).run(from_above(cube, STANDOFF))
-    assert outcome in (Outcome.DROPPED, Outcome.SLIPPED)
+    trial = MujocoBaseline(cube, standing(cube), slick).run(from_above(cube, STANDOFF))
+    assert trial.lifted
+    assert trial.outcome in (Outcome.DROPPED, Outcome.SLIPPED)
 
 
 def test_spread_turns_the_fingers(baseline: MujocoBaseline, cube: ObjectModel) -> None:
     """At 90 degrees both spread fingers are at the sides, where the third does not oppose them."""
-    outcome = baseline.run(from_above(cube, STANDOFF, spread=float(np.deg2rad(90.0))))
-    assert outcome is not Outcome.SUCCESS
+    trial = baseline.run(from_above(cube, STANDOFF, spread=float(np.deg2rad(90.0))))
+    assert trial.outcome is not Outcome.SUCCESS
+
+
+def peer(model: ObjectModel, *overrides: str) -> MujocoBaseline:
+    return MujocoBaseline(model, standing(model), load_config(overrides=overrides))
+
+
+@pytest.fixture(scope="module")
+def pinched(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
+    """A box that two fingers and one opposing finger of twice their torque pinch."""
+    return box_model(tmp_path_factory.mktemp("box"), [0.06, 0.06, 0.10])
+
+
+@pytest.mark.parametrize("drive", ["worm", "locked"])
+def test_worm_keeps_a_pinched_box_in_place(pinched: ObjectModel, drive: str) -> None:
+    trial = peer(pinched, f"lift.drive={drive}").run(from_above(pinched, STANDOFF))
+    assert trial.outcome is Outcome.SUCCESS
+    assert trial.slip < 1e-4
+    assert trial.turn < np.deg2rad(0.1)
+
+
+def test_torque_lets_the_box_push_fingers_open(pinched: ObjectModel) -> None:
+    trial = peer(pinched, "lift.drive=torque").run(from_above(pinched, STANDOFF))
+    assert trial.slip > 0.01
+    assert trial.turn > np.deg2rad(5.0)
+
+
+def test_friction_is_that_of_coulomb(pinched: ObjectModel) -> None:
+    """Two pads with 2 N m and one with 4 N m carry 1 kg from a coefficient of about 0.154 on."""
+    attempt = from_above(pinched, STANDOFF)
+    held = peer(pinched, "lift.drive=worm", "physics.friction_hand=0.17").run(attempt)
+    assert held.outcome is Outcome.SUCCESS
+    assert held.slip < 1e-4
+    lost = peer(pinched, "lift.drive=worm", "physics.friction_hand=0.13").run(attempt)
+    assert lost.slip > 5e-3
+
+
+def weak(monkeypatch: pytest.MonkeyPatch, **changes: object) -> None:
+    """Let the hand of the next peers have other fingers."""
+    hand = load_hand()
+    fingers = tuple(replace(finger, **changes) for finger in hand.fingers)  # type: ignore[arg-type]
+    monkeypatch.setattr(mujoco_baseline, "load_hand", lambda name: replace(hand, fingers=fingers))
+
+
+def test_worm_yields_beyond_its_strength(
+    pinched: ObjectModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The opposing finger loads the two with 4 N m in all."""
+    weak(monkeypatch, holding_torque=1.9)
+    trial = peer(pinched, "lift.drive=worm").run(from_above(pinched, STANDOFF))
+    assert trial.slip > 5e-3
+
+
+def test_contact_beside_the_pad_is_no_fingertip(
+    cube: ObjectModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    weak(monkeypatch, pad_region=((1.0, 0.0, 0.0, 0.05),))  # nearer to the tip than the contact
+    assert peer(cube).run(from_above(cube, STANDOFF)).outcome is Outcome.MISSING_FINGERTIP
+    weak(monkeypatch, pad_region=((-1.0, 0.0, 0.0, -0.06),))  # all but the tip
+    assert peer(cube).run(from_above(cube, STANDOFF)).outcome is Outcome.SUCCESS
+
+
+def test_palm_that_touches_is_another_link(cube: ObjectModel) -> None:
+    trial = peer(cube).run(from_above(cube, 0.03))
+    assert trial.outcome is Outcome.HAND_CONTACT
+
+
+def test_wrist_waits_while_the_object_is_released(cube: ObjectModel) -> None:
+    """A lift that is over when the wrist would move has lifted nothing."""
+    attempt = from_above(cube, STANDOFF)
+    now, later = (peer(cube, f"lift.release_time={time}") for time in (0.0, 0.5))
+    for baseline in (now, later):
+        assert baseline.run(attempt).outcome is Outcome.SUCCESS
+    assert later._data.time - now._data.time == pytest.approx(0.5, abs=0.003)
