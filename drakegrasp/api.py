@@ -31,6 +31,7 @@ from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.runtime.environment import available_cores
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.runtime.progress import progress_bar
+from drakegrasp.simulation.drive import drive_of
 from drakegrasp.verification.batch import ResultCallback, ignore_result, verify_batch
 from drakegrasp.verification.placed_grasp import (
     Mesh,
@@ -86,7 +87,7 @@ def build_dataset(
     """
     _refuse_workers(workers, scheduler, scheduler_file)
     out, config = Path(out).absolute(), config or load_config()
-    load_hand(config.hand)
+    drive_of(load_hand(config.hand), config.lift)
     sources = find_sources(objects, units, manifest)
     cluster = _announced(connect(workers, scheduler, scheduler_file), show)
     return build_on(cluster, sources, out, config, show=show)

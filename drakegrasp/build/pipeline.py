@@ -36,6 +36,7 @@ from drakegrasp.objects.sources import MeshSource, source_sha256
 from drakegrasp.runtime.executor import Executor, WorkerPool
 from drakegrasp.runtime.files import disk_full_named, sweep_temporary
 from drakegrasp.runtime.progress import Report, progress_bar
+from drakegrasp.simulation.drive import drive_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +105,7 @@ def build(
         DiskFullError: If there is no room; the same call goes on when there is.
         MachineError: If the workers cannot do the work.
     """
-    load_hand(config.hand)
+    drive_of(load_hand(config.hand), config.lift)
     with build_lock(out) as dead:
         return build_locked(sources, out, config, execute, dead=dead, pool=pool, show=show)
 

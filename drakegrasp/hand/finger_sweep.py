@@ -7,7 +7,7 @@ degree apart, from the open hand to the limit. This is geometry only, without a 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 
 import numpy as np
@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull
 
 from drakegrasp.arithmetic import dot, multiply, norm
 from drakegrasp.frames import Array, invert_pose
-from drakegrasp.hand.description import Hand
+from drakegrasp.hand.description import Finger, Hand
 from drakegrasp.hand.kinematics import coordinate_limits, link_poses
 from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.mesh.distance_field import DistanceField, make_distance_field
@@ -42,13 +42,16 @@ class FingerPath:
 
     Attributes:
         angles: (m,), closing angles from 0 to the limit [rad].
-        points: (m, n, 3), points of the links in {G} [m]; the points of the fingertip come first.
-        tip: Number of points of the fingertip.
+        points: (m, n, 3), points of the links in {G} [m]; those of the fingertip's pad come first,
+            then those of the rest of the fingertip.
+        pad: Number of points of the pad.
+        tip: Number of points of the fingertip, the pad included.
         travel: (n,), largest distance that each moves from one angle to the next [m].
     """
 
     angles: Array
     points: Points
+    pad: int
     tip: int
     travel: Points
 
@@ -116,8 +119,11 @@ def _finger_path(
         X_GL = link_poses(hand, link, spread=spread, closing=closing)
         return _place(X_GL, surfaces[link])
 
-    # Points of all links, the fingertip first.
-    tip = placed(hand.fingers[i].fingertip)
+    # Points of all links, the fingertip first, and of it the pad.
+    fingertip = hand.fingers[i].fingertip
+    on_pad = _near_pad(hand.fingers[i], surfaces[fingertip])
+    order = np.argsort(~on_pad, kind="stable")
+    tip = placed(fingertip)[:, order]
     points = np.concatenate([tip, *map(placed, rest)], axis=1)
 
     # Leave out points that do not move.
@@ -126,6 +132,7 @@ def _finger_path(
     return FingerPath(
         angles=angles,
         points=np.ascontiguousarray(points[:, moving]),
+        pad=int(np.count_nonzero(moving[: int(on_pad.sum())])),
         tip=int(np.count_nonzero(moving[: tip.shape[1]])),
         travel=travel[moving],
     )
@@ -183,6 +190,26 @@ def link_points(hand: Hand) -> dict[str, Array]:
         found = [_thinned_points(corners, spacing) for corners in shapes]
         points[link] = np.concatenate([np.zeros((0, 3)), *found])
     return points
+
+
+@cache
+def pad_points(hand: Hand) -> tuple[Array, ...]:
+    """Return points on the pad of each fingertip (n, 3) in the fingertip link's frame [m]."""
+    points = link_points(hand)
+    return tuple(
+        points[finger.fingertip][_near_pad(finger, points[finger.fingertip])]
+        for finger in hand.fingers
+    )
+
+
+def _near_pad(finger: Finger, p_FiQ: Array) -> npt.NDArray[np.bool_]:
+    """Return which points (n, 3) [m] of a fingertip are on its pad, or next to one that may be."""
+    # The points are samples of the surface: one beside the region stands for some within.
+    wider = tuple(
+        (nx, ny, nz, d - TIP_SPACING * float(norm(np.array([nx, ny, nz]))))
+        for nx, ny, nz, d in finger.pad_region
+    )
+    return replace(finger, pad_region=wider).on_pad(p_FiQ)
 
 
 def _triangles(corners: Array) -> Array:

@@ -269,6 +269,7 @@ def _add_hand(
     for weightless in (instance, wrist_instance):
         plant.set_gravity_enabled(weightless, False)
 
+    closing_joints = tuple(plant.GetJointByName(f.closing_joint, instance) for f in hand.fingers)
     return HandHandles(
         hand=hand,
         instance=instance,
@@ -277,7 +278,19 @@ def _add_hand(
         wrist_frame=wrist,
         wrist_trajectory=trajectory,
         fingertips=tuple(plant.GetBodyByName(f.fingertip, instance) for f in hand.fingers),
-        closing_joints=tuple(plant.GetJointByName(f.closing_joint, instance) for f in hand.fingers),
+        closing_joints=closing_joints,
+        closing_limits=tuple(
+            (float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0]))
+            for joint in closing_joints
+        ),
+        driven=tuple(
+            {
+                plant.GetJointByName(f.closing_joint, instance): 1.0,
+                **{plant.GetJointByName(c.joint, instance): c.ratio for c in f.coupled},
+            }
+            for f in hand.fingers
+        ),
+        motors=tuple(plant.GetJointActuatorByName(f.name, instance) for f in hand.fingers),
         parts=_points_inside(plant, scene_graph, instance),
     )
 

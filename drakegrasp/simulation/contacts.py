@@ -1,14 +1,15 @@
 """Drake's contact results as the contacts of a grasp, in the object's frame.
 
-The contact of a fingertip is the union of all hydroelastic patches between its link and the object.
-Its point is the pressure-weighted centre of the patches. Its normal is the pressure-weighted mean
-of the face normals and points out of the object. Both belong to the rigid object's surface, because
-a patch of a rigid and a compliant body is a piece of the rigid surface.
+The contact of a fingertip is the union of all hydroelastic patches between its pad and the object:
+the faces of the contact surface whose centroid is in the hand file's pad region. What the rest of
+that link touches counts as a contact of another link. Its point is the pressure-weighted centre of
+the patches. Its normal is the pressure-weighted mean of the face normals and points out of the
+object. Both belong to the rigid object's surface, because a patch of a rigid and a compliant body
+is a piece of the rigid surface.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,15 +28,16 @@ class Contacts:
     """The contacts at one instant, for a hand of k fingers.
 
     Attributes:
-        touching: (k,) bool, whether fingertip i presses on the object with more force than
-            `physics.contact_force`.
+        touching: (k,) bool, whether the pad of fingertip i presses on the object with more force
+            than `physics.contact_force`.
         p_OQ: (k, 3), contact point of each fingertip in {O} [m]; NaN where not touching.
         nhat_Q_O: (k, 3), unit normal out of the object in {O}; NaN where not touching.
         f_Q_O: (k, 3), force of the fingertip on the object in {O} [N]; 0 where not touching.
         area: (k,), area of the patches [m^2]; 0 where not touching.
         penetration: (k,), largest depth of the object's surface in the fingertip [m]; 0 where not
             touching.
-        other_links: Number of other links of the hand that touch the object.
+        other_links: Number of links of the hand that touch the object beside the pads; a fingertip
+            link that touches it outside its pad is one.
         hand_on_table, object_on_table: Whether hand and object touch the table.
         table_force: (3,), force of the table on the object in {W} [N].
         point_contacts: Number of point contacts (not hydroelastic) that involve the object.
@@ -175,16 +177,35 @@ class _Reader:
     def _add_tip_patch(
         self, i: int, surface: ContactSurface, force_W: Array, object_is_M: bool
     ) -> None:
-        self._force_W[i] += force_W
-        # Face normals point out of N into M.
-        outward = -1.0 if object_is_M else 1.0
-        for area, centre, normal, pressure, depth in _faces(surface, object_is_M):
-            weight = area * pressure
-            self._area[i] += area
-            self._weight[i] += weight
-            self._moment_p[i] += weight * centre
-            self._moment_n[i] += weight * outward * normal
-            self._penetration[i] = max(self._penetration[i], depth)
+        """Add a patch of fingertip i and the object, split into pad and rest of the link."""
+        assert self._scene.handles is not None
+        faces = _read_faces(surface, object_is_M)
+
+        # Which faces are on the pad, and how much of the patch they carry.
+        tip = self._scene.handles.fingertips[i]
+        p_FiQ = transform_points(invert_pose(self._scene.pose(tip)), faces.centres_W)
+        on_pad = self._scene.handles.hand.fingers[i].on_pad(p_FiQ)
+        weight = faces.areas * faces.pressures
+        moment_n = weight[:, None] * faces.normals_W
+
+        # Drake tells the force of the whole patch. Its normal part belongs to the faces; friction
+        # and damping are divided as the pressure is.
+        if on_pad.all():
+            pad_force_W = force_W
+        else:
+            share = weight[on_pad].sum() / weight.sum() if weight.any() else 0.0
+            rest = force_W + moment_n.sum(axis=0)
+            pad_force_W = -moment_n[on_pad].sum(axis=0) + share * rest
+            other = float(norm(force_W - pad_force_W))
+            self._other_force[tip.index()] = self._other_force.get(tip.index(), 0.0) + other
+
+        # Sums over the pad's faces.
+        self._force_W[i] += pad_force_W
+        self._area[i] += faces.areas[on_pad].sum()
+        self._weight[i] += weight[on_pad].sum()
+        self._moment_p[i] += (weight[:, None] * faces.centres_W)[on_pad].sum(axis=0)
+        self._moment_n[i] += moment_n[on_pad].sum(axis=0)
+        self._penetration[i] = max(self._penetration[i], *faces.depths[on_pad], 0.0)
 
     def add_point_pair(self, bodies: set[BodyIndex]) -> None:
         """Add a point contact of two bodies."""
@@ -226,26 +247,48 @@ def hand_bodies(scene: Scene) -> set[BodyIndex]:
     return set() if handles is None else set(scene.plant.GetBodyIndices(handles.instance))
 
 
-def _faces(
-    surface: ContactSurface, object_is_M: bool
-) -> Iterator[tuple[float, Array, Array, float, float]]:
-    """Yield area [m^2], centre W [m], normal W, pressure [Pa] and depth [m] of each face."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Faces:
+    """The n faces of a patch on the object.
+
+    Attributes:
+        areas: (n,) [m^2].
+        centres_W: (n, 3), centroids [m].
+        normals_W: (n, 3), unit, out of the object.
+        pressures: (n,), at the centroids [Pa].
+        depths: (n,), of the object's surface in the fingertip [m].
+    """
+
+    areas: Array
+    centres_W: Array
+    normals_W: Array
+    pressures: Array
+    depths: Array
+
+
+def _read_faces(surface: ContactSurface, object_is_M: bool) -> _Faces:
     # The fingertip's pressure is zero at its surface, so pressure over gradient is the depth of the
     # face below it.
     field, compliant_is_M = surface.poly_e_MN(), not object_is_M
     has_gradient = surface.HasGradE_M() if compliant_is_M else surface.HasGradE_N()
     gradient = surface.EvaluateGradE_M_W if compliant_is_M else surface.EvaluateGradE_N_W
-    for face in range(surface.num_faces()):
-        centre = np.array(surface.centroid(face))
-        pressure = float(field.EvaluateCartesian(face, centre))
-        slope = float(norm(gradient(face))) if has_gradient else np.inf
-        yield (
-            float(surface.area(face)),
-            centre,
-            np.array(surface.face_normal(face)),
-            pressure,
-            pressure / slope,
-        )
+    # Face normals point out of N into M.
+    outward = -1.0 if object_is_M else 1.0
+
+    indices = range(surface.num_faces())
+    centres = np.array([surface.centroid(face) for face in indices]).reshape(-1, 3)
+    pressures = np.array(
+        [field.EvaluateCartesian(face, centre) for face, centre in enumerate(centres)]
+    )
+    slopes = np.array([norm(gradient(face)) if has_gradient else np.inf for face in indices])
+    return _Faces(
+        areas=np.array([surface.area(face) for face in indices]),
+        centres_W=centres,
+        normals_W=outward
+        * np.array([surface.face_normal(face) for face in indices]).reshape(-1, 3),
+        pressures=pressures,
+        depths=pressures / slopes,
+    )
 
 
 def _body_of(scene: Scene, geometry_id: object) -> BodyIndex:

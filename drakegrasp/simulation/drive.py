@@ -10,7 +10,7 @@ with each of them:
 * `locked`: the joint keeps its angle, whatever the load.
 
 Limits of joints and actuators belong to the plant, not to its context: `disengage` restores them
-before the next attempt, and `hand_over` carries them to the scene that continues a lift.
+after a lift, and `hand_over` carries them to the scene that continues one.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
+from pydrake.multibody.tree import RevoluteJoint
 from pydrake.systems.framework import Context, EventStatus
 
 from drakegrasp.config import LiftConfig
@@ -52,12 +53,13 @@ def engage(scene: Scene, drive: Drive) -> None:
     """
     if drive == "torque":
         return
-    joints = hand_handles(scene).closing_joints
-    for joint, angle in zip(joints, closing_angles(scene), strict=True):
-        upper = angle if drive == "locked" else float(joint.position_upper_limits()[0])
-        _set_limits(joint, angle, upper)
+    handles = hand_handles(scene)
+    for joint, angle, (_, upper) in zip(
+        handles.closing_joints, closing_angles(scene), handles.closing_limits, strict=True
+    ):
+        _set_limits(joint, angle, angle if drive == "locked" else upper)
     if drive == "worm":
-        scene.simulator.set_monitor(partial(_turn_worms, scene))
+        _start_worms(scene)
 
 
 def disengage(scene: Scene) -> None:
@@ -66,68 +68,87 @@ def disengage(scene: Scene) -> None:
     scene.simulator.clear_monitor()
     for i, joint in enumerate(handles.closing_joints):
         _set_limits(joint, *handles.closing_limits[i])
-        _set_torque(scene, i, handles.hand.fingers[i].torque_limit)
+        handles.motors[i].set_effort_limit(handles.hand.fingers[i].torque_limit)
 
 
 def hand_over(scene: Scene, before: Scene) -> None:
-    """Let the drive go on in the scene that continues a lift.
+    """Let the drive go on in the scene that continues a lift, and no more in the one before.
 
     Args:
-        scene: The scene that continues.
+        scene: The scene that continues, with the state of the other one.
         before: The scene that simulated the lift until now.
     """
-    disengage(scene)
     source, target = hand_handles(before), hand_handles(scene)
-    for i, (joint, other) in enumerate(
-        zip(target.closing_joints, source.closing_joints, strict=True)
-    ):
-        _set_limits(
-            joint, float(other.position_lower_limits()[0]), float(other.position_upper_limits()[0])
-        )
-        _set_torque(scene, i, source.motors[i].effort_limit())
-    if before.simulator.get_monitor() is not None:
-        scene.simulator.set_monitor(partial(_turn_worms, scene))
+    for i, joint in enumerate(source.closing_joints):
+        _set_limits(target.closing_joints[i], *_limits(joint))
+        target.motors[i].set_effort_limit(source.motors[i].effort_limit())
+
+    worms_turn = before.simulator.get_monitor() is not None
+    disengage(before)
+    if worms_turn:
+        _start_worms(scene)
 
 
-def holding_torques(scene: Scene) -> Array:
-    """Return the torque (k,) [N m] by which the contacts push each closing joint open now."""
+def opening_torques(scene: Scene) -> Array:
+    """Return the torque (k,) [N m] by which contacts push each closing joint open now."""
+    # Contact forces in the coordinates of all joints of the hand.
+    handles, plant = hand_handles(scene), scene.plant
+    port = plant.get_generalized_contact_forces_output_port(handles.instance)
+    torques = np.zeros(plant.num_velocities())
+    plant.SetVelocitiesInArray(handles.instance, port.Eval(scene.context), torques)
+
+    # A motor turns its joints at fixed ratios, so it carries their torques by the same ratios.
+    return np.array(
+        [
+            -sum(ratio * torques[joint.velocity_start()] for joint, ratio in driven.items())
+            for driven in handles.driven
+        ]
+    )
+
+
+def _start_worms(scene: Scene) -> None:
+    turn = partial(_turn_worms, scene)
+    turn(scene.simulator.get_context())
+    scene.simulator.set_monitor(turn)
+
+
+def _turn_worms(scene: Scene, _: Context) -> EventStatus:
+    """Between two steps: follow the fingers that closed, and yield where a load is too large."""
     handles = hand_handles(scene)
-    port = scene.plant.get_generalized_contact_forces_output_port(handles.instance)
-    return -np.asarray(handles.closing_gain @ port.Eval(scene.context))
+    angles, rates = closing_angles(scene), closing_rates(scene)
 
+    # Set the limits before loads are read: Drake solves this state once, for the loads and for the
+    # step that follows.
+    for i, finger in enumerate(handles.hand.fingers):
+        joint, motor = handles.closing_joints[i], handles.motors[i]
+        lower, upper = _limits(joint)
+        yields = motor.effort_limit() > finger.torque_limit
+        if yields and rates[i] >= 0.0:
+            # A finger that yielded stands again: from now on the worm holds it here.
+            motor.set_effort_limit(finger.torque_limit)
+            _set_limits(joint, min(angles[i], upper), upper)
+        elif not yields and angles[i] > lower:
+            _set_limits(joint, min(angles[i], upper), upper)
 
-def _turn_worms(scene: Scene, context: Context) -> EventStatus:
-    """After a step: take up what the fingers have closed, and yield where a load is too large."""
-    handles = hand_handles(scene)
+    # A finger whose load exceeds what its worm holds opens against just that torque.
+    loads, overloaded = opening_torques(scene), False
+    for i, finger in enumerate(handles.hand.fingers):
+        assert finger.holding_torque is not None
+        motor = handles.motors[i]
+        if loads[i] > finger.holding_torque and motor.effort_limit() <= finger.torque_limit:
+            _set_limits(handles.closing_joints[i], *handles.closing_limits[i])
+            motor.set_effort_limit(finger.holding_torque)
+            overloaded = True
 
-    # Limits first: Drake solves this state once, for the load here and for the step that follows.
-    rates = closing_rates(scene)
-    yields = [
-        motor.effort_limit() > finger.torque_limit
-        for motor, finger in zip(handles.motors, handles.hand.fingers, strict=True)
-    ]
-    for i, (joint, angle) in enumerate(
-        zip(handles.closing_joints, closing_angles(scene), strict=True)
-    ):
-        lower, upper = (float(limit[0]) for limit in _limits(joint))
-        if yields[i] and rates[i] >= 0.0:
-            # The finger that was pushed open stands again: the worm holds it here.
-            _set_torque(scene, i, handles.hand.fingers[i].torque_limit)
-            _set_limits(joint, min(angle, upper), upper)
-        elif not yields[i] and angle > lower:
-            _set_limits(joint, min(angle, upper), upper)
-
-    # A finger whose load is beyond its strength opens against that strength.
-    loads = holding_torques(scene)
-    overloaded = [
-        i
-        for i, finger in enumerate(handles.hand.fingers)
-        if not yields[i] and finger.holding_torque is not None and loads[i] > finger.holding_torque
-    ]
-    for i in overloaded:
-        _set_limits(handles.closing_joints[i], *handles.closing_limits[i])
-        _set_torque(scene, i, handles.hand.fingers[i].holding_torque)
+    # What Drake has solved for this state is void then: a new state makes it solve again.
     if overloaded:
-        # What Drake has solved for this state holds no more.
         scene.plant.SetPositions(scene.context, scene.plant.GetPositions(scene.context))
     return EventStatus.DidNothing()
+
+
+def _limits(joint: RevoluteJoint) -> tuple[float, float]:
+    return float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0])
+
+
+def _set_limits(joint: RevoluteJoint, lower: float, upper: float) -> None:
+    joint.set_position_limits(np.array([lower]), np.array([upper]))

@@ -1,7 +1,9 @@
 """The lift of an attempt: the object is freed, and the wrist brings it to its target.
 
 In: a scene whose closed hand may lift, and the rules. Out: the contacts at the end, and where the
-object is then. Two things save time without changing the verdict:
+object is then. First the wrist stays where it is for `lift.release_time`, so that what the object
+moves by when it becomes free can be told from what the motion adds. Two things save time without
+changing the verdict:
 
 * While nothing moves in the hand, a step is `physics.coarse_steps` times as long: a grasp at rest
   needs no fine steps. A second diagram takes the coarse steps; it takes over the state.
@@ -18,8 +20,9 @@ import numpy as np
 from drakegrasp.arithmetic import multiply, norm
 from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, Array, invert_pose, rotation_angle, transform_points
-from drakegrasp.hand.finger_sweep import link_points
+from drakegrasp.hand.finger_sweep import pad_points
 from drakegrasp.simulation.contacts import Contacts, bodies_on_object, hand_bodies, read_contacts
+from drakegrasp.simulation.drive import disengage, drive_of, engage, hand_over
 from drakegrasp.simulation.scene import (
     Scene,
     WristMotion,
@@ -54,16 +57,21 @@ class Lift:
         q: Positions of the hand's joints [rad], in the plant's order.
         duration: Simulated time [s].
         X_TO: Pose of the object, (4, 4).
-        slip: Distance that {O} moved in {G} during the lift [m].
-        turn: Angle that it turned in {G} [rad].
+        X_OG: Pose of the palm, (4, 4).
+        slip: Distance that {O} moved in {G} since the object is free [m].
+        turn: Angle that it turned in {G} since then [rad].
+        slip_released, turn_released: The same before the wrist moved.
     """
 
     contacts: Contacts
     q: Array
     duration: float
     X_TO: Array
+    X_OG: Array
     slip: float
     turn: float
+    slip_released: float
+    turn_released: float
 
 
 def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
@@ -78,55 +86,77 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
         TrialTimeout: See `TrialLimits.advance`.
         StateError: See `TrialLimits.advance`.
     """
+    assert scene.handles is not None
     X_GO_start, start = _object_in_hand(scene), scene.time
 
-    # Free object and wrist, and send the wrist to its target.
+    # Free the object in the hand, then send the wrist to its target.
     release(scene)
-    motion = _start_motion(scene, config)
-    end = start + motion.duration + config.lift.hold_time
+    engage(scene, drive_of(scene.handles.hand, config.lift))
+    motion = _plan_motion(scene, config)
+    end = motion.begin + motion.duration + config.lift.hold_time
 
     # Simulate from check to check until the target was held, or the verdict is certain. `scene`
     # takes fine steps, `current` is the one that takes the steps that are needed now.
     now, current, monitor, certain = start, scene, _Monitor(scene), False
-    while now < end and not certain:
-        check = min(_next_check(now, config), end)
-        # Stop just before a step, so that rounding moves no step across a check.
-        margin = ROUNDING * current.physics.time_step if check < end else 0.0
-        limits.advance(current, check - margin - current.time)
-        certain = monitor.update(current, check - now, config.close.stop_speed)
-        now = check
+    slip_released, turn_released = 0.0, 0.0
+    try:
+        while now < end and not certain:
+            check = min(_next_check(now, config), motion.begin if now < motion.begin else end)
+            # Stop just before a step, so that rounding moves no step across a check.
+            margin = ROUNDING * current.physics.time_step if check < end else 0.0
+            limits.advance(current, check - margin - current.time)
+            certain = monitor.update(current, check - now, config.close.stop_speed)
+            now = check
 
-        # Choose the step for what comes next; the state moves to the diagram that has it.
-        if now < end and not certain:
-            chosen = _scene_for(scene, monitor.at_rest)
-            if chosen is not current:
-                transfer_state(chosen, current, now, motion)
-            current = chosen
+            # How far the object moved in the hand before the wrist moves.
+            if now <= motion.begin:
+                slip_released, turn_released = _motion(X_GO_start, _object_in_hand(current))
 
-    # Read what the hand holds now, and how far the object slipped in it.
-    slip, turn = _motion(X_GO_start, _object_in_hand(current))
+            # Choose the step for what comes next; the state moves to the diagram that has it.
+            if now < end and not certain:
+                chosen = _scene_for(scene, monitor.at_rest)
+                if chosen is not current:
+                    transfer_state(chosen, current, now, motion)
+                    hand_over(chosen, current)
+                current = chosen
+
+        # Read what the hand holds now, and how far the object slipped in it.
+        contacts, X_GO = read_contacts(current), _object_in_hand(current)
+    finally:
+        disengage(current)
+    slip, turn = _motion(X_GO_start, X_GO)
     return Lift(
-        contacts=read_contacts(current),
+        contacts=contacts,
         q=hand_positions(current),
         duration=now - start,
         X_TO=multiply(invert_pose(X_WT), current.pose(current.object)),
+        X_OG=invert_pose(X_GO),
         slip=slip,
         turn=turn,
+        slip_released=slip_released,
+        turn_released=turn_released,
     )
 
 
-def _start_motion(scene: Scene, config: Config) -> WristMotion:
-    """Command the wrist to its target, as fast as the limits allow."""
+def _plan_motion(scene: Scene, config: Config) -> WristMotion:
+    """Command the wrist to its target, as fast as the limits allow, after the release time."""
     target = X_WT[:3, 3] + config.lift.p_TG
     duration = lift_duration(float(norm(target - palm_pose(scene)[:3, 3])), config)
+    # A coarse step may begin together with the motion.
+    begin = _on_grid(scene.time + config.lift.release_time, config)
     # The palm may start at its target.
-    return move_wrist(scene, target, max(duration, config.physics.time_step))
+    return move_wrist(scene, target, max(duration, config.physics.time_step), begin=begin)
 
 
 def _next_check(now: float, config: Config) -> float:
     """Return the time of the next check [s]: after the period, where a coarse step begins."""
+    return _on_grid(now + config.lift.check_period, config)
+
+
+def _on_grid(time: float, config: Config) -> float:
+    """Return the first time [s] from a time on at which a coarse step begins."""
     step = config.physics.coarse_steps * config.physics.time_step
-    return float(np.ceil((now + config.lift.check_period) / step - ROUNDING) * step)
+    return float(np.ceil(time / step - ROUNDING) * step)
 
 
 def _scene_for(scene: Scene, at_rest: bool) -> Scene:
@@ -181,13 +211,13 @@ class _Monitor:
 
 
 def _has_lost_tip(scene: Scene) -> bool:
-    """Return whether some fingertip has lost the object for good."""
+    """Return whether the pad of some fingertip has lost the object for good."""
     assert scene.handles is not None
-    p_LP, field = link_points(scene.handles.hand), scene.model.field
-    X_OW = invert_pose(scene.pose(scene.object))
-    for tip in scene.handles.fingertips:
-        p_OP = transform_points(multiply(X_OW, scene.pose(tip)), p_LP[tip.name()])
-        distance = field.interpolate(*p_OP.astype(np.float32).T)
+    field, X_OW = scene.model.field, invert_pose(scene.pose(scene.object))
+    pads = pad_points(scene.handles.hand)
+    for tip, p_FiQ in zip(scene.handles.fingertips, pads, strict=True):
+        p_OQ = transform_points(multiply(X_OW, scene.pose(tip)), p_FiQ)
+        distance = field.interpolate(*p_OQ.astype(np.float32).T)
         if distance.min() > LOST + extra_margin(field):
             return True
     return False

@@ -17,6 +17,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
     FixedOffsetFrame,
+    JointActuator,
     ModelInstanceIndex,
     PrismaticJoint,
     RevoluteJoint,
@@ -47,6 +48,9 @@ class HandHandles:
     wrist_trajectory: TrajectorySource
     fingertips: tuple[RigidBody, ...]
     closing_joints: tuple[RevoluteJoint, ...]
+    closing_limits: tuple[tuple[float, float], ...]  # of the closing joints' angles [rad]
+    driven: tuple[dict[RevoluteJoint, float], ...]  # joints that each motor turns, and their ratios
+    motors: tuple[JointActuator, ...]  # of the closing joints
     parts: tuple[tuple[GeometryId, Array], ...]  # each shape of the hand with a point inside it
 
 
@@ -186,13 +190,16 @@ class WristMotion:
     duration: float
 
 
-def move_wrist(scene: Scene, p_WG_target: npt.ArrayLike, duration: float) -> WristMotion:
-    """Command a straight minimum-jerk motion of the wrist that starts here and now.
+def move_wrist(
+    scene: Scene, p_WG_target: npt.ArrayLike, duration: float, *, begin: float | None = None
+) -> WristMotion:
+    """Command a straight minimum-jerk motion of the wrist from where it is now.
 
     Args:
         scene: A scene with a hand.
         p_WG_target: Target of the palm's origin, (3,) [m]; it stays there afterwards.
         duration: Of the motion [s].
+        begin: Time at which it begins [s]; None is now.
 
     Raises:
         ValueError: If the scene has no hand.
@@ -201,7 +208,7 @@ def move_wrist(scene: Scene, p_WG_target: npt.ArrayLike, duration: float) -> Wri
     motion = WristMotion(
         p_start=np.array([joint.get_translation(scene.context) for joint in joints]),
         p_end=np.asarray(p_WG_target, dtype=float),
-        begin=scene.time,
+        begin=scene.time if begin is None else begin,
         duration=duration,
     )
     _follow(scene, motion)
@@ -268,7 +275,9 @@ def finger_speed(scene: Scene) -> float:
 
 def closing_angles(scene: Scene) -> Array:
     """Return the angle of each finger's closing joint (k,) [rad]."""
-    return np.array([joint.get_angle(scene.context) for joint in hand_handles(scene).closing_joints])
+    return np.array(
+        [joint.get_angle(scene.context) for joint in hand_handles(scene).closing_joints]
+    )
 
 
 def hand_positions(scene: Scene) -> Array:

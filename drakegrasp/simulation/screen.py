@@ -51,8 +51,8 @@ class Prediction:
         clear: Whether the open hand is farther from object and table than the margin.
         closing: (k,), closing angles up to which the fingers meet nothing [rad]; empty with an
             outcome.
-        last: (k,), closing angles beyond which a fingertip cannot meet the object any more [rad];
-            empty with an outcome.
+        last: (k,), closing angles beyond which a fingertip's pad cannot meet the object any more
+            [rad]; empty with an outcome.
     """
 
     outcome: Outcome | None
@@ -242,9 +242,9 @@ class _Sweep:
     Attributes:
         rows: (a,), the attempts, ascending.
         start: (a,), last evaluated angle up to which the finger keeps its clearance.
-        arrives: (a,), whether the fingertip comes within reach of the object before the finger is
-            blocked.
-        last: (a,), last evaluated angle with the fingertip within reach.
+        arrives: (a,), whether the fingertip's pad comes within reach of the object before the
+            finger is blocked.
+        last: (a,), last evaluated angle with the pad within reach.
     """
 
     rows: Counts
@@ -271,12 +271,12 @@ def _sweep_finger(
     starting = np.ones(count, dtype=np.bool_)
     clearance, reach = np.float32(config.clearance), np.float32(config.reach_margin)
     block = np.float32(config.block_margin)
-    rate, tip_rate = 1.0 / path.travel, 1.0 / path.travel[: path.tip]
+    rate, pad_rate = 1.0 / path.travel, 1.0 / path.travel[: path.pad]
     while len(active):
         # Where the finger's points are now: from the object, and from object and table.
         points = path.points[k[active]]
         to_object = lookup.distances(rows[active], points, config.clearance)
-        to_tip = to_object[:, : path.tip]
+        to_pad = to_object[:, : path.pad]
         to_any = np.minimum(to_object, lookup.heights(rows[active], points))
         least = to_any.min(axis=1)
 
@@ -285,14 +285,14 @@ def _sweep_finger(
         start[active[far]] = k[active[far]]
         starting[active] = far
 
-        # The fingertip is within reach of the object.
-        within = to_tip.min(axis=1) <= reach
+        # The fingertip's pad is within reach of the object.
+        within = to_pad.min(axis=1) <= reach
         arrives[active[within]] = True
         last[active[within]] = k[active[within]]
 
-        # Advance until a point may be blocked, the fingertip within reach, or the start found.
+        # Advance until a point may be blocked, the pad within reach, or the start found.
         room = ((to_any + block) * rate).min(axis=1)
-        to_reach = np.where(within, 0, ((to_tip - reach) * tip_rate).min(axis=1))
+        to_reach = np.where(within, 0, ((to_pad - reach) * pad_rate).min(axis=1))
         np.minimum(room, to_reach, out=room)
         if far.any():
             room[far] = np.minimum(room[far], ((to_any[far] - clearance) * rate).min(axis=1))

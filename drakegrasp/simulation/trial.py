@@ -50,8 +50,10 @@ class TrialRecord:
             order.
         time_close, time_lift: Simulated time of the two stages [s].
         X_TO_lifted: Pose of the object after the lift, (4, 4).
+        X_OG_lifted: Pose of the palm then, (4, 4).
         slip: Distance that {O} moved in {G} during the lift [m].
         turn: Angle that it turned in {G} [rad].
+        slip_released, turn_released: The same while the object is free and the wrist still stands.
         message: First line of the error for `solver_error`, else empty.
     """
 
@@ -65,8 +67,11 @@ class TrialRecord:
     time_close: float = 0.0
     time_lift: float = 0.0
     X_TO_lifted: Array | None = None
+    X_OG_lifted: Array | None = None
     slip: float = np.nan
     turn: float = np.nan
+    slip_released: float = np.nan
+    turn_released: float = np.nan
     message: str = field(default="")
 
 
@@ -146,8 +151,11 @@ def run_attempt(
             q_lifted=end.q,
             time_lift=end.duration,
             X_TO_lifted=end.X_TO,
+            X_OG_lifted=end.X_OG,
             slip=end.slip,
             turn=end.turn,
+            slip_released=end.slip_released,
+            turn_released=end.turn_released,
         )
     except TrialTimeout:
         return replace(start, outcome=Outcome.TIMEOUT)

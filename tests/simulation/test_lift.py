@@ -62,7 +62,8 @@ def test_lift_with_coarse_steps_ends_as_one_without(scene, cube, config, hand, m
     assert throughout.coarse_scene is None
     by_fine = run_attempt(throughout, standing(cube), attempt, fine)
     assert by_coarse.outcome is by_fine.outcome is Outcome.SUCCESS
-    assert by_coarse.time_lift == pytest.approx(by_fine.time_lift, abs=1e-9)
+    # The wrist starts where a step of the longest kind begins.
+    assert by_coarse.time_lift == pytest.approx(by_fine.time_lift, abs=long)
     assert np.allclose(by_coarse.X_TO_lifted[:3, 3], by_fine.X_TO_lifted[:3, 3], atol=1e-3)
     assert np.allclose(by_coarse.X_TO_lifted[:3, :3], by_fine.X_TO_lifted[:3, :3], atol=0.02)
     assert np.allclose(by_coarse.lifted.f_Q_O, by_fine.lifted.f_Q_O, atol=1.0)
@@ -120,11 +121,13 @@ def test_lift_ends_where_a_fingertip_stays_off(scene, cube, config, monkeypatch,
     close(scene, cube)
     distance = np.linalg.norm(X_WT[:3, 3] + config.lift.p_TG - palm_pose(scene)[:3, 3])
     whole = lift_duration(float(distance), config) + config.lift.hold_time
+    whole += config.lift.release_time
+    long = config.physics.coarse_steps * config.physics.time_step
     found = lift(scene, start_limits(config), config)
     if where == "off":
         assert found.duration < 0.9 * whole
     else:
-        assert found.duration == pytest.approx(whole, abs=1e-6)
+        assert whole - 1e-6 < found.duration < whole + long
 
 
 def test_lift_ends_when_the_object_is_lost(cube, config, hand):
@@ -134,3 +137,14 @@ def test_lift_ends_when_the_object_is_lost(cube, config, hand):
     assert record.outcome is Outcome.DROPPED
     whole = lift_duration(0.60 - CUBE - STANDOFF, slippery) + slippery.lift.hold_time
     assert record.time_lift < 0.7 * whole
+
+
+def test_slip_before_the_wrist_moves_is_told_apart(scene, cube, config):
+    """It creeps where fingers can be pushed open: a little while the wrist waits."""
+    torque = override_config(config, ["lift.drive=torque", "lift.release_time=0.5"])
+    still = override_config(torque, ["lift.p_TG=[0, 0, 0.13]"])
+    moved = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), torque)
+    waited = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), still)
+    assert 1e-5 < moved.slip_released < 0.5 * moved.slip
+    assert moved.slip_released == pytest.approx(waited.slip_released, rel=1e-6)
+    assert 1e-5 < moved.turn_released < moved.turn

@@ -1,0 +1,223 @@
+"""What keeps fingers from being pushed open during a lift: nothing, a worm gear, or a lock."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.hands import write_pincer
+from helpers.objects import STANDOFF, box_model, from_above, standing
+from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.plant import ExternallyAppliedSpatialForce
+
+from drakegrasp.config import Config, override_config
+from drakegrasp.errors import ConfigError
+from drakegrasp.frames import X_WT
+from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.outcomes import Outcome
+from drakegrasp.simulation import lift as lifting
+from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.drive import (
+    disengage,
+    drive_of,
+    engage,
+    hand_over,
+    opening_torques,
+)
+from drakegrasp.simulation.scene import (
+    Scene,
+    advance,
+    closing_angles,
+    move_wrist,
+    release,
+    reset_attempt,
+    transfer_state,
+)
+from drakegrasp.simulation.stepping import TrialTimeout, start_limits
+from drakegrasp.simulation.trial import TrialRecord, run_attempt
+
+#: Rounding and the compliance of Drake's joint limits [rad].
+STILL = np.deg2rad(0.02)
+
+
+def test_configuration_overrides_the_drive_of_the_hand(config: Config, hand: Hand) -> None:
+    assert drive_of(hand, config.lift) == "worm"
+    assert drive_of(hand, override_config(config, ["lift.drive=torque"]).lift) == "torque"
+
+
+def test_worm_needs_a_holding_torque(config: Config, tmp_path: Path) -> None:
+    pincer = load_hand(write_pincer(tmp_path))
+    assert drive_of(pincer, config.lift) == "torque"
+    with pytest.raises(ConfigError, match=r"lift\.drive: must be torque or locked .* got 'worm'"):
+        drive_of(pincer, override_config(config, ["lift.drive=worm"]).lift)
+
+
+@pytest.fixture(scope="module")
+def carton(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
+    return box_model(tmp_path_factory.mktemp("carton"), [0.06, 0.06, 0.10])
+
+
+@pytest.fixture(scope="module")
+def pinch(carton: ObjectModel, config: Config, hand: Hand) -> dict[str, TrialRecord]:
+    """The carton, pinched symmetrically from above, by drive."""
+    scene = build_scene(carton, config.physics, hand)
+    return {
+        drive: run_attempt(
+            scene,
+            standing(carton),
+            from_above(carton, STANDOFF),
+            override_config(config, [f"lift.drive={drive}"]),
+        )
+        for drive in ("worm", "torque", "locked")
+    }
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("drive", ["worm", "locked"])
+def test_pinched_carton_stays_where_it_is(pinch: dict[str, TrialRecord], drive: str) -> None:
+    held = pinch[drive]
+    assert held.outcome is Outcome.SUCCESS
+    assert held.slip < 1e-3
+    assert held.turn < np.deg2rad(1.0)
+
+
+@pytest.mark.sim
+def test_fingers_without_a_worm_are_pushed_open(pinch: dict[str, TrialRecord]) -> None:
+    """Finger 3 is as strong as the two that it opposes: nothing centres the carton."""
+    pushed = pinch["torque"]
+    assert pushed.slip > 15e-3
+    assert pushed.turn > np.deg2rad(8.0)
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("coarse", [False, True])
+def test_worm_lets_no_finger_open(
+    scene: Scene, cube: ObjectModel, config: Config, coarse: bool
+) -> None:
+    """A force that the motors cannot hold, in steps of either kind and across their change."""
+    current = _closed_on(scene, cube)
+    engage(current, "worm")
+    if coarse:
+        current = _continued_in_coarse_steps(scene, config)
+
+    angles = _pushed(current, FORCE, steps=20)
+    loads = opening_torques(current)
+    disengage(current)
+    torques = [finger.torque_limit for finger in current.handles.hand.fingers]
+    assert np.any(loads > 1.2 * np.array(torques))
+    assert np.diff(angles, axis=0).min() > -STILL
+
+
+@pytest.mark.sim
+def test_force_opens_fingers_without_a_worm(scene: Scene, cube: ObjectModel) -> None:
+    _closed_on(scene, cube)
+    engage(scene, "torque")
+    angles = _pushed(scene, FORCE, steps=20)
+    assert (angles[-1] - angles[0]).min() < np.deg2rad(-5.0)
+
+
+@pytest.mark.sim
+def test_locked_fingers_keep_their_angles(scene: Scene, cube: ObjectModel) -> None:
+    _closed_on(scene, cube)
+    engage(scene, "locked")
+    angles = _pushed(scene, 5.0 * FORCE, steps=20)
+    disengage(scene)
+    assert np.abs(angles - angles[0]).max() < STILL
+
+
+@pytest.mark.sim
+def test_worm_yields_beyond_its_strength_and_holds_again(
+    cube: ObjectModel, config: Config, hand: Hand
+) -> None:
+    """While it opens, a finger still pushes back with what it can hold."""
+    strength = 2.5
+    fingers = tuple(replace(finger, holding_torque=strength) for finger in hand.fingers[:2])
+    weak = replace(hand, fingers=(*fingers, hand.fingers[2]))
+    scene = build_scene(cube, config.physics, weak)
+    _closed_on(scene, cube)
+    engage(scene, "worm")
+    opened = _pushed(scene, FORCE, steps=8)
+    loads = opening_torques(scene)[:2]
+    assert (opened[-1] - opened[0])[:2].max() < np.deg2rad(-0.3)
+    assert loads == pytest.approx(strength, rel=0.02)
+
+    # Once the load is gone the motors close the fingers, with their own torque again.
+    stood = _pushed(scene, 0.0, steps=20)
+    assert np.diff(stood[2:, :2], axis=0).min() > -STILL
+    limits = [motor.effort_limit() for motor in scene.handles.motors]
+    assert limits == [finger.torque_limit for finger in weak.fingers]
+    disengage(scene)
+
+
+@pytest.mark.sim
+def test_worm_holds_what_is_within_its_strength(scene: Scene, cube: ObjectModel) -> None:
+    """The loads that it carries are those of the contacts: force times lever, motor included."""
+    _closed_on(scene, cube)
+    assert opening_torques(scene) == pytest.approx([2.0, 2.0, 4.0], rel=0.02)
+
+
+@pytest.mark.sim
+def test_lift_leaves_the_hand_as_it_was(
+    scene: Scene, cube: ObjectModel, config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where it is cut off: limits belong to the plant, which the next attempt uses."""
+
+    def limits() -> list[float]:
+        handles = scene.handles
+        lower = [float(joint.position_lower_limits()[0]) for joint in handles.closing_joints]
+        return [*lower, *(motor.effort_limit() for motor in handles.motors)]
+
+    before = limits()
+    _closed_on(scene, cube)
+    lifting.lift(scene, start_limits(config), config)
+    assert limits() == before
+
+    def too_late(*_: object) -> None:
+        raise TrialTimeout
+
+    monkeypatch.setattr(lifting._Monitor, "update", too_late)
+    _closed_on(scene, cube)
+    with pytest.raises(TrialTimeout):
+        lifting.lift(scene, start_limits(config), config)
+    assert limits() == before
+    assert scene.simulator.get_monitor() is None
+
+
+#: Pulls the cube towards fingers 1 and 2 [N]; their motors hold what finger 3 pushes with.
+FORCE = 40.0
+
+
+def _closed_on(scene: Scene, cube: ObjectModel) -> Scene:
+    """Return the scene with the hand closed on the cube, which is free."""
+    X_WO = X_WT @ standing(cube)
+    reset_attempt(scene, X_WO, X_WO @ from_above(cube, STANDOFF).X_OG, spread=0.0)
+    advance(scene, 2.4)
+    release(scene)
+    return scene
+
+
+def _continued_in_coarse_steps(scene: Scene, config: Config) -> Scene:
+    coarse = scene.coarse_scene()
+    motion = move_wrist(scene, X_WT[:3, 3] + config.lift.p_TG, 1.0, begin=1e3)
+    transfer_state(coarse, scene, 2.4, motion)
+    hand_over(coarse, scene)
+    return coarse
+
+
+def _pushed(scene: Scene, force: float, *, steps: int) -> np.ndarray:
+    """Return the closing angles (steps + 1, k) [rad] while a force pulls the object along y [N]."""
+    applied = ExternallyAppliedSpatialForce()
+    applied.body_index = scene.object.index()
+    applied.p_BoBq_B = np.zeros(3)
+    applied.F_Bq_W = SpatialForce(np.zeros(3), np.array([0.0, force, 0.0]))
+    scene.plant.get_applied_spatial_force_input_port().FixValue(scene.context, [applied])
+    angles = [closing_angles(scene)]
+    for _ in range(steps):
+        advance(scene, 0.024)
+        angles.append(closing_angles(scene))
+    applied.F_Bq_W = SpatialForce(np.zeros(3), np.zeros(3))
+    scene.plant.get_applied_spatial_force_input_port().FixValue(scene.context, [applied])
+    return np.array(angles)
