@@ -70,7 +70,7 @@ def test_draw_depends_on_the_seed_alone(dataset, tmp_path):
     def drawn(out):
         return [lift.trial_id for lift in draw_lifts(out, 8)]
 
-    assert drawn(dataset) == drawn(dataset) == [0, 6, 12][:0] + drawn(dataset)
+    assert drawn(dataset) == drawn(dataset)
     other = make_dataset(tmp_path / "data", tmp_path, "seed=5")
     assert drawn(other) != drawn(dataset)
 
@@ -84,7 +84,7 @@ def test_dataset_without_lifts_is_refused(dataset, tmp_path):
     out = make_dataset(tmp_path / "data", tmp_path)
     with h5py.File(out / TRIALS, "r+") as file:
         file["trials/outcome"][:] = Outcome.RAY_MISS
-    with pytest.raises(DataError, match="got one in which nothing was lifted$"):
+    with pytest.raises(DataError, match="got one in which nothing was lifted"):
         draw_lifts(out, 5)
 
 

@@ -11,11 +11,14 @@ from helpers.objects import CUBE, box_model, from_above, standing
 from drakegrasp.config import Config, load_config, override_config
 from drakegrasp.frames import make_pose
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.kinematics import fingertip_poses
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 
 pytest.importorskip("mujoco")
 pytest.importorskip("coacd")
+
+import mujoco
 
 from drakegrasp.bench import mujoco_baseline
 from drakegrasp.bench.mujoco_baseline import MujocoBaseline
@@ -78,10 +81,21 @@ def test_slippery_cube_is_not_held(cube: ObjectModel, config: Config) -> None:
     assert trial.outcome in (Outcome.DROPPED, Outcome.SLIPPED)
 
 
-def test_spread_turns_the_fingers(baseline: MujocoBaseline, cube: ObjectModel) -> None:
-    """At 90 degrees both spread fingers are at the sides, where the third does not oppose them."""
-    trial = baseline.run(from_above(cube, STANDOFF, spread=float(np.deg2rad(90.0))))
-    assert trial.outcome is not Outcome.SUCCESS
+def test_fingertips_are_where_kinematics_puts_them(
+    baseline: MujocoBaseline, cube: ObjectModel
+) -> None:
+    """At 90 degrees of spread the fingers still have every joint of the hand's files."""
+    attempt = from_above(cube, STANDOFF, spread=float(np.deg2rad(90.0)))
+    baseline.run(attempt)
+    m, d, hand = baseline._model, baseline._data, load_hand()
+    mujoco.mj_kinematics(m, d)
+    closing = [float(d.joint(finger.closing_joint).qpos[0]) for finger in hand.fingers]
+    X_WB = make_pose(d.body(hand.palm_link).xmat.reshape(3, 3), d.body(hand.palm_link).xpos)
+    for finger, X_GF in zip(
+        hand.fingers, fingertip_poses(hand, spread=attempt.spread, closing=closing), strict=True
+    ):
+        found = d.body(finger.fingertip).xpos
+        assert found == pytest.approx((X_WB @ hand.X_BG @ X_GF)[:3, 3], abs=1e-4)
 
 
 def peer(model: ObjectModel, *overrides: str) -> MujocoBaseline:
@@ -134,18 +148,38 @@ def test_worm_yields_beyond_its_strength(
     assert trial.slip > 5e-3
 
 
-def test_contact_beside_the_pad_is_no_fingertip(
+def test_contact_beside_the_pad_is_of_another_link(
     cube: ObjectModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    weak(monkeypatch, pad_region=((1.0, 0.0, 0.0, 0.05),))  # nearer to the tip than the contact
-    assert peer(cube).run(from_above(cube, STANDOFF)).outcome is Outcome.MISSING_FINGERTIP
-    weak(monkeypatch, pad_region=((-1.0, 0.0, 0.0, -0.06),))  # all but the tip
-    assert peer(cube).run(from_above(cube, STANDOFF)).outcome is Outcome.SUCCESS
+    """The fingertips meet the cube 55 mm from the distal joint."""
+    attempt = from_above(cube, STANDOFF)
+    weak(monkeypatch, pad_region=((1.0, 0.0, 0.0, 0.054), (-1.0, 0.0, 0.0, -0.056)))
+    baseline = peer(cube)
+    assert baseline.run(attempt).outcome is Outcome.SUCCESS
+    assert baseline._contacts().other_links == 0
+
+    weak(monkeypatch, pad_region=((1.0, 0.0, 0.0, 0.06),))
+    baseline = peer(cube)
+    assert baseline.run(attempt).outcome is Outcome.MISSING_FINGERTIP
+    assert baseline._contacts().other_links == 3
 
 
-def test_palm_that_touches_is_another_link(cube: ObjectModel) -> None:
-    trial = peer(cube).run(from_above(cube, 0.03))
-    assert trial.outcome is Outcome.HAND_CONTACT
+def test_contact_weaker_than_the_limit_does_not_count(cube: ObjectModel) -> None:
+    attempt = from_above(cube, STANDOFF)
+    trial = peer(cube, "physics.contact_force=100").run(attempt)
+    assert trial.outcome is Outcome.MISSING_FINGERTIP
+
+
+def test_friction_with_the_table_is_the_tables(cube: ObjectModel) -> None:
+    X_TO = standing(cube)
+    X_TO[2, 3] -= 1e-4
+    config = load_config(overrides=["physics.friction_hand=7.1", "physics.friction_table=0.3"])
+    baseline = MujocoBaseline(cube, X_TO, config)
+    baseline.run(from_above(cube, 0.3))
+    data = baseline._data
+    coefficients = [contact.friction[0] for contact in data.contact[: data.ncon]]
+    assert coefficients
+    assert coefficients == pytest.approx([0.3] * len(coefficients))
 
 
 def test_wrist_waits_while_the_object_is_released(cube: ObjectModel) -> None:
