@@ -105,6 +105,7 @@ class MujocoBaseline:
         self._wrist_v = [m.joint(f"wrist_{axis}").dofadr[0] for axis in "xyz"]
         q, v = m.joint("object").qposadr[0], m.joint("object").dofadr[0]
         self._object_q, self._object_v = slice(q, q + 7), slice(v, v + 6)
+        self._object_inertia = m.dof_M0[self._object_v].copy()
         closing = [finger.closing_joint for finger in hand.fingers]
         self._closing_v = [m.joint(name).dofadr[0] for name in closing]
 
@@ -145,7 +146,7 @@ class MujocoBaseline:
         m, d = self._model, self._data
         mujoco.mj_resetData(m, d)
         self._drive.disengage()
-        m.dof_armature[self._object_v] = IMMOVABLE
+        self._clamp_object(True)
 
         # The wrist has no rotation and the spread is locked, so both turn bodies of the model.
         X_WB = X_WG @ invert_pose(self._hand.X_BG)
@@ -156,6 +157,13 @@ class MujocoBaseline:
         d.qpos[self._wrist_q] = X_WB[:3, 3]
         d.qpos[self._object_q] = [*self._X_WO[:3, 3], *quaternion(self._X_WO[:3, :3])]
         mujoco.mj_forward(m, d)
+
+    def _clamp_object(self, clamp: bool) -> None:
+        """Give the object an inertia that no contact moves, or its own."""
+        # MuJoCo takes the inertia of a body whose centre of mass is its origin from dof_M0.
+        added = IMMOVABLE if clamp else 0.0
+        self._model.dof_armature[self._object_v] = added
+        self._model.dof_M0[self._object_v] = self._object_inertia + added
 
     def _close(self) -> None:
         """Close the fingers on the object, which is held in place, until they stop."""
@@ -174,7 +182,7 @@ class MujocoBaseline:
     def _lift(self, X_WG: Array) -> None:
         """Free the object, move the wrist to its target and hold it; end early if all is lost."""
         d, rules = self._data, self._config.lift
-        self._model.dof_armature[self._object_v] = 0.0
+        self._clamp_object(False)
         self._drive.engage(d)
 
         # The wrist stands still while the object is released, then moves as in Drake.

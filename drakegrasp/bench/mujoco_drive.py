@@ -27,6 +27,12 @@ class FingerDrive:
         self._joints = np.array([model.joint(f.closing_joint).id for f in hand.fingers])
         self._motors = np.array([model.actuator(f.name).id for f in hand.fingers])
         self._q, self._v = model.jnt_qposadr[self._joints], model.jnt_dofadr[self._joints]
+        # A motor turns its joints at fixed ratios, so it carries their torques by the same ratios.
+        self._gain = np.zeros((len(self._joints), model.nv))
+        for i, finger in enumerate(hand.fingers):
+            self._gain[i, self._v[i]] = 1.0
+            for coupling in finger.coupled:
+                self._gain[i, model.joint(coupling.joint).dofadr[0]] = coupling.ratio
         self._range = model.jnt_range[self._joints].copy()
         self._torque = np.array([finger.torque_limit for finger in hand.fingers])
         self._holding = np.array([finger.holding_torque or np.inf for finger in hand.fingers])
@@ -67,17 +73,16 @@ class FingerDrive:
         self._set_torques()
 
     def loads(self, data: mujoco.MjData) -> Array:
-        """Return the load (k,) [N m] that motor and worm of each finger carried in the last step.
+        """Return the torque (k,) [N m] by which contacts pushed each finger open in the last step.
 
-        It is the torque by which the contacts push a resting finger open.
+        Torques that a caller applies to joints count as contacts. Reactions of motors and limits do
+        not: where a finger runs into its limit they are larger for a step.
         """
-        loads = data.actuator_force[self._motors].copy()
-        below = data.qpos[self._q] < self._range[:, 1]
-        limits = data.efc_type == mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT
-        for joint, force in zip(data.efc_id[limits], data.efc_force[limits], strict=True):
-            # Below its end a joint can only be at its lower limit, which pushes towards closing.
-            loads[(self._joints == joint) & below] += force
-        return np.asarray(loads)
+        is_contact = data.efc_type >= int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
+        torques = np.zeros(self._model.nv)
+        forces = np.where(is_contact, data.efc_force, 0.0)
+        mujoco.mj_mulJacTVec(self._model, data, torques, forces)
+        return np.asarray(-self._gain @ (torques + data.qfrc_applied))
 
     def _set_torques(self) -> None:
         torque = np.where(self._yields, self._holding, self._torque)

@@ -9,7 +9,7 @@ import pytest
 from helpers.objects import CUBE, box_model, from_above, standing
 
 from drakegrasp.config import Config, load_config, override_config
-from drakegrasp.frames import make_pose
+from drakegrasp.frames import X_WT, make_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import fingertip_poses
 from drakegrasp.objects.model import ObjectModel
@@ -22,6 +22,7 @@ import mujoco
 
 from drakegrasp.bench import mujoco_baseline
 from drakegrasp.bench.mujoco_baseline import MujocoBaseline
+from drakegrasp.bench.mujoco_scene import TIME_STEP
 
 pytestmark = pytest.mark.sim
 
@@ -182,10 +183,44 @@ def test_friction_with_the_table_is_the_tables(cube: ObjectModel) -> None:
     assert coefficients == pytest.approx([0.3] * len(coefficients))
 
 
-def test_wrist_waits_while_the_object_is_released(cube: ObjectModel) -> None:
-    """A lift that is over when the wrist would move has lifted nothing."""
+def test_wrist_waits_while_the_object_is_released(
+    cube: ObjectModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After closing it stands for the release time, and then follows its path to the target."""
+    baseline, path = peer(cube, "lift.release_time=0.5"), []
+    step, close = baseline._step, baseline._close
+
+    def record(p_WB: np.ndarray) -> None:
+        path.append(np.array(p_WB))
+        step(p_WB)
+
+    def close_and_forget() -> None:
+        close()
+        path.clear()
+
+    monkeypatch.setattr(baseline, "_step", record)
+    monkeypatch.setattr(baseline, "_close", close_and_forget)
     attempt = from_above(cube, STANDOFF)
-    now, later = (peer(cube, f"lift.release_time={time}") for time in (0.0, 0.5))
-    for baseline in (now, later):
-        assert baseline.run(attempt).outcome is Outcome.SUCCESS
-    assert later._data.time - now._data.time == pytest.approx(0.5, abs=0.003)
+    assert baseline.run(attempt).outcome is Outcome.SUCCESS
+    positions, wait = np.array(path), round(0.5 / TIME_STEP)
+    np.testing.assert_allclose(positions[:wait], positions[[0] * wait], atol=1e-12)
+    assert np.linalg.norm(positions[wait + 50] - positions[0]) > 1e-4
+    config, hand = baseline._config, load_hand()
+    X_WG = X_WT @ standing(cube) @ attempt.X_OG
+    shift = X_WT[:3, 3] + config.lift.p_TG - X_WG[:3, 3]
+    start = (X_WG @ np.linalg.inv(hand.X_BG))[:3, 3]
+    np.testing.assert_allclose(positions[0], start, atol=1e-6)
+    np.testing.assert_allclose(positions[-1], start + shift, atol=1e-6)
+    np.testing.assert_allclose(baseline._data.qpos[baseline._wrist_q], start + shift, atol=1e-4)
+
+
+def test_nothing_moves_the_object_while_the_hand_closes(cube: ObjectModel) -> None:
+    """A palm off the middle closes with one finger first, which pushes on the cube."""
+    attempt = from_above(cube, STANDOFF)
+    attempt = replace(attempt, X_OG=attempt.X_OG @ make_pose(np.eye(3), [0.0, 0.02, 0.0]))
+    baseline = peer(cube)
+    baseline._reset(X_WT @ standing(cube) @ attempt.X_OG, 0.0)
+    baseline._close()
+    data = baseline._data
+    assert baseline._contacts().touching.any()
+    assert np.abs(data.qacc[baseline._object_v]).max() < 0.01
