@@ -256,8 +256,9 @@ def _add_hand(
     joints = _add_wrist(plant, wrist_instance)
     (instance,) = make_parser(plant).AddModels(hand.sdf_path)
     base = plant.GetBodyByName(hand.palm_link, instance)
+    # Links of any name may be in the hand's model: ours must not be one of them.
     palm = plant.AddFrame(
-        FixedOffsetFrame("palm", base.body_frame(), RigidTransform(hand.X_BG), instance)
+        FixedOffsetFrame("drakegrasp_palm", base.body_frame(), RigidTransform(hand.X_BG), instance)
     )
     wrist = plant.AddFrame(
         FixedOffsetFrame("wrist", joints[-1].child_body().body_frame(), RigidTransform())

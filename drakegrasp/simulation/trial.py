@@ -19,6 +19,7 @@ from drakegrasp.frames import X_WT, Array
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import Contacts, open_hand_collides, read_contacts
+from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.lift import lift
 from drakegrasp.simulation.scene import (
     Scene,
@@ -95,9 +96,12 @@ def run_attempt(
             record is the same without.
 
     Raises:
+        ConfigError: If the hand cannot have the drive that the configuration asks for.
         MemoryError: If the machine runs out of memory.
         OSError: If a file of the hand cannot be read.
     """
+    if scene.handles is not None:
+        drive_of(scene.handles.hand, config.lift)
     X_TO = np.asarray(X_TO, dtype=float)
     start = TrialRecord(outcome=Outcome.RAY_MISS, X_TO=X_TO, X_OG=attempt.X_OG)
     X_WO = multiply(X_WT, X_TO)

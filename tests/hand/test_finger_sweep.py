@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from helpers.hands import write_pincer
 
-from drakegrasp.frames import transform_points
+from drakegrasp.frames import invert_pose, transform_points
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.finger_sweep import hand_paths
+from drakegrasp.hand.finger_sweep import hand_paths, pad_points
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses, link_poses
 from drakegrasp.hand.shapes import link_shapes
 
@@ -38,6 +38,21 @@ def test_points_of_a_fingertip_move_with_it(hand):
         assert distance.max() < 1e-6
         assert np.all(tips > corners.min(axis=0) - 1e-6)
         assert np.all(tips < corners.max(axis=0) + 1e-6)
+
+
+def test_points_of_the_pad_come_first(hand):
+    """They are those of the pad region and next to it; the points are 3 mm apart."""
+    for i, finger in enumerate(hand.fingers):
+        path = hand_paths(hand, 0.0).fingers[i]
+        X_FG = invert_pose(fingertip_poses(hand, spread=0.0, closing=np.zeros(3))[i])
+        p_FQ = transform_points(X_FG, path.points[0, : path.tip].astype(float))
+        x, y = p_FQ[:, 0], p_FQ[:, 1]
+        near = (x > 0.015 + 1e-6) & (y > -0.003 + 1e-6)
+        off = (x < 0.015 - 1e-6) | (y < -0.003 - 1e-6)
+        assert near[: path.pad].sum() == near.sum() > 100
+        assert off[path.pad :].sum() == off.sum() > 100
+        assert np.allclose(pad_points(hand)[i], p_FQ[: path.pad], atol=1e-6)
+        assert finger.on_pad(p_FQ).sum() < path.pad < path.tip
 
 
 def test_link_poses_of_fingertips_are_the_fingertip_poses(hand):

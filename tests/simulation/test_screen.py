@@ -83,6 +83,14 @@ def test_object_under_one_finger_only_is_screened(cube, hand):
     assert ask(cube, hand, aside).outcome in (Outcome.SCREENED, Outcome.START_COLLISION)
 
 
+def test_fingertip_that_meets_the_object_beside_its_pad_is_screened(cube, hand):
+    """The cube is between the ends of the fingertips: their first 5 mm do not come to it."""
+    backs = tuple(replace(f, pad_region=((-1.0, 0.0, 0.0, -0.005),)) for f in hand.fingers)
+    assert ask(cube, hand, from_above(cube, STANDOFF)).outcome is None
+    found = ask(cube, replace(hand, fingers=backs), from_above(cube, STANDOFF))
+    assert found.outcome is Outcome.SCREENED
+
+
 def test_wide_margins_screen_nothing_that_could_touch(cube, hand):
     attempt = from_above(cube, 0.11)
     assert ask(cube, hand, attempt, reach_margin=0.2, block_margin=1.0).outcome is None
