@@ -1,1 +1,1 @@
-"""What attempts cost: throughput, and the same attempts in MuJoCo."""
+"""What attempts cost, how much labels depend on choices, and the same attempts in MuJoCo."""

@@ -13,26 +13,28 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-import numpy as np
-import trimesh
-
+from drakegrasp.bench.fidelity import (
+    Simulated,
+    compare_labels,
+    sum_drive,
+    sum_fidelity,
+    variants,
+)
 from drakegrasp.build.attempts import TrialSetup, predict_attempts, try_attempt
 from drakegrasp.build.prepare import prepare
 from drakegrasp.build.work_unit import render_successes
-from drakegrasp.config import Config, override_config
+from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import installed_versions
 from drakegrasp.dataset.prepared_objects import PreparedObject
 from drakegrasp.errors import DataError
 from drakegrasp.hand.description import load_hand
-from drakegrasp.objects.model import ObjectModel
 from drakegrasp.objects.sources import MeshSource
-from drakegrasp.outcomes import Outcome, Stage
+from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.allocator import allocator
 from drakegrasp.runtime.blas import one_thread
 from drakegrasp.runtime.progress import Report, silent
@@ -40,36 +42,12 @@ from drakegrasp.runtime.timing import timed
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.candidates import Attempt, make_attempts
 from drakegrasp.simulation.construction import build_scene
-from drakegrasp.simulation.screen import Prediction
 from drakegrasp.simulation.trial import TrialRecord
 
 #: Attempts between two reports of progress.
 STRIDE = 50
 #: Other work on the machine disturbs CPU time less than the wall clock.
 _cpu_timed = partial(timed, clock=time.process_time)
-
-
-@dataclass(frozen=True)
-class Variant:
-    """Another way to simulate the same attempts, with which their labels are compared.
-
-    Attributes:
-        overrides: Changes of the configuration; `{half}` stands for half of its time step.
-        fine: Whether to cut each face of the object into four, so that edges are half as long.
-    """
-
-    overrides: tuple[str, ...] = ()
-    fine: bool = False
-
-
-VARIANTS = {
-    "screen_off": Variant(("screen.mode=off",)),
-    "half_step": Variant(("physics.time_step={half}", "physics.coarse_steps=1")),
-    "coarse_steps_off": Variant(("physics.coarse_steps=1",)),
-    "double_resolution": Variant(fine=True),
-    "similar": Variant(("physics.solver=similar",)),
-    "sap": Variant(("physics.solver=sap",)),
-}
 
 
 def measure(
@@ -93,7 +71,7 @@ def measure(
     Raises:
         MeshError: If a mesh cannot be prepared.
     """
-    counter = _Counter(progress, len(sources), (2 if mujoco else 1), sample)
+    counter = _Counter(progress, len(sources), (2 if mujoco else 1), len(variants(config)), sample)
     for source in sources:
         yield _measure_object(source, config, sample, mujoco, counter)
 
@@ -101,14 +79,15 @@ def measure(
 class _Counter:
     """Counts attempts for the progress bar; estimates the total from the objects so far."""
 
-    def __init__(self, progress: Report, objects: int, runs: int, sample: int) -> None:
-        self._progress, self._objects, self._runs, self._sample = progress, objects, runs, sample
+    def __init__(self, progress: Report, objects: int, runs: int, ways: int, sample: int) -> None:
+        self._progress, self._objects, self._runs = progress, objects, runs
+        self._ways, self._sample = ways, sample
         self._done = self._begun = self._known = self._grasps = 0
 
     def begin(self, attempts: int, hits: int) -> None:
         """Add the attempts of the next object."""
         self._begun += 1
-        self._known += self._runs * attempts + len(VARIANTS) * min(self._sample, hits)
+        self._known += self._runs * attempts + self._ways * min(self._sample, hits)
 
     def add(self, outcome: Outcome) -> None:
         """Count an attempt."""
@@ -123,7 +102,8 @@ def summarize(objects: Sequence[dict[str, Any]], config: Config) -> dict[str, An
     """Return the whole report: machine, versions, each object and all together."""
     total = {"objects": len(objects), **_sum_rates(objects)}
     if any("fidelity" in report for report in objects):
-        total["fidelity"] = _sum_fidelity([report["fidelity"] for report in objects])
+        total["fidelity"] = sum_fidelity([report["fidelity"] for report in objects])
+        total["drive"] = sum_drive([report["drive"] for report in objects])
     if any("peer" in report for report in objects):
         total["peer"] = _sum_baseline([report["peer"] for report in objects])
 
@@ -201,10 +181,8 @@ def _measure_object(
         report["peer"] = {**baseline, "ratio": ratio}
     if sample:
         rows = [hits[k] for k in Stream(config.seed).permutation(len(hits))[:sample]]
-        report["fidelity"] = {
-            name: _compare_labels(bench, attempts, records, predictions, rows, variant, counter)
-            for name, variant in VARIANTS.items()
-        }
+        simulated = [Simulated(attempts[k], records[k], predictions[k]) for k in rows]
+        report.update(compare_labels(bench, simulated, counter.add))
     return report
 
 
@@ -250,7 +228,7 @@ def _run_baseline(
     outcomes: Counter[str] = Counter()
     for attempt in attempts:
         with _cpu_timed(seconds, "try"):
-            outcome = baseline.run(attempt)
+            outcome = baseline.run(attempt).outcome
         outcomes[outcome.label] += 1
         counter.add(outcome)
     return {"parts": baseline.parts, **_rates(outcomes, seconds)}
@@ -260,91 +238,6 @@ def _sum_baseline(reports: Sequence[dict[str, Any]]) -> dict[str, Any]:
     ratios = [report["ratio"] for report in reports if report["ratio"] is not None]
     middle = median(ratios) if ratios else None
     return {**_sum_rates(reports), "median_ratio": middle, "ratios": len(ratios)}
-
-
-def _compare_labels(
-    bench: TrialSetup,
-    attempts: Sequence[Attempt],
-    records: Sequence[TrialRecord],
-    predictions: Sequence[Prediction | None],
-    rows: Sequence[int],
-    variant: Variant,
-    counter: _Counter,
-) -> dict[str, int]:
-    """Return counts for one variant over some of an object's attempts."""
-    # The screen works on the original surface, also if the variant has finer faces.
-    half = bench.config.physics.time_step / 2.0
-    other = override_config(bench.config, [t.format(half=half) for t in variant.overrides])
-    sample = [attempts[row] for row in rows]
-    other_predictions = predict_attempts(replace(bench, config=other), sample)
-
-    # The scene is the variant's.
-    prepared = bench.prepared
-    if variant.fine:
-        prepared = replace(prepared, model=_finer(prepared.model))
-    scene = build_scene(prepared.model, other.physics, load_hand(other.hand))
-    bench = TrialSetup(prepared=prepared, config=other, scene=scene)
-
-    # Pairs of outcomes, the first as measured; whether geometry decided the first.
-    pairs, decided = [], []
-    for row, attempt, prediction in zip(rows, sample, other_predictions, strict=True):
-        outcome = try_attempt(bench, attempt, prediction).outcome
-        counter.add(outcome)
-        pairs.append((records[row].outcome, outcome))
-        first = predictions[row]
-        decided.append(first is not None and first.outcome is not None)
-    return _count(pairs, decided)
-
-
-def _finer(model: ObjectModel) -> ObjectModel:
-    """Return an object whose collision surface is the same in four times as many faces."""
-    vertices, faces = trimesh.remesh.subdivide(model.collision_vertices, model.collision_faces)
-    return replace(model, collision_vertices=vertices, collision_faces=faces.astype(np.int32))
-
-
-def _count(pairs: Sequence[tuple[Outcome, Outcome]], decided: Sequence[bool]) -> dict[str, int]:
-    """Return how often labels differ, from pairs of outcomes: as measured, by the variant.
-
-    Args:
-        pairs: The outcomes.
-        decided: Whether geometry alone decided the first outcome of each pair.
-    """
-    success = Outcome.SUCCESS
-    # Screened attempts stand for missing fingertips, so the two are the same label.
-    alike = {Outcome.SCREENED: Outcome.MISSING_FINGERTIP}
-    flips = [(a, b) for a, b in pairs if alike.get(a, a) is not alike.get(b, b)]
-    both = list(zip(pairs, decided, strict=True))
-    return {
-        "attempts": len(pairs),
-        "flips": len(flips),
-        "simulated": sum(a.stage > Stage.PLACED for a, _ in pairs),
-        "successes": sum(a is success for a, _ in pairs),
-        "successes_other": sum(b is success for _, b in pairs),
-        "success_flips": sum(success in pair for pair in flips),
-        "decided": sum(decided),
-        "successes_lost_by_screen": sum(sure and b is success for (_, b), sure in both),
-    }
-
-
-def _sum_fidelity(reports: Sequence[dict[str, dict[str, int]]]) -> dict[str, dict[str, Any]]:
-    sums: dict[str, dict[str, Any]] = {}
-    for name in VARIANTS:
-        counts: Counter[str] = Counter()
-        for report in reports:
-            counts.update(report[name])
-        flips = counts["flips"]
-        sums[name] = {
-            **counts,
-            "flip_share": flips / max(1, counts["attempts"]),
-            "flip_share_of_simulated": flips / max(1, counts["simulated"]),
-        }
-
-    # Without the screen, the successes show what the screen loses.
-    off = sums["screen_off"]
-    lost, successes = off["successes_lost_by_screen"], off["successes_other"]
-    off["recall"] = 1.0 - lost / successes if successes else None
-    off["precision"] = 1.0 - lost / off["decided"] if off["decided"] else None
-    return sums
 
 
 def _peak_memory() -> int:

@@ -42,6 +42,12 @@ from drakegrasp.cli.options import manifest_option, set_option, units_option
 )
 @click.option("--peer", "mujoco", is_flag=True, help="Run the same attempts in MuJoCo as well.")
 @click.option(
+    "--cross-check",
+    type=(click.Path(path_type=Path), click.IntRange(min=1)),
+    metavar="OUT N",
+    help="Instead, try N stored lifts of the dataset OUT again in MuJoCo.",
+)
+@click.option(
     "--compare",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
     metavar="FILE",
@@ -58,7 +64,9 @@ from drakegrasp.cli.options import manifest_option, set_option, units_option
 @units_option
 @manifest_option
 @click.option("--quiet", is_flag=True, help="No progress bar.")
+@click.pass_context
 def bench(
+    context: click.Context,
     objects: str,
     only: tuple[str, ...],
     preset: str | None,
@@ -66,6 +74,7 @@ def bench(
     candidates: int,
     fidelity: int,
     mujoco: bool,
+    cross_check: tuple[Path, int] | None,
     compare: Path | None,
     out: Path,
     units: str,
@@ -77,24 +86,38 @@ def bench(
     The command runs in one process and writes a report as JSON.
 
     With --fidelity, it simulates N random attempts of each object again without the screen, at
-    half the time step, with four times the faces and with Drake's other solvers. With --peer
-    (pip install 'drakegrasp[peer]'), it simulates all attempts in MuJoCo as well.
+    half the time step, with four times the faces, with Drake's other solvers and with the other
+    drives of the fingers. With --peer (pip install 'drakegrasp[peer]'), it simulates all attempts
+    in MuJoCo as well.
+
+    With --cross-check OUT N, it measures no speed: it tries N lifts of the dataset OUT, held and
+    lost, again in MuJoCo and says how many of them hold there.
     """
     import json
     import tempfile
 
     from drakegrasp.bench import measure as measuring
-    from drakegrasp.cli.tables import bench_lines, bench_table, fidelity_table, print_table
+    from drakegrasp.cli.tables import (
+        bench_lines,
+        bench_table,
+        drive_line,
+        fidelity_table,
+        print_table,
+    )
     from drakegrasp.config import load_config
     from drakegrasp.objects.builtin.catalog import export_builtin
     from drakegrasp.objects.sources import find_meshes
     from drakegrasp.runtime.progress import progress_bar
 
     # What cannot be used is refused before the measurement, which takes a while.
-    if mujoco:
-        _require_mujoco()
     if not os.access(out if out.exists() else out.absolute().parent, os.W_OK):
         raise click.UsageError(f"--out must be a file that can be written, got {out}")
+    if cross_check is not None:
+        _refuse_other_options(context)
+        _cross_check(*cross_check, out, quiet)
+        return
+    if mujoco:
+        _require_mujoco("--peer")
     # The time of OpenGL's threads would count as this core's.
     os.environ.setdefault("LP_NUM_THREADS", "0")
     config = load_config(preset, [*overrides, f"candidates.max={candidates}"])
@@ -119,6 +142,7 @@ def bench(
         click.echo(line)
     if fidelity:
         print_table(fidelity_table(report["all"]["fidelity"]))
+        click.echo(drive_line(report["all"]["drive"]))
     if earlier is not None:
         report["ratio"] = measuring.compare(report, earlier)
         for key, ratio in report["ratio"].items():
@@ -128,13 +152,50 @@ def bench(
     click.echo(str(out))
 
 
-def _require_mujoco() -> None:
-    """Refuse --peer where the libraries of its extra are missing."""
+def _cross_check(dataset: Path, count: int, out: Path, quiet: bool) -> None:
+    """Try lifts of a dataset again in MuJoCo, print the agreement and write the report."""
+    import json
+
+    _require_mujoco("--cross-check")
+    from drakegrasp.bench.cross_check import cross_check
+    from drakegrasp.cli.tables import cross_check_lines, cross_check_table, print_table
+    from drakegrasp.runtime.progress import progress_bar
+
+    with progress_bar("cross-check", "lifts", show=not quiet) as progress:
+        report = cross_check(dataset, count, progress=progress)
+    print_table(cross_check_table(report["groups"]))
+    for line in cross_check_lines(report):
+        click.echo(line)
+    out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    click.echo(str(out))
+
+
+def _refuse_other_options(context: click.Context) -> None:
+    """Refuse options that do nothing with --cross-check.
+
+    Raises:
+        click.UsageError: If there is one.
+    """
+    for parameter in context.command.params:
+        source = context.get_parameter_source(str(parameter.name))
+        given = source is click.core.ParameterSource.COMMANDLINE
+        if given and parameter.name not in ("cross_check", "out", "quiet"):
+            raise click.UsageError(
+                f"--cross-check must be used with --out and --quiet alone, got {parameter.opts[0]}"
+            )
+
+
+def _require_mujoco(option: str) -> None:
+    """Refuse an option where the libraries of the extra `[peer]` are missing.
+
+    Raises:
+        click.UsageError: If one is missing.
+    """
     from importlib.util import find_spec
 
     for module in ("mujoco", "coacd"):
         if find_spec(module) is None:
-            raise click.UsageError(f"--peer needs {module}: pip install 'drakegrasp[peer]'")
+            raise click.UsageError(f"{option} needs {module}: pip install 'drakegrasp[peer]'")
 
 
 def _read_report(path: Path) -> dict[str, Any]:

@@ -230,6 +230,9 @@ def fidelity_table(counts_by_variant: Mapping[str, Mapping[str, Any]]) -> Table:
         "simulated",
         "other\nlabels",
         "of the\nsimulated",
+        "lifts",
+        "other\nverdicts",
+        "of the\nlifts",
         "grasps",
         "variant's\ngrasps",
     )
@@ -239,8 +242,11 @@ def fidelity_table(counts_by_variant: Mapping[str, Mapping[str, Any]]) -> Table:
     for name, counts in counts_by_variant.items():
         numbers = [counts[key] for key in ("attempts", "simulated", "flips")]
         grasps = [counts[key] for key in ("successes", "successes_other")]
+        lifts = [counts[key] for key in ("lifted", "lifted_flips")]
         share = f"{counts['flip_share_of_simulated']:.1%}"
-        cells = [*(f"{n:,}" for n in numbers), share, *(f"{n:,}" for n in grasps)]
+        lift_share = f"{counts['flip_share_of_lifted']:.1%}"
+        cells = [*(f"{n:,}" for n in numbers), share, *(f"{n:,}" for n in lifts), lift_share]
+        cells += [f"{n:,}" for n in grasps]
         table.add_row(name.replace("_", " "), *cells)
 
     # Without the screen, the variant's grasps show what the screen loses.
@@ -250,6 +256,51 @@ def fidelity_table(counts_by_variant: Mapping[str, Mapping[str, Any]]) -> Table:
     table.caption = f"grasps that the screen removed: {counted}"
     table.caption_justify = "left"
     return table
+
+
+def drive_line(counts: Mapping[str, Any]) -> str:
+    """Return how many labels another drive of the fingers changes, as a line."""
+    return (
+        f"labels that depend on the drive: {counts['flips']:,} of {counts['attempts']:,} attempts "
+        f"({counts['flip_share']:.1%}), of {counts['lifted']:,} lifts "
+        f"({counts['flip_share_of_lifted']:.1%})"
+    )
+
+
+#: What a group of lifts is in the dataset.
+_GROUP_HEADS = {"sample": "samples", "removed": "held, no samples", "lost": "lost"}
+
+
+def cross_check_table(groups: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Return how many stored lifts are lifted in MuJoCo, and how many of these hold, by group."""
+    table = _table("Stored lifts, tried again in MuJoCo")
+    table.add_column("in the dataset", no_wrap=True)
+    heads = ("lifts", "not lifted\nthere", "lifted\nthere", "of these\nhold", "share")
+    for head in (*heads, "95 %\nconfidence"):
+        table.add_column(head, justify="right", no_wrap=True)
+
+    for group, counts in groups.items():
+        drawn, lifted, held = (counts[key] for key in ("drawn", "lifted", "held"))
+        cells = [f"{n:,}" for n in (drawn, drawn - lifted, lifted, held)]
+        cells += (
+            [f"{counts['share']:.1%}", f"{counts['low']:.1%} to {counts['high']:.1%}"]
+            if lifted
+            else ["-", "-"]
+        )
+        table.add_row(_GROUP_HEADS[group], *cells)
+    return table
+
+
+def cross_check_lines(report: Mapping[str, Any]) -> list[str]:
+    """Return the drive, why lifts are not lifted in MuJoCo, and the versions, as lines."""
+    lines = [f"drive of the fingers: {report['drive']}"]
+    for group, counts in report["groups"].items():
+        if counts["not_lifted"]:
+            found = Counter(counts["not_lifted"]).most_common()
+            reasons = ", ".join(f"{n:,} {label}" for label, n in found)
+            lines.append(f"{_GROUP_HEADS[group]} not lifted there: {reasons}")
+    versions = ", ".join(f"{name} {version}" for name, version in report["versions"].items())
+    return [*lines, f"with {versions}"]
 
 
 def _table(title: str) -> Table:

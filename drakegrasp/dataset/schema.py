@@ -341,6 +341,7 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
     Field("object", "", "str", "-", "-", "name of the object"),
     Field("method", "", "str", "-", "-", "how it was verified: hand, or forces alone"),
     _verdict(list(Outcome)),
+    *_WORDS,
     Field("reason", "", "str", "-", "-", "why, in words"),
     _X_TO,
     Field("X_TO_simulated", "12", "float64", "m, -", "T",
@@ -384,8 +385,11 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
         *_SLIP,
     ),
     Field("planned_force", "", "float64", "N", "-",
-          "method forces: largest normal force that the lift takes at least; inf if no forces "
-          "carry the object"),
+          "method forces: normal force of the finger that is loaded hardest for its strength; inf "
+          "if no forces carry the object"),
+    Field("planned_share", "", "float64", "-", "-",
+          "method forces: share of that finger's strength, as small as the lift allows; above 1 it "
+          "fails"),
     *_since(
         Stage.LIFTED,
         Field("applied_force", "", "float64", "N", "-",

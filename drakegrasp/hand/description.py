@@ -18,9 +18,15 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import numpy.typing as npt
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, with_config
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+    with_config,
+)
 from pydrake.math import RollPitchYaw
-from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, RevoluteJoint, RigidBody, WeldJoint
 
@@ -29,7 +35,8 @@ from drakegrasp.config import describe_mistake
 from drakegrasp.errors import HandError, first_line, one_line
 from drakegrasp.frames import Array, invert_pose, make_pose
 from drakegrasp.hand.files import hand_file
-from drakegrasp.runtime.environment import allow_network
+from drakegrasp.hand.parsing import make_parser as make_parser  # other rooms take it from here
+from drakegrasp.hand.shapes import pad_surfaces
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -71,6 +78,13 @@ class Finger:
     coupled: tuple[Coupling, ...] = ()
     pad_region: tuple[HalfSpace, ...] = ()  # in Fi [m]; only there a contact is a fingertip's
     pad_point: Vector  # usual contact point, in Fi [m]
+
+    def __post_init__(self) -> None:
+        for i, (*normal, _) in enumerate(self.pad_region):
+            if not any(normal):
+                raise ValueError(f"pad_region.{i} must have a normal that is not zero, got zero")
+        if not self.on_pad(self.p_FiP):
+            raise ValueError(f"pad_point must lie in the pad_region, got {list(self.pad_point)}")
 
     @property
     def p_FiP(self) -> Array:
@@ -120,7 +134,6 @@ class Hand:
     drive: Drive  # of the closing joints
     spread: Spread
     closing_speed: float  # of the closing joints [rad/s]
-    fingertip_force_limit: float  # [N]
     joint_names: tuple[str, ...]  # the n revolute joints
     joint_gain: Array  # (n, 1 + k), angles per coordinate; one non-zero in each row
     joint_limits: Array  # (n, 2), lower and upper [rad]
@@ -155,17 +168,19 @@ class _Description(BaseModel):
     drive: Literal["worm", "torque"] = "torque"
     spread: Spread = Spread()
     closing_speed_deg: Positive  # [deg/s]
-    fingertip_force_limit: Positive  # [N]
 
-
-def make_parser(plant: MultibodyPlant) -> Parser:
-    """Return a parser for a plant that also works under `DRAKE_ALLOW_NETWORK=none`.
-
-    A Drake parser registers a remote package, which raises under that setting even though our
-    models do not use the package. Nothing is downloaded.
-    """
-    with allow_network("package_map"):
-        return Parser(plant)
+    @model_validator(mode="after")
+    def _check_worms(self) -> _Description:
+        """Refuse a worm that holds less than its own motor gives, or of unknown strength."""
+        for i, finger in enumerate(self.fingers):
+            holding = finger.holding_torque
+            if self.drive == "worm" and (holding is None or holding < finger.torque_limit):
+                raise ValueError(
+                    f"fingers.{i}.holding_torque must be at least the torque_limit of "
+                    f"{finger.torque_limit:g} N m where drive is worm, got "
+                    f"{'none' if holding is None else f'{holding:g}'}"
+                )
+        return self
 
 
 def load_hand(name_or_yaml: str | Path = "barrett") -> Hand:
@@ -189,6 +204,7 @@ def load_hand(name_or_yaml: str | Path = "barrett") -> Hand:
     sdf_path = path.parent.resolve() / description.model
     try:
         hand = _build_hand(path.stem.removesuffix("_hand"), description, sdf_path)
+        _refuse_empty_pads(hand)
     except HandError as error:
         raise HandError(f"{path}: {error}") from None
     _loaded[path] = hand, _stamp(path, sdf_path)
@@ -253,7 +269,6 @@ def _build_hand(name: str, description: _Description, sdf_path: Path) -> Hand:
         drive=description.drive,
         spread=description.spread,
         closing_speed=float(np.deg2rad(description.closing_speed_deg)),
-        fingertip_force_limit=description.fingertip_force_limit,
         joint_names=tuple(revolute),
         joint_gain=np.array([gains[joint] for joint in revolute]),
         joint_limits=np.array(
@@ -266,6 +281,18 @@ def _build_hand(name: str, description: _Description, sdf_path: Path) -> Hand:
             if _is_carried(joints, body, base)
         },
     )
+
+
+def _refuse_empty_pads(hand: Hand) -> None:
+    """Refuse a pad region that holds nothing of its fingertip's surface: nothing could touch."""
+    if not any(finger.pad_region for finger in hand.fingers):
+        return
+    for i, (finger, triangles) in enumerate(zip(hand.fingers, pad_surfaces(hand), strict=True)):
+        if not len(triangles):
+            raise HandError(
+                f"fingers.{i}.pad_region: must hold a part of the surface of link "
+                f"{finger.fingertip!r}, got none of it"
+            )
 
 
 def _parse(sdf_path: Path) -> tuple[MultibodyPlant, ModelInstanceIndex]:

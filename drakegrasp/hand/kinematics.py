@@ -73,6 +73,27 @@ def link_poses(hand: Hand, link: str, *, spread: npt.ArrayLike, closing: npt.Arr
     return _chain_pose(hand.link_chains[link], _coordinates(hand, spread, closing))
 
 
+def joint_frames(hand: Hand, finger: int, *, spread: float, closing: npt.ArrayLike) -> Array:
+    """Return the poses X_GJ (m, 4, 4) of the joints from the palm to a fingertip, before they turn.
+
+    Args:
+        hand: The hand.
+        finger: Index of the finger.
+        spread: Angle of the spread joints [rad].
+        closing: (k,), angle of each finger's closing joint [rad].
+
+    Raises:
+        ValueError: If `closing` is not one angle per finger.
+    """
+    chain = hand.chains[finger]
+    q = multiply(chain.gain, _coordinates(hand, spread, closing))
+    X, frames = np.eye(4), []
+    for X_PJ, axis, angle in zip(chain.X_PJ, chain.axis, q, strict=True):
+        frames.append(multiply(X, X_PJ))
+        X = multiply(frames[-1], _turn(axis, angle))
+    return np.array(frames)
+
+
 def _coordinates(hand: Hand, spread: npt.ArrayLike, closing: npt.ArrayLike) -> Array:
     """Return coordinates (..., 1 + k) from a spread (...,) and closing angles (..., k)."""
     angles = np.asarray(closing, dtype=float)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydrake.geometry import (
@@ -20,14 +21,20 @@ from pydrake.geometry import (
     Sphere,
 )
 from pydrake.multibody.plant import MultibodyPlant
+from scipy.spatial import ConvexHull
 
-from drakegrasp.arithmetic import sin_cos
+from drakegrasp.arithmetic import dot, norm, sin_cos
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, transform_points
-from drakegrasp.hand.description import Hand, make_parser
+from drakegrasp.hand.parsing import make_parser
+
+if TYPE_CHECKING:
+    from drakegrasp.hand.description import HalfSpace, Hand
 
 #: Corners of the polygon that replaces a circle and encloses it.
 CIRCLE = 16
+#: Twice the area of a triangle that counts as a line [m^2].
+SLIVER = 1e-12
 
 
 def link_shapes(hand: Hand) -> dict[str, tuple[Array, ...]]:
@@ -51,6 +58,53 @@ def _link_shapes(sdf_path: Path) -> dict[str, tuple[Array, ...]]:
         geometries = plant.GetCollisionGeometriesForBody(body)
         shapes[body.name()] = tuple(_corners(inspector, geometry) for geometry in geometries)
     return shapes
+
+
+def pad_surfaces(hand: Hand) -> tuple[Array, ...]:
+    """Return the surface (t, 3, 3) [m] of each fingertip's pad as triangles, in its link's frame.
+
+    The surface is that of the convex hull of the link's shapes, as far as it is in the hand file's
+    pad region. The planes of the region are no surface, so it is open there. A fingertip without
+    shapes has no triangles.
+
+    Raises:
+        HandError: See `link_shapes`.
+    """
+    surfaces, shapes = [], link_shapes(hand)
+    for finger in hand.fingers:
+        parts = shapes[finger.fingertip]
+        triangles = hull_triangles(np.concatenate(parts)) if parts else np.zeros((0, 3, 3))
+        for half_space in finger.pad_region:
+            triangles = _clip(triangles, half_space)
+        surfaces.append(triangles)
+    return tuple(surfaces)
+
+
+def hull_triangles(corners: Array) -> Array:
+    """Return the triangles (t, 3, 3) [m] of the convex hull of corners (n, 3) [m]."""
+    hull = ConvexHull(corners)
+    return np.asarray(hull.points[hull.simplices])
+
+
+def _clip(triangles: Array, half_space: HalfSpace) -> Array:
+    """Return the triangles (s, 3, 3) [m] of what is in a half-space of triangles (t, 3, 3) [m]."""
+    normal, offset = np.array(half_space[:3]), half_space[3]
+    kept = []
+    for triangle, heights in zip(triangles, dot(triangles, normal) - offset, strict=True):
+        # Sutherland and Hodgman: keep the corners inside, and cut the edges that leave.
+        corners = []
+        for i, j in ((0, 1), (1, 2), (2, 0)):
+            if heights[i] >= 0.0:
+                corners.append(triangle[i])
+            if (heights[i] >= 0.0) != (heights[j] >= 0.0):
+                share = heights[i] / (heights[i] - heights[j])
+                corners.append(triangle[i] + share * (triangle[j] - triangle[i]))
+        kept += [(corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1)]
+    found = np.reshape(kept, (-1, 3, 3))
+
+    # Edges on the plane leave triangles without an area.
+    sides = found[:, 1:] - found[:, :1]
+    return found[norm(np.cross(sides[:, 0], sides[:, 1])) > SLIVER]
 
 
 def hull_corners(inspector: SceneGraphInspector, geometry: GeometryId) -> Array | None:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import Config
-from drakegrasp.frames import X_WT, Array, make_pose
+from drakegrasp.frames import X_WT, Array
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.settle import GRAVITY
 
@@ -81,15 +81,6 @@ def lift_path(X_TO: npt.ArrayLike, config: Config) -> LiftPath:
     # The object may start at its target.
     duration = max(duration, config.physics.time_step)
     return LiftPath(X_WO=X_WO, p_WO_end=p_WO_end, duration=duration)
-
-
-def lifted_palm(X_TG: Array, time: float, config: Config) -> Array:
-    """Return X_WG (4, 4) at a time [s] of the lift of a trial whose palm begins at X_TG (4, 4).
-
-    The trial itself may have ended earlier (`lift.lift`). The palm moves like an object that is
-    lifted by forces: to the same target, by the same path.
-    """
-    return make_pose(X_TG[:3, :3], lift_path(X_TG, config).at(time)[0])
 
 
 def lift_duration(distance: float, config: Config) -> float:

@@ -16,9 +16,8 @@ from matplotlib.patheffects import withStroke
 
 from drakegrasp.frames import Array, transform_points
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.outcomes import Outcome
 from drakegrasp.verification.views import PIXELS, Marks, View, is_seen, largest_force, render_views
-from drakegrasp.visualization.style import INK, PREDICTED, REACHED, add_axes, hide_ticks
+from drakegrasp.visualization.style import INK, LIFTED, PREDICTED, REACHED, add_axes, hide_ticks
 
 if TYPE_CHECKING:
     from drakegrasp.verification.result import Verification
@@ -27,8 +26,10 @@ if TYPE_CHECKING:
 EDGE = 3.3
 #: Distance of a number from its arrow [points].
 NUMBER = 7.0
-#: Colours of the verdict.
-HOLDS, FAILS = "#1B7F3B", "#B3261E"
+#: Shorter arrows are not drawn [px].
+SHORTEST = 8.0
+#: Colours of the verdict: stable, held but not stable, not held.
+STABLE, HELD, FAILS = "#1B7F3B", "#8A5A00", "#B3261E"
 
 
 def verification_figure(verified: Verification) -> Figure:
@@ -46,7 +47,7 @@ def verification_figure(verified: Verification) -> Figure:
 def _draw_figure(verified: Verification, model: ObjectModel, views: Sequence[View]) -> Figure:
     """Draw the views side by side, with the verdict above and the legend below."""
     # The page [inch].
-    gap, margin, head, foot = 0.08, 0.12, 0.85, 0.4
+    gap, margin, head, foot = 0.08, 0.12, 1.05, 0.4
     width = len(views) * (EDGE + gap) - gap + 2.0 * margin
     figure = Figure(figsize=(width, EDGE + head + foot), facecolor="white")
 
@@ -60,17 +61,27 @@ def _draw_figure(verified: Verification, model: ObjectModel, views: Sequence[Vie
         for marks in view.marks:
             _draw_marks(axes, view, model, marks)
 
-    # The verdict and its reason.
-    holds = verified.outcome is Outcome.SUCCESS
-    verdict = "holds" if holds else f"fails: {verified.outcome.label.replace('_', ' ')}"
+    # The verdict, its reason, and what happened in the hand.
     left, height = margin / width, EDGE + head + foot
-    figure.text(left, 1.0 - 0.1 / height, f"{model.name}  {verdict}", fontsize=12.5, va="top",
-                weight="bold", color=HOLDS if holds else FAILS)  # fmt: skip
-    figure.text(left, 1.0 - 0.36 / height, verified.reason, fontsize=9.5, va="top", color=INK,
-                wrap=True)  # fmt: skip
+    colour = STABLE if verified.stable else HELD if verified.held else FAILS
+    figure.text(left, 1.0 - 0.1 / height, f"{model.name}  {verified.words}", fontsize=12.5,
+                va="top", weight="bold", color=colour)  # fmt: skip
+    lines = (verified.reason, _lift_line(verified))
+    figure.text(left, 1.0 - 0.36 / height, "\n".join(filter(None, lines)), fontsize=9.5, va="top",
+                color=INK, linespacing=1.35)  # fmt: skip
 
     _draw_legend(figure, verified, (left, 0.3 / height))
     return figure
+
+
+def _lift_line(verified: Verification) -> str:
+    """Return the line on slip, turn and other links; empty if the hand lifted nothing."""
+    if verified.lifted is None:
+        return ""
+    return (
+        f"in the hand: slip {1e3 * verified.slip:.1f} mm, turn {np.rad2deg(verified.turn):.1f}°; "
+        f"other links at the end: {verified.other_links}"
+    )
 
 
 def _draw_marks(axes: Axes, view: View, model: ObjectModel, marks: Marks) -> None:
@@ -89,7 +100,9 @@ def _draw_marks(axes: Axes, view: View, model: ObjectModel, marks: Marks) -> Non
         arrow = {"arrowstyle": "-|>", "color": marks.colour, "linewidth": 0.36 * marks.size,
                  "shrinkA": 0.0, "shrinkB": 0.0, "mutation_scale": 4.0 + marks.size,
                  "path_effects": halo}  # fmt: skip
-        axes.annotate("", tip, tail, arrowprops=arrow, zorder=3)
+        # The head of a shorter arrow would be larger than the arrow.
+        if np.linalg.norm(tip - tail) > SHORTEST:
+            axes.annotate("", tip, tail, arrowprops=arrow, zorder=3)
         axes.plot(*dot, "o", markersize=marks.size, markeredgewidth=1.0 if visible else 1.7,
                   zorder=4, gid=f"{marks.kind} {i}",
                   markerfacecolor=marks.colour if visible else "white",
@@ -119,8 +132,10 @@ def _draw_legend(figure: Figure, verified: Verification, corner: tuple[float, fl
     handles = [dot(PREDICTED, PREDICTED, "predicted, with its normal")]
     force = largest_force(verified)
     if np.isfinite(force):
-        text = f"reached, with the finger's force (longest: {force:.1f} N)"
+        text = f"after closing, with the finger's force (longest: {force:.1f} N)"
         handles.append(dot(REACHED, REACHED, text))
+    if verified.lifted is not None and verified.lifted.touching.any():
+        handles.append(dot(LIFTED, LIFTED, "after the lift, and how far it slid"))
     handles.append(dot(INK, "white", "behind the object"))
     figure.legend(handles=handles, loc="upper left", bbox_to_anchor=corner, ncols=len(handles),
                   fontsize=9.0, frameon=False, handletextpad=0.2, columnspacing=1.5,

@@ -17,8 +17,10 @@ from pydrake.systems.framework import Context
 from drakegrasp.config import Config
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.placement import canonical_pose
 from drakegrasp.simulation.scene import Scene
 from drakegrasp.verification.forces.lift import ForceLift, lift_by_forces
@@ -39,7 +41,7 @@ from drakegrasp.visualization.style import REACHED
 if TYPE_CHECKING:
     from drakegrasp.verification.result import Verification
 
-#: Length of the arrow of a force as large as a fingertip's limit [m].
+#: Length of the arrow of a force as large as the strongest fingertip's limit [m].
 LARGEST_FORCE = 0.08
 
 
@@ -60,20 +62,21 @@ def record_lift(
         X_TO: (4, 4), its resting pose in the table-top frame.
         p_OQ: (k, 3), contacts in {O} [m].
         nhat_Q_O: (k, 3), their outward unit normals in {O}.
-        config: Hand (for the limit of its forces), physics, lift and limits.
+        config: Hand (for the limits of its forces), physics, lift and limits.
         path: The HTML file.
 
     Raises:
         OSError: If the file cannot be written.
     """
-    limit = load_hand(config.hand).fingertip_force_limit
+    hand = load_hand(config.hand)
+    limit = fingertip_forces(hand, drive_of(hand, config.lift))
 
     def run(meshcat: Meshcat) -> ForceLift:
         scene = build_scene(model, config.physics, meshcat=meshcat)
         # A lift that fails before it is simulated is shown at its start.
         show_start(meshcat, scene, X_TO, config)
         # The scene belongs to this function, so the monitor disturbs nobody else.
-        scene.simulator.set_monitor(_ForceArrows(meshcat, scene, limit).record)
+        scene.simulator.set_monitor(_ForceArrows(meshcat, scene, float(limit.max())).record)
         try:
             lift = lift_by_forces(scene, X_TO, p_OQ, nhat_Q_O, force_limit=limit, config=config)
         finally:

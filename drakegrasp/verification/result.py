@@ -15,6 +15,7 @@ from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.trial import TrialRecord
+from drakegrasp.simulation.verdict import is_precision, is_stable
 from drakegrasp.verification.forces.lift import ForceLift
 from drakegrasp.verification.wrist.solver import WristFit
 
@@ -66,8 +67,53 @@ class Verification:
 
     @property
     def success(self) -> bool:
-        """Whether the grasp holds."""
+        """Whether the grasp holds; the same as `held`."""
+        return self.held
+
+    @property
+    def held(self) -> bool:
+        """Whether every fingertip touches the object at the end of the lift, clear of the table."""
         return self.outcome is Outcome.SUCCESS
+
+    @property
+    def precision(self) -> bool:
+        """Whether the grasp is held, and by the fingertips alone."""
+        return bool(is_precision(self.outcome, self.other_links))
+
+    @property
+    def stable(self) -> bool:
+        """Whether it is a precision grasp that moved less than 5 mm and 5 degrees in the hand.
+
+        With method `forces`: from its path.
+        """
+        # A lift by forces has no hand; what it has instead is the path that the forces follow.
+        moved = (self.slip, self.turn)
+        if self.lift is not None:
+            moved = (self.lift.position_error, self.lift.angle_error)
+        return bool(is_stable(self.outcome, self.other_links, *moved))
+
+    @property
+    def words(self) -> str:
+        """The verdict in words: those of held, precision and stable that apply, or the failure."""
+        if not self.held:
+            return f"fails: {self.outcome.label.replace('_', ' ')}"
+        names = ("held", "precision", "stable")
+        return ", ".join(name for name in names if getattr(self, name))
+
+    @property
+    def slip(self) -> float:
+        """Distance that the object moved in the hand during the lift [m]."""
+        return np.nan if self.trial is None else self.trial.slip
+
+    @property
+    def turn(self) -> float:
+        """Angle that the object turned in the hand during the lift [rad]."""
+        return np.nan if self.trial is None else self.trial.turn
+
+    @property
+    def other_links(self) -> int:
+        """Number of other links of the hand that touch the object after the lift."""
+        return 0 if self.lifted is None else self.lifted.other_links
 
     @property
     def X_OG(self) -> Array | None:
@@ -136,10 +182,14 @@ class Verification:
         return verification_figure(self)
 
     def explain(self) -> str:
-        """Return the verdict, and why, in two or three sentences."""
+        """Return the verdict, and why, in a few sentences."""
         # The verdict.
         verdict = "holds" if self.success else f"fails ({self.outcome.label})"
         sentences = [f"The grasp of {self.placed.model.name} {verdict}: {self.reason}."]
+
+        # What happened in the hand.
+        if self.lifted is not None:
+            sentences.append(self._explain_lift())
 
         # How well the hand makes the predicted contacts.
         if self.fit is not None:
@@ -159,6 +209,23 @@ class Verification:
             sentences.append(self._explain_margin())
         return " ".join(sentences)
 
+    def _explain_lift(self) -> str:
+        """Return the sentence on what moved in the hand, and what touched the object at the end."""
+        # What happened.
+        touching = {0: "no other link of the hand touches it", 1: "another link touches it"}.get(
+            self.other_links, f"{self.other_links} other links touch it"
+        )
+        text = (
+            f"During the lift the object slips by {_mm(np.array(self.slip))} and turns by "
+            f"{np.rad2deg(self.turn):.1f}° in the hand, and at the end {touching}"
+        )
+
+        # What that is called, if it is held at all.
+        if not self.held:
+            return f"{text}."
+        precision = "a precision grasp" if self.precision else "no precision grasp"
+        return f"{text}: {precision}, {'' if self.stable else 'not '}stable."
+
     def _explain_margin(self) -> str:
         """Return the sentence on the friction that the contacts alone need."""
         simulated = self.config.physics.friction_hand
@@ -167,13 +234,15 @@ class Verification:
         else:
             needed = "are not enough at any friction"
         text = f"Forces at these points alone {needed}; the simulation has {simulated:.2f}"
-        if self.success and self.method == "hand" and self.smallest_friction > simulated:
-            # A point does not resist twisting; an area of contact does.
-            text += ", but the hand's contacts are areas, and its other parts may help"
+        if self.held and self.method == "hand" and self.smallest_friction > simulated:
+            # A point does not resist twisting, an area of contact does; and what slips is held
+            # elsewhere.
+            text += ", but the hand's contacts are areas"
+            text += "" if self.stable else ", and the object is not held where they were"
         return f"{text} (epsilon {self.epsilon:.3f})."
 
     def __repr__(self) -> str:
-        return f"Verification({self.method}, {self.outcome.label}: {self.reason})"
+        return f"Verification({self.method}, {self.words}: {self.reason})"
 
 
 def _mm(values: Array) -> str:

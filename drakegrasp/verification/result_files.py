@@ -140,13 +140,15 @@ def as_dict(index: int, result: Verification) -> dict[str, Any]:
         result: Its verdict.
     """
     # In the order in which a person reads them: verdict, contacts, hand, lift, margin.
-    trial, fit, lift = result.trial, result.fit, result.lift
+    fit, lift = result.fit, result.lift
 
     return {
         "index": index,
         "object": result.placed.model.name,
         "method": result.method,
         "success": result.success,
+        "precision": result.precision,
+        "stable": result.stable,
         "outcome": result.outcome.label,
         "reason": result.reason,
         "explain": result.explain(),
@@ -166,7 +168,8 @@ def as_dict(index: int, result: Verification) -> dict[str, Any]:
         else {"status": fit.status, "message": fit.message, "iterations": fit.iterations},
         "closed": _contacts_as_dict(result.closed, result.q_closed),
         "lifted": _contacts_as_dict(result.lifted, result.q_lifted),
-        "slip": None if trial is None else trial.slip,
+        "slip": result.slip,
+        "turn_deg": math.degrees(result.turn),
         "epsilon": result.epsilon,
         "smallest_friction": result.smallest_friction,
         # A null above is either infinity or not computed; this tells which.
@@ -178,6 +181,7 @@ def as_dict(index: int, result: Verification) -> dict[str, Any]:
         else {
             "end": lift.end.value,
             "planned_force": lift.planned_force,
+            "planned_share": lift.planned_share,
             "applied_force": lift.applied_force,
             "position_error": lift.position_error,
             "angle_error_deg": math.degrees(lift.angle_error),
@@ -251,6 +255,8 @@ def _row(result: Verification) -> dict[str, Any]:
         "object": result.placed.model.name,
         "method": result.method,
         "outcome": result.outcome,
+        "precision": result.precision,
+        "stable": result.stable,
         "reason": result.reason,
         "X_TO": pack_pose(result.placed.X_TO),
         "X_TO_simulated": pack_pose(canonical_pose(result.placed.X_TO)),
@@ -281,7 +287,7 @@ def _row(result: Verification) -> dict[str, Any]:
 
     # The lift by forces.
     if lift is not None:
-        names = ("planned_force", "applied_force", "position_error", "angle_error")
+        names = ("planned_force", "planned_share", "applied_force", "position_error", "angle_error")
         row |= {name: getattr(lift, name) for name in names}
 
     # One of the two lifted the object.

@@ -18,10 +18,12 @@ from drakegrasp.errors import OffSurfaceError
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import coordinate_limits
+from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.blas import one_thread
 from drakegrasp.runtime.timing import timed
 from drakegrasp.simulation.candidates import Pregrasp
+from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.placement import PlacedObject, canonical_pose
 from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
@@ -43,7 +45,7 @@ POINT_DIGITS, NORMAL_DIGITS = 4, 3
 MARGINS = (1.0, 0.5)
 #: The reason that a person reads, by the outcome of the trial.
 _REASONS = {
-    Outcome.SUCCESS: "every fingertip holds it at the end of the lift",
+    Outcome.SUCCESS: "every fingertip touches it at the end of the lift, clear of the table",
     Outcome.BELOW_TABLE: "the palm would be below the table",
     Outcome.START_COLLISION: "the opened hand would be inside the object or the table",
     Outcome.MISSING_FINGERTIP: "a fingertip closes without touching the object",
@@ -176,7 +178,7 @@ def _lift_by_hand(base: Verification, config: Config) -> Verification:
 
 def _lift_by_forces(base: Verification, config: Config) -> Verification:
     """Lift the object by forces at the contacts, without a hand."""
-    limit = load_hand(config.hand).fingertip_force_limit
+    hand = load_hand(config.hand)
     with timed(base.seconds, "simulate"):
         scene = cached_scene(base.placed.model, config.physics, None)
         lift = lift_by_forces(
@@ -184,7 +186,7 @@ def _lift_by_forces(base: Verification, config: Config) -> Verification:
             canonical_pose(base.placed.X_TO),
             base.p_OQ,
             base.nhat_Q_O,
-            force_limit=limit,
+            force_limit=fingertip_forces(hand, drive_of(hand, config.lift)),
             config=config,
         )
     if _ENDS[lift.end].inconclusive:
@@ -197,7 +199,7 @@ def _lift_by_forces(base: Verification, config: Config) -> Verification:
         f"arrives within {moved} of its target",
         LiftEnd.INFEASIBLE: "no forces within the friction cones carry it",
         LiftEnd.OVER_LIMIT: f"it takes a normal force of {lift.planned_force:.1f} N, more than the "
-        f"{limit:g} N of a fingertip",
+        f"{lift.planned_force / lift.planned_share:.1f} N that the fingertip carries",
         LiftEnd.STRAYED: f"the forces do not keep it on its path: it is off by {moved}",
         LiftEnd.ERROR: f"{_REASONS[Outcome.SOLVER_ERROR]}: {lift.message}",
         LiftEnd.TIMEOUT: _REASONS[Outcome.TIMEOUT],

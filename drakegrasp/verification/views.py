@@ -23,9 +23,9 @@ from drakegrasp.mesh.rays import first_hits
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.placement import canonical_pose
-from drakegrasp.simulation.trajectory import lifted_palm
+from drakegrasp.simulation.trial import TrialRecord
 from drakegrasp.vision.camera import Picture
-from drakegrasp.visualization.style import ARROW, HIDDEN, PREDICTED, REACHED
+from drakegrasp.visualization.style import ARROW, HIDDEN, LIFTED, PREDICTED, REACHED
 from drakegrasp.visualization.third_person import (
     AZIMUTHS_DEG,
     Snapshot,
@@ -109,11 +109,15 @@ def render_views(verified: Verification) -> list[View]:
     Raises:
         MachineError: If a picture is blank, which means that OpenGL failed.
     """
-    # The contacts: predicted ones, and those after closing.
+    # The contacts: predicted ones, those after closing, and where these are after the lift.
     renderer = _Renderer(verified.placed.model, load_hand(verified.config.hand))
     X_WO = X_WT @ canonical_pose(verified.placed.X_TO)
     closed = None if verified.trial is None else verified.trial.closed
-    marks = [_predicted(verified), *_reached(closed, _force_scale(verified))]
+    marks = [
+        _predicted(verified),
+        *_reached(closed, _force_scale(verified)),
+        *_moved(verified.trial),
+    ]
 
     # The object from two sides, then the last state that was reached.
     first, second = _two_sides(renderer.model, X_WO, marks)
@@ -137,11 +141,15 @@ def _last_view(
     # After the lift, by forces or by the hand.
     if lift is not None and lift.X_TO_lifted is not None:
         return [renderer.object_view("end of the lift", X_WT @ lift.X_TO_lifted, marks, azimuth)]
-    if trial is not None and trial.X_TO_lifted is not None and trial.q_lifted is not None:
-        X_WG = lifted_palm(trial.X_TO @ trial.X_OG, trial.time_lift, verified.config)
+    if (
+        trial is not None
+        and trial.X_TO_lifted is not None
+        and trial.X_OG_lifted is not None
+        and trial.q_lifted is not None
+    ):
         X_WO = X_WT @ trial.X_TO_lifted
-        snapshot = Snapshot(X_WG=X_WG, X_WO=X_WO, q=trial.q_lifted)
-        reached = _reached(trial.lifted, _force_scale(verified))
+        snapshot = Snapshot(X_WG=X_WO @ trial.X_OG_lifted, X_WO=X_WO, q=trial.q_lifted)
+        reached = _reached(trial.lifted, _force_scale(verified), kind="lifted", colour=LIFTED)
         return [renderer.hand_view("end of the lift", snapshot, reached)]
 
     # Before it: the closed hand, or the palm pose that comes closest.
@@ -201,7 +209,9 @@ def _predicted(verified: Verification) -> Marks:
     )
 
 
-def _reached(contacts: Contacts | None, scale: float) -> list[Marks]:
+def _reached(
+    contacts: Contacts | None, scale: float, *, kind: str = "reached", colour: str = REACHED
+) -> list[Marks]:
     """Return the contacts of touching fingertips, if any, with their forces as arrows.
 
     The arrow of a force ends at its contact; its length per force is `scale` [m/N].
@@ -215,14 +225,39 @@ def _reached(contacts: Contacts | None, scale: float) -> list[Marks]:
     names = [""] * len(p)
     return [
         Marks(
-            kind="reached",
-            colour=REACHED,
+            kind=kind,
+            colour=colour,
             size=5.0,
             p_OQ=p,
             nhat_Q_O=n,
             tail_O=tail,
             tip_O=p,
             names=names,
+        )
+    ]
+
+
+def _moved(trial: TrialRecord | None) -> list[Marks]:
+    """Return the contacts after the lift, with arrows from where they were after closing.
+
+    They are on the object as it lay: an arrow is how far a fingertip slid over its surface.
+    """
+    if trial is None or trial.closed is None or trial.lifted is None:
+        return []
+    both = trial.closed.touching & trial.lifted.touching
+    if not both.any():
+        return []
+    p, n = trial.lifted.p_OQ[both], trial.lifted.nhat_Q_O[both]
+    return [
+        Marks(
+            kind="lifted",
+            colour=LIFTED,
+            size=4.0,
+            p_OQ=p,
+            nhat_Q_O=n,
+            tail_O=trial.closed.p_OQ[both],
+            tip_O=p,
+            names=[""] * len(p),
         )
     ]
 

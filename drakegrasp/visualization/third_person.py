@@ -32,7 +32,8 @@ from pydrake.systems.sensors import CameraInfo
 
 from drakegrasp.errors import MachineError
 from drakegrasp.frames import X_WT, Array, make_pose, transform_points
-from drakegrasp.hand.description import Hand, make_parser
+from drakegrasp.hand.description import Hand
+from drakegrasp.hand.parsing import make_parser
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.vision.camera import Picture
 from drakegrasp.vision.rendering import BLANK, ENGINE, add_drawn_object

@@ -23,7 +23,6 @@ from drakegrasp.frames import X_WT, Array, make_pose, rotate_vectors, transform_
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome, Stage
-from drakegrasp.simulation.trajectory import lifted_palm
 from drakegrasp.vision.camera import Picture, unproject
 from drakegrasp.visualization.style import ARROW
 from drakegrasp.visualization.third_person import (
@@ -101,9 +100,8 @@ def load_trial(out: Path, trial_id: int, *, table_size: float = TABLE_SIZE) -> T
     # Poses of palm and object at the start, and after the lift.
     X_WO = X_WT @ unpack_pose(row["X_TO"])
     X_WG = X_WO @ unpack_pose(row["X_OG"])
-    X_TG = unpack_pose(row["X_TO"]) @ unpack_pose(row["X_OG"])
-    X_WG_lifted = lifted_palm(X_TG, float(row["time_lift"]), config)
     X_WO_lifted = X_WT @ unpack_pose(row["X_TO_lifted"])
+    X_WG_lifted = X_WO_lifted @ unpack_pose(row["X_OG_lifted"])
 
     # The scene, and the open hand's joints in its order.
     hand = load_hand(config.hand)

@@ -9,13 +9,9 @@ import trimesh
 from click.testing import CliRunner
 
 from drakegrasp.bench import measure
+from drakegrasp.bench.fidelity import VARIANTS
 from drakegrasp.cli.main import main
-from drakegrasp.config import load_config
 from drakegrasp.errors import DataError
-from drakegrasp.mesh.surfaces import signed_volume
-from drakegrasp.objects.model import prepare_object
-from drakegrasp.objects.sources import find_meshes
-from drakegrasp.outcomes import Outcome
 
 pytestmark = pytest.mark.sim
 
@@ -40,25 +36,18 @@ def test_report_says_what_attempts_cost(meshes, tmp_path):
     assert found["resolved_per_core_second"] > 0.0
     assert report["peak_memory"] > 50e6
     assert report["versions"]["drake"]
-    assert set(report["all"]["fidelity"]) == set(measure.VARIANTS)
+    assert set(report["all"]["fidelity"]) == {*VARIANTS, "drive_torque", "drive_locked"}
     assert all(counts["attempts"] == 2 for counts in report["all"]["fidelity"].values())
     assert "MuJoCo" in first.stdout
     assert "peak memory" in first.stdout
     for outcome, count in report["all"]["outcomes"].items():
         assert f"{count} {outcome}" in first.stdout
     assert "double resolution" in first.stdout
+    assert "labels that depend on the drive: " in first.stdout
+    assert report["all"]["drive"]["attempts"] == 2
     again = CliRunner().invoke(main, [*arguments, "--out", str(other), "--compare", str(path)])
     ratio = json.loads(other.read_text())["ratio"]["resolved_per_core_second"]
     assert f"{ratio:.2f} times that of {path}" in again.stdout.replace("\n", "")
-
-
-def test_finer_surface_is_the_same_surface(meshes):
-    (source,) = find_meshes(meshes)
-    model = prepare_object(source, load_config().objects)
-    finer = measure._finer(model)
-    assert len(finer.collision_faces) == 4 * len(model.collision_faces)
-    volumes = [signed_volume(m.collision_vertices, m.collision_faces) for m in (model, finer)]
-    assert volumes[1] == pytest.approx(volumes[0])
 
 
 def test_report_of_something_else_is_wrong_usage(meshes, tmp_path):
@@ -74,19 +63,6 @@ def test_name_that_no_mesh_has_is_wrong_usage(meshes):
     result = CliRunner().invoke(main, ["bench", "--objects", str(meshes), "--only", "9_cup"])
     assert result.exit_code == 2
     assert "--only must name objects" in result.output
-
-
-def test_screened_attempt_that_would_miss_a_fingertip_is_no_flip():
-    pairs = [
-        (Outcome.SCREENED, Outcome.MISSING_FINGERTIP),
-        (Outcome.START_COLLISION, Outcome.START_COLLISION),
-        (Outcome.SUCCESS, Outcome.SLIPPED),
-        (Outcome.SCREENED, Outcome.SUCCESS),
-    ]
-    counts = measure._count(pairs, [True, False, False, True])
-    assert counts["flips"] == 2
-    assert counts["successes_lost_by_screen"] == 1
-    assert (counts["decided"], counts["simulated"]) == (2, 1)
 
 
 def test_only_the_same_attempts_are_compared():
@@ -106,3 +82,25 @@ def test_report_that_cannot_be_written_is_refused_before_measuring(meshes, tmp_p
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 2
     assert "--out must be a file that can be written" in result.output
+
+
+@pytest.mark.parametrize("number", ["0", "-3", "many"])
+def test_number_of_lifts_must_be_positive(tmp_path, number):
+    result = CliRunner().invoke(main, ["bench", "--cross-check", str(tmp_path), number])
+    assert result.exit_code == 2
+    assert "'--cross-check'" in result.output
+
+
+def test_cross_check_takes_no_option_of_the_measurement(tmp_path):
+    arguments = ["bench", "--cross-check", str(tmp_path), "3", "--candidates", "100"]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 2
+    assert "must be used with --out and --quiet alone, got --candidates" in result.output
+
+
+@pytest.mark.parametrize("option", [["--peer"], ["--cross-check", ".", "3"]])
+def test_option_that_needs_mujoco_says_so(monkeypatch, tmp_path, option):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    result = CliRunner().invoke(main, ["bench", *option, "--out", str(tmp_path / "report.json")])
+    assert result.exit_code == 2
+    assert f"{option[0]} needs mujoco: pip install 'drakegrasp[peer]'" in result.output

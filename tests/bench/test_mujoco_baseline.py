@@ -9,14 +9,20 @@ import pytest
 from helpers.objects import CUBE, box_model, from_above, standing
 
 from drakegrasp.config import Config, load_config, override_config
-from drakegrasp.frames import make_pose
+from drakegrasp.frames import X_WT, make_pose
+from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.kinematics import fingertip_poses
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 
 pytest.importorskip("mujoco")
 pytest.importorskip("coacd")
 
+import mujoco
+
+from drakegrasp.bench import mujoco_baseline
 from drakegrasp.bench.mujoco_baseline import MujocoBaseline
+from drakegrasp.bench.mujoco_scene import TIME_STEP
 
 pytestmark = pytest.mark.sim
 
@@ -43,8 +49,10 @@ def test_cube_is_one_part_and_is_held_across_its_faces(
 ) -> None:
     assert baseline.parts == 1
     attempt = from_above(cube, STANDOFF)
-    assert baseline.run(attempt) is Outcome.SUCCESS
-    assert baseline.run(attempt) is Outcome.SUCCESS  # nothing is left of the first run
+    first, again = baseline.run(attempt), baseline.run(attempt)
+    assert first.outcome is Outcome.SUCCESS
+    assert first.lifted
+    assert again == first  # nothing is left of the first run
 
 
 @pytest.mark.parametrize(
@@ -54,25 +62,165 @@ def test_cube_is_one_part_and_is_held_across_its_faces(
 def test_attempts_fail_where_they_should(
     baseline: MujocoBaseline, cube: ObjectModel, standoff: float, outcome: Outcome
 ) -> None:
-    assert baseline.run(from_above(cube, standoff)) is outcome
+    trial = baseline.run(from_above(cube, standoff))
+    assert (trial.outcome, trial.lifted) == (outcome, False)
 
 
 def test_what_geometry_decides_is_not_simulated(
     baseline: MujocoBaseline, cube: ObjectModel
 ) -> None:
     attempt = from_above(cube, STANDOFF)
-    assert baseline.run(replace(attempt, ray_hits=False)) is Outcome.RAY_MISS
+    assert baseline.run(replace(attempt, ray_hits=False)).outcome is Outcome.RAY_MISS
     below = attempt.X_OG @ make_pose(np.eye(3), [0.0, 0.0, 0.3])
-    assert baseline.run(replace(attempt, X_OG=below)) is Outcome.BELOW_TABLE
+    assert baseline.run(replace(attempt, X_OG=below)).outcome is Outcome.BELOW_TABLE
 
 
 def test_slippery_cube_is_not_held(cube: ObjectModel, config: Config) -> None:
     slick = override_config(config, ["physics.friction_hand=0.05"])
-    outcome = MujocoBaseline(cube, standing(cube), slick).run(from_above(cube, STANDOFF))
-    assert outcome in (Outcome.DROPPED, Outcome.SLIPPED)
+    trial = MujocoBaseline(cube, standing(cube), slick).run(from_above(cube, STANDOFF))
+    assert trial.lifted
+    assert trial.outcome in (Outcome.DROPPED, Outcome.SLIPPED)
 
 
-def test_spread_turns_the_fingers(baseline: MujocoBaseline, cube: ObjectModel) -> None:
-    """At 90 degrees both spread fingers are at the sides, where the third does not oppose them."""
-    outcome = baseline.run(from_above(cube, STANDOFF, spread=float(np.deg2rad(90.0))))
-    assert outcome is not Outcome.SUCCESS
+def test_fingertips_are_where_kinematics_puts_them(
+    baseline: MujocoBaseline, cube: ObjectModel
+) -> None:
+    """At 90 degrees of spread the fingers still have every joint of the hand's files."""
+    attempt = from_above(cube, STANDOFF, spread=float(np.deg2rad(90.0)))
+    baseline.run(attempt)
+    m, d, hand = baseline._model, baseline._data, load_hand()
+    mujoco.mj_kinematics(m, d)
+    closing = [float(d.joint(finger.closing_joint).qpos[0]) for finger in hand.fingers]
+    X_WB = make_pose(d.body(hand.palm_link).xmat.reshape(3, 3), d.body(hand.palm_link).xpos)
+    for finger, X_GF in zip(
+        hand.fingers, fingertip_poses(hand, spread=attempt.spread, closing=closing), strict=True
+    ):
+        found = d.body(finger.fingertip).xpos
+        assert found == pytest.approx((X_WB @ hand.X_BG @ X_GF)[:3, 3], abs=1e-4)
+
+
+def peer(model: ObjectModel, *overrides: str) -> MujocoBaseline:
+    return MujocoBaseline(model, standing(model), load_config(overrides=overrides))
+
+
+@pytest.fixture(scope="module")
+def pinched(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
+    """A box that two fingers and one opposing finger of twice their torque pinch."""
+    return box_model(tmp_path_factory.mktemp("box"), [0.06, 0.06, 0.10])
+
+
+@pytest.mark.parametrize("drive", ["worm", "locked"])
+def test_worm_keeps_a_pinched_box_in_place(pinched: ObjectModel, drive: str) -> None:
+    trial = peer(pinched, f"lift.drive={drive}").run(from_above(pinched, STANDOFF))
+    assert trial.outcome is Outcome.SUCCESS
+    assert trial.slip < 1e-4
+    assert trial.turn < np.deg2rad(0.1)
+
+
+def test_torque_lets_the_box_push_fingers_open(pinched: ObjectModel) -> None:
+    trial = peer(pinched, "lift.drive=torque").run(from_above(pinched, STANDOFF))
+    assert trial.slip > 0.01
+    assert trial.turn > np.deg2rad(5.0)
+
+
+def test_friction_is_that_of_coulomb(pinched: ObjectModel) -> None:
+    """Two pads with 2 N m and one with 4 N m carry 1 kg from a coefficient of about 0.154 on."""
+    attempt = from_above(pinched, STANDOFF)
+    held = peer(pinched, "lift.drive=worm", "physics.friction_hand=0.17").run(attempt)
+    assert held.outcome is Outcome.SUCCESS
+    assert held.slip < 1e-4
+    lost = peer(pinched, "lift.drive=worm", "physics.friction_hand=0.13").run(attempt)
+    assert lost.slip > 5e-3
+
+
+def weak(monkeypatch: pytest.MonkeyPatch, **changes: object) -> None:
+    """Let the hand of the next peers have other fingers."""
+    hand = load_hand()
+    fingers = tuple(replace(finger, **changes) for finger in hand.fingers)  # type: ignore[arg-type]
+    monkeypatch.setattr(mujoco_baseline, "load_hand", lambda name: replace(hand, fingers=fingers))
+
+
+def test_worm_yields_beyond_its_strength(
+    pinched: ObjectModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The opposing finger loads the two with 4 N m in all."""
+    weak(monkeypatch, holding_torque=1.9)
+    trial = peer(pinched, "lift.drive=worm").run(from_above(pinched, STANDOFF))
+    assert trial.slip > 5e-3
+
+
+def test_contact_beside_the_pad_is_of_another_link(
+    cube: ObjectModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The fingertips meet the cube 55 mm from the distal joint."""
+    attempt = from_above(cube, STANDOFF)
+    weak(monkeypatch, pad_region=((1.0, 0.0, 0.0, 0.054), (-1.0, 0.0, 0.0, -0.056)))
+    baseline = peer(cube)
+    assert baseline.run(attempt).outcome is Outcome.SUCCESS
+    assert baseline._contacts().other_links == 0
+
+    weak(monkeypatch, pad_region=((1.0, 0.0, 0.0, 0.06),))
+    baseline = peer(cube)
+    assert baseline.run(attempt).outcome is Outcome.MISSING_FINGERTIP
+    assert baseline._contacts().other_links == 3
+
+
+def test_contact_weaker_than_the_limit_does_not_count(cube: ObjectModel) -> None:
+    attempt = from_above(cube, STANDOFF)
+    trial = peer(cube, "physics.contact_force=100").run(attempt)
+    assert trial.outcome is Outcome.MISSING_FINGERTIP
+
+
+def test_friction_with_the_table_is_the_tables(cube: ObjectModel) -> None:
+    X_TO = standing(cube)
+    X_TO[2, 3] -= 1e-4
+    config = load_config(overrides=["physics.friction_hand=7.1", "physics.friction_table=0.3"])
+    baseline = MujocoBaseline(cube, X_TO, config)
+    baseline.run(from_above(cube, 0.3))
+    data = baseline._data
+    coefficients = [contact.friction[0] for contact in data.contact[: data.ncon]]
+    assert coefficients
+    assert coefficients == pytest.approx([0.3] * len(coefficients))
+
+
+def test_wrist_waits_while_the_object_is_released(
+    cube: ObjectModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After closing it stands for the release time, and then follows its path to the target."""
+    baseline, path = peer(cube, "lift.release_time=0.5"), []
+    step, close = baseline._step, baseline._close
+
+    def record(p_WB: np.ndarray) -> None:
+        path.append(np.array(p_WB))
+        step(p_WB)
+
+    def close_and_forget() -> None:
+        close()
+        path.clear()
+
+    monkeypatch.setattr(baseline, "_step", record)
+    monkeypatch.setattr(baseline, "_close", close_and_forget)
+    attempt = from_above(cube, STANDOFF)
+    assert baseline.run(attempt).outcome is Outcome.SUCCESS
+    positions, wait = np.array(path), round(0.5 / TIME_STEP)
+    np.testing.assert_allclose(positions[:wait], positions[[0] * wait], atol=1e-12)
+    assert np.linalg.norm(positions[wait + 50] - positions[0]) > 1e-4
+    config, hand = baseline._config, load_hand()
+    X_WG = X_WT @ standing(cube) @ attempt.X_OG
+    shift = X_WT[:3, 3] + config.lift.p_TG - X_WG[:3, 3]
+    start = (X_WG @ np.linalg.inv(hand.X_BG))[:3, 3]
+    np.testing.assert_allclose(positions[0], start, atol=1e-6)
+    np.testing.assert_allclose(positions[-1], start + shift, atol=1e-6)
+    np.testing.assert_allclose(baseline._data.qpos[baseline._wrist_q], start + shift, atol=1e-4)
+
+
+def test_nothing_moves_the_object_while_the_hand_closes(cube: ObjectModel) -> None:
+    """A palm off the middle closes with one finger first, which pushes on the cube."""
+    attempt = from_above(cube, STANDOFF)
+    attempt = replace(attempt, X_OG=attempt.X_OG @ make_pose(np.eye(3), [0.0, 0.02, 0.0]))
+    baseline = peer(cube)
+    baseline._reset(X_WT @ standing(cube) @ attempt.X_OG, 0.0)
+    baseline._close()
+    data = baseline._data
+    assert baseline._contacts().touching.any()
+    assert np.abs(data.qacc[baseline._object_v]).max() < 0.01

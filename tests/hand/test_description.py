@@ -250,6 +250,26 @@ REFUSALS = {
         {"fingers": changed_finger(coupled=[{"joint": "right_hinge", "ratio": 0}])},
         r"fingers\.0\.coupled\.0: ratio must not be zero",
     ),
+    "flat region": (
+        {"fingers": changed_finger(pad_region=[[0, 1, 0, 0], [0, 0, 0, 1]])},
+        r"fingers\.0: pad_region\.1 must have a normal that is not zero",
+    ),
+    "pad point outside": (
+        {"fingers": changed_finger(pad_region=[[0, 0, 2, 0.19]])},
+        r"fingers\.0: pad_point must lie in the pad_region, got \[0\.0, 0\.01, 0\.09\]",
+    ),
+    "empty pad": (
+        {"fingers": changed_finger(pad_region=[[0, 0, 1, 0.12]], pad_point=[0.0, 0.01, 0.13])},
+        r"fingers\.0\.pad_region: must hold a part of the surface of link 'left', got none",
+    ),
+    "worm of unknown strength": (
+        {"drive": "worm"},
+        r"fingers\.0\.holding_torque must be at least the torque_limit of 1 N m .* got none",
+    ),
+    "worm weaker than its motor": (
+        {"drive": "worm", "fingers": changed_finger(holding_torque=0.5)},
+        r"fingers\.0\.holding_torque must be at least .* got 0\.5",
+    ),
     "missing file": ({"model": "gone.sdf"}, r"model: must be an SDFormat file, got '.*gone\.sdf'"),
     "not a model": ({"model": "pincer_hand.yaml"}, r"model: must be a file of one model"),
     "missing palm": (

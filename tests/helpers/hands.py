@@ -39,7 +39,6 @@ PINCER: dict[str, Any] = {
         for side, inward in (("left", 1.0), ("right", -1.0))
     ],
     "closing_speed_deg": 90.0,
-    "fingertip_force_limit": 10.0,
 }
 
 

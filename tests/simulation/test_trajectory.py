@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from drakegrasp.config import load_config
 from drakegrasp.frames import X_WT, make_pose
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.simulation.trajectory import LiftPath, carrying_force, lift_path
 from drakegrasp.verification.forces.quality import force_margin
 
@@ -82,7 +83,7 @@ def test_margin_of_a_pinched_cube_is_its_closed_form(cube):
     config = load_config()
     margin = force_margin(cube, standing(cube), P, N, config)
     load = lift_path(standing(cube), config).wrenches(cube)[0, 5]
-    limit = load_hand(config.hand).fingertip_force_limit
+    limit = fingertip_forces(load_hand(config.hand), "worm")[2]
     assert load > cube.mass * GRAVITY
     assert margin.smallest_friction == pytest.approx(load / (2.0 * limit), abs=2e-4)
     assert margin.epsilon > 0.0

@@ -15,16 +15,17 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from drakegrasp.config import Config, load_config
-from drakegrasp.frames import make_pose
+from drakegrasp.frames import X_WT, make_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.scene import Scene, palm_pose
-from drakegrasp.simulation.trajectory import lifted_palm
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.verification.figure import verification_figure
 from drakegrasp.verification.forces.lift import ForceLift, LiftEnd
+from drakegrasp.verification.result import Verification
 from drakegrasp.visualization.style import save_figure
 
 pytestmark = pytest.mark.sim
@@ -55,18 +56,18 @@ def held(scene: Scene, cube: ObjectModel, config: Config) -> TrialRecord:
 
 
 @pytest.fixture
-def verified(cube: ObjectModel) -> Callable[..., SimpleNamespace]:
+def verified(cube: ObjectModel) -> Callable[..., Verification]:
     """Return a function that makes a result, of a grasp that was not tried unless told."""
 
     def make(**values: object) -> SimpleNamespace:
         result: dict[str, object] = {
             "outcome": Outcome.OFF_SURFACE, "reason": "so it is",
-            "placed": SimpleNamespace(model=cube, X_TO=standing(cube)),
+            "placed": PlacedObject(model=cube, X_TO=standing(cube)),
+            "method": "hand", "surface_distance": np.zeros(3),
             "p_OQ": P_OQ, "nhat_Q_O": NHAT_Q_O,
-            "fit": None, "pregrasp": None, "trial": None, "lift": None,
             "config": load_config(),
         }  # fmt: skip
-        return SimpleNamespace(**result | values)
+        return Verification(**result | values)  # type: ignore[arg-type]
 
     return make
 
@@ -83,7 +84,7 @@ def texts_of(figure: Figure) -> list[str]:
 
 @needs_egl
 def test_contacts_on_opposite_sides_are_each_seen_once(
-    verified: Callable[..., SimpleNamespace], config: Config, tmp_path: Path
+    verified: Callable[..., Verification], config: Config, tmp_path: Path
 ) -> None:
     figure = verification_figure(verified())
     assert len(figure.axes) == 2
@@ -101,10 +102,11 @@ def test_contacts_on_opposite_sides_are_each_seen_once(
 
 @needs_egl
 def test_dots_are_on_the_object_and_its_hand_is_shown(
-    verified: Callable[..., SimpleNamespace], held: TrialRecord, config: Config
+    verified: Callable[..., Verification], held: TrialRecord, config: Config
 ) -> None:
     assert held.outcome is Outcome.SUCCESS
     assert held.closed is not None
+    assert held.lifted is not None
     result = verified(
         outcome=Outcome.SUCCESS,
         trial=held,
@@ -112,14 +114,19 @@ def test_dots_are_on_the_object_and_its_hand_is_shown(
         nhat_Q_O=held.closed.nhat_Q_O,
     )
     figure = verification_figure(result)
-    assert texts_of(figure)[0] == "1_box_a  holds"
+    assert texts_of(figure)[0] == f"1_box_a  {result.words}"
+    assert result.words.startswith("held")
+    line = texts_of(figure)[1].splitlines()[1]
+    assert f"slip {1e3 * held.slip:.1f} mm, turn {np.rad2deg(held.turn):.1f}°" in line
+    assert line.endswith(f"other links at the end: {held.lifted.other_links}")
     assert [axes.get_title(loc="left") for axes in figure.axes][2] == "end of the lift"
     # Predicted where they were reached: dots lie on each other.
     for panel in (0, 1):
         lines = {line.get_gid(): line.get_xydata()[0] for line in figure.axes[panel].lines}
         for i in range(3):
             np.testing.assert_allclose(lines[f"predicted {i}"], lines[f"reached {i}"], atol=1e-6)
-    assert set(dots_of(figure, 2)) == {"reached 0", "reached 1", "reached 2"}
+    assert set(dots_of(figure, 2)) == {"lifted 0", "lifted 1", "lifted 2"}
+    assert {"lifted 0", "lifted 1", "lifted 2"} < set(dots_of(figure, 0))
     alone, hand = (figure.axes[k].images[0].get_array() for k in (0, 2))
     # The hand is grey and black, the table and the cube are not.
     assert np.mean(np.ptp(hand, axis=2) < 8) > 0.05
@@ -135,12 +142,14 @@ def test_dots_are_on_the_object_and_its_hand_is_shown(
 
 @needs_egl
 def test_last_panel_shows_the_last_instant(
-    verified: Callable[..., SimpleNamespace], held: TrialRecord, cube: ObjectModel, config: Config
+    verified: Callable[..., Verification], held: TrialRecord, cube: ObjectModel, config: Config
 ) -> None:
     closed = replace(held, lifted=None, q_lifted=None, X_TO_lifted=None)
     fit = SimpleNamespace(X_OG=held.X_OG, spread=0.0, closing=np.full(3, 1.0))
     X_TO_lifted = make_pose(np.eye(3), [0.0, 0.0, 0.6])
-    lift = ForceLift(end=LiftEnd.HELD, planned_force=1.0, X_TO_lifted=X_TO_lifted)
+    lift = ForceLift(
+        end=LiftEnd.HELD, planned_force=1.0, planned_share=0.1, X_TO_lifted=X_TO_lifted
+    )
     for values, title in (
         ({"trial": closed, "fit": fit}, "after closing"),
         ({"fit": fit}, "the hand where it comes closest"),
@@ -148,7 +157,7 @@ def test_last_panel_shows_the_last_instant(
     ):
         figure = verification_figure(verified(**values))
         assert figure.axes[2].get_title(loc="left") == title
-    refused = ForceLift(end=LiftEnd.INFEASIBLE, planned_force=np.inf)
+    refused = ForceLift(end=LiftEnd.INFEASIBLE, planned_force=np.inf, planned_share=np.inf)
     assert len(verification_figure(verified(lift=refused)).axes) == 2
 
 
@@ -160,11 +169,13 @@ def test_palm_is_where_the_lift_ended(cube: ObjectModel, config: Config, frictio
     scene = build_scene(cube, physics, load_hand(config.hand))
     record = run_attempt(scene, standing(cube), from_above(cube, 0.06), slick)
     assert record.lifted is not None
+    assert record.X_TO_lifted is not None
+    assert record.X_OG_lifted is not None
     assert record.lifted.touching.any() == (friction > 0.5)
     # The coarse steps of a lift have a scene of their own.
     assert scene.coarse_scene is not None
     X_WG = palm_pose(max(scene, scene.coarse_scene(), key=lambda stage: stage.time))
-    X_TG = record.X_TO @ record.X_OG
-    np.testing.assert_allclose(lifted_palm(X_TG, record.time_lift, slick), X_WG, atol=2e-4)
+    X_WO = X_WT @ record.X_TO_lifted
+    np.testing.assert_allclose(X_WO @ record.X_OG_lifted, X_WG, atol=1e-9)
     if friction < 0.5:
         assert X_WG[2, 3] < 0.65 + config.lift.p_TG[2] - 0.1

@@ -108,6 +108,7 @@ def results() -> list[Verification]:
     lift = ForceLift(
         end=LiftEnd.HELD,
         planned_force=5.0,
+        planned_share=0.125,
         applied_force=6.0,
         position_error=0.001,
         angle_error=np.deg2rad(2.0),

@@ -251,7 +251,7 @@ def test_another_hands_grasp_is_refused(cube: PlacedObject) -> None:
 def test_results_know_what_they_were_asked(held: dg.Verification, cube: PlacedObject) -> None:
     assert held.placed is cube and held.method == "hand"
     assert np.isnan(replace(held, fit=None).spread)
-    assert repr(held).startswith("Verification(hand, success")
+    assert repr(held).startswith("Verification(hand, held, precision, stable: ")
     assert held.pregrasp is not None and held.pregrasp.closing is not None
     assert held.closing is not None
     # The fingers were opened before they closed.

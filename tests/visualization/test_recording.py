@@ -20,6 +20,7 @@ from helpers.objects import CUBE, box_model, from_above, standing
 from drakegrasp.build.replay import record_trial
 from drakegrasp.config import Config, load_config
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Attempt
@@ -109,7 +110,7 @@ def test_recording_a_trial_changes_no_bit_of_it(
 def test_recording_a_lift_changes_no_bit_of_it(
     cube: ObjectModel, config: Config, tmp_path: Path
 ) -> None:
-    limit = load_hand(config.hand).fingertip_force_limit
+    limit = fingertip_forces(load_hand(config.hand), "worm")
     scene = build_scene(cube, config.physics)
     plain = lift_by_forces(scene, standing(cube), P_OQ, NHAT_Q_O, force_limit=limit, config=config)
     path = tmp_path / "lift.html"

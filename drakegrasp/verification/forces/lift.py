@@ -2,16 +2,17 @@
 
 In: a scene of object and table, the object's resting pose, contact points and normals. Out: a
 `ForceLift` with the verdict. The smallest forces for the lift are computed first: if there are
-none, or they are larger than a fingertip's limit, the grasp fails. Otherwise the lift is
+none, or one is larger than its fingertip's limit, the grasp fails. Otherwise the lift is
 simulated. At every control step the forces that keep the object on its path are computed again
-and applied to the body ("applying forces directly", Veres et al., appendix). They never leave
-the friction cones or exceed the limit; if they are not enough, the object leaves its path.
+and applied to the body ("applying forces directly", Veres et al., appendix), with the torsional
+moments of the contacts of a hand with two fingertips. They never leave the friction cones or exceed
+the limits; if they are not enough, the object leaves its path.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -26,7 +27,11 @@ from drakegrasp.frames import X_WT, Array, invert_pose, rotation_angle
 from drakegrasp.simulation.scene import Scene, advance, reset_object
 from drakegrasp.simulation.stepping import StateError
 from drakegrasp.simulation.trajectory import LiftPath, carrying_force, lift_path
-from drakegrasp.verification.forces.contact_forces import ForceProgram, largest_normal_force
+from drakegrasp.verification.forces.contact_forces import (
+    ForceProgram,
+    hardest_forces,
+    patch_torsion_radius,
+)
 
 #: Time steps of the simulation per solution of the contact forces. Between two solutions the
 #: forces keep their direction while the object turns, which turns it further, as in a column that
@@ -58,8 +63,9 @@ class ForceLift:
 
     Attributes:
         end: How it ended.
-        planned_force: Smallest limit of normal forces at which the lift is possible [N]; inf if no
-            forces carry the object.
+        planned_force: Normal force of the finger that takes the largest share of its limit, where
+            that share is as small as the lift allows [N]; inf if no forces carry the object.
+        planned_share: That share; above 1 the fingers are too weak.
         applied_force: Largest normal force that was applied [N].
         position_error: Distance of the object's origin from its path when the simulation ended
             [m].
@@ -71,6 +77,7 @@ class ForceLift:
 
     end: LiftEnd
     planned_force: float
+    planned_share: float
     applied_force: float = np.nan
     position_error: float = np.nan
     angle_error: float = np.nan
@@ -90,7 +97,7 @@ def lift_by_forces(
     p_OQ: npt.ArrayLike,
     nhat_Q_O: npt.ArrayLike,
     *,
-    force_limit: float,
+    force_limit: npt.ArrayLike,
     config: Config,
 ) -> ForceLift:
     """Return what happens when forces at contact points lift the object.
@@ -103,7 +110,7 @@ def lift_by_forces(
         X_TO: Resting pose of the object, (4, 4).
         p_OQ: (k, 3), contact points in {O} [m].
         nhat_Q_O: (k, 3), unit normals out of the object in {O}.
-        force_limit: Largest normal force of a contact [N].
+        force_limit: (k,), largest normal force of each contact [N], as `strength.fingertip_forces`.
         config: Physics, lift and limits.
 
     Raises:
@@ -114,22 +121,31 @@ def lift_by_forces(
 
     # Are there forces within the limit at all?
     path = lift_path(X_TO, config)
-    program = ForceProgram(p_OQ, nhat_Q_O, scene.model.p_OOcm, config.physics.friction_hand)
-    force = largest_normal_force(program, path.wrenches(scene.model))
+    program = ForceProgram(
+        p_OQ,
+        nhat_Q_O,
+        scene.model.p_OOcm,
+        config.physics.friction_hand,
+        force_limit=force_limit,
+        torsion_radius=patch_torsion_radius(len(np.asarray(p_OQ))),
+    )
+    needed = hardest_forces(program, path.wrenches(scene.model))
+    force = float(needed.normal[np.argmax(needed.shares)])
+    planned = ForceLift(end=LiftEnd.INFEASIBLE, planned_force=force, planned_share=needed.share)
     if not np.isfinite(force):
-        return ForceLift(end=LiftEnd.INFEASIBLE, planned_force=force)
-    if force > force_limit:
-        return ForceLift(end=LiftEnd.OVER_LIMIT, planned_force=force)
+        return planned
+    if needed.share > 1.0:
+        return replace(planned, end=LiftEnd.OVER_LIMIT)
 
     # Simulate the lift.
-    fingers = _Fingers(scene, np.asarray(p_OQ, dtype=float), program, force_limit)
+    fingers = _Fingers(scene, np.asarray(p_OQ, dtype=float), program)
     try:
-        return _simulate(fingers, force, path, config)
+        return _simulate(fingers, planned, path, config)
     except (MemoryError, OSError):
         raise  # the machine failed, not the grasp
     # A failed assertion within Drake arrives as SystemExit.
     except (Exception, SystemExit) as error:
-        return ForceLift(end=LiftEnd.ERROR, planned_force=force, message=first_line(error))
+        return replace(planned, end=LiftEnd.ERROR, message=first_line(error))
     finally:
         fingers.release()
 
@@ -141,7 +157,6 @@ class _Fingers:
     scene: Scene
     p_OQ: Array  # (k, 3) [m]
     program: ForceProgram
-    force_limit: float  # [N]
 
     def push(self, wrench_O: Array) -> float:
         """Apply the forces that give the object a wrench (6,), or come closest to it.
@@ -150,33 +165,33 @@ class _Fingers:
             The largest normal force [N].
         """
         forces = self.program.smallest(wrench_O)
-        if forces.largest_normal > self.force_limit:
-            forces = self.program.closest(wrench_O, self.force_limit)
+        if forces.share > 1.0:
+            forces = self.program.closest(wrench_O)
         if not np.isfinite(forces.largest_normal):
             raise StateError("the solver found no contact forces")
         R_WO = self.scene.pose(self.scene.object)[:3, :3]
-        self._apply(forces.f_Q_O @ R_WO.T)
+        self._apply(forces.f_Q_O @ R_WO.T, forces.tau_Q_O @ R_WO.T)
         return forces.largest_normal
 
     def release(self) -> None:
         """Remove all forces from the scene."""
-        self._apply(np.zeros_like(self.p_OQ))
+        self._apply(np.zeros_like(self.p_OQ), np.zeros_like(self.p_OQ))
 
-    def _apply(self, f_Q_W: Array) -> None:
-        """Apply forces (k, 3) in {W} [N] until the next call."""
+    def _apply(self, f_Q_W: Array, tau_Q_W: Array) -> None:
+        """Apply forces [N] and moments [N m], (k, 3) each in {W}, until the next call."""
         applied = []
-        for p, f in zip(self.p_OQ, f_Q_W, strict=True):
+        for p, f, tau in zip(self.p_OQ, f_Q_W, tau_Q_W, strict=True):
             force = ExternallyAppliedSpatialForce()
             force.body_index = self.scene.object.index()
             force.p_BoBq_B = p
-            force.F_Bq_W = SpatialForce(np.zeros(3), f)
+            force.F_Bq_W = SpatialForce(tau, f)
             applied.append(force)
         port = self.scene.plant.get_applied_spatial_force_input_port()
         port.FixValue(self.scene.context, applied)
 
 
-def _simulate(fingers: _Fingers, planned: float, path: LiftPath, config: Config) -> ForceLift:
-    """Simulate the lift along a path; `planned` is the result's `planned_force` [N]."""
+def _simulate(fingers: _Fingers, planned: ForceLift, path: LiftPath, config: Config) -> ForceLift:
+    """Simulate the lift along a path, and return what was planned with what happened."""
     # The object rests at the start of its path.
     scene = fingers.scene
     period = STEPS_PER_CONTROL * config.physics.time_step
@@ -191,7 +206,7 @@ def _simulate(fingers: _Fingers, planned: float, path: LiftPath, config: Config)
     end = time.monotonic() + config.attempt_seconds
     while done < steps and _within(deviation, config, LOST):
         if time.monotonic() > end:
-            return ForceLift(end=LiftEnd.TIMEOUT, planned_force=planned)
+            return replace(planned, end=LiftEnd.TIMEOUT)
         wrench_O = _wanted_wrench(scene, path, FREQUENCY_TIMES_PERIOD / period)
         largest = max(largest, fingers.push(wrench_O))
         advance(scene, period)
@@ -202,8 +217,8 @@ def _simulate(fingers: _Fingers, planned: float, path: LiftPath, config: Config)
 
     # Has it arrived?
     arrived = done == steps and _within(deviation, config, 1.0)
-    return ForceLift(
-        planned_force=planned,
+    return replace(
+        planned,
         end=LiftEnd.HELD if arrived else LiftEnd.STRAYED,
         applied_force=largest,
         position_error=deviation[0],

@@ -2,7 +2,8 @@
 
 In: contact points, outward normals, a friction coefficient. Out: measures of what forces at the
 contacts can do; nothing is simulated. Contacts are points with Coulomb friction: a finger pushes
-along the inward normal and along the surface, but neither pulls nor twists.
+along the inward normal and along the surface, but neither pulls nor twists. For a hand with two
+fingertips they are patches, which twist, see `contact_forces`.
 
 A wrench here is [torque about Ocm; force], (6,), in axes of {O} [N m, N], in the order of
 Drake's spatial forces.
@@ -17,19 +18,32 @@ import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 
 from drakegrasp.config import Config
+from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.objects.model import ObjectModel
+from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.trajectory import lift_path
 from drakegrasp.verification.forces.contact_forces import (
     ForceProgram,
     contact_axes,
     grasp_map,
-    largest_normal_force,
+    hardest_forces,
+    patch_torsion_radius,
 )
 
 #: Edges of the pyramid that approximates a friction cone from inside. With 16, epsilon is about
 #: 2 % too small and varies by as much with the frame; the hull takes 15 ms.
 FRICTION_EDGES = 16
+#: Latitudes of the points that approximate the ellipsoid of a patch from inside, and their number
+#: on each: tangential forces alone (as for a point), both, torsional moments alone.
+PATCH_RINGS = (
+    (0.0, FRICTION_EDGES),
+    (np.pi / 4.0, 8),
+    (-np.pi / 4.0, 8),
+    (np.pi / 2.0, 1),
+    (-np.pi / 2.0, 1),
+)
 #: An epsilon below this is rounding: the origin is on the surface of the hull.
 ROUNDING = 1e-9
 #: Largest friction coefficient that is tried, and the tolerance of the smallest one.
@@ -57,6 +71,7 @@ def ferrari_canny(
     *,
     friction: float,
     length: float,
+    torsion_radius: float = 0.0,
 ) -> float:
     """Return the epsilon of a grasp: the smallest wrench that can break it.
 
@@ -71,19 +86,23 @@ def ferrari_canny(
         p_OOcm: (3,), the centre of mass in {O} [m].
         friction: Coulomb coefficient.
         length: Length by which torques are divided [m], see `characteristic_length`.
+        torsion_radius: Of the contacts' patches [m], see `contact_forces`; 0 for points.
 
     Returns:
         Epsilon, without unit; 0 if the origin is not inside the hull, the hull is flat, or a
         number is not finite.
     """
-    # Wrenches of the edges of all pyramids.
-    angles = 2.0 * np.pi * np.arange(FRICTION_EDGES) / FRICTION_EDGES
-    pyramid = np.stack(
-        [np.ones(FRICTION_EDGES), friction * np.cos(angles), friction * np.sin(angles)]
-    )
-    edges = contact_axes(nhat_Q_O) @ pyramid  # (k, 3, edges)
+    # Directions of the edges of a contact's cone: tangential forces, and torsional moments.
+    edges = _edges(patch=torsion_radius > 0.0)
+    tangential, torsional = friction * edges[:, :2], friction * torsion_radius * edges[:, 2]
+
+    # Their wrenches, for a normal force of one.
+    axes = contact_axes(nhat_Q_O)
+    forces = axes @ np.column_stack([np.ones(len(edges)), tangential]).T  # (k, 3, edges)
     blocks = grasp_map(p_OQ, p_OOcm).reshape(6, -1, 3)
-    wrenches = np.einsum("wki,kie->kew", blocks, edges).reshape(-1, 6)
+    wrenches = np.einsum("wki,kie->kew", blocks, forces)
+    wrenches[..., :3] += axes[:, None, :, 0] * torsional[:, None]
+    wrenches = wrenches.reshape(-1, 6)
     wrenches[:, :3] /= length
     if not np.isfinite(wrenches).all():
         return 0.0
@@ -98,12 +117,23 @@ def ferrari_canny(
     return epsilon if epsilon > ROUNDING else 0.0
 
 
+def _edges(*, patch: bool) -> Array:
+    """Return unit vectors (n, 3): shares of two tangential forces and of the torsional moment."""
+    rings = PATCH_RINGS if patch else PATCH_RINGS[:1]
+    edges = []
+    for latitude, count in rings:
+        angles = 2.0 * np.pi * np.arange(count) / count
+        along, across = np.cos(latitude), np.full(count, np.sin(latitude))
+        edges.append(np.column_stack([along * np.cos(angles), along * np.sin(angles), across]))
+    return np.concatenate(edges)
+
+
 @dataclass(frozen=True, kw_only=True)
 class ForceMargin:
     """By what margin forces at the contacts hold the object.
 
     Attributes:
-        smallest_friction: Smallest coefficient at which forces within the limit of the hand's
+        smallest_friction: Smallest coefficient at which forces within the limits of the hand's
             fingertips carry the lift; inf if none is enough.
         epsilon: Of Ferrari and Canny at the configured friction, with torques divided by the
             largest distance of the object's surface from its centre of mass; 0 without force
@@ -128,15 +158,21 @@ def force_margin(
         X_TO: (4, 4), its resting pose.
         p_OQ: (k, 3), contact points in {O} [m].
         nhat_Q_O: (k, 3), normals out of the object in {O}.
-        config: Hand, friction and lift.
+        config: Hand, its drive, friction and lift.
     """
+    # What the hand's fingertips can do.
+    hand = load_hand(config.hand)
+    limits = fingertip_forces(hand, drive_of(hand, config.lift))
+    radius = patch_torsion_radius(hand.num_fingers)
+
     return ForceMargin(
         smallest_friction=smallest_friction(
             p_OQ,
             nhat_Q_O,
             model.p_OOcm,
             lift_path(X_TO, config).wrenches(model),
-            load_hand(config.hand).fingertip_force_limit,
+            limits,
+            torsion_radius=radius,
         ),
         epsilon=ferrari_canny(
             p_OQ,
@@ -144,6 +180,7 @@ def force_margin(
             model.p_OOcm,
             friction=config.physics.friction_hand,
             length=characteristic_length(model.visual_vertices, model.p_OOcm),
+            torsion_radius=radius,
         ),
     )
 
@@ -153,7 +190,9 @@ def smallest_friction(
     nhat_Q_O: npt.ArrayLike,
     p_OOcm: npt.ArrayLike,
     wrenches_O: npt.ArrayLike,
-    force_limit: float,
+    force_limit: npt.ArrayLike,
+    *,
+    torsion_radius: float = 0.0,
 ) -> float:
     """Return the smallest friction coefficient at which all wrenches can be applied.
 
@@ -164,7 +203,8 @@ def smallest_friction(
         nhat_Q_O: (k, 3), normals out of the object in {O}.
         p_OOcm: (3,), centre of mass in {O} [m].
         wrenches_O: (n, 6), each torque about Ocm and force on the object in {O} [N m, N].
-        force_limit: Largest normal force of a contact [N].
+        force_limit: (k,), largest normal force of each contact, or one for all [N].
+        torsion_radius: Of the contacts' patches [m], see `contact_forces`; 0 for points.
 
     Returns:
         The coefficient, rounded up by at most `FRICTION_TOLERANCE`; inf if `MAX_FRICTION` is not
@@ -172,8 +212,15 @@ def smallest_friction(
     """
 
     def holds(friction: float) -> bool:
-        program = ForceProgram(p_OQ, nhat_Q_O, p_OOcm, friction)
-        return largest_normal_force(program, wrenches_O) <= force_limit
+        program = ForceProgram(
+            p_OQ,
+            nhat_Q_O,
+            p_OOcm,
+            friction,
+            force_limit=force_limit,
+            torsion_radius=torsion_radius,
+        )
+        return hardest_forces(program, wrenches_O).share <= 1.0
 
     low, high = 0.0, MAX_FRICTION
     if not holds(high):

@@ -14,7 +14,7 @@ from drakegrasp.errors import HandError
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import coordinate_limits
-from drakegrasp.hand.shapes import link_shapes
+from drakegrasp.hand.shapes import link_shapes, pad_surfaces
 from drakegrasp.verification.wrist.pads import Pads, make_pads
 
 #: A vector times this, reshaped to 3 x 3, is the matrix of its cross product.
@@ -82,7 +82,7 @@ def hand_constants(hand: Hand) -> HandConstants:
     chains = _stack_chains(hand)
     return HandConstants(
         **chains,
-        pads=make_pads(corners),
+        pads=make_pads(corners, [finger.pad_region for finger in hand.fingers], pad_surfaces(hand)),
         pad_points=np.array([finger.p_FiP for finger in hand.fingers]),
         limits=coordinate_limits(hand),
         fingertips=padded,

@@ -8,6 +8,10 @@ The distance of p from a convex body with face planes n_j . p = d_j is at least 
 of n_j . p - d_j, and equal to it in front of a face. Here the largest is replaced by the smooth
 maximum s log sum exp((n_j . p - d_j) / s) (Boyd and Vandenberghe, "Convex Optimization",
 3.1.5), which rounds edges with a radius of about s.
+
+A fingertip may touch within its pad region only. The planes of the region are no surface, so the
+distance is that of the whole fingertip, and how far a point is outside of the region is told beside
+it: a point on the fingertip but so far outside is about as far from the pad.
 """
 
 from __future__ import annotations
@@ -20,6 +24,7 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from drakegrasp.frames import Array
+from drakegrasp.hand.description import HalfSpace
 
 #: Rounding s of the edges [m]: about the unevenness of the pads themselves.
 ROUNDING = 0.7e-3
@@ -29,16 +34,20 @@ SAME_PLANE = 6
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pads:
-    """The surfaces of k fingertips, each with m planes (padded with planes at infinity).
+    """The surfaces of k fingertips, each with m planes and h half-spaces (padded).
 
     Attributes:
         normals: (k, m, 3), unit, outward, in each fingertip's frame.
-        offsets: (k, m), n . p on the plane [m].
-        triangles: For each fingertip (t, 3, 3), the corners of its surface's triangles [m].
+        offsets: (k, m), n . p on the plane [m]; padded with planes at infinity.
+        region_normals: (k, h, 3), unit, into the pad region; padded with zeros.
+        region_offsets: (k, h), n . p on the border of the region [m]; padded with -1.
+        triangles: For each fingertip (t, 3, 3), the corners of its pad's triangles [m].
     """
 
     normals: Array
     offsets: Array
+    region_normals: Array
+    region_offsets: Array
     triangles: tuple[Array, ...]
 
 
@@ -52,16 +61,29 @@ class PadContact:
         gradient: (k, 3), derivative of `distance` by the point; along `normal`, shorter than one at
             edges.
         normal_jacobian: (k, 3, 3), derivative of `normal` by the point [1/m].
+        outside: (k, h), how far the point is outside of each half-space of the pad region, 0 inside
+            [m].
+        outside_gradient: (k, h, 3), derivative of `outside` by the point.
     """
 
     distance: Array
     normal: Array
     gradient: Array
     normal_jacobian: Array
+    outside: Array
+    outside_gradient: Array
 
 
-def make_pads(corners: Sequence[Array]) -> Pads:
-    """Return the pads of k fingertips, each the convex hull of corners (n, 3) [m]."""
+def make_pads(
+    corners: Sequence[Array], regions: Sequence[Sequence[HalfSpace]], triangles: Sequence[Array]
+) -> Pads:
+    """Return the pads of k fingertips.
+
+    Args:
+        corners: (n, 3), of each fingertip; its shape is their convex hull [m].
+        regions: Half-spaces of each pad.
+        triangles: (t, 3, 3), surface of each pad, see `hand.shapes.pad_surfaces` [m].
+    """
     # The planes of each hull; a row of equations is a unit normal and minus the offset.
     hulls = [ConvexHull(points) for points in corners]
     planes = [np.unique(np.round(hull.equations, SAME_PLANE), axis=0) for hull in hulls]
@@ -74,8 +96,23 @@ def make_pads(corners: Sequence[Array]) -> Pads:
         normals[i, : len(equations)] = equations[:, :3]
         offsets[i, : len(equations)] = -equations[:, 3]
 
-    triangles = tuple(hull.points[hull.simplices] for hull in hulls)
-    return Pads(normals=normals, offsets=offsets, triangles=triangles)
+    # Stack the half-spaces; every point is in one without a normal whose border is at -1.
+    most = max(map(len, regions))
+    region_normals = np.zeros((len(planes), most, 3))
+    region_offsets = np.full((len(planes), most), -1.0)
+    for i, region in enumerate(regions):
+        for j, (*normal, offset) in enumerate(region):
+            length = np.linalg.norm(normal)
+            region_normals[i, j] = np.array(normal) / length
+            region_offsets[i, j] = offset / length
+
+    return Pads(
+        normals=normals,
+        offsets=offsets,
+        region_normals=region_normals,
+        region_offsets=region_offsets,
+        triangles=tuple(triangles),
+    )
 
 
 def nearest_on_pads(pads: Pads, p_FiQ: Array) -> Array:
@@ -121,9 +158,14 @@ def signed_distance(pads: Pads, p_FiQ: Array) -> PadContact:
     along = np.matmul(normal[:, None, :], hessian)
     normal_jacobian = (hessian - normal[:, :, None] * along) / length[:, None, None]
 
+    # How far outside of the pad region the point is.
+    outside = pads.region_offsets - np.matmul(pads.region_normals, p_FiQ[:, :, None])[..., 0]
+
     return PadContact(
         distance=ROUNDING * (highest + np.log(total)),
         normal=normal,
         gradient=gradient,
         normal_jacobian=normal_jacobian,
+        outside=np.maximum(outside, 0.0),
+        outside_gradient=-pads.region_normals * (outside > 0.0)[..., None],
     )

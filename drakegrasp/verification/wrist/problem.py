@@ -101,12 +101,13 @@ def evaluate(problem: WristProblem, x: Array) -> Evaluation:
     and c = (spread, closing 1..k) are the hand's coordinates. The objective is
 
         sum_i  phi_i^2 + w_n^2 |m_i + n_i|^2 + w_v^2 |v_i + n_i|^2 + w_p^2 |p_FiQi - p_FiP|^2
-        + w_c^2 |c - c_S|^2
+        + w_c^2 |c - c_S|^2 + |o_i|^2
 
     with phi_i the distance of the predicted point Q_i from the surface of fingertip i, m_i the
     pad's outward normal there (`pads.signed_distance`), n_i the predicted outward normal, v_i the
     unit direction in which fingertip i moves at Q_i when its finger closes, p_FiP the hand file's
-    pad point, and c_S the coordinates of the start. The weights are `NORMAL_WEIGHT` (w_n),
+    pad point, c_S the coordinates of the start, and o_i how far Q_i is outside of each half-space
+    of the pad region of finger i. The weights are `NORMAL_WEIGHT` (w_n),
     `CLOSING_WEIGHT` (w_v), `PAD_WEIGHT` (w_p) and `POSTURE_WEIGHT` (w_c). The residuals are the
     terms in this order, unsquared. The constraints are that the clearances, the smooth minima of
     the heights of palm and fingertips over the table, are not negative.
@@ -157,6 +158,7 @@ def evaluate(problem: WristProblem, x: Array) -> Evaluation:
             CLOSING_WEIGHT * (closing + n_G).ravel(),
             PAD_WEIGHT * (p_FQ - constants.pad_points).ravel(),
             POSTURE_WEIGHT * (coordinates - problem.posture),
+            contact.outside.ravel(),
         ]
     )
     jacobian = np.zeros((len(residuals), n))
@@ -164,7 +166,8 @@ def evaluate(problem: WristProblem, x: Array) -> Evaluation:
     jacobian[k : 4 * k] = NORMAL_WEIGHT * dpad_G.reshape(-1, n)
     jacobian[4 * k : 7 * k] = CLOSING_WEIGHT * dclosing.reshape(-1, n)
     jacobian[7 * k : 10 * k] = PAD_WEIGHT * dp_F.reshape(-1, n)
-    jacobian[10 * k :, POSE:] = POSTURE_WEIGHT * np.eye(n - POSE)
+    jacobian[10 * k : 10 * k + n - POSE, POSE:] = POSTURE_WEIGHT * np.eye(n - POSE)
+    jacobian[10 * k + n - POSE :] = np.matmul(contact.outside_gradient, dp_F).reshape(-1, n)
 
     # The heights over the table.
     clearance, clearance_jacobian = _clearance(problem, X_OG, R_SG, spin_G, X_GF, axes, origins)

@@ -12,8 +12,8 @@ from drakegrasp.verification.forces.contact_forces import (
     ForceProgram,
     contact_axes,
     grasp_map,
-    largest_normal_force,
-    smallest_forces,
+    hardest_forces,
+    patch_torsion_radius,
 )
 from drakegrasp.verification.forces.quality import (
     FRICTION_TOLERANCE,
@@ -33,6 +33,11 @@ def ring(k: int, radius: float = 0.04) -> tuple[np.ndarray, np.ndarray]:
     angles = 2.0 * np.pi * np.arange(k) / k
     normals = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(k)])
     return radius * normals, normals
+
+
+def smallest_forces(p, n, p_OOcm, wrench, friction, **limits) -> ContactForces:
+    """Return the smallest forces of one wrench."""
+    return ForceProgram(p, n, p_OOcm, friction, **limits).smallest(wrench)
 
 
 #: Two contacts on one face of a box, one in the middle of the opposite face.
@@ -126,9 +131,9 @@ def test_forces_move_and_turn_with_the_frame(seed):
 
 def test_one_programme_serves_all_wrenches_in_any_order():
     p, n, p_OOcm = some_grasp(3)
-    program = ForceProgram(p, n, p_OOcm, MU)
+    program = ForceProgram(p, n, p_OOcm, MU, force_limit=20.0)
     heavy = program.smallest(2.0 * CARRY)
-    program.closest([1.0, 0.0, 0.0, 0.0, 0.0, 100.0], 20.0)
+    program.closest([1.0, 0.0, 0.0, 0.0, 0.0, 100.0])
     light = program.smallest(CARRY)
     assert heavy.largest_normal == pytest.approx(2.0 * light.largest_normal, rel=1e-6)
     alone = ForceProgram(p, n, p_OOcm, MU).smallest(CARRY)
@@ -166,7 +171,7 @@ def test_grasp_that_cannot_carry_the_object_says_so(p, n):
 def test_wrench_that_is_not_finite_cannot_be_given():
     program = ForceProgram(*PINCH, ORIGIN, MU)
     assert not program.smallest(CARRY * np.nan).feasible
-    assert not program.closest(CARRY * np.nan, 20.0).feasible
+    assert not program.closest(CARRY * np.nan).feasible
 
 
 def test_pinch_without_friction_cannot_carry():
@@ -175,7 +180,7 @@ def test_pinch_without_friction_cannot_carry():
 
 def test_closest_forces_give_a_wrench_that_is_within_the_limit():
     p, n, p_OOcm = some_grasp(1)
-    forces = ForceProgram(p, n, p_OOcm, MU).closest(CARRY, 20.0)
+    forces = ForceProgram(p, n, p_OOcm, MU, force_limit=20.0).closest(CARRY)
     assert_in_cones(forces, n, MU)
     assert np.allclose(grasp_map(p, p_OOcm) @ forces.f_Q_O.ravel(), CARRY, atol=1e-3)
 
@@ -183,7 +188,7 @@ def test_closest_forces_give_a_wrench_that_is_within_the_limit():
 def test_closest_forces_to_a_load_that_is_too_heavy_are_at_the_limit():
     """Three contacts around a cylinder carry at most 3 mu times the limit."""
     p, n = ring(3)
-    forces = ForceProgram(p, n, ORIGIN, MU).closest(100.0 * CARRY, 20.0)
+    forces = ForceProgram(p, n, ORIGIN, MU, force_limit=20.0).closest(100.0 * CARRY)
     assert not forces.feasible
     assert_in_cones(forces, n, MU)
     assert forces.largest_normal == pytest.approx(20.0, rel=1e-5)
@@ -193,7 +198,7 @@ def test_closest_forces_to_a_load_that_is_too_heavy_are_at_the_limit():
 def test_no_forces_within_friction_are_closer_than_the_closest():
     p, n, p_OOcm = some_grasp(4)
     wrench = np.array([0.8, -0.5, 1.0, 30.0, -10.0, 40.0])
-    forces = ForceProgram(p, n, p_OOcm, MU).closest(wrench, 20.0)
+    forces = ForceProgram(p, n, p_OOcm, MU, force_limit=20.0).closest(wrench)
     assert_in_cones(forces, n, MU)
     arm = np.linalg.norm(p - p_OOcm, axis=1).max()
     units = np.repeat([arm, 1.0], 3)
@@ -226,8 +231,8 @@ def test_smallest_friction_is_where_the_force_limit_is_met(seed):
     p, n, p_OOcm = some_grasp(seed)
     loads = np.array([1.1 * CARRY, 0.9 * CARRY])
     friction = smallest_friction(p, n, p_OOcm, loads, 20.0)
-    at = largest_normal_force(ForceProgram(p, n, p_OOcm, friction), loads)
-    below = largest_normal_force(ForceProgram(p, n, p_OOcm, friction - 2e-4), loads)
+    at = hardest_forces(ForceProgram(p, n, p_OOcm, friction), loads).largest_normal
+    below = hardest_forces(ForceProgram(p, n, p_OOcm, friction - 2e-4), loads).largest_normal
     assert at <= 20.0 < below
 
 
@@ -240,3 +245,80 @@ def test_smallest_friction_is_infinite_where_the_limit_is_too_low():
     p, n = ring(3)
     limit = 0.99 * WEIGHT / (3.0 * MAX_FRICTION)
     assert smallest_friction(p, n, ORIGIN, [CARRY], limit) == np.inf
+
+
+def test_weak_finger_is_spared():
+    """It could carry 0.1 of its limit by friction alone; unequal forces must balance as well."""
+    p, n = ring(3)
+    limits = np.array([10.0, 20.0, 30.0])
+    up = 0.1 * MU * limits[:, None] * [0.0, 0.0, 1.0]
+    wrench = np.append(np.cross(p, up).sum(axis=0), up.sum(axis=0))
+    forces = smallest_forces(p, n, ORIGIN, wrench, MU, force_limit=limits)
+    assert 0.1 <= forces.share < 0.13
+    assert np.allclose(forces.shares, forces.normal / limits)
+    assert smallest_forces(p, n, ORIGIN, wrench, MU).normal[0] > 1.1 * forces.normal[0]
+
+
+def test_no_forces_take_a_smaller_share_of_unequal_limits():
+    """Doubling the limit of the finger that presses hardest halves the share, and no more."""
+    forces = smallest_forces(*PINCH, ORIGIN, CARRY, MU, force_limit=[20.0, 20.0, 40.0])
+    # Finger 3 presses as hard as both others: N = m g / (2 mu), half of that on each of them.
+    normal = WEIGHT / (2.0 * MU)
+    assert forces.share == pytest.approx(normal / 40.0, rel=1e-6)
+    assert np.allclose(forces.normal, [normal / 2.0, normal / 2.0, normal], rtol=1e-5)
+    weak = smallest_forces(*PINCH, ORIGIN, CARRY, MU, force_limit=[40.0, 40.0, 20.0])
+    assert weak.share == pytest.approx(normal / 20.0, rel=1e-6)
+
+
+def test_closest_forces_keep_to_the_limit_of_each_finger():
+    p, n = ring(3)
+    limits = np.array([5.0, 20.0, 20.0])
+    forces = ForceProgram(p, n, ORIGIN, MU, force_limit=limits).closest(100.0 * CARRY)
+    assert np.all(forces.normal <= limits * (1.0 + 1e-6))
+    assert forces.normal[0] == pytest.approx(5.0, rel=1e-4)
+
+
+def two_pads(offset: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return two contacts on opposite faces, `offset` [m] beside the centre of mass."""
+    p = np.array([[offset, 0.03, 0.0], [offset, -0.03, 0.0]])
+    return p, np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def test_two_points_resist_no_torque_about_their_line_and_two_patches_do():
+    """Half of the weight and of its torque on each: mu N = sqrt((W/2)^2 + (W d / (2 r))^2)."""
+    offset, radius = 0.004, 0.003
+    p, n = two_pads(offset)
+    assert not smallest_forces(p, n, ORIGIN, CARRY, MU).feasible
+    forces = smallest_forces(p, n, ORIGIN, CARRY, MU, torsion_radius=radius)
+    assert forces.feasible
+    exact = WEIGHT / 2.0 * np.hypot(1.0, offset / radius) / MU
+    assert forces.largest_normal == pytest.approx(exact, rel=1e-6)
+    moment = np.cross(p, forces.f_Q_O).sum(axis=0) + forces.tau_Q_O.sum(axis=0)
+    assert np.allclose(moment, 0.0, atol=1e-7)
+
+
+def test_torsional_moment_is_about_the_normal_and_within_the_ellipsoid():
+    p, n, p_OOcm = some_grasp(2)
+    radius, wrench = 0.004, np.array([0.05, -0.02, 0.08, 3.0, 1.0, 9.0])
+    forces = smallest_forces(p, n, p_OOcm, wrench, MU, torsion_radius=radius)
+    torsion = np.einsum("ij,ij->i", forces.tau_Q_O, n)
+    assert np.abs(torsion).max() > 1e-3
+    assert np.allclose(forces.tau_Q_O, torsion[:, None] * n)
+    tangential = np.linalg.norm(forces.f_Q_O + forces.normal[:, None] * n, axis=1)
+    assert np.all(np.hypot(tangential, torsion / radius) <= MU * forces.normal + 1e-6)
+    moments = (np.cross(p - p_OOcm, forces.f_Q_O) + forces.tau_Q_O).sum(axis=0)
+    assert np.allclose(np.append(moments, forces.f_Q_O.sum(axis=0)), wrench, atol=1e-6)
+
+
+def test_patches_are_for_hands_that_points_cannot_hold_with():
+    """A disc of 68 mm^2 has a radius of 4.65 mm."""
+    assert [patch_torsion_radius(k) > 0.0 for k in (1, 2, 3, 4)] == [True, True, False, False]
+    assert patch_torsion_radius(2) == pytest.approx(2.0 / 3.0 * 4.65e-3, rel=1e-3)
+
+
+def test_smallest_friction_of_two_patches_is_their_closed_form():
+    p, n = two_pads(0.004)
+    friction = smallest_friction(p, n, ORIGIN, [CARRY], [20.0, 30.0], torsion_radius=0.003)
+    assert smallest_friction(p, n, ORIGIN, [CARRY], [20.0, 30.0]) == np.inf
+    exact = WEIGHT / 2.0 * np.hypot(1.0, 4.0 / 3.0) / 20.0
+    assert friction == pytest.approx(exact, abs=2e-4)

@@ -12,11 +12,13 @@ from scipy.spatial.transform import Rotation
 from drakegrasp.config import Config, load_config
 from drakegrasp.frames import X_WT, make_pose
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.scene import Scene, advance, reset_object
 from drakegrasp.simulation.trajectory import PEAK_ACCELERATION, lift_duration
 from drakegrasp.verification.forces import lift as force_lift_module
+from drakegrasp.verification.forces.contact_forces import patch_torsion_radius
 from drakegrasp.verification.forces.lift import ForceLift, LiftEnd, lift_by_forces
 from drakegrasp.verification.forces.quality import force_margin
 
@@ -78,7 +80,8 @@ def test_more_friction_than_the_smallest_holds_and_less_does_not(scene, cube, co
     for factor, outcome in ((1.001, LiftEnd.HELD), (0.999, LiftEnd.OVER_LIMIT)):
         friction = factor * smallest
         changed = load_config(overrides=[f"physics.friction_hand={friction}"])
-        found = lift_by_forces(scene, standing(cube), P, N, force_limit=LIMIT, config=changed)
+        limits = fingertip_forces(load_hand(), "worm")
+        found = lift_by_forces(scene, standing(cube), P, N, force_limit=limits, config=changed)
         assert found.end is outcome
 
 
@@ -210,6 +213,33 @@ def test_error_within_drake_is_an_outcome(scene, cube, config, monkeypatch, erro
     assert found.end is LiftEnd.ERROR
     assert found.message == str(error).splitlines()[0]
     assert not found.held
+
+
+def test_limit_is_that_of_the_finger(scene, cube, config):
+    """Finger 3 opposes two: it needs twice their force, and only its own limit counts for it."""
+    mu = config.physics.friction_hand
+    needed = heaviest(config) / (2.0 * mu)
+    weak = 0.9 * needed
+    for limits, outcome in (
+        ([weak, weak, 1.1 * needed], LiftEnd.HELD),
+        ([1.1 * needed, 1.1 * needed, weak], LiftEnd.OVER_LIMIT),
+    ):
+        found = lift_by_forces(scene, standing(cube), P, N, force_limit=limits, config=config)
+        assert found.end is outcome
+        assert found.planned_force == pytest.approx(needed, rel=1e-4)
+        assert found.planned_share == pytest.approx(needed / limits[2], rel=1e-4)
+
+
+def test_two_fingertips_hold_a_cube_beside_its_centre_by_torsion(scene, cube, config):
+    """As points they would let it swing about the line between them."""
+    p = np.array([[0.004, HALF, 0.0], [0.004, -HALF, 0.0]])
+    n = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
+    found = lift_by_forces(scene, standing(cube), p, n, force_limit=[LIMIT, LIMIT], config=config)
+    share = np.hypot(1.0, 0.004 / patch_torsion_radius(2)) / 2.0
+    mu = config.physics.friction_hand
+    assert found.planned_force == pytest.approx(heaviest(config) * share / mu, rel=1e-4)
+    assert found.end is LiftEnd.HELD
+    assert found.angle_error < 1e-3
 
 
 def test_scene_with_a_hand_is_refused(cube, config):

@@ -14,8 +14,10 @@ from scipy.spatial import ConvexHull
 
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array
-from drakegrasp.hand.description import Hand, load_hand, make_parser
-from drakegrasp.hand.shapes import link_shapes
+from drakegrasp.hand import shapes
+from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.parsing import make_parser
+from drakegrasp.hand.shapes import hull_triangles, link_shapes, pad_surfaces
 from drakegrasp.verification.wrist.pads import (
     ROUNDING,
     Pads,
@@ -38,9 +40,14 @@ def bodies() -> list[Array]:
     return [trimesh.creation.box(2.0 * HALF).vertices, tetrahedron, fingertip]
 
 
+def whole_pads(corners: list[Array]) -> Pads:
+    """Return fingertips that are pads all over."""
+    return make_pads(corners, [()] * len(corners), [hull_triangles(c) for c in corners])
+
+
 @pytest.fixture(scope="module")
 def pads() -> Pads:
-    return make_pads(bodies())
+    return whole_pads(bodies())
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +91,7 @@ def test_smooth_distance_is_over_the_planes_by_its_rounding_at_most(
 def test_before_the_middle_of_a_face_the_distance_is_the_exact_one(
     pads: Pads, hulls: list[trimesh.Trimesh]
 ) -> None:
-    box = make_pads([trimesh.creation.box(2.0 * HALF).vertices])
+    box = whole_pads([trimesh.creation.box(2.0 * HALF).vertices])
     for axis in range(3):
         for height in (0.02, 0.003, 0.0, -0.001):
             for side in (-1.0, 1.0):
@@ -148,9 +155,65 @@ def test_nearest_point_is_trimeshs_own(pads: Pads, hulls: list[trimesh.Trimesh],
 
 
 def test_nearest_point_has_no_rounding() -> None:
-    box = make_pads([trimesh.creation.box(2.0 * HALF).vertices])
+    box = whole_pads([trimesh.creation.box(2.0 * HALF).vertices])
     corner = nearest_on_pads(box, np.array([HALF + 0.01]))
     np.testing.assert_allclose(corner[0], HALF, atol=1e-12)
+
+
+# The pad region
+
+
+#: A box with edges of 20, 20 and 60 mm is a pad above x = 0, and below y = 5 mm.
+REGION = ((2.0, 0.0, 0.0, 0.0), (0.0, -1.0, 0.0, -0.005))
+
+
+def half_box() -> Pads:
+    """Return two boxes, the first a pad in `REGION` only."""
+    corners = trimesh.creation.box([0.02, 0.02, 0.06]).vertices
+    whole = hull_triangles(corners)
+    half = whole
+    for half_space in REGION:
+        half = shapes._clip(half, half_space)
+    return make_pads([corners, corners], [REGION, ()], [half, whole])
+
+
+def test_pad_ends_at_its_region_without_a_face_there() -> None:
+    """Area of half a box, without the cuts: an end, and parts of two ends and of two sides."""
+    pads = half_box()
+    area = [float(trimesh.triangles.area(triangles).sum()) for triangles in pads.triangles]
+    assert area[0] == pytest.approx(0.015 * 0.06 + 2.0 * 0.01 * 0.015 + 0.01 * 0.06)
+    assert area[1] == pytest.approx(4.0 * 0.02 * 0.06 + 2.0 * 0.02**2)
+
+
+def test_nearest_point_of_a_pad_is_not_on_a_cut() -> None:
+    """Before the middle of the removed half, the pad begins at its border."""
+    inside = np.tile([0.002, 0.004, 0.0], (2, 1))
+    near = nearest_on_pads(half_box(), inside)
+    assert np.allclose(near, [[0.01, 0.004, 0.0], [0.002, 0.01, 0.0]])
+    outside = np.tile([-0.012, 0.0, 0.0], (2, 1))
+    near = nearest_on_pads(half_box(), outside)
+    assert np.allclose(near[:, 0], [0.0, -0.01])
+    assert abs(near[0, 1]) == pytest.approx(0.01) or abs(near[0, 2]) == pytest.approx(0.03)
+
+
+def test_point_outside_the_region_is_told_by_how_much() -> None:
+    p = np.tile([-0.003, 0.006, 0.0], (2, 1))
+    contact = signed_distance(half_box(), p)
+    assert np.allclose(contact.outside, [[0.003, 0.001], [0.0, 0.0]])
+    assert np.allclose(contact.outside_gradient[0], [[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    assert not contact.outside_gradient[1].any()
+    within = signed_distance(half_box(), np.tile([0.003, 0.001, 0.0], (2, 1)))
+    assert not within.outside.any()
+    assert not within.outside_gradient.any()
+
+
+def test_pads_of_the_barrett_hand_are_in_their_region() -> None:
+    hand = load_hand()
+    for finger, triangles in zip(hand.fingers, pad_surfaces(hand), strict=True):
+        corners = triangles.reshape(-1, 3)
+        assert finger.on_pad(corners + 1e-9).all()
+        assert np.allclose(corners.min(axis=0)[:2], [0.018, 0.0])
+        assert corners[:, 0].max() > 0.057
 
 
 # The shapes of links
@@ -162,10 +225,10 @@ def hand() -> Hand:
 
 
 def test_every_link_of_the_barrett_hand_has_shapes_that_are_solids(hand: Hand) -> None:
-    shapes = link_shapes(hand)
-    assert len(shapes) == 9
-    assert {hand.palm_link, *hand.fingertip_links} <= set(shapes)
-    for parts in shapes.values():
+    links = link_shapes(hand)
+    assert len(links) == 9
+    assert {hand.palm_link, *hand.fingertip_links} <= set(links)
+    for parts in links.values():
         assert parts
         for corners in parts:
             assert corners.shape[1] == 3
@@ -176,7 +239,7 @@ def test_barretts_pad_points_are_on_their_fingertips(hand: Hand) -> None:
     """The median of contacts on a rounded pad is a little below its surface."""
     corners = [np.concatenate(link_shapes(hand)[link]) for link in hand.fingertip_links]
     p_FiP = np.array([finger.p_FiP for finger in hand.fingers])
-    off = np.linalg.norm(nearest_on_pads(make_pads(corners), p_FiP) - p_FiP, axis=1)
+    off = np.linalg.norm(nearest_on_pads(whole_pads(corners), p_FiP) - p_FiP, axis=1)
     assert off.max() < 2.5e-3
 
 
@@ -207,9 +270,9 @@ SHAPES = {
 @pytest.mark.parametrize("kind", SHAPES)
 def test_shapes_have_the_volume_and_place_of_their_formula(tmp_path: Path, kind: str) -> None:
     sdf, volume, tolerance = SHAPES[kind]
-    shapes = link_shapes(load_hand(with_shape(tmp_path, sdf)))
-    assert shapes["mount"] == ()
-    (corners,) = shapes["left"]
+    links = link_shapes(load_hand(with_shape(tmp_path, sdf)))
+    assert links["mount"] == ()
+    (corners,) = links["left"]
     assert ConvexHull(corners).volume == pytest.approx(volume, rel=tolerance)
     # The collision's pose in the link.
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2.0

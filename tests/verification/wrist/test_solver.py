@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import combinations, permutations
 
@@ -114,6 +114,33 @@ def test_contacts_that_the_hand_made_are_found_again() -> None:
         turned.append(np.rad2deg(fits[0].normal_error.max()))
     assert np.mean(np.array(turned) < 15.0) >= 0.95
     assert max(turned) < 40.0
+
+
+@pytest.mark.parametrize("seed", SEEDS[:6])
+def test_points_that_the_back_of_a_fingertip_touched_are_brought_onto_the_pad(seed: int) -> None:
+    """Near the tip but behind the pad: without the region the fit stays there, with it it moves."""
+    hand = hand_of("barrett")
+    bare = replace(hand, fingers=tuple(replace(f, pad_region=()) for f in hand.fingers))
+    X_GF = fingertip_poses(hand, spread=0.3, closing=np.deg2rad([60.0, 50.0, 70.0]))
+    p_FQ = np.random.default_rng(seed).uniform([0.055, -0.008, -0.003], [0.058, -0.006, 0.003])
+    p_FQ = nearest_on_pads(hand_constants(bare).pads, np.tile(p_FQ, (3, 1)))
+    normals = signed_distance(hand_constants(bare).pads, p_FQ).normal
+    made = Touch(
+        X_OG=np.eye(4),
+        coordinates=np.zeros(4),
+        p_OQ=np.einsum("kab,kb->ka", X_GF[:, :3, :3], p_FQ) + X_GF[:, :3, 3],
+        nhat_Q_O=-np.einsum("kab,kb->ka", X_GF[:, :3, :3], normals),
+    )
+
+    def farthest_outside(which: Hand) -> float:
+        found = fit_wrist(which, made.p_OQ, made.nhat_Q_O, up_O=UP, height=HIGH)[0]
+        X_OF = found.X_OG @ fingertip_poses(hand, spread=found.spread, closing=found.closing)
+        X_FO = invert_pose(X_OF)
+        p_FQ = np.einsum("kab,kb->ka", X_FO[:, :3, :3], made.p_OQ) + X_FO[:, :3, 3]
+        return float(signed_distance(hand_constants(hand).pads, p_FQ).outside.max())
+
+    assert farthest_outside(bare) > 2.5e-3
+    assert farthest_outside(hand) < 2e-3
 
 
 @pytest.mark.parametrize("seed", SEEDS[:10])

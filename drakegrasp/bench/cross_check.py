@@ -1,0 +1,245 @@
+"""Tries stored lifts of a dataset again in MuJoCo, and counts in how many both simulators agree.
+
+In: the directory of a dataset and a number of lifts. Out: plain data for a JSON file. The lifts are
+drawn with the dataset's seed from three groups: samples, held grasps that the filters removed, and
+lost lifts. Needs the extra `[peer]`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from itertools import chain, groupby, islice, zip_longest
+from math import sqrt
+from pathlib import Path
+from statistics import NormalDist
+from typing import Any, Literal, TypeVar, get_args
+
+import h5py
+import numpy as np
+
+from drakegrasp.config import Config
+from drakegrasp.dataset.filters import Removal
+from drakegrasp.dataset.manifest import installed_versions, read_manifest
+from drakegrasp.dataset.paths import TRIALS_FILE
+from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.errors import DataError
+from drakegrasp.frames import unpack_pose
+from drakegrasp.hand.description import load_hand
+from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.blas import one_thread
+from drakegrasp.runtime.progress import Report, silent
+from drakegrasp.seeding import Stream, object_key
+from drakegrasp.simulation.candidates import Pregrasp
+from drakegrasp.simulation.drive import drive_of
+
+T = TypeVar("T")
+#: What a lift is in the dataset: a sample, held but removed by the filters, or lost.
+Group = Literal["sample", "removed", "lost"]
+GROUPS: tuple[Group, ...] = get_args(Group)
+#: Outcomes of lifts that were lost; after closing, `table_contact` is no lift.
+LOST = (Outcome.SLIPPED, Outcome.DROPPED, Outcome.TABLE_CONTACT)
+#: Probability that the true share lies in the interval that is printed.
+CONFIDENCE = 0.95
+#: Last number of the place of the stream that draws lifts: the split's is 1.
+_PLACE = 2
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StoredLift:
+    """A lift of a dataset.
+
+    Attributes:
+        trial_id: Its row.
+        object_name: Its object.
+        group: What it is in the dataset.
+        outcome: Its verdict there.
+        pregrasp: The palm pose and the spread from which the hand closed.
+    """
+
+    trial_id: int
+    object_name: str
+    group: Group
+    outcome: Outcome
+    pregrasp: Pregrasp
+
+
+def draw_lifts(out: Path, count: int) -> list[StoredLift]:
+    """Return lifts of a dataset, in equal numbers of each group and object as far as there are any.
+
+    The draw depends on the dataset and its seed alone.
+
+    Args:
+        out: Directory of the dataset.
+        count: How many; all of them if there are fewer.
+
+    Raises:
+        DataError: If there is no dataset, or no lift in it.
+    """
+    seed = read_manifest(out).config.seed
+    lifts = _read_lifts(out)
+    if not lifts:
+        raise DataError(f"{out}: must be a dataset with lifts, got one in which nothing was lifted")
+
+    # Each group deals its objects in turns, and the groups are dealt in turns.
+    piles = []
+    for number, group in enumerate(GROUPS):
+        members = [lift for lift in lifts if lift.group == group]
+        by_object = []
+        for name, same in groupby(members, key=lambda lift: lift.object_name):
+            pile = list(same)
+            order = Stream(seed, object_key(name), number, _PLACE).permutation(len(pile))
+            by_object.append([pile[i] for i in order])
+        piles.append(_in_turns(by_object))
+    return list(islice(_in_turns(piles), count))
+
+
+@one_thread
+def cross_check(out: Path, count: int, *, progress: Report = silent) -> dict[str, Any]:
+    """Try lifts of a dataset again in MuJoCo and return the report.
+
+    Args:
+        out: Directory of the dataset.
+        count: How many lifts, see `draw_lifts`.
+        progress: Called with the number of lifts done and of all.
+
+    Raises:
+        DataError: If there is no dataset, or no lift in it, or its objects are damaged.
+        ConfigError: If the dataset's hand cannot have its drive.
+    """
+    config = read_manifest(out).config
+    lifts = draw_lifts(out, count)
+    rows: list[dict[str, Any]] = []
+
+    # An object is cut into convex parts once.
+    progress(0, len(lifts))
+    for name, same in groupby(sorted(lifts, key=_by_object), key=lambda lift: lift.object_name):
+        for row in _try_object(out, name, list(same), config):
+            rows.append(row)
+            progress(len(rows), len(lifts), held=sum(_holds(row) for row in rows))
+
+    return {
+        "drive": drive_of(load_hand(config.hand), config.lift),
+        "groups": {
+            group: agreement([row for row in rows if row["group"] == group]) for group in GROUPS
+        },
+        "lifts": sorted(rows, key=lambda row: row["trial_id"]),
+        "versions": {
+            **installed_versions(config),
+            **{name: metadata.version(name) for name in ("mujoco", "coacd")},
+        },
+    }
+
+
+def agreement(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return how many lifts of a group are lifted in MuJoCo, and how many of these hold.
+
+    Args:
+        rows: Of `cross_check`, under "lifts".
+
+    Returns:
+        Numbers of lifts drawn, lifted and held; the share of the lifted that hold with its
+        interval, None if nothing is lifted; the outcomes of those that are not.
+    """
+    lifted = [row for row in rows if row["lifted"]]
+    held = sum(_holds(row) for row in lifted)
+    low, high = wilson_interval(held, len(lifted)) if lifted else (None, None)
+    return {
+        "drawn": len(rows),
+        "lifted": len(lifted),
+        "held": held,
+        "share": held / len(lifted) if lifted else None,
+        "low": low,
+        "high": high,
+        "not_lifted": dict(Counter(row["there"] for row in rows if not row["lifted"])),
+    }
+
+
+def wilson_interval(hits: int, count: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
+    """Return the interval of a share, from hits among independent trials (Wilson, 1927).
+
+    Unlike the normal approximation it is right near 0 and 1, where these shares lie.
+
+    Args:
+        hits: Number of hits.
+        count: Number of trials, positive.
+        confidence: Probability that the true share lies within.
+    """
+    z = NormalDist().inv_cdf(0.5 + confidence / 2.0)
+    share, weight = hits / count, z * z / count
+    centre = (share + weight / 2.0) / (1.0 + weight)
+    half = z * sqrt(share * (1.0 - share) / count + weight / (4.0 * count)) / (1.0 + weight)
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+def _read_lifts(out: Path) -> list[StoredLift]:
+    """Return all lifts of a dataset, in the order of its rows: objects are together."""
+    path = out / TRIALS_FILE
+    try:
+        with h5py.File(path, "r") as file:
+            trials, successes = file["trials"], file["successes"]
+            names = [name.decode() for name in file["objects/name"][:]]
+            objects, outcomes = trials["object"][:], trials["outcome"][:]
+            X_OG, spreads = trials["X_OG"][:], trials["spread"][:]
+            # Only what was lifted has the time of a lift.
+            lifted = np.isfinite(trials["time_lift"][:])
+            kept = successes["trial_id"][:][successes["removal"][:] == Removal.KEPT]
+    except (OSError, KeyError) as error:
+        raise DataError(f"{path}: must be the trials of a dataset, got none ({error})") from None
+
+    samples = set(kept.tolist())
+    lifts = []
+    for row in np.flatnonzero(lifted & np.isin(outcomes, [Outcome.SUCCESS, *LOST])):
+        outcome = Outcome(int(outcomes[row]))
+        held: Group = "sample" if int(row) in samples else "removed"
+        lifts.append(
+            StoredLift(
+                trial_id=int(row),
+                object_name=names[objects[row]],
+                group=held if outcome is Outcome.SUCCESS else "lost",
+                outcome=outcome,
+                pregrasp=Pregrasp(X_OG=unpack_pose(X_OG[row]), spread=float(spreads[row])),
+            )
+        )
+    return lifts
+
+
+def _in_turns(piles: Iterable[Iterable[T]]) -> Iterator[T]:
+    """Yield the first of each pile, then the second of each, until all are empty."""
+    nothing = object()
+    every = chain.from_iterable(zip_longest(*piles, fillvalue=nothing))
+    return (item for item in every if item is not nothing)  # type: ignore[misc]
+
+
+def _try_object(
+    out: Path, name: str, lifts: Sequence[StoredLift], config: Config
+) -> Iterator[dict[str, Any]]:
+    """Yield a row of the report for each lift of one object."""
+    # Lifts can be drawn without the extra.
+    from drakegrasp.bench.mujoco_baseline import MujocoBaseline
+
+    prepared = load_prepared(out, name, config)
+    peer = MujocoBaseline(prepared.model, prepared.X_TO, config)
+    for lift in lifts:
+        trial = peer.run(lift.pregrasp)
+        yield {
+            "trial_id": lift.trial_id,
+            "object": lift.object_name,
+            "group": lift.group,
+            "outcome": lift.outcome.label,
+            "there": trial.outcome.label,
+            "lifted": trial.lifted,
+            # JSON has no NaN.
+            "slip": trial.slip if trial.lifted else None,
+            "turn": trial.turn if trial.lifted else None,
+        }
+
+
+def _holds(row: dict[str, Any]) -> bool:
+    return bool(row["there"] == Outcome.SUCCESS.label)
+
+
+def _by_object(lift: StoredLift) -> tuple[str, int]:
+    return lift.object_name, lift.trial_id

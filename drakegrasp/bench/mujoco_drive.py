@@ -1,0 +1,89 @@
+"""The drive of the fingers in MuJoCo, by the rules of `drakegrasp.simulation.drive`.
+
+MuJoCo's joint limits hold what the drive holds. The motor's torque stays on.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from drakegrasp.frames import Array
+from drakegrasp.hand.description import Drive, Hand
+
+
+class FingerDrive:
+    """Keeps the closing joints of a hand from being pushed open during a lift."""
+
+    def __init__(self, model: mujoco.MjModel, hand: Hand, drive: Drive) -> None:
+        """Find the joints and motors.
+
+        Args:
+            model: With the joints and motors of `mujoco_scene`; its limits are changed.
+            hand: The hand.
+            drive: What holds the closing joints, see `drakegrasp.simulation.drive`.
+        """
+        self._model, self._drive = model, drive
+        self._joints = np.array([model.joint(f.closing_joint).id for f in hand.fingers])
+        self._motors = np.array([model.actuator(f.name).id for f in hand.fingers])
+        self._q, self._v = model.jnt_qposadr[self._joints], model.jnt_dofadr[self._joints]
+        # A motor turns its joints at fixed ratios, so it carries their torques by the same ratios.
+        self._gain = np.zeros((len(self._joints), model.nv))
+        for i, finger in enumerate(hand.fingers):
+            self._gain[i, self._v[i]] = 1.0
+            for coupling in finger.coupled:
+                self._gain[i, model.joint(coupling.joint).dofadr[0]] = coupling.ratio
+        self._range = model.jnt_range[self._joints].copy()
+        self._torque = np.array([finger.torque_limit for finger in hand.fingers])
+        self._holding = np.array([finger.holding_torque or np.inf for finger in hand.fingers])
+        self._yields = np.zeros(len(self._joints), dtype=np.bool_)
+
+    def disengage(self) -> None:
+        """Give joints and motors the limits of the hand's files again."""
+        self._yields[:] = False
+        self._model.jnt_range[self._joints] = self._range
+        self._set_torques()
+
+    def engage(self, data: mujoco.MjData) -> None:
+        """Let the drive hold the closing joints at their angles from now on."""
+        if self._drive != "torque":
+            self._model.jnt_range[self._joints, 0] = data.qpos[self._q]
+        if self._drive == "locked":
+            self._model.jnt_range[self._joints, 1] = data.qpos[self._q]
+
+    def update(self, data: mujoco.MjData) -> None:
+        """After a step: let worms take up what the fingers closed, or yield to their load."""
+        if self._drive != "worm":
+            return
+
+        # A finger that was pushed open is held again where it stands or closes.
+        angles, lower = data.qpos[self._q], self._model.jnt_range[self._joints, 0]
+        held_again = self._yields & (data.qvel[self._v] >= 0.0)
+        lower = np.where(
+            held_again, angles, np.where(self._yields, lower, np.maximum(lower, angles))
+        )
+        self._yields &= ~held_again
+
+        # A worm yields to a load beyond its strength; its finger opens against that strength.
+        loads = self.loads(data)
+        overloaded = ~self._yields & ~held_again & (loads > self._holding)
+        self._yields |= overloaded
+        lower = np.where(overloaded, self._range[:, 0], lower)
+        self._model.jnt_range[self._joints, 0] = np.minimum(lower, self._range[:, 1])
+        self._set_torques()
+
+    def loads(self, data: mujoco.MjData) -> Array:
+        """Return the torque (k,) [N m] by which contacts pushed each finger open in the last step.
+
+        Torques that a caller applies to joints count as contacts. Reactions of motors and limits do
+        not: where a finger runs into its limit they are larger for a step.
+        """
+        is_contact = data.efc_type >= int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
+        torques = np.zeros(self._model.nv)
+        forces = np.where(is_contact, data.efc_force, 0.0)
+        mujoco.mj_mulJacTVec(self._model, data, torques, forces)
+        return np.asarray(-self._gain @ (torques + data.qfrc_applied))
+
+    def _set_torques(self) -> None:
+        torque = np.where(self._yields, self._holding, self._torque)
+        self._model.actuator_forcerange[self._motors] = np.column_stack([-torque, torque])

@@ -1,0 +1,150 @@
+"""Stored lifts, tried again in MuJoCo: the draw and what is counted."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+
+import h5py
+import pytest
+from click.testing import CliRunner
+from helpers.datasets import AFTER_LIFT, BOXES, OUTCOMES, TRIALS, make_dataset
+
+from drakegrasp.bench.cross_check import GROUPS, agreement, draw_lifts, wilson_interval
+from drakegrasp.cli.main import main
+from drakegrasp.dataset.filters import Removal
+from drakegrasp.errors import DataError
+from drakegrasp.outcomes import Outcome
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return make_dataset(tmp_path_factory.mktemp("out") / "data", tmp_path_factory.mktemp("meshes"))
+
+
+def names(file):
+    return [name.decode() for name in file["objects/name"][:]]
+
+
+def test_drawn_lifts_are_what_the_dataset_says(dataset):
+    lifts = draw_lifts(dataset, 1000)
+    # Per object three successes, and three lifts that were lost: slipped, dropped, on the table.
+    assert len(lifts) == 6 * len(BOXES)
+    assert len({lift.trial_id for lift in lifts}) == len(lifts)
+    with h5py.File(dataset / TRIALS) as file:
+        removals = dict(zip(file["successes/trial_id"], file["successes/removal"], strict=True))
+        for lift in lifts:
+            row = lift.trial_id
+            assert lift.outcome == file["trials/outcome"][row]
+            assert lift.object_name == names(file)[file["trials/object"][row]]
+            assert lift.pregrasp.X_OG[:3].ravel().tolist() == file["trials/X_OG"][row].tolist()
+            assert lift.pregrasp.spread == file["trials/spread"][row]
+            if lift.outcome is Outcome.SUCCESS:
+                kept = removals[row] == Removal.KEPT
+                assert lift.group == ("sample" if kept else "removed")
+            else:
+                assert lift.group == "lost"
+
+
+def test_hand_on_the_table_after_closing_is_no_lift(dataset):
+    drawn = {lift.trial_id for lift in draw_lifts(dataset, 1000)}
+    on_table = [i for i, outcome in enumerate(OUTCOMES) if outcome is Outcome.TABLE_CONTACT]
+    assert drawn & set(on_table) == {AFTER_LIFT}
+
+
+def test_groups_and_objects_take_turns(dataset, tmp_path):
+    """With every second success removed, each group has lifts of each object."""
+    out = make_dataset(tmp_path / "data", tmp_path)
+    with h5py.File(out / TRIALS, "r+") as file:
+        file["successes/removal"][::3] = Removal.OUTLIER
+    lifts = draw_lifts(out, 9)
+    assert set(Counter((lift.group, lift.object_name) for lift in lifts).values()) == {1}
+    assert Counter(lift.group for lift in lifts) == dict.fromkeys(GROUPS, 3)
+    # A group that is empty leaves its turn to the others.
+    with h5py.File(out / TRIALS, "r+") as file:
+        file["successes/removal"][:] = Removal.OUTLIER
+    assert Counter(lift.group for lift in draw_lifts(out, 9)) == {"removed": 5, "lost": 4}
+
+
+def test_draw_depends_on_the_seed_alone(dataset, tmp_path):
+    def drawn(out):
+        return [lift.trial_id for lift in draw_lifts(out, 8)]
+
+    assert drawn(dataset) == drawn(dataset)
+    other = make_dataset(tmp_path / "data", tmp_path, "seed=5")
+    assert drawn(other) != drawn(dataset)
+
+
+def test_fewer_lifts_are_the_first_of_more(dataset):
+    few, more = ([lift.trial_id for lift in draw_lifts(dataset, n)] for n in (5, 11))
+    assert more[:5] == few
+
+
+def test_dataset_without_lifts_is_refused(dataset, tmp_path):
+    out = make_dataset(tmp_path / "data", tmp_path)
+    with h5py.File(out / TRIALS, "r+") as file:
+        file["trials/outcome"][:] = Outcome.RAY_MISS
+    with pytest.raises(DataError, match="got one in which nothing was lifted"):
+        draw_lifts(out, 5)
+
+
+def test_dataset_without_trials_is_refused(dataset, tmp_path):
+    out = make_dataset(tmp_path / "data", tmp_path)
+    (out / TRIALS).unlink()
+    with pytest.raises(DataError, match=r"trials.hdf5: must be the trials of a dataset, got none"):
+        draw_lifts(out, 5)
+    with pytest.raises(DataError, match="must be the directory of a dataset"):
+        draw_lifts(tmp_path / "nothing", 5)
+
+
+def test_agreement_counts_what_is_lifted_there():
+    def row(there, lifted):
+        return {"there": there.label, "lifted": lifted}
+
+    rows = [
+        *[row(Outcome.SUCCESS, True)] * 3,
+        row(Outcome.TABLE_CONTACT, True),
+        *[row(Outcome.MISSING_FINGERTIP, False)] * 2,
+        row(Outcome.TABLE_CONTACT, False),
+    ]
+    found = agreement(rows)
+    assert (found["drawn"], found["lifted"], found["held"], found["share"]) == (7, 4, 3, 0.75)
+    assert found["not_lifted"] == {"missing_fingertip": 2, "table_contact": 1}
+    assert (found["low"], found["high"]) == wilson_interval(3, 4)
+    nothing = agreement(rows[4:])
+    assert nothing["share"] is nothing["low"] is nothing["high"] is None
+
+
+@pytest.mark.parametrize(
+    ("hits", "count", "low", "high"),
+    # Newcombe (1998), Table I: method 3.
+    [
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+    ],
+)
+def test_interval_of_a_share(hits, count, low, high):
+    assert wilson_interval(hits, count) == pytest.approx((low, high), abs=5e-5)
+    mirrored = wilson_interval(count - hits, count)
+    assert mirrored == pytest.approx((1.0 - high, 1.0 - low), abs=5e-5)
+
+
+@pytest.mark.sim
+def test_command_prints_the_agreement(dataset, tmp_path):
+    pytest.importorskip("mujoco")
+    pytest.importorskip("coacd")
+    path = tmp_path / "report.json"
+    arguments = ["bench", "--cross-check", str(dataset), "6", "--out", str(path), "--quiet"]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 0, result.output
+    report = json.loads(path.read_text())
+    assert [row["trial_id"] for row in report["lifts"]] == sorted(
+        lift.trial_id for lift in draw_lifts(dataset, 6)
+    )
+    assert sum(counts["drawn"] for counts in report["groups"].values()) == 6
+    assert report["drive"] == "worm"
+    assert "drive of the fingers: worm" in result.output
+    assert "held, no samples" in result.output
+    assert report["versions"]["mujoco"] in result.output

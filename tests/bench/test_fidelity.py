@@ -1,0 +1,81 @@
+"""Labels of the same attempts, simulated in other ways."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from helpers.objects import CUBE, box_model
+
+from drakegrasp.bench import fidelity
+from drakegrasp.config import load_config
+from drakegrasp.hand.description import load_hand
+from drakegrasp.mesh.surfaces import signed_volume
+from drakegrasp.outcomes import Outcome
+
+
+def test_finer_surface_is_the_same_surface(tmp_path):
+    model = box_model(tmp_path, [CUBE, CUBE, CUBE])
+    finer = fidelity._finer(model)
+    assert len(finer.collision_faces) == 4 * len(model.collision_faces)
+    volumes = [signed_volume(m.collision_vertices, m.collision_faces) for m in (model, finer)]
+    assert volumes[1] == pytest.approx(volumes[0])
+
+
+def test_screened_attempt_that_would_miss_a_fingertip_is_no_flip():
+    pairs = [
+        (Outcome.SCREENED, Outcome.MISSING_FINGERTIP),
+        (Outcome.START_COLLISION, Outcome.START_COLLISION),
+        (Outcome.SUCCESS, Outcome.SLIPPED),
+        (Outcome.SCREENED, Outcome.SUCCESS),
+    ]
+    counts = fidelity._count(pairs, [True, False, False, True], [False, False, True, False])
+    assert counts["flips"] == 2
+    assert counts["successes_lost_by_screen"] == 1
+    assert (counts["decided"], counts["simulated"]) == (2, 1)
+    assert (counts["lifted"], counts["lifted_flips"]) == (1, 1)
+
+
+@pytest.mark.parametrize("own", ["worm", "torque", "locked"])
+def test_other_drives_are_variants(own):
+    others = set(fidelity.DRIVES) - {f"drive_{own}"}
+    found = fidelity.variants(load_config(overrides=[f"lift.drive={own}"]))
+    assert set(found) == {*fidelity.VARIANTS, *others}
+    assert found["sap"] == fidelity.VARIANTS["sap"]
+    for name in others:
+        assert found[name].overrides == (f"lift.drive={fidelity.DRIVES[name]}",)
+
+
+def test_hand_without_holding_torque_has_no_worm(monkeypatch):
+    hand = load_hand()
+    fingers = tuple(replace(finger, holding_torque=None) for finger in hand.fingers)
+    other = replace(hand, fingers=fingers, drive="torque")
+    monkeypatch.setattr(fidelity, "load_hand", lambda name: other)
+    found = fidelity.variants(load_config())
+    assert set(found) == {*fidelity.VARIANTS, "drive_locked"}
+
+
+def test_label_depends_on_the_drive_if_any_other_drive_changes_it(monkeypatch):
+    """Three lifts: one that all drives hold, one that two drives lose, one that one loses."""
+
+    class Record:
+        outcome, lifted = Outcome.SUCCESS, object()
+
+    outcomes = {
+        "lift.drive=torque": [Outcome.SUCCESS, Outcome.SLIPPED, Outcome.SUCCESS],
+        "lift.drive=locked": [Outcome.SUCCESS, Outcome.SLIPPED, Outcome.DROPPED],
+    }
+    same = [Outcome.SUCCESS] * 3
+
+    class Bench:
+        config = load_config()
+
+    def simulate(bench, attempts, variant, count):
+        return outcomes.get("".join(variant.overrides), same)
+
+    monkeypatch.setattr(fidelity, "_simulate", simulate)
+    lifts = [fidelity.Simulated(None, Record(), None)] * 3
+    report = fidelity.compare_labels(Bench(), lifts, lambda outcome: None)
+    assert report["drive"] == {"attempts": 3, "lifted": 3, "flips": 2}
+    assert report["fidelity"]["drive_torque"]["flips"] == 1
+    assert fidelity.sum_drive([report["drive"]] * 2)["flip_share_of_lifted"] == 4 / 6

@@ -1,0 +1,69 @@
+"""How hard fingertips can be loaded: levers by hand and by differences, torques by drive."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.hands import PINCER_SDF, changed_finger, write_pincer
+
+from drakegrasp.frames import transform_points
+from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses
+from drakegrasp.hand.strength import closing_levers, fingertip_forces
+
+#: Distance of the gripper's pad points from their hinges [m].
+ARM = np.hypot(0.01, 0.09)
+
+
+def pad_points(hand: Hand, spread: float, closing: np.ndarray) -> np.ndarray:
+    """Return the pad points (k, 3) in {G} [m]."""
+    X_GF = fingertip_poses(hand, spread=spread, closing=closing)
+    return np.array(
+        [transform_points(X, f.p_FiP[None])[0] for X, f in zip(X_GF, hand.fingers, strict=True)]
+    )
+
+
+def test_lever_of_a_single_hinge_is_the_distance_from_it(tmp_path):
+    hand = load_hand(write_pincer(tmp_path))
+    for closing in ([0.0, 0.0], [0.3, 0.9]):
+        assert np.allclose(closing_levers(hand, closing), ARM)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.8])
+def test_lever_of_coupled_joints_is_the_speed_of_the_pad_point(spread):
+    hand, h = load_hand(), 1e-6
+    for closing in (np.zeros(3), np.array([0.4, 1.1, 2.2])):
+        moved = pad_points(hand, spread, closing + h) - pad_points(hand, spread, closing - h)
+        assert np.allclose(
+            closing_levers(hand, closing), np.linalg.norm(moved, axis=1) / (2.0 * h), rtol=1e-8
+        )
+
+
+def test_barrett_hand_is_as_strong_as_its_worms_or_its_motors():
+    """5 N m of all worms; 2, 2 and 4 N m of the motors; at 70 degrees the lever is 116 mm."""
+    hand = load_hand()
+    levers = closing_levers(hand, np.full(3, np.deg2rad(70.0)))
+    assert np.allclose(levers, 0.116, atol=1e-3)
+    assert np.allclose(fingertip_forces(hand, "worm") * levers, 5.0)
+    assert np.allclose(fingertip_forces(hand, "torque") * levers, [2.0, 2.0, 4.0])
+    assert np.array_equal(fingertip_forces(hand, "locked"), fingertip_forces(hand, "worm"))
+
+
+def test_strength_at_the_ends_of_the_range_is_what_the_docs_say():
+    hand = load_hand()
+    ends = [closing_levers(hand, limit) for limit in coordinate_limits(hand)[1:].T]
+    middle = 5.0 / fingertip_forces(hand, "worm")
+    assert np.allclose(middle / ends[0] - 1.0, -0.10, atol=0.005)
+    assert np.allclose(middle / ends[1] - 1.0, 0.19, atol=0.005)
+
+
+def test_locked_finger_without_a_holding_torque_carries_its_motors_torque(tmp_path):
+    hand = load_hand(write_pincer(tmp_path, fingers=changed_finger(holding_torque=3.0)))
+    assert np.allclose(fingertip_forces(hand, "locked"), [3.0 / ARM, 1.0 / ARM])
+    assert np.allclose(fingertip_forces(hand, "torque"), [1.0 / ARM, 1.0 / ARM])
+
+
+def test_joint_without_limits_has_the_lever_of_the_open_hand(tmp_path):
+    sdf = PINCER_SDF.replace("<limit><lower>0</lower><upper>1</upper></limit>", "")
+    hand = load_hand(write_pincer(tmp_path, sdf=sdf))
+    assert np.allclose(fingertip_forces(hand, "torque"), 1.0 / ARM)

@@ -1,0 +1,144 @@
+"""What a verdict is called, and what is said of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from helpers.objects import standing
+
+from drakegrasp.config import load_config
+from drakegrasp.frames import make_pose
+from drakegrasp.objects.model import make_object
+from drakegrasp.outcomes import Outcome
+from drakegrasp.simulation.contacts import Contacts
+from drakegrasp.simulation.placement import PlacedObject
+from drakegrasp.simulation.trial import TrialRecord
+from drakegrasp.verification.forces.lift import ForceLift, LiftEnd
+from drakegrasp.verification.result import Verification
+
+CONFIG = load_config()
+
+
+def lifted(
+    *, slip_mm: float, turn_deg: float, links: int, outcome: Outcome = Outcome.SUCCESS
+) -> Verification:
+    """Return the verdict on a grasp whose object moved so much in the hand."""
+    box = trimesh.creation.box([0.06, 0.05, 0.12])
+    model = make_object(
+        box.vertices, box.faces, CONFIG.objects, name="vase", class_name="vase", mesh_sha256=""
+    )
+    contacts = Contacts(
+        touching=np.ones(3, dtype=bool),
+        p_OQ=np.zeros((3, 3)),
+        nhat_Q_O=np.eye(3),
+        f_Q_O=np.eye(3),
+        area=np.ones(3),
+        penetration=np.zeros(3),
+        other_links=links,
+        hand_on_table=False,
+        object_on_table=False,
+        table_force=np.zeros(3),
+        point_contacts=0,
+    )
+    trial = TrialRecord(
+        outcome=outcome,
+        X_TO=standing(model),
+        X_OG=np.eye(4),
+        closed=contacts,
+        lifted=contacts,
+        slip=1e-3 * slip_mm,
+        turn=np.deg2rad(turn_deg),
+    )
+    return Verification(
+        method="hand",
+        outcome=outcome,
+        reason="so it is",
+        placed=PlacedObject(model=model, X_TO=trial.X_TO),
+        config=CONFIG,
+        p_OQ=np.zeros((3, 3)),
+        nhat_Q_O=np.eye(3),
+        surface_distance=np.zeros(3),
+        trial=trial,
+    )
+
+
+@pytest.mark.parametrize(
+    ("slip_mm", "turn_deg", "links", "words"),
+    [
+        (0.2, 0.3, 0, "held, precision, stable"),
+        (4.9, 4.9, 0, "held, precision, stable"),
+        (5.1, 0.3, 0, "held, precision"),
+        (0.2, 5.1, 0, "held, precision"),
+        (0.2, 0.3, 1, "held"),
+        (73.0, 98.0, 1, "held"),
+    ],
+)
+def test_words_follow_from_slip_turn_and_other_links(
+    slip_mm: float, turn_deg: float, links: int, words: str
+) -> None:
+    verdict = lifted(slip_mm=slip_mm, turn_deg=turn_deg, links=links)
+    assert verdict.words == words
+    assert verdict.held is verdict.success is True
+    assert verdict.precision is ("precision" in words)
+    assert verdict.stable is ("stable" in words)
+    assert repr(verdict) == f"Verification(hand, {words}: so it is)"
+
+
+def test_grasp_that_fails_is_none_of_the_words() -> None:
+    verdict = lifted(slip_mm=0.0, turn_deg=0.0, links=0, outcome=Outcome.SLIPPED)
+    assert (verdict.held, verdict.precision, verdict.stable) == (False, False, False)
+    assert verdict.words == "fails: slipped"
+    # What was not lifted is nothing, either.
+    verdict = replace(verdict, trial=None, outcome=Outcome.UNREACHABLE)
+    assert (verdict.held, verdict.precision, verdict.stable) == (False, False, False)
+    assert np.isnan(verdict.slip)
+    assert np.isnan(verdict.turn)
+    assert "slips" not in verdict.explain()
+
+
+@pytest.mark.parametrize(
+    ("slip_mm", "turn_deg", "links", "said"),
+    [
+        (0.2, 0.3, 0, "no other link of the hand touches it: a precision grasp, stable."),
+        (9.0, 0.3, 0, "no other link of the hand touches it: a precision grasp, not stable."),
+        (73.0, 98.0, 1, "another link touches it: no precision grasp, not stable."),
+        (73.0, 98.0, 2, "2 other links touch it: no precision grasp, not stable."),
+    ],
+)
+def test_explanation_tells_what_moved_and_what_touched(
+    slip_mm: float, turn_deg: float, links: int, said: str
+) -> None:
+    text = lifted(slip_mm=slip_mm, turn_deg=turn_deg, links=links).explain()
+    moved = f"slips by {slip_mm:.1f} mm and turns by {turn_deg:.1f}° in the hand"
+    assert text == (
+        f"The grasp of vase holds: so it is. During the lift the object {moved}, "
+        f"and at the end {said}"
+    )
+
+
+def test_explanation_of_a_lost_object_gives_no_mark() -> None:
+    text = lifted(slip_mm=80.0, turn_deg=9.0, links=0, outcome=Outcome.DROPPED).explain()
+    assert text.startswith("The grasp of vase fails (dropped): so it is. During the lift")
+    assert text.endswith("no other link of the hand touches it.")
+
+
+@pytest.mark.parametrize(("error_mm", "words"), [(1.0, "held, precision, stable"),
+                                                 (8.0, "held, precision")])  # fmt: skip
+def test_forces_alone_are_a_precision_grasp_that_is_stable_on_its_path(
+    error_mm: float, words: str
+) -> None:
+    lift = ForceLift(
+        end=LiftEnd.HELD,
+        planned_force=5.0,
+        planned_share=0.1,
+        position_error=1e-3 * error_mm,
+        angle_error=0.01,
+        X_TO_lifted=make_pose(np.eye(3), [0.0, 0.0, 0.6]),
+    )
+    verdict = replace(
+        lifted(slip_mm=90.0, turn_deg=0.0, links=0), trial=None, method="forces", lift=lift
+    )
+    assert verdict.words == words
