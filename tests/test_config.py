@@ -73,6 +73,8 @@ close:
   stop_speed: 0.02
   check_period: 0.2
 lift:
+  drive: locked
+  release_time: 0.1
   p_TG: [0.1, 0.0, 0.5]
   max_speed: 0.4
   max_acceleration: 2.0
@@ -128,6 +130,8 @@ RELEASED = {
     "candidates.local_y_deg": GRID_45,
     "candidates.local_z_deg": GRID_45,
     "candidates.jitter_deg": 45.0,
+    # V-REP's motors are pushed open beyond their torque.
+    "lift.drive": "torque",
     "lift.p_TG": [0.0, 0.0, 0.50],
     "lift.max_speed": 0.2,
     "lift.max_acceleration": 0.05,
