@@ -5,14 +5,20 @@ from __future__ import annotations
 from collections import Counter
 from pathlib import Path
 
+import h5py
+import numpy as np
 import pytest
-from helpers.datasets import OTM, OTO, TRIALS, make_dataset
+from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
 
 from drakegrasp.dataset import shards
 from drakegrasp.dataset.assemble import assemble, assemble_locked, summarise
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.lock import FILE_NAME, build_lock
+from drakegrasp.dataset.manifest import change_postprocessing
+from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import DataError
+from drakegrasp.frames import invert_pose, transform_points, unpack_pose
+from drakegrasp.grasp import unpack_grasp
 from drakegrasp.runtime.files import refuse_broken_seal
 
 FILES = (OTO, OTM, TRIALS)
@@ -50,6 +56,32 @@ def test_holder_of_the_lock_assembles_in_it(out: Path) -> None:
     with build_lock(out):
         assert assemble_locked(out) == summarise(out)
         assert (out / FILE_NAME).exists()
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_palm_and_contacts_of_a_sample_are_as_far_apart_as_in_its_trial(
+    out: Path, camera: str
+) -> None:
+    """Seen from the palm, a contact is where it was in the trial, in any camera and at any end."""
+    with h5py.File(out / f"grasping_{camera}.hdf5") as data, h5py.File(out / TRIALS) as trials:
+        sample, trial = data["test"], trials["trials"]
+        number = int(sample["trial_id"][2])
+        p_GQ = {}
+        for when, end in (("closed", ""), ("lifted", "_held")):
+            X_GC = invert_pose(unpack_pose(sample[f"grasp_props/X_CG{end}"][2]))
+            p_CQ, _ = unpack_grasp(sample[f"grasps{end}"][2])
+            X_GO = invert_pose(unpack_pose(trial["X_OG" if not end else "X_OG_lifted"][number]))
+            p_GQ[when] = transform_points(X_GC, p_CQ)
+            expected = transform_points(X_GO, trial[f"{when}_p_OQ"][number])
+            np.testing.assert_allclose(p_GQ[when], expected, atol=1e-6)
+    assert np.abs(p_GQ["closed"] - p_GQ["lifted"]).max() > SLIP / 4
+
+
+def test_limits_of_the_hold_change_without_a_simulation(out: Path) -> None:
+    change_postprocessing(out, [f"filters.max_slip={SLIP / 2}"])
+    assert assemble(out).removed == {Removal.SLID: 9}
+    change_postprocessing(out, ["filters.require=held"])
+    assert assemble(out).removed == {Removal.KEPT: 9}
 
 
 def test_rejected_trials_become_no_samples(out: Path) -> None:
