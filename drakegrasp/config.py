@@ -71,7 +71,7 @@ class PhysicsConfig(_Section):
     friction_table: Positive = 0.71  # effective coefficient between table and object
     fingertip_modulus: Annotated[float, Field(gt=0.0, le=1e8)] = 1e7  # hydroelastic [Pa]
     link_modulus: Annotated[float, Field(gt=0.0, le=1e8)] = 1e7  # other hand links [Pa]
-    table_modulus: Annotated[float, Field(gt=0.0, le=1e10)] = 1e9  # [Pa], over half of its 0.1 m
+    table_modulus: Annotated[float, Field(gt=0.0, le=1e10)] = 5e9  # [Pa], over half of its 0.1 m
     dissipation: Annotated[float, Field(ge=0.0, le=500.0)] = 20.0  # Hunt-Crossley [s/m]
     relaxation_time: Positive = 0.02  # [s], used by the solver `sap` in place of dissipation
     solver: Literal["lagged", "similar", "sap"] = "lagged"  # Drake's contact approximation

@@ -29,16 +29,17 @@ def subdivide(solid: Solid, max_edge: float, max_faces: int) -> Solid:
     it does not; a surface that has more already stays as it is.
     """
     while True:
-        finer = _split_long_edges(solid, max_edge)
-        if len(finer.faces) <= max(max_faces, len(solid.faces)):
+        finer = _split_long_edges(solid, max_edge, max(max_faces, len(solid.faces)))
+        if finer is not None:
             return finer
         max_edge *= 1.25
 
 
-def _split_long_edges(solid: Solid, max_edge: float) -> Solid:
+def _split_long_edges(solid: Solid, max_edge: float, max_faces: int) -> Solid | None:
+    """Return the surface without longer edges, or None if that takes more than `max_faces`."""
     vertices, faces = solid.vertices, solid.faces
     limit = (max_edge * (1.0 + TOLERANCE)) ** 2
-    while True:
+    while len(faces) <= max_faces:
         # The ends of each edge, of one of its two half-edges, and which edges are too long.
         ids, counts = edge_ids(faces)
         ends = np.empty((len(counts), 2), dtype=np.int64)
@@ -54,6 +55,7 @@ def _split_long_edges(solid: Solid, max_edge: float) -> Solid:
         new = (vertices[ends[long, 0]] + vertices[ends[long, 1]]) / 2.0
         vertices = np.vstack((vertices, new))
         faces = _split(vertices, faces, midpoint[ids].reshape(-1, 3))
+    return None
 
 
 def _split(vertices: Array, faces: Faces, midpoints: Faces) -> Faces:

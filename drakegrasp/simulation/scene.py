@@ -268,9 +268,7 @@ def finger_speed(scene: Scene) -> float:
 
 def closing_angles(scene: Scene) -> Array:
     """Return the angle of each finger's closing joint (k,) [rad]."""
-    return np.array(
-        [joint.get_angle(scene.context) for joint in hand_handles(scene).closing_joints]
-    )
+    return np.array([joint.get_angle(scene.context) for joint in hand_handles(scene).closing_joints])
 
 
 def hand_positions(scene: Scene) -> Array:
