@@ -134,6 +134,7 @@ def _settle(model: ObjectModel, config: Config) -> Resting:
 
 def _wait_for_rest(scene: Scene, config: Config) -> bool:
     """Simulate until the object has been slow for long enough; return whether it was stopped."""
+    # Refuse what takes too long.
     rules, name = config.settle, scene.model.name
     resting_for, stopped, linear, angular = 0.0, False, 0.0, 0.0
     start = scene.time
@@ -143,6 +144,8 @@ def _wait_for_rest(scene: Scene, config: Config) -> bool:
                 f"{name}: must come to rest on the table within {rules.max_time:g} s of "
                 f"simulation, got {linear:.3g} m/s and {angular:.3g} rad/s"
             )
+
+        # Look at its speed a little later.
         advance(scene, CHECK_PERIOD)
         linear, angular = _speeds(scene)
         if not np.isfinite(linear) or linear > config.physics.max_speed:
@@ -150,6 +153,8 @@ def _wait_for_rest(scene: Scene, config: Config) -> bool:
                 f"{name}: its speed must stay below {config.physics.max_speed:g} m/s while "
                 f"it settles, got {linear:.3g} m/s"
             )
+
+        # Count for how long it has been slow; stop it if it moves for too long.
         slow = linear < rules.max_linear_speed and angular < rules.max_angular_speed
         resting_for = resting_for + CHECK_PERIOD if slow else 0.0
         if not slow and scene.time - start > STOP_FRACTION * rules.max_time:
