@@ -44,7 +44,7 @@ class ObjectConfig(_Section):
     """Mass and meshes of the objects."""
 
     mass: Positive = 1.0  # [kg], the same for every object (paper, "Object representation")
-    max_collision_faces: Annotated[int, Field(ge=12)] = 3000  # triangles of the collision mesh
+    max_collision_faces: Annotated[int, Field(ge=12)] = 3000  # that decimation may leave
     min_diagonal: Positive = 0.01  # [m], a smaller bounding box diagonal is refused
     max_diagonal: Positive = 2.0  # [m], a larger one is refused
 
@@ -71,7 +71,7 @@ class PhysicsConfig(_Section):
     friction_table: Positive = 0.71  # effective coefficient between table and object
     fingertip_modulus: Annotated[float, Field(gt=0.0, le=1e8)] = 1e7  # hydroelastic [Pa]
     link_modulus: Annotated[float, Field(gt=0.0, le=1e8)] = 1e7  # other hand links [Pa]
-    table_modulus: Annotated[float, Field(gt=0.0, le=1e8)] = 1e7  # [Pa]
+    table_modulus: Annotated[float, Field(gt=0.0, le=1e10)] = 5e9  # [Pa], over half of its 0.1 m
     dissipation: Annotated[float, Field(ge=0.0, le=500.0)] = 20.0  # Hunt-Crossley [s/m]
     relaxation_time: Positive = 0.02  # [s], used by the solver `sap` in place of dissipation
     solver: Literal["lagged", "similar", "sap"] = "lagged"  # Drake's contact approximation
@@ -91,13 +91,13 @@ class PhysicsConfig(_Section):
 class SettleConfig(_Section):
     """Dropping the object on the table until it is at rest."""
 
-    drop_height: NonNegative = 0.3  # [m], of the lowest point above the table (paper)
+    drop_height: NonNegative = 0.3  # [m], of {O} above the table (paper); taller ones stand on it
     max_time: Positive = 15.0  # [s] of simulation (released code)
     max_linear_speed: Positive = 1e-3  # [m/s], slower than this is at rest
     max_angular_speed: Positive = 1e-2  # [rad/s], slower than this is at rest
     rest_time: Positive = 0.2  # [s], at rest for this long
     time_step: Annotated[float, Field(gt=0.0, le=0.02)] = (
-        0.004  # [s]; longer ones tilt it in landing
+        0.002  # [s]; longer ones tilt it in landing
     )
 
 

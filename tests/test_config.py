@@ -49,7 +49,7 @@ settle:
   max_linear_speed: 2.0e-3
   max_angular_speed: 2.0e-2
   rest_time: 0.3
-  time_step: 0.002
+  time_step: 0.001
 candidates:
   method: normals
   max: 100

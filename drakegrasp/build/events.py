@@ -83,7 +83,12 @@ class BuildEvents:
         if isinstance(entry, RefusedMesh):
             self._log("mesh refused", name=entry.name, reason=entry.reason)
         else:
-            self._log("mesh prepared", name=entry.name, candidates=entry.candidates)
+            self._log(
+                "mesh prepared",
+                name=entry.name,
+                candidates=entry.candidates,
+                notes=list(entry.notes),
+            )
 
     def unit_done(self, summary: UnitSummary) -> None:
         """Log what a work unit returned."""

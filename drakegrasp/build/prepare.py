@@ -6,7 +6,7 @@ manifest: what it is, or why it was refused.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -135,7 +135,7 @@ def prepare(source: MeshSource, config: Config) -> PreparedObject:
     model = prepare_object(source, config.objects)
     resting = settle(model, config)
     return PreparedObject(
-        model=model,
+        model=replace(model, notes=(*model.notes, *resting.notes)),
         X_TO=resting.X_TO,
         candidates=sample_candidates(model, resting.X_TO, config.candidates, config.seed),
         table_force=resting.table_force,

@@ -73,6 +73,10 @@ WRIST_STIFFNESS, WRIST_DAMPING = 1e6, 1e4
 FINGER_DAMPING = 20.0
 #: Drake requires a positive stiffness; this one adds less than a millionth of the torque.
 FINGER_STIFFNESS = 1e-6
+#: Distance above the table at which the solver knows of a contact before it has a force [m]: a flat
+#: base on a stiff table jitters without it (RobotLocomotion/drake#21514). An edge or a tip sinks in
+#: by about twice as much.
+TABLE_MARGIN = 5e-5
 #: Resolution hint for the few hand parts that are cylinders [m]; boxes and meshes ignore it.
 RESOLUTION_HINT = 0.005
 #: Frames per simulated second in Meshcat [Hz]. A power of two makes their times exact, so that
@@ -209,6 +213,7 @@ def _add_table(plant: MultibodyPlant, scene_graph: SceneGraph, physics: PhysicsC
     plant.WeldFrames(plant.world_frame(), body.body_frame(), RigidTransform(X_WT))
     properties = ProximityProperties()
     AddCompliantHydroelasticProperties(RESOLUTION_HINT, physics.table_modulus, properties)
+    properties.AddProperty("hydroelastic", "margin", TABLE_MARGIN)
     _add_material(properties, partner_friction(physics.friction_table, physics), physics)
     _assign_proximity(plant, scene_graph, body, properties)
     return body

@@ -9,12 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.math import RotationMatrix
+from pydrake.math import RigidTransform, RotationMatrix
 
 from drakegrasp.arithmetic import multiply, norm
 from drakegrasp.config import Config
 from drakegrasp.errors import MeshError, first_line
-from drakegrasp.frames import X_WT, Array, invert_pose, make_pose
+from drakegrasp.frames import X_WT, Array, invert_pose, make_pose, transform_points
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.contacts import read_contacts
@@ -28,6 +28,10 @@ GRAVITY, MAX_FORCE_ERROR = 9.81, 0.01
 #: a micrometre and a microradian. Drake's last bits depend on the CPU, and the palm poses depend on
 #: the resting pose.
 POSE_GRID = 2.0**-20
+#: An object that landed deeper in the table is raised by that and set down again [m], this often.
+MAX_SINK, MAX_SETTINGS = 3e-4, 4
+#: A larger tilt of an object at rest is noted [rad], 5 degrees: less is how an uneven base stands.
+NOTED_TILT = np.pi / 36.0
 #: Share of the longest time after which an object that still rolls is stopped; see `settle`.
 STOP_FRACTION = 0.6
 
@@ -40,17 +44,38 @@ class Resting:
         X_TO: Pose in the table-top frame, (4, 4); p_TO = (0, 0, z).
         seconds: Simulated time until it rested [s].
         table_force: Upward force of the table at rest [N].
+        sink: Depth of its lowest point in the table [m].
         stopped: Whether it was stopped because it was still rolling.
     """
 
     X_TO: Array
     seconds: float
     table_force: float
+    sink: float
     stopped: bool
+
+    @property
+    def tilt(self) -> float:
+        """Angle between the object's z-axis, which pointed up when it fell, and up [rad]."""
+        return float(np.arccos(np.clip(self.X_TO[2, 2], -1.0, 1.0)))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user may not expect of how it rests, in sentences."""
+        notes = []
+        if self.tilt > NOTED_TILT:
+            degrees = np.degrees(self.tilt)
+            notes.append(f"it tipped over by {degrees:.0f} degrees when it was dropped")
+        if self.stopped:
+            notes.append("it still rolled on the table and was stopped")
+        return tuple(notes)
 
 
 def settle(model: ObjectModel, config: Config) -> Resting:
     """Return the resting pose of an object dropped with {O} aligned to {W}.
+
+    {O} begins at `settle.drop_height` above the table (Veres et al.), the lowest point of a taller
+    object just on it.
 
     Hydroelastic contact has no rolling resistance, so a round object may roll for very long. After
     `STOP_FRACTION` of `settle.max_time` each check therefore sets the velocity of an object that
@@ -69,34 +94,27 @@ def settle(model: ObjectModel, config: Config) -> Resting:
 
 
 def _settle(model: ObjectModel, config: Config) -> Resting:
-    # Hold the object over the table, aligned to {W}, and let it go.
+    # Free fall does not turn it, so the simulation begins where it touches the table. From above,
+    # the first step in contact would find it millimetres deep, and throw it up and over.
     rules = config.settle
     scene = build_scene(model, config.physics.model_copy(update={"time_step": rules.time_step}))
     lowest = float(model.collision_vertices[:, 2].min())
-    X_WO = multiply(X_WT, make_pose(np.eye(3), [0.0, 0.0, rules.drop_height - lowest]))
-    reset_object(scene, X_WO)
+    fall = max(rules.drop_height + lowest, 0.0)
+    reset_object(scene, multiply(X_WT, make_pose(np.eye(3), [0.0, 0.0, -lowest])))
+    # The object is the only body that moves: angular, then linear velocity.
+    speed = float(np.sqrt(2.0 * GRAVITY * fall))
+    scene.plant.SetVelocities(scene.context, [0.0, 0.0, 0.0, 0.0, 0.0, -speed])
     scene.simulator.Initialize()
+    stopped = _wait_for_rest(scene, config)
 
-    # Simulate until it has been slow for long enough.
-    resting_for, stopped, linear, angular = 0.0, False, 0.0, 0.0
-    while resting_for < rules.rest_time:
-        if scene.time >= rules.max_time:
-            raise MeshError(
-                f"{model.name}: must come to rest on the table within {rules.max_time:g} s of "
-                f"simulation, got {linear:.3g} m/s and {angular:.3g} rad/s"
-            )
-        advance(scene, CHECK_PERIOD)
-        linear, angular = _speeds(scene)
-        if not np.isfinite(linear) or linear > config.physics.max_speed:
-            raise MeshError(
-                f"{model.name}: its speed must stay below {config.physics.max_speed:g} m/s while "
-                f"it settles, got {linear:.3g} m/s"
-            )
-        slow = linear < rules.max_linear_speed and angular < rules.max_angular_speed
-        resting_for = resting_for + CHECK_PERIOD if slow else 0.0
-        if not slow and scene.time > STOP_FRACTION * rules.max_time:
-            scene.plant.SetVelocities(scene.context, np.zeros(scene.plant.num_velocities()))
-            stopped = True
+    # What landed on a tip may stick in the table like a nail: raise it and set it down.
+    sink = _sink(scene)
+    for _ in range(MAX_SETTINGS):
+        if sink <= MAX_SINK:
+            break
+        _raise(scene, sink)
+        stopped = _wait_for_rest(scene, config) or stopped
+        sink = _sink(scene)
 
     # The pose over the table's centre, on the grid.
     X_TO = multiply(invert_pose(X_WT), scene.pose(scene.object))
@@ -111,7 +129,52 @@ def _settle(model: ObjectModel, config: Config) -> Resting:
         raise MeshError(
             f"{model.name}: the table must carry its {weight:.3g} N at rest, got {force:.3g} N"
         )
-    return Resting(X_TO=X_TO, seconds=scene.time, table_force=force, stopped=stopped)
+    return Resting(X_TO=X_TO, seconds=scene.time, table_force=force, sink=sink, stopped=stopped)
+
+
+def _wait_for_rest(scene: Scene, config: Config) -> bool:
+    """Simulate until the object has been slow for long enough; return whether it was stopped."""
+    # Refuse what takes too long.
+    rules, name = config.settle, scene.model.name
+    resting_for, stopped, linear, angular = 0.0, False, 0.0, 0.0
+    start = scene.time
+    while resting_for < rules.rest_time:
+        if scene.time - start >= rules.max_time:
+            raise MeshError(
+                f"{name}: must come to rest on the table within {rules.max_time:g} s of "
+                f"simulation, got {linear:.3g} m/s and {angular:.3g} rad/s"
+            )
+
+        # Look at its speed a little later.
+        advance(scene, CHECK_PERIOD)
+        linear, angular = _speeds(scene)
+        if not np.isfinite(linear) or linear > config.physics.max_speed:
+            raise MeshError(
+                f"{name}: its speed must stay below {config.physics.max_speed:g} m/s while "
+                f"it settles, got {linear:.3g} m/s"
+            )
+
+        # Count for how long it has been slow; stop it if it moves for too long.
+        slow = linear < rules.max_linear_speed and angular < rules.max_angular_speed
+        resting_for = resting_for + CHECK_PERIOD if slow else 0.0
+        if not slow and scene.time - start > STOP_FRACTION * rules.max_time:
+            scene.plant.SetVelocities(scene.context, np.zeros(scene.plant.num_velocities()))
+            stopped = True
+    return stopped
+
+
+def _sink(scene: Scene) -> float:
+    """Return how deep the object's lowest point is in the table [m]; negative above it."""
+    X_TO = multiply(invert_pose(X_WT), scene.pose(scene.object))
+    return -float(transform_points(X_TO, scene.model.collision_vertices)[:, 2].min())
+
+
+def _raise(scene: Scene, height: float) -> None:
+    """Move the object up by a height [m], at rest."""
+    X_WO = scene.pose(scene.object).copy()
+    X_WO[2, 3] += height
+    scene.plant.SetFreeBodyPose(scene.context, scene.object, RigidTransform(X_WO))
+    scene.plant.SetVelocities(scene.context, np.zeros(scene.plant.num_velocities()))
 
 
 def snapped(X_TO: Array) -> Array:

@@ -1,0 +1,133 @@
+"""Coming to rest: what stands stays standing, nothing sinks in, and what does not is told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from helpers.meshes import G3DB, needs_g3db
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
+
+from drakegrasp.config import Config, load_config, override_config
+from drakegrasp.errors import MeshError
+from drakegrasp.objects.model import ObjectModel, make_object, prepare_object
+from drakegrasp.objects.sources import find_meshes
+from drakegrasp.simulation import settle as settle_module
+from drakegrasp.simulation.settle import Resting, settle
+
+pytestmark = pytest.mark.sim
+
+#: Boxes of twelve triangles [mm].
+BOXES = [
+    (60, 80, 100),
+    (60, 90, 200),
+    (60, 60, 100),
+    (50, 50, 150),
+    (100, 100, 100),
+    (200, 30, 60),
+    (40, 120, 160),
+]
+
+
+def as_dropped(mesh: trimesh.Trimesh) -> ObjectModel:
+    """Return a mesh with its own few triangles as a model."""
+    return make_object(
+        mesh.vertices,
+        mesh.faces,
+        load_config().objects,
+        name="1_thing_a",
+        class_name="thing",
+        mesh_sha256="0",
+    )
+
+
+def tilt_deg(resting: Resting) -> float:
+    return float(np.degrees(np.arccos(np.clip(resting.X_TO[2, 2], -1.0, 1.0))))
+
+
+SHAPES = {
+    **{"x".join(map(str, mm)): trimesh.creation.box(np.array(mm) / 1e3) for mm in BOXES},
+    "cylinder": trimesh.creation.cylinder(radius=0.03, height=0.12, sections=16),
+    "cone": trimesh.creation.cone(radius=0.04, height=0.10, sections=16),
+}
+
+
+@pytest.mark.parametrize("name", list(SHAPES))
+def test_shape_with_a_base_of_few_triangles_rests_as_it_was_dropped(name: str, config: Config):
+    resting = settle(as_dropped(SHAPES[name]), config)
+    assert tilt_deg(resting) < 0.5
+    assert abs(resting.sink) < 1e-5
+    assert resting.seconds < 2.0 and not resting.stopped and resting.notes == ()
+
+
+@settings(max_examples=12, deadline=None, derandomize=True)
+@given(
+    base=st.lists(st.tuples(*[st.floats(-0.1, 0.1)] * 2), min_size=3, max_size=7),
+    top=st.lists(
+        st.tuples(*[st.floats(-0.1, 0.1)] * 2, st.floats(0.03, 0.2)), min_size=1, max_size=6
+    ),
+)
+def test_convex_solid_stays_on_a_face_that_carries_it(base, top):
+    """Its centre of mass is at least 5 mm within the edges of the face that it is dropped on."""
+    flat = np.array(base)
+    assume(np.linalg.svd(flat - flat.mean(axis=0), compute_uv=False)[1] > 0.01)
+    points = np.vstack((np.column_stack((flat, np.zeros(len(flat)))), top))
+    mesh = trimesh.convex.convex_hull(points)
+    edges = ConvexHull(flat).equations
+    assume((edges[:, :2] @ mesh.center_mass[:2] + edges[:, 2]).max() < -0.005)
+    assert tilt_deg(settle(as_dropped(mesh), load_config())) < 0.5
+
+
+def test_object_falls_from_its_own_origin_and_a_tall_one_from_the_table(config: Config):
+    """A cube of 100 mm falls by 0.25 m; one of 800 mm does not fall, however high that is."""
+    small, tall = (as_dropped(trimesh.creation.box([side] * 3)) for side in (0.1, 0.8))
+    higher = override_config(config, ["settle.drop_height=0.39"])
+    np.testing.assert_array_equal(settle(tall, config).X_TO, settle(tall, higher).X_TO)
+    assert settle(small, override_config(config, ["settle.drop_height=0"])).seconds <= (
+        settle(small, config).seconds
+    )
+
+
+def test_what_tips_over_is_noted(config: Config):
+    """A slab that is dropped on its corner ends on a face."""
+    mesh = trimesh.creation.box([0.10, 0.02, 0.08])
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(0.5, [1, 0, 0]))
+    resting = settle(as_dropped(mesh), config)
+    assert np.degrees(resting.tilt) == pytest.approx(90.0 - np.degrees(0.5), abs=1.0)
+    assert resting.notes == ("it tipped over by 61 degrees when it was dropped",)
+
+
+def test_what_rolls_is_stopped_and_noted(config: Config, monkeypatch: pytest.MonkeyPatch):
+    """A cube that is said to move until 60 % of the longest time are over."""
+    quick, measured = override_config(config, ["settle.max_time=2"]), settle_module._speeds
+    monkeypatch.setattr(
+        settle_module, "_speeds", lambda scene: (0.5, 5.0) if scene.time < 1.3 else measured(scene)
+    )
+    resting = settle(as_dropped(trimesh.creation.box([0.05] * 3)), quick)
+    assert resting.stopped and resting.seconds > 1.3
+    assert resting.notes == ("it still rolled on the table and was stopped",)
+
+
+def test_what_never_rests_is_refused_with_its_speed(config: Config):
+    ball = as_dropped(trimesh.creation.icosphere(subdivisions=3, radius=0.03))
+    strict = override_config(config, ["settle.max_time=0.1"])
+    with pytest.raises(MeshError, match=r"must come to rest .* within 0\.1 s .* got .* m/s"):
+        settle(ball, strict)
+
+
+@needs_g3db
+@pytest.mark.slow
+def test_no_mesh_of_g3db_sinks_into_the_table(config: Config):
+    sinks = {}
+    for source in find_meshes(Path(G3DB), units="cm"):
+        try:
+            model = prepare_object(source, config.objects)
+        except MeshError:
+            continue  # in another unit
+        sinks[source.name] = settle(model, config).sink
+    assert len(sinks) >= 29
+    assert max(sinks.values()) < 3e-4
