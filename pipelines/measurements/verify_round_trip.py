@@ -4,8 +4,8 @@
     python pipelines/measurements/verify_round_trip.py OUT [OUT ...] --workers 2 > round_trip.json
 
 The script verifies the grasp of every sample in the frames of both cameras and of the object, by
-both methods, at the dataset's own friction. Then it verifies the same grasps, spoilt in three
-ways. Prints JSON.
+both methods, at the dataset's own friction. Then it verifies the contacts at the end of the lift
+(`grasps_held`), and the grasps spoilt in three ways. Prints JSON.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
@@ -31,6 +31,9 @@ from drakegrasp.verification.result import Verification
 
 #: Distance of spoilt contacts from the surface, and from each other on one side [m].
 OFF, APART = 0.03, 0.02
+
+#: Key of the contacts at the end of the lift.
+HELD = "at the end of the lift"
 
 Array = npt.NDArray[np.float64]
 
@@ -64,6 +67,8 @@ def main(outs: tuple[Path, ...], workers: int, every: int) -> None:
                     for camera in CAMERAS:
                         grasps = data[camera].column("grasps")[rows].astype(float)
                         verify(camera, method, grasps, dataset=data[camera], rows=rows)
+                    held = data["oto"].column("grasps_held")[rows].astype(float)
+                    verify(HELD, method, held, dataset=data["oto"], rows=rows)
                     for key, grasps in spoilt.items():
                         where = {"dataset": data["oto"], "rows": rows, "frame": "object"}
                         verify(key, method, grasps, **where)
@@ -118,6 +123,14 @@ def figures(by_key: dict[str, list[Verification]]) -> dict[str, Any]:
         "grasps": len(plain),
         "objects": len({v.placed.model.name for v in plain}),
         "held": share(plain),
+        "held, precision, stable": [
+            float(np.mean([getattr(v, word) for v in plain]))
+            for word in ("held", "precision", "stable")
+        ],
+        "contacts at the end of the lift": {
+            "held": share(by_key[HELD]),
+            "outcomes": dict(Counter(v.outcome.label for v in by_key[HELD])),
+        },
         "held by the first wrist pose": float(np.mean([v.success and v.tries <= 1 for v in plain])),
         "same outcome in all frames": float(
             np.mean([len(set(o)) == 1 for o in zip(*frames, strict=True)])
@@ -136,7 +149,7 @@ def figures(by_key: dict[str, list[Verification]]) -> dict[str, Any]:
                 "outcomes": dict(Counter(v.outcome.label for v in verdicts)),
             }
             for key, verdicts in by_key.items()
-            if key not in ("object", *CAMERAS)
+            if key not in ("object", HELD, *CAMERAS)
         },
     }
 
