@@ -22,6 +22,10 @@ from drakegrasp.frames import Array, invert_pose, rotate_vectors, transform_poin
 from drakegrasp.mesh.surfaces import winding_numbers
 from drakegrasp.simulation.scene import Scene
 
+#: Largest share of a patch's pressure that may lie beside the pad of a fingertip's contact; own
+#: choice, see docs/explanation/physics.md, "Pads".
+MAX_BESIDE = 0.5
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Contacts:
@@ -188,12 +192,15 @@ class _Reader:
         weight = faces.areas * faces.pressures
         moment_n = weight[:, None] * faces.normals_W
 
-        # Drake tells the force of the whole patch. Its normal part belongs to the faces; friction
-        # and damping are divided as the pressure is.
-        if on_pad.all():
+        # A patch that reaches over the pad's border is the fingertip's as a whole. One that lies
+        # mostly beside the pad is split: its rest is a contact of another link. Drake tells the
+        # force of the whole patch. Its normal part belongs to the faces; friction and damping are
+        # divided as the pressure is.
+        share = weight[on_pad].sum() / weight.sum() if weight.any() else 0.0
+        if share >= 1.0 - MAX_BESIDE:
+            on_pad = np.ones_like(on_pad)
             pad_force_W = force_W
         else:
-            share = weight[on_pad].sum() / weight.sum() if weight.any() else 0.0
             rest = force_W + moment_n.sum(axis=0)
             pad_force_W = -moment_n[on_pad].sum(axis=0) + share * rest
             other = float(norm(force_W - pad_force_W))

@@ -27,6 +27,9 @@ from drakegrasp.frames import Array
 from drakegrasp.hand.description import Drive, Hand
 from drakegrasp.simulation.scene import Scene, closing_angles, closing_rates, hand_handles
 
+#: A finger that opens more slowly than this stands [rad/s].
+STANDING = 1e-4
+
 
 def drive_of(hand: Hand, config: LiftConfig) -> Drive:
     """Return the drive of a hand's fingers under a configuration.
@@ -123,7 +126,7 @@ def _turn_worms(scene: Scene, _: Context) -> EventStatus:
         joint, motor = handles.closing_joints[i], handles.motors[i]
         lower, upper = _limits(joint)
         yields = motor.effort_limit() > finger.torque_limit
-        if yields and rates[i] >= 0.0:
+        if yields and rates[i] >= -STANDING:
             # A finger that yielded stands again: from now on the worm holds it here.
             motor.set_effort_limit(finger.torque_limit)
             _set_limits(joint, min(angles[i], upper), upper)

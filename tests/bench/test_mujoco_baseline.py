@@ -154,12 +154,14 @@ def test_contact_beside_the_pad_is_of_another_link(
 ) -> None:
     """The fingertips meet the cube 55 mm from the distal joint."""
     attempt = from_above(cube, STANDOFF)
-    weak(monkeypatch, pad_region=((1.0, 0.0, 0.0, 0.054), (-1.0, 0.0, 0.0, -0.056)))
+    at = (0.055, 0.006, 0.0)
+    bounds = ((1.0, 0.0, 0.0, 0.054), (-1.0, 0.0, 0.0, -0.056))
+    weak(monkeypatch, pad_region=bounds, pad_point=at)
     baseline = peer(cube)
     assert baseline.run(attempt).outcome is Outcome.SUCCESS
     assert baseline._contacts().other_links == 0
 
-    weak(monkeypatch, pad_region=((1.0, 0.0, 0.0, 0.06),))
+    weak(monkeypatch, pad_region=((1.0, 0.0, 0.0, 0.06),), pad_point=(0.06, 0.0, 0.0))
     baseline = peer(cube)
     assert baseline.run(attempt).outcome is Outcome.MISSING_FINGERTIP
     assert baseline._contacts().other_links == 3

@@ -47,8 +47,9 @@ def test_points_of_the_pad_come_first(hand):
         X_FG = invert_pose(fingertip_poses(hand, spread=0.0, closing=np.zeros(3))[i])
         p_FQ = transform_points(X_FG, path.points[0, : path.tip].astype(float))
         x, y = p_FQ[:, 0], p_FQ[:, 1]
-        near = (x > 0.015 + 1e-6) & (y > -0.003 + 1e-6)
-        off = (x < 0.015 - 1e-6) | (y < -0.003 - 1e-6)
+        above = 0.085 * x + y - (0.00153 - 0.003 * np.hypot(0.085, 1.0))
+        near = (x > 0.015 + 1e-6) & (above > 1e-6)
+        off = (x < 0.015 - 1e-6) | (above < -1e-6)
         assert near[: path.pad].sum() == near.sum() > 100
         assert off[path.pad :].sum() == off.sum() > 100
         assert np.allclose(pad_points(hand)[i], p_FQ[: path.pad], atol=1e-6)

@@ -44,7 +44,7 @@ def test_barrett_hand_is_as_strong_as_its_worms_or_its_motors():
     hand = load_hand()
     levers = closing_levers(hand, np.full(3, np.deg2rad(70.0)))
     assert np.allclose(levers, 0.116, atol=1e-3)
-    assert np.allclose(fingertip_forces(hand, "worm") * levers, 5.0)
+    assert np.allclose(fingertip_forces(hand, "worm") * levers, 10.0)
     assert np.allclose(fingertip_forces(hand, "torque") * levers, [2.0, 2.0, 4.0])
     assert np.array_equal(fingertip_forces(hand, "locked"), fingertip_forces(hand, "worm"))
 
@@ -52,7 +52,7 @@ def test_barrett_hand_is_as_strong_as_its_worms_or_its_motors():
 def test_strength_at_the_ends_of_the_range_is_what_the_docs_say():
     hand = load_hand()
     ends = [closing_levers(hand, limit) for limit in coordinate_limits(hand)[1:].T]
-    middle = 5.0 / fingertip_forces(hand, "worm")
+    middle = 10.0 / fingertip_forces(hand, "worm")
     assert np.allclose(middle / ends[0] - 1.0, -0.10, atol=0.005)
     assert np.allclose(middle / ends[1] - 1.0, 0.19, atol=0.005)
 

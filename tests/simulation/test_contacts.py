@@ -19,6 +19,7 @@ pytestmark = pytest.mark.sim
 
 #: Beyond the end of every link [m].
 NOWHERE = ((1.0, 0.0, 0.0, 0.5),)
+EVERYWHERE: tuple[HalfSpace, ...] = ()
 
 
 @pytest.fixture(scope="module")
@@ -33,11 +34,20 @@ def with_pads(scene: Scene, *regions: tuple[HalfSpace, ...]) -> Contacts:
     """Return the contacts as they are with other pad regions of the three fingers."""
     hand = scene.handles.hand
     fingers = tuple(
-        replace(finger, pad_region=region)
+        replace(finger, pad_region=region, pad_point=_inside(region, finger.pad_point))
         for finger, region in zip(hand.fingers, regions, strict=True)
     )
     handles = replace(scene.handles, hand=replace(hand, fingers=fingers))
     return read_contacts(replace(scene, handles=handles))
+
+
+def _inside(region: tuple[HalfSpace, ...], usual: tuple[float, ...]) -> tuple[float, ...]:
+    """Return a point of a region: a hand must have its usual contact point there."""
+    if len(region) != 1:
+        return usual
+    ((x, y, z, d),) = region
+    length = x**2 + y**2 + z**2
+    return tuple(1.01 * d * n / length + 0.01 * n for n in (x, y, z))
 
 
 def test_contact_off_the_pad_is_one_of_another_link(closed):
@@ -51,42 +61,49 @@ def test_contact_off_the_pad_is_one_of_another_link(closed):
     assert judge_closed(contacts.touching, contacts.other_links, False).item()
 
 
-def test_patch_on_the_edge_of_the_pad_is_split(closed, cube):
-    """Force and area of both parts are those of the whole; the point is the pad's."""
-    whole = with_pads(closed, (), (), ())
-    assert whole.other_links == 0
-
-    # A cut through the middle of the patch of finger 1, whose two sides are read in turn.
-    tip = closed.handles.fingertips[0]
-    X_FO = invert_pose(closed.pose(tip)) @ closed.pose(closed.object)
-    x = float(transform_points(X_FO, whole.p_OQ[:1])[0, 0])
-    outer = with_pads(closed, ((1.0, 0.0, 0.0, x),), (), ())
-    inner = with_pads(closed, ((-2.0, 0.0, 0.0, -2.0 * x),), (), ())
-    for part in (outer, inner):
-        assert part.touching.all()
-        assert part.other_links == 1
-        assert 0.1 * whole.area[0] < part.area[0] < 0.9 * whole.area[0]
-        assert np.array_equal(part.f_Q_O[1:], whole.f_Q_O[1:])
-    assert outer.area[0] + inner.area[0] == pytest.approx(whole.area[0])
-    assert np.allclose(outer.f_Q_O[0] + inner.f_Q_O[0], whole.f_Q_O[0], atol=1e-9)
-    assert transform_points(X_FO, outer.p_OQ[:1])[0, 0] > x + 1e-4
-    assert transform_points(X_FO, inner.p_OQ[:1])[0, 0] < x - 1e-4
+def test_patch_over_the_border_is_the_fingertips(closed):
+    """As a whole, where most of it is on the pad: its force, area and point do not change."""
+    whole = with_pads(closed, EVERYWHERE, EVERYWHERE, EVERYWHERE)
+    x = _contact_in_link(closed, whole)
+    part = with_pads(closed, ((1.0, 0.0, 0.0, x - 1e-3),), EVERYWHERE, EVERYWHERE)
+    assert part.other_links == 0
+    assert np.array_equal(part.f_Q_O, whole.f_Q_O)
+    assert np.array_equal(part.p_OQ, whole.p_OQ)
+    assert np.array_equal(part.area, whole.area)
 
 
-def test_force_of_a_part_pushes_along_its_own_normal(closed):
-    """Where the pad carries half of a patch, it carries about half of its force."""
-    whole = with_pads(closed, (), (), ())
-    tip = closed.handles.fingertips[0]
-    X_FO = invert_pose(closed.pose(tip)) @ closed.pose(closed.object)
-    x = float(transform_points(X_FO, whole.p_OQ[:1])[0, 0])
-    part = with_pads(closed, ((1.0, 0.0, 0.0, x),), (), ())
+@pytest.mark.parametrize("scale", [1.0, 2.0])
+def test_patch_mostly_beside_the_pad_is_split(closed, scale):
+    """The pad's part is a fingertip's contact, and the rest is one of another link."""
+    whole = with_pads(closed, EVERYWHERE, EVERYWHERE, EVERYWHERE)
+    x = _contact_in_link(closed, whole)
+    beyond = (scale, 0.0, 0.0, scale * (x + 1e-3))
+    part = with_pads(closed, (beyond,), EVERYWHERE, EVERYWHERE)
+    assert part.touching.all()
+    assert part.other_links == 1
+    assert np.array_equal(part.f_Q_O[1:], whole.f_Q_O[1:])
+    assert 0.05 * whole.area[0] < part.area[0] < 0.6 * whole.area[0]
+    assert part.penetration[0] <= whole.penetration[0]
+    assert _contact_in_link(closed, part) > x + 1e-3
+
+    # It carries what the pressure on its faces says, and pushes along its own normal.
     share = np.linalg.norm(part.f_Q_O[0]) / np.linalg.norm(whole.f_Q_O[0])
-    assert 0.3 < share < 0.7
-    assert (part.f_Q_O[0] * part.nhat_Q_O[0]).sum() < 0.0
+    assert 0.05 < share < 0.5
+    cosine = -(part.f_Q_O[0] * part.nhat_Q_O[0]).sum() / np.linalg.norm(part.f_Q_O[0])
+    assert cosine > np.cos(np.arctan(0.71)) - 1e-3
+
+
+def _contact_in_link(scene: Scene, contacts: Contacts) -> float:
+    """Return how far along its link finger 1 touches [m]."""
+    tip = scene.handles.fingertips[0]
+    X_FO = invert_pose(scene.pose(tip)) @ scene.pose(scene.object)
+    return float(transform_points(X_FO, contacts.p_OQ[:1])[0, 0])
 
 
 def test_barretts_pad_is_the_front_of_its_fingertip(closed):
-    """Both bounds count: the pad begins 18 mm along the link and faces its palm side."""
+    """It begins 18 mm along the link and has the round tip, but neither back nor sides."""
     (finger, *_) = closed.handles.hand.fingers
-    points = np.array([[0.04, 0.01, 0.0], [0.04, -0.001, 0.0], [0.0179, 0.01, 0.0]])
-    assert finger.on_pad(points).tolist() == [True, False, False]
+    on = np.array([[0.04, 0.011, 0.0], [0.0183, 0.0, 0.01], [0.0589, -0.003, 0.0]])
+    off = np.array([[0.0179, 0.01, 0.0], [0.03, -0.002, 0.011], [0.059, -0.004, 0.0]])
+    assert finger.on_pad(on).all()
+    assert not finger.on_pad(off).any()

@@ -145,6 +145,6 @@ def test_slip_before_the_wrist_moves_is_told_apart(scene, cube, config):
     still = override_config(torque, ["lift.p_TG=[0, 0, 0.13]"])
     moved = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), torque)
     waited = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), still)
-    assert 1e-5 < moved.slip_released < 0.5 * moved.slip
+    assert 1e-6 < moved.slip_released < 0.5 * moved.slip
     assert moved.slip_released == pytest.approx(waited.slip_released, rel=1e-6)
-    assert 1e-5 < moved.turn_released < moved.turn
+    assert 1e-6 < moved.turn_released < moved.turn

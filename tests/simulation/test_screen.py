@@ -85,7 +85,8 @@ def test_object_under_one_finger_only_is_screened(cube, hand):
 
 def test_fingertip_that_meets_the_object_beside_its_pad_is_screened(cube, hand):
     """The cube is between the ends of the fingertips: their first 5 mm do not come to it."""
-    backs = tuple(replace(f, pad_region=((-1.0, 0.0, 0.0, -0.005),)) for f in hand.fingers)
+    base = {"pad_region": ((-1.0, 0.0, 0.0, -0.005),), "pad_point": (0.0, 0.009, 0.0)}
+    backs = tuple(replace(finger, **base) for finger in hand.fingers)
     assert ask(cube, hand, from_above(cube, STANDOFF)).outcome is None
     found = ask(cube, replace(hand, fingers=backs), from_above(cube, STANDOFF))
     assert found.outcome is Outcome.SCREENED

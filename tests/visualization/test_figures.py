@@ -195,6 +195,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "X_TO": pack_pose(prepared.X_TO),
         "X_OG": pack_pose(make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, palm])),
         "X_TO_lifted": pack_pose(X_TO_lifted),
+        "X_OG_lifted": pack_pose(make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, palm])),
         "time_lift": 2.5,
         "closed_q": np.full(8, 0.3),
         "lifted_q": np.full(8, 0.3),
