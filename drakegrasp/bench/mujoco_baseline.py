@@ -26,6 +26,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Pregrasp
+from drakegrasp.simulation.contacts import MAX_BESIDE
 from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.trajectory import lift_path
 from drakegrasp.simulation.verdict import judge_closed, judge_lifted
@@ -223,8 +224,9 @@ class MujocoBaseline:
     def _contacts(self) -> PeerContacts:
         """Return the contacts of the last step; weaker ones than the limit do not count."""
         m, d, limit = self._model, self._data, self._config.physics.contact_force
-        pads, others = np.zeros((len(self._tips), 3)), dict[int, float]()
-        hand_on_table, object_on_table = 0.0, np.zeros(3)
+        # Of each fingertip on its pad and beside it: the force, and the sum of normal forces.
+        tips, pressure = np.zeros((len(self._tips), 2, 3)), np.zeros((len(self._tips), 2))
+        others, hand_on_table, object_on_table = dict[int, float](), 0.0, np.zeros(3)
         for i, contact in enumerate(d.contact[: d.ncon]):
             # The force of the second body on the first, in the world's frame.
             wrench = np.zeros(6)
@@ -234,20 +236,28 @@ class MujocoBaseline:
             link = int(two if one == self._object else one)
             signed = force if one == self._object else -force
 
-            # Sum by the kind of pair: with the table, with a pad, with anything else of the hand.
+            # Sum by the kind of pair: with the table, or of the object with a link of the hand.
             if self._table in (contact.geom1, contact.geom2):
                 if self._object in (one, two):
                     object_on_table += signed
                 else:
                     hand_on_table += float(np.linalg.norm(force))
-            elif link in self._tips and self._on_pad(link, contact.pos):
-                pads[self._tips.index(link)] += signed
+            elif self._object not in (one, two):
+                continue
+            elif link in self._tips:
+                beside = int(not self._on_pad(link, contact.pos))
+                tips[self._tips.index(link), beside] += signed
+                pressure[self._tips.index(link), beside] += wrench[0]
             else:
                 others[link] = others.get(link, 0.0) + float(np.linalg.norm(force))
 
+        # As in Drake: contact that is mostly on the pad is the fingertip's, else it is split.
+        whole = pressure[:, 1] <= MAX_BESIDE * pressure.sum(axis=1)
+        tips[whole] = np.stack([tips[whole].sum(axis=1), np.zeros((whole.sum(), 3))], axis=1)
+        on_pad, beside = np.moveaxis(np.linalg.norm(tips, axis=2) > limit, 1, 0)
         return PeerContacts(
-            touching=np.linalg.norm(pads, axis=1) > limit,
-            other_links=sum(force > limit for force in others.values()),
+            touching=on_pad,
+            other_links=int(beside.sum()) + sum(force > limit for force in others.values()),
             hand_on_table=hand_on_table > limit,
             object_on_table=bool(np.linalg.norm(object_on_table) > limit),
         )
