@@ -11,13 +11,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
-
 from drakegrasp.api import build_dataset
-from drakegrasp.cli.tables import WIDTH, funnel_table, split_table
+from drakegrasp.cli.build import print_stats
+from drakegrasp.cli.tables import make_console
 from drakegrasp.config import load_config
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
-from drakegrasp.dataset.statistics import count_funnel, count_splits
 from drakegrasp.errors import DrakegraspError
 from drakegrasp.objects.builtin.catalog import export_builtin
 from drakegrasp.visualization.contact_sheet import contact_sheet
@@ -67,10 +65,8 @@ def run(directory: Path, *, candidates: int, workers: int | None = None) -> None
     config = load_config(None, [f"candidates.max={candidates}", "unit_candidates=25"])
     build_dataset(meshes, out, config=config, workers=workers)
 
-    console = Console()
-    console = console if console.is_terminal else Console(width=WIDTH)
-    console.print(funnel_table(count_funnel(out)))
-    console.print(split_table(count_splits(out)))
+    print_stats(out)
+    console = make_console()
     drawn = contact_sheet(out / DATA_FILES["oto"], sheet)
     console.print(f"{sheet}: {drawn} samples drawn", soft_wrap=True, highlight=False)
     for name in (*DATA_FILES.values(), TRIALS_FILE):

@@ -95,7 +95,7 @@ def assemble(out: Path, reject: Path | None, overrides: tuple[str, ...]) -> None
         change_postprocessing(out, overrides)
     with progress_bar("assemble", "shards") as progress:
         assemble_files(out, rejected=rejected, progress=progress)
-    _print_stats(out)
+    print_stats(out)
 
 
 @click.command()
@@ -105,10 +105,11 @@ def stats(out: Path) -> None:
 
     While a build runs, or after it was stopped, the command counts what is done so far.
     """
-    _print_stats(out)
+    print_stats(out)
 
 
-def _print_stats(out: Path) -> None:
+def print_stats(out: Path) -> None:
+    """Print the tables of a dataset: outcomes, how well the hand holds, samples by split."""
     from rich.measure import Measurement
 
     from drakegrasp.cli.tables import (
@@ -148,7 +149,7 @@ def print_plan(request: BuildRequest, workers: int | None, times: Path | None) -
 
 def print_report(report: BuildReport) -> None:
     """Print what a build did, and the paths of its files."""
-    _print_stats(report.out)
+    print_stats(report.out)
     if report.simulated:
         reused = f" ({report.reused} had been done before)" if report.reused else ""
         click.echo(f"{report.simulated} work units simulated{reused}")
