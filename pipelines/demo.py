@@ -24,10 +24,10 @@ from drakegrasp.visualization.contact_sheet import contact_sheet
 OBJECTS = (
     "7_wineglass_round",
     "8_wineglass_flute",
-    "9_box_flat",
-    "10_box_tall",
     "15_candlestick_short",
     "16_candlestick_tall",
+    "23_jar_small",
+    "24_jar_large",
     "31_spray_bottle_small",
     "32_spray_bottle_large",
 )
@@ -40,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("directory", type=Path, metavar="DIR", help="where to write")
     parser.add_argument(
-        "--candidates", type=int, default=100, help="palm poses per object  [default: 100]"
+        "--candidates", type=int, default=200, help="palm poses per object  [default: 200]"
     )
     parser.add_argument("--workers", type=int, help="processes  [default: one per core]")
     arguments = parser.parse_args(argv)

@@ -131,6 +131,7 @@ def print_stats(out: Path) -> None:
         table = funnel_table(funnel, compact=True)
     console.print(table)
     console.print(hold_table(funnel))
+    console.print()
     if unfinished is None:
         console.print(split_table(count_splits(out)))
     else:

@@ -150,7 +150,7 @@ def _last_view(
         X_WO = X_WT @ trial.X_TO_lifted
         snapshot = Snapshot(X_WG=X_WO @ trial.X_OG_lifted, X_WO=X_WO, q=trial.q_lifted)
         reached = _reached(trial.lifted, _force_scale(verified), kind="lifted", colour=LIFTED)
-        return [renderer.hand_view("end of the lift", snapshot, reached)]
+        return [renderer.hand_view("end of the lift, with forces", snapshot, reached)]
 
     # Before it: the closed hand, or the palm pose that comes closest.
     if trial is not None and trial.q_closed is not None:

@@ -13,6 +13,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 from doc_figures import Panel, Triad, find_sample
+from pydrake.geometry import LightParameter
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
@@ -26,6 +27,7 @@ from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.vision.camera import Picture, unproject
 from drakegrasp.visualization.style import ARROW
 from drakegrasp.visualization.third_person import (
+    LIGHTS,
     TABLE_SIZE,
     RenderScene,
     Snapshot,
@@ -38,12 +40,18 @@ from drakegrasp.visualization.third_person import (
 )
 
 #: Edge of the table where the world's origin below it must be seen [m].
-SMALL_TABLE = 0.36
+SMALL_TABLE = 0.28
 #: Azimuth between a camera's line of sight and the view that shows it from the side [rad].
 SIDE_VIEW = np.deg2rad(62.0)
 #: For the picture of the lift the camera rises by this share of the lift, and moves back by this
 #: share of its distance.
 FOLLOW, BACK = 0.85, 0.3
+#: Lights of the picture of the lift, the last without shadows: seen from that light the table is
+#: far behind the object, and VTK's shadow map is then too coarse and draws spots on the object.
+LIFT_LIGHTS = (
+    *LIGHTS[:2],
+    LightParameter(type="point", frame="camera", position=[-1.0, -1.3, 0.2], intensity=0.7),
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -148,8 +156,9 @@ def render_trial(out: Path, trial_id: int, *, size: tuple[int, int] = (480, 480)
     rise = trial.lift.X_WG[:3, 3] - trial.close.X_WG[:3, 3]
     distance = float(np.linalg.norm(X_WC[:3, 3] - trial.close.X_WO[:3, 3]))
     back = make_pose(np.eye(3), [0.0, 0.0, -BACK * distance])
-    set_snapshot(scene, trial.lift)
-    pictures.append(render_view(scene, make_pose(np.eye(3), FOLLOW * rise) @ X_WC @ back, size))
+    lifted = build_render_scene(trial.model, scene.hand, lights=LIFT_LIGHTS)
+    set_snapshot(lifted, trial.lift)
+    pictures.append(render_view(lifted, make_pose(np.eye(3), FOLLOW * rise) @ X_WC @ back, size))
     return pictures
 
 

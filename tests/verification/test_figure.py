@@ -119,7 +119,7 @@ def test_dots_are_on_the_object_and_its_hand_is_shown(
     line = texts_of(figure)[1].splitlines()[1]
     assert f"slip {1e3 * held.slip:.1f} mm, turn {np.rad2deg(held.turn):.1f}°" in line
     assert line.endswith(f"other links at the end: {held.lifted.other_links}")
-    assert [axes.get_title(loc="left") for axes in figure.axes][2] == "end of the lift"
+    assert [axes.get_title(loc="left") for axes in figure.axes][2] == "end of the lift, with forces"
     # Predicted where they were reached: dots lie on each other.
     for panel in (0, 1):
         lines = {line.get_gid(): line.get_xydata()[0] for line in figure.axes[panel].lines}
