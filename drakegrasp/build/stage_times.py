@@ -51,22 +51,22 @@ class StageTimes:
     source: str
 
 
-#: By the log and the files of thirty G3DB meshes with 300 palm poses each (27,000 attempts, preset
-#: `paper`, Drake 1.51.1) on two workers; preparing and assembling by
+#: By the log and the files of thirty G3DB meshes with 400 palm poses each (34,800 attempts, preset
+#: `paper`, Drake 1.51.1, 2026-11-22) on two workers; files by `measure_storage` of
 #: `pipelines/measurements/measure_stages.py`.
 MEASURED = StageTimes(
     prepare=3.2,
-    scene=0.3,
-    attempt=0.011,
-    look=0.029,
-    assemble=0.0005,
-    successes=0.0087,
-    samples=0.88,
-    unit_bytes=136e3,
-    attempt_bytes=260.0,
-    success_bytes=67e3,
-    sample_bytes=82e3,
-    object_bytes=124e3,
+    scene=0.4,
+    attempt=0.018,
+    look=0.039,
+    assemble=0.0006,
+    successes=0.0101,
+    samples=0.43,
+    unit_bytes=151e3,
+    attempt_bytes=278.0,
+    success_bytes=66e3,
+    sample_bytes=71e3,
+    object_bytes=215e3,
     source="measured on 30 G3DB meshes, preset paper; --times for those of your own",
 )
 

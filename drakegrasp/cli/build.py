@@ -101,7 +101,7 @@ def assemble(out: Path, reject: Path | None, overrides: tuple[str, ...]) -> None
 @click.command()
 @out_argument
 def stats(out: Path) -> None:
-    """Count outcomes by object and samples by split.
+    """Count outcomes, how well grasps hold, and samples.
 
     While a build runs, or after it was stopped, the command counts what is done so far.
     """
