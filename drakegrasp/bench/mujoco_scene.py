@@ -28,7 +28,8 @@ from pydrake.multibody.tree import RevoluteJoint, RigidBody
 
 from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, Array
-from drakegrasp.hand.description import Hand, make_parser
+from drakegrasp.hand.description import Hand
+from drakegrasp.hand.parsing import make_parser
 from drakegrasp.hand.shapes import hull_corners
 from drakegrasp.objects.model import ObjectModel
 

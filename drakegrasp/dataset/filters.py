@@ -49,6 +49,7 @@ class Successes:
         trial_id: (n,) int64, row of /trials.
         object: (n,) int32, row of /objects.
         grasp_T: (n, 6k), grasps in the table-top frame [m, -].
+        held_O: (n, 6k), contacts at the end of the lift in {O} [m, -].
         other_links: (n,), number of other links that touch the object after the lift.
         slip, turn: (n,), how far the object moved [m] and turned [rad] in the hand.
         seen: (n,) bool, whether both masks have object pixels.
@@ -63,6 +64,7 @@ class Successes:
     trial_id: npt.NDArray[np.int64]
     object: npt.NDArray[np.int32]
     grasp_T: Array
+    held_O: Array
     other_links: npt.NDArray[np.integer]
     slip: Array
     turn: Array
@@ -96,6 +98,7 @@ def judge_successes(
         (Removal.FLAT_DEPTH, successes.depth_variance < config.min_depth_variance),
         # The mean normal of opposed patches has length zero: normalised it is NaN.
         (Removal.OFF_SURFACE, ~np.isfinite(successes.grasp_T).all(axis=1)),
+        (Removal.OFF_SURFACE, ~np.isfinite(successes.held_O).all(axis=1)),
         *breaks_surface(config, successes.surface_distance, successes.normal_angle),
     ):
         removal[bad & (removal == Removal.KEPT)] = reason

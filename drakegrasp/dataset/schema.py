@@ -38,7 +38,8 @@ CONVENTIONS = {
     "grasps": "[p_1 .. p_k, n_1 .. n_k]: contact points, then unit normals out of the object, "
     "in finger order of the hand file",
     "contacts": "pressure-weighted centre and mean normal of the hydroelastic patches between the "
-    "pad of a fingertip and the object; a fingertip's link beside its pad counts as another link",
+    "pad of a fingertip and the object; a patch mostly beside the pad is split there, and its rest "
+    "counts as another link",
     "held": "of the end of the lift, seen on the object in its resting pose: what moved with the "
     "object is moved back with it",
     "oto": "one-to-one: the camera is rolled with the palm",

@@ -35,7 +35,7 @@ from drakegrasp.config import describe_mistake
 from drakegrasp.errors import HandError, first_line, one_line
 from drakegrasp.frames import Array, invert_pose, make_pose
 from drakegrasp.hand.files import hand_file
-from drakegrasp.hand.parsing import make_parser as make_parser  # other rooms take it from here
+from drakegrasp.hand.parsing import make_parser
 from drakegrasp.hand.shapes import pad_surfaces
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -83,6 +83,11 @@ class Finger:
         for i, (*normal, _) in enumerate(self.pad_region):
             if not any(normal):
                 raise ValueError(f"pad_region.{i} must have a normal that is not zero, got zero")
+        if self.holding_torque is not None and self.holding_torque < self.torque_limit:
+            raise ValueError(
+                f"holding_torque must be at least the torque_limit of {self.torque_limit:g} N m, "
+                f"got {self.holding_torque:g}"
+            )
         if not self.on_pad(self.p_FiP):
             raise ValueError(f"pad_point must lie in the pad_region, got {list(self.pad_point)}")
 
@@ -171,14 +176,11 @@ class _Description(BaseModel):
 
     @model_validator(mode="after")
     def _check_worms(self) -> _Description:
-        """Refuse a worm that holds less than its own motor gives, or of unknown strength."""
+        """Refuse worms of unknown strength."""
         for i, finger in enumerate(self.fingers):
-            holding = finger.holding_torque
-            if self.drive == "worm" and (holding is None or holding < finger.torque_limit):
+            if self.drive == "worm" and finger.holding_torque is None:
                 raise ValueError(
-                    f"fingers.{i}.holding_torque must be at least the torque_limit of "
-                    f"{finger.torque_limit:g} N m where drive is worm, got "
-                    f"{'none' if holding is None else f'{holding:g}'}"
+                    f"fingers.{i}.holding_torque must be given where drive is worm, got none"
                 )
         return self
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array, multiply, norm
 from drakegrasp.frames import transform_points
-from drakegrasp.hand.description import Drive, Finger, Hand
+from drakegrasp.hand.description import Drive, Hand
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses, joint_frames
 
 
@@ -22,24 +22,34 @@ def fingertip_forces(hand: Hand, drive: Drive) -> Array:
     `closing_levers`, in the middle of the closing joint's range. At the ends of the range the
     Barrett Hand's differs by -10 and +19 %.
 
+    Only motors press. What a worm carries beyond its own motor's torque comes from the motors of
+    the other fingers, which press on it through the object: so a finger carries at most what they
+    give together, and never more than its `holding_torque`.
+
     Args:
         hand: Of k fingers.
-        drive: What keeps the closing joints from being pushed open. A worm carries its
-            `holding_torque`, a motor its `torque_limit`. A locked joint is an idealisation of the
-            worm: it carries the `holding_torque` where the hand file gives one.
+        drive: What keeps the closing joints from being pushed open. A motor alone carries its
+            `torque_limit`. A locked joint carries what a worm does, without a `holding_torque` any
+            torque of the others.
     """
     # A joint without a limit counts as limited by 0, the open hand.
     limits = coordinate_limits(hand)[1:]
     middle = np.where(np.isfinite(limits), limits, 0.0).mean(axis=1)
-    torques = np.array([_carried_torque(finger, drive) for finger in hand.fingers])
-    return torques / closing_levers(hand, middle)
+    levers = closing_levers(hand, middle)
+    motors = np.array([finger.torque_limit for finger in hand.fingers]) / levers
+    if drive == "torque":
+        return motors
+
+    # The other motors' forces, up to what the finger can hold.
+    strongest = [np.inf if f.holding_torque is None else f.holding_torque for f in hand.fingers]
+    return np.minimum(np.maximum(motors, motors.sum() - motors), np.array(strongest) / levers)
 
 
 def closing_levers(hand: Hand, closing: npt.ArrayLike) -> Array:
     """Return how far each pad point moves per angle of its closing joint, (k,) [m/rad].
 
     By virtual work this is the lever of a force along that motion, coupled joints included: the
-    same torque that `simulation.drive.holding_torques` measures, over the force.
+    same torque that `simulation.drive.opening_torques` measures, over the force.
 
     Args:
         hand: Of k fingers.
@@ -58,10 +68,3 @@ def closing_levers(hand: Hand, closing: npt.ArrayLike) -> Array:
         velocity = chain.gain[:, 1 + i, None] * np.cross(axes, p_GP - X_GJ[:, :3, 3])
         levers.append(norm(velocity.sum(axis=0)))
     return np.array(levers)
-
-
-def _carried_torque(finger: Finger, drive: Drive) -> float:
-    """Return the torque that a finger carries at its closing joint [N m]."""
-    if drive == "torque" or finger.holding_torque is None:
-        return finger.torque_limit
-    return finger.holding_torque

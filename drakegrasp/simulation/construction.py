@@ -57,8 +57,9 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from drakegrasp.config import PhysicsConfig
 from drakegrasp.frames import X_WT, Array
-from drakegrasp.hand.description import Hand, make_parser
+from drakegrasp.hand.description import Hand
 from drakegrasp.hand.files import MODELS
+from drakegrasp.hand.parsing import make_parser
 from drakegrasp.hand.shapes import hull_corners
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import ObjectModel, object_colour

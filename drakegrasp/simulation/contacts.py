@@ -1,8 +1,9 @@
 """Drake's contact results as the contacts of a grasp, in the object's frame.
 
-The contact of a fingertip is the union of all hydroelastic patches between its pad and the object:
-the faces of the contact surface whose centroid is in the hand file's pad region. What the rest of
-that link touches counts as a contact of another link. Its point is the pressure-weighted centre of
+The contact of a fingertip is the union of all hydroelastic patches between its pad and the object.
+A patch whose pressure is mostly on the hand file's pad region is the fingertip's as a whole. One
+that is mostly beside it is split by the centroids of its faces, and its rest counts as a contact of
+another link. The contact's point is the pressure-weighted centre of
 the patches. Its normal is the pressure-weighted mean of the face normals and points out of the
 object. Both belong to the rigid object's surface, because a patch of a rigid and a compliant body
 is a piece of the rigid surface.
@@ -41,7 +42,7 @@ class Contacts:
         penetration: (k,), largest depth of the object's surface in the fingertip [m]; 0 where not
             touching.
         other_links: Number of links of the hand that touch the object beside the pads; a fingertip
-            link that touches it outside its pad is one.
+            link whose patch is mostly beside its pad is one.
         hand_on_table, object_on_table: Whether hand and object touch the table.
         table_force: (3,), force of the table on the object in {W} [N].
         point_contacts: Number of point contacts (not hydroelastic) that involve the object.

@@ -89,17 +89,17 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
     assert scene.handles is not None
     X_GO_start, start = _object_in_hand(scene), scene.time
 
-    # Free the object in the hand, then send the wrist to its target.
-    release(scene)
-    engage(scene, drive_of(scene.handles.hand, config.lift))
-    motion = _plan_motion(scene, config)
-    end = motion.begin + motion.duration + config.lift.hold_time
-
-    # Simulate from check to check until the target was held, or the verdict is certain. `scene`
-    # takes fine steps, `current` is the one that takes the steps that are needed now.
+    # `scene` takes fine steps, `current` is the one that takes the steps that are needed now.
     now, current, monitor, certain = start, scene, _Monitor(scene), False
-    slip_released, turn_released = 0.0, 0.0
+    slip_released, turn_released, used = 0.0, 0.0, [scene]
     try:
+        # Free the object in the hand; later the wrist goes to its target.
+        release(scene)
+        engage(scene, drive_of(scene.handles.hand, config.lift))
+        motion = _plan_motion(scene, config)
+        end = motion.begin + motion.duration + config.lift.hold_time
+
+        # Simulate from check to check until the target was held, or the verdict is certain.
         while now < end and not certain:
             check = min(_next_check(now, config), motion.begin if now < motion.begin else end)
             # Stop just before a step, so that rounding moves no step across a check.
@@ -116,6 +116,7 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
             if now < end and not certain:
                 chosen = _scene_for(scene, monitor.at_rest)
                 if chosen is not current:
+                    used.append(chosen)
                     transfer_state(chosen, current, now, motion)
                     hand_over(chosen, current)
                 current = chosen
@@ -123,7 +124,8 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
         # Read what the hand holds now, and how far the object slipped in it.
         contacts, X_GO = read_contacts(current), _object_in_hand(current)
     finally:
-        disengage(current)
+        for stage in used:
+            disengage(stage)
     slip, turn = _motion(X_GO_start, X_GO)
     return Lift(
         contacts=contacts,

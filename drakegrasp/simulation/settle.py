@@ -66,6 +66,8 @@ class Resting:
         if self.tilt > NOTED_TILT:
             degrees = np.degrees(self.tilt)
             notes.append(f"it tipped over by {degrees:.0f} degrees when it was dropped")
+        if self.sink > MAX_SINK:
+            notes.append(f"its lowest point is {1e3 * self.sink:.2g} mm deep in the table")
         if self.stopped:
             notes.append("it still rolled on the table and was stopped")
         return tuple(notes)

@@ -37,8 +37,8 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.config import CameraConfig
 from drakegrasp.errors import BlankImageError
 from drakegrasp.frames import X_WT
-from drakegrasp.hand.description import make_parser
 from drakegrasp.hand.files import MODELS
+from drakegrasp.hand.parsing import make_parser
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import ObjectModel, object_colour
 from drakegrasp.vision.camera import intrinsics

@@ -26,6 +26,7 @@ def good(count: int) -> Successes:
         trial_id=np.arange(count, dtype=np.int64) * 3,
         object=np.zeros(count, dtype=np.int32),
         grasp_T=rng.normal(size=(count, 18)),
+        held_O=rng.normal(size=(count, 18)),
         other_links=np.zeros(count, dtype=np.uint8),
         slip=np.full(count, 0.010),
         turn=np.full(count, np.deg2rad(9.9)),
@@ -118,6 +119,15 @@ def test_rejected_trials_are_found_by_id() -> None:
     assert judge_successes(good(4), FilterConfig(), rejected=[6]).tolist() == [
         *(0, 0, Removal.REJECTED, 0)
     ]
+
+
+@pytest.mark.parametrize("name", ["grasp_T", "held_O"])
+def test_normal_of_opposed_patches_is_off_the_surface(name: str) -> None:
+    """Its length is zero, so that it has no direction: neither grasp of a sample may have one."""
+    grasps = good(3).grasp_T.copy()
+    grasps[1, 12] = np.nan
+    removal = judge_successes(replace(good(3), **{name: grasps}), FilterConfig())
+    assert removal.tolist() == [Removal.KEPT, Removal.OFF_SURFACE, Removal.KEPT]
 
 
 def test_outlier_is_judged_by_its_own_objects_population() -> None:

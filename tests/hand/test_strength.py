@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.hands import PINCER_SDF, changed_finger, write_pincer
@@ -39,28 +41,35 @@ def test_lever_of_coupled_joints_is_the_speed_of_the_pad_point(spread):
         )
 
 
-def test_barrett_hand_is_as_strong_as_its_worms_or_its_motors():
-    """5 N m of all worms; 2, 2 and 4 N m of the motors; at 70 degrees the lever is 116 mm."""
+def test_fingers_press_with_their_motors_and_hold_what_the_others_press():
+    """Motors of 2, 2 and 4 N m; finger 3 is pressed by two of 2 N m; the lever is 116 mm."""
     hand = load_hand()
     levers = closing_levers(hand, np.full(3, np.deg2rad(70.0)))
     assert np.allclose(levers, 0.116, atol=1e-3)
-    assert np.allclose(fingertip_forces(hand, "worm") * levers, 10.0)
     assert np.allclose(fingertip_forces(hand, "torque") * levers, [2.0, 2.0, 4.0])
+    assert np.allclose(fingertip_forces(hand, "worm") * levers, [6.0, 6.0, 4.0])
     assert np.array_equal(fingertip_forces(hand, "locked"), fingertip_forces(hand, "worm"))
+
+
+def test_no_finger_holds_more_than_its_worm():
+    hand = load_hand()
+    weak = replace(hand, fingers=tuple(replace(f, holding_torque=4.5) for f in hand.fingers))
+    levers = closing_levers(hand, np.full(3, np.deg2rad(70.0)))
+    assert np.allclose(fingertip_forces(weak, "worm") * levers, [4.5, 4.5, 4.0])
 
 
 def test_strength_at_the_ends_of_the_range_is_what_the_docs_say():
     hand = load_hand()
     ends = [closing_levers(hand, limit) for limit in coordinate_limits(hand)[1:].T]
-    middle = 10.0 / fingertip_forces(hand, "worm")
+    middle = np.array([2.0, 2.0, 4.0]) / fingertip_forces(hand, "torque")
     assert np.allclose(middle / ends[0] - 1.0, -0.10, atol=0.005)
     assert np.allclose(middle / ends[1] - 1.0, 0.19, atol=0.005)
 
 
-def test_locked_finger_without_a_holding_torque_carries_its_motors_torque(tmp_path):
-    hand = load_hand(write_pincer(tmp_path, fingers=changed_finger(holding_torque=3.0)))
-    assert np.allclose(fingertip_forces(hand, "locked"), [3.0 / ARM, 1.0 / ARM])
-    assert np.allclose(fingertip_forces(hand, "torque"), [1.0 / ARM, 1.0 / ARM])
+def test_locked_finger_without_a_holding_torque_holds_what_the_others_press(tmp_path):
+    hand = load_hand(write_pincer(tmp_path, fingers=changed_finger(torque_limit=3.0)))
+    assert np.allclose(fingertip_forces(hand, "locked"), [3.0 / ARM, 3.0 / ARM])
+    assert np.allclose(fingertip_forces(hand, "torque"), [3.0 / ARM, 1.0 / ARM])
 
 
 def test_joint_without_limits_has_the_lever_of_the_open_hand(tmp_path):
