@@ -262,7 +262,10 @@ def _successes(shard_slice: ShardSlice, shard: Shard, K: Array) -> Successes:
         object=np.full(len(rows), shard_slice.object, dtype=np.int32),
         grasp_T=np.array(grasps).reshape(-1, length),
         held_O=np.concatenate(
-            [trials[f"lifted_{name}"].reshape(len(rows), -1) for name in ("p_OQ", "nhat_Q_O")],
+            [
+                trials[f"lifted_{name}"].reshape(len(rows), length // 2)
+                for name in ("p_OQ", "nhat_Q_O")
+            ],
             axis=1,
         ),
         other_links=trials["lifted_other_links"],
