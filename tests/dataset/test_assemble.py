@@ -52,6 +52,14 @@ def test_assembling_again_gives_the_same_bytes(out: Path) -> None:
     assert [(out / name).read_bytes() for name in FILES] == before
 
 
+def test_shard_without_a_success_has_trials_only(tmp_path: Path) -> None:
+    """The third of the four candidates fails at each stand-off: its shard has no success."""
+    (tmp_path / "meshes").mkdir()
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes", "unit_candidates=1")
+    assert len(list(out.glob("shards/*/*.h5"))) == 12
+    assert assemble(out).removed == {Removal.KEPT: 9}
+
+
 def test_holder_of_the_lock_assembles_in_it(out: Path) -> None:
     with build_lock(out):
         assert assemble_locked(out) == summarise(out)
