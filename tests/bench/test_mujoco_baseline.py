@@ -143,8 +143,8 @@ def weak(monkeypatch: pytest.MonkeyPatch, **changes: object) -> None:
 def test_worm_yields_beyond_its_strength(
     pinched: ObjectModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The opposing finger loads the two with 4 N m in all."""
-    weak(monkeypatch, holding_torque=1.9)
+    """Two fingers load the opposing one with 4 N m in all."""
+    weak(monkeypatch, torque_limit=2.0, holding_torque=2.0)
     trial = peer(pinched, "lift.drive=worm").run(from_above(pinched, STANDOFF))
     assert trial.slip > 5e-3
 

@@ -70,29 +70,29 @@ def test_worm_keeps_what_the_finger_has_closed(model: mujoco.MjModel) -> None:
     rig = Rig(model, "worm")
     closed = rig.push(0.0)
     assert closed > ANGLE + 0.1
-    assert rig.push(4.0) > closed - STILL
+    assert rig.push(8.0) > closed - STILL
 
 
 def test_locked_finger_neither_opens_nor_closes(model: mujoco.MjModel) -> None:
     rig = Rig(model, "locked")
     assert rig.push(0.0) == pytest.approx(ANGLE, abs=STILL)
-    assert rig.push(9.0) == pytest.approx(ANGLE, abs=np.deg2rad(0.02))
+    assert rig.push(8.0) == pytest.approx(ANGLE, abs=np.deg2rad(0.02))
 
 
 def test_worm_yields_to_its_strength_and_holds_again(model: mujoco.MjModel) -> None:
-    """It opens against its holding torque of 5 N m, so 5.2 N m push it open slowly."""
+    """It opens against its holding torque of 10 N m, so 10.2 N m push it open slowly."""
     rig = Rig(model, "worm")
-    opened = rig.push(5.2, seconds=0.05)
+    opened = rig.push(10.2, seconds=0.05)
     assert ANGLE - 0.3 < opened < ANGLE - 0.02
-    stands = rig.push(4.0)
+    stands = rig.push(8.0)
     assert stands < ANGLE
-    assert rig.push(4.9) == pytest.approx(stands, abs=STILL)
+    assert rig.push(9.0) == pytest.approx(stands, abs=STILL)
 
 
 def test_disengaged_finger_has_the_limits_of_its_files(model: mujoco.MjModel) -> None:
     limits, torques = model.jnt_range.copy(), model.actuator_forcerange.copy()
     rig = Rig(model, "worm")
-    rig.push(5.2)
+    rig.push(10.2)
     rig.drive.disengage()
     np.testing.assert_array_equal(model.jnt_range, limits)
     np.testing.assert_array_equal(model.actuator_forcerange, torques)

@@ -119,8 +119,11 @@ def test_contacts_that_the_hand_made_are_found_again() -> None:
 @pytest.mark.parametrize("seed", SEEDS[:6])
 def test_points_that_the_back_of_a_fingertip_touched_are_brought_onto_the_pad(seed: int) -> None:
     """Near the tip but behind the pad: without the region the fit stays there, with it it moves."""
-    hand = hand_of("barrett")
-    bare = replace(hand, fingers=tuple(replace(f, pad_region=()) for f in hand.fingers))
+    barrett = hand_of("barrett")
+    bare, hand = (
+        replace(barrett, fingers=tuple(replace(f, pad_region=r) for f in barrett.fingers))
+        for r in ((), ((0.0, 1.0, 0.0, 0.0),))
+    )
     X_GF = fingertip_poses(hand, spread=0.3, closing=np.deg2rad([60.0, 50.0, 70.0]))
     p_FQ = np.random.default_rng(seed).uniform([0.055, -0.008, -0.003], [0.058, -0.006, 0.003])
     p_FQ = nearest_on_pads(hand_constants(bare).pads, np.tile(p_FQ, (3, 1)))
