@@ -3,10 +3,9 @@
 The contact of a fingertip is the union of all hydroelastic patches between its pad and the object.
 A patch whose pressure is mostly on the hand file's pad region is the fingertip's as a whole. One
 that is mostly beside it is split by the centroids of its faces, and its rest counts as a contact of
-another link. The contact's point is the pressure-weighted centre of
-the patches. Its normal is the pressure-weighted mean of the face normals and points out of the
-object. Both belong to the rigid object's surface, because a patch of a rigid and a compliant body
-is a piece of the rigid surface.
+another link. The contact's point is the pressure-weighted centre of the patches. Its normal is the
+pressure-weighted mean of the face normals and points out of the object. Both belong to the rigid
+object's surface, because a patch of a rigid and a compliant body is a piece of the rigid surface.
 """
 
 from __future__ import annotations

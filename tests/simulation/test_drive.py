@@ -18,6 +18,7 @@ from drakegrasp.frames import X_WT
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
+from drakegrasp.simulation import drive as drive_module
 from drakegrasp.simulation import lift as lifting
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.drive import (
@@ -195,6 +196,15 @@ def test_lift_leaves_the_hand_as_it_was(
         lifting.lift(scene, start_limits(config), config)
     assert limits() == before
     assert scene.simulator.get_monitor() is None
+
+    def fail(_: Scene) -> None:
+        raise RuntimeError("no solution")
+
+    monkeypatch.setattr(drive_module, "opening_torques", fail)
+    _closed_on(scene, cube)
+    with pytest.raises(RuntimeError, match="no solution"):
+        lifting.lift(scene, start_limits(config), config)
+    assert limits() == before
 
 
 #: Pulls the cube towards fingers 1 and 2 [N]; their motors hold what finger 3 pushes with.
