@@ -15,7 +15,15 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 from pydantic_core import PydanticCustomError
 
 from drakegrasp.errors import ConfigError, one_line
@@ -25,6 +33,7 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
 NonNegativeCount = Annotated[int, Field(ge=0)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Angles = Annotated[tuple[Annotated[float, Field(allow_inf_nan=False)], ...], Field(min_length=1)]
 
 
@@ -186,6 +195,42 @@ class CameraConfig(_Section):
         return self
 
 
+#: The light from above stays above the horizon [deg]: it usually comes 26.6 degrees from the
+#: vertical.
+MAX_LIGHT_ANGLE = 60.0
+
+
+def _rising(limits: tuple[float, float]) -> tuple[float, float]:
+    if limits[0] > limits[1]:
+        raise ValueError(f"must be a range, low before high, got {list(limits)}")
+    return limits
+
+
+#: Least and largest value of a uniform draw.
+Range = Annotated[tuple[Positive, Positive], AfterValidator(_rising)]
+
+
+class RandomizeConfig(_Section):
+    """What is drawn anew for each attempt; see docs/explanation/randomization.md.
+
+    Null or 0 switches a draw off. The defaults are all off; what the preset `randomized` draws has
+    its sources there.
+    """
+
+    object_colour: Share = 0.0  # of a random colour in the object's; 1: any colour
+    table_colour: Share = 0.0  # of a random colour in the table's
+    # At most, of the light from above from where it usually comes.
+    light_angle_deg: Annotated[float, Field(ge=0.0, le=MAX_LIGHT_ANGLE)] = 0.0
+    light_strength: Range | None = None  # factor of the light from above
+    camera_shift: NonNegative = 0.0  # [m] at most, along each axis of the camera
+    camera_turn_deg: Annotated[float, Field(ge=0.0, le=90.0)] = 0.0  # at most, about each axis
+    depth_noise: Range | None = None  # [1/m], standard deviation of depth over depth squared
+    depth_baseline: NonNegative = 0.0  # [m], of the depth camera: where its projector is hidden
+    friction_hand: Range | None = None  # factor of the coefficient
+    friction_table: Range | None = None  # factor of the coefficient
+    mass: Range | None = None  # factor of the object's mass and inertia
+
+
 class FilterConfig(_Section):
     """Which successes become samples, decided when the files are assembled.
 
@@ -246,6 +291,7 @@ class Config(_Section):
     lift: LiftConfig = LiftConfig()
     certify: CertifyConfig = CertifyConfig()
     camera: CameraConfig = CameraConfig()
+    randomize: RandomizeConfig = RandomizeConfig()
     max_grasps: Count | None = None  # successes per object after which no more are tried
     filters: FilterConfig = FilterConfig()
     split: SplitConfig = SplitConfig()
@@ -266,6 +312,8 @@ class Config(_Section):
             del values[key]
         if not self.certify.repeats:
             del values["certify"]  # without repeats the noise is not used
+        if self.randomize == RandomizeConfig():
+            del values["randomize"]  # nothing is drawn
         canonical = json.dumps(values, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 

@@ -25,7 +25,7 @@ from drakegrasp.bench.fidelity import (
     sum_fidelity,
     variants,
 )
-from drakegrasp.build.attempts import TrialSetup, predict_attempts, try_attempt
+from drakegrasp.build.attempts import TrialSetup, list_attempts, predict_attempts, try_attempt
 from drakegrasp.build.prepare import prepare
 from drakegrasp.build.work_unit import render_successes
 from drakegrasp.config import Config
@@ -40,7 +40,7 @@ from drakegrasp.runtime.blas import one_thread
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.runtime.timing import timed
 from drakegrasp.seeding import Stream
-from drakegrasp.simulation.candidates import Attempt, make_attempts
+from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.trial import TrialRecord
 
@@ -143,7 +143,7 @@ def _measure_object(
     seconds: dict[str, float] = {}
     with _cpu_timed(seconds, "prepare"):
         prepared = prepare(source, config)
-    attempts = _attempts(prepared, config)
+    attempts = list_attempts(prepared, range(len(prepared.candidates)), config)
     hits = [row for row, attempt in enumerate(attempts) if attempt.ray_hits]
     counter.begin(len(attempts), len(hits))
 
@@ -163,7 +163,7 @@ def _measure_object(
             records.append(try_attempt(bench, attempt, prediction))
         counter.add(records[-1].outcome)
     with _cpu_timed(seconds, "look"):
-        render_successes(bench, records)
+        render_successes(bench, attempts, records)
 
     report = {
         "name": source.name,
@@ -184,12 +184,6 @@ def _measure_object(
         simulated = [Simulated(attempts[k], records[k], predictions[k]) for k in rows]
         report.update(compare_labels(bench, simulated, counter.add))
     return report
-
-
-def _attempts(prepared: PreparedObject, config: Config) -> list[Attempt]:
-    every = range(len(prepared.candidates))
-    name, rules = prepared.model.name, config.candidates
-    return list(make_attempts(prepared.candidates, every, rules, name=name, seed=config.seed))
 
 
 def _rates(outcomes: Counter[str], seconds: Mapping[str, float]) -> dict[str, Any]:

@@ -25,13 +25,16 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.contact_fit import ContactFit, fit_contacts
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import release_memory
-from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.candidates import Attempt, make_attempts
+from drakegrasp.simulation.randomization.conditions import usual_conditions
+from drakegrasp.simulation.randomization.draws import draw_conditions
 from drakegrasp.simulation.scene import Scene
 from drakegrasp.simulation.scene_cache import cached_renderer, cached_scene, forget_scenes
 from drakegrasp.simulation.screen import Prediction, predict
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, image_frame, intrinsics
-from drakegrasp.vision.rendering import Renderer, render
+from drakegrasp.vision.depth_sensor import spoil_depth
+from drakegrasp.vision.rendering import Renderer, paint, render
 
 #: Prepared objects that a process keeps: the next unit is mostly of the same object.
 KEPT_OBJECTS = 2
@@ -101,6 +104,19 @@ def _load(out: Path, name: str, mesh_sha256: str, config: Config) -> PreparedObj
     return prepared
 
 
+def list_attempts(prepared: PreparedObject, indices: range, config: Config) -> list[Attempt]:
+    """Return the attempts of a range of an object's candidates, with their conditions."""
+    model, rules, seed = prepared.model, config.candidates, config.seed
+    made = make_attempts(prepared.candidates, indices, rules, name=model.name, seed=seed)
+    return [
+        replace(
+            attempt,
+            conditions=draw_conditions(model, config, attempt.candidate, attempt.standoff_index),
+        )
+        for attempt in made
+    ]
+
+
 def predict_attempts(setup: TrialSetup, attempts: Sequence[Attempt]) -> list[Prediction | None]:
     """Return what geometry says of each attempt; one call for all of them is much faster."""
     config, prepared = setup.config, setup.prepared
@@ -130,21 +146,29 @@ def measure_contacts(setup: TrialSetup, record: TrialRecord) -> ContactFit | Non
     return fit_contacts(setup.prepared.model, record.closed.p_OQ, record.closed.nhat_Q_O)
 
 
-def render_views(setup: TrialSetup, record: TrialRecord) -> dict[str, View]:
+def render_views(setup: TrialSetup, attempt: Attempt, record: TrialRecord) -> dict[str, View]:
     """Return what both cameras see of a success, by the names of `CAMERAS`.
 
     Raises:
         BlankImageError: If an image is blank, because OpenGL failed.
     """
-    camera = setup.config.camera
-    X_TG = multiply(record.X_TO, record.X_OG)
-    oto = _render_view(setup, record, camera_pose_oto(X_TG, camera))
-    otm = _render_view(setup, record, camera_pose_otm(X_TG, camera))
-    if otm.mask.any():
-        otm = replace(otm, X_CI=image_frame(intrinsics(camera), otm.mask, otm.image[3]))
-    return {"oto": oto, "otm": otm}
+    # The cameras, and how the scene looks.
+    camera, model = setup.config.camera, setup.prepared.model
+    conditions = attempt.conditions or usual_conditions(model, setup.config.physics)
+    X_TG, X_C0C = multiply(record.X_TO, record.X_OG), conditions.X_C0C
+    poses = {
+        "oto": camera_pose_oto(X_TG, camera, X_C0C),
+        "otm": camera_pose_otm(X_TG, camera, X_C0C),
+    }
+    paint(setup.renderer, conditions.appearance)
 
-
-def _render_view(setup: TrialSetup, record: TrialRecord, X_TC: Array) -> View:
-    seen = render(setup.renderer, record.X_TO, X_TC)
-    return View(image=seen.image, mask=seen.mask, X_TC=X_TC)
+    # The object's frame comes from the clean image; the sensor's errors come last.
+    K, views = intrinsics(camera), dict[str, View]()
+    for number, (name, X_TC) in enumerate(poses.items()):
+        seen = render(setup.renderer, record.X_TO, X_TC)
+        estimated = name == "otm" and seen.mask.any()
+        X_CI = image_frame(K, seen.mask, seen.image[3]) if estimated else None
+        image = seen.image
+        image[3] = spoil_depth(image[3], K, conditions.sensor, number, camera)
+        views[name] = View(image=image, mask=seen.mask, X_TC=X_TC, X_CI=X_CI)
+    return views

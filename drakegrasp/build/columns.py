@@ -17,6 +17,7 @@ from drakegrasp.frames import pack_pose
 from drakegrasp.objects.contact_fit import ContactFit
 from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.contacts import Contacts
+from drakegrasp.simulation.randomization.conditions import usual_conditions
 from drakegrasp.simulation.scene import hand_joint_names
 from drakegrasp.simulation.trial import TrialRecord
 from drakegrasp.simulation.verdict import is_precision, is_stable
@@ -40,8 +41,11 @@ def trial_rows(
     """
     shape = array_sizes(setup)
     columns = {f.name: f.empty(len(records), shape) for f in trial_columns()}
+    usual = usual_conditions(setup.prepared.model, setup.config.physics)
     for row, (attempt, record, fit) in enumerate(zip(attempts, records, fits, strict=True)):
-        for name, value in _trial_values(attempt, record, fit).items():
+        conditions = attempt.conditions or usual
+        values = _trial_values(attempt, record, fit) | conditions.values()
+        for name, value in values.items():
             columns[name][row] = value
     return columns
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from drakegrasp.build.attempts import (
     TrialSetup,
+    list_attempts,
     measure_contacts,
     predict_attempts,
     render_views,
@@ -45,7 +46,7 @@ from drakegrasp.runtime.journal import (
     open_journal,
 )
 from drakegrasp.runtime.timing import timed
-from drakegrasp.simulation.candidates import Attempt, make_attempts
+from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.robustness import UNKNOWN, Certificate, certify
 from drakegrasp.simulation.screen import Prediction
 from drakegrasp.simulation.trial import TrialRecord
@@ -155,7 +156,7 @@ def _run_experiment(unit: WorkUnit, journal: Journal) -> UnitSummary:
 
     # Render both cameras' images of each success.
     with timed(seconds, "look"):
-        looks = render_successes(setup, records, journal)
+        looks = render_successes(setup, attempts, records, journal)
 
     # Certify: simulate each success again with noise and with less friction, if asked for.
     if config.certify.repeats:
@@ -189,15 +190,7 @@ def unit_attempts(
     prepared: PreparedObject, header: ShardHeader, config: Config
 ) -> Sequence[Attempt]:
     """Return the attempts of a unit in the order of its rows."""
-    return list(
-        make_attempts(
-            prepared.candidates,
-            range(header.start, header.stop),
-            config.candidates,
-            name=prepared.model.name,
-            seed=config.seed,
-        )
-    )
+    return list_attempts(prepared, range(header.start, header.stop), config)
 
 
 def count_outcomes(outcomes: AnyArray) -> dict[Outcome, int]:
@@ -207,7 +200,10 @@ def count_outcomes(outcomes: AnyArray) -> dict[Outcome, int]:
 
 
 def render_successes(
-    setup: TrialSetup, records: Sequence[TrialRecord], journal: Journal = NO_JOURNAL
+    setup: TrialSetup,
+    attempts: Sequence[Attempt],
+    records: Sequence[TrialRecord],
+    journal: Journal = NO_JOURNAL,
 ) -> dict[str, AnyArray]:
     """Return the columns of `/looks`: both images of every success.
 
@@ -222,7 +218,7 @@ def render_successes(
         _refuse_failing(journal, step, setup.prepared.model.name)
         looks["row"][k] = row
         with journal.step(step, STAGE_SECONDS):
-            fill_look(looks, k, render_views(setup, records[row]))
+            fill_look(looks, k, render_views(setup, attempts[row], records[row]))
     return looks
 
 

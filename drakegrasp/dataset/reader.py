@@ -36,6 +36,7 @@ class Sample:
         trial_id: Row of /trials in trials.hdf5.
         grasp_props: Fields of `grasp_props` by name: how well it holds, forces, palm, joints.
         props: Fields of `object_props` by name: names, mass properties, frames.
+        conditions: Fields of `conditions` by name: friction, colours, light, camera, noise.
     """
 
     image: npt.NDArray[np.float32]
@@ -45,6 +46,7 @@ class Sample:
     trial_id: int
     grasp_props: dict[str, Any]
     props: dict[str, Any]
+    conditions: dict[str, Any]
 
 
 class GraspDataset:
@@ -104,6 +106,7 @@ class GraspDataset:
             trial_id=int(values["trial_id"]),
             grasp_props=_group(values, "grasp_props/"),
             props=_group(values, "object_props/"),
+            conditions=_group(values, "conditions/"),
         )
 
     def __iter__(self) -> Iterator[Sample]:

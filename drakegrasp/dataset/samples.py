@@ -19,7 +19,7 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.hdf5 import create_field
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import model_path
-from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS, SPLITS, sizes
+from drakegrasp.dataset.schema import CAMERAS, CONDITION_FIELDS, DATA_FIELDS, SPLITS, sizes
 from drakegrasp.dataset.shards import Shard, ShardHeader, read_shard, trial_columns
 from drakegrasp.frames import (
     X_WT,
@@ -173,13 +173,15 @@ def _sample(model: ObjectModel, shard: Shard, row: int, k: int, camera: str) -> 
     X_CO = multiply(invert_pose(X_TC[camera]), X_TO)
 
     # What does not depend on the camera of the file.
-    R_TO = X_TO[:3, :3]
+    R_TO, mass = X_TO[:3, :3], trials["mass"][row]
     properties = {
         "object_name": model.name,
         "class_name": model.class_name,
         "work2com": transform_points(X_TO, model.p_OOcm[None])[0],
-        "work2inertia": multiply(multiply(R_TO, model.I_OOcm_O), R_TO.T).ravel(),
-        "work2mass": [model.mass],
+        "work2inertia": mass
+        / model.mass
+        * multiply(multiply(R_TO, model.I_OOcm_O), R_TO.T).ravel(),
+        "work2mass": [mass],
         "frame_cam2img_otm": looks["X_CI_otm"][k],
         "frame_cam2work_otm": pack_pose(invert_pose(X_TC["otm"])),
         "frame_cam2work_oto": pack_pose(invert_pose(X_TC["oto"])),
@@ -198,6 +200,7 @@ def _sample(model: ObjectModel, shard: Shard, row: int, k: int, camera: str) -> 
         "grasps_held": _grasp(X_CO, trial, "lifted"),
         **{f"grasp_props/{name}": value for name, value in _grasp_props(X_CO, trial).items()},
         **{f"object_props/{name}": value for name, value in properties.items()},
+        **{f"conditions/{f.name}": trial[f.name] for f in CONDITION_FIELDS},
     }
 
 

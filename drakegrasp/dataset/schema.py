@@ -17,7 +17,7 @@ from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome, Stage
 
 #: Goes up with every change of the table that an older reader cannot read.
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 #: What to do with a file of another version: its labels mean something else.
 OTHER_SCHEMA = "build the dataset again with this version of drakegrasp, in another directory"
 
@@ -33,7 +33,8 @@ CONVENTIONS = {
     "of the mesh's bounding box, axes of the mesh file; Ocm its centre of mass; G palm, +Gz out "
     "of the palm; Q contact point; C camera; I image",
     "camera_axes": "OpenCV and Drake: +X right, +Y down, +Z forward; pixel centres at integers",
-    "depth": "z of the camera frame in metres; pixels with nothing before `far` hold `far`",
+    "depth": "z of the camera frame in metres; pixels with nothing before `far`, and those that a "
+    "depth camera would lose, hold `far`",
     "images": "channels R, G, B in 0..1, then depth in metres; row 0 is the top",
     "grasps": "[p_1 .. p_k, n_1 .. n_k]: contact points, then unit normals out of the object, "
     "in finger order of the hand file",
@@ -192,6 +193,26 @@ _WORDS = (
           "whether it is a precision grasp with slip below 5 mm and turn below 5 deg"),
 )
 
+#: The conditions of an attempt, drawn or not: what `simulation.randomization` may change.
+CONDITION_FIELDS: tuple[Field, ...] = (
+    Field("friction_hand", "", "float64", "-", "-",
+          "effective coefficient of friction between hand and object"),
+    Field("friction_table", "", "float64", "-", "-",
+          "effective coefficient of friction between table and object"),
+    Field("mass", "", "float64", "kg", "-", "mass of the object; its inertia is in proportion"),
+    Field("object_colour", "3", "float64", "-", "-", "R, G, B of the object in 0..1"),
+    Field("table_colour", "3", "float64", "-", "-", "R, G, B of the table in 0..1"),
+    Field("light_direction", "3", "float64", "-", "W",
+          "unit vector along which the light from above shines"),
+    Field("light_strength", "", "float64", "-", "-", "intensity of the light from above"),
+    Field("X_C0C", "12", "float64", "m, -", "C0",
+          "pose of the oto camera in its usual pose behind the palm"),
+    Field("depth_noise", "", "float64", "1/m", "-",
+          "standard deviation of the depths over their square; 0 for images without noise"),
+    Field("depth_seed", "", "uint64", "-", "-",
+          "seed of the noise of the depth images; 0 for images without noise"),
+)
+
 #: A row per grasp, in `/train`, `/valid` and `/test` of both data files.
 DATA_FIELDS: tuple[Field, ...] = (
     Field("images", "4 S S", "float32", "-, -, -, m", "C",
@@ -225,13 +246,18 @@ DATA_FIELDS: tuple[Field, ...] = (
           "areas of the contact patches after closing"),
     Field("grasp_props/area_held", "k", "float32", "m^2", "-",
           "areas of the contact patches after the lift"),
+    # The mass is in object_props.
+    *(replace(field, name=f"conditions/{field.name}", dtype=field.dtype.replace("64", "32")
+              if field.dtype == "float64" else field.dtype)
+      for field in CONDITION_FIELDS if field.name != "mass"),
     Field("object_props/object_name", "", "str", "-", "-", "name of the object"),
     Field("object_props/class_name", "", "str", "-", "-", "name of the object's class"),
     Field("object_props/work2com", "3", "float32", "m", "T",
           "p_TOcm, centre of mass of the resting object"),
     Field("object_props/work2inertia", "9", "float32", "kg m^2", "T",
           "rotational inertia of the resting object about Ocm, 3x3 row-major"),
-    Field("object_props/work2mass", "1", "float32", "kg", "-", "mass of the object"),
+    Field("object_props/work2mass", "1", "float32", "kg", "-",
+          "mass of the object, as in the trial"),
     Field("object_props/frame_cam2img_otm", "12", "float32", "m, -", "C (otm)",
           "X_CI, image frame estimated from the otm mask"),
     Field("object_props/frame_cam2work_otm", "12", "float32", "m, -", "C (otm)",
@@ -266,6 +292,7 @@ TRIAL_FIELDS: tuple[Field, ...] = (
     _X_TO,
     Field("X_OG", "12", "float64", "m, -", "O",
           "pose of the palm at the start; the candidate's where the palm ray misses"),
+    *CONDITION_FIELDS,
     *_since(Stage.CLOSED, _TIME_CLOSE, *_CLOSED),
     *_since(
         Stage.LIFTED,

@@ -25,6 +25,7 @@ from drakegrasp.mesh.rays import first_hits
 from drakegrasp.mesh.surfaces import on_faces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key
+from drakegrasp.simulation.randomization.conditions import Conditions
 
 #: The first palm's axes in {O}: +Gz looks down onto the object, Gx = Ox.
 R_OG0 = np.diag([1.0, -1.0, -1.0])
@@ -71,12 +72,14 @@ class Pregrasp:
         spread: Angle of the spread joints [rad].
         closing: Angles of the closing joints (k,) [rad] at the start; None is the open hand.
         ray_hits: Whether the palm ray meets the object; true if no ray places the palm.
+        conditions: Friction, mass, looks and cameras; None are the usual ones.
     """
 
     X_OG: Array
     spread: float
     closing: Array | None = None
     ray_hits: bool = True
+    conditions: Conditions | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -175,15 +175,8 @@ def _plant_config(physics: PhysicsConfig) -> MultibodyPlantConfig:
 
 
 def _add_object(plant: MultibodyPlant, model: ObjectModel, physics: PhysicsConfig) -> RigidBody:
-    # Mass properties about Ocm in {O}; Drake shifts them to the origin of {O}.
-    I = model.I_OOcm_O  # noqa: E741
-    inertia = SpatialInertia.MakeFromCentralInertia(
-        model.mass,
-        model.p_OOcm,
-        RotationalInertia(I[0, 0], I[1, 1], I[2, 2], I[0, 1], I[0, 2], I[1, 2]),
-    )
     instance = plant.AddModelInstance("object")
-    body = plant.AddRigidBody("object", instance, inertia)
+    body = plant.AddRigidBody("object", instance, object_inertia(model, model.mass))
 
     # The collision mesh as a rigid hydroelastic surface.
     text = obj_text(model.collision_vertices, model.collision_faces, normals=False)
@@ -198,6 +191,17 @@ def _add_object(plant: MultibodyPlant, model: ObjectModel, physics: PhysicsConfi
         properties,
     )
     return body
+
+
+def object_inertia(model: ObjectModel, mass: float) -> SpatialInertia:
+    """Return the spatial inertia of an object in {O} that has a mass [kg] of any amount."""
+    # Mass properties about Ocm in {O}; Drake shifts them to the origin of {O}.
+    I = mass / model.mass * model.I_OOcm_O  # noqa: E741
+    return SpatialInertia.MakeFromCentralInertia(
+        mass,
+        model.p_OOcm,
+        RotationalInertia(I[0, 0], I[1, 1], I[2, 2], I[0, 1], I[0, 2], I[1, 2]),
+    )
 
 
 def _add_visual(plant: MultibodyPlant, body: RigidBody, model: ObjectModel) -> None:

@@ -23,6 +23,7 @@ from drakegrasp.frames import X_WT, Array, invert_pose, rotation_angle, transfor
 from drakegrasp.hand.finger_sweep import pad_points
 from drakegrasp.simulation.contacts import Contacts, bodies_on_object, hand_bodies, read_contacts
 from drakegrasp.simulation.drive import disengage, drive_of, engage, hand_over
+from drakegrasp.simulation.randomization.materials import copy_materials
 from drakegrasp.simulation.scene import (
     Scene,
     WristMotion,
@@ -117,6 +118,7 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
                 chosen = _scene_for(scene, monitor.at_rest)
                 if chosen is not current:
                     used.append(chosen)
+                    copy_materials(chosen, current)
                     transfer_state(chosen, current, now, motion)
                     hand_over(chosen, current)
                 current = chosen

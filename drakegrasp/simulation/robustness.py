@@ -22,6 +22,7 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.randomization.conditions import Materials, usual_conditions
 from drakegrasp.simulation.screen import Prediction, predict
 from drakegrasp.simulation.trial import run_attempt
 
@@ -36,9 +37,9 @@ class Certificate:
 
     Attributes:
         share: Share of the repeats that hold, 0..1; NaN if every repeat was inconclusive.
-        friction: Least coefficient of hand and object at which it holds, to within
-            `physics.friction_hand` / 2^`certify.friction_steps`; inf if it does not hold at
-            `physics.friction_hand` at half the step, NaN if a simulation was inconclusive.
+        friction: Least coefficient of hand and object at which it holds, to within the attempt's
+            own / 2^`certify.friction_steps`; inf if it does not hold at its own at half the step,
+            NaN if a simulation was inconclusive.
     """
 
     share: float
@@ -58,23 +59,28 @@ def certify(model: ObjectModel, X_TO: Array, attempt: Attempt, config: Config) -
     Args:
         model: The object.
         X_TO: Its resting pose, (4, 4).
-        attempt: One that succeeds under the configuration.
+        attempt: One that succeeds under the configuration; noise and less friction start from its
+            own friction and mass.
         config: The rules; `certify` has the number of repeats and the noise.
     """
     # Repeat the attempt with noise; inconclusive repeats do not count.
+    usual = usual_conditions(model, config.physics)
+    attempt = replace(attempt, conditions=attempt.conditions or usual)
+    repeater = _Repeater(model, X_TO, config)
     stream = Stream(attempt.seed, attempt.standoff_index)
-    repeats = _repeats(stream, model, X_TO, attempt, config)
+    repeats = [repeater.holds(noisy) for noisy in _noisy_attempts(stream, attempt, config.certify)]
     conclusive = [holds for holds in repeats if holds is not None]
 
     # Search for the least friction; what geometry decides does not depend on friction.
-    (prediction,) = predict(model, load_hand(config.hand), X_TO, [attempt], config.screen)
+    prediction = repeater.predict(attempt)
 
     def holds(friction: float) -> bool | None:
-        return _holds(model, X_TO, attempt, prediction, config, friction)
+        return repeater.holds(_with_materials(attempt, friction_hand=friction), prediction)
 
+    highest = _materials(attempt).friction_hand
     return Certificate(
         share=float(np.mean(conclusive)) if conclusive else np.nan,
-        friction=least_friction(holds, config.physics.friction_hand, config.certify.friction_steps),
+        friction=least_friction(holds, highest, config.certify.friction_steps),
     )
 
 
@@ -104,21 +110,27 @@ def least_friction(holds: Callable[[float], bool | None], highest: float, steps:
     return high
 
 
-def _repeats(
-    stream: Stream, model: ObjectModel, X_TO: Array, attempt: Attempt, config: Config
-) -> Iterator[bool | None]:
-    """Yield for each repeat with noise whether it holds, None if inconclusive."""
-    rules, mu = config.certify, config.physics.friction_hand
+def _noisy_attempts(stream: Stream, attempt: Attempt, rules: CertifyConfig) -> Iterator[Attempt]:
+    """Yield each repeat of an attempt: with noise on palm pose, friction and mass."""
+    known = _materials(attempt)
     for _ in range(rules.repeats):
         # The order of the draws is part of the seed's meaning: palm, friction, mass.
         noisy = replace(attempt, X_OG=multiply(attempt.X_OG, _palm_noise(stream, rules)))
-        friction = mu * _noise_factor(stream, rules.friction_noise)
-        factor = _noise_factor(stream, rules.mass_noise)
-        scaled = replace(model, mass=factor * model.mass, I_OOcm_O=factor * model.I_OOcm_O)
+        friction = known.friction_hand * _noise_factor(stream, rules.friction_noise)
+        mass = known.mass * _noise_factor(stream, rules.mass_noise)
+        yield _with_materials(noisy, friction_hand=friction, mass=mass)
 
-        # `model` has the same shape as `scaled`, and its distance field is already computed.
-        (prediction,) = predict(model, load_hand(config.hand), X_TO, [noisy], config.screen)
-        yield _holds(scaled, X_TO, noisy, prediction, config, friction)
+
+def _materials(attempt: Attempt) -> Materials:
+    assert attempt.conditions is not None
+    return attempt.conditions.materials
+
+
+def _with_materials(attempt: Attempt, **changes: float) -> Attempt:
+    """Return an attempt with another friction or mass."""
+    assert attempt.conditions is not None
+    materials = replace(attempt.conditions.materials, **changes)
+    return replace(attempt, conditions=replace(attempt.conditions, materials=materials))
 
 
 def _noise_factor(stream: Stream, deviation: float) -> float:
@@ -135,24 +147,33 @@ def _palm_noise(stream: Stream, rules: CertifyConfig) -> Array:
     return make_pose(rotation_about(axis, angle), shift)
 
 
-def _holds(
-    model: ObjectModel,
-    X_TO: Array,
-    attempt: Attempt,
-    prediction: Prediction | None,
-    config: Config,
-    friction: float,
-) -> bool | None:
-    """Return whether an attempt succeeds, or None if that is inconclusive."""
-    changes = {
-        "friction_hand": friction,
-        "time_step": STEP_RATIO * config.physics.time_step,
-        "coarse_steps": 1,
-    }
-    physics = config.physics.model_copy(update=changes)
-    config = config.model_copy(update={"physics": physics})
+class _Repeater:
+    """Runs attempts at half the time step."""
 
-    # Friction and masses are fixed when a scene is built.
-    scene = build_scene(model, physics, load_hand(config.hand))
-    outcome = run_attempt(scene, X_TO, attempt, config, prediction).outcome
-    return None if outcome.inconclusive else outcome is Outcome.SUCCESS
+    def __init__(self, model: ObjectModel, X_TO: Array, config: Config) -> None:
+        """Take an object, its resting pose (4, 4) and the rules of the attempts."""
+        step = STEP_RATIO * config.physics.time_step
+        physics = config.physics.model_copy(update={"time_step": step, "coarse_steps": 1})
+        self._config = config.model_copy(update={"physics": physics})
+        self._model, self._X_TO, self._hand = model, X_TO, load_hand(config.hand)
+        self._scene = build_scene(model, physics, self._hand)
+
+    def predict(self, attempt: Attempt) -> Prediction | None:
+        """Return what geometry says of an attempt."""
+        rules = self._config.screen
+        (prediction,) = predict(self._model, self._hand, self._X_TO, [attempt], rules)
+        return prediction
+
+    def holds(self, attempt: Attempt, prediction: Prediction | None = None) -> bool | None:
+        """Return whether an attempt succeeds, or None if that is inconclusive.
+
+        Args:
+            attempt: What to try.
+            prediction: What `predict` returns for it, where the caller has it already.
+        """
+        record = run_attempt(self._scene, self._X_TO, attempt, self._config, prediction)
+        if not record.outcome.inconclusive:
+            return record.outcome is Outcome.SUCCESS
+        # A scene in which Drake failed must not be used again.
+        self._scene = build_scene(self._model, self._config.physics, self._hand)
+        return None

@@ -21,6 +21,8 @@ from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import Contacts, open_hand_collides, read_contacts
 from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.lift import lift
+from drakegrasp.simulation.randomization.conditions import Materials, usual_materials
+from drakegrasp.simulation.randomization.materials import set_materials
 from drakegrasp.simulation.scene import (
     Scene,
     closing_angles,
@@ -122,6 +124,7 @@ def run_attempt(
 
         # Place: object and palm stand still, the fingers are where the attempt starts them.
         limits = start_limits(config)
+        set_materials(scene, _materials(scene, attempt))
         reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=attempt.closing)
         if open_hand_collides(scene):
             return replace(start, outcome=Outcome.START_COLLISION)
@@ -175,6 +178,13 @@ def _predict(scene: Scene, X_TO: Array, attempt: Pregrasp, config: Config) -> Pr
         return None
     (prediction,) = predict(scene.model, scene.handles.hand, X_TO, [attempt], config.screen)
     return prediction
+
+
+def _materials(scene: Scene, attempt: Pregrasp) -> Materials:
+    """Return the friction and mass of an attempt; the scene's own where it says nothing."""
+    if attempt.conditions is None:
+        return usual_materials(scene.model, scene.physics)
+    return attempt.conditions.materials
 
 
 def _close(

@@ -29,17 +29,29 @@ def intrinsics(config: CameraConfig) -> Array:
     return np.array([[focal, 0.0, centre], [0.0, focal, centre], [0.0, 0.0, 1.0]])
 
 
-def camera_pose_oto(X_TG: npt.ArrayLike, config: CameraConfig) -> Array:
-    """Return X_TC (4, 4) of the camera that rolls with the palm: R_GC is the identity."""
-    return multiply(X_TG, make_pose(np.eye(3), [0.0, 0.0, -config.distance]))
+def camera_pose_oto(
+    X_TG: npt.ArrayLike, config: CameraConfig, X_C0C: npt.ArrayLike | None = None
+) -> Array:
+    """Return X_TC (4, 4) of the camera that rolls with the palm: R_GC is the identity.
+
+    Args:
+        X_TG: Pose of the palm (4, 4).
+        config: The camera's distance.
+        X_C0C: Pose (4, 4) of the camera in that usual pose, if it is another.
+    """
+    X_TC = multiply(X_TG, make_pose(np.eye(3), [0.0, 0.0, -config.distance]))
+    # A product with the identity may change the sign of a zero.
+    return X_TC if X_C0C is None or np.array_equal(X_C0C, np.eye(4)) else multiply(X_TC, X_C0C)
 
 
-def camera_pose_otm(X_TG: npt.ArrayLike, config: CameraConfig) -> Array:
-    """Return X_TC (4, 4) of the camera whose image up is world up.
+def camera_pose_otm(
+    X_TG: npt.ArrayLike, config: CameraConfig, X_C0C: npt.ArrayLike | None = None
+) -> Array:
+    """Return X_TC (4, 4) of the camera whose image up is world up; see `camera_pose_oto`.
 
     A camera that looks straight up or down has no such direction; its image up is +Ty.
     """
-    X_TC = camera_pose_oto(X_TG, config)
+    X_TC = camera_pose_oto(X_TG, config, X_C0C)
     z = X_TC[:3, 2]
     up = np.array([0.0, 0.0, 1.0])
     if norm(np.cross(z, up)) < LOOKS_VERTICALLY:

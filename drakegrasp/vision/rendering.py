@@ -24,8 +24,12 @@ from pydrake.geometry import (
     LightParameter,
     MakeRenderEngineVtk,
     Mesh,
+    PerceptionProperties,
     RenderCameraCore,
     RenderEngineVtkParams,
+    Rgba,
+    Role,
+    SceneGraph,
 )
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
@@ -33,7 +37,7 @@ from pydrake.multibody.tree import RigidBody, SpatialInertia
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
-from drakegrasp.arithmetic import multiply
+from drakegrasp.arithmetic import Array, multiply
 from drakegrasp.config import CameraConfig
 from drakegrasp.errors import BlankImageError
 from drakegrasp.frames import X_WT
@@ -41,16 +45,13 @@ from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.parsing import make_parser
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import ObjectModel, object_colour
+from drakegrasp.vision.appearance import Appearance, usual_appearance
 from drakegrasp.vision.camera import intrinsics
 
 #: Colour of pixels beyond the table.
 BACKGROUND = np.array([0.86, 0.90, 0.94])
-#: A light at the camera, and one from above at a slant: without it the table is black where the
-#: camera looks along it.
-LIGHTS = (
-    LightParameter(type="directional", frame="camera", direction=[0.0, 0.0, 1.0], intensity=0.6),
-    LightParameter(type="directional", frame="world", direction=[0.3, 0.4, -1.0], intensity=0.7),
-)
+#: Intensity of the light at the camera, which never changes.
+CAMERA_LIGHT = 0.6
 #: Message of the error about a blank image.
 BLANK = (
     "the rendered image must not be blank, got all zeros: OpenGL works in one thread of a "
@@ -73,15 +74,26 @@ class RenderedView:
     mask: npt.NDArray[np.uint8]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(kw_only=True, eq=False)
 class Renderer:
-    """A diagram that renders one object and the table."""
+    """A diagram that renders one object and the table.
+
+    Attributes:
+        diagram, context: The diagram with its one context.
+        plant, scene_graph: The two systems of the diagram.
+        object, table: The bodies.
+        config: The camera.
+        appearance: How object and table look, and in which light; `paint` changes it.
+    """
 
     diagram: Diagram
     context: Context
     plant: MultibodyPlant
+    scene_graph: SceneGraph
     object: RigidBody
+    table: RigidBody
     config: CameraConfig
+    appearance: Appearance
 
 
 def build_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
@@ -90,22 +102,73 @@ def build_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
     os.environ.setdefault("LP_NUM_THREADS", "0")
 
     # The object, and the table of the simulation.
-    builder = DiagramBuilder()
-    lights = RenderEngineVtkParams(default_clear_color=BACKGROUND, lights=list(LIGHTS))
-    plant, body = add_drawn_object(builder, model, lights)
-    (table,) = make_parser(plant).AddModels(MODELS / "table.sdf")
-    plant.WeldFrames(
-        plant.world_frame(), plant.GetFrameByName("table", table), RigidTransform(X_WT)
-    )
+    builder, appearance = DiagramBuilder(), usual_appearance(model.name)
+    plant, body = add_drawn_object(builder, model, _engine_parameters(appearance))
+    (instance,) = make_parser(plant).AddModels(MODELS / "table.sdf")
+    table = plant.GetBodyByName("table", instance)
+    plant.WeldFrames(plant.world_frame(), table.body_frame(), RigidTransform(X_WT))
     plant.Finalize()
     diagram = builder.Build()
     return Renderer(
         diagram=diagram,
         context=diagram.CreateDefaultContext(),
         plant=plant,
+        scene_graph=diagram.GetSubsystemByName("scene_graph"),
         object=body,
+        table=table,
         config=config,
+        appearance=appearance,
     )
+
+
+def paint(renderer: Renderer, appearance: Appearance) -> None:
+    """Give a renderer the colours and the light of an attempt; nothing is done where it has them.
+
+    The lights of a render engine are fixed, so this makes a new engine. That takes as long as some
+    ten images.
+    """
+    if _equal(renderer.appearance, appearance):
+        return
+
+    # An engine takes the colours over when it is added.
+    graph = renderer.scene_graph
+    context = graph.GetMyMutableContextFromRoot(renderer.context)
+    graph.RemoveRenderer(context, ENGINE)
+    _set_colour(renderer, renderer.object, appearance.object_colour)
+    _set_colour(renderer, renderer.table, appearance.table_colour)
+    graph.AddRenderer(context, ENGINE, MakeRenderEngineVtk(_engine_parameters(appearance)))
+    renderer.appearance = appearance
+
+
+def _equal(one: Appearance, other: Appearance) -> bool:
+    return all(np.array_equal(value, getattr(other, name)) for name, value in vars(one).items())
+
+
+def _engine_parameters(appearance: Appearance) -> RenderEngineVtkParams:
+    """Return background and lights: one at the camera, one from above."""
+    at_camera = LightParameter(
+        type="directional", frame="camera", direction=[0.0, 0.0, 1.0], intensity=CAMERA_LIGHT
+    )
+    above = LightParameter(
+        type="directional",
+        frame="world",
+        direction=appearance.light_direction,
+        intensity=appearance.light_strength,
+    )
+    return RenderEngineVtkParams(default_clear_color=BACKGROUND, lights=[at_camera, above])
+
+
+def _set_colour(renderer: Renderer, body: RigidBody, colour: Array) -> None:
+    """Give all shapes of a body a colour (3,)."""
+    plant, graph = renderer.plant, renderer.scene_graph
+    context, source = graph.GetMyMutableContextFromRoot(renderer.context), plant.get_source_id()
+    inspector = plant.EvalSceneGraphInspector(plant.GetMyContextFromRoot(renderer.context))
+    for geometry in plant.GetVisualGeometriesForBody(body):
+        # Drake replaces no properties of this role: it is removed and assigned anew.
+        properties = PerceptionProperties(inspector.GetPerceptionProperties(geometry))
+        properties.UpdateProperty("phong", "diffuse", Rgba(*colour))
+        graph.RemoveRole(context, source, geometry, Role.kPerception)
+        graph.AssignRole(context, source, geometry, properties)
 
 
 def add_drawn_object(

@@ -1,0 +1,1 @@
+"""What may differ from attempt to attempt of an object: friction, mass, looks, cameras."""

@@ -1,0 +1,134 @@
+"""The draw of an attempt's conditions, from the seed and the attempt's own numbers alone.
+
+Each attempt has a stream of random words, and each quantity words of its own in it: whether one
+quantity is drawn changes none of the others. All is elementary arithmetic, so it is the same on
+every machine (docs/explanation/determinism.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from drakegrasp.arithmetic import Array, multiply, norm, sin_cos
+from drakegrasp.config import Config, RandomizeConfig
+from drakegrasp.frames import make_pose, rotation_about
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.seeding import Stream, object_key
+from drakegrasp.simulation.randomization.conditions import (
+    Conditions,
+    Materials,
+    usual_conditions,
+)
+from drakegrasp.vision.appearance import Appearance
+from drakegrasp.vision.depth_sensor import DepthSensor
+
+#: The words of each quantity in an attempt's stream; their places are part of the seed's meaning.
+WORDS = {
+    "object_colour": slice(0, 3),
+    "table_colour": slice(3, 6),
+    "light_direction": slice(6, 8),
+    "light_strength": slice(8, 9),
+    "camera_shift": slice(9, 12),
+    "camera_turn": slice(12, 15),
+    "depth_noise": slice(15, 16),
+    "friction_hand": slice(16, 17),
+    "friction_table": slice(17, 18),
+    "mass": slice(18, 19),
+}
+#: Last number of the place of an attempt's stream; no other stream's place has four numbers.
+_PLACE = 0
+
+
+def draw_conditions(
+    model: ObjectModel, config: Config, candidate: int, standoff_index: int
+) -> Conditions:
+    """Return the conditions of an attempt; those that nothing is drawn for are the usual ones.
+
+    Args:
+        model: The object; its own mass and colour are what factors and shares apply to.
+        config: What is drawn, and the seed.
+        candidate: Index of the attempt's candidate.
+        standoff_index: Index of its stand-off.
+    """
+    usual, rules = usual_conditions(model, config.physics), config.randomize
+    if rules == RandomizeConfig():
+        return usual
+
+    # One number in [0, 1) per word.
+    stream = Stream(config.seed, object_key(model.name), candidate, standoff_index, _PLACE)
+    numbers = stream.uniform(max(words.stop for words in WORDS.values()))
+    drawn = {name: numbers[words] for name, words in WORDS.items()}
+
+    return replace(
+        usual,
+        materials=_materials(usual.materials, rules, drawn),
+        appearance=_appearance(usual.appearance, rules, drawn),
+        X_C0C=_camera_jitter(rules, drawn),
+        sensor=DepthSensor(
+            noise=_between(rules.depth_noise, drawn["depth_noise"], 0.0),
+            baseline=rules.depth_baseline,
+            seed=stream.key if rules.depth_noise else 0,
+        ),
+    )
+
+
+def _materials(usual: Materials, rules: RandomizeConfig, drawn: dict[str, Array]) -> Materials:
+    return Materials(
+        **{
+            name: getattr(usual, name) * _between(getattr(rules, name), drawn[name], 1.0)
+            for name in ("friction_hand", "friction_table", "mass")
+        }
+    )
+
+
+def _appearance(usual: Appearance, rules: RandomizeConfig, drawn: dict[str, Array]) -> Appearance:
+    factor = _between(rules.light_strength, drawn["light_strength"], 1.0)
+    return Appearance(
+        object_colour=_mixed(usual.object_colour, drawn["object_colour"], rules.object_colour),
+        table_colour=_mixed(usual.table_colour, drawn["table_colour"], rules.table_colour),
+        light_direction=_turned_light(
+            usual.light_direction, rules.light_angle_deg, drawn["light_direction"]
+        ),
+        light_strength=usual.light_strength * factor,
+    )
+
+
+def _between(limits: tuple[float, float] | None, number: Array, otherwise: float) -> float:
+    """Return the number (1,) in 0..1 laid over a range; `otherwise` where there is no range."""
+    return otherwise if limits is None else limits[0] + (limits[1] - limits[0]) * float(number[0])
+
+
+def _mixed(own: Array, random: Array, share: float) -> Array:
+    """Return a colour (3,) with a share of a random one."""
+    return np.asarray((1.0 - share) * own + share * random)
+
+
+def _turned_light(direction: Array, angle_deg: float, numbers: Array) -> Array:
+    """Return a unit vector (3,), uniform over the cap of half angle `angle_deg` about another."""
+    if not angle_deg:
+        return direction
+    # Two directions across; the light is never along x.
+    across = np.cross(direction, [1.0, 0.0, 0.0])
+    across /= norm(across)
+    other = np.cross(direction, across)
+
+    # The height within a cap is uniform (Archimedes).
+    _, least = sin_cos(np.deg2rad(angle_deg))
+    cosine = 1.0 - numbers[0] * (1.0 - least)
+    sine = np.sqrt(np.maximum(1.0 - cosine * cosine, 0.0))
+    s, c = sin_cos(2.0 * np.pi * numbers[1])
+    turned = cosine * direction + sine * (c * across + s * other)
+    return np.asarray(turned / norm(turned))
+
+
+def _camera_jitter(rules: RandomizeConfig, drawn: dict[str, Array]) -> Array:
+    """Return X_C0C (4, 4): shifts along, then turns about, the axes x, y, z of the camera."""
+    shift = rules.camera_shift * (2.0 * drawn["camera_shift"] - 1.0)
+    angles = np.deg2rad(rules.camera_turn_deg) * (2.0 * drawn["camera_turn"] - 1.0)
+    R = np.eye(3)
+    if rules.camera_turn_deg:
+        for axis, angle in zip(np.eye(3), angles, strict=True):
+            R = multiply(R, rotation_about(axis, angle))
+    return make_pose(R, shift)

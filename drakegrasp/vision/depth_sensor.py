@@ -1,0 +1,110 @@
+"""A depth camera's errors: noise that grows with distance, and pixels without a depth.
+
+The model is that of a camera which triangulates: it sees a pattern that a projector beside it
+throws on the scene, and tells the depth z from how far the pattern is shifted, d = f b / z, with
+focal length f and baseline b.
+
+* **Noise.** A shift that is uncertain by a constant makes a depth that is uncertain by sigma = c
+  z^2: c = 1.425e-3 / m for a Kinect, whose shift is certain to half a pixel (Khoshelham and Oude
+  Elberink, 2012). Each pixel errs by itself, normally distributed.
+* **Shadow.** What the camera sees and the projector does not light has no depth: stripes beside
+  near edges, on the side away from the projector. Such a pixel holds what one without anything
+  before the far plane holds: `far`.
+
+In: the clean depth image. Out: the image with errors, or clean depths from it again. NumPy only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.arithmetic import Array
+from drakegrasp.config import CameraConfig
+from drakegrasp.seeding import Stream
+
+#: A pixel is in the shadow if one that is nearer covers it by more than this [px]: far above
+#: rounding.
+COVERED = 1e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepthSensor:
+    """The errors of one depth camera; all are zero for one without errors.
+
+    Attributes:
+        noise: Standard deviation of a depth over its square, c [1/m].
+        baseline: From the camera to the projector along +Cx, b [m].
+        seed: Of the noise; each camera of an attempt has a stream of its own.
+    """
+
+    noise: float = 0.0
+    baseline: float = 0.0
+    seed: int = 0
+
+
+def spoil_depth(
+    depth: npt.NDArray[np.float32], K: Array, sensor: DepthSensor, camera: int, config: CameraConfig
+) -> npt.NDArray[np.float32]:
+    """Return a depth image (S, S) [m] with the errors of a sensor.
+
+    Args:
+        depth: Clean depths (S, S) [m], `near` to `far`.
+        K: Camera matrix (3, 3) [px].
+        sensor: The errors.
+        camera: Number of the camera among those of its attempt.
+        config: Near and far plane; a depth that the noise takes beyond `far` is lost.
+    """
+    spoilt = depth
+    if sensor.noise:
+        clean = depth.astype(float)
+        noisy = clean + sensor.noise * _normal(depth, sensor, camera) * clean * clean
+        noisy = np.clip(noisy.astype(np.float32), config.near, config.far)
+        spoilt = np.where(_measured(depth, config), noisy, depth)
+    if sensor.baseline:
+        hidden = shadow(depth, K, sensor.baseline)
+        spoilt = np.where(hidden, np.float32(config.far), spoilt)
+    return spoilt
+
+
+def clean_depth(
+    depth: npt.NDArray[np.float32], sensor: DepthSensor, camera: int, config: CameraConfig
+) -> npt.NDArray[np.float32]:
+    """Return a depth image (S, S) [m] without the noise of a sensor; what is lost stays lost.
+
+    The inverse of `spoil_depth` but for rounding: z' = z + a z^2 has the solution z = 2 z' / (1 +
+    sqrt(1 + 4 a z')) that is z' where a is 0.
+    """
+    if not sensor.noise:
+        return depth
+    a = sensor.noise * _normal(depth, sensor, camera)
+    noisy = depth.astype(float)
+    clean = 2.0 * noisy / (1.0 + np.sqrt(np.maximum(1.0 + 4.0 * a * noisy, 0.0)))
+    return np.where(_measured(depth, config), clean, depth).astype(np.float32)
+
+
+def shadow(depth: npt.NDArray[np.float32], K: Array, baseline: float) -> npt.NDArray[np.bool_]:
+    """Return where (S, S) a depth image shows what the projector at +Cx does not light.
+
+    The projector sees a point of column u and depth z in its own column u - f b / z. Along a row
+    from left to right this column rises wherever the projector sees the surface too; where a
+    pixel further right has a smaller one, something nearer is between the two.
+    """
+    columns = np.arange(depth.shape[1]) - K[0, 0] * baseline / depth.astype(float)
+    # The least column of all pixels to the right; none is right of the last.
+    least = np.minimum.accumulate(columns[:, ::-1], axis=1)[:, ::-1]
+    covered = np.zeros(depth.shape, dtype=np.bool_)
+    covered[:, :-1] = least[:, 1:] < columns[:, :-1] - COVERED
+    return covered
+
+
+def _measured(depth: npt.NDArray[np.float32], config: CameraConfig) -> npt.NDArray[np.bool_]:
+    """Return where (S, S) there is a depth; pixels at a clipping plane hold none."""
+    return (depth > np.float32(config.near)) & (depth < np.float32(config.far))
+
+
+def _normal(depth: npt.NDArray[np.float32], sensor: DepthSensor, camera: int) -> Array:
+    """Return a normal number for each pixel (S, S), row by row."""
+    return Stream(sensor.seed, camera).normal(depth.size).reshape(depth.shape)
