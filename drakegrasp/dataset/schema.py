@@ -247,8 +247,8 @@ DATA_FIELDS: tuple[Field, ...] = (
     Field("grasp_props/area_held", "k", "float32", "m^2", "-",
           "areas of the contact patches after the lift"),
     # The mass is in object_props.
-    *(replace(field, name=f"conditions/{field.name}", dtype=field.dtype.replace("64", "32")
-              if field.dtype == "float64" else field.dtype)
+    *(replace(field, name=f"conditions/{field.name}",
+              dtype="float32" if field.dtype == "float64" else field.dtype)
       for field in CONDITION_FIELDS if field.name != "mass"),
     Field("object_props/object_name", "", "str", "-", "-", "name of the object"),
     Field("object_props/class_name", "", "str", "-", "-", "name of the object's class"),

@@ -10,19 +10,21 @@ import h5py
 import numpy as np
 import trimesh
 
-from drakegrasp.config import CameraConfig, load_config
+from drakegrasp.config import CameraConfig, Config, load_config
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import Manifest, installed_versions, write_manifest
 from drakegrasp.dataset.prepared_objects import PreparedObject, save_prepared
-from drakegrasp.dataset.schema import CAMERAS, LOOK_FIELDS, sizes
+from drakegrasp.dataset.schema import LOOK_FIELDS, sizes
 from drakegrasp.dataset.shards import Shard, ShardHeader, trial_columns, write_shard
 from drakegrasp.frames import Array, invert_pose, make_pose, pack_pose, rotation_about, unpack_pose
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.simulation.candidates import Candidates
+from drakegrasp.simulation.randomization.draws import draw_conditions
 from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, image_frame, intrinsics
+from drakegrasp.vision.depth_sensor import spoil_depth
 
 OTO, OTM, TRIALS = "grasping_oto.hdf5", "grasping_otm.hdf5", "trials.hdf5"
 
@@ -116,7 +118,7 @@ def hold(row: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def trial_row(model: ObjectModel, number: int, X_TO: Array) -> dict[str, Any]:
+def trial_row(model: ObjectModel, number: int, X_TO: Array, config: Config) -> dict[str, Any]:
     """Return what `/trials` says of an attempt, by its number among the object's."""
     outcome = OUTCOMES[number]
     # The palm is above the box, turned about the vertical and tilted.
@@ -133,6 +135,7 @@ def trial_row(model: ObjectModel, number: int, X_TO: Array) -> dict[str, Any]:
         "outcome": outcome,
         "X_TO": pack_pose(X_TO),
         "X_OG": pack_pose(make_pose(R_OG, -height * R_OG[:, 2])),
+        **draw_conditions(model, config, number // 3, number % 3).values(),
     }
     after_lift = number == AFTER_LIFT
     stage = Stage.LIFTED if after_lift else outcome.stage
@@ -152,9 +155,10 @@ def trial_row(model: ObjectModel, number: int, X_TO: Array) -> dict[str, Any]:
     return row
 
 
-def make_shard(model: ObjectModel, header: ShardHeader, X_TO: Array, camera: CameraConfig) -> Shard:
+def make_shard(model: ObjectModel, header: ShardHeader, X_TO: Array, config: Config) -> Shard:
+    camera = config.camera
     numbers = range(3 * header.start, 3 * header.stop)
-    rows = [trial_row(model, number, X_TO) for number in numbers]
+    rows = [trial_row(model, number, X_TO, config) for number in numbers]
     trials = {f.name: f.empty(len(rows), SIZES) for f in trial_columns()}
     for i, row in enumerate(rows):
         for name, value in row.items():
@@ -164,12 +168,16 @@ def make_shard(model: ObjectModel, header: ShardHeader, X_TO: Array, camera: Cam
     for k, i in enumerate(hits):
         looks["row"][k] = i
         X_TG = X_TO @ unpack_pose(trials["X_OG"][i])
-        for name, pose in zip(CAMERAS, (camera_pose_oto, camera_pose_otm), strict=True):
-            X_TC = pose(X_TG, camera)
+        drawn, K = draw_conditions(model, config, *divmod(numbers[i], 3)), intrinsics(camera)
+        poses = {"oto": camera_pose_oto, "otm": camera_pose_otm}
+        for c, (name, pose) in enumerate(poses.items()):
+            X_TC = pose(X_TG, camera, drawn.X_C0C)
             image, mask = see(model, X_TO, X_TC, camera)
+            if name == "otm":
+                looks["X_CI_otm"][k] = pack_pose(image_frame(K, mask, image[3]))
+            image[3] = spoil_depth(image[3], K, drawn.sensor, c, camera)
             looks[f"image_{name}"][k], looks[f"mask_{name}"][k] = image, mask
             looks[f"X_TC_{name}"][k] = pack_pose(X_TC)
-        looks["X_CI_otm"][k] = pack_pose(image_frame(intrinsics(camera), mask, image[3]))
     return Shard(header=header, trials=trials, looks=looks)
 
 
@@ -213,7 +221,7 @@ def make_dataset(out: Path, meshes: Path, *overrides: str) -> Path:
     by_name = {model.name: (model, X_TO) for model, X_TO in models}
     for header in manifest.headers():
         model, X_TO = by_name[header.object_name]
-        write_shard(out, make_shard(model, header, X_TO, config.camera))
+        write_shard(out, make_shard(model, header, X_TO, config))
     assemble(out)
     return out
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -13,10 +14,12 @@ import trimesh
 
 from drakegrasp.config import CameraConfig
 from drakegrasp.frames import Array, invert_pose, make_pose, transform_points
+from drakegrasp.hand.files import MODELS
 from drakegrasp.objects.model import ObjectModel, object_colour, prepare_object
 from drakegrasp.objects.sources import MeshSource
+from drakegrasp.vision.appearance import TABLE_COLOUR, Appearance, usual_appearance
 from drakegrasp.vision.camera import intrinsics, project, unproject
-from drakegrasp.vision.rendering import RenderedView, Renderer, build_renderer, render
+from drakegrasp.vision.rendering import RenderedView, Renderer, build_renderer, paint, render
 
 
 def has_egl() -> bool:
@@ -42,6 +45,15 @@ HALF = EXTENTS / 2.0
 X_TO = make_pose(np.eye(3), [0.0, 0.0, HALF[2]])
 #: Columns are the camera's axes in {T}: looking along -x, from +x, world up on top.
 R_FROM_X = np.column_stack([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
+#: Looking along -y, from +y, world up on top.
+R_FROM_Y = np.column_stack([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
+#: Looks unlike the usual ones in everything.
+GARISH = Appearance(
+    object_colour=np.array([0.1, 0.9, 0.2]),
+    table_colour=np.array([0.8, 0.1, 0.7]),
+    light_direction=np.array([-0.6, 0.0, -0.8]),
+    light_strength=0.3,
+)
 #: Looking straight down, +Ty on top.
 R_FROM_ABOVE = np.diag([1.0, -1.0, -1.0])
 
@@ -231,3 +243,79 @@ def test_image_follows_the_object(renderer: Renderer) -> None:
         _, columns = np.nonzero(render(renderer, X, facing_x(0.25)).mask)
         middles.append((columns.min() + columns.max()) / 2.0)
     assert middles[1] - middles[0] == pytest.approx(K[0, 0] * 0.03 / 0.25, abs=1.0)
+
+
+@pytest.fixture
+def painted(box: ObjectModel) -> Iterator[Renderer]:
+    """The renderer of the box, whose looks are as usual again afterwards."""
+    renderer = build_renderer(box, CONFIG)
+    yield renderer
+    paint(renderer, usual_appearance(box.name))
+
+
+def test_table_looks_as_its_model_says(box: ObjectModel) -> None:
+    """The constant is what the checks compare with; the model is what is drawn."""
+    text = (MODELS / "table.sdf").read_text()
+    assert f"<diffuse>{' '.join(f'{c:.2f}' for c in TABLE_COLOUR)} 1.0</diffuse>" in text
+
+
+def brightness(renderer: Renderer) -> tuple[Array, Array]:
+    """Return the mean colour of object and table, (3,) each."""
+    seen = render(renderer, X_TO, oblique())
+    mask = seen.mask.astype(bool)
+    table = ~mask & (seen.image[3] < CONFIG.far)
+    return seen.image[:3, mask].mean(axis=1), seen.image[:3, table].mean(axis=1)
+
+
+def test_painting_changes_the_colours_of_object_and_table(painted: Renderer) -> None:
+    red, green = np.array([0.9, 0.05, 0.05]), np.array([0.05, 0.6, 0.05])
+    paint(painted, replace(painted.appearance, object_colour=red, table_colour=green))
+    thing, table = brightness(painted)
+    assert thing[0] > 4.0 * thing[1:].max()
+    assert table[1] > 4.0 * table[[0, 2]].max()
+
+
+def test_light_from_another_side_lights_another_face(painted: Renderer) -> None:
+    def faces() -> tuple[float, float]:
+        """Return how bright the faces towards +x and +y are."""
+        return tuple(
+            float(render(painted, X_TO, make_pose(R, p)).image[:3, 64, 64].mean())
+            for R, p in (
+                (R_FROM_X, [0.25, 0.0, HALF[2]]),
+                (R_FROM_Y, [0.0, 0.25, HALF[2]]),
+            )
+        )  # type: ignore[return-value]
+
+    along_x, along_y = np.array([-0.8, 0.0, -0.6]), np.array([0.0, -0.8, -0.6])
+    paint(painted, replace(painted.appearance, light_direction=along_x))
+    x, y = faces()
+    assert x > 1.2 * y
+    paint(painted, replace(painted.appearance, light_direction=along_y))
+    x, y = faces()
+    assert y > 1.2 * x
+
+
+def test_stronger_light_makes_a_brighter_image(painted: Renderer) -> None:
+    _, usual = brightness(painted)
+    paint(painted, replace(painted.appearance, light_strength=0.2))
+    _, dim = brightness(painted)
+    assert np.all(dim < 0.8 * usual)
+
+
+def test_painting_changes_neither_depth_nor_mask(painted: Renderer) -> None:
+    before = render(painted, X_TO, oblique())
+    paint(painted, GARISH)
+    after = render(painted, X_TO, oblique())
+    assert np.array_equal(before.image[3], after.image[3])
+    assert np.array_equal(before.mask, after.mask)
+    assert not np.array_equal(before.image[:3], after.image[:3])
+
+
+def test_nothing_remains_of_the_looks_before(painted: Renderer, box: ObjectModel) -> None:
+    usual = pixels(render(painted, X_TO, oblique()))
+    paint(painted, GARISH)
+    garish = pixels(render(painted, X_TO, oblique()))
+    paint(painted, usual_appearance(box.name))
+    assert pixels(render(painted, X_TO, oblique())) == usual != garish
+    paint(painted, GARISH)
+    assert pixels(render(painted, X_TO, oblique())) == garish

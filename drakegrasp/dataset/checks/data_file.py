@@ -11,6 +11,7 @@ from functools import partial
 
 import numpy as np
 
+from drakegrasp.dataset.checks import conditions as condition_rules
 from drakegrasp.dataset.checks import consistency
 from drakegrasp.dataset.checks import hold as hold_rules
 from drakegrasp.dataset.checks import images as image_rules
@@ -20,7 +21,7 @@ from drakegrasp.dataset.checks.findings import AnyArray, Batch, Findings, Violat
 from drakegrasp.dataset.checks.images import Lens
 from drakegrasp.dataset.checks.open_file import OpenFile
 from drakegrasp.dataset.paths import TRIALS_FILE
-from drakegrasp.dataset.schema import SHARED_FIELDS, SPLITS
+from drakegrasp.dataset.schema import CONDITION_FIELDS, SHARED_FIELDS, SPLITS
 from drakegrasp.outcomes import Outcome
 
 #: Samples in a batch: some 20 MB of images.
@@ -32,6 +33,7 @@ COMPARED = (
     *("object", "outcome", "X_TO", "X_OG", "X_OG_lifted", "surface_distance", "normal_angle"),
     *(f"{when}_{name}" for when in ("closed", "lifted") for name in ("p_OQ", "nhat_Q_O", "f_Q_O")),
     *hold_rules.COPIES.values(),
+    *(field.name for field in CONDITION_FIELDS),
 )
 
 
@@ -47,7 +49,7 @@ def check_data_file(data: OpenFile, camera: str, context: Context) -> None:
     if data.config is None:
         return  # a finding already; without a lens no image can be judged
     findings, dataset, filters = context.findings, context.dataset, data.config.filters
-    lens = Lens.of(camera, data.config.camera)
+    lens = Lens.of(camera, data.config)
     context.add(data, consistency.splits(data))
     for split in data.groups:
         for whole in data.batches(split, SAMPLE_ROWS, findings):
@@ -80,6 +82,7 @@ def check_data_file(data: OpenFile, camera: str, context: Context) -> None:
                 batch = _judge_by_trial(data, batch, camera, dataset, findings)
 
             # What the images show, which needs right frames.
+            batch = image_rules.without_noise(batch, lens, data.config.camera)
             batch = data.judge(
                 batch,
                 findings,
@@ -141,6 +144,7 @@ def _judge_by_trial(
         findings,
         partial(sample_rules.same_as_trial, trials=own, camera=camera, config=data.config.camera),
         partial(hold_rules.same_as_trial, trials=own, camera=camera),
+        partial(condition_rules.same_as_trial, trials=own),
         partial(hold_rules.surface_limits, trials=own, filters=data.config.filters),
     )
     return batch.without(set(judged.rows.tolist()) - set(agreeing.rows.tolist()))

@@ -7,15 +7,17 @@ the object. Out: a `Violation` for every row that is wrong. No file is read.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drakegrasp.config import CameraConfig
+from drakegrasp.config import CameraConfig, Config
 from drakegrasp.dataset.checks.findings import UNIT_TOLERANCE, AnyArray, Batch, Violation
+from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.frames import Array, invert_pose, transform_points
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.vision.camera import intrinsics, project, unproject
+from drakegrasp.vision.depth_sensor import DepthSensor, clean_depth
 
 #: With the right lens, depth images reproduce the table and the mesh to 1e-6 m. An error of half a
 #: pixel moves them by 1 to 3 mm.
@@ -45,22 +47,30 @@ class Lens:
         camera: `oto` or `otm`.
         K: Camera matrix (3, 3) [px].
         near, far: Range of the depth image [m].
+        loses: Whether pixels that show something may have no depth, which is `far` then.
     """
 
     camera: str
     K: Array
     near: np.float32
     far: np.float32
+    loses: bool
 
     @classmethod
-    def of(cls, camera: str, config: CameraConfig) -> Lens:
+    def of(cls, camera: str, config: Config) -> Lens:
         """Return the lens of a configuration; its range is rounded to float32, as images are."""
+        rules = config.randomize
         return cls(
             camera=camera,
-            K=intrinsics(config),
-            near=np.float32(config.near),
-            far=np.float32(config.far),
+            K=intrinsics(config.camera),
+            near=np.float32(config.camera.near),
+            far=np.float32(config.camera.far),
+            loses=rules.depth_noise is not None or rules.depth_baseline > 0.0,
         )
+
+    def has_depth(self, depth: AnyArray) -> AnyArray:
+        """Return where a depth image (S, S) has a depth; everywhere if no pixel may lose its."""
+        return depth < self.far if self.loses else np.ones_like(depth, dtype=np.bool_)
 
 
 def image_values(batch: Batch, lens: Lens) -> Iterator[Violation]:
@@ -119,6 +129,19 @@ def image_frames(batch: Batch, lens: Lens) -> Iterator[Violation]:
 # What the images show
 
 
+def without_noise(batch: Batch, lens: Lens, config: CameraConfig) -> Batch:
+    """Return the samples with depth images from which the noise is taken that was drawn."""
+    noise, seeds = batch["conditions/depth_noise"], batch["conditions/depth_seed"]
+    if not noise.any():
+        return batch
+    images = batch["images"].copy()
+    for i in range(len(batch)):
+        sensor = DepthSensor(noise=float(noise[i]), seed=int(seeds[i]))
+        number = CAMERAS.index(lens.camera)
+        images[i, 3] = clean_depth(images[i, 3], sensor, number, config)
+    return replace(batch, columns={**batch.columns, "images": images})
+
+
 def contacts_in_image(batch: Batch, lens: Lens) -> Iterator[Violation]:
     """Contacts project onto the mask, and lie on the visible surface or behind it."""
     p_CQ, _ = batch.contacts()
@@ -131,7 +154,8 @@ def contacts_in_image(batch: Batch, lens: Lens) -> Iterator[Violation]:
             v, u = np.nonzero(batch["masks"][i])
             beside[i] = np.hypot(u - pixel[0], v - pixel[1]).min()
             if beside[i] <= MASK_TOLERANCE:
-                before[i] = _nearest_depth(batch["images"][i, 3], pixel) - z[i]
+                nearest = _nearest_depth(batch["images"][i, 3], lens, pixel)
+                before[i] = nearest - z[i] if np.isfinite(nearest) else 0.0
 
         yield from batch.broken(
             f"contact of finger {finger + 1} must be before the camera [m]", z <= 0.0, z
@@ -176,7 +200,12 @@ def object_pixels(batch: Batch, lens: Lens, model: ObjectModel) -> Iterator[Viol
     X_OC = invert_pose(batch.object_in_camera(lens.camera))
     beyond, chosen = np.zeros(len(batch)), []
     for i in range(len(batch)):
-        p_OQ = _points(X_OC[i], lens, batch["images"][i, 3], batch["masks"][i] == 1)
+        depth = batch["images"][i, 3]
+        seen = (batch["masks"][i] == 1) & lens.has_depth(depth)
+        # A corner of the mesh stands for an image whose depths are all lost.
+        p_OQ = model.visual_vertices[:1]
+        if seen.any():
+            p_OQ = _points(X_OC[i], lens, depth, seen)
         beyond[i] = (np.abs(p_OQ) - model.half_extents).max()
         chosen.append(p_OQ[np.linspace(0, len(p_OQ) - 1, MEASURED_PIXELS).astype(int)])
     yield from batch.broken(
@@ -195,12 +224,16 @@ def object_pixels(batch: Batch, lens: Lens, model: ObjectModel) -> Iterator[Viol
     )
 
 
-def _nearest_depth(depth: AnyArray, pixel: Array) -> float:
-    """Return the least depth [m] around a pixel (2,), which is clipped into the image."""
+def _nearest_depth(depth: AnyArray, lens: Lens, pixel: Array) -> float:
+    """Return the least depth [m] around a pixel (2,), which is clipped into the image.
+
+    It is infinite where no pixel around has a depth.
+    """
     size = len(depth)
     u, v = np.clip(np.rint(pixel), 0, size - 1).astype(int)
     low = np.maximum([v - SILHOUETTE, u - SILHOUETTE], 0)
-    return float(depth[low[0] : v + SILHOUETTE + 1, low[1] : u + SILHOUETTE + 1].min())
+    around = depth[low[0] : v + SILHOUETTE + 1, low[1] : u + SILHOUETTE + 1]
+    return float(around.min(initial=np.inf, where=lens.has_depth(around)))
 
 
 def _points(X_AC: Array, lens: Lens, depth: AnyArray, chosen: AnyArray) -> Array:

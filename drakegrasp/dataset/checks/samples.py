@@ -165,11 +165,13 @@ def object_values(batch: Batch, model: ObjectModel) -> Iterator[Violation]:
     X_TO = invert_pose(X_WT) @ batch.frame("world2obj")
     R_TO = X_TO[:, :3, :3]
     com = R_TO @ model.p_OOcm + X_TO[:, :3, 3]
-    inertia = (R_TO @ model.I_OOcm_O @ np.swapaxes(R_TO, 1, 2)).reshape(-1, 9)
+    # The mass is that of the trial, and the inertia in proportion.
+    factor = batch["object_props/work2mass"][:, 0].astype(float) / model.mass
+    inertia = (R_TO @ model.I_OOcm_O @ np.swapaxes(R_TO, 1, 2)).reshape(-1, 9) * factor[:, None]
+    scale = RELATIVE_TOLERANCE * np.trace(model.I_OOcm_O) * max(1.0, factor.max())
     for name, unit, values, tolerance in (
         ("work2com", "m", com, POSITION_TOLERANCE),
-        ("work2inertia", "kg m^2", inertia, RELATIVE_TOLERANCE * np.trace(model.I_OOcm_O)),
-        ("work2mass", "kg", np.full((len(batch), 1), model.mass), RELATIVE_TOLERANCE * model.mass),
+        ("work2inertia", "kg m^2", inertia, scale),
     ):
         off = np.abs(batch[f"object_props/{name}"] - values).max(axis=1)
         yield from batch.broken(
@@ -203,10 +205,10 @@ def same_as_trial(
     # The object's pose and both cameras' poses.
     X_TO, X_OG = unpack_pose(trials["X_TO"]), unpack_pose(trials["X_OG"])
     poses = {"frame_world2obj": X_WT @ X_TO}
+    starts = list(zip(X_TO @ X_OG, unpack_pose(trials["X_C0C"]), strict=True))
     for name, pose in zip(CAMERAS, (camera_pose_oto, camera_pose_otm), strict=True):
-        poses[f"frame_work2cam_{name}"] = np.array([pose(X, config) for X in X_TO @ X_OG]).reshape(
-            -1, 4, 4
-        )
+        X_TC = [pose(X_TG, config, X_C0C) for X_TG, X_C0C in starts]
+        poses[f"frame_work2cam_{name}"] = np.array(X_TC).reshape(-1, 4, 4)
     for name, expected in poses.items():
         off = np.abs(batch.pose(f"object_props/{name}") - expected).max(axis=(1, 2))
         yield from batch.broken(

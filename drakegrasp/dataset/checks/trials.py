@@ -152,7 +152,7 @@ def contacts(batch: Batch) -> Iterator[Violation]:
 
 def poses(batch: Batch) -> Iterator[Violation]:
     """The rotations of a trial's poses are orthonormal with determinant +1."""
-    for name in ("X_TO", "X_OG", "X_TO_lifted", "X_OG_lifted"):
+    for name in ("X_TO", "X_OG", "X_C0C", "X_TO_lifted", "X_OG_lifted"):
         yield from rotation(batch, name)
 
 

@@ -10,6 +10,7 @@ from functools import partial
 
 import numpy as np
 
+from drakegrasp.dataset.checks import conditions as condition_rules
 from drakegrasp.dataset.checks import consistency
 from drakegrasp.dataset.checks import trials as trial_rules
 from drakegrasp.dataset.checks.context import Context
@@ -50,6 +51,15 @@ def check_trials_file(trials: OpenFile, context: Context) -> None:
     ]
     if objects is not None and trials.count("objects") == len(objects):
         last.append(partial(trial_rules.resting_poses, X_TO=[entry.X_TO for entry in objects]))
+    if dataset is not None and trials.count("objects") == len(dataset.names):
+        last.append(
+            partial(
+                condition_rules.as_drawn,
+                names=dataset.names,
+                model=dataset.model,
+                config=dataset.manifest.config,
+            )
+        )
 
     # Numbers, then stages, which need a legal outcome, then what needs finite values, then what
     # needs sound poses.

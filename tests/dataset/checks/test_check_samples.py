@@ -106,7 +106,7 @@ SAMPLE_CASES: Mapping[str, tuple[str, str, Edit, str]] = {
     ),
     "com": (OTO, PROPS + "work2com", lambda p: p + 1e-3, "work2com must be the resting object's"),
     "scaled inertia": (OTO, PROPS + "work2inertia", lambda i: 1.1 * i, "work2inertia must be the"),
-    "scaled mass": (OTO, PROPS + "work2mass", lambda m: 1.1 * m, "work2mass must be the resting"),
+    "scaled mass": (OTO, PROPS + "work2mass", lambda m: 1.1 * m, "work2mass must be that of its"),
 }
 
 

@@ -1,0 +1,68 @@
+"""Rules of the conditions of attempts: friction, mass, looks, cameras and noise are those drawn.
+
+In: a `Batch` of rows of `/trials` or of samples. Out: a `Violation` for every row that is wrong. No
+file is read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+import numpy as np
+
+from drakegrasp.config import Config, RandomizeConfig
+from drakegrasp.dataset.checks.findings import AnyArray, Batch, Violation, all_per_row
+from drakegrasp.dataset.schema import CONDITION_FIELDS
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.simulation.randomization.draws import draw_conditions
+
+
+def as_drawn(
+    batch: Batch,
+    names: Sequence[str],
+    model: Callable[[str], ObjectModel | None],
+    config: Config,
+) -> Iterator[Violation]:
+    """The conditions of a trial are what the seed gives it, or the usual ones.
+
+    Args:
+        batch: Rows of `/trials`.
+        names: Names of the objects, by row of `/objects`.
+        model: Returns an object by its name, None where its file is broken.
+        config: What is drawn, and the seed.
+    """
+    expected = {f.name: np.array(batch[f.name]) for f in CONDITION_FIELDS}
+    for index in np.unique(batch["object"]).tolist():
+        known = model(names[index])
+        if known is None:
+            continue  # a finding already
+        rows = np.flatnonzero(batch["object"] == index)
+        # Where nothing is drawn all attempts of an object have the same conditions.
+        if config.randomize == RandomizeConfig():
+            for name, value in draw_conditions(known, config, 0, 0).values().items():
+                expected[name][rows] = value
+            continue
+        for row in rows:
+            numbers = int(batch["candidate"][row]), int(batch["standoff_index"][row])
+            for name, value in draw_conditions(known, config, *numbers).values().items():
+                expected[name][row] = value
+
+    for name, values in expected.items():
+        yield from batch.broken(
+            f"{name} must be what the seed gives the attempt",
+            ~all_per_row(batch[name] == values),
+            lambda i, name=name: str(batch[name][i]),  # type: ignore[misc]
+        )
+
+
+def same_as_trial(batch: Batch, trials: Mapping[str, AnyArray]) -> Iterator[Violation]:
+    """The conditions of a sample are its trial's, given the columns of the trials by row."""
+    for field in CONDITION_FIELDS:
+        own = "object_props/work2mass" if field.name == "mass" else f"conditions/{field.name}"
+        values = batch[own]
+        due = trials[field.name].astype(values.dtype).reshape(values.shape)
+        yield from batch.broken(
+            f"{own.split('/')[1]} must be that of its trial",
+            ~all_per_row(values == due),
+            lambda i, values=values: str(values[i]),  # type: ignore[misc]
+        )

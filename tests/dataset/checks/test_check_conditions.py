@@ -1,0 +1,116 @@
+"""Rules of the conditions: as drawn in a trial, as in the trial in a sample; noise is taken off."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from helpers.datasets import (
+    BELOW,
+    OTM,
+    OTO,
+    TRIALS,
+    change,
+    found,
+    make_dataset,
+    must_find,
+    set_at,
+)
+
+from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.schema import CONDITION_FIELDS
+
+#: Small turns: the boxes' contacts stay in view.
+DRAWN = (
+    *("randomize.object_colour=1", "randomize.table_colour=1", "randomize.light_angle_deg=60"),
+    *("randomize.light_strength=[0.2,1.5]", "randomize.camera_shift=0.005"),
+    *("randomize.camera_turn_deg=2", "randomize.depth_noise=[0.002,0.004]"),
+    *("randomize.depth_baseline=0.02", "randomize.friction_hand=[0.7,1.3]"),
+    *("randomize.friction_table=[0.7,1.3]", "randomize.mass=[0.5,1.5]"),
+)
+
+
+@pytest.fixture(scope="session")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset of boxes in which everything is drawn. Read only."""
+    folder = tmp_path_factory.mktemp("drawn")
+    return make_dataset(folder, tmp_path_factory.mktemp("meshes"), *DRAWN)
+
+
+@pytest.fixture
+def spoilt(drawn: Path, tmp_path: Path) -> Path:
+    """A copy of it to spoil."""
+    return Path(shutil.copytree(drawn, tmp_path / "out"))
+
+
+def test_nothing_is_found_where_everything_is_drawn(drawn: Path) -> None:
+    assert check_dataset(drawn) == []
+    for name in (OTO, OTM, TRIALS):
+        assert check_dataset(drawn / name) == []
+
+
+def test_every_condition_of_a_sample_differs_from_the_others(drawn: Path) -> None:
+    data = GraspDataset(drawn / OTO, split="test")
+    names = [f.name for f in CONDITION_FIELDS if f.name != "mass"]
+    assert list(data[0].conditions) == names
+    for name in (f"conditions/{n}" for n in names):
+        assert len(np.unique(data.column(name), axis=0)) == len(data)
+    mass, inertia = data.column("object_props/work2mass")[:, 0], [s.props for s in data]
+    assert len(np.unique(mass)) == len(data)
+    assert all(p["work2inertia"][0] > 0.0 for p in inertia)
+
+
+@pytest.mark.parametrize("name", [f.name for f in CONDITION_FIELDS])
+@pytest.mark.parametrize("where", ["sound", "drawn"])
+def test_a_condition_that_was_not_drawn_is_found(
+    request: pytest.FixtureRequest, tmp_path: Path, where: str, name: str
+) -> None:
+    out = Path(shutil.copytree(request.getfixturevalue(where), tmp_path / "out"))
+    # A pose stays one.
+    edit = set_at(3, to=0.5) if name == "X_C0C" else lambda v: v + v.dtype.type(1)
+    change(out, TRIALS, f"trials/{name}", BELOW, edit)
+    must_find(out, (TRIALS, "/trials", BELOW, f"{name} must be what the seed gives the attempt"))
+
+
+@pytest.mark.parametrize("name", [f.name for f in CONDITION_FIELDS if f.name != "mass"])
+def test_a_condition_of_a_sample_that_is_not_its_trials_is_found(spoilt: Path, name: str) -> None:
+    edit = set_at(3, to=0.5) if name == "X_C0C" else lambda v: v + v.dtype.type(1)
+    change(spoilt, OTM, f"train/conditions/{name}", 1, edit)
+    hits = found(spoilt)
+    assert (OTM, "/train", 1, f"{name} must be that of its trial") in hits
+    assert {h[:3] for h in hits} == {(OTM, "/train", 1)}
+
+
+def test_noise_of_another_seed_is_found_as_a_wrong_depth(spoilt: Path) -> None:
+    for name in (OTO, OTM):
+        change(spoilt, name, "train/conditions/depth_seed", 1, lambda v: v + v.dtype.type(1))
+    hits = found(spoilt / OTO)
+    assert {h[:3] for h in hits} == {(OTO, "/train", 1)}
+    assert any("points beside the mask must be on the table" in h[3] for h in hits)
+
+
+def test_a_depth_that_is_off_by_more_than_its_noise_is_found(spoilt: Path) -> None:
+    with h5py.File(spoilt / OTO) as file:
+        row = 1
+        beside = np.argwhere((file["train/masks"][row] == 0) & (file["train/images"][row, 3] < 0.7))
+    v, u = beside[len(beside) // 2]
+    change(spoilt, OTO, "train/images", row, lambda i: _raised(i, v, u))
+    must_find(
+        spoilt, (OTO, "/train", row, "points beside the mask must be on the table within 0.0003 m")
+    )
+
+
+def _raised(image: np.ndarray, v: int, u: int) -> np.ndarray:
+    image[3, v, u] -= 0.001
+    return image
+
+
+def test_lost_pixels_are_found_where_none_can_be_lost(out: Path) -> None:
+    with h5py.File(out / OTO) as file:
+        v, u = np.argwhere(file["train/masks"][1] == 1)[0]
+    change(out, OTO, "train/images", 1, set_at(3, v, u, to=0.75))
+    must_find(out, (OTO, "/train", 1, "points in the mask must be in the object's box"))

@@ -1,0 +1,140 @@
+"""What is drawn for an attempt: in range, spread over it, and by the seed and its number alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drakegrasp.config import Config, load_config
+from drakegrasp.frames import rotation_angle
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.simulation.randomization.conditions import Conditions, usual_conditions
+from drakegrasp.simulation.randomization.draws import draw_conditions
+
+COUNT = 400
+#: One key of `randomize` each, and the values of `Conditions.values` that it may change.
+KEYS: dict[str, tuple[str, ...]] = {
+    "object_colour=1": ("object_colour",),
+    "table_colour=0.5": ("table_colour",),
+    "light_angle_deg=40": ("light_direction",),
+    "light_strength=[0.5,2]": ("light_strength",),
+    "camera_shift=0.01": ("X_C0C",),
+    "camera_turn_deg=5": ("X_C0C",),
+    "depth_noise=[0.001,0.002]": ("depth_noise", "depth_seed"),
+    "friction_hand=[0.5,1.5]": ("friction_hand",),
+    "friction_table=[0.5,1.5]": ("friction_table",),
+    "mass=[0.5,2]": ("mass",),
+}
+
+
+def config_with(*keys: str) -> Config:
+    return load_config(overrides=[f"randomize.{key}" for key in keys])
+
+
+def draws(model: ObjectModel, config: Config) -> list[Conditions]:
+    return [draw_conditions(model, config, i // 3, i % 3) for i in range(COUNT)]
+
+
+def column(conditions: list[Conditions], name: str) -> np.ndarray:
+    return np.array([one.values()[name] for one in conditions])
+
+
+def equal(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
+    """Return the names of values that are equal."""
+    return [name for name, value in one.items() if np.array_equal(value, other[name])]
+
+
+def test_nothing_is_drawn_by_default(cube: ObjectModel) -> None:
+    config = load_config()
+    usual = usual_conditions(cube, config.physics).values()
+    assert equal(draw_conditions(cube, config, 3, 1).values(), usual) == list(usual)
+    assert (usual["mass"], usual["friction_hand"]) == (cube.mass, 0.71)
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_a_key_changes_its_own_values_and_switches_no_other_draw(
+    cube: ObjectModel, key: str
+) -> None:
+    usual = usual_conditions(cube, load_config().physics).values()
+    alone = draw_conditions(cube, config_with(key), 3, 1).values()
+    assert set(usual) - set(equal(alone, usual)) == set(KEYS[key])
+    # Shift and turn share a value.
+    if KEYS[key] != ("X_C0C",):
+        together = draw_conditions(cube, config_with(*KEYS), 3, 1).values()
+        assert set(KEYS[key]) <= set(equal(alone, together))
+
+
+@pytest.mark.parametrize(
+    ("name", "low", "high"),
+    [
+        ("friction_hand", 0.71 * 0.5, 0.71 * 1.5),
+        ("friction_table", 0.71 * 0.5, 0.71 * 1.5),
+        ("mass", 0.5, 2.0),
+        ("light_strength", 0.35, 1.4),
+        ("depth_noise", 0.001, 0.002),
+        ("object_colour", 0.0, 1.0),
+    ],
+)
+def test_ranges_are_kept_and_filled_evenly(
+    cube: ObjectModel, name: str, low: float, high: float
+) -> None:
+    values = column(draws(cube, config_with(*KEYS)), name)
+    assert values.min() >= low
+    assert values.max() <= high
+    share = (values - low) / (high - low)
+    assert share.mean() == pytest.approx(0.5, abs=0.05)
+    assert share.std() == pytest.approx(1.0 / np.sqrt(12.0), abs=0.03)
+
+
+def test_half_a_random_colour_leaves_half_of_the_own_one(cube: ObjectModel) -> None:
+    own = usual_conditions(cube, load_config().physics).appearance.table_colour
+    colours = column(draws(cube, config_with(*KEYS)), "table_colour")
+    assert np.all((colours >= own / 2.0) & (colours <= own / 2.0 + 0.5))
+
+
+def test_light_is_uniform_over_its_cap(cube: ObjectModel) -> None:
+    usual = usual_conditions(cube, load_config().physics).appearance.light_direction
+    ways = column(draws(cube, config_with(*KEYS)), "light_direction")
+    assert np.allclose(np.linalg.norm(ways, axis=1), 1.0, atol=1e-15)
+    cosine, least = ways @ usual, np.cos(np.deg2rad(40.0))
+    assert cosine.min() >= least - 1e-12
+    assert ((cosine - least) / (1.0 - least)).mean() == pytest.approx(0.5, abs=0.05)
+    # From all sides.
+    assert np.linalg.norm((ways - cosine[:, None] * usual).mean(axis=0)) < 0.05
+
+
+def test_camera_is_shifted_and_turned_about_all_axes_at_most_so_far(cube: ObjectModel) -> None:
+    poses = np.array([one.X_C0C for one in draws(cube, config_with(*KEYS))])
+    assert np.abs(poses[:, :3, 3]).max() <= 0.01
+    assert np.abs(poses[:, :3, 3]).max(axis=0).min() > 0.0099
+    turns = np.array([rotation_angle(pose[:3, :3]) for pose in poses])
+    assert turns.max() <= np.deg2rad(5.0) * np.sqrt(3.0) * 1.01
+    # x, y and z each reach 5 degrees, to first order the entries below the diagonal.
+    skew = np.abs([poses[:, 2, 1], poses[:, 0, 2], poses[:, 1, 0]])
+    assert np.all(skew.max(axis=1) > np.sin(np.deg2rad(4.8)))
+    assert np.abs(np.swapaxes(poses, 1, 2)[:, :3, :3] @ poses[:, :3, :3] - np.eye(3)).max() < 1e-15
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        lambda model, config: draw_conditions(model, config, 4, 1),
+        lambda model, config: draw_conditions(model, config, 3, 2),
+        lambda model, config: draw_conditions(model, load_config(config_path, seed=1), 3, 1),
+    ],
+    ids=["candidate", "stand-off", "seed"],
+)
+def test_another_attempt_has_other_draws(
+    cube: ObjectModel, other: Callable[[ObjectModel, Config], Conditions]
+) -> None:
+    config = load_config(config_path)
+    first = draw_conditions(cube, config, 3, 1).values()
+    assert equal(first, other(cube, config).values()) == []
+    assert equal(first, draw_conditions(cube, config, 3, 1).values()) == list(first)
+
+
+#: The preset that draws everything.
+config_path = "randomized"

@@ -1,0 +1,82 @@
+"""A scene with other friction and mass gives the bits of a scene that is built with them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.objects import STANDOFF, from_above, standing
+
+from drakegrasp.config import Config
+from drakegrasp.hand.description import Hand
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.outcomes import Outcome
+from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.randomization.conditions import Materials, usual_conditions
+from drakegrasp.simulation.scene import Scene
+from drakegrasp.simulation.trial import TrialRecord, run_attempt
+
+pytestmark = pytest.mark.sim
+
+
+def attempt_with(cube: ObjectModel, config: Config, **materials: float) -> Attempt:
+    usual = usual_conditions(cube, config.physics)
+    return replace(
+        from_above(cube, STANDOFF),
+        conditions=replace(usual, materials=replace(usual.materials, **materials)),
+    )
+
+
+def assert_same_bits(one: TrialRecord, other: TrialRecord) -> None:
+    assert one.outcome is other.outcome
+    for name in ("q_closed", "q_lifted", "X_TO_lifted", "X_OG_lifted", "slip", "turn"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    for name in ("closed", "lifted"):
+        np.testing.assert_array_equal(getattr(one, name).f_Q_O, getattr(other, name).f_Q_O)
+
+
+@pytest.mark.parametrize(
+    "materials",
+    [
+        Materials(friction_hand=0.3, friction_table=0.9, mass=1.4),
+        Materials(friction_hand=1.5, friction_table=0.2, mass=1.0),
+    ],
+)
+def test_materials_of_an_attempt_are_those_of_a_scene_built_with_them(
+    scene: Scene, cube: ObjectModel, config: Config, hand: Hand, materials: Materials
+) -> None:
+    changes = {k: v for k, v in vars(materials).items() if k != "mass"}
+    physics = config.physics.model_copy(update=changes)
+    factor = materials.mass / cube.mass
+    heavy = replace(cube, mass=materials.mass, I_OOcm_O=factor * cube.I_OOcm_O)
+    plain = from_above(cube, STANDOFF)
+    built = run_attempt(build_scene(heavy, physics, hand), standing(cube), plain, config)
+    assert built.outcome is Outcome.SUCCESS
+
+    found = run_attempt(
+        scene, standing(cube), attempt_with(cube, config, **vars(materials)), config
+    )
+    assert_same_bits(found, built)
+
+
+def test_nothing_remains_of_the_materials_of_the_attempt_before(
+    scene: Scene, cube: ObjectModel, config: Config
+) -> None:
+    plain, X_TO = from_above(cube, STANDOFF), standing(cube)
+    first = run_attempt(scene, X_TO, plain, config)
+    other = attempt_with(cube, config, friction_hand=0.4, friction_table=0.3, mass=1.3)
+    changed = run_attempt(scene, X_TO, other, config)
+    assert changed.slip != first.slip
+    assert_same_bits(run_attempt(scene, X_TO, plain, config), first)
+
+
+def test_friction_and_mass_decide_what_is_lost(
+    scene: Scene, cube: ObjectModel, config: Config
+) -> None:
+    X_TO = standing(cube)
+    slick = attempt_with(cube, config, friction_hand=0.05)
+    assert run_attempt(scene, X_TO, slick, config).outcome is not Outcome.SUCCESS
+    heavy = attempt_with(cube, config, mass=20.0)
+    assert run_attempt(scene, X_TO, heavy, config).outcome is not Outcome.SUCCESS
