@@ -93,6 +93,18 @@ camera:
   fov_y_deg: 40.0
   near: 0.02
   far: 1.0
+randomize:
+  object_colour: 0.5
+  table_colour: 0.4
+  light_angle_deg: 20.0
+  light_strength: [0.5, 1.2]
+  camera_shift: 0.01
+  camera_turn_deg: 5.0
+  depth_noise: [0.001, 0.002]
+  depth_baseline: 0.02
+  friction_hand: [0.8, 1.2]
+  friction_table: [0.6, 1.4]
+  mass: [0.9, 1.1]
 filters:
   min_depth_variance: 0.002
   min_camera_height: 0.02
@@ -232,7 +244,7 @@ def test_resolved_values_load_again_to_the_same(tmp_path: Path) -> None:
 
 
 def test_presets_are_listed() -> None:
-    assert preset_names() == ["paper", "released"]
+    assert preset_names() == ["paper", "randomized", "released"]
 
 
 def test_paper_is_the_default_and_states_the_papers_numbers() -> None:
@@ -243,6 +255,14 @@ def test_paper_is_the_default_and_states_the_papers_numbers() -> None:
 def test_released_differs_from_the_paper_in_exactly_the_published_numbers() -> None:
     values = dict(leaves(load_config("released").to_dict()))
     assert values == {**DEFAULT_VALUES, **RELEASED}
+
+
+def test_randomized_is_the_paper_with_every_draw_on() -> None:
+    values, off = load_config("randomized").to_dict(), Config().to_dict()
+    drawn, nothing = values.pop("randomize"), off.pop("randomize")
+    assert values == off
+    assert not any(nothing.values())
+    assert all(drawn.values())
 
 
 def test_override_reaches_into_a_section_and_leaves_its_other_keys() -> None:
@@ -304,6 +324,11 @@ def test_number_may_be_written_as_people_do(text: str, value: float) -> None:
         ("candidates.standoffs=0.1", r"candidates\.standoffs: must be .*, got 0\.1"),
         ("candidates.global_x_deg=[.inf]", r"global_x_deg\.0: must be a finite number, got inf"),
         ("candidates.spreads_deg=[.nan]", r"candidates\.spreads_deg\.0: must be .*, got nan"),
+        ("randomize.mass=[2, 1]", r"randomize\.mass: must be a range, low .*, got \[2\.0, 1\.0\]"),
+        ("randomize.mass=[0, 1]", r"randomize\.mass\.0: must be greater than 0, got 0"),
+        ("randomize.mass=1", r"randomize\.mass: must be a list, got 1"),
+        ("randomize.table_colour=2", r"table_colour: must be less than or equal to 1, got 2"),
+        ("randomize.light_angle_deg=70", r"light_angle_deg: must be .* equal to 60, got 70"),
         ("lift.p_TG=3", r"lift\.p_TG: must be .*, got 3"),
         ("lift.p_TG=[0, 0]", r"lift\.p_TG.*: must be .*, got \[0, 0\]"),
         ("lift.p_TG=[0, 0, 0, 1]", r"lift\.p_TG: must be .*, got \[0, 0, 0, 1\]"),
@@ -341,7 +366,7 @@ def test_file_that_is_no_configuration_is_refused(tmp_path: Path, text: str, mes
 
 @pytest.mark.parametrize("name", ["papper", "no/such.yaml", "."])
 def test_missing_file_is_refused_with_the_presets_there_are(name: str) -> None:
-    with pytest.raises(ConfigError, match=rf"presets paper, released, got '{re.escape(name)}'"):
+    with pytest.raises(ConfigError, match=rf"presets paper, randomized, released, got '{re.escape(name)}'"):
         load_config(name)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from importlib import metadata
 from itertools import chain, groupby, islice, zip_longest
 from math import sqrt
@@ -34,6 +34,7 @@ from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.drive import drive_of
+from drakegrasp.simulation.randomization.conditions import Materials, usual_conditions
 
 T = TypeVar("T")
 #: What a lift is in the dataset: a sample, held but removed by the filters, or lost.
@@ -57,6 +58,7 @@ class StoredLift:
         group: What it is in the dataset.
         outcome: Its verdict there.
         pregrasp: The palm pose and the spread from which the hand closed.
+        materials: The friction and mass with which it was tried.
     """
 
     trial_id: int
@@ -64,6 +66,7 @@ class StoredLift:
     group: Group
     outcome: Outcome
     pregrasp: Pregrasp
+    materials: Materials
 
 
 def draw_lifts(out: Path, count: int) -> list[StoredLift]:
@@ -183,6 +186,7 @@ def _read_lifts(out: Path) -> list[StoredLift]:
             names = [name.decode() for name in file["objects/name"][:]]
             objects, outcomes = trials["object"][:], trials["outcome"][:]
             X_OG, spreads = trials["X_OG"][:], trials["spread"][:]
+            materials = {f.name: trials[f.name][:] for f in fields(Materials)}
             # Only what was lifted has the time of a lift.
             lifted = np.isfinite(trials["time_lift"][:])
             kept = successes["trial_id"][:][successes["removal"][:] == Removal.KEPT]
@@ -201,6 +205,7 @@ def _read_lifts(out: Path) -> list[StoredLift]:
                 group=held if outcome is Outcome.SUCCESS else "lost",
                 outcome=outcome,
                 pregrasp=Pregrasp(X_OG=unpack_pose(X_OG[row]), spread=float(spreads[row])),
+                materials=Materials(**{k: float(v[row]) for k, v in materials.items()}),
             )
         )
     return lifts
@@ -222,8 +227,10 @@ def _try_object(
 
     prepared = load_prepared(out, name, config)
     peer = MujocoBaseline(prepared.model, prepared.X_TO, config)
+    usual = usual_conditions(prepared.model, config.physics)
     for lift in lifts:
-        trial = peer.run(lift.pregrasp)
+        conditions = replace(usual, materials=lift.materials)
+        trial = peer.run(replace(lift.pregrasp, conditions=conditions))
         yield {
             "trial_id": lift.trial_id,
             "object": lift.object_name,

@@ -8,6 +8,7 @@ that of `drakegrasp.simulation.trial`: the same hand, drive, pads, path and verd
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import mujoco
@@ -28,6 +29,7 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import MAX_BESIDE
 from drakegrasp.simulation.drive import drive_of
+from drakegrasp.simulation.randomization.conditions import Materials, usual_materials
 from drakegrasp.simulation.trajectory import lift_path
 from drakegrasp.simulation.verdict import judge_closed, judge_lifted
 
@@ -89,6 +91,7 @@ class MujocoBaseline:
             ConfigError: See `drive_of`.
         """
         self._config, self._hand = config, load_hand(config.hand)
+        self._usual = usual_materials(model, config.physics)
         self._X_WO = X_WT @ X_TO
         scene = build_mujoco_scene(model, self._hand, config)
         self.parts, self._spreads = scene.parts, scene.spreads
@@ -107,8 +110,30 @@ class MujocoBaseline:
         q, v = m.joint("object").qposadr[0], m.joint("object").dofadr[0]
         self._object_q, self._object_v = slice(q, q + 7), slice(v, v + 6)
         self._object_inertia = m.dof_M0[self._object_v].copy()
+        self._weights = {name: getattr(m, name)[at].copy() for name, at in self._weighed()}
         closing = [finger.closing_joint for finger in hand.fingers]
         self._closing_v = [m.joint(name).dofadr[0] for name in closing]
+
+    def _weighed(self) -> Iterator[tuple[str, int | slice]]:
+        """Yield MuJoCo's arrays that are in proportion to the object's mass, and its place there.
+
+        Those named `invweight0` are in inverse proportion.
+        """
+        body, velocity = self._object, self._object_v
+        for name in ("body_mass", "body_subtreemass", "body_inertia", "body_invweight0"):
+            yield name, body
+        for name in ("dof_M0", "dof_invweight0"):
+            yield name, velocity
+
+    def _set_materials(self, materials: Materials) -> None:
+        """Give the object its mass, and the coefficient of friction to each side."""
+        m, factor = self._model, materials.mass / self._usual.mass
+        for name, at in self._weighed():
+            scale = 1.0 / factor if name.endswith("invweight0") else factor
+            getattr(m, name)[at] = scale * self._weights[name]
+        self._object_inertia = m.dof_M0[self._object_v].copy()
+        m.geom_friction[:, 0] = materials.friction_hand
+        m.geom_friction[self._table, 0] = materials.friction_table
 
     def run(self, attempt: Pregrasp) -> PeerTrial:
         """Return the result of one attempt; its fingers close from the open hand."""
@@ -118,6 +143,8 @@ class MujocoBaseline:
         X_WG = self._X_WO @ attempt.X_OG
         if X_WG[2, 3] <= X_WT[2, 3]:
             return PeerTrial(outcome=Outcome.BELOW_TABLE)
+        conditions = attempt.conditions
+        self._set_materials(self._usual if conditions is None else conditions.materials)
         self._reset(X_WG, attempt.spread)
         if self._open_hand_collides():
             return PeerTrial(outcome=Outcome.START_COLLISION)

@@ -7,7 +7,7 @@ In: grasp vectors in one of three frames, with a mesh, or with rows of a dataset
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from drakegrasp.config import Config, parse_config
+from drakegrasp.config import Config, RandomizeConfig, parse_config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.reader import GraspDataset
@@ -155,7 +155,9 @@ def place_grasps(grasps: npt.ArrayLike, arguments: VerifyArguments) -> list[Plac
             for index, p_OQ, nhat_Q_O in zip(target.indices, *contacts, strict=True)
         ]
     _refuse_other_units(placed_grasps)
-    return placed_grasps
+    if arguments.dataset is None or arguments.config is not None:
+        return placed_grasps
+    return _as_tried(placed_grasps, arguments.dataset, rows, known.randomize)
 
 
 def _refuse_contradictions(arguments: VerifyArguments) -> None:
@@ -246,6 +248,43 @@ def _targets_of_rows(
         poses = read_pose(X_TC[indices], "the camera's pose") if in_camera else None
         targets.append(_Target(placed=placed, indices=indices, X_TC=poses))
     return targets
+
+
+def _as_tried(
+    grasps: Sequence[PlacedGrasp],
+    dataset: GraspDataset,
+    rows: npt.NDArray[np.int64],
+    rules: RandomizeConfig,
+) -> list[PlacedGrasp]:
+    """Return grasps with the friction and mass that were drawn for their rows.
+
+    Args:
+        grasps: On the objects of a dataset.
+        dataset: The data file.
+        rows: (n,), the row of each grasp, by its index.
+        rules: What was drawn for the dataset.
+    """
+    # The drawn values by row.
+    frictions = {
+        name: dataset.column(f"conditions/{name}")[rows].astype(float)
+        for name in ("friction_hand", "friction_table")
+        if getattr(rules, name) is not None
+    }
+    masses = dataset.column("object_props/work2mass")[rows, 0].astype(float)
+
+    tried = []
+    for grasp in grasps:
+        i, placed, config = grasp.index, grasp.placed, grasp.config
+        if frictions:
+            drawn = {name: float(values[i]) for name, values in frictions.items()}
+            physics = config.physics.model_copy(update=drawn)
+            config = config.model_copy(update={"physics": physics})
+        if rules.mass is not None:
+            mass, known = float(masses[i]), placed.model
+            inertia = mass / known.mass * known.I_OOcm_O
+            placed = replace(placed, model=replace(known, mass=mass, I_OOcm_O=inertia))
+        tried.append(replace(grasp, placed=placed, config=config))
+    return tried
 
 
 def _choose_rows(

@@ -46,6 +46,18 @@ def test_drawn_lifts_are_what_the_dataset_says(dataset):
                 assert lift.group == "lost"
 
 
+def test_drawn_lifts_have_their_own_friction_and_mass(tmp_path):
+    (tmp_path / "meshes").mkdir()
+    ranges = ("randomize.mass=[0.5,1.5]", "randomize.friction_hand=[0.7,1.3]")
+    out = make_dataset(tmp_path / "data", tmp_path / "meshes", *ranges)
+    lifts = draw_lifts(out, 10)
+    with h5py.File(out / TRIALS) as file:
+        for lift in lifts:
+            for name, value in vars(lift.materials).items():
+                assert value == file[f"trials/{name}"][lift.trial_id]
+    assert len({lift.materials for lift in lifts}) == len(lifts)
+
+
 def test_hand_on_the_table_after_closing_is_no_lift(dataset):
     drawn = {lift.trial_id for lift in draw_lifts(dataset, 1000)}
     on_table = [i for i, outcome in enumerate(OUTCOMES) if outcome is Outcome.TABLE_CONTACT]

@@ -14,6 +14,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import fingertip_poses
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
+from drakegrasp.simulation.randomization.conditions import usual_conditions
 
 pytest.importorskip("mujoco")
 pytest.importorskip("coacd")
@@ -80,6 +81,27 @@ def test_slippery_cube_is_not_held(cube: ObjectModel, config: Config) -> None:
     trial = MujocoBaseline(cube, standing(cube), slick).run(from_above(cube, STANDOFF))
     assert trial.lifted
     assert trial.outcome in (Outcome.DROPPED, Outcome.SLIPPED)
+
+
+def test_friction_and_mass_of_an_attempt_are_those_of_a_model_built_with_them(
+    cube: ObjectModel, config: Config
+) -> None:
+    slick = override_config(config, ["physics.friction_hand=0.3", "physics.friction_table=0.4"])
+    heavy = replace(cube, mass=1.5, I_OOcm_O=1.5 * cube.I_OOcm_O)
+    built = MujocoBaseline(heavy, standing(cube), slick)
+    conditions = usual_conditions(heavy, slick.physics)
+
+    # What ran before leaves nothing.
+    found, attempt = MujocoBaseline(cube, standing(cube), config), from_above(cube, STANDOFF)
+    before = found.run(attempt)
+    other = found.run(replace(attempt, conditions=conditions))
+    for name in ("body_mass", "body_inertia", "body_invweight0", "dof_M0", "geom_friction"):
+        one, two = getattr(found._model, name), getattr(built._model, name)
+        np.testing.assert_allclose(one[1:], two[1:], rtol=1e-9, err_msg=name)
+    expected = built.run(attempt)
+    assert other.outcome is expected.outcome is Outcome.SUCCESS
+    assert other.slip == pytest.approx(expected.slip, rel=1e-3)
+    assert found.run(attempt) == before != other
 
 
 def test_fingertips_are_where_kinematics_puts_them(

@@ -27,8 +27,10 @@ from drakegrasp.objects.builtin.catalog import export_builtin
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.candidates import make_attempts, normal_candidates, rotation_candidates
+from drakegrasp.simulation.randomization.draws import draw_conditions
 from drakegrasp.simulation.robustness import _noise_factor, _palm_noise
 from drakegrasp.simulation.screen import predict
+from drakegrasp.vision.depth_sensor import DepthSensor, spoil_depth
 
 #: Of the real meshes: a thin one, one with many faces, one that lies on its side.
 REAL = ("24_mug_final", "42_wineglass_final", "110_bunny_final")
@@ -78,6 +80,11 @@ def object_draws(source: MeshSource) -> Iterator[tuple[str, str]]:
             np.array([a.seed for a in attempts], dtype=np.uint64),
         ),
     )
+    drawn = [
+        draw_conditions(model, load_config("randomized"), a.candidate, a.standoff_index).values()
+        for a in attempts[:PREDICTED]
+    ]
+    yield "conditions", digest(*(np.array([d[name] for d in drawn]) for name in drawn[0]))
     yield "normals", digest(normal_candidates(model, 1000, Stream(7)))
     predictions = predict(model, hand, prepared.X_TO, attempts[:PREDICTED], config.screen)
     yield (
@@ -119,6 +126,10 @@ def main(meshes: Path | None) -> dict[str, object]:
         *(_palm_noise(stream, config) for _ in range(100)),
         np.array([_noise_factor(stream, 0.1) for _ in range(100)]),
     )
+    clean = np.full((64, 64), 0.3, dtype=np.float32)
+    sensor = DepthSensor(noise=1e-3, baseline=0.02, seed=7)
+    spoilt = [spoil_depth(clean, np.eye(3), sensor, c, load_config().camera) for c in range(2)]
+    found["depth noise"] = digest(*spoilt)
     found["kernels"] = kernels()
     return found
 
