@@ -366,7 +366,9 @@ def test_file_that_is_no_configuration_is_refused(tmp_path: Path, text: str, mes
 
 @pytest.mark.parametrize("name", ["papper", "no/such.yaml", "."])
 def test_missing_file_is_refused_with_the_presets_there_are(name: str) -> None:
-    with pytest.raises(ConfigError, match=rf"presets paper, randomized, released, got '{re.escape(name)}'"):
+    with pytest.raises(
+        ConfigError, match=rf"presets paper, randomized, released, got '{re.escape(name)}'"
+    ):
         load_config(name)
 
 

@@ -1,0 +1,127 @@
+"""A build in which everything is drawn: the usual attempts, each in conditions of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from conftest import SMALL
+from helpers.assertions import assert_same_dataset
+
+from drakegrasp.api import verify_grasps
+from drakegrasp.build.pipeline import build
+from drakegrasp.build.replay import record_trial, replay_trial
+from drakegrasp.config import Config, load_config
+from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.schema import CONDITION_FIELDS
+from drakegrasp.objects.sources import MeshSource, find_meshes
+from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.executor import run_here
+
+pytestmark = [pytest.mark.sim, pytest.mark.slow]
+
+#: The object that is built; of the small dataset it has most grasps.
+NAME = "11_box_slim"
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return load_config("randomized", overrides=[*SMALL, "candidates.max=20"])
+
+
+@pytest.fixture(scope="module")
+def sources(small_meshes: Path) -> list[MeshSource]:
+    return [source for source in find_meshes(small_meshes) if source.name == NAME]
+
+
+@pytest.fixture(scope="module")
+def randomized(
+    sources: list[MeshSource], config: Config, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """The dataset. Read only."""
+    out = tmp_path_factory.mktemp("randomized") / "out"
+    build(sources, out, config, run_here, show=False)
+    return out
+
+
+def trials(out: Path) -> dict[str, np.ndarray]:
+    """Return the columns of the object's rows in `/trials`."""
+    with h5py.File(out / "trials.hdf5") as file:
+        names = [name.decode() for name in file["objects/name"][:]]
+        rows = file["trials/object"][:] == names.index(NAME)
+        return {name: values[:][rows] for name, values in file["trials"].items()}
+
+
+def test_check_finds_nothing(randomized: Path) -> None:
+    assert [str(v) for v in check_dataset(randomized)] == []
+
+
+def test_attempts_are_those_of_a_build_without_draws(randomized: Path, small_dataset: Path) -> None:
+    drawn = trials(randomized)
+    usual = {k: v[: len(drawn["outcome"])] for k, v in trials(small_dataset).items()}
+    for name in ("X_TO", "X_OG", "spread", "seed", "candidate", "standoff_index"):
+        np.testing.assert_array_equal(drawn[name], usual[name])
+    for name in (f.name for f in CONDITION_FIELDS):
+        assert len(np.unique(usual[name], axis=0)) == 1
+        assert len(np.unique(drawn[name], axis=0)) == len(drawn[name])
+    # The simulation goes its own way.
+    lifted = np.isfinite(drawn["slip"]) & np.isfinite(usual["slip"])
+    assert lifted.any()
+    assert np.all(drawn["slip"][lifted] != usual["slip"][lifted])
+
+
+def test_order_of_work_changes_nothing(
+    sources: list[MeshSource], config: Config, randomized: Path, tmp_path: Path
+) -> None:
+    def backwards(function: Callable, items: Iterable) -> Iterator:
+        return (function(item) for item in reversed(list(items)))
+
+    build(sources, tmp_path / "out", config, backwards, show=False)
+    assert_same_dataset(randomized, tmp_path / "out")
+
+
+@pytest.mark.parametrize("outcome", [Outcome.SUCCESS, Outcome.MISSING_FINGERTIP])
+def test_replay_gives_the_same_bits(randomized: Path, tmp_path: Path, outcome: Outcome) -> None:
+    rows = np.flatnonzero(trials(randomized)["outcome"] == outcome)
+    replay = replay_trial(randomized, int(rows[0]))
+    assert replay.same, replay.differences
+    assert record_trial(randomized, int(rows[0]), tmp_path / "trial.html") is outcome
+
+
+def test_images_differ_in_light_and_colour_and_lose_depths_beside_the_object(
+    randomized: Path, small_dataset: Path
+) -> None:
+    data = GraspDataset(randomized / "grasping_oto.hdf5", split="test")
+    means = np.array([s.image[:3, s.mask == 1].mean(axis=1) for s in data])
+    assert np.ptp(means, axis=0).min() > 0.1
+
+    # Pixels without a depth in images whose border shows the table all around.
+    usual = GraspDataset(small_dataset / "grasping_oto.hdf5", split="test")
+    lost, lost_usual = ([_lost_within(s.image[3]) for s in every] for every in (data, usual))
+    assert max(lost) > 50
+    assert max(lost_usual) == 0
+
+
+def _lost_within(depth: np.ndarray) -> int:
+    """Return how many pixels have no depth, 0 if the border of the image has such pixels."""
+    lost = depth == np.float32(0.75)
+    border = np.concatenate([lost[0], lost[-1], lost[:, 0], lost[:, -1]])
+    return 0 if border.any() else int(lost.sum())
+
+
+def test_grasps_are_verified_with_their_own_friction_and_mass(randomized: Path) -> None:
+    data = GraspDataset(randomized / "grasping_oto.hdf5", split="test")
+    rows = [0, 1]
+    grasps = np.array([data[row].grasp for row in rows])
+    for row, verdict in zip(
+        rows, verify_grasps(grasps, dataset=data, rows=rows, method="forces"), strict=True
+    ):
+        props, conditions = data[row].props, data[row].conditions
+        assert verdict.placed.model.mass == pytest.approx(float(props["work2mass"][0]))
+        physics = verdict.config.physics
+        assert physics.friction_hand == pytest.approx(float(conditions["friction_hand"]))
+        assert physics.friction_table == pytest.approx(float(conditions["friction_table"]))
