@@ -61,7 +61,8 @@ _OPTIONS = (
     click.option(
         "--config",
         metavar="YAML|PRESET",
-        help="Configuration: a file, or the preset paper or released.  [default: paper]",
+        help="Configuration: a file, or the preset paper, randomized or released.  [default: "
+        "paper]",
     ),
     set_option,
     click.option(

@@ -66,8 +66,8 @@ if TYPE_CHECKING:
 @click.option(
     "--config",
     metavar="YAML|PRESET",
-    help="Configuration: a file, or the preset paper or released.  [default: that of the dataset, "
-    "else paper]",
+    help="Configuration: a file, or the preset paper, randomized or released.  [default: that of "
+    "the dataset, else paper]",
 )
 @set_option
 @click.option(

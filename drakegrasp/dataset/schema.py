@@ -31,7 +31,7 @@ CONVENTIONS = {
     "three rows of the 4x4 matrix, row-major; X_AB likewise",
     "frames": "W world; T = work, centre of the table top, p_WT = (0, 0, 0.65); O object, centre "
     "of the mesh's bounding box, axes of the mesh file; Ocm its centre of mass; G palm, +Gz out "
-    "of the palm; Q contact point; C camera; I image",
+    "of the palm; Q contact point; C camera; C0 its usual pose behind the palm; I image",
     "camera_axes": "OpenCV and Drake: +X right, +Y down, +Z forward; pixel centres at integers",
     "depth": "z of the camera frame in metres; pixels with nothing before `far`, and those that a "
     "depth camera would lose, hold `far`",

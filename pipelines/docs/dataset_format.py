@@ -75,8 +75,8 @@ table then, and the forces of the fingertips need not balance.
 
 A file is read only if its `schema_version` is the one above. Every command and the reader refuse
 another one with a line that names the file and both versions: build the dataset again, in another
-directory. Version 1 had other labels: fingers that the object pushed open, and contacts anywhere on
-a fingertip's link.
+directory. Version 2 had no conditions of an attempt. Version 1 had other labels, too: fingers that
+the object pushed open, and contacts anywhere on a fingertip's link.
 
 ## Seals
 
@@ -112,7 +112,8 @@ A sample has two grasps. `grasps` are the contacts where closing ended, on the o
 freed. `grasps_held` are those at the end of the lift, where the object may have moved in the hand;
 they are drawn on the object in its resting pose, as if hand and object were put back together. All
 names that end in `_held` are of that instant, in that way. `grasp_props/` says how well the hand
-holds; its words are explained in [outcomes](outcomes.md#held-precision-stable).
+holds; its words are explained in [outcomes](outcomes.md#held-precision-stable). `conditions/` are
+the values in use, drawn for the attempt or not, see [randomisation](../explanation/randomization.md).
 """
 
 _VERIFICATION = """

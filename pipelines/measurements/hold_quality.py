@@ -21,7 +21,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linprog
 
-from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import TRIALS_FILE, model_path
 from drakegrasp.frames import unpack_pose
 from drakegrasp.objects.model import load_object
@@ -40,16 +39,15 @@ Array = npt.NDArray[np.float64]
 @click.argument("out", type=click.Path(path_type=Path, exists=True, file_okay=False))
 def main(out: Path) -> None:
     """Run the script."""
-    friction = read_manifest(out).config.physics.friction_hand
     with h5py.File(out / TRIALS_FILE) as file:
         trials = {name: column[()] for name, column in file["trials"].items()}
         names = file["objects/name"].asstr()[()]
         removal = file["successes/removal"][()]
-    click.echo(json.dumps(figures(out, trials, names, removal, friction), indent=1))
+    click.echo(json.dumps(figures(out, trials, names, removal), indent=1))
 
 
 def figures(
-    out: Path, trials: dict[str, Any], names: npt.NDArray[Any], removal: Any, friction: float
+    out: Path, trials: dict[str, Any], names: npt.NDArray[Any], removal: Any
 ) -> dict[str, Any]:
     """Return all figures of a dataset."""
     attempts = len(trials["outcome"])
@@ -67,9 +65,7 @@ def figures(
     for stage, pose in (("closed", "X_TO"), ("lifted", "X_TO_lifted")):
         for kind in ("points", "patches"):
             answers = [
-                _balances(
-                    trials, row, stage, pose, models[names[trials["object"][row]]], kind, friction
-                )
+                _balances(trials, row, stage, pose, models[names[trials["object"][row]]], kind)
                 for row in held.tolist()
             ]
             balance[f"{stage}, {kind}"] = {
@@ -108,7 +104,7 @@ def figures(
 
 
 def _balances(
-    trials: dict[str, Any], row: int, stage: str, pose: str, model: Any, kind: str, friction: float
+    trials: dict[str, Any], row: int, stage: str, pose: str, model: Any, kind: str
 ) -> float:
     """Return the least limit of a fingertip's normal force [N] that carries the weight, or inf."""
     p, n = trials[f"{stage}_p_OQ"][row], trials[f"{stage}_nhat_Q_O"][row]
@@ -119,6 +115,7 @@ def _balances(
     )
 
     # The edges of all cones as wrenches about the centre of mass, with a normal force of 1 N.
+    friction, mass = trials["friction_hand"][row], trials["mass"][row]
     forces, points, finger = [], [], []
     angles = 2.0 * np.pi * np.arange(EDGES) / EDGES
     rims = 2.0 * np.pi * np.arange(RIM) / RIM if kind == "patches" else np.zeros(1)
@@ -137,7 +134,7 @@ def _balances(
 
     # Least t with the sum of each finger's normal forces at most t.
     R_TO = unpack_pose(trials[pose][row])[:3, :3]
-    weight = np.concatenate([R_TO.T @ [0.0, 0.0, model.mass * GRAVITY], np.zeros(3)])
+    weight = np.concatenate([R_TO.T @ [0.0, 0.0, mass * GRAVITY], np.zeros(3)])
     fingers = np.eye(len(p))[np.array(finger)].T
     result = linprog(
         np.append(np.zeros(len(f)), 1.0),

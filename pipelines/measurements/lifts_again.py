@@ -22,6 +22,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from drakegrasp.build.attempts import list_attempts
 from drakegrasp.config import Config, override_config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import TRIALS_FILE
@@ -29,7 +30,6 @@ from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.progress import Report, progress_bar
-from drakegrasp.simulation.candidates import make_attempts
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.simulation.verdict import is_stable
@@ -59,8 +59,11 @@ def lift_again(
         other: The configuration of the simulations.
         report: Is told the progress.
     """
-    # The dataset's own configuration made the attempts; one hand has a drive that nothing opens.
+    # The dataset's own configuration made the attempts, friction and mass are those asked for.
+    # One hand has a drive that nothing opens.
     config = read_manifest(dataset).config
+    asked = {"physics": other.physics, "randomize": other.randomize}
+    rules = config.model_copy(update=asked)
     hand = load_hand(other.hand)
     fingers = tuple(replace(finger, holding_torque=UNLIMITED) for finger in hand.fingers)
     strong = replace(hand, fingers=fingers)
@@ -76,9 +79,7 @@ def lift_again(
             build_scene(prepared.model, other.physics, each) for each in (hand, strong)
         )
         count = range(len(prepared.candidates))
-        made = make_attempts(
-            prepared.candidates, count, config.candidates, name=names[index], seed=config.seed
-        )
+        made = list_attempts(prepared, count, rules)
         attempts = {(a.candidate, a.standoff_index): a for a in made}
 
         # Its lifts again.

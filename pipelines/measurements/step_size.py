@@ -14,12 +14,13 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+from drakegrasp.build.attempts import list_attempts
 from drakegrasp.config import Config, override_config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
 from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome, Stage
-from drakegrasp.simulation.candidates import Attempt, make_attempts
+from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.trial import run_attempt
 
@@ -56,9 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             continue
         prepared = load_prepared(arguments.dataset, entry.name, config)
         count = range(len(prepared.candidates))
-        made = make_attempts(
-            prepared.candidates, count, config.candidates, name=entry.name, seed=config.seed
-        )
+        made = list_attempts(prepared, count, config)
         attempts = [a for a in made if a.ray_hits][: arguments.attempts]
         pairs.update(
             zip(
