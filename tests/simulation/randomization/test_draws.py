@@ -12,9 +12,11 @@ from drakegrasp.config import Config, load_config
 from drakegrasp.frames import rotation_angle
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.randomization.conditions import Conditions, usual_conditions
-from drakegrasp.simulation.randomization.draws import draw_conditions
+from drakegrasp.simulation.randomization.draws import WORDS, draw_conditions
 
 COUNT = 400
+#: The preset that draws everything.
+PRESET = "randomized"
 #: One key of `randomize` each, and the values of `Conditions.values` that it may change.
 KEYS: dict[str, tuple[str, ...]] = {
     "object_colour=1": ("object_colour",),
@@ -89,6 +91,11 @@ def test_ranges_are_kept_and_filled_evenly(
     assert share.std() == pytest.approx(1.0 / np.sqrt(12.0), abs=0.03)
 
 
+def test_no_two_quantities_share_a_word() -> None:
+    places = [i for words in WORDS.values() for i in range(words.start, words.stop)]
+    assert places == list(range(len(places)))
+
+
 def test_half_a_random_colour_leaves_half_of_the_own_one(cube: ObjectModel) -> None:
     own = usual_conditions(cube, load_config().physics).appearance.table_colour
     colours = column(draws(cube, config_with(*KEYS)), "table_colour")
@@ -123,18 +130,14 @@ def test_camera_is_shifted_and_turned_about_all_axes_at_most_so_far(cube: Object
     [
         lambda model, config: draw_conditions(model, config, 4, 1),
         lambda model, config: draw_conditions(model, config, 3, 2),
-        lambda model, config: draw_conditions(model, load_config(config_path, seed=1), 3, 1),
+        lambda model, config: draw_conditions(model, load_config(PRESET, seed=1), 3, 1),
     ],
     ids=["candidate", "stand-off", "seed"],
 )
 def test_another_attempt_has_other_draws(
     cube: ObjectModel, other: Callable[[ObjectModel, Config], Conditions]
 ) -> None:
-    config = load_config(config_path)
+    config = load_config(PRESET)
     first = draw_conditions(cube, config, 3, 1).values()
     assert equal(first, other(cube, config).values()) == []
     assert equal(first, draw_conditions(cube, config, 3, 1).values()) == list(first)
-
-
-#: The preset that draws everything.
-config_path = "randomized"
