@@ -113,7 +113,8 @@ freed. `grasps_held` are those at the end of the lift, where the object may have
 they are drawn on the object in its resting pose, as if hand and object were put back together. All
 names that end in `_held` are of that instant, in that way. `grasp_props/` says how well the hand
 holds; its words are explained in [outcomes](outcomes.md#held-precision-stable). `conditions/` are
-the values in use, drawn for the attempt or not, see [randomisation](../explanation/randomization.md).
+the values in use, drawn for the attempt or not, see
+[randomisation](../explanation/randomization.md).
 """
 
 _VERIFICATION = """
