@@ -32,6 +32,7 @@ ORDER = (
     "build",
     "cluster",
     "verification",
+    "exchange",
     "bench",
     "api",
     "cli",
@@ -49,6 +50,7 @@ WALLS = {
     "click": ("cli",),
     "matplotlib": ("visualization", "verification.figure"),
     "pydrake": ("hand", "vision", "simulation", "visualization", "verification", "bench"),
+    "pyarrow": ("exchange",),
 }
 #: Modules that name a type of a library for the type checker alone: what callers give or get.
 NAMES_TYPES = {("api", "distributed"), ("verification.result", "matplotlib")}

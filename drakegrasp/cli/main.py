@@ -15,6 +15,7 @@ import click
 
 from drakegrasp.cli.bench import bench
 from drakegrasp.cli.build import assemble, build, stats
+from drakegrasp.cli.export import export
 from drakegrasp.cli.group import main
 from drakegrasp.cli.options import (
     manifest_option,
@@ -145,7 +146,9 @@ def replay(out: Path, trial: int, html: Path | None) -> None:
 
 
 # The help lists them in this order.
-for _command in (doctor, objects, audit, build, assemble, check, stats, replay, verify, bench):
+for _command in (
+    *(doctor, objects, audit, build, assemble, check, stats, replay, verify, export, bench),
+):
     main.add_command(_command)
 
 

@@ -63,6 +63,7 @@ class GraspDataset:
         path, split: As given.
         camera: Camera of the images and of the grasps' frame, `oto` or `otm`.
         K: Camera matrix (3, 3) [px].
+        image_size: Edge of the square images [px].
 
     Raises:
         DataError: If the file is missing, of another kind or schema, or the split is unknown.
@@ -79,6 +80,7 @@ class GraspDataset:
                 # The version first: another schema may have other fields.
                 refuse_other_schema(self.path, file.attrs["schema_version"])
                 self._length = len(file[split]["grasps"])
+                self.image_size = int(file[split]["images"].shape[-1])
                 self.K = np.array(file.attrs["K"])
                 self.camera = str(file.attrs["camera"])
         except (OSError, KeyError) as error:
@@ -118,13 +120,21 @@ class GraspDataset:
         Raises:
             DataError: If there is no such field.
         """
+        return self.rows(name, 0, len(self))
+
+    def rows(self, name: str, start: int, stop: int) -> npt.NDArray[Any]:
+        """Return the rows `start` to `stop` - 1 of a field, fewer where the split ends.
+
+        Raises:
+            DataError: If there is no such field.
+        """
         names = {f.name: f for f in DATA_FIELDS}
         if name not in names:
             raise DataError(f"field must be one of {', '.join(names)}, got {name!r}")
         dataset = self._open()[self.split][name]
         if names[name].dtype == "str":
-            return np.asarray(dataset.asstr()[:])
-        return np.asarray(dataset[:])
+            return np.asarray(dataset.asstr()[start:stop])
+        return np.asarray(dataset[start:stop])
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_file": None, "_process": -1}

@@ -12,6 +12,7 @@ import hashlib
 import os
 import re
 import secrets
+import shutil
 import sys
 import time
 from collections.abc import Iterator
@@ -59,6 +60,34 @@ def write_atomic(path: Path, content: bytes) -> None:
     """Write a file of these bytes, see `atomic_path`."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
+
+
+@contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """Give the block a temporary folder to fill; it becomes `path` when the block ends well.
+
+    Args:
+        path: Of the folder, which must be missing or empty.
+
+    Raises:
+        OSError: If the disk is full or the folder cannot be written; nothing is left behind.
+    """
+    path = path.absolute()
+    path.parent.mkdir(parents=True, exist_ok=True)
+
+    # Remove what a process that died left of the same folder.
+    for entry in path.parent.iterdir():
+        ours = entry.name.startswith(f".{path.name}.") and _TEMPORARY.search(entry.name)
+        if ours and entry.is_dir() and _is_stale(entry):
+            shutil.rmtree(entry, ignore_errors=True)
+
+    temporary = temporary_name(path)
+    temporary.mkdir()
+    try:
+        yield temporary
+        sync_and_rename(temporary, path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 @contextmanager

@@ -1,0 +1,46 @@
+"""`drakegrasp export`: a dataset in the format of another tool."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from drakegrasp.cli.options import out_argument
+
+#: The formats as the help lists them; loading them would take longer than printing the help.
+FORMATS = ("hub", "original", "dexgraspbench", "glb")
+
+
+@click.command()
+@out_argument
+@click.argument("directory", type=click.Path(path_type=Path))
+@click.option("--to", "form", type=click.Choice(FORMATS), required=True, help="The format.")
+@click.option(
+    "--license",
+    "licence",
+    metavar="ID",
+    default="unknown",
+    show_default=True,
+    help="Licence that the card of format hub names, e.g. cc-by-4.0.",
+)
+@click.option("--quiet", is_flag=True, help="Show no progress.")
+def export(out: Path, directory: Path, form: str, licence: str, quiet: bool) -> None:
+    """Write the samples of a dataset in another format.
+
+    DIRECTORY must be new or empty.
+
+    \b
+    hub            Parquet, a dataset card and Croissant metadata, as the Hugging
+                   Face Hub has them; needs pip install 'drakegrasp[hub]'
+    original       HDF5 as of the paper's released code: depth first, 27 numbers
+                   a grasp, axes of its cameras
+    dexgraspbench  a .npy file per grasp: poses and joints
+    glb            a 3D scene per grasp: the object in the closed hand
+    """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
+    from drakegrasp.exchange.export import export_dataset
+    from drakegrasp.runtime.progress import progress_bar
+
+    with progress_bar("export", "sample", show=not quiet) as progress:
+        count = export_dataset(out, directory, form, licence=licence, progress=progress)  # type: ignore[arg-type]
+    click.echo(f"{count:,} samples in {directory}")

@@ -1,0 +1,1 @@
+"""Exchange: a dataset in the formats of other tools."""

@@ -1,0 +1,159 @@
+"""A folder for the Hugging Face Hub: Parquet files, a dataset card and Croissant metadata.
+
+In: a dataset. Out: `<camera>/<split>-00000-of-00001.parquet` for both cameras and all splits that
+have samples, `README.md` and `croissant.json`. `datasets.load_dataset(folder, "oto")` reads it.
+
+Colour is an 8-bit PNG, depth a 16-bit PNG in units of `DEPTH_UNIT`, the mask an 8-bit PNG of 0 and
+255. All other columns are those of the data file, by their last names. Needs the extra `[hub]`.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.dataset.paths import DATA_FILES
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS, SPLITS, Field
+from drakegrasp.errors import MachineError
+from drakegrasp.exchange.hub_card import ParquetFile, card, croissant
+from drakegrasp.runtime.progress import Report
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+#: Depth of one unit of a depth image [m]: a tenth of a millimetre, up to 6.5 m.
+DEPTH_UNIT = 1e-4
+#: Samples in a file, which takes about 150 MB, and in a group of rows, which is read as a whole.
+FILE_ROWS, GROUP_ROWS = 4000, 100
+#: Columns that are images, made of the fields `images` and `masks`.
+IMAGES = ("image", "depth", "mask")
+#: What the other fields are called here, where it is not their last name.
+NAMES = {"grasps": "grasp", "grasps_held": "grasp_held"}
+
+Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+
+
+def write_hub(out: Path, folder: Path, progress: Report, *, licence: str) -> int:
+    """Write the folder and return the number of samples; see `export.export_dataset`.
+
+    Raises:
+        MachineError: If pyarrow is not installed.
+    """
+    try:
+        import pyarrow  # noqa: F401
+    except ModuleNotFoundError:
+        raise MachineError(
+            "format hub needs pyarrow, got none: pip install 'drakegrasp[hub]'"
+        ) from None
+
+    # The Parquet files of each camera and split.
+    splits = {
+        (camera, split): GraspDataset(out / DATA_FILES[camera], split=split)
+        for camera in CAMERAS
+        for split in SPLITS
+    }
+    done, total = 0, sum(len(data) for data in splits.values())
+    written: list[ParquetFile] = []
+    for (camera, split), data in splits.items():
+        count = -(-len(data) // FILE_ROWS)
+        for number in range(count):
+            start, stop = number * FILE_ROWS, min((number + 1) * FILE_ROWS, len(data))
+            path = f"{camera}/{split}-{number:05d}-of-{count:05d}.parquet"
+            _write_file(folder / path, data, range(start, stop))
+            written.append(ParquetFile(camera=camera, split=split, path=path, rows=stop - start))
+            done += stop - start
+            progress(done, total)
+
+    # What they are, for people and for programs.
+    text = card(out, written, licence=licence)
+    (folder / "README.md").write_text(text, encoding="utf-8")
+    description = croissant(folder, written, columns(), licence=licence)
+    (folder / "croissant.json").write_text(json.dumps(description, indent=1), encoding="utf-8")
+    return total // len(CAMERAS)
+
+
+def columns() -> dict[str, Field | None]:
+    """Return the fields of the columns by the columns' names; None for an image."""
+    found: dict[str, Field | None] = dict.fromkeys(IMAGES)
+    for field in DATA_FIELDS:
+        if not field.sample:
+            found[NAMES.get(field.name, field.name.rpartition("/")[2])] = field
+    return found
+
+
+def encode_images(image: npt.ArrayLike, mask: npt.ArrayLike) -> dict[str, bytes]:
+    """Return the PNG files of an image (4, S, S) with depth [m] and its mask (S, S)."""
+    channels = np.asarray(image)
+    colour = np.rint(np.moveaxis(channels[:3], 0, -1) * 255.0).astype(np.uint8)
+    depth = np.clip(np.rint(channels[3] / DEPTH_UNIT), 0, np.iinfo(np.uint16).max)
+    pixels: tuple[Pixels, ...] = (
+        colour,
+        depth.astype(np.uint16),
+        (np.asarray(mask) * 255).astype(np.uint8),
+    )
+    return {name: _png(each) for name, each in zip(IMAGES, pixels, strict=True)}
+
+
+def _write_file(path: Path, data: GraspDataset, rows: range) -> None:
+    import pyarrow.parquet as pq
+
+    path.parent.mkdir(exist_ok=True)
+    schema = _schema()
+    with pq.ParquetWriter(path, schema) as writer:
+        for group in _groups(data, rows, schema):
+            writer.write_table(group, row_group_size=GROUP_ROWS)
+
+
+def _groups(data: GraspDataset, rows: range, schema: pa.Schema) -> Iterator[pa.Table]:
+    """Yield the rows as tables of `GROUP_ROWS`."""
+    import pyarrow as pa
+
+    for start in range(rows.start, rows.stop, GROUP_ROWS):
+        stop = min(start + GROUP_ROWS, rows.stop)
+        images, masks = (data.rows(name, start, stop) for name in ("images", "masks"))
+        files = [encode_images(*pair) for pair in zip(images, masks, strict=True)]
+        content: dict[str, Any] = {
+            name: [{"bytes": file[name], "path": None} for file in files] for name in IMAGES
+        }
+        for name, field in columns().items():
+            if field is not None:
+                content[name] = data.rows(field.name, start, stop).tolist()
+        yield pa.Table.from_pydict(content, schema=schema)
+
+
+def _schema() -> pa.Schema:
+    """Return the schema of the files, with the types that `datasets` reads them as."""
+    import pyarrow as pa
+
+    features: dict[str, Any] = {}
+    fields = []
+    for name, field in columns().items():
+        if field is None:
+            kind = pa.struct({"bytes": pa.binary(), "path": pa.string()})
+            features[name] = {"_type": "Image"}
+        else:
+            text = field.dtype == "str"
+            dtype = {"str": "string", "bool": "bool"}.get(field.dtype, field.dtype)
+            kind = pa.string() if text else pa.from_numpy_dtype(np.dtype(field.dtype))
+            features[name] = {"dtype": dtype, "_type": "Value"}
+            for _ in field.axes:
+                kind = pa.list_(kind)
+                features[name] = {"feature": features[name], "_type": "Sequence"}
+        fields.append(pa.field(name, kind))
+    metadata: Mapping[str, str] = {"huggingface": json.dumps({"info": {"features": features}})}
+    return pa.schema(fields, metadata=dict(metadata))
+
+
+def _png(pixels: Pixels) -> bytes:
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, format="PNG")
+    return file.getvalue()

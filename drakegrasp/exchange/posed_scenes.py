@@ -1,0 +1,101 @@
+"""Posed scenes: a GLB file per grasp, with the object and the hand's shapes as the fingers closed.
+
+In: a dataset. Out: `<object>/<trial_id>.glb`, which any viewer opens without a simulator. glTF has
++Y up, so our table frame {T} is turned by -90 degrees about X. Links are drawn as their collision
+shapes, which are convex.
+"""
+
+from __future__ import annotations
+
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from drakegrasp.arithmetic import multiply
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.paths import model_path
+from drakegrasp.exchange.closed_grasps import ClosedGrasp, read_closed_grasps
+from drakegrasp.frames import Array, make_pose
+from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.posture import Posture
+from drakegrasp.hand.shapes import hull_triangles, link_shapes
+from drakegrasp.objects.model import ObjectModel, load_object, object_colour
+from drakegrasp.runtime.progress import Report
+
+#: Pose of {T} in the frame U of the file, whose +Y is up.
+X_UT = make_pose(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.zeros(3))
+#: Colours of fingertips and of other links, RGBA.
+TIP_COLOUR, LINK_COLOUR = (0.93, 0.55, 0.20, 1.0), (0.45, 0.48, 0.52, 1.0)
+
+
+def write_glb(out: Path, folder: Path, progress: Report) -> int:
+    """Write a scene per sample and return their number; see `export.export_dataset`."""
+    hand = load_hand(read_manifest(out).config.hand)
+    posture, links = Posture(hand), link_meshes(hand)
+    grasps = list(read_closed_grasps(out))
+    progress(0, len(grasps))
+    done = 0
+    for name, same in groupby(grasps, key=lambda grasp: grasp.object_name):
+        model = load_object(model_path(out, name))
+        (folder / name).mkdir()
+        for grasp in same:
+            scene = posed_scene(model, posture, links, grasp)
+            (folder / name / f"{grasp.trial_id}.glb").write_bytes(scene.export(file_type="glb"))
+            done += 1
+            progress(done, len(grasps))
+    return done
+
+
+def posed_scene(
+    model: ObjectModel, posture: Posture, links: dict[str, trimesh.Trimesh], grasp: ClosedGrasp
+) -> trimesh.Scene:
+    """Return object and hand as they are when the fingers have closed.
+
+    Args:
+        model: The object.
+        posture: The hand.
+        links: The links' meshes by name, each in its link's frame.
+        grasp: The sample.
+    """
+    scene = trimesh.Scene(base_frame="scene")
+    body = model.visual.copy()
+    body.visual = _paint(body, (*object_colour(model.name), 1.0))
+    _add(scene, model.name, body, grasp.X_TO)
+    for link, X_GL in posture.link_poses(grasp.q).items():
+        if link in links:
+            _add(scene, link, links[link], multiply(grasp.X_TG, X_GL))
+    return scene
+
+
+def _add(scene: trimesh.Scene, name: str, mesh: trimesh.Trimesh, X_TB: Array) -> None:
+    scene.add_geometry(mesh, node_name=name, geom_name=name, transform=multiply(X_UT, X_TB))
+
+
+def link_meshes(hand: Hand) -> dict[str, trimesh.Trimesh]:
+    """Return the links that have shapes, each as one mesh in its link's frame."""
+    meshes = {}
+    for link, shapes in link_shapes(hand).items():
+        parts = [trimesh.Trimesh(**_indexed(hull_triangles(corners))) for corners in shapes]
+        if parts:
+            mesh = trimesh.util.concatenate(parts)
+            mesh.fix_normals()
+            tip = link in hand.fingertip_links
+            mesh.visual = _paint(mesh, TIP_COLOUR if tip else LINK_COLOUR)
+            meshes[link] = mesh
+    return meshes
+
+
+def _indexed(triangles: Array) -> dict[str, Array]:
+    return trimesh.triangles.to_kwargs(triangles)
+
+
+def _paint(mesh: trimesh.Trimesh, rgba: tuple[float, float, float, float]) -> object:
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorFactor=[round(255 * value) for value in rgba],
+        metallicFactor=0.0,
+        roughnessFactor=0.8,
+        doubleSided=True,
+    )
+    return trimesh.visual.TextureVisuals(material=material)

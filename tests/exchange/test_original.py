@@ -1,0 +1,85 @@
+"""The original layout: equal counts, depth first, and the same geometry in its camera's axes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.exchange.export import export_dataset
+from drakegrasp.frames import rotate_vectors, transform_points, unpack_pose
+
+SPLITS = ("train", "valid", "test")
+
+
+@pytest.fixture(scope="module")
+def folder(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    to = tmp_path_factory.mktemp("original") / "to"
+    export_dataset(dataset, to, "original")
+    return to
+
+
+@pytest.mark.parametrize("camera", ["oto", "otm"])
+@pytest.mark.parametrize("split", SPLITS)
+def test_images_and_properties_are_those_of_the_dataset(
+    dataset: Path, folder: Path, camera: str, split: str
+) -> None:
+    data = GraspDataset(dataset / f"grasping_{camera}.hdf5", split=split)
+    with h5py.File(folder / f"grasping_{camera}.hdf5") as file:
+        group = file[split]
+        images, ours = group["images"][:], data.column("images")
+        assert images.shape == ours.shape
+        assert (images[:, 0] == ours[:, 3]).all()
+        assert (images[:, 1:] == ours[:, :3]).all()
+        assert group["grasps"].shape == (len(data), 27)
+        for name in ("work2com", "work2mass", "work2inertia", "frame_world2obj"):
+            values = group[f"object_props/{name}"][:]
+            assert (values == data.column(f"object_props/{name}")).all()
+        names = group["object_props/object_name"].asstr()[:]
+        assert names.tolist() == data.column("object_props/object_name").tolist()
+
+
+@pytest.mark.parametrize("camera", ["oto", "otm"])
+def test_grasps_are_at_the_same_place_over_the_table(
+    dataset: Path, folder: Path, camera: str
+) -> None:
+    data = GraspDataset(dataset / f"grasping_{camera}.hdf5", split="train")
+    with h5py.File(folder / f"grasping_{camera}.hdf5") as file:
+        vectors = file["train/grasps"][:].reshape(len(data), 3, 3, 3)
+        frames = unpack_pose(file[f"train/object_props/frame_work2cam_{camera}"][:])
+        back = unpack_pose(file[f"train/object_props/frame_cam2work_{camera}"][:])
+    X_TC = unpack_pose(data.column(f"object_props/frame_work2cam_{camera}"))
+    ours = data.column("grasps").reshape(len(data), 2, 3, 3)
+    forces = data.column("grasp_props/f_Q_C")
+
+    for i in range(len(data)):
+        # The axes of its camera: +X left, +Y up, +Z forward.
+        assert frames[i][:3, 0] == pytest.approx(-X_TC[i][:3, 0], abs=1e-6)
+        assert frames[i][:3, 1] == pytest.approx(-X_TC[i][:3, 1], abs=1e-6)
+        assert frames[i][:3, 2] == pytest.approx(X_TC[i][:3, 2], abs=1e-6)
+        assert frames[i] @ back[i] == pytest.approx(np.eye(4), abs=1e-6)
+
+        points, normals, pushes = vectors[i]
+        assert transform_points(frames[i], points) == pytest.approx(
+            transform_points(X_TC[i], ours[i, 0]), abs=1e-6
+        )
+        assert rotate_vectors(frames[i], normals) == pytest.approx(
+            rotate_vectors(X_TC[i], ours[i, 1]), abs=1e-6
+        )
+        assert rotate_vectors(frames[i], pushes) == pytest.approx(
+            rotate_vectors(X_TC[i], forces[i]), abs=1e-5
+        )
+
+
+def test_image_frame_stays_where_it_is(dataset: Path, folder: Path) -> None:
+    data = GraspDataset(dataset / "grasping_otm.hdf5", split="train")
+    with h5py.File(folder / "grasping_otm.hdf5") as file:
+        props = file["train/object_props"]
+        X_TV = unpack_pose(props["frame_work2cam_otm"][:])
+        X_VI = unpack_pose(props["frame_cam2img_otm"][:])
+    X_TC = unpack_pose(data.column("object_props/frame_work2cam_otm"))
+    X_CI = unpack_pose(data.column("object_props/frame_cam2img_otm"))
+    assert pytest.approx(X_TC @ X_CI, abs=1e-6) == X_TV @ X_VI

@@ -1,0 +1,51 @@
+"""Posed scenes: every node is where the body is, and up is up."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from drakegrasp.exchange.closed_grasps import ClosedGrasp
+from drakegrasp.exchange.export import export_dataset
+from drakegrasp.exchange.posed_scenes import X_UT
+from drakegrasp.frames import invert_pose
+from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.posture import Posture
+
+
+@pytest.fixture(scope="module")
+def folder(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    to = tmp_path_factory.mktemp("glb") / "to"
+    export_dataset(dataset, to, "glb")
+    return to
+
+
+def test_bodies_are_where_they_are(folder: Path, grasps: list[ClosedGrasp]) -> None:
+    hand = load_hand()
+    posture = Posture(hand)
+    assert len(list(folder.rglob("*.glb"))) == len(grasps)
+    for grasp in grasps:
+        scene = trimesh.load_scene(folder / grasp.object_name / f"{grasp.trial_id}.glb")
+        poses = {
+            name: invert_pose(X_UT) @ scene.graph.get(name)[0]
+            for name in scene.graph.nodes_geometry
+        }
+        assert poses.pop(grasp.object_name) == pytest.approx(grasp.X_TO, abs=1e-6)
+        links = posture.link_poses(grasp.q)
+        assert set(hand.fingertip_links) <= set(poses) <= set(links)
+        for name, X_TL in poses.items():
+            assert pytest.approx(grasp.X_TG @ links[name], abs=1e-6) == X_TL
+
+
+def test_up_is_y(folder: Path, grasps: list[ClosedGrasp]) -> None:
+    """The object of the dataset is a box that stands on the table, and the palm is above it."""
+    grasp = grasps[0]
+    scene = trimesh.load_scene(folder / grasp.object_name / f"{grasp.trial_id}.glb")
+    X, name = scene.graph.get(grasp.object_name)
+    corners = trimesh.transform_points(scene.geometry[name].vertices, X)
+    assert corners[:, 1].min() == pytest.approx(0.0, abs=1e-6)
+    palm = np.array(scene.graph.get(load_hand().palm_link)[0])
+    assert palm[1, 3] > corners[:, 1].max()
