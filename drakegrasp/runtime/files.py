@@ -13,17 +13,20 @@ import os
 import re
 import secrets
 import shutil
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from io import BufferedRandom, BufferedReader, BytesIO
+from io import BufferedRandom, BufferedReader, BytesIO, FileIO
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import h5py
 
 from drakegrasp.errors import DataError, DiskFullError
 from drakegrasp.runtime.processes import host_label, is_running
+
+if TYPE_CHECKING:
+    from typing_extensions import Buffer
 
 #: Size of the user block that holds the seal [B]; HDF5 demands a power of two.
 SEAL_SIZE = 512
@@ -97,7 +100,7 @@ def atomic_hdf5(path: Path, *, sealed: bool = False) -> Iterator[h5py.File]:
     Args:
         path: Of the file.
         sealed: Whether to leave room for a seal and set it, see `seal`. Such a file is built in
-            memory: a full disk is then the error of one write, and HDF5 stays usable.
+            memory; others may be larger than that.
 
     Raises:
         OSError: If the disk is full or the folder cannot be written; nothing is left behind.
@@ -110,8 +113,57 @@ def atomic_hdf5(path: Path, *, sealed: bool = False) -> Iterator[h5py.File]:
             temporary.write_bytes(content.getbuffer())
             seal(temporary)
         else:
-            with h5py.File(temporary, "w") as file:
-                yield file
+            with _PatientFile(temporary) as patient:
+                try:
+                    with h5py.File(patient, "w") as file:
+                        yield file
+                finally:
+                    # Other errors follow from this one.
+                    patient.refuse_failure()
+
+
+class _PatientFile(FileIO):
+    """A new file whose writes never fail for HDF5, although the disk may be full.
+
+    HDF5 (1.14) repeats a write that failed when it frees a handle, and closing the file then ends
+    in a segmentation fault. Here the first error is kept, every later write is dropped, and HDF5
+    closes the file, which is of no use then, in peace.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, "x+")
+        self._failure: OSError | None = None
+
+    def write(self, content: Buffer, /) -> int:
+        """Write bytes, unless an earlier write failed; return their number."""
+        view = memoryview(content).cast("B")
+        try:
+            done = 0 if self._failure is None else len(view)
+            while done < len(view):
+                done += super().write(view[done:])
+        except OSError as error:
+            self._failure = error
+        return len(view)
+
+    def readinto(self, buffer: Buffer, /) -> int:
+        """Fill a buffer; zeros stand for what could not be written."""
+        view = memoryview(buffer).cast("B")
+        done = super().readinto(view)
+        view[done:] = bytes(len(view) - done)
+        return len(view)
+
+    def truncate(self, size: int | None = None, /) -> int:
+        """Set the size of the file, unless a write failed; return it."""
+        try:
+            return (size or 0) if self._failure is not None else super().truncate(size)
+        except OSError as error:
+            self._failure = error
+            return size or 0
+
+    def refuse_failure(self) -> None:
+        """Raise the error of the first write that failed."""
+        if self._failure is not None:
+            raise self._failure
 
 
 def seal(path: Path) -> None:
@@ -219,22 +271,10 @@ def disk_full_named(out: Path) -> Iterator[None]:
     except (OSError, RuntimeError) as error:
         if not _is_no_room(error):
             raise
-        _silence_repetitions()
         raise DiskFullError(
             f"{out}: the disk or the quota is full ({os.strerror(_NO_ROOM[0])}); make room, and "
             "the same command goes on from here"
         ) from None
-
-
-def _silence_repetitions() -> None:
-    """Drop HDF5's errors of a full disk that come again when the file's handles are freed."""
-    before = sys.unraisablehook
-
-    def hook(unraisable: sys.UnraisableHookArgs) -> None:
-        if unraisable.exc_value is None or not _is_no_room(unraisable.exc_value):
-            before(unraisable)
-
-    sys.unraisablehook = hook
 
 
 def _is_no_room(error: BaseException) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 
@@ -118,3 +120,42 @@ def test_directory_without_a_dataset_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"without manifest\.json"):
         assemble(tmp_path / "missing")
     assert list(tmp_path.iterdir()) == []
+
+
+#: Assembles a dataset with less and less room for a file: each in a process of its own, because a
+#: fault of HDF5 would end it. Prints for each amount how the process ended and what it said.
+FULL_DISK = """
+import os, resource, signal, sys
+from pathlib import Path
+from drakegrasp.dataset.assemble import assemble
+from drakegrasp.errors import DiskFullError
+
+for limit in map(int, sys.argv[2:]):
+    child = os.fork()
+    if not child:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+        try:
+            assemble(Path(sys.argv[1]))
+        except DiskFullError as error:
+            print(error, end=" ", flush=True)
+        os._exit(0)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
+
+
+def test_full_disk_is_one_line_wherever_it_fills(out: Path) -> None:
+    before = {name: (out / name).read_bytes() for name in FILES}
+    largest = max(map(len, before.values()))
+    limits = [largest * share // 12 for share in range(1, 12)]
+    run = subprocess.run(
+        [sys.executable, "-c", FULL_DISK, str(out), *map(str, limits)],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    line = f"{out}: the disk or the quota is full (No space left on device); make room, and the "
+    line += "same command goes on from here 0"
+    assert run.stdout.splitlines() == [line] * len(limits)
+    assert not run.stderr
+    assert {name: (out / name).read_bytes() for name in FILES} == before
+    assert not list(out.glob(".*"))
