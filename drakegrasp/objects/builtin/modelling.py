@@ -13,6 +13,7 @@ import numpy.typing as npt
 import trimesh
 from scipy.interpolate import PchipInterpolator
 
+from drakegrasp.arithmetic import norm
 from drakegrasp.frames import Array
 from drakegrasp.mesh.surfaces import Faces
 from drakegrasp.objects.builtin.profiles import EDGE, arc_length, ring_angles, ring_size
@@ -230,6 +231,14 @@ def cut(body: trimesh.Trimesh, *tools: trimesh.Trimesh) -> trimesh.Trimesh:
     return _from_boolean(trimesh.boolean.difference([body, *tools], engine="manifold"))
 
 
+def flat_base(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return the part of a mesh above z = 0."""
+    low, high = mesh.bounds
+    size = np.append(1.5 * (high - low)[:2], 0.2)
+    middle = np.append((low + high)[:2] / 2.0, -0.1)
+    return cut(mesh, grid_box(size, centre=middle, edge=1.0))
+
+
 def stand(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """Return the mesh moved along z until its lowest point is at z = 0."""
     return solid(mesh.vertices - [0.0, 0.0, mesh.bounds[0, 2]], mesh.faces)
@@ -271,13 +280,13 @@ def _from_boolean(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 def _edge_lengths(points: Array, faces: Faces) -> Array:
     """Return the lengths (n, 3) [m] of the edges that start at each corner of each face."""
     corners = points[faces]
-    return np.asarray(np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2))
+    return norm(np.roll(corners, -1, axis=1) - corners)
 
 
 def _heights(points: Array, faces: Faces) -> Array:
     """Return the height (n,) [m] of each face above its longest edge."""
     p, q, r = np.moveaxis(points[faces], 1, 0)
-    doubled = np.linalg.norm(np.cross(q - p, r - p), axis=1)
+    doubled = norm(np.cross(q - p, r - p))
     return np.asarray(doubled / np.maximum(_edge_lengths(points, faces).max(axis=1), ON_AXIS))
 
 

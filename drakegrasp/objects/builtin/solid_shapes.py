@@ -126,12 +126,9 @@ def spray_bottle(
     return fuse(body, collar, head, trigger)
 
 
-def hammer(
-    *, length: float, head_length: float, head_thickness: float, claw: bool
-) -> trimesh.Trimesh:
-    """Return a hammer that lies on its side, handle along -x, head along y.
+def hammer(*, length: float, head_length: float, head_thickness: float) -> trimesh.Trimesh:
+    """Return a claw hammer that lies on its side, handle along -x, head along y.
 
-    With `claw` one half of the head is a bent claw, else the head is a square mallet.
     All lengths are in [m].
     """
     half = head_thickness / 2.0
@@ -146,35 +143,25 @@ def hammer(
         scale=((0.0, 1.0), (0.3, 1.0), (0.55, 0.75), (1.0, 0.75)),
     )
     reach = head_length / 2.0
-    if claw:
-        y = np.linspace(reach, -reach, 60)
-        bend = np.clip(-(y + 0.012), 0.0, None)
-        path = np.column_stack([-8.0 * bend**2, y, np.full_like(y, half)])
-        path = spread_evenly(path, EDGE)
-        knots = np.array(
-            [
-                (-1.0, 0.18, 0.8),
-                (-0.35, 0.75, 0.9),
-                (0.0, 1.0, 1.0),
-                (0.35, 1.0, 1.0),
-                (0.55, 0.72, 0.72),
-                (0.75, 1.0, 1.0),
-                (0.93, 1.0, 1.0),
-                (1.0, 0.88, 0.88),
-            ]
-        )
-        scale = PchipInterpolator(knots[:, 0], knots[:, 1:])(path[:, 1] / reach)
-        section = rounded_rectangle(2.0 * half, 2.0 * half, 0.55 * half, edge=EDGE)
-        head = sweep(path, section, normal=up, scale=scale)
-    else:
-        section = rounded_rectangle(1.1 * head_thickness, head_thickness, 0.006, edge=EDGE)
-        head = bar(
-            (0.0, reach, half),
-            (0.0, -reach, half),
-            section,
-            normal=up,
-            scale=((0.0, 1.0), (1.0, 1.0)),
-        )
+    y = np.linspace(reach, -reach, 60)
+    bend = np.clip(-(y + 0.012), 0.0, None)
+    path = np.column_stack([-8.0 * bend**2, y, np.full_like(y, half)])
+    path = spread_evenly(path, EDGE)
+    knots = np.array(
+        [
+            (-1.0, 0.18, 0.8),
+            (-0.35, 0.75, 0.9),
+            (0.0, 1.0, 1.0),
+            (0.35, 1.0, 1.0),
+            (0.55, 0.72, 0.72),
+            (0.75, 1.0, 1.0),
+            (0.93, 1.0, 1.0),
+            (1.0, 0.88, 0.88),
+        ]
+    )
+    scale = PchipInterpolator(knots[:, 0], knots[:, 1:])(path[:, 1] / reach)
+    section = rounded_rectangle(2.0 * half, 2.0 * half, 0.55 * half, edge=EDGE)
+    head = sweep(path, section, normal=up, scale=scale)
     return fuse(handle, head)
 
 

@@ -1,0 +1,296 @@
+"""Things of a household, one function per class: sizes come in, watertight meshes go out.
+
+Every mesh stands on the plane z = 0 as it would on a table, z up. All lengths are in [m];
+`drakegrasp.objects.builtin.catalog` holds the table of sizes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+
+from drakegrasp.arithmetic import sin_cos_deg
+from drakegrasp.objects.builtin.modelling import cut, fuse, revolve
+from drakegrasp.objects.builtin.primitives import (
+    ball,
+    block,
+    lathe,
+    moved,
+    pillar,
+    prism,
+    rod,
+    rotated,
+    tube,
+)
+from drakegrasp.objects.builtin.profiles import EDGE, resample, smooth
+
+#: Edge length of things with many parts [m].
+BROAD = 1.3 * EDGE
+
+
+def watertap(*, base: float, pipe: float, height: float, reach: float) -> trimesh.Trimesh:
+    """Return a tap on its base: radii of `base` and `pipe`, a spout that reaches towards +x."""
+    bend = reach / 2.0
+    s, c = sin_cos_deg(np.linspace(180.0, 0.0, 24))
+    top = height - bend - pipe
+    arch = np.column_stack([bend + bend * c, 0.0 * c, top + bend * s])
+    path = np.vstack([[(0.0, 0.0, 0.004)], arch, [(reach, 0.0, top - 0.022)]])
+    column = 0.52 * top
+    # The valve: a cross on the side of the column.
+    z, y = 0.72 * column, -1.3 * pipe - 0.026
+    wings = [
+        rod((-0.026 * a, y, z - 0.026 * b), (0.026 * a, y, z + 0.026 * b), 0.0055)
+        for a, b in ((1.0, 0.0), (0.0, 1.0))
+    ]
+    return fuse(
+        lathe(smooth([(base, 0.0), (base, 0.008), (0.75 * base, 0.014), (1.3 * pipe, 0.018)], EDGE)),
+        rod((0.0, 0.0, 0.002), (0.0, 0.0, column), 1.45 * pipe, 1.3 * pipe),
+        tube(resample(path, EDGE), pipe),
+        rod((reach, 0.0, top - 0.026), (reach, 0.0, top - 0.012), 1.2 * pipe),
+        rod((0.0, 0.0, z), (0.0, y, z), 0.75 * pipe),
+        ball((0.0, y, z), 0.9 * pipe),
+        *wings,
+    )
+
+
+def knob(*, rose: float, neck: float, radius: float, height: float) -> trimesh.Trimesh:
+    """Return a door knob on its `rose`; all but the height are radii."""
+    side = [
+        *resample([(rose, 0.0), (rose, 0.007)], EDGE),
+        *smooth(
+            [
+                (0.86 * rose, 0.011),
+                (1.15 * neck, 0.016),
+                (neck, 0.36 * height),
+                (1.15 * neck, 0.50 * height),
+                (0.80 * radius, 0.58 * height),
+                (radius, 0.74 * height),
+                (0.86 * radius, 0.92 * height),
+                (0.5 * radius, height),
+                (0.25 * radius, 0.995 * height),
+            ],
+            0.8 * EDGE,
+        ),
+    ]
+    return lathe(side)
+
+
+def lamp(*, base: float, shade: float, height: float) -> trimesh.Trimesh:
+    """Return a table lamp: radii of its `base` and of the rim of its `shade`."""
+    low, top = 0.54 * height, 0.58 * shade
+    wall = 0.005
+    outer = resample([(shade, low), (top, height)], BROAD)
+    inner = resample([(top - wall, height - 0.006), (shade - wall, low)], 1.5 * BROAD)
+    cap = resample([(top, height), (0.0, height)], BROAD)[1:]
+    ceiling = resample([(0.0, height - 0.006), inner[0]], 1.5 * BROAD)
+    # From the axis under the cap, down inside, up outside, to the axis.
+    screen = revolve(np.vstack([ceiling[:-1], inner, outer, cap]), edge=BROAD)
+    foot = lathe(
+        [
+            *resample([(base, 0.0), (base, 0.008)], EDGE),
+            *smooth(
+                [
+                    (0.86 * base, 0.013),
+                    (0.30 * base, 0.024),
+                    (0.15 * base + 0.003, 0.034),
+                    (0.38 * base, 0.26 * height),
+                    (0.40 * base, 0.33 * height),
+                    (0.15 * base + 0.002, 0.46 * height),
+                    (0.14 * base, 0.55 * height),
+                ],
+                EDGE,
+            ),
+        ]
+    )
+    stem = rod((0.0, 0.0, 0.5 * height), (0.0, 0.0, height - 0.002), 0.14 * base)
+    finial = ball((0.0, 0.0, height + 0.005), 0.007, edge=0.7 * EDGE)
+    return fuse(screen, foot, stem, finial)
+
+
+def iron(*, length: float, width: float, height: float) -> trimesh.Trimesh:
+    """Return a clothes iron on its sole, its tip towards +x, with a closed handle."""
+    t = np.linspace(0.0, 1.0, 200)
+    nose = 0.5 * width * np.sqrt(1.0 - t**2.2)
+    side = np.vstack(
+        [
+            smooth([(-0.40 * length, 0.47 * width), (-0.2 * length, 0.5 * width),
+                    (-0.05 * length, 0.5 * width)], EDGE / 4.0)[:-1],
+            np.column_stack([-0.05 * length + 0.6 * length * t, nose]),
+        ]
+    )  # fmt: skip
+    outline = resample(np.vstack([side, side[-2::-1] * [1.0, -1.0], side[:1]]), 1.0)
+    spaced = _spread_ring(outline, BROAD)
+    low = 0.085 * height
+    sole = prism(spaced, 0.0, low)
+    body = prism(0.94 * spaced, low - 0.003, 0.50 * height, top=0.72)
+
+    # The handle: two posts and a grip.
+    z, thick = height - 0.012, 0.0105
+    path = smooth(
+        [
+            (-0.24 * length, 0.0, 0.42 * height),
+            (-0.27 * length, 0.0, 0.72 * height),
+            (-0.18 * length, 0.0, z),
+            (0.05 * length, 0.0, z),
+            (0.19 * length, 0.0, 0.80 * height),
+            (0.20 * length, 0.0, 0.42 * height),
+        ],
+        EDGE,
+    )
+    dial = rod((0.0, 0.0, 0.46 * height), (0.0, 0.0, 0.50 * height + 0.006), 0.19 * width)
+    return fuse(sole, body, tube(path, thick), dial)
+
+
+def camera(*, width: float, height: float, depth: float, lens: float) -> trimesh.Trimesh:
+    """Return a camera that looks towards -y: its body, and `lens` the radius of its lens."""
+    z = 0.46 * height
+    front = -depth / 2.0
+    body = block((width, depth, height), (0.0, 0.0, height / 2.0), corner=0.009, edge=BROAD)
+    grip = block((0.17 * width, 0.55 * depth, 0.9 * height),
+                 (-0.38 * width, -0.42 * depth, 0.47 * height), corner=0.006)  # fmt: skip
+    hump = pillar(
+        [(height - 0.006, 0.40 * width, 0.86 * depth), (height + 0.010, 0.30 * width, 0.80 * depth),
+         (height + 0.016, 0.20 * width, 0.7 * depth)],
+        corner=0.005,
+    )  # fmt: skip
+    glass = ball((0.0, front - 0.040, z), (0.62 * lens, 0.010, 0.62 * lens))
+    barrel = fuse(
+        rod((0.0, front + 0.008, z), (0.0, front - 0.020, z), lens),
+        rod((0.0, front + 0.008, z), (0.0, front - 0.034, z), 0.88 * lens),
+    )
+    mouth = rod((0.0, front - 0.028, z), (0.0, front - 0.060, z), 0.70 * lens)
+    return fuse(
+        body, grip, hump, cut(barrel, mouth), moved(glass, (0.0, 0.014, 0.0)),
+        rod((-0.36 * width, -0.2 * depth, height - 0.004),
+            (-0.36 * width, -0.2 * depth, height + 0.007), 0.0075),
+        rod((0.34 * width, 0.0, height - 0.004), (0.34 * width, 0.0, height + 0.008), 0.012),
+    )  # fmt: skip
+
+
+def hourglass(*, radius: float, waist: float, height: float) -> trimesh.Trimesh:
+    """Return an hourglass between two discs of `radius`, with three posts."""
+    plate = 0.009
+    bulb = 0.70 * radius
+    half = [
+        (0.80 * bulb, plate - 0.002),
+        (bulb, 0.10 * height + plate),
+        (0.92 * bulb, 0.24 * height),
+        (0.4 * bulb + 0.5 * waist, 0.40 * height),
+        (waist, 0.5 * height),
+    ]
+    glass = lathe(smooth([*half, *((r, height - z) for r, z in half[-2::-1])], EDGE))
+    s, c = sin_cos_deg(np.array([30.0, 150.0, 270.0]))
+    posts = [
+        rod((0.86 * radius * x, 0.86 * radius * y, plate / 2.0),
+            (0.86 * radius * x, 0.86 * radius * y, height - plate / 2.0), 0.0042, edge=EDGE)
+        for x, y in zip(c, s, strict=True)
+    ]  # fmt: skip
+    return fuse(
+        glass,
+        *posts,
+        rod((0.0, 0.0, 0.0), (0.0, 0.0, plate), radius),
+        rod((0.0, 0.0, height - plate), (0.0, 0.0, height), radius),
+    )
+
+
+def bell(*, radius: float, body: float, handle: float) -> trimesh.Trimesh:
+    """Return a hand bell that stands on its mouth: heights of its `body` and its `handle`."""
+    wall = 0.006
+    outer = smooth(
+        [
+            (radius, 0.0),
+            (0.90 * radius, 0.09 * body),
+            (0.70 * radius, 0.30 * body),
+            (0.58 * radius, 0.65 * body),
+            (0.48 * radius, 0.86 * body),
+            (0.25 * radius, 0.98 * body),
+            (0.14 * radius + 0.003, body),
+        ],
+        EDGE,
+    )
+    grip = smooth(
+        [
+            (0.14 * radius + 0.003, body),
+            (0.22 * radius + 0.003, body + 0.12 * handle),
+            (0.14 * radius + 0.003, body + 0.26 * handle),
+            (0.27 * radius + 0.003, body + 0.62 * handle),
+            (0.22 * radius, body + 0.90 * handle),
+            (0.1 * radius, body + handle),
+        ],
+        EDGE,
+    )[1:]
+    inner = smooth(
+        [
+            (0.0, 0.86 * body),
+            (0.30 * radius, 0.82 * body),
+            (0.58 * radius - wall, 0.55 * body),
+            (0.70 * radius - wall, 0.28 * body),
+            (radius - wall, 0.0),
+        ],
+        1.5 * EDGE,
+    )
+    head = resample([grip[-1], (0.0, body + handle)], EDGE)[1:]
+    return revolve(np.vstack([inner, outer, grip, head]))
+
+
+def alarm_clock(*, radius: float, depth: float) -> trimesh.Trimesh:
+    """Return an alarm clock with two bells on top, its face towards -y."""
+    foot = 0.016
+    z = foot + radius
+    s, c = sin_cos_deg(np.array([60.0, 120.0]))
+    case = cut(
+        rod((0.0, depth / 2.0, z), (0.0, -depth / 2.0, z), radius, edge=BROAD),
+        rod((0.0, 0.004 - depth / 2.0, z), (0.0, -depth, z), 0.86 * radius, edge=BROAD),
+    )
+    face = -depth / 2.0
+    hands = [
+        block((0.006, 0.009, 0.62 * radius), (0.0, face + 0.004, z + 0.27 * radius), corner=0.0015),
+        block((0.44 * radius, 0.009, 0.007), (0.18 * radius, face + 0.004, z), corner=0.0015),
+        rod((0.0, face + 0.006, z), (0.0, face - 0.002, z), 0.006, edge=0.6 * EDGE),
+    ]
+    marks = [
+        moved(block((0.006, 0.007, 0.006), (0.72 * radius * x, face + 0.005, z + 0.72 * radius * y)),
+              (0.0, 0.0, 0.0))
+        for x, y in ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
+    ]  # fmt: skip
+
+    # Bells, hammer and feet.
+    parts = []
+    for x, y in zip(c, s, strict=True):
+        side = np.sign(x)
+        dome = moved(
+            rotated(
+                cut(
+                    ball((0.0, 0.0, 0.0), (0.42 * radius, 0.42 * radius, 0.36 * radius)),
+                    block((radius, radius, radius), (0.0, 0.0, -0.5 * radius)),
+                ),
+                "y",
+                30.0 * float(side),
+            ),
+            (1.18 * radius * x, 0.0, z + 1.18 * radius * y),
+        )
+        stalk = rod((0.9 * radius * x, 0.0, z + 0.9 * radius * y),
+                    (1.3 * radius * x, 0.0, z + 1.3 * radius * y), 0.0045)  # fmt: skip
+        leg = rod((0.45 * radius * side, 0.0, z - 0.6 * radius),
+                  (0.80 * radius * side, 0.0, 0.0), 0.0085, 0.0075)  # fmt: skip
+        parts += [dome, stalk, leg]
+    legs = [
+        rod((0.5 * radius * x, 0.32 * y * depth, z - 0.7 * radius),
+            (0.72 * radius * x, 0.36 * y * depth, 0.0), 0.009, 0.0065)
+        for x in (-1.0, 1.0) for y in (-1.0, 1.0)
+    ]  # fmt: skip
+    kept = [part for k, part in enumerate(parts) if k % 3 != 2]
+    hammer = [
+        rod((0.0, 0.0, z + 0.9 * radius), (0.0, 0.0, z + 1.28 * radius), 0.0035),
+        rod((-0.009, 0.0, z + 1.3 * radius), (0.009, 0.0, z + 1.3 * radius), 0.0065),
+    ]
+    from drakegrasp.objects.builtin.modelling import flat_base
+
+    return flat_base(fuse(case, *hands, *marks, *kept, *legs, *hammer))
+
+
+def _spread_ring(outline: np.ndarray, edge: float) -> np.ndarray:
+    """Return a closed outline (n, 2), its last point its first, with points about `edge` apart."""
+    from drakegrasp.objects.builtin.profiles import spread_evenly
+
+    return spread_evenly(outline, edge)[:-1]
