@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from drakegrasp.objects.builtin.modelling import flat_base, fuse
+from drakegrasp.objects.builtin.booleans import flat_base, fuse
 from drakegrasp.objects.builtin.primitives import ball, moved, rod, rotated, tube
 from drakegrasp.objects.builtin.profiles import EDGE, ring_angles, smooth
 
@@ -95,7 +95,7 @@ def toy_dog(*, length: float, height: float, girth: float) -> trimesh.Trimesh:
 def snake(*, coil: float, thickness: float, neck: float) -> trimesh.Trimesh:
     """Return a coiled snake: radius of its `coil`, `thickness` of its body, height of its head."""
     half = thickness / 2.0
-    upper = 1.55 * half + half
+    upper = 2.3 * half
 
     def ring(radius: float, size: float, z: float) -> trimesh.Trimesh:
         angles = np.append(ring_angles(max(16, round(2.0 * np.pi * radius / COAT))), 2.0 * np.pi)
@@ -119,8 +119,8 @@ def snake(*, coil: float, thickness: float, neck: float) -> trimesh.Trimesh:
     )
     rise = smooth(
         [
-            (-0.55 * coil, 0.35 * coil, upper),
-            (-0.50 * coil, 0.0, upper + 0.18 * neck),
+            (-0.58 * coil, 0.36 * coil, upper),
+            (-0.56 * coil, 0.0, upper + 0.18 * neck),
             (-0.30 * coil, 0.0, upper + 0.6 * neck),
             (0.02 * coil, 0.0, upper + 0.88 * neck),
             (0.40 * coil, 0.0, upper + 0.94 * neck),
@@ -131,7 +131,7 @@ def snake(*, coil: float, thickness: float, neck: float) -> trimesh.Trimesh:
     return flat_base(
         fuse(
             ring(coil, half, 0.97 * half),
-            ring(0.62 * coil, 0.95 * half, upper),
+            ring(0.68 * coil, 0.95 * half, upper),
             tube(tail, np.linspace(half, 0.35 * half, len(tail)), edge=COAT),
             tube(rise, np.linspace(0.95 * half, 0.75 * half, len(rise)), edge=COAT),
             ball(head, (1.55 * half, 1.15 * half, 0.85 * half), edge=COAT),

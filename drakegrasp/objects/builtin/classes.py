@@ -97,7 +97,7 @@ _ROWS: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, Range]], ...] = (
     (solid_shapes.book, dict(
         width=mm(88, 105), length=mm(120, 150), thickness=mm(34, 52))),
     (solid_shapes.banana, dict(
-        bend_radius=mm(90, 130), angle=deg(88, 100), thickness=mm(34, 40))),
+        bend_radius=mm(76, 96), angle=deg(105, 122), thickness=mm(34, 40))),
     (hollow_shapes.saucepan, dict(
         radius=mm(48, 58), height=mm(55, 85), handle_length=mm(85, 100))),
     (revolved_shapes.apple, dict(

@@ -11,12 +11,17 @@ import trimesh
 from scipy.interpolate import PchipInterpolator
 
 from drakegrasp.arithmetic import sin_cos_deg
-from drakegrasp.objects.builtin.modelling import cut, fuse, revolve, skin, solid
-from drakegrasp.objects.builtin.primitives import ball, block, moved, rod, rotated, tube
+from drakegrasp.frames import Array
+from drakegrasp.objects.builtin.booleans import cut, fuse
+from drakegrasp.objects.builtin.modelling import revolve, skin, solid
+from drakegrasp.objects.builtin.primitives import ball, block, moved, prism, rod, rotated, tube
 from drakegrasp.objects.builtin.profiles import EDGE, resample, smooth
 
 #: Edge length of shoes [m].
 LEATHER = 1.3 * EDGE
+
+#: Edge length of a hat [m].
+FELT = 1.2 * EDGE
 
 
 def hat(*, brim: float, crown: float, height: float) -> trimesh.Trimesh:
@@ -25,16 +30,16 @@ def hat(*, brim: float, crown: float, height: float) -> trimesh.Trimesh:
     top = 1.06 * crown
     inner = smooth(
         [(0.9 * crown, height - 0.008), (0.95 * crown - wall, 0.5 * height), (crown - wall, 0.0)],
-        1.4 * EDGE,
+        1.6 * FELT,
     )
-    under = resample([inner[-1], (brim - 0.002, 0.0)], EDGE)[1:]
-    over = resample([(brim, 0.5 * thick), (brim - 0.002, thick), (crown, thick)], EDGE)
+    under = resample([inner[-1], (brim - 0.002, 0.0)], FELT)[1:]
+    over = resample([(brim, 0.5 * thick), (brim - 0.002, thick), (crown, thick)], FELT)
     band = resample([(crown + 0.002, thick), (crown + 0.002, 0.26 * height), (0.97 * crown, 0.26 * height)],
-                    EDGE)[1:]  # fmt: skip
-    side = smooth([band[-1], (0.95 * crown, 0.55 * height), (top - 0.002, height)], EDGE)[1:]
-    cap = resample([(top - 0.002, height), (0.0, height - 0.004)], EDGE)[1:]
-    ceiling = resample([(0.0, height - 0.010), inner[0]], 1.4 * EDGE)[:-1]
-    upright = revolve(np.vstack([ceiling, inner, under, over, band, side, cap]))
+                    FELT)[1:]  # fmt: skip
+    side = smooth([band[-1], (0.95 * crown, 0.55 * height), (top - 0.002, height)], FELT)[1:]
+    cap = resample([(top - 0.002, height), (0.0, height - 0.004)], FELT)[1:]
+    ceiling = resample([(0.0, height - 0.010), inner[0]], 1.6 * FELT)[:-1]
+    upright = revolve(np.vstack([ceiling, inner, under, over, band, side, cap]), edge=FELT)
 
     # The curl of the brim.
     x, y, z = upright.vertices.T
@@ -48,30 +53,21 @@ def hat(*, brim: float, crown: float, height: float) -> trimesh.Trimesh:
 def comb(*, length: float, depth: float, spine: float, teeth: float, count: int) -> trimesh.Trimesh:
     """Return a wide comb that stands on its teeth: heights of `spine` and `teeth`."""
     height = spine + teeth
-    back = moved(
-        rotated(
-            _slab(smooth([(-length / 2.0, teeth), (-0.47 * length, height - 0.004),
-                          (-0.25 * length, height), (0.25 * length, height),
-                          (0.47 * length, height - 0.004), (length / 2.0, teeth)], LEATHER), depth),
-            "z", 0.0,
-        ),
-        (0.0, 0.0, 0.0),
+    side = smooth(
+        [(-length / 2.0, 0.96 * teeth), (-0.47 * length, height - 0.005), (-0.3 * length, height),
+         (0.3 * length, height), (0.47 * length, height - 0.005), (length / 2.0, 0.96 * teeth)],
+        LEATHER,
     )  # fmt: skip
-    # The outer teeth are wider.
-    guard = 0.06 * length
-    pitch = (length - 2.0 * guard) / count
-    parts = [
-        block((guard, depth, teeth + 0.004), (side * (length - guard) / 2.0, 0.0, teeth / 2.0 + 0.002),
-              edge=LEATHER)
-        for side in (-1.0, 1.0)
+    body = _slab(side, depth)
+
+    # The gaps between the teeth; the outer teeth are wider.
+    pitch = 0.88 * length / count
+    gaps = [
+        block((0.52 * pitch, 2.0 * depth, teeth), (pitch * (k - (count - 1) / 2.0), 0.0, teeth / 2.0 - 0.01),
+              corner=0.2 * pitch, edge=LEATHER)
+        for k in range(count)
     ]  # fmt: skip
-    for k in range(count - 1):
-        x = -length / 2.0 + guard + pitch * (k + 1.0)
-        parts.append(
-            block((0.46 * pitch, depth, teeth + 0.004), (x, 0.0, teeth / 2.0 + 0.002),
-                  corner=0.0015, edge=LEATHER)
-        )  # fmt: skip
-    return fuse(back, *parts)
+    return cut(body, *gaps)
 
 
 def shoe(*, length: float, width: float, height: float) -> trimesh.Trimesh:
@@ -153,26 +149,25 @@ def _sole(length: float, width: float, thick: float) -> list[trimesh.Trimesh]:
     halves = PchipInterpolator(knots[:, 0], knots[:, 1])(along)
     right = np.column_stack([along * length, -halves * width])
     outline = np.vstack([right, right[-2:0:-1] * [1.0, -1.0]])
-    from drakegrasp.objects.builtin.primitives import prism
 
     slab = prism(outline, 0.0, 1.25 * thick, edge=LEATHER)
     arch = block((0.2 * length, 2.0 * width, thick), (-0.06 * length, 0.0, 0.0), edge=LEATHER)
     return [cut(slab, arch)]
 
 
-def _slab(side: np.ndarray, depth: float) -> trimesh.Trimesh:
-    """Return a curve (n, 2) of points (x, z), closed by a straight base, as a slab across y."""
-    low = float(side[0, 1])
-    stations = side[:, 0]
+def _slab(side: Array, depth: float) -> trimesh.Trimesh:
+    """Return the space below a curve (n, 2) of points (x, z), down to z = 0, as a slab across y."""
     counts = max(2, round(depth / LEATHER))
+    y = np.linspace(-depth / 2.0, depth / 2.0, counts + 1)
     rings = []
-    for x, z in side:
-        y = np.linspace(-depth / 2.0, depth / 2.0, counts + 1)
-        high = max(z, low + 0.002)
-        bottom = np.column_stack([np.full_like(y, x), y, np.full_like(y, low)])
-        middle = [(x, depth / 2.0, (low + high) / 2.0)]
-        top = np.column_stack([np.full_like(y, x), y[::-1], np.full_like(y, high)])
-        rings.append(np.vstack([bottom, middle, top, [(x, -depth / 2.0, (low + high) / 2.0)]]))
+    for x, high in side:
+        z = np.linspace(0.0, high, max(2, round(float(side[:, 1].max()) / LEATHER)) + 1)
+        ring = [
+            *((x, v, 0.0) for v in y[:-1]),
+            *((x, y[-1], w) for w in z[:-1]),
+            *((x, v, high) for v in y[:0:-1]),
+            *((x, y[0], w) for w in z[:0:-1]),
+        ]
+        rings.append(np.array(ring))
     tips = [ring.mean(axis=0)[None] for ring in (rings[0], rings[-1])]
-    del stations
     return skin([tips[0], *rings, tips[1]], closed=False)

@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from drakegrasp.objects.builtin.modelling import bar, cut, fuse, revolve, solid, sweep
+from drakegrasp.objects.builtin.booleans import cut, fuse
+from drakegrasp.objects.builtin.modelling import bar, revolve, solid, sweep
 from drakegrasp.objects.builtin.profiles import (
     COARSE,
     EDGE,
@@ -84,7 +85,7 @@ def vase(
     lip_radius: float,
     height: float,
     wall: float = 0.005,
-    edge: float = EDGE,
+    edge: float = 0.007,
 ) -> trimesh.Trimesh:
     """Return a hollow vase with a belly, a neck and a lip.
 

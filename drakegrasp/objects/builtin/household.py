@@ -10,7 +10,8 @@ import numpy as np
 import trimesh
 
 from drakegrasp.arithmetic import sin_cos_deg
-from drakegrasp.objects.builtin.modelling import cut, fuse, revolve
+from drakegrasp.objects.builtin.booleans import cut, flat_base, fuse
+from drakegrasp.objects.builtin.modelling import revolve
 from drakegrasp.objects.builtin.primitives import (
     ball,
     block,
@@ -22,7 +23,7 @@ from drakegrasp.objects.builtin.primitives import (
     rotated,
     tube,
 )
-from drakegrasp.objects.builtin.profiles import EDGE, resample, smooth
+from drakegrasp.objects.builtin.profiles import EDGE, resample, smooth, spread_evenly
 
 #: Edge length of things with many parts [m].
 BROAD = 1.3 * EDGE
@@ -119,7 +120,7 @@ def iron(*, length: float, width: float, height: float) -> trimesh.Trimesh:
         ]
     )  # fmt: skip
     outline = resample(np.vstack([side, side[-2::-1] * [1.0, -1.0], side[:1]]), 1.0)
-    spaced = _spread_ring(outline, BROAD)
+    spaced = spread_evenly(outline, BROAD)[:-1]
     low = 0.085 * height
     sole = prism(spaced, 0.0, low)
     body = prism(0.94 * spaced, low - 0.003, 0.50 * height, top=0.72)
@@ -178,7 +179,7 @@ def hourglass(*, radius: float, waist: float, height: float) -> trimesh.Trimesh:
         (0.4 * bulb + 0.5 * waist, 0.40 * height),
         (waist, 0.5 * height),
     ]
-    glass = lathe(smooth([*half, *((r, height - z) for r, z in half[-2::-1])], EDGE))
+    glass = lathe(smooth([*half, *((r, height - z) for r, z in half[-2::-1])], BROAD), edge=BROAD)
     s, c = sin_cos_deg(np.array([30.0, 150.0, 270.0]))
     posts = [
         rod((0.86 * radius * x, 0.86 * radius * y, plate / 2.0),
@@ -188,8 +189,8 @@ def hourglass(*, radius: float, waist: float, height: float) -> trimesh.Trimesh:
     return fuse(
         glass,
         *posts,
-        rod((0.0, 0.0, 0.0), (0.0, 0.0, plate), radius),
-        rod((0.0, 0.0, height - plate), (0.0, 0.0, height), radius),
+        rod((0.0, 0.0, 0.0), (0.0, 0.0, plate), radius, edge=BROAD),
+        rod((0.0, 0.0, height - plate), (0.0, 0.0, height), radius, edge=BROAD),
     )
 
 
@@ -284,13 +285,5 @@ def alarm_clock(*, radius: float, depth: float) -> trimesh.Trimesh:
         rod((0.0, 0.0, z + 0.9 * radius), (0.0, 0.0, z + 1.28 * radius), 0.0035),
         rod((-0.009, 0.0, z + 1.3 * radius), (0.009, 0.0, z + 1.3 * radius), 0.0065),
     ]
-    from drakegrasp.objects.builtin.modelling import flat_base
 
     return flat_base(fuse(case, *hands, *marks, *kept, *legs, *hammer))
-
-
-def _spread_ring(outline: np.ndarray, edge: float) -> np.ndarray:
-    """Return a closed outline (n, 2), its last point its first, with points about `edge` apart."""
-    from drakegrasp.objects.builtin.profiles import spread_evenly
-
-    return spread_evenly(outline, edge)[:-1]

@@ -10,7 +10,8 @@ import numpy as np
 import trimesh
 
 from drakegrasp.objects.builtin.hollow_shapes import loop_handle
-from drakegrasp.objects.builtin.modelling import cut, flat_base, fuse, revolve, sweep
+from drakegrasp.objects.builtin.booleans import cut, flat_base, fuse
+from drakegrasp.objects.builtin.modelling import extrude, revolve, sweep
 from drakegrasp.objects.builtin.primitives import (
     ball,
     block,
@@ -35,13 +36,16 @@ from drakegrasp.objects.builtin.profiles import (
 #: Edge length of things with many parts [m].
 BROAD = 1.3 * EDGE
 
+#: Edge length of large flat sides [m].
+LARGE = 1.8 * EDGE
+
 
 def toaster(*, length: float, width: float, height: float) -> trimesh.Trimesh:
     """Return a toaster with two slots along x and a lever at +x."""
     foot = 0.006
-    across = rounded_rectangle(height - foot, width, 0.3 * width, edge=BROAD)
+    across = rounded_rectangle(height - foot, width, 0.2 * width, edge=LARGE)
     stations = resample(
-        [[-length / 2.0], [0.004 - length / 2.0], [length / 2.0 - 0.004], [length / 2.0]], BROAD
+        [[-length / 2.0], [0.004 - length / 2.0], [length / 2.0 - 0.004], [length / 2.0]], LARGE
     )[:, 0]
     middle = (height + foot) / 2.0
     path = np.column_stack([stations, 0.0 * stations, np.full_like(stations, middle)])
@@ -55,7 +59,7 @@ def toaster(*, length: float, width: float, height: float) -> trimesh.Trimesh:
     ]
 
     slots = [
-        block((0.78 * length, 0.17 * width, 0.11), (0.0, 0.19 * side * width, 0.42 * height + 0.055))
+        block((0.78 * length, 0.17 * width, 0.11), (0.0, 0.19 * side * width, 0.42 * height + 0.055), edge=LARGE)
         for side in (-1.0, 1.0)
     ]
     groove = block((0.02, 0.009, 0.5 * height), (length / 2.0 + 0.005, 0.0, 0.56 * height))
@@ -80,6 +84,7 @@ def carton(*, width: float, height: float, roof: float) -> trimesh.Trimesh:
             (height + roof + fin, width, 0.008),
         ],
         corner=0.003,
+        edge=LARGE,
     )
     # The gable's ends are folded inwards.
     folds = []
@@ -109,7 +114,7 @@ def towel_roll(*, radius: float, height: float, core: float) -> trimesh.Trimesh:
         closed=True,
     )
     sheet = block(
-        (0.9 * radius, 0.005, height - 0.004), (0.52 * radius, radius - 0.0045, height / 2.0),
+        (0.62 * radius, 0.005, height - 0.004), (0.36 * radius, radius - 0.0035, height / 2.0),
         corner=0.0015, edge=BROAD,
     )  # fmt: skip
     return fuse(paper, sheet)
@@ -121,17 +126,17 @@ def coffeemaker(*, width: float, depth: float, height: float) -> trimesh.Trimesh
     jug, floor, head = 0.36 * width, 0.020, 0.24 * height
     x = 0.5 * depth - 0.42 * width
     parts = [
-        block((depth, width, floor), (0.0, 0.0, floor / 2.0), corner=0.01, edge=BROAD),
+        block((depth, width, floor), (0.0, 0.0, floor / 2.0), corner=0.01, edge=LARGE),
         block(
-            (tank, width, height), ((tank - depth) / 2.0, 0.0, height / 2.0), corner=0.01, edge=BROAD
+            (tank, width, height), ((tank - depth) / 2.0, 0.0, height / 2.0), corner=0.01, edge=LARGE
         ),
         pillar(
             [(height - head, 0.86 * depth, 0.94 * width), (height, depth, width)],
             corner=0.012,
-            edge=BROAD,
+            edge=LARGE,
         ),
         # The filter under the head.
-        moved(lathe(resample([(0.45 * jug, 0.0), (0.8 * jug, 0.02)], BROAD), edge=BROAD),
+        moved(lathe(resample([(0.45 * jug, 0.0), (0.8 * jug, 0.02)], BROAD), edge=LARGE),
               (x, 0.0, height - head - 0.014)),
     ]
 
@@ -147,9 +152,9 @@ def coffeemaker(*, width: float, depth: float, height: float) -> trimesh.Trimesh
         ],
         BROAD,
     )
-    parts.append(moved(lathe(side, edge=BROAD), (x, 0.0, floor - 0.002)))
+    parts.append(moved(lathe(side, edge=LARGE), (x, 0.0, floor - 0.002)))
     handle = loop_handle(x=x + 0.6 * jug, top=0.92 * top, bottom=floor + 0.22 * (top - floor),
-                         reach=0.78 * jug, radius=0.0045, edge=BROAD)  # fmt: skip
+                         reach=0.78 * jug, radius=0.0045, edge=LARGE)  # fmt: skip
     parts.append(handle)
     lamp = ball((0.5 * depth, 0.25 * width, height - 0.5 * head), 0.006, edge=0.6 * EDGE)
     return fuse(*parts, lamp)
@@ -218,7 +223,6 @@ def juicer(*, radius: float, rim: float, cone: float) -> trimesh.Trimesh:
         *((float(np.sqrt(max(0.0, 1.0 - h**1.6))), 0.2 * rim + h * (cone - 0.2 * rim))
           for h in heights),
     ]
-    from drakegrasp.objects.builtin.modelling import extrude
 
     handle = block((0.5 * radius, 0.36 * radius, 0.008), (-1.15 * radius, 0.0, rim - 0.006),
                    corner=0.12 * radius)  # fmt: skip

@@ -10,7 +10,8 @@ import numpy as np
 import trimesh
 
 from drakegrasp.arithmetic import sin_cos_deg
-from drakegrasp.objects.builtin.modelling import extrude, flat_base, fuse
+from drakegrasp.objects.builtin.booleans import flat_base, fuse
+from drakegrasp.objects.builtin.modelling import extrude
 from drakegrasp.objects.builtin.primitives import ball, lathe, moved, scalloped, tube
 from drakegrasp.objects.builtin.profiles import EDGE, resample, smooth
 

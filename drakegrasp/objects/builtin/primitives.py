@@ -189,10 +189,10 @@ def prism(
     """
     section = np.asarray(outline, dtype=float)
     inward = 1.0 - BEVEL / float(norm(section).min())
-    side = resample([(low + BEVEL, 1.0), (high - BEVEL, top)], edge)
+    heights = resample([[low + BEVEL], [high - BEVEL]], edge)[:, 0]
     profile = [
         *((inward * share, low) for share in (*FLAT_END, 1.0)),
-        *((scale, z) for z, scale in side),
+        *zip(np.linspace(1.0, top, len(heights)), heights, strict=True),
         *((inward * top * share, high) for share in (1.0, *FLAT_END[::-1])),
     ]
     return extrude(section, profile)

@@ -11,7 +11,8 @@ import numpy as np
 import trimesh
 
 from drakegrasp.frames import Array
-from drakegrasp.objects.builtin.modelling import bar, fuse, revolve, stand
+from drakegrasp.objects.builtin.booleans import fuse, stand
+from drakegrasp.objects.builtin.modelling import bar, revolve
 from drakegrasp.objects.builtin.profiles import COARSE, EDGE, bevelled, ellipse, resample, smooth
 
 

@@ -12,7 +12,8 @@ import trimesh
 from scipy.interpolate import PchipInterpolator
 
 from drakegrasp.frames import Array
-from drakegrasp.objects.builtin.modelling import bar, extrude, fuse, grid_box, revolve, skin, sweep
+from drakegrasp.objects.builtin.booleans import fuse
+from drakegrasp.objects.builtin.modelling import bar, extrude, grid_box, revolve, skin, sweep
 from drakegrasp.objects.builtin.profiles import (
     EDGE,
     ellipse,
@@ -69,7 +70,7 @@ def book(*, width: float, length: float, thickness: float, edge: float = 0.011) 
 
 
 def spray_bottle(
-    *, width: float, depth: float, height: float, edge: float = EDGE
+    *, width: float, depth: float, height: float, edge: float = 0.007
 ) -> trimesh.Trimesh:
     """Return a spray bottle, solid: an oval body, a neck, a head and a trigger towards +x.
 

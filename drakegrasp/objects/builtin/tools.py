@@ -11,7 +11,8 @@ import trimesh
 
 from drakegrasp.arithmetic import sin_cos_deg
 from drakegrasp.objects.builtin.hollow_shapes import loop_handle, vessel
-from drakegrasp.objects.builtin.modelling import cut, fuse, stand, sweep
+from drakegrasp.objects.builtin.booleans import cut, fuse, stand
+from drakegrasp.objects.builtin.modelling import sweep
 from drakegrasp.objects.builtin.primitives import (
     ball,
     block,
@@ -25,8 +26,8 @@ from drakegrasp.objects.builtin.primitives import (
 )
 from drakegrasp.objects.builtin.profiles import EDGE, resample, smooth
 
-#: Edge length of things with many parts [m].
-BROAD = 1.3 * EDGE
+#: Edge length of things with many parts [m], and of large flat sides.
+BROAD, LARGE = 1.3 * EDGE, 1.8 * EDGE
 
 
 def screwdriver(*, handle: float, radius: float, shaft: float) -> trimesh.Trimesh:
@@ -180,15 +181,15 @@ def garbage_bin(*, width: float, height: float) -> trimesh.Trimesh:
     body = pillar(
         [(0.0, 0.72 * depth, 0.74 * width, 0.05 * depth, 0.0),
          (height, depth, width, 0.0, 0.0)],
-        corner=0.08 * width, edge=BROAD,
+        corner=0.08 * width, edge=LARGE,
     )  # fmt: skip
     rim = block((1.1 * depth, 1.1 * width, 0.010), (0.0, 0.0, height - 0.003), corner=0.09 * width,
-                edge=BROAD)  # fmt: skip
+                edge=LARGE)  # fmt: skip
     lid = pillar(
         [(height, 1.08 * depth, 1.06 * width, 0.0, 0.0),
          (height + 0.13 * width, 0.86 * depth, 0.88 * width, -0.05 * depth, 0.0),
          (height + 0.17 * width, 0.6 * depth, 0.7 * width, -0.10 * depth, 0.0)],
-        corner=0.09 * width, edge=BROAD,
+        corner=0.09 * width, edge=LARGE,
     )  # fmt: skip
     x = -0.36 * depth
     wheels = [

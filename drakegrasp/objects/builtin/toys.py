@@ -13,7 +13,7 @@ import trimesh
 
 from drakegrasp.arithmetic import sin_cos_deg
 from drakegrasp.objects.builtin.hollow_shapes import loop_handle, vessel
-from drakegrasp.objects.builtin.modelling import cut, fuse
+from drakegrasp.objects.builtin.booleans import cut, fuse
 from drakegrasp.objects.builtin.primitives import (
     ball,
     block,
@@ -27,6 +27,9 @@ from drakegrasp.objects.builtin.profiles import EDGE, resample, smooth
 
 #: Edge length of things with many parts [m].
 BROAD = 1.3 * EDGE
+
+#: Edge length of large flat sides [m].
+LARGE = 1.9 * EDGE
 
 
 def chess_pawn(*, base: float, head: float, height: float) -> trimesh.Trimesh:
@@ -69,9 +72,9 @@ def trophy(*, base: float, cup: float, height: float) -> trimesh.Trimesh:
     """Return a cup with two handles on a square pedestal: edge of `base`, radius of `cup`."""
     foot, stem = 0.17 * height, 0.46 * height
     plinth = pillar(
-        [(0.0, base, base), (0.7 * foot, 0.94 * base, 0.94 * base)], corner=0.003, edge=BROAD
+        [(0.0, base, base), (0.7 * foot, 0.94 * base, 0.94 * base)], corner=0.003, edge=LARGE
     )
-    step = block((0.72 * base, 0.72 * base, 0.012), (0.0, 0.0, foot - 0.004), corner=0.003)
+    step = block((0.72 * base, 0.72 * base, 0.012), (0.0, 0.0, foot - 0.004), corner=0.003, edge=LARGE)
     column = lathe(
         smooth([(0.32 * base, foot), (0.10 * base + 0.003, 0.7 * foot + 0.3 * stem),
                 (0.10 * base + 0.003, 0.88 * stem), (0.5 * cup, stem + 0.012)], EDGE)
@@ -79,7 +82,7 @@ def trophy(*, base: float, cup: float, height: float) -> trimesh.Trimesh:
     bowl, core = vessel(
         smooth([(0.36 * cup, 0.0), (0.80 * cup, 0.16 * (height - stem)),
                 (0.94 * cup, 0.5 * (height - stem)), (cup, height - stem)], EDGE),
-        wall=0.005, floor=0.012,
+        wall=0.005, floor=0.012, edge=1.15 * EDGE,
     )  # fmt: skip
     ear = cut(
         loop_handle(x=0.86 * cup, top=0.86 * (height - stem), bottom=0.26 * (height - stem),
@@ -93,11 +96,11 @@ def trophy(*, base: float, cup: float, height: float) -> trimesh.Trimesh:
 def house(*, width: float, depth: float, wall: float, roof: float) -> trimesh.Trimesh:
     """Return a toy house: heights of `wall` and `roof`, a door towards -y, a chimney."""
     eaves = 0.012
-    body = pillar([(0.0, width, depth), (wall + 0.004, width, depth)], corner=0.002, edge=BROAD)
+    body = pillar([(0.0, width, depth), (wall + 0.004, width, depth)], corner=0.002, edge=LARGE)
     gable = pillar(
         [(wall - 0.004, width + 2.0 * eaves, depth + eaves), (wall, width + 2.0 * eaves, depth + eaves),
          (wall + roof, 0.010, depth + eaves)],
-        corner=0.002, edge=BROAD,
+        corner=0.002, edge=LARGE,
     )  # fmt: skip
     front = -depth / 2.0
     recesses = [
@@ -179,6 +182,7 @@ def rocket(*, radius: float, height: float, span: float) -> trimesh.Trimesh:
                 (0.34 * height, 0.30 * span, 0.008, 0.32 * span, 0.0),
             ],
             corner=0.002,
+            edge=LARGE,
         )
         fins.append(rotated(fin, "z", 45.0 + 90.0 * k))
     window = rod((0.0, 0.0, 0.62 * height), (0.0, -0.99 * radius, 0.62 * height), 0.36 * radius)
