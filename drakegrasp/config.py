@@ -220,7 +220,8 @@ class SplitConfig(_Section):
     """How the samples are split for training, validation and test."""
 
     valid_fraction: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.1
-    train_classes: tuple[str, ...] | None = None  # None: every class with two objects or more
+    # Names of the classes that train, with their only object too; None: all with two or more.
+    train_classes: tuple[str, ...] | None = None
 
 
 class VerifyConfig(_Section):

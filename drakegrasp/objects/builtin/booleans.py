@@ -1,13 +1,13 @@
-"""Unions and differences of solids, by manifold3d through trimesh, with sound triangles along seams.
+"""Unions and differences of solids, with sound triangles along their seams.
 
-manifold3d cuts triangles where surfaces meet and leaves slivers there and long triangles in flat
-faces. Both are mended: they would cost contact patches for nothing. Nothing is random.
+manifold3d, through trimesh, cuts triangles where surfaces meet, and leaves slivers there and long
+triangles in flat faces. Both are mended: they would cost contact patches for nothing. Nothing is
+random.
 """
 
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import trimesh
 
 from drakegrasp.arithmetic import dot, norm

@@ -1,5 +1,4 @@
-"""The built-in objects: everyday things drawn from the table of classes, so that a dataset needs
-no meshes.
+"""The built-in objects: everyday things of drawn sizes, so that a dataset needs no meshes.
 
 An object is a class, an index from 1 and a seed: its sizes are drawn from the ranges of
 `drakegrasp.objects.builtin.classes`. Its name is `<number>_<class>_<index>`. The same index and
@@ -22,6 +21,7 @@ from drakegrasp.objects.builtin.classes import CLASSES, ObjectClass
 from drakegrasp.objects.builtin.modelling import DECIMALS
 from drakegrasp.objects.sources import MeshSource, find_mesh
 from drakegrasp.runtime.files import write_atomic
+from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.seeding import Stream, object_key
 
 
@@ -71,11 +71,12 @@ def builtin_object(name: str, *, seed: int = 0) -> BuiltinObject:
     Raises:
         MeshError: If there is no such class; the message lists the classes.
     """
-    stem, _, index = name.rpartition("_")
+    index = name.rpartition("_")[2]
     for object_class in CLASSES:
-        if stem == f"{object_class.number}_{object_class.name}" and index.isdecimal():
-            if int(index) >= 1 and index == str(int(index)):
-                return BuiltinObject(object_class=object_class, index=int(index), seed=seed)
+        number = int(index) if index.isdecimal() else 0
+        item = BuiltinObject(object_class=object_class, index=number, seed=seed)
+        if number >= 1 and item.name == name:
+            return item
     stems = ", ".join(f"{c.number}_{c.name}" for c in CLASSES)
     raise MeshError(
         f"a built-in object must be a class and a number from 1, e.g. 1_mug_2, got {name!r}; "
@@ -88,6 +89,7 @@ def export_builtin(
     names: Iterable[str] | None = None,
     *,
     config: BuiltinConfig | None = None,
+    progress: Report = silent,
 ) -> list[Path]:
     """Write built-in objects as `<name>.obj` and return the paths, in the order asked for.
 
@@ -97,6 +99,7 @@ def export_builtin(
         directory: Where to write; made if it is missing.
         names: Which objects; all of the configuration by default.
         config: How many of each class, and the seed of their sizes; the defaults if None.
+        progress: Is told how many meshes there are.
 
     Raises:
         MeshError: If a name is unknown; nothing is written then.
@@ -115,12 +118,15 @@ def export_builtin(
         path = folder / f"{item.name}.obj"
         write_atomic(path, _wavefront(item.build()))
         paths.append(path)
+        progress(len(paths), len(chosen))
     return paths
 
 
-def builtin_sources(folder: str | os.PathLike[str], config: BuiltinConfig) -> list[MeshSource]:
+def builtin_sources(
+    folder: str | os.PathLike[str], config: BuiltinConfig, progress: Report = silent
+) -> list[MeshSource]:
     """Return the built-in objects as meshes in a folder, which is made, sorted by name."""
-    sources = [find_mesh(path) for path in export_builtin(folder, config=config)]
+    sources = [find_mesh(path) for path in export_builtin(folder, config=config, progress=progress)]
     return sorted(sources, key=lambda source: source.name)
 
 

@@ -14,19 +14,19 @@ from dataclasses import dataclass
 
 import trimesh
 
-from drakegrasp.objects.builtin import (
+from drakegrasp.objects.builtin.parameters import Range, deg, mm, pieces
+from drakegrasp.objects.builtin.shapes import (
     animals,
+    belongings,
     clothing,
-    hollow_shapes,
     household,
     kitchenware,
+    packaging,
     plants,
-    revolved_shapes,
-    solid_shapes,
     tools,
     toys,
+    vessels,
 )
-from drakegrasp.objects.builtin.parameters import Range, deg, mm, pieces
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,63 +56,64 @@ class ObjectClass:
 
 # fmt: off
 _ROWS: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, Range]], ...] = (
-    (hollow_shapes.mug, dict(
-        radius=mm(35, 45), height=mm(80, 105), handle_reach=mm(26, 35), handle_radius=mm(4.5, 6.5))),
-    (revolved_shapes.bottle, dict(
+    (vessels.mug, dict(
+        radius=mm(35, 45), height=mm(80, 105), handle_reach=mm(26, 35),
+        handle_radius=mm(4.5, 6.5))),
+    (packaging.bottle, dict(
         radius=mm(29, 40), height=mm(150, 210), neck_radius=mm(11, 16))),
-    (hollow_shapes.bowl, dict(
+    (vessels.bowl, dict(
         radius=mm(52, 70), height=mm(50, 68), foot_radius=mm(25, 34))),
-    (hollow_shapes.wineglass, dict(
+    (vessels.wineglass, dict(
         foot_radius=mm(33, 38), stem_radius=mm(5.5, 7), belly_radius=mm(30, 42),
         rim_radius=mm(26, 34), height=mm(145, 180), stem_height=mm(60, 75))),
-    (solid_shapes.box, dict(
+    (packaging.box, dict(
         width=mm(60, 100), depth=mm(45, 70), height=mm(60, 150))),
-    (revolved_shapes.can, dict(
+    (packaging.can, dict(
         radius=mm(32, 38), height=mm(75, 120))),
-    (solid_shapes.hammer, dict(
+    (tools.hammer, dict(
         length=mm(190, 225), head_length=mm(95, 115), head_thickness=mm(28, 34))),
-    (revolved_shapes.candlestick, dict(
+    (household.candlestick, dict(
         foot_radius=mm(43, 52), stem_radius=mm(10, 12.5), height=mm(120, 190))),
-    (hollow_shapes.vase, dict(
+    (vessels.vase, dict(
         foot_radius=mm(31, 37), belly_radius=mm(42, 52), neck_radius=mm(20, 26),
         lip_radius=mm(29, 34), height=mm(130, 190))),
-    (revolved_shapes.flashlight, dict(
+    (belongings.flashlight, dict(
         head_radius=mm(26, 34), body_radius=mm(15, 20), height=mm(120, 170),
         head_height=mm(28, 36))),
-    (hollow_shapes.cup, dict(
+    (vessels.cup, dict(
         top_radius=mm(36, 43), bottom_radius=mm(26, 31), height=mm(85, 120))),
-    (revolved_shapes.jar, dict(
+    (packaging.jar, dict(
         radius=mm(34, 43), height=mm(80, 125), lid_radius=mm(28, 34), lid_height=mm(14, 18))),
-    (hollow_shapes.pitcher, dict(
+    (vessels.pitcher, dict(
         foot_radius=mm(36, 42), belly_radius=mm(44, 52), neck_radius=mm(31, 36),
         rim_radius=mm(36, 42), height=mm(120, 165), handle_reach=mm(21, 26),
         handle_radius=mm(6, 7), lip=mm(14, 18))),
-    (hollow_shapes.funnel, dict(
+    (vessels.funnel, dict(
         radius=mm(42, 55), spout_radius=mm(11, 13.5), cone_height=mm(50, 70), height=mm(98, 130))),
-    (solid_shapes.dumbbell, dict(
+    (belongings.dumbbell, dict(
         length=mm(160, 200), head_width=mm(56, 76), head_length=mm(40, 52),
         grip_radius=mm(13.5, 16.5))),
-    (solid_shapes.spray_bottle, dict(
+    (packaging.spray_bottle, dict(
         width=mm(64, 84), depth=mm(46, 56), height=mm(170, 220))),
-    (solid_shapes.book, dict(
+    (belongings.book, dict(
         width=mm(88, 105), length=mm(120, 150), thickness=mm(34, 52))),
-    (solid_shapes.banana, dict(
+    (plants.banana, dict(
         bend_radius=mm(76, 96), angle=deg(105, 122), thickness=mm(34, 40))),
-    (hollow_shapes.saucepan, dict(
+    (vessels.saucepan, dict(
         radius=mm(48, 58), height=mm(55, 85), handle_length=mm(85, 100))),
-    (revolved_shapes.apple, dict(
+    (plants.apple, dict(
         radius=mm(34, 42), height=mm(60, 70))),
-    (revolved_shapes.pear, dict(
+    (plants.pear, dict(
         radius=mm(35, 38), neck_radius=mm(17, 20), height=mm(85, 105))),
     (clothing.hat, dict(
         brim=mm(56, 64), crown=mm(35, 42), height=mm(64, 85))),
     (kitchenware.toaster, dict(
         length=mm(115, 140), width=mm(66, 80), height=mm(80, 98))),
-    (kitchenware.carton, dict(
+    (packaging.carton, dict(
         width=mm(54, 70), height=mm(85, 120), roof=mm(24, 32))),
     (household.watertap, dict(
         base=mm(36, 42), pipe=mm(8, 10), height=mm(140, 170), reach=mm(64, 80))),
-    (kitchenware.towel_roll, dict(
+    (packaging.towel_roll, dict(
         radius=mm(36, 46), height=mm(95, 125), core=mm(16, 20))),
     (kitchenware.coffeemaker, dict(
         width=mm(76, 90), depth=mm(104, 122), height=mm(130, 160))),
@@ -157,7 +158,7 @@ _ROWS: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, Range]], ...] = (
         radius=mm(38, 45), height=mm(80, 95), spout=mm(62, 76))),
     (household.iron, dict(
         length=mm(150, 175), width=mm(76, 88), height=mm(84, 98))),
-    (household.camera, dict(
+    (belongings.camera, dict(
         width=mm(104, 122), height=mm(66, 78), depth=mm(38, 46), lens=mm(25, 29))),
     (household.hourglass, dict(
         radius=mm(36, 42), waist=mm(5.5, 7.5), height=mm(110, 140))),
@@ -185,9 +186,9 @@ _ROWS: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, Range]], ...] = (
         length=mm(170, 200), head_length=mm(86, 104), radius=mm(25, 30))),
     (tools.barrel, dict(
         radius=mm(30, 36), bulge=mm(6, 10), height=mm(85, 105))),
-    (kitchenware.soap_dispenser, dict(
+    (packaging.soap_dispenser, dict(
         width=mm(62, 74), depth=mm(44, 52), height=mm(135, 160))),
-    (household.alarm_clock, dict(
+    (belongings.alarm_clock, dict(
         radius=mm(36, 43), depth=mm(36, 44))),
     (tools.traffic_cone, dict(
         base=mm(84, 100), radius=mm(30, 35), height=mm(115, 145))),

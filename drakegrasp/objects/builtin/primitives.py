@@ -54,9 +54,7 @@ def ball(centre: npt.ArrayLike, radii: npt.ArrayLike, *, edge: float = EDGE) -> 
     half = np.broadcast_to(np.asarray(radii, dtype=float), 3)
     count = max(6, round(np.pi * float(half.mean()) / edge))
     sine, cosine = sin_cos_deg(np.linspace(-90.0, 90.0, count + 1))
-    unit = revolve(
-        np.column_stack([cosine * half[:2].mean(), sine * half[2]]), edge=edge
-    )
+    unit = revolve(np.column_stack([cosine * half[:2].mean(), sine * half[2]]), edge=edge)
     stretch = [half[0] / half[:2].mean(), half[1] / half[:2].mean(), 1.0]
     return solid(unit.vertices * stretch + np.asarray(centre, dtype=float), unit.faces)
 
@@ -89,9 +87,7 @@ def rod(
     return solid(multiply(upright.vertices, _axes((q - p) / length).T) + p, upright.faces)
 
 
-def tube(
-    path: npt.ArrayLike, radius: npt.ArrayLike, *, edge: float = EDGE
-) -> trimesh.Trimesh:
+def tube(path: npt.ArrayLike, radius: npt.ArrayLike, *, edge: float = EDGE) -> trimesh.Trimesh:
     """Return a round bar along a curve, with flat ends.
 
     Args:

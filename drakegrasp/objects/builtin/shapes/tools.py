@@ -1,18 +1,18 @@
 """Tools and things of a yard, one function per class: sizes come in, watertight meshes go out.
 
-Every mesh stands or lies on the plane z = 0 as it would on a table, z up. All lengths are in [m];
-`drakegrasp.objects.builtin.catalog` holds the table of sizes.
+Every mesh stands or lies on the plane z = 0 as it would on a table, z up. All lengths are in [m]
+and all angles in [rad]; `drakegrasp.objects.builtin.classes` has the table of their ranges.
 """
 
 from __future__ import annotations
 
 import numpy as np
 import trimesh
+from scipy.interpolate import PchipInterpolator
 
 from drakegrasp.arithmetic import sin_cos_deg
-from drakegrasp.objects.builtin.hollow_shapes import loop_handle, vessel
 from drakegrasp.objects.builtin.booleans import cut, fuse, stand
-from drakegrasp.objects.builtin.modelling import sweep
+from drakegrasp.objects.builtin.modelling import bar, sweep
 from drakegrasp.objects.builtin.primitives import (
     ball,
     block,
@@ -24,10 +24,53 @@ from drakegrasp.objects.builtin.primitives import (
     scalloped,
     tube,
 )
-from drakegrasp.objects.builtin.profiles import EDGE, resample, smooth
+from drakegrasp.objects.builtin.profiles import (
+    BROAD,
+    EDGE,
+    LARGE,
+    ellipse,
+    resample,
+    rounded_rectangle,
+    smooth,
+    spread_evenly,
+)
+from drakegrasp.objects.builtin.shapes.vessels import loop_handle, vessel
 
-#: Edge length of things with many parts [m], and of large flat sides.
-BROAD, LARGE = 1.3 * EDGE, 1.8 * EDGE
+
+def hammer(*, length: float, head_length: float, head_thickness: float) -> trimesh.Trimesh:
+    """Return a claw hammer that lies on its side, handle along -x, head along y."""
+    half = head_thickness / 2.0
+    up = (0.0, 0.0, 1.0)
+    grip = min(half, 0.016)
+    # The handle leans, if need be, so that its end lies on the table beside the head.
+    handle = bar(
+        (-length, 0.0, grip),
+        (0.0, 0.0, half),
+        ellipse(0.85 * grip, grip, edge=EDGE),
+        normal=up,
+        scale=((0.0, 1.0), (0.3, 1.0), (0.55, 0.75), (1.0, 0.75)),
+    )
+    reach = head_length / 2.0
+    y = np.linspace(reach, -reach, 60)
+    bend = np.clip(-(y + 0.012), 0.0, None)
+    path = np.column_stack([-8.0 * bend**2, y, np.full_like(y, half)])
+    path = spread_evenly(path, EDGE)
+    knots = np.array(
+        [
+            (-1.0, 0.18, 0.8),
+            (-0.35, 0.75, 0.9),
+            (0.0, 1.0, 1.0),
+            (0.35, 1.0, 1.0),
+            (0.55, 0.72, 0.72),
+            (0.75, 1.0, 1.0),
+            (0.93, 1.0, 1.0),
+            (1.0, 0.88, 0.88),
+        ]
+    )
+    scale = PchipInterpolator(knots[:, 0], knots[:, 1:])(path[:, 1] / reach)
+    section = rounded_rectangle(2.0 * half, 2.0 * half, 0.55 * half, edge=EDGE)
+    head = sweep(path, section, normal=up, scale=scale)
+    return fuse(handle, head)
 
 
 def screwdriver(*, handle: float, radius: float, shaft: float) -> trimesh.Trimesh:
@@ -37,8 +80,18 @@ def screwdriver(*, handle: float, radius: float, shaft: float) -> trimesh.Trimes
     s, c = (float(value) for value in sin_cos_deg(30.0))
     section = section @ np.array([[c, s], [-s, c]])
     lowest = float(section[:, 0].max())
-    knots = np.array([(0.0, 0.62), (0.05, 0.86), (0.14, 1.0), (0.62, 1.0), (0.78, 0.74),
-                      (0.88, 0.72), (0.97, 0.80), (1.0, 0.72)])  # fmt: skip
+    knots = np.array(
+        [
+            (0.0, 0.62),
+            (0.05, 0.86),
+            (0.14, 1.0),
+            (0.62, 1.0),
+            (0.78, 0.74),
+            (0.88, 0.72),
+            (0.97, 0.80),
+            (1.0, 0.72),
+        ]
+    )
     along = np.linspace(0.0, 1.0, round(handle / EDGE) + 1)
     path = np.column_stack([-handle * (1.0 - along), 0.0 * along, np.full_like(along, lowest)])
     grip = sweep(
@@ -48,10 +101,14 @@ def screwdriver(*, handle: float, radius: float, shaft: float) -> trimesh.Trimes
     blade = max(0.0045, 0.24 * radius)
     steel = rod((-0.01, 0.0, lowest), (0.86 * shaft, 0.0, lowest), blade, edge=0.8 * EDGE)
     flat = pillar(
-        [(0.76 * shaft, 1.5 * blade, 1.5 * blade), (0.88 * shaft, 1.3 * blade, 2.9 * blade),
-         (shaft, 0.65 * blade, 2.5 * blade)],
-        corner=0.3 * blade, edge=0.8 * EDGE,
-    )  # fmt: skip
+        [
+            (0.76 * shaft, 1.5 * blade, 1.5 * blade),
+            (0.88 * shaft, 1.3 * blade, 2.9 * blade),
+            (shaft, 0.65 * blade, 2.5 * blade),
+        ],
+        corner=0.3 * blade,
+        edge=0.8 * EDGE,
+    )
     return stand(fuse(grip, steel, moved(rotated(flat, "y", 90.0), (0.0, 0.0, lowest))))
 
 
@@ -60,15 +117,22 @@ def mallet(*, length: float, head_length: float, radius: float) -> trimesh.Trime
     grip = 0.4 * radius + 0.004
     half = head_length / 2.0
     side = smooth(
-        [(0.88 * radius, -half), (radius, 0.006 - half), (radius, half - 0.006),
-         (0.88 * radius, half)], EDGE,
-    )  # fmt: skip
+        [
+            (0.88 * radius, -half),
+            (radius, 0.006 - half),
+            (radius, half - 0.006),
+            (0.88 * radius, half),
+        ],
+        EDGE,
+    )
     head = moved(rotated(lathe(side, edge=BROAD), "x", 90.0), (0.0, 0.0, radius))
     bands = [
-        moved(rotated(rod((0.0, 0.0, y - 0.006), (0.0, 0.0, y + 0.006), radius + 0.002), "x", 90.0),
-              (0.0, 0.0, radius))
+        moved(
+            rotated(rod((0.0, 0.0, y - 0.006), (0.0, 0.0, y + 0.006), radius + 0.002), "x", 90.0),
+            (0.0, 0.0, radius),
+        )
         for y in (-0.62 * half, 0.62 * half)
-    ]  # fmt: skip
+    ]
     # The handle leans, so that its end lies on the table.
     handle = rod((-length, 0.0, 0.98 * grip), (0.4 * radius, 0.0, radius), grip, 0.8 * grip)
     knob = ball((-length, 0.0, 1.12 * grip), (1.0 * grip, 1.15 * grip, 1.12 * grip))
@@ -80,20 +144,28 @@ def padlock(*, width: float, height: float, depth: float, shackle: float) -> tri
     radius = 0.085 * width + 0.001
     body = moved(
         rotated(
-            pillar([(-depth / 2.0, width, height), (depth / 2.0, width, height)],
-                   corner=0.2 * width, edge=BROAD),
-            "x", 90.0,
+            pillar(
+                [(-depth / 2.0, width, height), (depth / 2.0, width, height)],
+                corner=0.2 * width,
+                edge=BROAD,
+            ),
+            "x",
+            90.0,
         ),
         (0.0, 0.0, height / 2.0),
-    )  # fmt: skip
+    )
     reach = 0.33 * width
     s, c = sin_cos_deg(np.linspace(0.0, 180.0, 24))
     rise = shackle - radius - reach
     arch = np.column_stack([reach * c, 0.0 * c, height + rise + reach * s])
     path = np.vstack([[(reach, 0.0, height - 0.012)], arch, [(-reach, 0.0, height - 0.012)]])
     bow = tube(resample(path, EDGE), radius)
-    hole = rod((0.0, -depth, 0.52 * height), (0.0, 0.004 - depth / 2.0, 0.52 * height), 0.085 * width)
-    slit = block((0.075 * width, depth, 0.2 * height), (0.0, 0.004 - depth, 0.40 * height), corner=0.001)
+    hole = rod(
+        (0.0, -depth, 0.52 * height), (0.0, 0.004 - depth / 2.0, 0.52 * height), 0.085 * width
+    )
+    slit = block(
+        (0.075 * width, depth, 0.2 * height), (0.0, 0.004 - depth, 0.40 * height), corner=0.001
+    )
     return fuse(cut(body, fuse(hole, slit)), bow)
 
 
@@ -105,13 +177,24 @@ def watering_can(*, radius: float, height: float, spout: float) -> trimesh.Trime
     start = (0.9 * radius, 0.0, 0.22 * height)
     towards = np.subtract(tip, start) / np.linalg.norm(np.subtract(tip, start))
     pipe = rod(start, tip, 0.20 * radius, 0.11 * radius)
-    rose = rod(np.asarray(tip) - 0.008 * towards, np.asarray(tip) + 0.022 * towards,
-               0.12 * radius, 0.42 * radius)  # fmt: skip
+    rose = rod(
+        np.asarray(tip) - 0.008 * towards,
+        np.asarray(tip) + 0.022 * towards,
+        0.12 * radius,
+        0.42 * radius,
+    )
     handle = rotated(
-        loop_handle(x=0.92 * radius, top=0.98 * height, bottom=0.25 * height, reach=0.75 * radius,
-                    radius=0.0055, edge=BROAD),
-        "z", 180.0,
-    )  # fmt: skip
+        loop_handle(
+            x=0.92 * radius,
+            top=0.98 * height,
+            bottom=0.25 * height,
+            reach=0.75 * radius,
+            radius=0.0055,
+            edge=BROAD,
+        ),
+        "z",
+        180.0,
+    )
     # The front half of the top is covered.
     cover = cut(
         rod((0.0, 0.0, height - 0.007), (0.0, 0.0, height), 0.8 * radius - 0.001, edge=BROAD),
@@ -125,13 +208,22 @@ def bucket(*, top_radius: float, bottom_radius: float, height: float) -> trimesh
     wall = 0.005
     body = vessel(
         resample([(bottom_radius, 0.0), (top_radius, height)], BROAD),
-        wall=wall, floor=0.008, edge=BROAD,
-    )[0]  # fmt: skip
-    rim = lathe([(top_radius - 0.002, height - 0.010), (top_radius + 0.003, height - 0.009),
-                 (top_radius + 0.003, height - 0.001), (top_radius - 0.002, height)],
-                edge=BROAD)  # fmt: skip
-    hole = rod((0.0, 0.0, height - 0.05), (0.0, 0.0, height + 0.05), top_radius - wall + 0.0005,
-               edge=BROAD)  # fmt: skip
+        wall=wall,
+        floor=0.008,
+        edge=BROAD,
+    )[0]
+    rim = lathe(
+        [
+            (top_radius - 0.002, height - 0.010),
+            (top_radius + 0.003, height - 0.009),
+            (top_radius + 0.003, height - 0.001),
+            (top_radius - 0.002, height),
+        ],
+        edge=BROAD,
+    )
+    hole = rod(
+        (0.0, 0.0, height - 0.05), (0.0, 0.0, height + 0.05), top_radius - wall + 0.0005, edge=BROAD
+    )
     s, c = sin_cos_deg(np.linspace(0.0, 180.0, 40))
     reach = top_radius + 0.002
     bail = np.column_stack([reach * c, 0.0 * c, height - 0.012 + 0.95 * top_radius * s])
@@ -139,8 +231,11 @@ def bucket(*, top_radius: float, bottom_radius: float, height: float) -> trimesh
         ball((side * (top_radius + 0.001), 0.0, height - 0.012), (0.006, 0.009, 0.009))
         for side in (-1.0, 1.0)
     ]
-    grip = rod((-0.022, 0.0, height - 0.012 + 0.95 * top_radius),
-               (0.022, 0.0, height - 0.012 + 0.95 * top_radius), 0.0085)  # fmt: skip
+    grip = rod(
+        (-0.022, 0.0, height - 0.012 + 0.95 * top_radius),
+        (0.022, 0.0, height - 0.012 + 0.95 * top_radius),
+        0.0085,
+    )
     return fuse(fuse(body, cut(rim, hole)), *ears, tube(resample(bail, EDGE), 0.004), grip)
 
 
@@ -158,7 +253,7 @@ def traffic_cone(*, base: float, radius: float, height: float) -> trimesh.Trimes
 
 
 def barrel(*, radius: float, bulge: float, height: float) -> trimesh.Trimesh:
-    """Return a barrel with four hoops: `radius` of its ends, `bulge` by which its middle is wider."""
+    """Return a barrel with four hoops: `radius` of its ends, its middle wider by `bulge`."""
     inset = 0.006
     levels = np.linspace(0.0, 1.0, max(10, round(height / BROAD)) + 1)
     reach = radius + bulge * 4.0 * levels * (1.0 - levels)
@@ -179,29 +274,42 @@ def garbage_bin(*, width: float, height: float) -> trimesh.Trimesh:
     """Return a bin on two wheels, its lid closed: front towards +x, wheels and bar at -x."""
     depth, wheel = 1.08 * width, 0.16 * width
     body = pillar(
-        [(0.0, 0.72 * depth, 0.74 * width, 0.05 * depth, 0.0),
-         (height, depth, width, 0.0, 0.0)],
-        corner=0.08 * width, edge=LARGE,
-    )  # fmt: skip
-    rim = block((1.1 * depth, 1.1 * width, 0.010), (0.0, 0.0, height - 0.003), corner=0.09 * width,
-                edge=LARGE)  # fmt: skip
+        [(0.0, 0.72 * depth, 0.74 * width, 0.05 * depth, 0.0), (height, depth, width, 0.0, 0.0)],
+        corner=0.08 * width,
+        edge=LARGE,
+    )
+    rim = block(
+        (1.1 * depth, 1.1 * width, 0.010),
+        (0.0, 0.0, height - 0.003),
+        corner=0.09 * width,
+        edge=LARGE,
+    )
     lid = pillar(
-        [(height, 1.08 * depth, 1.06 * width, 0.0, 0.0),
-         (height + 0.13 * width, 0.86 * depth, 0.88 * width, -0.05 * depth, 0.0),
-         (height + 0.17 * width, 0.6 * depth, 0.7 * width, -0.10 * depth, 0.0)],
-        corner=0.09 * width, edge=LARGE,
-    )  # fmt: skip
+        [
+            (height, 1.08 * depth, 1.06 * width, 0.0, 0.0),
+            (height + 0.13 * width, 0.86 * depth, 0.88 * width, -0.05 * depth, 0.0),
+            (height + 0.17 * width, 0.6 * depth, 0.7 * width, -0.10 * depth, 0.0),
+        ],
+        corner=0.09 * width,
+        edge=LARGE,
+    )
     x = -0.36 * depth
     wheels = [
         rod((x, 0.34 * side * width, wheel), (x, 0.54 * side * width, wheel), wheel)
         for side in (-1.0, 1.0)
     ]
     axle = rod((x, -0.4 * width, wheel), (x, 0.4 * width, wheel), 0.35 * wheel)
-    bar = rod((-0.62 * depth, -0.42 * width, height - 0.008),
-              (-0.62 * depth, 0.42 * width, height - 0.008), 0.006)  # fmt: skip
+    bar = rod(
+        (-0.62 * depth, -0.42 * width, height - 0.008),
+        (-0.62 * depth, 0.42 * width, height - 0.008),
+        0.006,
+    )
     arms = [
-        rod((-0.62 * depth, 0.38 * side * width, height - 0.008),
-            (-0.45 * depth, 0.38 * side * width, height - 0.008), 0.0055)
+        rod(
+            (-0.62 * depth, 0.38 * side * width, height - 0.008),
+            (-0.45 * depth, 0.38 * side * width, height - 0.008),
+            0.0055,
+        )
         for side in (-1.0, 1.0)
-    ]  # fmt: skip
+    ]
     return fuse(body, rim, lid, *wheels, axle, bar, *arms)

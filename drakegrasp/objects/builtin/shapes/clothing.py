@@ -1,7 +1,8 @@
-"""Clothing and its care, one function per class: sizes come in, watertight meshes go out.
+"""Clothing and a comb, one function per class: sizes come in, watertight meshes go out.
 
-Every mesh stands on the plane z = 0 as it would on a table, z up; shoes point towards +x. All
-lengths are in [m]; `drakegrasp.objects.builtin.catalog` holds the table of sizes.
+Every mesh stands or lies on the plane z = 0 as it would on a table, z up. Shoes point towards +x.
+All lengths are in [m] and all angles in [rad]; `drakegrasp.objects.builtin.classes` has the table
+of their ranges.
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ from drakegrasp.objects.builtin.modelling import revolve, skin, solid
 from drakegrasp.objects.builtin.primitives import ball, block, moved, prism, rod, rotated, tube
 from drakegrasp.objects.builtin.profiles import EDGE, resample, smooth
 
-#: Edge length of shoes [m].
-LEATHER = 1.3 * EDGE
-
 #: Edge length of a hat [m].
 FELT = 1.2 * EDGE
+
+#: Edge length of shoes [m].
+LEATHER = 1.3 * EDGE
 
 
 def hat(*, brim: float, crown: float, height: float) -> trimesh.Trimesh:
@@ -34,8 +35,10 @@ def hat(*, brim: float, crown: float, height: float) -> trimesh.Trimesh:
     )
     under = resample([inner[-1], (brim - 0.002, 0.0)], FELT)[1:]
     over = resample([(brim, 0.5 * thick), (brim - 0.002, thick), (crown, thick)], FELT)
-    band = resample([(crown + 0.002, thick), (crown + 0.002, 0.26 * height), (0.97 * crown, 0.26 * height)],
-                    FELT)[1:]  # fmt: skip
+    band = resample(
+        [(crown + 0.002, thick), (crown + 0.002, 0.26 * height), (0.97 * crown, 0.26 * height)],
+        FELT,
+    )[1:]
     side = smooth([band[-1], (0.95 * crown, 0.55 * height), (top - 0.002, height)], FELT)[1:]
     cap = resample([(top - 0.002, height), (0.0, height - 0.004)], FELT)[1:]
     ceiling = resample([(0.0, height - 0.010), inner[0]], 1.6 * FELT)[:-1]
@@ -54,19 +57,29 @@ def comb(*, length: float, depth: float, spine: float, teeth: float, count: int)
     """Return a wide comb that stands on its teeth: heights of `spine` and `teeth`."""
     height = spine + teeth
     side = smooth(
-        [(-length / 2.0, 0.96 * teeth), (-0.47 * length, height - 0.005), (-0.3 * length, height),
-         (0.3 * length, height), (0.47 * length, height - 0.005), (length / 2.0, 0.96 * teeth)],
+        [
+            (-length / 2.0, 0.96 * teeth),
+            (-0.47 * length, height - 0.005),
+            (-0.3 * length, height),
+            (0.3 * length, height),
+            (0.47 * length, height - 0.005),
+            (length / 2.0, 0.96 * teeth),
+        ],
         LEATHER,
-    )  # fmt: skip
+    )
     body = _slab(side, depth)
 
     # The gaps between the teeth; the outer teeth are wider.
     pitch = 0.88 * length / count
     gaps = [
-        block((0.52 * pitch, 2.0 * depth, teeth), (pitch * (k - (count - 1) / 2.0), 0.0, teeth / 2.0 - 0.01),
-              corner=0.2 * pitch, edge=LEATHER)
+        block(
+            (0.52 * pitch, 2.0 * depth, teeth),
+            (pitch * (k - (count - 1) / 2.0), 0.0, teeth / 2.0 - 0.01),
+            corner=0.2 * pitch,
+            edge=LEATHER,
+        )
         for k in range(count)
-    ]  # fmt: skip
+    ]
     return cut(body, *gaps)
 
 
@@ -74,20 +87,32 @@ def shoe(*, length: float, width: float, height: float) -> trimesh.Trimesh:
     """Return a laced shoe on its heel and sole; `height` of its collar."""
     last = _last(length, width, 0.62 * height, height)
     opening = moved(
-        rotated(ball((0.0, 0.0, 0.0), (0.24 * length, 0.29 * width, 0.5 * height), edge=LEATHER),
-                "y", 12.0),
+        rotated(
+            ball((0.0, 0.0, 0.0), (0.24 * length, 0.29 * width, 0.5 * height), edge=LEATHER),
+            "y",
+            12.0,
+        ),
         (-0.24 * length, 0.0, 1.18 * height),
-    )  # fmt: skip
+    )
     tongue = moved(
-        rotated(ball((0.0, 0.0, 0.0), (0.15 * length, 0.22 * width, 0.05 * height + 0.002),
-                     edge=LEATHER), "y", 33.0),
+        rotated(
+            ball(
+                (0.0, 0.0, 0.0), (0.15 * length, 0.22 * width, 0.05 * height + 0.002), edge=LEATHER
+            ),
+            "y",
+            33.0,
+        ),
         (0.02 * length, 0.0, 0.86 * height),
-    )  # fmt: skip
+    )
     laces = [
-        rod((x * length, -0.24 * width, z * height), (x * length, 0.24 * width, z * height), 0.0035,
-            edge=0.8 * EDGE)
+        rod(
+            (x * length, -0.24 * width, z * height),
+            (x * length, 0.24 * width, z * height),
+            0.0035,
+            edge=0.8 * EDGE,
+        )
         for x, z in ((0.01, 0.90), (0.075, 0.80), (0.14, 0.705))
-    ]  # fmt: skip
+    ]
     return fuse(cut(last, opening), tongue, *laces, *_sole(length, width, 0.13 * height))
 
 
@@ -96,15 +121,19 @@ def boot(*, length: float, width: float, height: float) -> trimesh.Trimesh:
     foot = _last(length, width, 0.36 * height, 0.5 * height)
     x, radius = -0.24 * length, 0.25 * length
     levels = smooth(
-        [(0.95 * radius, 0.12 * height), (0.92 * radius, 0.4 * height), (radius, 0.75 * height),
-         (1.1 * radius, height)], LEATHER,
-    )  # fmt: skip
+        [
+            (0.95 * radius, 0.12 * height),
+            (0.92 * radius, 0.4 * height),
+            (radius, 0.75 * height),
+            (1.1 * radius, height),
+        ],
+        LEATHER,
+    )
     rings = [
-        np.column_stack([
-            r * c + x, 0.86 * min(r, 0.56 * width) / r * r * s, np.full_like(s, z)])
+        np.column_stack([r * c + x, 0.86 * min(r, 0.56 * width) / r * r * s, np.full_like(s, z)])
         for r, z in levels
         for s, c in (sin_cos_deg(np.arange(24) * 15.0),)
-    ]  # fmt: skip
+    ]
     tips = [rings[0].mean(axis=0)[None], rings[-1].mean(axis=0)[None]]
     shaft = skin([tips[0], *rings, tips[1]], closed=False)
     rim = np.vstack([rings[-1], rings[-1][:1]]) - [0.0, 0.0, 0.004]
@@ -117,11 +146,19 @@ def boot(*, length: float, width: float, height: float) -> trimesh.Trimesh:
 def _last(length: float, width: float, instep: float, collar: float) -> trimesh.Trimesh:
     """Return the closed upper of a shoe: heights at the `instep` and at the `collar` [m]."""
     # Along the foot: half widths and heights.
-    knots = np.array([
-        (-0.49, 0.24, 0.55), (-0.45, 0.34, 0.92), (-0.30, 0.38, 1.0), (-0.12, 0.38, 1.0),
-        (0.02, 0.41, 0.86), (0.20, 0.48, 0.60), (0.36, 0.45, 0.47), (0.45, 0.33, 0.38),
-        (0.49, 0.18, 0.26),
-    ])  # fmt: skip
+    knots = np.array(
+        [
+            (-0.49, 0.24, 0.55),
+            (-0.45, 0.34, 0.92),
+            (-0.30, 0.38, 1.0),
+            (-0.12, 0.38, 1.0),
+            (0.02, 0.41, 0.86),
+            (0.20, 0.48, 0.60),
+            (0.36, 0.45, 0.47),
+            (0.45, 0.33, 0.38),
+            (0.49, 0.18, 0.26),
+        ]
+    )
     along = np.linspace(-0.49, 0.49, round(length / LEATHER) + 1)
     halves = width * PchipInterpolator(knots[:, 0], knots[:, 1])(along)
     rise = PchipInterpolator(knots[:, 0], knots[:, 2])(along)
@@ -133,18 +170,35 @@ def _last(length: float, width: float, instep: float, collar: float) -> trimesh.
     roof = np.column_stack([np.sign(c) * np.abs(c) ** 0.6, 0.3 + 0.7 * s])
     across = np.vstack([[(0.0, 0.0), (0.5, 0.0), (0.96, 0.0)], roof, [(-0.96, 0.0), (-0.5, 0.0)]])
     rings = [
-        np.column_stack([np.full(len(across), x * length), half * across[:, 0],
-                         0.004 + (high - 0.004) * across[:, 1]])
+        np.column_stack(
+            [
+                np.full(len(across), x * length),
+                half * across[:, 0],
+                0.004 + (high - 0.004) * across[:, 1],
+            ]
+        )
         for x, half, high in zip(along, halves, heights, strict=True)
-    ]  # fmt: skip
+    ]
     tips = [ring.mean(axis=0)[None] for ring in (rings[0], rings[-1])]
     return skin([tips[0], *rings, tips[1]], closed=False)
 
 
 def _sole(length: float, width: float, thick: float) -> list[trimesh.Trimesh]:
     """Return the sole of a shoe, `thick` [m], its heel apart from it by an arch."""
-    knots = np.array([(-0.505, 0.0), (-0.49, 0.24), (-0.42, 0.38), (-0.28, 0.42), (-0.05, 0.38),
-                      (0.20, 0.50), (0.36, 0.46), (0.46, 0.30), (0.50, 0.16), (0.505, 0.0)])  # fmt: skip
+    knots = np.array(
+        [
+            (-0.505, 0.0),
+            (-0.49, 0.24),
+            (-0.42, 0.38),
+            (-0.28, 0.42),
+            (-0.05, 0.38),
+            (0.20, 0.50),
+            (0.36, 0.46),
+            (0.46, 0.30),
+            (0.50, 0.16),
+            (0.505, 0.0),
+        ]
+    )
     along = np.linspace(-0.505, 0.505, round(length / LEATHER) + 1)
     halves = PchipInterpolator(knots[:, 0], knots[:, 1])(along)
     right = np.column_stack([along * length, -halves * width])

@@ -1,7 +1,8 @@
-"""Toy animals, one function per class: sizes in metres come in, watertight meshes go out.
+"""Toy animals, one function per class: sizes come in, watertight meshes go out.
 
-Every mesh stands on the plane z = 0 as it would on a table, z up, and looks towards +x. All
-lengths are in [m]; `drakegrasp.objects.builtin.catalog` holds the table of sizes.
+Every mesh stands or lies on the plane z = 0 as it would on a table, z up. They look towards +x. All
+lengths are in [m] and all angles in [rad]; `drakegrasp.objects.builtin.classes` has the table of
+their ranges.
 """
 
 from __future__ import annotations
@@ -88,7 +89,9 @@ def toy_dog(*, length: float, height: float, girth: float) -> trimesh.Trimesh:
             )
         ear = ball((0.0, 0.0, -0.45 * girth), (0.36 * girth, 0.17 * girth, 0.68 * girth), edge=COAT)
         leaning = rotated(ear, "x", 14.0 * side)
-        parts.append(moved(leaning, (nose[0] - 0.3 * girth, 0.8 * side * girth, nose[2] + 0.42 * girth)))
+        parts.append(
+            moved(leaning, (nose[0] - 0.3 * girth, 0.8 * side * girth, nose[2] + 0.42 * girth))
+        )
     return flat_base(fuse(*parts))
 
 
@@ -136,8 +139,11 @@ def snake(*, coil: float, thickness: float, neck: float) -> trimesh.Trimesh:
             tube(rise, np.linspace(0.95 * half, 0.75 * half, len(rise)), edge=COAT),
             ball(head, (1.55 * half, 1.15 * half, 0.85 * half), edge=COAT),
             *(
-                ball((head[0] + 0.4 * half, 0.62 * s * half, head[2] + 0.6 * half), 0.3 * half,
-                     edge=0.5 * COAT)
+                ball(
+                    (head[0] + 0.4 * half, 0.62 * s * half, head[2] + 0.6 * half),
+                    0.3 * half,
+                    edge=0.5 * COAT,
+                )
                 for s in (-1.0, 1.0)
             ),
         )
@@ -159,8 +165,12 @@ def rubber_duck(*, length: float, head: float) -> trimesh.Trimesh:
 
     # The bill, wide and flat, its two halves apart at the tip; eyes and wings.
     for tilt, z in ((-10.0, 0.02), (12.0, -0.2)):
-        bill = ball((0.45 * head, 0.0, 0.0), (0.62 * head, 0.5 * head, 0.15 * head), edge=0.7 * COAT)
-        parts.append(moved(rotated(bill, "y", tilt), (poll[0] + 0.72 * head, 0.0, poll[2] + z * head)))
+        bill = ball(
+            (0.45 * head, 0.0, 0.0), (0.62 * head, 0.5 * head, 0.15 * head), edge=0.7 * COAT
+        )
+        parts.append(
+            moved(rotated(bill, "y", tilt), (poll[0] + 0.72 * head, 0.0, poll[2] + z * head))
+        )
     for side in (-1.0, 1.0):
         parts += [
             ball(
@@ -169,9 +179,7 @@ def rubber_duck(*, length: float, head: float) -> trimesh.Trimesh:
                 edge=0.5 * COAT,
             ),
             moved(
-                rotated(
-                    ball((0.0, 0.0, 0.0), (0.52 * a, 0.16 * a, 0.3 * a), edge=COAT), "y", 16.0
-                ),
+                rotated(ball((0.0, 0.0, 0.0), (0.52 * a, 0.16 * a, 0.3 * a), edge=COAT), "y", 16.0),
                 (-0.22 * a, 0.92 * side * b, 1.05 * c),
             ),
         ]

@@ -1,7 +1,7 @@
-"""Things of a kitchen, one function per class: sizes in metres come in, watertight meshes go out.
+"""Things of a kitchen, one function per class: sizes come in, watertight meshes go out.
 
-Every mesh stands on the plane z = 0 as it would on a table, z up. All lengths are in [m];
-`drakegrasp.objects.builtin.catalog` holds the table of sizes.
+Every mesh stands or lies on the plane z = 0 as it would on a table, z up. All lengths are in [m]
+and all angles in [rad]; `drakegrasp.objects.builtin.classes` has the table of their ranges.
 """
 
 from __future__ import annotations
@@ -9,8 +9,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from drakegrasp.objects.builtin.hollow_shapes import loop_handle
-from drakegrasp.objects.builtin.booleans import cut, flat_base, fuse
+from drakegrasp.objects.builtin.booleans import cut, fuse
 from drakegrasp.objects.builtin.modelling import extrude, revolve, sweep
 from drakegrasp.objects.builtin.primitives import (
     ball,
@@ -18,26 +17,20 @@ from drakegrasp.objects.builtin.primitives import (
     lathe,
     moved,
     pillar,
-    prism,
     rod,
     rotated,
     scalloped,
     tube,
 )
 from drakegrasp.objects.builtin.profiles import (
+    BROAD,
     EDGE,
-    arc_length,
-    bevelled,
+    LARGE,
     resample,
     rounded_rectangle,
     smooth,
 )
-
-#: Edge length of things with many parts [m].
-BROAD = 1.3 * EDGE
-
-#: Edge length of large flat sides [m].
-LARGE = 1.8 * EDGE
+from drakegrasp.objects.builtin.shapes.vessels import loop_handle
 
 
 def toaster(*, length: float, width: float, height: float) -> trimesh.Trimesh:
@@ -53,13 +46,19 @@ def toaster(*, length: float, width: float, height: float) -> trimesh.Trimesh:
     scale[[0, -1]] = 0.94
     body = sweep(path, across, normal=(0.0, 1.0, 0.0), scale=scale)
     feet = [
-        block((0.014, 0.014, 2.0 * foot + 0.016), (0.36 * x * length, 0.24 * y * width, foot + 0.008))
+        block(
+            (0.014, 0.014, 2.0 * foot + 0.016), (0.36 * x * length, 0.24 * y * width, foot + 0.008)
+        )
         for x in (-1.0, 1.0)
         for y in (-1.0, 1.0)
     ]
 
     slots = [
-        block((0.78 * length, 0.17 * width, 0.11), (0.0, 0.19 * side * width, 0.42 * height + 0.055), edge=LARGE)
+        block(
+            (0.78 * length, 0.17 * width, 0.11),
+            (0.0, 0.19 * side * width, 0.42 * height + 0.055),
+            edge=LARGE,
+        )
         for side in (-1.0, 1.0)
     ]
     groove = block((0.02, 0.009, 0.5 * height), (length / 2.0 + 0.005, 0.0, 0.56 * height))
@@ -73,53 +72,6 @@ def toaster(*, length: float, width: float, height: float) -> trimesh.Trimesh:
     return fuse(cut(fuse(body, *feet), *slots, groove), lever, dial)
 
 
-def carton(*, width: float, height: float, roof: float) -> trimesh.Trimesh:
-    """Return a milk carton with a gable of height `roof` and a screw cap at -y."""
-    fin = 0.014
-    shell = pillar(
-        [
-            (0.0, width, width),
-            (height, width, width),
-            (height + roof, width, 0.008),
-            (height + roof + fin, width, 0.008),
-        ],
-        corner=0.003,
-        edge=LARGE,
-    )
-    # The gable's ends are folded inwards.
-    folds = []
-    for side in (-1.0, 1.0):
-        fold = pillar(
-            [(height + 0.004, 0.0105, 0.86 * width), (height + 0.86 * roof, 0.024, 0.005)]
-        )
-        folds.append(moved(fold, (0.5 * side * width, 0.0, 0.0)))
-    slope = np.degrees(np.arctan2(roof, 0.5 * width - 0.004))
-    cap = rotated(rod((0.0, 0.0, -0.006), (0.0, 0.0, 0.011), 0.15 * width + 0.003), "x", slope)
-    return fuse(
-        cut(shell, *folds), moved(cap, (0.0, -0.27 * width, height + 0.48 * roof))
-    )
-
-
-def towel_roll(*, radius: float, height: float, core: float) -> trimesh.Trimesh:
-    """Return a paper towel roll that stands, with an open `core` and a loose sheet at +y."""
-    paper = revolve(
-        np.vstack(
-            [
-                resample(bevelled(radius, height, 0.002), BROAD),
-                resample([(core, height), (core, 0.0)], 1.5 * BROAD),
-                resample([(core, 0.0), (radius - 0.002, 0.0)], 2.0 * BROAD)[1:-1],
-            ]
-        ),
-        edge=BROAD,
-        closed=True,
-    )
-    sheet = block(
-        (0.62 * radius, 0.005, height - 0.004), (0.36 * radius, radius - 0.0035, height / 2.0),
-        corner=0.0015, edge=BROAD,
-    )  # fmt: skip
-    return fuse(paper, sheet)
-
-
 def coffeemaker(*, width: float, depth: float, height: float) -> trimesh.Trimesh:
     """Return a coffee machine with its tank at -x and its jug in front, towards +x."""
     tank = 0.36 * depth
@@ -128,7 +80,10 @@ def coffeemaker(*, width: float, depth: float, height: float) -> trimesh.Trimesh
     parts = [
         block((depth, width, floor), (0.0, 0.0, floor / 2.0), corner=0.01, edge=LARGE),
         block(
-            (tank, width, height), ((tank - depth) / 2.0, 0.0, height / 2.0), corner=0.01, edge=LARGE
+            (tank, width, height),
+            ((tank - depth) / 2.0, 0.0, height / 2.0),
+            corner=0.01,
+            edge=LARGE,
         ),
         pillar(
             [(height - head, 0.86 * depth, 0.94 * width), (height, depth, width)],
@@ -136,8 +91,10 @@ def coffeemaker(*, width: float, depth: float, height: float) -> trimesh.Trimesh
             edge=LARGE,
         ),
         # The filter under the head.
-        moved(lathe(resample([(0.45 * jug, 0.0), (0.8 * jug, 0.02)], BROAD), edge=LARGE),
-              (x, 0.0, height - head - 0.014)),
+        moved(
+            lathe(resample([(0.45 * jug, 0.0), (0.8 * jug, 0.02)], BROAD), edge=LARGE),
+            (x, 0.0, height - head - 0.014),
+        ),
     ]
 
     # The jug on its plate, with a handle.
@@ -153,8 +110,14 @@ def coffeemaker(*, width: float, depth: float, height: float) -> trimesh.Trimesh
         BROAD,
     )
     parts.append(moved(lathe(side, edge=LARGE), (x, 0.0, floor - 0.002)))
-    handle = loop_handle(x=x + 0.6 * jug, top=0.92 * top, bottom=floor + 0.22 * (top - floor),
-                         reach=0.78 * jug, radius=0.0045, edge=LARGE)  # fmt: skip
+    handle = loop_handle(
+        x=x + 0.6 * jug,
+        top=0.92 * top,
+        bottom=floor + 0.22 * (top - floor),
+        reach=0.78 * jug,
+        radius=0.0045,
+        edge=LARGE,
+    )
     parts.append(handle)
     lamp = ball((0.5 * depth, 0.25 * width, height - 0.5 * head), 0.006, edge=0.6 * EDGE)
     return fuse(*parts, lamp)
@@ -196,41 +159,59 @@ def teapot(*, radius: float, height: float, spout: float) -> trimesh.Trimesh:
     )
     size = np.linspace(0.24 * radius, 0.11 * radius, len(path))
     handle = loop_handle(
-        x=-0.72 * radius, top=0.76 * height, bottom=0.24 * height, reach=0.78 * radius,
-        radius=0.11 * radius, edge=BROAD,
-    )  # fmt: skip
+        x=-0.72 * radius,
+        top=0.76 * height,
+        bottom=0.24 * height,
+        reach=0.78 * radius,
+        radius=0.11 * radius,
+        edge=BROAD,
+    )
     mirrored = rotated(moved(handle, (1.44 * radius, 0.0, 0.0)), "z", 180.0)
-    return fuse(body, lid, button, tube(path, size, edge=0.9 * EDGE), moved(mirrored, (0.0, 0.0, 0.0)))
+    return fuse(
+        body, lid, button, tube(path, size, edge=0.9 * EDGE), moved(mirrored, (0.0, 0.0, 0.0))
+    )
 
 
 def juicer(*, radius: float, rim: float, cone: float) -> trimesh.Trimesh:
     """Return a citrus juicer: a dish with a rim of height `rim`, and in it a ribbed `cone`."""
     wall = 0.005
     side = smooth([(0.7 * radius, 0.0), (0.92 * radius, 0.3 * rim), (radius, rim)], BROAD)
-    inner = smooth([(radius - wall, rim), (0.86 * radius, 0.5 * rim), (0.62 * radius, 0.32 * rim)],
-                   BROAD)  # fmt: skip
+    inner = smooth(
+        [(radius - wall, rim), (0.86 * radius, 0.5 * rim), (0.62 * radius, 0.32 * rim)], BROAD
+    )
     dish = revolve(
-        np.vstack([
-            resample([(0.0, 0.0), side[0]], 1.5 * BROAD)[:-1], side, inner,
-            resample([inner[-1], (0.0, 0.3 * rim)], 1.5 * BROAD)[1:],
-        ]),
+        np.vstack(
+            [
+                resample([(0.0, 0.0), side[0]], 1.5 * BROAD)[:-1],
+                side,
+                inner,
+                resample([inner[-1], (0.0, 0.3 * rim)], 1.5 * BROAD)[1:],
+            ]
+        ),
         edge=BROAD,
-    )  # fmt: skip
+    )
     ribs = scalloped(0.5 * radius, 0.07 * radius, 10, edge=BROAD)
     heights = np.linspace(0.0, 1.0, max(5, round(cone / BROAD)) + 1)
     profile = [
         *((0.9 * share, 0.2 * rim) for share in (0.0, 0.5)),
-        *((float(np.sqrt(max(0.0, 1.0 - h**1.6))), 0.2 * rim + h * (cone - 0.2 * rim))
-          for h in heights),
+        *(
+            (float(np.sqrt(max(0.0, 1.0 - h**1.6))), 0.2 * rim + h * (cone - 0.2 * rim))
+            for h in heights
+        ),
     ]
 
-    handle = block((0.5 * radius, 0.36 * radius, 0.008), (-1.15 * radius, 0.0, rim - 0.006),
-                   corner=0.12 * radius)  # fmt: skip
+    handle = block(
+        (0.5 * radius, 0.36 * radius, 0.008),
+        (-1.15 * radius, 0.0, rim - 0.006),
+        corner=0.12 * radius,
+    )
     lip = pillar(
-        [(rim - 0.015, 0.10 * radius, 0.12 * radius, 0.93 * radius, 0.0),
-         (rim, 0.3 * radius, 0.3 * radius, 1.03 * radius, 0.0)],
+        [
+            (rim - 0.015, 0.10 * radius, 0.12 * radius, 0.93 * radius, 0.0),
+            (rim, 0.3 * radius, 0.3 * radius, 1.03 * radius, 0.0),
+        ],
         corner=0.04 * radius,
-    )  # fmt: skip
+    )
     return fuse(dish, extrude(ribs, profile), handle, lip)
 
 
@@ -254,36 +235,3 @@ def pepper_mill(*, radius: float, waist: float, height: float) -> trimesh.Trimes
     )
     button = ball((0.0, 0.0, 0.945 * height), 0.055 * height)
     return fuse(lathe(side), button)
-
-
-def soap_dispenser(*, width: float, depth: float, height: float) -> trimesh.Trimesh:
-    """Return a soap dispenser: an oval bottle and a pump whose spout points towards +x."""
-    body = 0.64 * height
-    bottle = pillar(
-        [
-            (0.0, 0.94 * width, 0.94 * depth),
-            (0.3 * body, width, depth),
-            (0.75 * body, width, depth),
-            (0.93 * body, 0.72 * width, 0.76 * depth),
-            (body, 0.42 * width, 0.52 * depth),
-        ],
-        corner=0.48 * depth,
-        edge=BROAD,
-    )
-    collar, stem = 0.25 * depth + 0.004, 0.006
-    z = height - 0.012
-    spout = tube(
-        smooth(
-            [(-0.012, 0.0, z), (0.2 * width, 0.0, z), (0.46 * width, 0.0, z - 0.001),
-             (0.56 * width, 0.0, z - 0.011)],
-            EDGE,
-        ),
-        0.0062,
-    )  # fmt: skip
-    return fuse(
-        bottle,
-        rod((0.0, 0.0, body - 0.006), (0.0, 0.0, body + 0.016), collar),
-        rod((0.0, 0.0, body), (0.0, 0.0, z), stem),
-        rod((0.0, 0.0, z - 0.010), (0.0, 0.0, height), 0.013, 0.0125),
-        spout,
-    )

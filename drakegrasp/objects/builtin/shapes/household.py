@@ -1,7 +1,7 @@
 """Things of a household, one function per class: sizes come in, watertight meshes go out.
 
-Every mesh stands on the plane z = 0 as it would on a table, z up. All lengths are in [m];
-`drakegrasp.objects.builtin.catalog` holds the table of sizes.
+Every mesh stands or lies on the plane z = 0 as it would on a table, z up. All lengths are in [m]
+and all angles in [rad]; `drakegrasp.objects.builtin.classes` has the table of their ranges.
 """
 
 from __future__ import annotations
@@ -10,23 +10,10 @@ import numpy as np
 import trimesh
 
 from drakegrasp.arithmetic import sin_cos_deg
-from drakegrasp.objects.builtin.booleans import cut, flat_base, fuse
+from drakegrasp.objects.builtin.booleans import fuse
 from drakegrasp.objects.builtin.modelling import revolve
-from drakegrasp.objects.builtin.primitives import (
-    ball,
-    block,
-    lathe,
-    moved,
-    pillar,
-    prism,
-    rod,
-    rotated,
-    tube,
-)
-from drakegrasp.objects.builtin.profiles import EDGE, resample, smooth, spread_evenly
-
-#: Edge length of things with many parts [m].
-BROAD = 1.3 * EDGE
+from drakegrasp.objects.builtin.primitives import ball, lathe, prism, rod, tube
+from drakegrasp.objects.builtin.profiles import BROAD, COARSE, EDGE, resample, smooth, spread_evenly
 
 
 def watertap(*, base: float, pipe: float, height: float, reach: float) -> trimesh.Trimesh:
@@ -44,7 +31,9 @@ def watertap(*, base: float, pipe: float, height: float, reach: float) -> trimes
         for a, b in ((1.0, 0.0), (0.0, 1.0))
     ]
     return fuse(
-        lathe(smooth([(base, 0.0), (base, 0.008), (0.75 * base, 0.014), (1.3 * pipe, 0.018)], EDGE)),
+        lathe(
+            smooth([(base, 0.0), (base, 0.008), (0.75 * base, 0.014), (1.3 * pipe, 0.018)], EDGE)
+        ),
         rod((0.0, 0.0, 0.002), (0.0, 0.0, column), 1.45 * pipe, 1.3 * pipe),
         tube(resample(path, EDGE), pipe),
         rod((reach, 0.0, top - 0.026), (reach, 0.0, top - 0.012), 1.2 * pipe),
@@ -114,11 +103,17 @@ def iron(*, length: float, width: float, height: float) -> trimesh.Trimesh:
     nose = 0.5 * width * np.sqrt(1.0 - t**2.2)
     side = np.vstack(
         [
-            smooth([(-0.40 * length, 0.47 * width), (-0.2 * length, 0.5 * width),
-                    (-0.05 * length, 0.5 * width)], EDGE / 4.0)[:-1],
+            smooth(
+                [
+                    (-0.40 * length, 0.47 * width),
+                    (-0.2 * length, 0.5 * width),
+                    (-0.05 * length, 0.5 * width),
+                ],
+                EDGE / 4.0,
+            )[:-1],
             np.column_stack([-0.05 * length + 0.6 * length * t, nose]),
         ]
-    )  # fmt: skip
+    )
     outline = resample(np.vstack([side, side[-2::-1] * [1.0, -1.0], side[:1]]), 1.0)
     spaced = spread_evenly(outline, BROAD)[:-1]
     low = 0.085 * height
@@ -142,32 +137,6 @@ def iron(*, length: float, width: float, height: float) -> trimesh.Trimesh:
     return fuse(sole, body, tube(path, thick), dial)
 
 
-def camera(*, width: float, height: float, depth: float, lens: float) -> trimesh.Trimesh:
-    """Return a camera that looks towards -y: its body, and `lens` the radius of its lens."""
-    z = 0.46 * height
-    front = -depth / 2.0
-    body = block((width, depth, height), (0.0, 0.0, height / 2.0), corner=0.009, edge=BROAD)
-    grip = block((0.17 * width, 0.55 * depth, 0.9 * height),
-                 (-0.38 * width, -0.42 * depth, 0.47 * height), corner=0.006)  # fmt: skip
-    hump = pillar(
-        [(height - 0.006, 0.40 * width, 0.86 * depth), (height + 0.010, 0.30 * width, 0.80 * depth),
-         (height + 0.016, 0.20 * width, 0.7 * depth)],
-        corner=0.005,
-    )  # fmt: skip
-    glass = ball((0.0, front - 0.040, z), (0.62 * lens, 0.010, 0.62 * lens))
-    barrel = fuse(
-        rod((0.0, front + 0.008, z), (0.0, front - 0.020, z), lens),
-        rod((0.0, front + 0.008, z), (0.0, front - 0.034, z), 0.88 * lens),
-    )
-    mouth = rod((0.0, front - 0.028, z), (0.0, front - 0.060, z), 0.70 * lens)
-    return fuse(
-        body, grip, hump, cut(barrel, mouth), moved(glass, (0.0, 0.014, 0.0)),
-        rod((-0.36 * width, -0.2 * depth, height - 0.004),
-            (-0.36 * width, -0.2 * depth, height + 0.007), 0.0075),
-        rod((0.34 * width, 0.0, height - 0.004), (0.34 * width, 0.0, height + 0.008), 0.012),
-    )  # fmt: skip
-
-
 def hourglass(*, radius: float, waist: float, height: float) -> trimesh.Trimesh:
     """Return an hourglass between two discs of `radius`, with three posts."""
     plate = 0.009
@@ -182,10 +151,14 @@ def hourglass(*, radius: float, waist: float, height: float) -> trimesh.Trimesh:
     glass = lathe(smooth([*half, *((r, height - z) for r, z in half[-2::-1])], BROAD), edge=BROAD)
     s, c = sin_cos_deg(np.array([30.0, 150.0, 270.0]))
     posts = [
-        rod((0.86 * radius * x, 0.86 * radius * y, plate / 2.0),
-            (0.86 * radius * x, 0.86 * radius * y, height - plate / 2.0), 0.0042, edge=EDGE)
+        rod(
+            (0.86 * radius * x, 0.86 * radius * y, plate / 2.0),
+            (0.86 * radius * x, 0.86 * radius * y, height - plate / 2.0),
+            0.0042,
+            edge=EDGE,
+        )
         for x, y in zip(c, s, strict=True)
-    ]  # fmt: skip
+    ]
     return fuse(
         glass,
         *posts,
@@ -234,56 +207,22 @@ def bell(*, radius: float, body: float, handle: float) -> trimesh.Trimesh:
     return revolve(np.vstack([inner, outer, grip, head]))
 
 
-def alarm_clock(*, radius: float, depth: float) -> trimesh.Trimesh:
-    """Return an alarm clock with two bells on top, its face towards -y."""
-    foot = 0.016
-    z = foot + radius
-    s, c = sin_cos_deg(np.array([60.0, 120.0]))
-    case = cut(
-        rod((0.0, depth / 2.0, z), (0.0, -depth / 2.0, z), radius, edge=BROAD),
-        rod((0.0, 0.004 - depth / 2.0, z), (0.0, -depth, z), 0.86 * radius, edge=BROAD),
-    )
-    face = -depth / 2.0
-    hands = [
-        block((0.006, 0.009, 0.62 * radius), (0.0, face + 0.004, z + 0.27 * radius), corner=0.0015),
-        block((0.44 * radius, 0.009, 0.007), (0.18 * radius, face + 0.004, z), corner=0.0015),
-        rod((0.0, face + 0.006, z), (0.0, face - 0.002, z), 0.006, edge=0.6 * EDGE),
+def candlestick(*, foot_radius: float, stem_radius: float, height: float) -> trimesh.Trimesh:
+    """Return a candlestick with a wide foot, a knob and a drip cup with a socket."""
+    cup, socket = 2.6 * stem_radius, 0.010
+    outline = [
+        (foot_radius, 0.0),
+        (foot_radius, 0.008),
+        (0.55 * foot_radius, 0.020),
+        (stem_radius, 0.3 * height),
+        (stem_radius, 0.5 * height),
+        (1.6 * stem_radius, 0.56 * height),
+        (stem_radius, 0.62 * height),
+        (stem_radius, 0.78 * height),
+        (cup, height - 0.012),
+        (cup, height),
     ]
-    marks = [
-        moved(block((0.006, 0.007, 0.006), (0.72 * radius * x, face + 0.005, z + 0.72 * radius * y)),
-              (0.0, 0.0, 0.0))
-        for x, y in ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
-    ]  # fmt: skip
-
-    # Bells, hammer and feet.
-    parts = []
-    for x, y in zip(c, s, strict=True):
-        side = np.sign(x)
-        dome = moved(
-            rotated(
-                cut(
-                    ball((0.0, 0.0, 0.0), (0.42 * radius, 0.42 * radius, 0.36 * radius)),
-                    block((radius, radius, radius), (0.0, 0.0, -0.5 * radius)),
-                ),
-                "y",
-                30.0 * float(side),
-            ),
-            (1.18 * radius * x, 0.0, z + 1.18 * radius * y),
-        )
-        stalk = rod((0.9 * radius * x, 0.0, z + 0.9 * radius * y),
-                    (1.3 * radius * x, 0.0, z + 1.3 * radius * y), 0.0045)  # fmt: skip
-        leg = rod((0.45 * radius * side, 0.0, z - 0.6 * radius),
-                  (0.80 * radius * side, 0.0, 0.0), 0.0085, 0.0075)  # fmt: skip
-        parts += [dome, stalk, leg]
-    legs = [
-        rod((0.5 * radius * x, 0.32 * y * depth, z - 0.7 * radius),
-            (0.72 * radius * x, 0.36 * y * depth, 0.0), 0.009, 0.0065)
-        for x in (-1.0, 1.0) for y in (-1.0, 1.0)
-    ]  # fmt: skip
-    kept = [part for k, part in enumerate(parts) if k % 3 != 2]
-    hammer = [
-        rod((0.0, 0.0, z + 0.9 * radius), (0.0, 0.0, z + 1.28 * radius), 0.0035),
-        rod((-0.009, 0.0, z + 1.3 * radius), (0.009, 0.0, z + 1.3 * radius), 0.0065),
-    ]
-
-    return flat_base(fuse(case, *hands, *marks, *kept, *legs, *hammer))
+    side = np.vstack([resample(outline[:2], EDGE), smooth(outline[1:], 0.8 * EDGE)[1:]])
+    top = [(cup, height), (socket, height), (socket, height - 0.018), (0.0, height - 0.018)]
+    foot = resample([(0.0, 0.0), side[0]], COARSE * EDGE)[:-1]
+    return revolve(np.vstack([foot, side, resample(top, EDGE)[1:]]))
