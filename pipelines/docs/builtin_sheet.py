@@ -79,9 +79,13 @@ def picture(item: BuiltinObject) -> npt.NDArray[np.float32]:
     """Return the picture (n, n, 3) of an object as it stands on the table, 0..1."""
     mesh = item.build()
     model = make_object(
-        mesh.vertices, mesh.faces, ObjectConfig(), name=item.name,
-        class_name=item.object_class.name, mesh_sha256="",
-    )  # fmt: skip
+        mesh.vertices,
+        mesh.faces,
+        ObjectConfig(),
+        name=item.name,
+        class_name=item.object_class.name,
+        mesh_sha256="",
+    )
     size = round(EDGE * DPI) * OVERSAMPLING
     config = CameraConfig(size=size, fov_y_deg=FOV_Y_DEG, near=0.05, far=5.0)
     X_TO = make_pose(np.eye(3), [0.0, 0.0, model.half_extents[2]])
@@ -101,7 +105,6 @@ def camera_pose(model: ObjectModel) -> Array:
             np.sin(ELEVATION),
         ]
     )
-    down = np.cross(sideways, -back) * -1.0
     R_TC = np.column_stack([sideways, np.cross(-back, sideways), -back])
 
     # The middle of what the camera sees of the object, and half of its larger side.
@@ -110,7 +113,6 @@ def camera_pose(model: ObjectModel) -> Array:
     middle = R_TC @ ((low + high) / 2.0) + [0.0, 0.0, model.half_extents[2]]
     half = 0.5 * float((high - low)[:2].max())
     distance = 1.12 * half / np.tan(np.deg2rad(FOV_Y_DEG) / 2.0) + 0.5 * float((high - low)[2])
-    del down
     return make_pose(R_TC, middle + distance * back)
 
 

@@ -116,7 +116,7 @@ def export_builtin(
     paths = []
     for item in chosen:
         path = folder / f"{item.name}.obj"
-        write_atomic(path, _wavefront(item.build()))
+        write_atomic(path, wavefront(item.build()))
         paths.append(path)
         progress(len(paths), len(chosen))
     return paths
@@ -130,7 +130,7 @@ def builtin_sources(
     return sorted(sources, key=lambda source: source.name)
 
 
-def _wavefront(mesh: trimesh.Trimesh) -> bytes:
+def wavefront(mesh: trimesh.Trimesh) -> bytes:
     """Return a mesh as Wavefront text; not trimesh's, which may change by release."""
     d = DECIMALS
     lines = [f"v {x:.{d}f} {y:.{d}f} {z:.{d}f}" for x, y, z in mesh.vertices.tolist()]

@@ -57,7 +57,7 @@ class ObjectClass:
 # fmt: off
 _ROWS: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, Range]], ...] = (
     (vessels.mug, dict(
-        radius=mm(35, 45), height=mm(80, 105), handle_reach=mm(26, 35),
+        radius=mm(34, 42), height=mm(80, 102), handle_reach=mm(26, 34),
         handle_radius=mm(4.5, 6.5))),
     (packaging.bottle, dict(
         radius=mm(29, 40), height=mm(150, 210), neck_radius=mm(11, 16))),

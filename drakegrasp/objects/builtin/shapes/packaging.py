@@ -41,8 +41,8 @@ def bottle(*, radius: float, height: float, neck_radius: float) -> trimesh.Trime
     # From the bottom up: body, shoulder, neck and cap.
     side = np.vstack(
         [
-            resample([*bevelled(radius, height, 0.004)[:2], (radius, shoulder)], EDGE),
-            smooth([(radius, shoulder), (0.8 * radius, 0.66 * height), (neck_radius, neck)], EDGE)[
+            resample([*bevelled(radius, height, 0.004)[:2], (radius, shoulder)], BROAD),
+            smooth([(radius, shoulder), (0.8 * radius, 0.66 * height), (neck_radius, neck)], BROAD)[
                 1:
             ],
             resample(
@@ -53,7 +53,7 @@ def bottle(*, radius: float, height: float, neck_radius: float) -> trimesh.Trime
                     (neck_radius + 0.003, height - 0.003),
                     (neck_radius, height),
                 ],
-                EDGE,
+                BROAD,
             )[1:],
         ]
     )

@@ -115,7 +115,7 @@ def screwdriver(*, handle: float, radius: float, shaft: float) -> trimesh.Trimes
 def mallet(*, length: float, head_length: float, radius: float) -> trimesh.Trimesh:
     """Return a mallet that lies on its side: handle along -x, a round head along y."""
     grip = 0.4 * radius + 0.004
-    half = head_length / 2.0
+    half, band = head_length / 2.0, radius + 0.002
     side = smooth(
         [
             (0.88 * radius, -half),
@@ -125,16 +125,16 @@ def mallet(*, length: float, head_length: float, radius: float) -> trimesh.Trime
         ],
         EDGE,
     )
-    head = moved(rotated(lathe(side, edge=BROAD), "x", 90.0), (0.0, 0.0, radius))
+    head = moved(rotated(lathe(side, edge=BROAD), "x", 90.0), (0.0, 0.0, band))
     bands = [
         moved(
-            rotated(rod((0.0, 0.0, y - 0.006), (0.0, 0.0, y + 0.006), radius + 0.002), "x", 90.0),
-            (0.0, 0.0, radius),
+            rotated(rod((0.0, 0.0, y - 0.006), (0.0, 0.0, y + 0.006), band), "x", 90.0),
+            (0.0, 0.0, band),
         )
         for y in (-0.62 * half, 0.62 * half)
     ]
-    # The handle leans, so that its end lies on the table.
-    handle = rod((-length, 0.0, 0.98 * grip), (0.4 * radius, 0.0, radius), grip, 0.8 * grip)
+    # The handle leans, so that the knob at its end lies on the table as the bands do.
+    handle = rod((-length, 0.0, 1.06 * grip), (0.4 * radius, 0.0, band), grip, 0.8 * grip)
     knob = ball((-length, 0.0, 1.12 * grip), (1.0 * grip, 1.15 * grip, 1.12 * grip))
     return stand(fuse(head, *bands, handle, knob))
 
