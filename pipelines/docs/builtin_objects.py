@@ -1,4 +1,4 @@
-"""Write docs/reference/builtin-objects.md from the table of classes, or check that it is up to date.
+"""Write docs/reference/builtin-objects.md from the table of classes, or check it.
 
 Usage: python pipelines/docs/builtin_objects.py [--check] FILE
 """
@@ -13,35 +13,44 @@ from pathlib import Path
 from drakegrasp.config import BuiltinConfig
 from drakegrasp.objects.builtin.classes import CLASSES, ObjectClass
 
-_HEAD = f"""<!-- Made by `make docs` from drakegrasp/objects/builtin/classes.py: change that, not this. -->
+_HEAD = f"""<!-- Made by `make docs` from drakegrasp/objects/builtin/classes.py: change that. -->
 
 # Built-in objects
 
-{len(CLASSES)} classes of everyday things come with the package, so that a dataset needs no meshes. They follow the kinds of
-objects of the paper; the shapes and sizes are our own, for a hand of the Barrett Hand's size.
+{len(CLASSES)} classes of everyday things come with the package, so that a dataset needs no
+meshes. They follow the kinds of objects of the paper; the shapes and sizes are our own, for a
+hand of the Barrett Hand's size.
 
 ![The first object of every class](../images/builtin.png)
 
 ```
-drakegrasp objects list                                    # the classes and their parameters
-drakegrasp objects export MESHES --per-class 5             # {5 * len(CLASSES)} meshes, .obj, metres
-drakegrasp build --objects builtin --per-class 5 --out OUT # the same, built
+drakegrasp objects list
+drakegrasp objects export MESHES --per-class 5
+drakegrasp build --objects builtin --per-class 5 --out OUT
 ```
 
-A class is a function of a few parameters. Each object draws them from the ranges below, in steps of 0.1 mm, 0.1° or one
-piece. An object is called `<number>_<class>_<index>`, e.g. `1_mug_2`; its sizes depend on its class, its index and
-`--objects-seed` (`builtin.seed`) alone, so more objects per class change no earlier one. The same seed gives the same mesh
-files on every machine. `--per-class` (`builtin.per_class`) is {BuiltinConfig().per_class} by default: of the objects of a class one
-is [tested](outcomes.md#split) and the others train. Both are stored in `manifest.json`, and a build goes on only with the same.
+The first command prints the classes and their parameters, the second writes {5 * len(CLASSES)}
+meshes (`.obj`, metres), the third builds a dataset of the same objects.
 
-Every object is one watertight solid of at most 3000 triangles. It stands or lies on z = 0 as it does on a table, z up, and
-rests so when it is dropped. Hollow things have walls of 4.5 to 6 mm. Thin flat things of the paper's set, such as forks and
-pens, are left out: the Barrett Hand cannot take them from a table.
+A class is a function of a few parameters. Each object draws them from the ranges below, in steps
+of 0.1 mm, 0.1° or one piece. It is called `<number>_<class>_<index>`, e.g. `1_mug_2`; its sizes
+depend on its class, its index and `--objects-seed` (`builtin.seed`) alone, so more objects per
+class change no earlier one. The same seed gives the same mesh files on every machine.
 
-In Python: `export_builtin("MESHES", ["1_mug_1", "1_mug_2"])` of `drakegrasp.objects.builtin.catalog` writes single objects, and
-`builtin_object("1_mug_2", seed=3).sizes` are the sizes of one. To add a class, write a function in
-`drakegrasp/objects/builtin/shapes/`, add a row at the end of the table in `drakegrasp/objects/builtin/classes.py`, and run
-`make docs`.
+`--per-class` (`builtin.per_class`) is {BuiltinConfig().per_class} by default: of the objects of
+a class one is [tested](outcomes.md#split) and the others train. Both options are stored in
+`manifest.json`, and a build goes on only with the same.
+
+Every object is one watertight solid of at most 3000 triangles. It stands or lies on z = 0 as it
+does on a table, z up, and stays so when it is dropped. Hollow things have walls of 4.5 to 6 mm.
+Thin flat things of the paper's set, such as forks and pens, are left out: the Barrett Hand
+cannot take them from a table.
+
+In Python, `export_builtin("MESHES", ["1_mug_1", "1_mug_2"])` of
+`drakegrasp.objects.builtin.catalog` writes single objects, and `builtin_object("1_mug_2",
+seed=3).sizes` are the sizes of one. To add a class, write a function in
+`drakegrasp/objects/builtin/shapes/`, add a row at the end of the table in
+`drakegrasp/objects/builtin/classes.py`, and run `make docs`.
 """
 
 

@@ -89,14 +89,14 @@ _ROWS: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, Range]], ...] = (
         rim_radius=mm(36, 42), height=mm(120, 165), handle_reach=mm(21, 26),
         handle_radius=mm(6, 7), lip=mm(14, 18))),
     (vessels.funnel, dict(
-        radius=mm(42, 55), spout_radius=mm(11, 13.5), cone_height=mm(50, 70), height=mm(98, 130))),
+        radius=mm(38, 46), spout_radius=mm(12, 15), cone_height=mm(58, 72), height=mm(110, 140))),
     (belongings.dumbbell, dict(
         length=mm(160, 200), head_width=mm(56, 76), head_length=mm(40, 52),
         grip_radius=mm(13.5, 16.5))),
     (packaging.spray_bottle, dict(
         width=mm(64, 84), depth=mm(46, 56), height=mm(170, 220))),
     (belongings.book, dict(
-        width=mm(88, 105), length=mm(120, 150), thickness=mm(34, 52))),
+        width=mm(70, 88), length=mm(105, 130), thickness=mm(42, 56))),
     (plants.banana, dict(
         bend_radius=mm(76, 96), angle=deg(105, 122), thickness=mm(34, 40))),
     (vessels.saucepan, dict(

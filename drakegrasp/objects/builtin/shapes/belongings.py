@@ -17,6 +17,7 @@ from drakegrasp.objects.builtin.primitives import ball, block, lathe, moved, pil
 from drakegrasp.objects.builtin.profiles import (
     BROAD,
     EDGE,
+    LARGE,
     bevelled,
     ellipse,
     resample,
@@ -116,7 +117,7 @@ def camera(*, width: float, height: float, depth: float, lens: float) -> trimesh
     """Return a camera that looks towards -y: its body, and `lens` the radius of its lens."""
     z = 0.46 * height
     front = -depth / 2.0
-    body = block((width, depth, height), (0.0, 0.0, height / 2.0), corner=0.009, edge=BROAD)
+    body = block((width, depth, height), (0.0, 0.0, height / 2.0), corner=0.009, edge=LARGE)
     grip = block(
         (0.17 * width, 0.55 * depth, 0.9 * height),
         (-0.38 * width, -0.42 * depth, 0.47 * height),

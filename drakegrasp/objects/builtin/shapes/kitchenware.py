@@ -47,7 +47,9 @@ def toaster(*, length: float, width: float, height: float) -> trimesh.Trimesh:
     body = sweep(path, across, normal=(0.0, 1.0, 0.0), scale=scale)
     feet = [
         block(
-            (0.014, 0.014, 2.0 * foot + 0.016), (0.36 * x * length, 0.24 * y * width, foot + 0.008)
+            (0.014, 0.014, 2.0 * foot + 0.016),
+            (0.36 * x * length, 0.24 * y * width, foot + 0.008),
+            edge=LARGE,
         )
         for x in (-1.0, 1.0)
         for y in (-1.0, 1.0)
@@ -107,7 +109,7 @@ def coffeemaker(*, width: float, depth: float, height: float) -> trimesh.Trimesh
             (0.62 * jug, 0.9 * (top - floor)),
             (0.68 * jug, top - floor),
         ],
-        BROAD,
+        LARGE,
     )
     parts.append(moved(lathe(side, edge=LARGE), (x, 0.0, floor - 0.002)))
     handle = loop_handle(

@@ -102,7 +102,7 @@ def trophy(*, base: float, cup: float, height: float) -> trimesh.Trimesh:
         ),
         wall=0.005,
         floor=0.012,
-        edge=1.15 * EDGE,
+        edge=BROAD,
     )
     ear = cut(
         loop_handle(
@@ -131,21 +131,28 @@ def house(*, width: float, depth: float, wall: float, roof: float) -> trimesh.Tr
         corner=0.002,
         edge=LARGE,
     )
-    front = -depth / 2.0
+    front, window = -depth / 2.0, 0.26 * wall
     recesses = [
-        block((0.24 * width, 0.007, 0.62 * wall), (0.0, front, 0.29 * wall)),
+        block((0.24 * width, 0.007, 0.62 * wall), (0.0, front, 0.29 * wall), edge=LARGE),
         *(
-            block((0.19 * width, 0.007, 0.26 * wall), (0.32 * side * width, front, 0.58 * wall))
+            block(
+                (0.19 * width, 0.007, 0.26 * wall),
+                (0.32 * side * width, front, 0.58 * wall),
+                edge=LARGE,
+            )
             for side in (-1.0, 1.0)
         ),
         *(
-            block((0.007, 0.3 * depth, 0.3 * wall), (0.5 * side * width, 0.0, 0.56 * wall))
+            block(
+                (0.007, 0.3 * depth, 0.3 * wall), (0.5 * side * width, 0.0, 0.56 * wall), edge=LARGE
+            )
             for side in (-1.0, 1.0)
         ),
     ]
     chimney = block(
         (0.15 * width, 0.15 * width, 0.6 * roof + 0.012),
         (0.26 * width, 0.18 * depth, wall + 0.75 * roof),
+        edge=LARGE,
     )
     return fuse(cut(fuse(body, gable), *recesses), chimney)
 
@@ -162,7 +169,7 @@ def toy_car(*, length: float, width: float, wheel: float) -> trimesh.Trimesh:
             (belt, 0.93 * length, 0.88 * width),
         ],
         corner=0.14 * length,
-        edge=BROAD,
+        edge=LARGE,
     )
     cabin = pillar(
         [
@@ -171,7 +178,7 @@ def toy_car(*, length: float, width: float, wheel: float) -> trimesh.Trimesh:
             (roof, 0.34 * length, 0.64 * width, -0.08 * length, 0.0),
         ],
         corner=0.06 * length,
-        edge=BROAD,
+        edge=1.5 * EDGE,
     )
     panes = [
         block(

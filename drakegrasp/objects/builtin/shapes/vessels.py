@@ -148,7 +148,7 @@ def pitcher(
     handle_radius: float,
     lip: float,
     wall: float = 0.005,
-    edge: float = 0.007,
+    edge: float = 0.008,
 ) -> trimesh.Trimesh:
     """Return a hollow pitcher with a handle at +x and a lip pulled out by `lip` at -x."""
     side = smooth(
