@@ -166,8 +166,10 @@ def command_lines(page: Path) -> Iterator[tuple[click.Command, list[str]]]:
 
 
 def options_of(command: click.Command) -> set[str]:
+    """Return the options of a command, of a group those of all its commands."""
     options = {o for p in command.params for o in p.opts if isinstance(p, click.Option)}
-    return options | {"--help", "-h"}
+    below = command.commands.values() if isinstance(command, click.Group) else ()
+    return options.union({"--help", "-h"}, *map(options_of, below))
 
 
 @pytest.mark.parametrize("page", DOCS, ids=page_id)

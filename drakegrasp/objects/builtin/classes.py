@@ -29,7 +29,7 @@ from drakegrasp.objects.builtin.shapes import (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectClass:
     """A class of built-in objects.
 

@@ -131,12 +131,16 @@ def camera(*, width: float, height: float, depth: float, lens: float) -> trimesh
         ],
         corner=0.005,
     )
+
+    # The lens: two rings, hollow in front, and a curved glass.
     glass = ball((0.0, front - 0.040, z), (0.62 * lens, 0.010, 0.62 * lens))
     barrel = fuse(
         rod((0.0, front + 0.008, z), (0.0, front - 0.020, z), lens),
         rod((0.0, front + 0.008, z), (0.0, front - 0.034, z), 0.88 * lens),
     )
     mouth = rod((0.0, front - 0.028, z), (0.0, front - 0.060, z), 0.70 * lens)
+
+    # With a release button and a dial on top.
     return fuse(
         body,
         grip,

@@ -86,6 +86,8 @@ def comb(*, length: float, depth: float, spine: float, teeth: float, count: int)
 def shoe(*, length: float, width: float, height: float) -> trimesh.Trimesh:
     """Return a laced shoe on its heel and sole; `height` of its collar."""
     last = _last(length, width, 0.62 * height, height)
+
+    # Where the foot goes in, and what covers the instep.
     opening = moved(
         rotated(
             ball((0.0, 0.0, 0.0), (0.24 * length, 0.29 * width, 0.5 * height), edge=LEATHER),
@@ -136,6 +138,8 @@ def boot(*, length: float, width: float, height: float) -> trimesh.Trimesh:
     ]
     tips = [rings[0].mean(axis=0)[None], rings[-1].mean(axis=0)[None]]
     shaft = skin([tips[0], *rings, tips[1]], closed=False)
+
+    # A thick rim, and the hollow inside.
     rim = np.vstack([rings[-1], rings[-1][:1]]) - [0.0, 0.0, 0.004]
     half = len(rim) // 2
     cuff = [tube(part, 0.0042, edge=0.9 * EDGE) for part in (rim[: half + 2], rim[half - 1 :])]

@@ -149,6 +149,8 @@ def hourglass(*, radius: float, waist: float, height: float) -> trimesh.Trimesh:
         (waist, 0.5 * height),
     ]
     glass = lathe(smooth([*half, *((r, height - z) for r, z in half[-2::-1])], BROAD), edge=BROAD)
+
+    # Three posts around it.
     s, c = sin_cos_deg(np.array([30.0, 150.0, 270.0]))
     posts = [
         rod(
@@ -193,6 +195,8 @@ def bell(*, radius: float, body: float, handle: float) -> trimesh.Trimesh:
         ],
         EDGE,
     )[1:]
+
+    # Hollow from below.
     inner = smooth(
         [
             (0.0, 0.86 * body),

@@ -80,17 +80,17 @@ def coffeemaker(*, width: float, depth: float, height: float) -> trimesh.Trimesh
     jug, floor, head = 0.36 * width, 0.020, 0.24 * height
     x = 0.5 * depth - 0.42 * width
     parts = [
-        block((depth, width, floor), (0.0, 0.0, floor / 2.0), corner=0.01, edge=LARGE),
+        block((depth, width, floor), (0.0, 0.0, floor / 2.0), corner=0.01, edge=2.0 * BROAD),
         block(
             (tank, width, height),
             ((tank - depth) / 2.0, 0.0, height / 2.0),
             corner=0.01,
-            edge=LARGE,
+            edge=2.0 * BROAD,
         ),
         pillar(
             [(height - head, 0.86 * depth, 0.94 * width), (height, depth, width)],
             corner=0.012,
-            edge=LARGE,
+            edge=2.0 * BROAD,
         ),
         # The filter under the head.
         moved(

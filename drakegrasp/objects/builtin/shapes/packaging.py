@@ -185,6 +185,8 @@ def soap_dispenser(*, width: float, depth: float, height: float) -> trimesh.Trim
         corner=0.48 * depth,
         edge=BROAD,
     )
+
+    # The pump: collar, stem and spout.
     collar, stem = 0.25 * depth + 0.004, 0.006
     z = height - 0.012
     spout = tube(

@@ -105,31 +105,29 @@ def banana(*, bend_radius: float, angle: float, thickness: float) -> trimesh.Tri
 def mushroom(*, cap: float, stalk: float, height: float) -> trimesh.Trimesh:
     """Return a mushroom: radii of its `cap` and its `stalk`."""
     low = 0.56 * height
-    side = np.vstack(
+    foot = smooth(
         [
-            smooth(
-                [
-                    (1.15 * stalk, 0.0),
-                    (1.25 * stalk, 0.10 * height),
-                    (0.88 * stalk, 0.34 * height),
-                    (0.85 * stalk, low + 0.004),
-                ],
-                EDGE,
-            ),
-            smooth(
-                [
-                    (0.9 * stalk, low + 0.004),
-                    (0.9 * cap, low - 0.006),
-                    (cap, low + 0.004),
-                    (0.90 * cap, 0.78 * height),
-                    (0.55 * cap, 0.95 * height),
-                    (0.12 * cap, height),
-                ],
-                EDGE,
-            )[1:],
-        ]
+            (1.15 * stalk, 0.0),
+            (1.25 * stalk, 0.10 * height),
+            (0.88 * stalk, 0.34 * height),
+            (0.85 * stalk, low + 0.004),
+        ],
+        EDGE,
     )
-    return lathe(side)
+
+    # The cap bulges a little below its rim.
+    head = smooth(
+        [
+            (0.9 * stalk, low + 0.004),
+            (0.9 * cap, low - 0.006),
+            (cap, low + 0.004),
+            (0.90 * cap, 0.78 * height),
+            (0.55 * cap, 0.95 * height),
+            (0.12 * cap, height),
+        ],
+        EDGE,
+    )
+    return lathe(np.vstack([foot, head[1:]]))
 
 
 def pumpkin(*, radius: float, height: float, ribs: int) -> trimesh.Trimesh:
@@ -173,6 +171,8 @@ def cactus(*, pot: float, radius: float, height: float) -> trimesh.Trimesh:
             EDGE,
         )
     )
+
+    # The ribbed trunk, round at its top.
     section = scalloped(radius, 0.16 * radius, 8, edge=EDGE)
     s, c = sin_cos_deg(np.linspace(15.0, 90.0, 6))
     top = height - radius

@@ -154,6 +154,8 @@ def padlock(*, width: float, height: float, depth: float, shackle: float) -> tri
         ),
         (0.0, 0.0, height / 2.0),
     )
+
+    # The shackle, and a keyhole.
     reach = 0.33 * width
     s, c = sin_cos_deg(np.linspace(0.0, 180.0, 24))
     rise = shackle - radius - reach
@@ -224,6 +226,8 @@ def bucket(*, top_radius: float, bottom_radius: float, height: float) -> trimesh
     hole = rod(
         (0.0, 0.0, height - 0.05), (0.0, 0.0, height + 0.05), top_radius - wall + 0.0005, edge=BROAD
     )
+
+    # The bail stands up, with a grip in its middle.
     s, c = sin_cos_deg(np.linspace(0.0, 180.0, 40))
     reach = top_radius + 0.002
     bail = np.column_stack([reach * c, 0.0 * c, height - 0.012 + 0.95 * top_radius * s])
@@ -293,6 +297,8 @@ def garbage_bin(*, width: float, height: float) -> trimesh.Trimesh:
         corner=0.09 * width,
         edge=LARGE,
     )
+
+    # Wheels on an axle, and the bar by which it is pulled.
     x = -0.36 * depth
     wheels = [
         rod((x, 0.34 * side * width, wheel), (x, 0.54 * side * width, wheel), wheel)

@@ -61,6 +61,8 @@ def chess_rook(*, base: float, top: float, height: float) -> trimesh.Trimesh:
             )[1:],
         ]
     )
+
+    # Three cuts across leave six battlements.
     gaps = [
         rotated(
             block((3.0 * top, 0.34 * top, 0.1), (0.0, 0.0, 0.88 * height + 0.05)), "z", 60.0 * k
@@ -90,6 +92,8 @@ def trophy(*, base: float, cup: float, height: float) -> trimesh.Trimesh:
             EDGE,
         )
     )
+
+    # The cup and its handles.
     bowl, core = vessel(
         smooth(
             [
@@ -131,7 +135,9 @@ def house(*, width: float, depth: float, wall: float, roof: float) -> trimesh.Tr
         corner=0.002,
         edge=LARGE,
     )
-    front, window = -depth / 2.0, 0.26 * wall
+
+    # Door, windows and a chimney.
+    front = -depth / 2.0
     recesses = [
         block((0.24 * width, 0.007, 0.62 * wall), (0.0, front, 0.29 * wall), edge=LARGE),
         *(
@@ -180,6 +186,8 @@ def toy_car(*, length: float, width: float, wheel: float) -> trimesh.Trimesh:
         corner=0.06 * length,
         edge=1.5 * EDGE,
     )
+
+    # Windows, wheels with rims, and lights.
     panes = [
         block(
             (0.14 * length, 0.5 * width, 0.115 * length),
@@ -229,6 +237,8 @@ def rocket(*, radius: float, height: float, span: float) -> trimesh.Trimesh:
         )
     )
     nozzle = rod((0.0, 0.0, 0.05 * height), (0.0, 0.0, low + 0.006), 0.5 * radius, 0.36 * radius)
+
+    # Four fins, on which it stands, and a window.
     fins = []
     for k in range(4):
         fin = pillar(
@@ -264,6 +274,8 @@ def dice(*, size: float, pip: float) -> trimesh.Trimesh:
         corner=0.12 * size,
         edge=edge,
     )
+
+    # Where the pips of each face are, in its plane; opposite faces add up to seven.
     a = 0.25 * size
     five = [(-a, -a), (-a, a), (a, -a), (a, a)]
     faces = {
