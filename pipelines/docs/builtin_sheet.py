@@ -14,11 +14,11 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from drakegrasp.config import CameraConfig, ObjectConfig
+from drakegrasp.config import CameraConfig
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.objects.builtin.catalog import BuiltinObject
 from drakegrasp.objects.builtin.classes import CLASSES
-from drakegrasp.objects.model import ObjectModel, make_object
+from drakegrasp.objects.model import ObjectModel
 from drakegrasp.vision.rendering import build_renderer, render
 from drakegrasp.visualization.style import INK, add_axes, hide_ticks, save_figure
 
@@ -77,15 +77,24 @@ def draw_sheet(objects: Sequence[BuiltinObject]) -> Figure:
 
 def picture(item: BuiltinObject) -> npt.NDArray[np.float32]:
     """Return the picture (n, n, 3) of an object as it stands on the table, 0..1."""
+    # Only its surface is drawn: the rest of the model is arbitrary.
     mesh = item.build()
-    model = make_object(
-        mesh.vertices,
-        mesh.faces,
-        ObjectConfig(),
+    vertices, faces = mesh.vertices - mesh.bounds.mean(axis=0), mesh.faces.astype(np.int32)
+    model = ObjectModel(
         name=item.name,
         class_name=item.object_class.name,
         mesh_sha256="",
+        visual_vertices=vertices,
+        visual_faces=faces,
+        collision_vertices=vertices,
+        collision_faces=faces,
+        mass=1.0,
+        p_OOcm=np.zeros(3),
+        I_OOcm_O=np.eye(3),
+        collision_error=0.0,
     )
+
+    # From the camera, larger than shown, and averaged.
     size = round(EDGE * DPI) * OVERSAMPLING
     config = CameraConfig(size=size, fov_y_deg=FOV_Y_DEG, near=0.05, far=5.0)
     X_TO = make_pose(np.eye(3), [0.0, 0.0, model.half_extents[2]])

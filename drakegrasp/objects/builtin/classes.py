@@ -98,7 +98,7 @@ _ROWS: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, Range]], ...] = (
     (belongings.book, dict(
         width=mm(70, 88), length=mm(105, 130), thickness=mm(42, 56))),
     (plants.banana, dict(
-        bend_radius=mm(76, 96), angle=deg(105, 122), thickness=mm(34, 40))),
+        bend_radius=mm(66, 82), angle=deg(98, 112), thickness=mm(32, 37))),
     (vessels.saucepan, dict(
         radius=mm(48, 58), height=mm(55, 85), handle_length=mm(85, 100))),
     (plants.apple, dict(
@@ -120,7 +120,7 @@ _ROWS: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, Range]], ...] = (
     (kitchenware.teapot, dict(
         radius=mm(44, 54), height=mm(80, 96), spout=mm(34, 42))),
     (tools.screwdriver, dict(
-        handle=mm(95, 115), radius=mm(18, 22), shaft=mm(85, 110))),
+        handle=mm(88, 105), radius=mm(18, 22), shaft=mm(65, 85))),
     (household.knob, dict(
         rose=mm(32, 36), neck=mm(10, 12.5), radius=mm(26, 31), height=mm(60, 74))),
     (clothing.comb, dict(
@@ -135,7 +135,7 @@ _ROWS: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, Range]], ...] = (
     (animals.toy_dog, dict(
         length=mm(90, 110), height=mm(62, 74), girth=mm(20, 24))),
     (animals.snake, dict(
-        coil=mm(38, 46), thickness=mm(26, 32), neck=mm(52, 66))),
+        coil=mm(34, 40), thickness=mm(26, 30), neck=mm(60, 76))),
     (animals.rubber_duck, dict(
         length=mm(88, 106), head=mm(23, 28))),
     (kitchenware.pepper_mill, dict(

@@ -14,7 +14,15 @@ from drakegrasp.arithmetic import sin_cos_deg
 from drakegrasp.objects.builtin.booleans import flat_base, fuse, stand
 from drakegrasp.objects.builtin.modelling import bar, extrude, revolve, sweep
 from drakegrasp.objects.builtin.primitives import ball, lathe, moved, scalloped, tube
-from drakegrasp.objects.builtin.profiles import EDGE, ellipse, resample, rounded_polygon, smooth
+from drakegrasp.objects.builtin.profiles import (
+    BROAD,
+    EDGE,
+    LARGE,
+    ellipse,
+    resample,
+    rounded_polygon,
+    smooth,
+)
 
 
 def apple(*, radius: float, height: float) -> trimesh.Trimesh:
@@ -71,14 +79,38 @@ def pear(*, radius: float, neck_radius: float, height: float) -> trimesh.Trimesh
 
 
 def banana(*, bend_radius: float, angle: float, thickness: float) -> trimesh.Trimesh:
-    """Return a banana that lies on its side, bent by `angle` [rad] about `bend_radius`."""
-    theta = np.linspace(-angle / 2.0, angle / 2.0, round(bend_radius * angle / EDGE) + 1)
+    """Return a bunch of three bananas, bent by `angle` about `bend_radius`, one on the others."""
+    # Side by side and halfway above, a little into each other; their stalks meet in a crown.
+    half = thickness / 2.0
+    low = _single_banana(bend_radius, angle, thickness)
+    side = _single_banana(bend_radius + 0.82 * thickness, angle, thickness)
+    top = _single_banana(bend_radius + 0.41 * thickness, angle, thickness)
+    middle = -0.41 * thickness
+    s, c = (float(value) for value in sin_cos_deg(np.degrees(-angle / 2.0)))
+    reach = bend_radius + 0.41 * thickness
+    crown = ball(
+        (reach * s, reach * (c - 1.0), 0.5 * thickness),
+        (0.36 * thickness, 0.62 * thickness, 0.5 * thickness),
+    )
+    return flat_base(
+        fuse(
+            moved(low, (0.0, middle, 0.0)),
+            moved(side, (0.0, -middle, 0.0)),
+            moved(top, (0.0, 0.0, 1.45 * half)),
+            crown,
+        )
+    )
+
+
+def _single_banana(bend_radius: float, angle: float, thickness: float) -> trimesh.Trimesh:
+    """Return a banana that lies on its side."""
+    theta = np.linspace(-angle / 2.0, angle / 2.0, round(bend_radius * angle / BROAD) + 1)
     knots = np.array(
         [
-            (0.0, 0.34),
-            (0.03, 0.38),
-            (0.12, 0.36),
-            (0.26, 0.85),
+            (0.0, 0.30),
+            (0.03, 0.36),
+            (0.10, 0.36),
+            (0.24, 0.85),
             (0.5, 1.0),
             (0.78, 0.85),
             (0.95, 0.42),
@@ -86,17 +118,18 @@ def banana(*, bend_radius: float, angle: float, thickness: float) -> trimesh.Tri
         ]
     )
     scale = PchipInterpolator(knots[:, 0], knots[:, 1])(np.linspace(0.0, 1.0, len(theta)))
-    half = thickness / 2.0
+
     # Five soft edges, one face down; the underside stays on the table along the whole fruit.
+    half = thickness / 2.0
     turns = 2.0 * np.pi * np.arange(5) / 5.0 - np.pi / 2.0 + np.pi / 5.0
     corners = 1.18 * half * np.column_stack([np.cos(turns), np.sin(turns)])
-    section = rounded_polygon(corners, 0.45 * half, edge=EDGE)
+    section = rounded_polygon(corners, 0.45 * half, edge=LARGE)
     lowest = -section[:, 1].min()
     path = np.column_stack(
         [
             bend_radius * np.sin(theta),
-            bend_radius * (1.0 - np.cos(theta)),
-            lowest * scale,
+            bend_radius * (np.cos(theta) - 1.0),
+            lowest * (0.35 + 0.65 * scale),
         ]
     )
     return sweep(path, section, normal=(0.0, 0.0, 1.0), scale=scale)

@@ -12,7 +12,7 @@ from scipy.interpolate import PchipInterpolator
 
 from drakegrasp.arithmetic import sin_cos_deg
 from drakegrasp.objects.builtin.booleans import cut, fuse, stand
-from drakegrasp.objects.builtin.modelling import bar, sweep
+from drakegrasp.objects.builtin.modelling import bar, extrude, sweep
 from drakegrasp.objects.builtin.primitives import (
     ball,
     block,
@@ -74,42 +74,38 @@ def hammer(*, length: float, head_length: float, head_thickness: float) -> trime
 
 
 def screwdriver(*, handle: float, radius: float, shaft: float) -> trimesh.Trimesh:
-    """Return a screwdriver that lies along x: lengths of its fluted `handle` and its `shaft`."""
-    section = scalloped(radius, 0.13 * radius, 6)
-    # The section's first coordinate runs along -z: turned by half a lobe it lies on two lobes.
-    s, c = (float(value) for value in sin_cos_deg(30.0))
-    section = section @ np.array([[c, s], [-s, c]])
-    lowest = float(section[:, 0].max())
-    knots = np.array(
-        [
-            (0.0, 0.62),
-            (0.05, 0.86),
-            (0.14, 1.0),
-            (0.62, 1.0),
-            (0.78, 0.74),
-            (0.88, 0.72),
-            (0.97, 0.80),
-            (1.0, 0.72),
-        ]
-    )
-    along = np.linspace(0.0, 1.0, round(handle / EDGE) + 1)
-    path = np.column_stack([-handle * (1.0 - along), 0.0 * along, np.full_like(along, lowest)])
-    grip = sweep(
-        path, section, normal=(0.0, 1.0, 0.0), scale=np.interp(along, knots[:, 0], knots[:, 1])
+    """Return a screwdriver that stands on its fluted `handle`, of that length as its `shaft`."""
+    knots = [
+        (0.86, 0.0),
+        (0.96, 0.03),
+        (1.0, 0.12),
+        (1.0, 0.60),
+        (0.74, 0.78),
+        (0.70, 0.88),
+        (0.80, 0.96),
+        (0.62, 1.0),
+    ]
+    side = resample([(scale * radius, z * handle) for scale, z in knots], EDGE) / [radius, 1.0]
+    flat_end = [(0.86 * share, 0.0) for share in (0.0, 0.5)]
+    grip = extrude(
+        scalloped(radius, 0.13 * radius, 6), [*flat_end, *side, (0.3, handle), (0.0, handle)]
     )
 
-    blade = max(0.0045, 0.24 * radius)
-    steel = rod((-0.01, 0.0, lowest), (0.86 * shaft, 0.0, lowest), blade, edge=0.8 * EDGE)
-    flat = pillar(
+    # The shaft, its end a flat blade.
+    steel = max(0.0045, 0.24 * radius)
+    low, high = handle - 0.01, handle + shaft
+    blade = pillar(
         [
-            (0.76 * shaft, 1.5 * blade, 1.5 * blade),
-            (0.88 * shaft, 1.3 * blade, 2.9 * blade),
-            (shaft, 0.65 * blade, 2.5 * blade),
+            (high - 0.24 * shaft, 1.5 * steel, 1.5 * steel),
+            (high - 0.12 * shaft, 2.9 * steel, 1.3 * steel),
+            (high, 2.5 * steel, 0.65 * steel),
         ],
-        corner=0.3 * blade,
+        corner=0.3 * steel,
         edge=0.8 * EDGE,
     )
-    return stand(fuse(grip, steel, moved(rotated(flat, "y", 90.0), (0.0, 0.0, lowest))))
+    return fuse(
+        grip, rod((0.0, 0.0, low), (0.0, 0.0, high - 0.14 * shaft), steel, edge=0.8 * EDGE), blade
+    )
 
 
 def mallet(*, length: float, head_length: float, radius: float) -> trimesh.Trimesh:
