@@ -21,7 +21,7 @@ from drakegrasp.objects.builtin.catalog import draw_builtin, export_builtin
 from drakegrasp.visualization.contact_sheet import contact_sheet
 
 #: Classes that the hand often grasps, and objects of each: two train and validate, one is tested.
-CLASSES = ("wineglass", "jar", "spray_bottle", "pepper_mill")
+CLASSES = ("wineglass", "spray_bottle", "carton", "boot")
 PER_CLASS = 3
 
 
@@ -32,7 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("directory", type=Path, metavar="DIR", help="where to write")
     parser.add_argument(
-        "--candidates", type=int, default=200, help="palm poses per object  [default: 200]"
+        "--candidates", type=int, default=150, help="palm poses per object  [default: 150]"
     )
     parser.add_argument(
         "--per-class",

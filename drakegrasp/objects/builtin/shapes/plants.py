@@ -90,7 +90,7 @@ def banana(*, bend_radius: float, angle: float, thickness: float) -> trimesh.Tri
     reach = bend_radius + 0.41 * thickness
     crown = ball(
         (reach * s, reach * (c - 1.0), 0.5 * thickness),
-        (0.36 * thickness, 0.62 * thickness, 0.5 * thickness),
+        (0.26 * thickness, 0.52 * thickness, 0.5 * thickness),
     )
     return flat_base(
         fuse(
