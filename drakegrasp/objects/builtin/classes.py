@@ -71,7 +71,7 @@ _ROWS: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, Range]], ...] = (
     (packaging.can, dict(
         radius=mm(32, 38), height=mm(75, 120))),
     (tools.hammer, dict(
-        length=mm(190, 225), head_length=mm(95, 115), head_thickness=mm(28, 34))),
+        length=mm(120, 145), head_length=mm(95, 115), head_thickness=mm(36, 42))),
     (household.candlestick, dict(
         foot_radius=mm(43, 52), stem_radius=mm(10, 12.5), height=mm(120, 190))),
     (vessels.vase, dict(

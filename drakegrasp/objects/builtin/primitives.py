@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from drakegrasp.arithmetic import multiply, norm, sin_cos_deg
+from drakegrasp.arithmetic import dot, multiply, norm, sin_cos_deg
 from drakegrasp.frames import Array
 from drakegrasp.objects.builtin.modelling import extrude, revolve, skin, solid
 from drakegrasp.objects.builtin.profiles import (
@@ -105,7 +105,7 @@ def tube(path: npt.ArrayLike, radius: npt.ArrayLike, *, edge: float = EDGE) -> t
     across = _axes(tangents[0])[:, 0]
     rings = []
     for point, tangent, size in zip(points, tangents, radii, strict=True):
-        across = across - tangent * float(across @ tangent)
+        across = across - tangent * dot(across, tangent)
         across /= norm(across)
         other = np.cross(tangent, across)
         circle = np.outer(np.cos(angles), across) + np.outer(np.sin(angles), other)

@@ -133,7 +133,7 @@ def camera(*, width: float, height: float, depth: float, lens: float) -> trimesh
     )
 
     # The lens: two rings, hollow in front, and a curved glass.
-    glass = ball((0.0, front - 0.040, z), (0.62 * lens, 0.010, 0.62 * lens))
+    glass = ball((0.0, front - 0.026, z), (0.62 * lens, 0.010, 0.62 * lens))
     barrel = fuse(
         rod((0.0, front + 0.008, z), (0.0, front - 0.020, z), lens),
         rod((0.0, front + 0.008, z), (0.0, front - 0.034, z), 0.88 * lens),
@@ -146,7 +146,7 @@ def camera(*, width: float, height: float, depth: float, lens: float) -> trimesh
         grip,
         hump,
         cut(barrel, mouth),
-        moved(glass, (0.0, 0.014, 0.0)),
+        glass,
         rod(
             (-0.36 * width, -0.2 * depth, height - 0.004),
             (-0.36 * width, -0.2 * depth, height + 0.007),
@@ -158,14 +158,11 @@ def camera(*, width: float, height: float, depth: float, lens: float) -> trimesh
 
 def alarm_clock(*, radius: float, depth: float) -> trimesh.Trimesh:
     """Return an alarm clock with two bells on top, its face towards -y."""
-    foot = 0.016
-    z = foot + radius
-    s, c = sin_cos_deg(np.array([60.0, 120.0]))
+    z, face = 0.016 + radius, -depth / 2.0
     case = cut(
-        rod((0.0, depth / 2.0, z), (0.0, -depth / 2.0, z), radius, edge=BROAD),
-        rod((0.0, 0.004 - depth / 2.0, z), (0.0, -depth, z), 0.86 * radius, edge=BROAD),
+        rod((0.0, -face, z), (0.0, face, z), radius, edge=BROAD),
+        rod((0.0, face + 0.004, z), (0.0, -depth, z), 0.86 * radius, edge=BROAD),
     )
-    face = -depth / 2.0
     hands = [
         block((0.006, 0.009, 0.62 * radius), (0.0, face + 0.004, z + 0.27 * radius), corner=0.0015),
         block((0.44 * radius, 0.009, 0.007), (0.18 * radius, face + 0.004, z), corner=0.0015),
@@ -176,33 +173,12 @@ def alarm_clock(*, radius: float, depth: float) -> trimesh.Trimesh:
         for x, y in ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
     ]
 
-    # Bells, hammer and feet.
-    parts = []
-    for x, y in zip(c, s, strict=True):
-        side = np.sign(x)
-        dome = moved(
-            rotated(
-                cut(
-                    ball((0.0, 0.0, 0.0), (0.42 * radius, 0.42 * radius, 0.36 * radius)),
-                    block((radius, radius, radius), (0.0, 0.0, -0.5 * radius)),
-                ),
-                "y",
-                30.0 * float(side),
-            ),
-            (1.18 * radius * x, 0.0, z + 1.18 * radius * y),
-        )
-        stalk = rod(
-            (0.9 * radius * x, 0.0, z + 0.9 * radius * y),
-            (1.3 * radius * x, 0.0, z + 1.3 * radius * y),
-            0.0045,
-        )
-        leg = rod(
-            (0.45 * radius * side, 0.0, z - 0.6 * radius),
-            (0.80 * radius * side, 0.0, 0.0),
-            0.0085,
-            0.0075,
-        )
-        parts += [dome, stalk, leg]
+    # Two bells on stalks, a hammer between them, and four feet.
+    bells = [_bell_on_stalk(radius, z, side) for side in (1.0, -1.0)]
+    hammer = [
+        rod((0.0, 0.0, z + 0.9 * radius), (0.0, 0.0, z + 1.28 * radius), 0.0035),
+        rod((-0.009, 0.0, z + 1.3 * radius), (0.009, 0.0, z + 1.3 * radius), 0.0065),
+    ]
     legs = [
         rod(
             (0.5 * radius * x, 0.32 * y * depth, z - 0.7 * radius),
@@ -213,10 +189,26 @@ def alarm_clock(*, radius: float, depth: float) -> trimesh.Trimesh:
         for x in (-1.0, 1.0)
         for y in (-1.0, 1.0)
     ]
-    kept = [part for k, part in enumerate(parts) if k % 3 != 2]
-    hammer = [
-        rod((0.0, 0.0, z + 0.9 * radius), (0.0, 0.0, z + 1.28 * radius), 0.0035),
-        rod((-0.009, 0.0, z + 1.3 * radius), (0.009, 0.0, z + 1.3 * radius), 0.0065),
-    ]
+    return flat_base(fuse(case, *hands, *marks, *bells, *legs, *hammer))
 
-    return flat_base(fuse(case, *hands, *marks, *kept, *legs, *hammer))
+
+def _bell_on_stalk(radius: float, z: float, side: float) -> trimesh.Trimesh:
+    """Return a bell of an alarm clock of a `radius`, whose middle is at height `z` [m].
+
+    Args:
+        radius: Of the clock [m].
+        z: Of its middle [m].
+        side: 1 for the bell at +x, -1 for that at -x.
+    """
+    s, c = (float(value) for value in sin_cos_deg(60.0))
+    dome = cut(
+        ball((0.0, 0.0, 0.0), (0.42 * radius, 0.42 * radius, 0.36 * radius)),
+        block((radius, radius, radius), (0.0, 0.0, -0.5 * radius)),
+    )
+    leaning = rotated(dome, "y", 30.0 * side)
+    stalk = rod(
+        (0.9 * radius * c * side, 0.0, z + 0.9 * radius * s),
+        (1.3 * radius * c * side, 0.0, z + 1.3 * radius * s),
+        0.0045,
+    )
+    return fuse(moved(leaning, (1.18 * radius * c * side, 0.0, z + 1.18 * radius * s)), stalk)

@@ -115,7 +115,7 @@ def shoe(*, length: float, width: float, height: float) -> trimesh.Trimesh:
         )
         for x, z in ((0.01, 0.90), (0.075, 0.80), (0.14, 0.705))
     ]
-    return fuse(cut(last, opening), tongue, *laces, *_sole(length, width, 0.13 * height))
+    return fuse(cut(last, opening), tongue, *laces, _sole(length, width, 0.13 * height))
 
 
 def boot(*, length: float, width: float, height: float) -> trimesh.Trimesh:
@@ -144,7 +144,7 @@ def boot(*, length: float, width: float, height: float) -> trimesh.Trimesh:
     half = len(rim) // 2
     cuff = [tube(part, 0.0042, edge=0.9 * EDGE) for part in (rim[: half + 2], rim[half - 1 :])]
     hole = ball((x - 0.002, 0.0, height), (0.82 * radius, 0.40 * width, 0.5 * height), edge=LEATHER)
-    return fuse(cut(fuse(foot, shaft, *cuff), hole), *_sole(length, width, 0.085 * height))
+    return fuse(cut(fuse(foot, shaft, *cuff), hole), _sole(length, width, 0.085 * height))
 
 
 def _last(length: float, width: float, instep: float, collar: float) -> trimesh.Trimesh:
@@ -166,8 +166,7 @@ def _last(length: float, width: float, instep: float, collar: float) -> trimesh.
     along = np.linspace(-0.49, 0.49, round(length / LEATHER) + 1)
     halves = width * PchipInterpolator(knots[:, 0], knots[:, 1])(along)
     rise = PchipInterpolator(knots[:, 0], knots[:, 2])(along)
-    heights = np.where(along < 0.0, collar, collar) * rise
-    heights = np.where(along > 0.2, np.minimum(heights, instep), heights)
+    heights = np.where(along > 0.2, np.minimum(collar * rise, instep), collar * rise)
 
     # Across it: a flat base, a rounded top.
     s, c = sin_cos_deg(np.linspace(0.0, 180.0, 15))
@@ -187,7 +186,7 @@ def _last(length: float, width: float, instep: float, collar: float) -> trimesh.
     return skin([tips[0], *rings, tips[1]], closed=False)
 
 
-def _sole(length: float, width: float, thick: float) -> list[trimesh.Trimesh]:
+def _sole(length: float, width: float, thick: float) -> trimesh.Trimesh:
     """Return the sole of a shoe, `thick` [m], its heel apart from it by an arch."""
     knots = np.array(
         [
@@ -210,7 +209,7 @@ def _sole(length: float, width: float, thick: float) -> list[trimesh.Trimesh]:
 
     slab = prism(outline, 0.0, 1.25 * thick, edge=LEATHER)
     arch = block((0.2 * length, 2.0 * width, thick), (-0.06 * length, 0.0, 0.0), edge=LEATHER)
-    return [cut(slab, arch)]
+    return cut(slab, arch)
 
 
 def _slab(side: Array, depth: float) -> trimesh.Trimesh:

@@ -161,17 +161,15 @@ def teapot(*, radius: float, height: float, spout: float) -> trimesh.Trimesh:
     )
     size = np.linspace(0.24 * radius, 0.11 * radius, len(path))
     handle = loop_handle(
-        x=-0.72 * radius,
+        x=0.72 * radius,
         top=0.76 * height,
         bottom=0.24 * height,
         reach=0.78 * radius,
         radius=0.11 * radius,
         edge=BROAD,
     )
-    mirrored = rotated(moved(handle, (1.44 * radius, 0.0, 0.0)), "z", 180.0)
-    return fuse(
-        body, lid, button, tube(path, size, edge=0.9 * EDGE), moved(mirrored, (0.0, 0.0, 0.0))
-    )
+    pipe = tube(path, size, edge=0.9 * EDGE)
+    return fuse(body, lid, button, pipe, rotated(handle, "z", 180.0))
 
 
 def juicer(*, radius: float, rim: float, cone: float) -> trimesh.Trimesh:

@@ -104,7 +104,7 @@ def banana(*, bend_radius: float, angle: float, thickness: float) -> trimesh.Tri
 
 def _single_banana(bend_radius: float, angle: float, thickness: float) -> trimesh.Trimesh:
     """Return a banana that lies on its side."""
-    theta = np.linspace(-angle / 2.0, angle / 2.0, round(bend_radius * angle / BROAD) + 1)
+    theta = np.linspace(-angle / 2.0, angle / 2.0, round(bend_radius * angle / LARGE) + 1)
     knots = np.array(
         [
             (0.0, 0.30),

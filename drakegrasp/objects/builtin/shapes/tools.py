@@ -38,18 +38,19 @@ from drakegrasp.objects.builtin.shapes.vessels import loop_handle, vessel
 
 
 def hammer(*, length: float, head_length: float, head_thickness: float) -> trimesh.Trimesh:
-    """Return a claw hammer that lies on its side, handle along -x, head along y."""
+    """Return a claw hammer that stands on its head, which is along y; `length` of its handle."""
     half = head_thickness / 2.0
     up = (0.0, 0.0, 1.0)
-    grip = min(half, 0.016)
-    # The handle leans, if need be, so that its end lies on the table beside the head.
+    grip = 0.013
     handle = bar(
-        (-length, 0.0, grip),
+        (-length, 0.0, half),
         (0.0, 0.0, half),
         ellipse(0.85 * grip, grip, edge=EDGE),
         normal=up,
         scale=((0.0, 1.0), (0.3, 1.0), (0.55, 0.75), (1.0, 0.75)),
     )
+
+    # The head: a claw on one side, which bends up, and a round face on the other.
     reach = head_length / 2.0
     y = np.linspace(reach, -reach, 60)
     bend = np.clip(-(y + 0.012), 0.0, None)
@@ -68,9 +69,9 @@ def hammer(*, length: float, head_length: float, head_thickness: float) -> trime
         ]
     )
     scale = PchipInterpolator(knots[:, 0], knots[:, 1:])(path[:, 1] / reach)
-    section = rounded_rectangle(2.0 * half, 2.0 * half, 0.55 * half, edge=EDGE)
+    section = rounded_rectangle(2.0 * half, 2.0 * half, 0.3 * half, edge=EDGE)
     head = sweep(path, section, normal=up, scale=scale)
-    return fuse(handle, head)
+    return stand(rotated(fuse(handle, head), "y", 90.0))
 
 
 def screwdriver(*, handle: float, radius: float, shaft: float) -> trimesh.Trimesh:
