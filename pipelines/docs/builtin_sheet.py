@@ -27,7 +27,7 @@ ACROSS, EDGE = 8, 1.3
 #: Pixels per inch, and how many times larger pictures are rendered than they are shown.
 DPI, OVERSAMPLING = 150, 2
 #: Where the camera is: azimuth from +x and elevation [rad]; its field of view is narrow.
-AZIMUTH, ELEVATION, FOV_Y_DEG = np.deg2rad(-58.0), np.deg2rad(24.0), 20.0
+AZIMUTH, ELEVATION, FOV_Y_DEG = np.deg2rad(-58.0), np.deg2rad(27.0), 20.0
 
 
 def main(argv: Sequence[str] | None = None) -> int:

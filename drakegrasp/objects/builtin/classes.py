@@ -71,7 +71,7 @@ _ROWS: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, Range]], ...] = (
     (packaging.can, dict(
         radius=mm(32, 38), height=mm(75, 120))),
     (tools.hammer, dict(
-        length=mm(120, 145), head_length=mm(95, 115), head_thickness=mm(36, 42))),
+        length=mm(115, 135), head_length=mm(95, 115), head_thickness=mm(42, 47))),
     (household.candlestick, dict(
         foot_radius=mm(43, 52), stem_radius=mm(10, 12.5), height=mm(120, 190))),
     (vessels.vase, dict(
@@ -98,7 +98,7 @@ _ROWS: tuple[tuple[Callable[..., trimesh.Trimesh], dict[str, Range]], ...] = (
     (belongings.book, dict(
         width=mm(70, 88), length=mm(105, 130), thickness=mm(42, 56))),
     (plants.banana, dict(
-        bend_radius=mm(66, 82), angle=deg(98, 112), thickness=mm(32, 37))),
+        bend_radius=mm(105, 125), angle=deg(60, 72), thickness=mm(38, 43))),
     (vessels.saucepan, dict(
         radius=mm(48, 58), height=mm(55, 85), handle_length=mm(85, 100))),
     (plants.apple, dict(
