@@ -15,7 +15,6 @@ from drakegrasp.objects.builtin.booleans import flat_base, fuse, stand
 from drakegrasp.objects.builtin.modelling import bar, extrude, revolve, sweep
 from drakegrasp.objects.builtin.primitives import ball, lathe, moved, scalloped, tube
 from drakegrasp.objects.builtin.profiles import (
-    BROAD,
     EDGE,
     LARGE,
     ellipse,

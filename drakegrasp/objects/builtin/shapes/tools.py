@@ -71,7 +71,8 @@ def hammer(*, length: float, head_length: float, head_thickness: float) -> trime
     scale = PchipInterpolator(knots[:, 0], knots[:, 1:])(path[:, 1] / reach)
     section = rounded_rectangle(2.0 * half, 2.0 * half, 0.3 * half, edge=EDGE)
     head = sweep(path, section, normal=up, scale=scale)
-    return stand(rotated(fuse(handle, head), "y", 90.0))
+    notch = block((0.1, 0.05, 0.15 * head_thickness), (0.0, 0.002 - reach, half))
+    return stand(rotated(fuse(handle, cut(head, notch)), "y", 90.0))
 
 
 def screwdriver(*, handle: float, radius: float, shaft: float) -> trimesh.Trimesh:
