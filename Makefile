@@ -69,6 +69,7 @@ lint: $(STAMP)   ## style, types, and docs that are made from code
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python pipelines/docs/dataset_format.py --check docs/reference/dataset-format.md
+	$(BIN)/python pipelines/docs/builtin_objects.py --check docs/reference/builtin-objects.md
 
 format: $(STAMP) ## let ruff lay out the code
 	$(BIN)/ruff check --fix .
@@ -76,6 +77,7 @@ format: $(STAMP) ## let ruff lay out the code
 
 docs: $(STAMP)   ## write the docs that are made from code
 	$(BIN)/python pipelines/docs/dataset_format.py docs/reference/dataset-format.md
+	$(BIN)/python pipelines/docs/builtin_objects.py docs/reference/builtin-objects.md
 
 clean:           ## remove what was made here
 	rm -rf $(VENV) $(DEMO) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

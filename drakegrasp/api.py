@@ -26,7 +26,7 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import ConfigError, GraspError
 from drakegrasp.frames import as_numbers
 from drakegrasp.hand.description import load_hand
-from drakegrasp.objects.builtin.catalog import export_builtin
+from drakegrasp.objects.builtin.catalog import builtin_sources
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.runtime.environment import available_cores
 from drakegrasp.runtime.executor import run_here
@@ -67,7 +67,8 @@ def build_dataset(
     What is complete in `out` is kept: the same call goes on where an earlier one stopped.
 
     Args:
-        objects: Directory of meshes, or "builtin" for the built-in objects.
+        objects: Directory of meshes, or "builtin" for the built-in objects, of which
+            `config.builtin` says how many.
         out: Directory of the dataset; it must be visible to every worker.
         config: All the rules; the preset `paper` if None.
         units: Unit of length of the meshes: m, cm or mm.
@@ -148,8 +149,8 @@ def build_on(
         # The built-in objects become mesh files of the dataset.
         if sources is None:
             claim_directory(out, config)
-            export_builtin(out / BUILTIN_FOLDER)
-            sources = find_meshes(out / BUILTIN_FOLDER)
+            with progress_bar("objects", "meshes", show=show) as report:
+                sources = builtin_sources(out / BUILTIN_FOLDER, config.builtin, report)
 
         execute = DaskExecutor(client, resubmissions=RESUBMISSIONS)
         execute.pool.kernel = kernel

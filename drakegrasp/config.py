@@ -67,6 +67,16 @@ class ObjectConfig(_Section):
         return self
 
 
+class BuiltinConfig(_Section):
+    """Which built-in objects there are, in a build of `builtin`; without effect on meshes of files.
+
+    With two objects of a class one trains and one tests.
+    """
+
+    per_class: Annotated[int, Field(ge=1, le=10_000)] = 2  # objects of each of the 64 classes
+    seed: Annotated[int, Field(ge=0)] = 0  # of the draw of their sizes, apart from the others
+
+
 #: Longest coarse step that is allowed [s]; own choice, 24 ms are what was measured.
 MAX_COARSE_STEP = 0.06
 
@@ -255,7 +265,8 @@ class SplitConfig(_Section):
     """How the samples are split for training, validation and test."""
 
     valid_fraction: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.1
-    train_classes: tuple[str, ...] | None = None  # None: every class with two objects or more
+    # Names of the classes that train, with their only object too; None: all with two or more.
+    train_classes: tuple[str, ...] | None = None
 
 
 class VerifyConfig(_Section):
@@ -283,6 +294,7 @@ class Config(_Section):
     unit_candidates: Count = 50  # candidates in a work unit
     attempt_seconds: Positive = 60.0  # [s] of wall clock before an attempt is a `timeout`
     objects: ObjectConfig = ObjectConfig()
+    builtin: BuiltinConfig = BuiltinConfig()
     physics: PhysicsConfig = PhysicsConfig()
     settle: SettleConfig = SettleConfig()
     candidates: CandidateConfig = CandidateConfig()

@@ -1,4 +1,4 @@
-"""Build a small dataset of eight built-in objects in a few minutes and show its contents.
+"""Build a small dataset of twelve built-in objects in a few minutes and show its contents.
 
 Writes DIR/meshes (the objects), DIR/dataset (the dataset) and DIR/contact_sheet.png. The
 same command continues an interrupted build.
@@ -17,20 +17,12 @@ from drakegrasp.cli.tables import make_console
 from drakegrasp.config import load_config
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.errors import DrakegraspError
-from drakegrasp.objects.builtin.catalog import export_builtin
+from drakegrasp.objects.builtin.catalog import draw_builtin, export_builtin
 from drakegrasp.visualization.contact_sheet import contact_sheet
 
-#: Objects that the hand can grasp, two of each class.
-OBJECTS = (
-    "7_wineglass_round",
-    "8_wineglass_flute",
-    "15_candlestick_short",
-    "16_candlestick_tall",
-    "23_jar_small",
-    "24_jar_large",
-    "31_spray_bottle_small",
-    "32_spray_bottle_large",
-)
+#: Classes that the hand often grasps, and objects of each: two train and validate, one is tested.
+CLASSES = ("wineglass", "spray_bottle", "carton", "boot")
+PER_CLASS = 3
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -40,19 +32,32 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("directory", type=Path, metavar="DIR", help="where to write")
     parser.add_argument(
-        "--candidates", type=int, default=200, help="palm poses per object  [default: 200]"
+        "--candidates", type=int, default=150, help="palm poses per object  [default: 150]"
+    )
+    parser.add_argument(
+        "--per-class",
+        type=int,
+        default=PER_CLASS,
+        help=f"objects per class  [default: {PER_CLASS}]",
     )
     parser.add_argument("--workers", type=int, help="processes  [default: one per core]")
     arguments = parser.parse_args(argv)
     try:
-        run(arguments.directory, candidates=arguments.candidates, workers=arguments.workers)
+        run(
+            arguments.directory,
+            candidates=arguments.candidates,
+            per_class=arguments.per_class,
+            workers=arguments.workers,
+        )
     except DrakegraspError as error:
         print(f"error: {error}", file=sys.stderr)  # noqa: T201
         return 1
     return 0
 
 
-def run(directory: Path, *, candidates: int, workers: int | None = None) -> None:
+def run(
+    directory: Path, *, candidates: int, per_class: int = PER_CLASS, workers: int | None = None
+) -> None:
     """Export the objects, build their dataset, and print and draw what it holds."""
     meshes, out, sheet = (
         directory / "meshes",
@@ -60,15 +65,17 @@ def run(directory: Path, *, candidates: int, workers: int | None = None) -> None
         directory / "contact_sheet.png",
     )
 
-    export_builtin(meshes, OBJECTS)
     # Shards of 25 candidates keep all cores busy to the end of so small a dataset.
-    config = load_config(None, [f"candidates.max={candidates}", "unit_candidates=25"])
+    overrides = [f"candidates.max={candidates}", f"builtin.per_class={per_class}"]
+    config = load_config(None, [*overrides, "unit_candidates=25"])
+    drawn = draw_builtin(config.builtin)
+    export_builtin(meshes, [item.name for item in drawn if item.object_class.name in CLASSES])
     build_dataset(meshes, out, config=config, workers=workers)
 
     print_stats(out)
     console = make_console()
-    drawn = contact_sheet(out / DATA_FILES["oto"], sheet)
-    console.print(f"{sheet}: {drawn} samples drawn", soft_wrap=True, highlight=False)
+    count = contact_sheet(out / DATA_FILES["oto"], sheet)
+    console.print(f"{sheet}: {count} samples drawn", soft_wrap=True, highlight=False)
     for name in (*DATA_FILES.values(), TRIALS_FILE):
         console.print(str(out / name), soft_wrap=True, highlight=False)
 

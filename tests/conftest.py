@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 import trimesh
+from helpers.meshes import write_fixed
 from hypothesis import settings
 
 from drakegrasp.build.pipeline import build
 from drakegrasp.config import Config, load_config
-from drakegrasp.objects.builtin.catalog import export_builtin
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.executor import run_here
 
@@ -44,7 +44,7 @@ SMALL = [
 def small_meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two built-in objects and a box, of two classes, as files."""
     folder = tmp_path_factory.mktemp("meshes")
-    export_builtin(folder, ["8_wineglass_flute", "10_box_tall"])
+    write_fixed(folder, "8_wineglass_flute", "10_box_tall")
     slim = trimesh.creation.box([0.065, 0.05, 0.14]).subdivide().subdivide()
     slim.export(folder / "11_box_slim.obj")
     return folder

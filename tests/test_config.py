@@ -30,6 +30,9 @@ objects:
   max_collision_faces: 2000
   min_diagonal: 0.02
   max_diagonal: 1.5
+builtin:
+  per_class: 5
+  seed: 6
 physics:
   time_step: 0.002
   friction_hand: 0.8

@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
+import builtin_objects
 import click
 import dataset_format
 import pytest
@@ -34,6 +35,7 @@ TABLES = (
     VERIFICATION_FIELDS,
 )
 FORMAT_PAGE = ROOT / "docs" / "reference" / "dataset-format.md"
+BUILTIN_PAGE = ROOT / "docs" / "reference" / "builtin-objects.md"
 COMMAND_PAGE = ROOT / "docs" / "reference" / "command-line.md"
 CONFIG_PAGE = ROOT / "docs" / "reference" / "configuration.md"
 DOCS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -70,6 +72,15 @@ def test_format_page_is_what_the_schema_says(tmp_path: Path) -> None:
     assert dataset_format.main(["--check", str(stale)]) == 1
     assert dataset_format.main([str(stale)]) == 0
     assert stale.read_bytes() == FORMAT_PAGE.read_bytes()
+
+
+def test_page_of_built_in_objects_is_what_the_table_says(tmp_path: Path) -> None:
+    assert builtin_objects.main(["--check", str(BUILTIN_PAGE)]) == 0
+    stale = tmp_path / "page.md"
+    stale.write_text(read(BUILTIN_PAGE).replace("mm", "cm"), encoding="utf-8")
+    assert builtin_objects.main(["--check", str(stale)]) == 1
+    assert builtin_objects.main([str(stale)]) == 0
+    assert stale.read_bytes() == BUILTIN_PAGE.read_bytes()
 
 
 def test_every_field_is_on_the_format_page() -> None:
@@ -155,8 +166,10 @@ def command_lines(page: Path) -> Iterator[tuple[click.Command, list[str]]]:
 
 
 def options_of(command: click.Command) -> set[str]:
+    """Return the options of a command, of a group those of all its commands."""
     options = {o for p in command.params for o in p.opts if isinstance(p, click.Option)}
-    return options | {"--help", "-h"}
+    below = command.commands.values() if isinstance(command, click.Group) else ()
+    return options.union({"--help", "-h"}, *map(options_of, below))
 
 
 @pytest.mark.parametrize("page", DOCS, ids=page_id)

@@ -13,7 +13,7 @@ from drakegrasp.build.request import BUILTIN, BuildRequest
 from drakegrasp.build.stage_times import MEASURED, StageTimes
 from drakegrasp.config import Config
 from drakegrasp.errors import ConfigError
-from drakegrasp.objects.builtin.catalog import BUILTIN_OBJECTS
+from drakegrasp.objects.builtin.classes import CLASSES
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.environment import available_cores
 
@@ -129,7 +129,7 @@ def plan_request(
         ConfigError: If there is no worker.
     """
     if request.objects == BUILTIN:
-        objects = len(BUILTIN_OBJECTS)
+        objects = len(CLASSES) * request.config.builtin.per_class
     else:
         meshes = find_meshes(request.objects, units=request.units, manifest=request.manifest)
         objects = len(meshes)

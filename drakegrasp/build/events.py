@@ -26,7 +26,8 @@ class BuildEvents:
         Args:
             out: Directory of the dataset.
             pool: The workers; None if this process does the work.
-            show: Whether to tell the user on standard error that the build waits for workers.
+            show: Whether to tell the user on standard error what cannot wait for the end: a
+                warning, or that the build waits for workers.
         """
         self._out, self._pool, self._show = out, pool, show
         self._log = BuildLog(out)
@@ -64,6 +65,12 @@ class BuildEvents:
         if self._pool is not None:
             self._pool.on_change = self.workers_changed
             self._pool.on_none = self.no_worker
+
+    def warn(self, text: str) -> None:
+        """Log what the user should know before the work begins, and say it."""
+        self._log("notice", text=text)
+        if self._show:
+            sys.stderr.write(f"{text}\n")
 
     def workers_changed(self, joined: set[str], left: set[str]) -> None:
         """Log the addresses of workers that joined and of those that left."""

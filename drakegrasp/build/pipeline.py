@@ -7,6 +7,7 @@ work unit. Results may come back in any order; the files are the same.
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -16,8 +17,9 @@ from drakegrasp.build.counts import NAMED, Counts
 from drakegrasp.build.events import BuildEvents
 from drakegrasp.build.prepare import PrepareTask, prepare_one
 from drakegrasp.build.work_unit import WorkUnit, find_outcomes, run_unit
-from drakegrasp.config import Config
+from drakegrasp.config import Config, SplitConfig
 from drakegrasp.dataset.assemble import Assembly, assemble_locked, is_assembled, summarise
+from drakegrasp.dataset.filters import may_train
 from drakegrasp.dataset.lock import Holder, build_lock
 from drakegrasp.dataset.manifest import (
     Manifest,
@@ -170,6 +172,8 @@ def _build(
     write_manifest(manifest, out)
     notices += job.events.kernel_notice()
     job.events.started(manifest, notices)
+    if (warning := nothing_trains(sources, config.split)) is not None:
+        job.events.warn(warning)
 
     # Prepare each object, or refuse its mesh.
     with progress_bar("prepare", "objects", show=job.show) as report:
@@ -207,6 +211,22 @@ def _build(
         errors=dict(counts.errors),
         notices=tuple(notices),
         assembly=summarise(out),
+    )
+
+
+def nothing_trains(sources: Sequence[MeshSource], split: SplitConfig) -> str | None:
+    """Return a warning if no sample of these meshes can be in the split `train`, else None."""
+    counts = Counter(source.class_name for source in sources)
+    if any(may_train(name, count, split) for name, count in counts.items()):
+        return None
+    if split.train_classes is not None:
+        why = "split.train_classes names none of the classes"
+    else:
+        why = "every class has one object, which is tested"
+    return (
+        f"nothing will train: {why}. Give classes more objects (--per-class for built-in ones; "
+        "objects.yaml says which meshes are of one class), or name the classes to train on, e.g. "
+        f"--set split.train_classes=[{min(counts)}]"
     )
 
 

@@ -9,13 +9,22 @@ from typing import Any
 import click
 
 from drakegrasp.build.request import BUILTIN
-from drakegrasp.cli.options import manifest_option, set_option, units_option
+from drakegrasp.cli.options import (
+    builtin_overrides,
+    manifest_option,
+    objects_seed_option,
+    per_class_option,
+    set_option,
+    units_option,
+)
 
 
 @click.command()
 @click.option(
     "--objects", default=BUILTIN, show_default=True, metavar="MESH_DIR|builtin", help="The meshes."
 )
+@per_class_option
+@objects_seed_option
 @click.option(
     "--only",
     multiple=True,
@@ -68,6 +77,8 @@ from drakegrasp.cli.options import manifest_option, set_option, units_option
 def bench(
     context: click.Context,
     objects: str,
+    per_class: int | None,
+    objects_seed: int | None,
     only: tuple[str, ...],
     preset: str | None,
     overrides: tuple[str, ...],
@@ -105,7 +116,7 @@ def bench(
         print_table,
     )
     from drakegrasp.config import load_config
-    from drakegrasp.objects.builtin.catalog import export_builtin
+    from drakegrasp.objects.builtin.catalog import builtin_sources
     from drakegrasp.objects.sources import find_meshes
     from drakegrasp.runtime.progress import progress_bar
 
@@ -120,14 +131,16 @@ def bench(
         _require_mujoco("--peer")
     # The time of OpenGL's threads would count as this core's.
     os.environ.setdefault("LP_NUM_THREADS", "0")
-    config = load_config(preset, [*overrides, f"candidates.max={candidates}"])
+    drawn = builtin_overrides(objects, per_class, objects_seed)
+    config = load_config(preset, [*overrides, *drawn, f"candidates.max={candidates}"])
     earlier = None if compare is None else _read_report(compare)
 
     with tempfile.TemporaryDirectory() as folder:
         if objects == BUILTIN:
-            export_builtin(Path(folder))
-        meshes = Path(folder) if objects == BUILTIN else Path(objects)
-        every = find_meshes(meshes, units=units, manifest=manifest)
+            with progress_bar("objects", "meshes", show=not quiet) as progress:
+                every = builtin_sources(folder, config.builtin, progress)
+        else:
+            every = find_meshes(objects, units=units, manifest=manifest)
         sources = [s for s in every if not only or s.name.startswith(only)]
         if not sources:
             raise click.UsageError(f"--only must name objects of {objects}, got {', '.join(only)}")

@@ -18,8 +18,11 @@ from drakegrasp.cli.build import assemble, build, stats
 from drakegrasp.cli.export import export
 from drakegrasp.cli.group import main
 from drakegrasp.cli.options import (
+    builtin_overrides,
     manifest_option,
+    objects_seed_option,
     out_argument,
+    per_class_option,
     units_option,
 )
 from drakegrasp.cli.verify import verify
@@ -51,25 +54,37 @@ def doctor(directory: Path) -> None:
 
 @click.group()
 def objects() -> None:
-    """List or export the built-in objects."""
+    """List the built-in classes or export objects of them."""
 
 
 @objects.command("list")
 def list_objects() -> None:
-    """Print the name and class of every built-in object."""
-    from drakegrasp.objects.builtin.catalog import BUILTIN_OBJECTS
+    """Print every built-in class, with the parameters that are drawn."""
+    from drakegrasp.objects.builtin.classes import CLASSES
 
-    for item in BUILTIN_OBJECTS:
-        click.echo(f"{item.name:<26} {item.class_name}")
+    for item in CLASSES:
+        sizes = ", ".join(f"{name} {span}" for name, span in item.parameters.items())
+        click.echo(f"{item.number:>2} {item.name:<15} {sizes}")
 
 
 @objects.command("export")
 @click.argument("directory", type=click.Path(path_type=Path))
-def export_objects(directory: Path) -> None:
-    """Write the built-in objects' meshes (.obj, metres) to DIRECTORY."""
-    from drakegrasp.objects.builtin.catalog import export_builtin
+@per_class_option
+@objects_seed_option
+def export_objects(directory: Path, per_class: int | None, objects_seed: int | None) -> None:
+    """Write the built-in objects' meshes (.obj, metres) to DIRECTORY.
 
-    click.echo(f"{len(export_builtin(directory))} meshes in {directory}")
+    Equal options write equal bytes on every machine.
+    """
+    from drakegrasp.build.request import BUILTIN
+    from drakegrasp.config import load_config
+    from drakegrasp.objects.builtin.catalog import export_builtin
+    from drakegrasp.runtime.progress import progress_bar
+
+    config = load_config(overrides=builtin_overrides(BUILTIN, per_class, objects_seed))
+    with progress_bar("objects", "meshes") as progress:
+        paths = export_builtin(directory, config=config.builtin, progress=progress)
+    click.echo(f"{len(paths)} meshes in {directory}")
 
 
 @click.command()

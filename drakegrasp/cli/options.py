@@ -11,11 +11,24 @@ from typing import Any, TypeVar
 
 import click
 
-from drakegrasp.build.request import BuildRequest
+from drakegrasp.build.request import BUILTIN, BuildRequest
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
+#: Which built-in objects there are, for every command that takes them.
+per_class_option = click.option(
+    "--per-class",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Built-in objects of each class.  [default: 2]",
+)
+objects_seed_option = click.option(
+    "--objects-seed",
+    type=click.IntRange(min=0),
+    metavar="S",
+    help="Seed of the sizes of the built-in objects.  [default: 0]",
+)
 units_option = click.option(
     "--units",
     default="m",
@@ -51,6 +64,8 @@ _OPTIONS = (
         metavar="MESH_DIR|builtin",
         help="A directory of .obj, .stl, .ply or .glb files, or the built-in objects.",
     ),
+    per_class_option,
+    objects_seed_option,
     click.option(
         "--out",
         required=True,
@@ -116,6 +131,8 @@ def build_options(command: F) -> F:
 def parse_request(
     *,
     objects: str,
+    per_class: int | None,
+    objects_seed: int | None,
     out: Path,
     config: str | None,
     overrides: Sequence[str],
@@ -130,12 +147,13 @@ def parse_request(
     """Return what the options of `build_options` ask for.
 
     Raises:
+        click.UsageError: If options of the built-in objects are given with other meshes.
         ConfigError: If a value of the configuration cannot be used.
     """
     # Loading pydantic takes a while, and `--help` must answer at once.
     from drakegrasp.config import load_config
 
-    chosen = list(overrides)
+    chosen = [*overrides, *builtin_overrides(objects, per_class, objects_seed)]
     if candidates is not None:
         chosen.append(f"candidates.max={candidates}")
     if certify is not None:
@@ -148,3 +166,22 @@ def parse_request(
         manifest=manifest,
         show=not quiet,
     )
+
+
+def builtin_overrides(objects: str, per_class: int | None, seed: int | None) -> list[str]:
+    """Return what the options of the built-in objects change in the configuration.
+
+    Args:
+        objects: A directory of meshes, or "builtin".
+        per_class: Objects of each class; the configuration's if None.
+        seed: Seed of their sizes; the configuration's if None.
+
+    Raises:
+        click.UsageError: If they are given with a directory of meshes.
+    """
+    values = {"per-class": per_class, "objects-seed": seed}
+    given = [f"--{name}" for name, value in values.items() if value is not None]
+    if given and objects != BUILTIN:
+        raise click.UsageError(f"{given[0]} must be used with --objects builtin, got {objects}")
+    keys = {"builtin.per_class": per_class, "builtin.seed": seed}
+    return [f"{key}={value}" for key, value in keys.items() if value is not None]

@@ -165,6 +165,13 @@ def is_outlier(values: Array, sigma: float) -> npt.NDArray[np.bool_]:
     return np.any(np.abs(values - values.mean(axis=0)) > sigma * deviation, axis=1)
 
 
+def may_train(class_name: str, count: int, config: SplitConfig) -> bool:
+    """Return whether samples of a class with `count` objects train or validate."""
+    if config.train_classes is None:
+        return count > 1
+    return class_name in config.train_classes
+
+
 def split_samples(
     objects: npt.NDArray[np.int32],
     names: Sequence[str],
@@ -176,8 +183,9 @@ def split_samples(
 
     From each class one object is drawn; all its samples go to the test split. Of the samples of
     the other objects a share goes to the validation split and the rest to the training split. A
-    class goes to the test split as a whole if only one of its objects has samples, or if
-    `train_classes` leaves it out. The draw of a class depends on its own objects alone.
+    class goes to the test split as a whole if only one of its objects has samples and
+    `train_classes` does not name it, or if `train_classes` leaves it out. A class with one object
+    that `train_classes` names is not tested. The draw of a class depends on its own objects alone.
 
     Args:
         objects: (n,), row of /objects of each sample.
@@ -196,11 +204,11 @@ def split_samples(
         indices = sorted(members[class_name], key=lambda i: names[i])
         # A key of three numbers: never the stream of a candidate of an object of that name.
         stream = Stream(seed, object_key(class_name), 0, 1)
-        trains = config.train_classes is None or class_name in config.train_classes
-
-        # The test object, or all of them.
-        if len(indices) < 2 or not trains:
+        # The test object, or all of them, or none.
+        if not may_train(class_name, len(indices), config):
             tested, others = indices, []
+        elif len(indices) < 2:
+            tested, others = [], indices
         else:
             tested = [indices[int(stream.integers(len(indices), 1)[0])]]
             others = [i for i in indices if i not in tested]

@@ -26,7 +26,7 @@ from drakegrasp.simulation.candidates import sample_candidates
 
 #: Titles of the two methods in the figure of the candidates.
 METHODS = {"normals": "along surface normals", "rotations": "global and local rotations"}
-MUG = "1_mug_small"
+MUG = "1_mug_1"
 
 
 def main(argv: Sequence[str] | None = None) -> int:

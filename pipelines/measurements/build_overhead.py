@@ -38,12 +38,12 @@ from drakegrasp.runtime.executor import run_here
 WORK = ("build", "try", "look")
 #: The built-in objects that are used by default.
 OBJECTS = (
-    "2_mug_large",
-    "4_bottle_stout",
-    "8_wineglass_flute",
-    "10_box_tall",
-    "31_spray_bottle_small",
-    "40_apple_large",
+    "1_mug_1",
+    "2_bottle_1",
+    "4_wineglass_1",
+    "5_box_1",
+    "16_spray_bottle_1",
+    "20_apple_1",
 )
 #: The plain loops try one palm pose in this many.
 LESS = 4

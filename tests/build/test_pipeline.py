@@ -13,17 +13,18 @@ import trimesh
 from helpers.assertions import assert_same_dataset
 
 from drakegrasp.api import build_dataset
-from drakegrasp.build.pipeline import build
+from drakegrasp.build.pipeline import build, nothing_trains
 from drakegrasp.build.replay import replay_trial
-from drakegrasp.config import Config, load_config, override_config
+from drakegrasp.config import Config, SplitConfig, load_config, override_config
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.filters import Removal
+from drakegrasp.dataset.log import read_log
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.statistics import count_funnel, count_splits
 from drakegrasp.errors import ConfigError, DataError, MachineError, MeshError
-from drakegrasp.objects.sources import find_meshes
+from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
 
@@ -208,6 +209,48 @@ def test_refused_meshes_are_listed_and_the_others_go_on(tmp_path: Path) -> None:
     assert "--units" in report.refused[0].reason
     again = build(find_meshes(meshes), out, config, _nothing_runs, show=False)
     assert again.refused == report.refused
+
+
+@pytest.mark.parametrize(
+    ("classes", "named", "warning"),
+    [
+        (["a", "b"], None, "every class has one object, which is tested"),
+        (["a", "b", "b"], None, None),
+        (["a", "b"], ("b",), None),
+        (["a", "a"], ("c",), "split.train_classes names none of the classes"),
+    ],
+)
+def test_a_split_that_trains_nothing_is_a_warning(
+    classes: list[str], named: tuple[str, ...] | None, warning: str | None
+) -> None:
+    sources = [
+        MeshSource(name=f"{i}_{name}", class_name=name, path=Path("x.obj"))
+        for i, name in enumerate(classes)
+    ]
+    said = nothing_trains(sources, SplitConfig(train_classes=named))
+    assert (said is None) == (warning is None)
+    if said is not None and warning is not None:
+        assert said.startswith(f"nothing will train: {warning}. ")
+        assert "--per-class" in said and "--set split.train_classes=[a]" in said
+
+
+def test_a_build_that_trains_nothing_says_so_before_it_prepares(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    meshes, out = tmp_path / "meshes", tmp_path / "out"
+    meshes.mkdir()
+    trimesh.creation.box([0.06, 0.06, 0.09]).export(meshes / "1_box_a.obj")
+
+    def stop(*_: object) -> Iterator[object]:
+        raise KeyboardInterrupt
+
+    for show in (True, False):
+        with pytest.raises(KeyboardInterrupt):
+            build(find_meshes(meshes), out, load_config(), stop, show=show)
+        said = capsys.readouterr().err
+        assert ("nothing will train: every class has one object" in said) is show
+    notices = [event["text"] for event in read_log(out) if event["event"] == "notice"]
+    assert [text.partition(":")[0] for text in notices] == ["nothing will train"] * 2
 
 
 def test_names_with_spaces_and_other_alphabets_work(tmp_path: Path) -> None:

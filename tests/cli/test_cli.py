@@ -19,9 +19,11 @@ from click.testing import CliRunner, Result
 from helpers.assertions import arrays_of
 
 from drakegrasp.cli.main import main
+from drakegrasp.cli.options import parse_request
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.frames import make_pose
+from drakegrasp.objects.builtin.catalog import BuiltinObject
 from drakegrasp.verification.prediction import FRAMES
 from drakegrasp.verification.verify import METHODS
 
@@ -102,12 +104,67 @@ def test_help_fits_into_80_columns_and_is_not_cut() -> None:
         assert max(map(len, page.splitlines())) <= 80
 
 
-def test_objects_are_listed_and_exported(tmp_path: Path) -> None:
+@pytest.fixture
+def quick_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every built-in object is a tetrahedron: building the shapes takes long."""
+    points, faces = np.vstack([np.zeros(3), 0.1 * np.eye(3)]), [[0, 2, 1], [0, 1, 3], [0, 3, 2]]
+    mesh = trimesh.Trimesh(points, [*faces, [1, 2, 3]], process=False)
+
+    def build(self: BuiltinObject) -> trimesh.Trimesh:
+        return trimesh.Trimesh((1.0 + 0.1 * self.seed) * mesh.vertices, mesh.faces, process=False)
+
+    monkeypatch.setattr(BuiltinObject, "build", build)
+
+
+def test_classes_are_listed_with_their_parameters() -> None:
     listed = run("objects", "list").stdout.splitlines()
-    assert len(listed) >= 24
-    assert len({line.split()[1] for line in listed}) >= 12
-    assert run("objects", "export", tmp_path / "meshes").exit_code == 0
-    assert len(list((tmp_path / "meshes").glob("*.obj"))) == len(listed)
+    assert len(listed) == 64
+    assert listed[5].split() == [
+        "6",
+        "can",
+        "radius",
+        "32",
+        "to",
+        "38",
+        "mm,",
+        "height",
+        "75",
+        "to",
+        "120",
+        "mm",
+    ]
+
+
+@pytest.mark.usefixtures("quick_shapes")
+def test_as_many_objects_are_exported_as_asked_for(tmp_path: Path) -> None:
+    for arguments, count, seed in (([], 2, 0), (["--per-class", 3, "--objects-seed", 7], 3, 7)):
+        folder = tmp_path / str(count)
+        result = run("objects", "export", folder, *arguments)
+        assert result.exit_code == 0
+        assert result.stdout == f"{64 * count} meshes in {folder}\n"
+        assert len(list(folder.glob("*.obj"))) == 64 * count
+        text = (folder / f"64_traffic_cone_{count}.obj").read_text()
+        assert f"v {0.1 * (1.0 + 0.1 * seed):.7f} 0.0000000 0.0000000" in text
+
+
+@pytest.mark.parametrize("command", ["build", "bench"])
+@pytest.mark.parametrize("option", ["--per-class", "--objects-seed"])
+def test_options_of_built_in_objects_are_refused_with_other_meshes(
+    tmp_path: Path, command: str, option: str
+) -> None:
+    result = run(command, "--objects", tmp_path, "--out", tmp_path / "out", option, "3")
+    assert result.exit_code == 2
+    assert f"{option} must be used with --objects builtin, got {tmp_path}" in error_line(result)
+    assert not list(tmp_path.iterdir())
+
+
+def test_options_of_built_in_objects_are_values_of_the_configuration(tmp_path: Path) -> None:
+    request = dict.fromkeys(
+        ("config", "candidates", "max_grasps", "certify", "seed", "manifest", "quiet")
+    ) | {"objects": "builtin", "out": tmp_path, "overrides": ["builtin.seed=9"], "units": "m"}
+    for per_class, seed, expected in ((3, None, (3, 9)), (None, 4, (2, 4)), (None, None, (2, 9))):
+        config = parse_request(**request, per_class=per_class, objects_seed=seed).config
+        assert (config.builtin.per_class, config.builtin.seed) == expected
 
 
 def _empty_directory(folder: Path) -> None:

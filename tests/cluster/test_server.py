@@ -14,6 +14,7 @@ import psutil
 import pytest
 from distributed import Client
 from helpers.assertions import assert_same_dataset
+from helpers.meshes import write_fixed
 from helpers.scripts import PIPELINES
 from server.processes import wait_until
 from server.slurm import PARTITION, queued_jobs, running_slurm
@@ -25,7 +26,6 @@ from drakegrasp.cluster.admission import worker_environment
 from drakegrasp.cluster.launch import start_cluster
 from drakegrasp.cluster.request import ClusterRequest
 from drakegrasp.config import load_config
-from drakegrasp.objects.builtin.catalog import export_builtin
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.executor import run_here
 
@@ -39,7 +39,7 @@ PATIENCE = 600.0
 @pytest.fixture(scope="module")
 def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("meshes")
-    export_builtin(folder, ["10_box_tall"])
+    write_fixed(folder, "10_box_tall")
     return folder
 
 

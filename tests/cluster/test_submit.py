@@ -19,6 +19,7 @@ import pytest
 from click.testing import CliRunner, Result
 from distributed import Client
 from helpers.assertions import assert_same_dataset
+from helpers.meshes import write_fixed
 from helpers.scripts import PIPELINES, load_script
 
 import drakegrasp
@@ -31,7 +32,6 @@ from drakegrasp.cluster.launch import _exports, start_cluster
 from drakegrasp.cluster.request import ClusterRequest, walltime_seconds
 from drakegrasp.config import load_config
 from drakegrasp.errors import ConfigError, MachineError
-from drakegrasp.objects.builtin.catalog import export_builtin
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.executor import run_here
 
@@ -43,7 +43,7 @@ TINY_OPTIONS = ["--candidates", "8", "--set", "unit_candidates=4"]
 @pytest.fixture(scope="session")
 def box(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("box")
-    export_builtin(folder, ["10_box_tall"])
+    write_fixed(folder, "10_box_tall")
     return folder
 
 

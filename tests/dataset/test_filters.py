@@ -15,6 +15,7 @@ from drakegrasp.dataset.filters import (
     Successes,
     is_outlier,
     judge_successes,
+    may_train,
     split_samples,
 )
 
@@ -184,6 +185,22 @@ def test_classes_that_do_not_train_are_tested_whole() -> None:
     split = split_samples(OBJECTS, NAMES, CLASSES, SplitConfig(train_classes=("a",)), 0)
     assert {CLASSES[i] for i in set(OBJECTS[split["train"]])} == {"a"}
     assert {3, 4, 5} <= set(OBJECTS[split["test"]])
+
+
+def test_a_named_class_trains_with_its_only_object() -> None:
+    split = split_samples(OBJECTS, NAMES, CLASSES, SplitConfig(train_classes=("b",)), 0)
+    trained = np.concatenate([split["train"], split["valid"]])
+    assert set(OBJECTS[trained]) == {3}
+    assert len(split["valid"]) == 5
+    assert set(OBJECTS[split["test"]]) == {0, 1, 2, 4, 5}
+
+
+@pytest.mark.parametrize(
+    ("named", "count", "trains"),
+    [(None, 1, False), (None, 2, True), (("a",), 1, True), (("b",), 9, False)],
+)
+def test_which_classes_train(named: tuple[str, ...] | None, count: int, trains: bool) -> None:
+    assert may_train("a", count, SplitConfig(train_classes=named)) is trains
 
 
 def test_another_class_does_not_change_a_classs_draw() -> None:

@@ -20,7 +20,7 @@ import trimesh
 from threadpoolctl import threadpool_info
 
 from drakegrasp.build.prepare import prepare
-from drakegrasp.config import SplitConfig, load_config
+from drakegrasp.config import BuiltinConfig, SplitConfig, load_config
 from drakegrasp.dataset.filters import split_samples
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.builtin.catalog import export_builtin
@@ -101,7 +101,7 @@ def main(meshes: Path | None) -> dict[str, object]:
     found: dict[str, object] = {}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        builtin = export_builtin(folder / "builtin")
+        builtin = export_builtin(folder / "builtin", config=BuiltinConfig(per_class=1))
         found["builtin meshes"] = digest(*(path.read_bytes() for path in builtin))
         for source in objects(folder, meshes):
             for what, value in object_draws(source):

@@ -9,6 +9,8 @@ import pytest
 import trimesh
 
 from drakegrasp.config import ObjectConfig
+from drakegrasp.objects.builtin.catalog import wavefront
+from drakegrasp.objects.builtin.shapes import packaging, vessels
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource
 
@@ -19,6 +21,27 @@ needs_g3db = pytest.mark.skipif(not G3DB.is_dir(), reason="the G3DB meshes are n
 
 
 BOX = (0.06, 0.10, 0.04)
+
+
+#: Objects of fixed sizes, whatever the ranges of their classes are; easy to grasp.
+FIXED = {
+    "8_wineglass_flute": vessels.wineglass(
+        foot_radius=0.034,
+        stem_radius=0.006,
+        belly_radius=0.028,
+        rim_radius=0.026,
+        height=0.180,
+        stem_height=0.065,
+    ),
+    "10_box_tall": packaging.box(width=0.070, depth=0.050, height=0.150),
+}
+
+
+def write_fixed(folder: Path, *names: str) -> None:
+    """Write some of the objects of fixed sizes into a folder, which is made."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        (folder / f"{name}.obj").write_bytes(wavefront(FIXED[name]))
 
 
 def write(path: Path, *meshes: trimesh.Trimesh) -> Path:

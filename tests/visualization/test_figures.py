@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from doc_figures import candidates_figure, find_sample, frames_figure, hero_figure
 from helpers.machine import needs_egl
+from helpers.meshes import FIXED, write_fixed
 from helpers.scripts import PIPELINES
 from matplotlib.image import imread
 
@@ -28,7 +29,6 @@ from drakegrasp.dataset.schema import (
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, make_pose, pack_pose
 from drakegrasp.grasp import pack_grasp
-from drakegrasp.objects.builtin.catalog import builtin_object, export_builtin
 from drakegrasp.vision.camera import intrinsics, project
 from drakegrasp.visualization.contact_sheet import contact_sheet, draw_sheet, spread_over_objects
 
@@ -132,7 +132,7 @@ def test_samples_are_spread_over_objects() -> None:
 
 
 def test_candidates_are_drawn_beside_each_other(tmp_path: Path) -> None:
-    box = builtin_object(BOX).build()
+    box = FIXED[BOX]
     rays = np.array([[[0.2, 0.0, 0.0], [0.0, 0.0, 0.0]], [[0.0, 0.0, 0.2], [0.0, 0.0, 0.1]]])
     png = tmp_path / "candidates.png"
     candidates_figure(box.vertices, box.faces, {"a": rays, "b": rays[:1]}, png)
@@ -178,7 +178,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from drakegrasp.outcomes import Outcome
 
     folder = tmp_path_factory.mktemp("figures")
-    export_builtin(folder / "meshes", [BOX])
+    write_fixed(folder / "meshes", BOX)
     config, out = load_config(None, ["candidates.max=1"]), folder / "out"
     prepared = prepare(find_meshes(folder / "meshes")[0], config)
     save_prepared(prepared, out, config)

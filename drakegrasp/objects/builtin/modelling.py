@@ -2,8 +2,7 @@
 
 `trimesh.creation` is not enough: its `revolve` puts the same number of vertices on every ring, so
 that a stem gets slivers where a rim gets good triangles, and its `extrude_polygon` needs Shapely.
-Here the number of vertices of a ring depends on its circumference. Boolean operations are
-manifold3d's, through trimesh. Nothing is random.
+Here the number of vertices of a ring depends on its circumference. Nothing is random.
 """
 
 from __future__ import annotations
@@ -20,12 +19,6 @@ from drakegrasp.objects.builtin.profiles import EDGE, arc_length, ring_angles, r
 #: Vertices are rounded to this many decimals [m], in files too. This also hides the rounding
 #: errors by which machines differ.
 DECIMALS = 7
-
-#: Triangles lower than this [m] are removed after a Boolean operation: their normals mean little.
-SLIVER = 0.0005
-
-#: Largest number of those repairs; a seam needs some dozens.
-MAX_REPAIRS = 1000
 
 #: A point nearer to the axis than this lies on it, and no edge is shorter [m].
 ON_AXIS = 1e-9
@@ -215,97 +208,3 @@ def _zip_rings(a0: int, a_size: int, b0: int, b_size: int) -> list[tuple[int, in
             faces.append((a, b0 + (j + 1) % b_size, b))
             j += 1
     return faces
-
-
-# From other solids.
-
-
-def fuse(*parts: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return the union of overlapping solids."""
-    return _from_boolean(trimesh.boolean.union(list(parts), engine="manifold"))
-
-
-def cut(body: trimesh.Trimesh, *tools: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return a solid without the space of the tools."""
-    return _from_boolean(trimesh.boolean.difference([body, *tools], engine="manifold"))
-
-
-def stand(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return the mesh moved along z until its lowest point is at z = 0."""
-    return solid(mesh.vertices - [0.0, 0.0, mesh.bounds[0, 2]], mesh.faces)
-
-
-def _from_boolean(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return the result of a boolean without the slivers along its seams."""
-    # A canonical order first, because the repairs below depend on the order.
-    tidy = solid(mesh.vertices, mesh.faces)
-    points, faces = tidy.vertices.copy(), tidy.faces.copy()
-    refused: set[tuple[int, ...]] = set()
-
-    # The lowest sliver first: collapse its shortest edge if that is short, else flip its longest.
-    for _ in range(MAX_REPAIRS):
-        lengths, heights = _edge_lengths(points, faces), _heights(points, faces)
-        slivers = [
-            k for k in np.flatnonzero(heights < SLIVER) if tuple(faces[k].tolist()) not in refused
-        ]
-        if not slivers:
-            break
-        k = min(slivers, key=lambda face: float(heights[face]))
-        sliver = tuple(faces[k].tolist())
-        if lengths[k].min() < 2.0 * SLIVER:
-            short = int(lengths[k].argmin())
-            a, b = sliver[short], sliver[(short + 1) % 3]
-            repaired = _collapse(faces, a, b)
-            if repaired is not None:
-                points[a] = (points[a] + points[b]) / 2.0
-        else:
-            long = int(lengths[k].argmax())
-            repaired = _flip(points, faces, sliver[long], sliver[(long + 1) % 3])
-        if repaired is None:
-            refused.add(sliver)
-        else:
-            faces = repaired
-    return solid(points, faces)
-
-
-def _edge_lengths(points: Array, faces: Faces) -> Array:
-    """Return the lengths (n, 3) [m] of the edges that start at each corner of each face."""
-    corners = points[faces]
-    return np.asarray(np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2))
-
-
-def _heights(points: Array, faces: Faces) -> Array:
-    """Return the height (n,) [m] of each face above its longest edge."""
-    p, q, r = np.moveaxis(points[faces], 1, 0)
-    doubled = np.linalg.norm(np.cross(q - p, r - p), axis=1)
-    return np.asarray(doubled / np.maximum(_edge_lengths(points, faces).max(axis=1), ON_AXIS))
-
-
-def _collapse(faces: Faces, a: int, b: int) -> Faces | None:
-    """Return the faces with vertex `b` made one with `a`, None if that would pinch the surface."""
-    around_a = set(faces[(faces == a).any(axis=1)].ravel().tolist())
-    around_b = set(faces[(faces == b).any(axis=1)].ravel().tolist())
-    if len((around_a & around_b) - {a, b}) != 2:
-        return None
-    joined = np.where(faces == b, a, faces)
-    return joined[(joined != np.roll(joined, 1, axis=1)).all(axis=1)]
-
-
-def _flip(points: Array, faces: Faces, a: int, b: int) -> Faces | None:
-    """Return the faces with the edge from `a` to `b` turned, None if that does not help."""
-    pair = np.flatnonzero((faces == a).any(axis=1) & (faces == b).any(axis=1))
-    left, right = (
-        next(
-            int(face[(i + 2) % 3])
-            for face in faces[pair]
-            for i in range(3)
-            if face[i] == start and face[(i + 1) % 3] == end
-        )
-        for start, end in ((a, b), (b, a))
-    )
-    if ((faces == left).any(axis=1) & (faces == right).any(axis=1)).any():
-        return None
-    turned = faces.copy()
-    turned[pair] = [(a, right, left), (right, b, left)]
-    before, after = (_heights(points, either[pair]).min() for either in (faces, turned))
-    return turned if after > before else None

@@ -17,6 +17,9 @@ from drakegrasp.frames import Array
 #: Usual edge length where fingers touch [m]: below the width of a fingertip.
 EDGE = 0.006
 
+#: Edge lengths of things with many parts, and of large flat sides [m].
+BROAD, LARGE = 1.3 * EDGE, 1.8 * EDGE
+
 #: Edges inside a cavity or below a foot are longer by this factor: no finger goes there.
 COARSE = 1.7
 

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import h5py
 import numpy as np
+import pytest
 from helpers.datasets import BOTH, OTM, OTO, TRIALS, change, found, moved, must_find
 
 from drakegrasp.outcomes import Outcome
+
+#: How the rule of classes goes on.
+OUTSIDE = ", as it has others outside"
 
 
 def test_a_sample_of_another_trial_is_found(out: Path) -> None:
@@ -62,6 +67,39 @@ def test_classes_are_checked(out: Path) -> None:
         file["train/object_props/class_name"][...] = "brick"
         file["valid/object_props/class_name"][...] = "cup"
     must_find(out / OTO, (OTO, "", None, "class cup must have one object in /test"))
+
+
+@pytest.mark.parametrize(
+    ("named", "what"),
+    [
+        (None, "class cup must have one object in /test"),
+        (["cup"], None),
+        (["box"], "a class must be one of split.train_classes"),
+    ],
+)
+def test_a_class_is_not_tested_if_it_is_named_and_has_one_object(
+    out: Path, named: list[str] | None, what: str | None
+) -> None:
+    with h5py.File(out / OTO, "r+") as file:
+        for split in ("train", "valid"):
+            file[f"{split}/object_props/class_name"][...] = "cup"
+        config = json.loads(file.attrs["config"])
+        config["split"]["train_classes"] = named
+        file.attrs["config"] = json.dumps(config, sort_keys=True)
+    groups = ("",) if named is None else ("/train", "/valid")
+    must_find(out / OTO, *((OTO, group, None, what) for group in groups if what is not None))
+
+
+def test_a_named_class_with_two_objects_is_tested(out: Path) -> None:
+    with h5py.File(out / OTO, "r+") as file:
+        names = file["train/object_props/object_name"]
+        names[0] = b"9_other"
+        for split in ("train", "valid"):
+            file[f"{split}/object_props/class_name"][...] = "cup"
+        config = json.loads(file.attrs["config"])
+        config["split"]["train_classes"] = ["cup"]
+        file.attrs["config"] = json.dumps(config, sort_keys=True)
+    assert (OTO, "", None, f"class cup must have one object in /test{OUTSIDE}") in found(out / OTO)
 
 
 def test_both_data_files_must_agree(out: Path) -> None:

@@ -1,7 +1,8 @@
-"""Hollow shapes, one function per class: sizes in metres come in, watertight meshes go out.
+"""Vessels, one function per class: sizes come in, watertight meshes go out.
 
-Every mesh stands on the plane z = 0 as it would on a table, z up;
-`drakegrasp.objects.builtin.catalog` holds the table of sizes.
+Every mesh stands or lies on the plane z = 0 as it would on a table, z up. `vessel` and
+`loop_handle` are for other families too. All lengths are in [m] and all angles in [rad];
+`drakegrasp.objects.builtin.classes` has the table of their ranges.
 """
 
 from __future__ import annotations
@@ -10,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from drakegrasp.objects.builtin.modelling import bar, cut, fuse, revolve, solid, sweep
+from drakegrasp.objects.builtin.booleans import cut, fuse
+from drakegrasp.objects.builtin.modelling import bar, revolve, solid, sweep
 from drakegrasp.objects.builtin.profiles import (
     COARSE,
     EDGE,
@@ -26,10 +28,7 @@ from drakegrasp.objects.builtin.profiles import (
 def mug(
     *, radius: float, height: float, handle_reach: float, handle_radius: float, wall: float = 0.005
 ) -> trimesh.Trimesh:
-    """Return a hollow straight mug with a handle at +x; `handle_reach` is how far it stands out.
-
-    All lengths are in [m].
-    """
+    """Return a hollow straight mug with a handle at +x; `handle_reach` is how far it stands out."""
     shell, core = vessel(
         resample([*bevelled(radius, height, 0.004)[:2], (radius, height)], EDGE),
         wall=wall,
@@ -48,10 +47,7 @@ def mug(
 def cup(
     *, top_radius: float, bottom_radius: float, height: float, wall: float = 0.0045
 ) -> trimesh.Trimesh:
-    """Return a hollow tapered cup without a handle.
-
-    All lengths are in [m].
-    """
+    """Return a hollow tapered cup without a handle."""
     side = resample([(bottom_radius, 0.0), (top_radius, height)], EDGE)
     return vessel(side, wall=wall, floor=0.006)[0]
 
@@ -59,10 +55,7 @@ def cup(
 def bowl(
     *, radius: float, height: float, foot_radius: float, wall: float = 0.005
 ) -> trimesh.Trimesh:
-    """Return a hollow bowl on a ring foot.
-
-    All lengths are in [m].
-    """
+    """Return a hollow bowl on a ring foot."""
     side = smooth(
         [
             (foot_radius, 0.0),
@@ -84,12 +77,9 @@ def vase(
     lip_radius: float,
     height: float,
     wall: float = 0.005,
-    edge: float = EDGE,
+    edge: float = 0.007,
 ) -> trimesh.Trimesh:
-    """Return a hollow vase with a belly, a neck and a lip.
-
-    All lengths are in [m].
-    """
+    """Return a hollow vase with a belly, a neck and a lip."""
     side = smooth(
         [
             (foot_radius, 0.0),
@@ -112,10 +102,7 @@ def wineglass(
     stem_height: float,
     wall: float = 0.0045,
 ) -> trimesh.Trimesh:
-    """Return a wineglass: a solid foot and stem, a hollow cup.
-
-    All lengths are in [m].
-    """
+    """Return a wineglass: a solid foot and stem, a hollow cup."""
     # The cup, outside and inside.
     cup_height = height - stem_height
     outer = smooth(
@@ -161,12 +148,9 @@ def pitcher(
     handle_radius: float,
     lip: float,
     wall: float = 0.005,
-    edge: float = 0.007,
+    edge: float = 0.008,
 ) -> trimesh.Trimesh:
-    """Return a hollow pitcher with a handle at +x and a lip pulled out by `lip` at -x.
-
-    All lengths are in [m].
-    """
+    """Return a hollow pitcher with a handle at +x and a lip pulled out by `lip` at -x."""
     side = smooth(
         [
             (foot_radius, 0.0),
@@ -197,10 +181,7 @@ def pitcher(
 def saucepan(
     *, radius: float, height: float, handle_length: float, wall: float = 0.005
 ) -> trimesh.Trimesh:
-    """Return a hollow saucepan with a straight handle along +x.
-
-    All lengths are in [m].
-    """
+    """Return a hollow saucepan with a straight handle along +x."""
     edge = 1.2 * EDGE
     shell, core = vessel(
         resample([*bevelled(radius, height, 0.005)[:2], (radius, height)], edge),
@@ -223,10 +204,7 @@ def saucepan(
 def funnel(
     *, radius: float, spout_radius: float, cone_height: float, height: float, wall: float = 0.0045
 ) -> trimesh.Trimesh:
-    """Return a funnel, open at both ends, that stands on its wide end.
-
-    All lengths are in [m].
-    """
+    """Return a funnel, open at both ends, that stands on its wide end."""
     outer = resample(
         [
             (radius, 0.0),
@@ -251,9 +229,6 @@ def funnel(
     profile = np.vstack([outer, inner])
     edges = np.r_[np.full(len(outer), EDGE), np.full(len(inner), COARSE * EDGE)]
     return revolve(profile, edge=edges, closed=True)
-
-
-# Parts that several classes share.
 
 
 def vessel(

@@ -1,0 +1,235 @@
+"""Parts of shapes: sizes and places in metres come in, watertight parts go out.
+
+A class of objects is a handful of these parts, made one by `drakegrasp.objects.builtin.modelling`.
+Parts overlap where they are to be joined.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+
+from drakegrasp.arithmetic import dot, multiply, norm, sin_cos_deg
+from drakegrasp.frames import Array
+from drakegrasp.objects.builtin.modelling import extrude, revolve, skin, solid
+from drakegrasp.objects.builtin.profiles import (
+    COARSE,
+    EDGE,
+    arc_length,
+    resample,
+    ring_angles,
+    ring_size,
+    rounded_rectangle,
+)
+
+#: Rings of a flat end, as shares of its outline: the triangles at the centre stay plump.
+FLAT_END = (0.0, 0.5, 0.93)
+
+#: How far the edge of a flat end is bevelled [m].
+BEVEL = 0.0015
+
+
+def lathe(side: npt.ArrayLike, *, edge: float = EDGE) -> trimesh.Trimesh:
+    """Return the solid of revolution of a side (n, 2) of points (r, z) [m], closed at both ends.
+
+    Args:
+        side: From the foot to the head.
+        edge: Edge length [m].
+    """
+    points = np.asarray(side, dtype=float)
+    foot = resample([(0.0, points[0, 1]), points[0]], COARSE * edge)[:-1]
+    head = resample([points[-1], (0.0, points[-1, 1])], edge)[1:]
+    return revolve(np.vstack([foot, points, head]), edge=edge)
+
+
+def ball(centre: npt.ArrayLike, radii: npt.ArrayLike, *, edge: float = EDGE) -> trimesh.Trimesh:
+    """Return an ellipsoid.
+
+    Args:
+        centre: (3,) [m].
+        radii: Half-axes (3,) [m], or the radius of a sphere.
+        edge: Edge length [m].
+    """
+    half = np.broadcast_to(np.asarray(radii, dtype=float), 3)
+    count = max(6, round(np.pi * float(half.mean()) / edge))
+    sine, cosine = sin_cos_deg(np.linspace(-90.0, 90.0, count + 1))
+    unit = revolve(np.column_stack([cosine * half[:2].mean(), sine * half[2]]), edge=edge)
+    stretch = [half[0] / half[:2].mean(), half[1] / half[:2].mean(), 1.0]
+    return solid(unit.vertices * stretch + np.asarray(centre, dtype=float), unit.faces)
+
+
+def rod(
+    start: npt.ArrayLike,
+    end: npt.ArrayLike,
+    radius: float,
+    end_radius: float | None = None,
+    *,
+    edge: float = EDGE,
+) -> trimesh.Trimesh:
+    """Return a round bar, or a truncated cone, with bevelled ends.
+
+    Args:
+        start: Middle (3,) of one end [m].
+        end: Middle (3,) of the other [m].
+        radius: At the start [m].
+        end_radius: At the end [m]; as at the start if None.
+        edge: Edge length [m].
+    """
+    p, q = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
+    length = float(norm(q - p))
+    tip = radius if end_radius is None else end_radius
+    bevel = min(BEVEL, 0.2 * min(radius, tip), 0.2 * length)
+    side = resample(
+        [(radius - bevel, 0.0), (radius, bevel), (tip, length - bevel), (tip - bevel, length)], edge
+    )
+    upright = lathe(side, edge=edge)
+    return solid(multiply(upright.vertices, _axes((q - p) / length).T) + p, upright.faces)
+
+
+def tube(path: npt.ArrayLike, radius: npt.ArrayLike, *, edge: float = EDGE) -> trimesh.Trimesh:
+    """Return a round bar along a curve, with flat ends.
+
+    Args:
+        path: Points (k, 3) [m] about an edge length apart.
+        radius: () or (k,) [m]; zero makes an end a point.
+        edge: Edge length [m].
+    """
+    points = np.asarray(path, dtype=float)
+    radii = np.broadcast_to(np.asarray(radius, dtype=float), len(points))
+    angles = ring_angles(ring_size(float(radii.max()), edge))
+    tangents = np.gradient(points, arc_length(points), axis=0)
+    tangents /= norm(tangents)[:, None]
+
+    # The section turns with the path and not about it.
+    across = _axes(tangents[0])[:, 0]
+    rings = []
+    for point, tangent, size in zip(points, tangents, radii, strict=True):
+        across = across - tangent * dot(across, tangent)
+        across /= norm(across)
+        other = np.cross(tangent, across)
+        circle = np.outer(np.cos(angles), across) + np.outer(np.sin(angles), other)
+        rings.append(point + size * circle if size > 0.0 else point[None])
+    for place in (0, -1):
+        if len(rings[place]) > 1:
+            rings.insert(0, points[:1]) if place == 0 else rings.append(points[-1:])
+    return skin(rings, closed=False)
+
+
+def block(
+    size: npt.ArrayLike,
+    centre: npt.ArrayLike,
+    *,
+    corner: float = 0.002,
+    edge: float = 1.2 * EDGE,
+) -> trimesh.Trimesh:
+    """Return an upright box with rounded upright edges.
+
+    Args:
+        size: (3,) along x, y and z [m].
+        centre: (3,) [m].
+        corner: Radius of the upright edges [m].
+        edge: Edge length [m].
+    """
+    width, depth, height = (float(value) for value in np.asarray(size, dtype=float))
+    x, y, z = (float(value) for value in np.asarray(centre, dtype=float))
+    levels = [(z - height / 2.0, width, depth, x, y), (z + height / 2.0, width, depth, x, y)]
+    return pillar(levels, corner=corner, edge=edge)
+
+
+def pillar(
+    levels: npt.ArrayLike, *, corner: float = 0.002, edge: float = 1.2 * EDGE
+) -> trimesh.Trimesh:
+    """Return a solid of rounded rectangles, one above the other, with bevelled ends.
+
+    Args:
+        levels: Rows (z, width, depth) or (z, width, depth, x, y) of rising z [m].
+        corner: Radius of the upright edges of the largest rectangle [m].
+        edge: Edge length [m].
+    """
+    rows = np.asarray(levels, dtype=float)
+    if rows.shape[1] == 3:
+        rows = np.hstack([rows, np.zeros((len(rows), 2))])
+    width, depth = rows[:, 1].max(), rows[:, 2].max()
+    outline = rounded_rectangle(width, depth, corner, edge=edge) / [width, depth]
+
+    # The bevels: a little inwards at both ends.
+    rows = resample(rows, edge)
+    first, last = rows[0].copy(), rows[-1].copy()
+    rows[0, 0], rows[-1, 0] = first[0] + BEVEL, last[0] - BEVEL
+    for row in (first, last):
+        row[1:3] -= np.minimum(2.0 * BEVEL, 0.3 * row[1:3])
+
+    def ring(row: Array, share: float = 1.0) -> Array:
+        if share == 0.0:
+            return np.array([[row[3], row[4], row[0]]])
+        flat = share * outline * row[1:3] + row[3:]
+        return np.column_stack([flat, np.full(len(flat), row[0])])
+
+    low = [ring(first, share) for share in FLAT_END]
+    high = [ring(last, share) for share in FLAT_END[::-1]]
+    return skin([*low, ring(first), *map(ring, rows), ring(last), *high], closed=False)
+
+
+def prism(
+    outline: npt.ArrayLike, low: float, high: float, *, top: float = 1.0, edge: float = 1.2 * EDGE
+) -> trimesh.Trimesh:
+    """Return an outline raised from z = `low` to z = `high` [m], with bevelled ends.
+
+    Args:
+        outline: (n, 2), closed, all of it seen from the origin [m].
+        low: Height of the lower end [m].
+        high: Height of the upper end [m].
+        top: Scale of the outline there.
+        edge: Edge length [m].
+    """
+    section = np.asarray(outline, dtype=float)
+    inward = 1.0 - BEVEL / float(norm(section).min())
+    heights = resample([[low + BEVEL], [high - BEVEL]], edge)[:, 0]
+    profile = [
+        *((inward * share, low) for share in (*FLAT_END, 1.0)),
+        *zip(np.linspace(1.0, top, len(heights)), heights, strict=True),
+        *((inward * top * share, high) for share in (1.0, *FLAT_END[::-1])),
+    ]
+    return extrude(section, profile)
+
+
+def scalloped(radius: float, depth: float, count: int, *, edge: float = EDGE) -> Array:
+    """Return a closed outline (n, 2) with `count` round lobes, `depth` [m] deep between them.
+
+    Args:
+        radius: Of the tips of the lobes [m].
+        depth: Of the grooves [m].
+        count: Of lobes.
+        edge: Edge length [m].
+    """
+    pieces = max(4, 2 * round(np.pi * radius / (count * edge)))
+    angles = np.arange(count * pieces) * 360.0 / (count * pieces)
+    sine, cosine = sin_cos_deg(angles)
+    lobes = np.abs(sin_cos_deg(angles * count / 2.0)[1])
+    reach = radius - depth * (1.0 - lobes)
+    return np.column_stack([reach * cosine, reach * sine])
+
+
+def moved(mesh: trimesh.Trimesh, offset: npt.ArrayLike) -> trimesh.Trimesh:
+    """Return a mesh moved by `offset` (3,) [m]."""
+    return solid(mesh.vertices + np.asarray(offset, dtype=float), mesh.faces)
+
+
+def rotated(mesh: trimesh.Trimesh, axis: str, degrees: float) -> trimesh.Trimesh:
+    """Return a mesh turned about an axis of its frame, "x", "y" or "z", by an angle [deg]."""
+    s, c = (float(value) for value in sin_cos_deg(degrees))
+    R = {
+        "x": [[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]],
+        "y": [[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]],
+        "z": [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]],
+    }[axis]
+    return solid(multiply(mesh.vertices, np.transpose(R)), mesh.faces)
+
+
+def _axes(direction: Array) -> Array:
+    """Return a rotation matrix (3, 3) whose third column is a unit vector."""
+    helper = np.array([0.0, 1.0, 0.0]) if abs(direction[1]) < 0.9 else np.array([1.0, 0.0, 0.0])
+    x = np.cross(helper, direction)
+    x /= norm(x)
+    return np.column_stack([x, np.cross(direction, x), direction])

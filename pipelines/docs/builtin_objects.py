@@ -1,0 +1,88 @@
+"""Write docs/reference/builtin-objects.md from the table of classes, or check it.
+
+Usage: python pipelines/docs/builtin_objects.py [--check] FILE
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from drakegrasp.config import BuiltinConfig
+from drakegrasp.objects.builtin.classes import CLASSES, ObjectClass
+
+_HEAD = f"""<!-- Made by `make docs` from drakegrasp/objects/builtin/classes.py: change that. -->
+
+# Built-in objects
+
+{len(CLASSES)} classes of everyday things come with the package, so that a dataset needs no
+meshes. They follow the kinds of objects of the paper; the shapes and sizes are our own, for a
+hand of the Barrett Hand's size.
+
+![The first object of every class](../images/builtin.png)
+
+```
+drakegrasp objects list
+drakegrasp objects export MESHES --per-class 5
+drakegrasp build --objects builtin --per-class 5 --out OUT
+```
+
+The first command prints the classes and their parameters, the second writes {5 * len(CLASSES)}
+meshes (`.obj`, metres), the third builds a dataset of the same objects.
+
+A class is a function of a few parameters. Each object draws them from the ranges below, in steps
+of 0.1 mm, 0.1° or one piece. It is called `<number>_<class>_<index>`, e.g. `1_mug_2`; its sizes
+depend on its class, its index and `--objects-seed` (`builtin.seed`) alone, so more objects per
+class change no earlier one. The same seed gives the same mesh files on every machine.
+
+`--per-class` (`builtin.per_class`) is {BuiltinConfig().per_class} by default: of the objects of
+a class one is [tested](outcomes.md#split) and the others train. Both options are stored in
+`manifest.json`, and a build goes on only with the same.
+
+Every object is one watertight solid of at most 3000 triangles. It stands or lies on z = 0 as it
+does on a table, z up, and stays so when it is dropped. Hollow things have walls of 4.5 to 6 mm.
+Thin flat things of the paper's set, such as forks and pens, are left out: the Barrett Hand
+cannot take them from a table.
+
+In Python, `export_builtin("MESHES", ["1_mug_1", "1_mug_2"])` of
+`drakegrasp.objects.builtin.catalog` writes single objects, and `builtin_object("1_mug_2",
+seed=3).sizes` are the sizes of one. To add a class, write a function in
+`drakegrasp/objects/builtin/shapes/`, add a row at the end of the table in
+`drakegrasp/objects/builtin/classes.py`, and run `make docs`.
+"""
+
+
+def format_page() -> str:
+    """Return the page as Markdown."""
+    lines = ["| | class | what it is | parameters |", "|---|---|---|---|"]
+    lines += [_row(item) for item in CLASSES]
+    return f"{_HEAD}\n## The classes\n\n" + "\n".join(lines) + "\n"
+
+
+def _row(item: ObjectClass) -> str:
+    """Return the row of a class."""
+    spans = ", ".join(f"`{name}` {span}" for name, span in item.parameters.items())
+    return f"| {item.number} | `{item.name}` | {item.meaning} | {spans} |"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Write the page, or with --check return 1 if the file differs from it."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("target", type=Path, help="the page")
+    parser.add_argument("--check", action="store_true", help="compare, and write nothing")
+    arguments = parser.parse_args(argv)
+
+    target, page = arguments.target, format_page()
+    if not arguments.check:
+        target.write_text(page, encoding="utf-8")
+        return 0
+    if target.exists() and target.read_text(encoding="utf-8") == page:
+        return 0
+    sys.stderr.write(f"{target}: must be what `make docs` writes, got another text\n")
+    return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
