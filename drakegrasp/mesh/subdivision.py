@@ -10,9 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from drakegrasp.arithmetic import dot
-from drakegrasp.frames import Array
 from drakegrasp.mesh.components import edge_ids
-from drakegrasp.mesh.surfaces import Faces, Solid, half_edges, split_faces
+from drakegrasp.mesh.surfaces import Solid, half_edges, split_faces
 
 #: An edge that is longer than the limit by rounding is not split.
 TOLERANCE = 1e-9

@@ -61,6 +61,11 @@ def certify(model: ObjectModel, X_TO: Array, attempt: Attempt, config: Config) -
         attempt: One that succeeds under the configuration.
         config: The rules; `certify` has the number of repeats and the noise.
     """
+    # The object's own friction, if it has one, varies as the configured one does.
+    physics = model.own_physics(config.physics)
+    config = config.model_copy(update={"physics": physics})
+    model = replace(model, friction=None)
+
     # Repeat the attempt with noise; inconclusive repeats do not count.
     stream = Stream(attempt.seed, attempt.standoff_index)
     repeats = _repeats(stream, model, X_TO, attempt, config)

@@ -8,7 +8,7 @@ through a grid of voxels, with its ripple and 0.2 to 0.5 mm of noise on the surf
 its number of faces; welded where two sheets of the surface touch; without the face that stood
 on the turntable. Four are thin-walled, as a mug is. Prints a line per mesh: status, collision
 faces, deviation of the collision surface, seconds, notes.
-"""  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
+"""
 
 from __future__ import annotations
 
