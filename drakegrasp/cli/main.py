@@ -16,6 +16,7 @@ import click
 from drakegrasp.cli.bench import bench
 from drakegrasp.cli.build import assemble, build, stats
 from drakegrasp.cli.group import main
+from drakegrasp.cli.morph import morph
 from drakegrasp.cli.options import (
     manifest_option,
     out_argument,
@@ -50,7 +51,7 @@ def doctor(directory: Path) -> None:
 
 @click.group()
 def objects() -> None:
-    """List or export the built-in objects."""
+    """List or export the built-in objects, or make morphs of meshes."""
 
 
 @objects.command("list")
@@ -143,6 +144,8 @@ def replay(out: Path, trial: int, html: Path | None) -> None:
     if not again.same:
         sys.exit(1)
 
+
+objects.add_command(morph)
 
 # The help lists them in this order.
 for _command in (doctor, objects, audit, build, assemble, check, stats, replay, verify, bench):

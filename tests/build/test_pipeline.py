@@ -159,14 +159,14 @@ def test_object_keeps_to_what_is_said_of_it(
     assert [str(v) for v in check_dataset(out)] == []
 
     # The manifest and /objects have it, and the lift is simulated with it.
-    entry = read_manifest(out).objects[-1]
+    entry = read_manifest(out).objects[1]
     assert (entry.name, entry.friction) == ("11_box_slim", 0.9)
     assert entry.mass == pytest.approx(600.0 * 0.065 * 0.05 * 0.14, rel=1e-6)
     with h5py.File(out / "trials.hdf5") as file:
-        assert file["objects/mass"][-1] == entry.mass
-        assert np.isnan(file["objects/friction"][0]) and file["objects/friction"][-1] == 0.9
+        assert file["objects/mass"][1] == entry.mass
+        assert np.isnan(file["objects/friction"][0]) and file["objects/friction"][1] == 0.9
         lifted = np.flatnonzero(
-            (file["trials/object"][()] == 2) & np.isfinite(file["trials/slip"][()])
+            (file["trials/object"][()] == 1) & np.isfinite(file["trials/slip"][()])
         )
     assert replay_trial(out, int(lifted[0])).same
     again = build(find_meshes(meshes), out, small_config, _nothing_runs, show=False)
