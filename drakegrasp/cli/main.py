@@ -13,14 +13,13 @@ from pathlib import Path
 
 import click
 
+from drakegrasp.cli.audit import audit
 from drakegrasp.cli.bench import bench
 from drakegrasp.cli.build import assemble, build, stats
 from drakegrasp.cli.group import main
 from drakegrasp.cli.morph import morph
 from drakegrasp.cli.options import (
-    manifest_option,
     out_argument,
-    units_option,
 )
 from drakegrasp.cli.verify import verify
 from drakegrasp.runtime.allocator import restart_with_jemalloc
@@ -70,25 +69,6 @@ def export_objects(directory: Path) -> None:
     from drakegrasp.objects.builtin.catalog import export_builtin
 
     click.echo(f"{len(export_builtin(directory))} meshes in {directory}")
-
-
-@click.command()
-@click.argument("mesh_dir", type=click.Path(path_type=Path))
-@units_option
-@manifest_option
-def audit(mesh_dir: Path, units: str, manifest: Path | None) -> None:
-    """Check which meshes are fit, repaired or refused.
-
-    A build also drops each object on the table, and refuses one that does not come to rest.
-    Exit code 1 if every mesh is refused.
-    """
-    from drakegrasp.cli.tables import audit_table, print_table
-    from drakegrasp.objects.audit import audit as audit_meshes
-
-    rows = audit_meshes(mesh_dir, units=units, manifest=manifest)
-    print_table(audit_table(rows))
-    if all(row.status == "refused" for row in rows):
-        sys.exit(1)
 
 
 @click.command()

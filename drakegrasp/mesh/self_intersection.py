@@ -13,8 +13,9 @@ from drakegrasp.arithmetic import dot, norm
 from drakegrasp.frames import Array
 from drakegrasp.mesh.surfaces import Faces, diagonal
 
-#: A face passes through another if it has corners farther than this on both of its sides, as a
-#: fraction of the diagonal. Surfaces that only touch do not, though their vertices are rounded.
+#: An edge passes through a face if its ends are farther than this on both sides, and it farther
+#: than this from the face's edges, as a fraction of the diagonal. Surfaces that only touch do
+#: not, though their vertices are rounded.
 DEPTH = 2e-6
 #: Pairs of faces that are looked at together.
 PAIRS = 1_000_000
@@ -81,7 +82,10 @@ def _pass(p: Array, q: Array, triangles: Array, depth: float) -> Mask:
     above, below = dot(p - a, normal), dot(q - a, normal)
     sides = (np.minimum(above, below) < -depth) & (np.maximum(above, below) > depth)
 
-    # ... and the segment turns the same way about all three edges.
+    # ... and it passes all three edges on the same side, at a distance.
     along = q - p
-    turns = [dot(along, np.cross(u - p, v - p)) for u, v in ((a, b), (b, c), (c, a))]
-    return sides & ((np.min(turns, axis=0) > 0.0) | (np.max(turns, axis=0) < 0.0))
+    passed = []
+    for u, v in ((a, b), (b, c), (c, a)):
+        lengths = np.maximum(norm(np.cross(along, v - u)), 1e-300)
+        passed.append(dot(along, np.cross(u - p, v - p)) / lengths)
+    return sides & ((np.min(passed, axis=0) > depth) | (np.max(passed, axis=0) < -depth))
