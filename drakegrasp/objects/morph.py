@@ -1,7 +1,7 @@
 """Morphs: one object comes in, others of its kind and of other proportions go out.
 
-The radial morph of the Grasping 3D Database (Kleinhans et al. 2015, "G3DB"), from whose morphs the
-paper's objects come. Around an axis, with p the projection of a vertex on it, normalised to -1..1,
+The radial morph of the Grasping 3D Database [Kleinhans2016], from whose morphs the paper's objects
+come. Around an axis, with p the projection of a vertex on it, normalised to -1..1,
 and r its distance from it: the distance is scaled by max(0.25, c1 + c2 p + c3 p^2), and the
 projection by c4 + c5 (r / r_max)^2.
 
