@@ -26,8 +26,9 @@ Mask = npt.NDArray[np.bool_]
 def crossing_faces(vertices: Array, faces: Faces) -> Faces:
     """Return the faces (k,) that pass through another face, in their order.
 
-    Faces with a common edge do not count, as they cannot cross unless they are folded flat. The
-    same bits everywhere: nothing but sums and products.
+    Faces with a common edge do not count, as they cannot cross unless they are folded flat. An edge
+    that passes exactly through another face's edge is not seen; that of a neighbour is. The same
+    bits everywhere: nothing but sums, products and roots.
 
     Args:
         vertices: (n, 3) [m].
