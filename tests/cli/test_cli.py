@@ -270,7 +270,7 @@ def test_audit_lists_what_would_be_refused(tmp_path: Path) -> None:
     assert result.exit_code == 0
     assert "fit" in result.stdout
     assert "refused" in result.stdout
-    assert "2 meshes: 1 fit, 0 repaired, 1 refused; 1 with a warning (!)" in result.stdout
+    assert "2 meshes: 1 fit, 0 repaired, 1 refused; 0 with a warning (!)" in result.stdout
 
 
 def test_audit_writes_findings_and_a_sheet(tmp_path: Path) -> None:
