@@ -31,7 +31,8 @@ class MorphReport:
     Attributes:
         morphs: Number of morphs.
         first_draws: Number of those whose first draw could be used.
-        crossing: Number of faces that pass through others in a mesh and its morphs, by its name.
+        crossing: Number of faces that pass through others in a mesh, by its name, if any: its
+            morphs have about as many.
         refused: Why a mesh has no morphs, a line each.
     """
 
@@ -82,8 +83,8 @@ def morph_meshes(
                 refused.append(str(reason))
                 total -= per_mesh
                 continue
-            if len(original.crossing):
-                crossing[source.name] = len(original.crossing)
+            if original.crossing:
+                crossing[source.name] = original.crossing
         if not draws:
             raise MeshError(f"{directory}: one mesh must have morphs, got none: {refused[0]}")
         content = {"units": "m", "objects": entries}
