@@ -143,7 +143,8 @@ def audit_table(rows: Sequence[AuditRow], *, compact: bool = False) -> Table:
     """
     # Few columns on a narrow terminal; what is unusual is in words in any case.
     table = _table("Meshes")
-    table.add_column("object", no_wrap=True, overflow="ellipsis", max_width=24)
+    most = 24 if compact else 40
+    table.add_column("object", no_wrap=True, overflow="ellipsis", max_width=most)
     table.add_column("status", no_wrap=True)
     table.add_column("faces", justify="right", no_wrap=True)
     table.add_column(escape("size [mm]"), justify="right", no_wrap=True)

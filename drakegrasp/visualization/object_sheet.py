@@ -104,7 +104,8 @@ def _looking_along(z: Array) -> Array:
 
 
 def _shortened(name: str) -> str:
-    return name if len(name) <= NAME else f"{name[: NAME - 1]}…"
+    # The end tells morphs of one mesh apart.
+    return name if len(name) <= NAME else f"{name[: NAME - 10]}…{name[-9:]}"
 
 
 def _wrapped(text: str) -> str:
