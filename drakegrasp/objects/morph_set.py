@@ -66,11 +66,14 @@ def morph_meshes(
     Raises:
         MeshError: If there is no mesh, `out` holds anything, or no mesh can be morphed.
     """
+    # What is wanted, and what comes of it.
     sources = find_meshes(directory, units=units, manifest=manifest)
     total, draws, refused = len(sources) * per_mesh, list[int](), list[str]()
     entries: dict[str, dict[str, Any]] = {}
     crossing: dict[str, int] = {}
+
     with _whole_directory(Path(out)) as folder:
+        # Mesh by mesh; one that has no morphs costs no other.
         for source in sources:
             try:
                 original = load_original(source)
@@ -85,6 +88,8 @@ def morph_meshes(
                 continue
             if original.crossing:
                 crossing[source.name] = original.crossing
+
+        # The manifest, which keeps their classes.
         if not draws:
             raise MeshError(f"{directory}: one mesh must have morphs, got none: {refused[0]}")
         content = {"units": "m", "objects": entries}
