@@ -155,7 +155,10 @@ def command_lines(page: Path) -> Iterator[tuple[click.Command, list[str]]]:
 
 
 def options_of(command: click.Command) -> set[str]:
+    """Return the options of a command, and of its subcommands."""
     options = {o for p in command.params for o in p.opts if isinstance(p, click.Option)}
+    if isinstance(command, click.Group):
+        options |= set().union(*map(options_of, command.commands.values()))
     return options | {"--help", "-h"}
 
 
