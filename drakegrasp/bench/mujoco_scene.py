@@ -99,6 +99,7 @@ class MujocoScene:
 
 def build_mujoco_scene(model: ObjectModel, hand: Hand, config: Config) -> MujocoScene:
     """Return object, table and hand as a model of MuJoCo."""
+    config = config.model_copy(update={"physics": model.own_physics(config.physics)})
     parts = _convex_parts(model)
     spec = _spec()
     _add_table(spec, config)

@@ -13,17 +13,17 @@ from pathlib import Path
 
 import click
 
+from drakegrasp.cli.audit import audit
 from drakegrasp.cli.bench import bench
 from drakegrasp.cli.build import assemble, build, stats
 from drakegrasp.cli.export import export
 from drakegrasp.cli.group import main
+from drakegrasp.cli.morph import morph
 from drakegrasp.cli.options import (
     builtin_overrides,
-    manifest_option,
     objects_seed_option,
     out_argument,
     per_class_option,
-    units_option,
 )
 from drakegrasp.cli.verify import verify
 from drakegrasp.runtime.allocator import restart_with_jemalloc
@@ -54,7 +54,7 @@ def doctor(directory: Path) -> None:
 
 @click.group()
 def objects() -> None:
-    """List the built-in classes or export objects of them."""
+    """List or export the built-in objects, or make morphs of meshes."""
 
 
 @objects.command("list")
@@ -85,25 +85,6 @@ def export_objects(directory: Path, per_class: int | None, objects_seed: int | N
     with progress_bar("objects", "meshes") as progress:
         paths = export_builtin(directory, config=config.builtin, progress=progress)
     click.echo(f"{len(paths)} meshes in {directory}")
-
-
-@click.command()
-@click.argument("mesh_dir", type=click.Path(path_type=Path))
-@units_option
-@manifest_option
-def audit(mesh_dir: Path, units: str, manifest: Path | None) -> None:
-    """Check which meshes are fit, repaired or refused.
-
-    A build also drops each object on the table, and refuses one that does not come to rest.
-    Exit code 1 if every mesh is refused.
-    """
-    from drakegrasp.cli.tables import audit_table, print_table
-    from drakegrasp.objects.audit import audit as audit_meshes
-
-    rows = audit_meshes(mesh_dir, units=units, manifest=manifest)
-    print_table(audit_table(rows))
-    if all(row.status == "refused" for row in rows):
-        sys.exit(1)
 
 
 @click.command()
@@ -159,6 +140,8 @@ def replay(out: Path, trial: int, html: Path | None) -> None:
     if not again.same:
         sys.exit(1)
 
+
+objects.add_command(morph)
 
 # The help lists them in this order.
 for _command in (

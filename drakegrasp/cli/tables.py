@@ -45,6 +45,8 @@ _COMPACT_HEADS = {
 }
 
 
+#: Width of a terminal from which the audit has all of its columns [characters].
+ROOMY = 110
 #: Width of the console where standard output is not a terminal [characters]: tables fit always.
 WIDTH = 1000
 
@@ -132,27 +134,57 @@ def unfinished_line(unfinished: Unfinished) -> str:
     )
 
 
-def audit_table(rows: Sequence[AuditRow]) -> Table:
-    """Return the findings on each mesh, a row per mesh."""
+def audit_table(rows: Sequence[AuditRow], *, compact: bool = False) -> Table:
+    """Return the findings on each mesh, a row per mesh.
+
+    Args:
+        rows: The findings.
+        compact: Whether to leave out what warnings tell anyway.
+    """
+    # Few columns on a narrow terminal; what is unusual is in words in any case.
     table = _table("Meshes")
-    table.add_column("object", no_wrap=True)
-    table.add_column("class", no_wrap=True)
+    most = 24 if compact else 40
+    table.add_column("object", no_wrap=True, overflow="ellipsis", max_width=most)
     table.add_column("status", no_wrap=True)
-    table.add_column("faces", justify="right")
+    table.add_column("faces", justify="right", no_wrap=True)
     table.add_column(escape("size [mm]"), justify="right", no_wrap=True)
-    table.add_column("notes", overflow="fold")
+    if not compact:
+        table.add_column("bodies", justify="right", no_wrap=True)
+        table.add_column("water-\ntight", no_wrap=True)
+        table.add_column(escape("wall\n[mm]"), justify="right", no_wrap=True)
+        table.add_column(escape("contact\n[mm]"), justify="right", no_wrap=True)
+        table.add_column(escape("memory\n[MB]"), justify="right", no_wrap=True)
+    table.add_column("notes, and what may be wrong (!)", overflow="fold")
+
+    # A row each.
     colours = {"fit": "green", "repaired": "yellow", "refused": "red"}
     for row in rows:
         size = "-" if row.extents is None else "x".join(f"{1e3 * e:.0f}" for e in row.extents)
-        table.add_row(
+        cells = [
             escape(row.name),
-            escape(row.class_name),
             f"[{colours[row.status]}]{row.status}[/]",
             "-" if row.faces is None else f"{row.faces:,}",
             size,
-            escape("; ".join(row.notes)),
-        )
+        ]
+        if not compact:
+            cells += [
+                "-" if row.bodies is None else f"{row.bodies:,}",
+                {True: "yes", False: "no", None: "-"}[row.watertight],
+                "-" if row.wall is None else f"{1e3 * row.wall:.1f}",
+                "-" if row.collision_error is None else f"{1e3 * row.collision_error:.1f}",
+                "-" if row.memory is None else f"{row.memory / 1e6:.0f}",
+            ]
+        words = [*row.notes, *(f"! {text}" for text in row.warnings)]
+        table.add_row(*cells, escape("\n".join(words)))
     return table
+
+
+def audit_line(rows: Sequence[AuditRow]) -> str:
+    """Return how many meshes are fit, repaired and refused, and how many have a warning."""
+    counts = Counter(row.status for row in rows)
+    told = ", ".join(f"{counts[status]} {status}" for status in ("fit", "repaired", "refused"))
+    warned = sum(bool(row.warnings) for row in rows)
+    return f"{len(rows)} meshes: {told}; {warned} with a warning (!)"
 
 
 def verdict_table(outcomes: Sequence[Outcome]) -> Table:

@@ -214,7 +214,8 @@ def _write_attributes(file: h5py.File, manifest: Manifest) -> None:
 def _write_objects(file: h5py.File, manifest: Manifest) -> None:
     group = file.create_group("objects")
     for field in OBJECT_FIELDS:
-        values = [getattr(entry, field.name) for entry in manifest.objects]
+        own = [getattr(entry, field.name) for entry in manifest.objects]
+        values = [np.nan if value is None else value for value in own]
         dtype = object if field.dtype == "str" else field.dtype
         write_field(group, field, np.array(values, dtype=dtype))
 

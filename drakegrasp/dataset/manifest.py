@@ -38,8 +38,13 @@ class ObjectEntry:
 
     Attributes:
         name, class_name: Of the object.
-        mesh_sha256: Hash of the mesh file and its scale, hexadecimal.
+        mesh_sha256: Hash of the mesh file and of what `objects.yaml` says of it, hexadecimal.
+        scale: Metres per unit of length of the mesh file.
+        up: Axis of the mesh file that is +z of {O}.
         mass: Mass [kg].
+        density: Mass over volume [kg/m^3].
+        friction: Its own coefficient with hand and table; None: the configuration's.
+        collision_error: Largest distance between mesh and collision surface [m].
         X_TO: Resting pose, (12,): the first three rows of the 4x4 matrix [m, -].
         rolled: Whether the object would have rolled on and was stopped.
         candidates: Number of palm poses to try, drawn from the distinct ones.
@@ -52,7 +57,12 @@ class ObjectEntry:
     name: str
     class_name: str
     mesh_sha256: str
+    scale: float
+    up: str
     mass: float
+    density: float
+    friction: float | None
+    collision_error: float
     X_TO: tuple[float, ...]
     rolled: bool
     candidates: int
@@ -87,7 +97,7 @@ class RefusedMesh:
 
     Attributes:
         name: Of the object.
-        mesh_sha256: Hash of the mesh file and its scale, hexadecimal.
+        mesh_sha256: Hash of the mesh file and of what `objects.yaml` says of it, hexadecimal.
         reason: Why it was refused, in words.
     """
 

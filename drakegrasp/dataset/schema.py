@@ -30,8 +30,9 @@ CONVENTIONS = {
     "poses": "frame_a2b is the pose of b expressed in a (maps b-coordinates to a), the first "
     "three rows of the 4x4 matrix, row-major; X_AB likewise",
     "frames": "W world; T = work, centre of the table top, p_WT = (0, 0, 0.65); O object, centre "
-    "of the mesh's bounding box, axes of the mesh file; Ocm its centre of mass; G palm, +Gz out "
-    "of the palm; Q contact point; C camera; C0 its usual pose behind the palm; I image",
+    "of the mesh's bounding box, axes of the mesh file, turned so that its `up` is +z; Ocm its "
+    "centre of mass; G palm, +Gz out of the palm; Q contact point; C camera; C0 its usual pose "
+    "behind the palm; I image",
     "camera_axes": "OpenCV and Drake: +X right, +Y down, +Z forward; pixel centres at integers",
     "depth": "z of the camera frame in metres; pixels with nothing before `far`, and those that a "
     "depth camera would lose, hold `far`",
@@ -355,7 +356,16 @@ SUCCESS_FIELDS: tuple[Field, ...] = (
 OBJECT_FIELDS: tuple[Field, ...] = (
     Field("name", "", "str", "-", "-", "name of the object"),
     Field("class_name", "", "str", "-", "-", "name of its class"),
-    Field("mesh_sha256", "", "str", "-", "-", "hash of the mesh file and its scale"),
+    Field("mesh_sha256", "", "str", "-", "-",
+          "hash of the mesh file and of what objects.yaml says of it"),
+    Field("scale", "", "float64", "m", "-", "metres per unit of length of the mesh file"),
+    Field("up", "", "str", "-", "-", "axis of the mesh file that is +z of the object"),
+    Field("mass", "", "float64", "kg", "-", "mass"),
+    Field("density", "", "float64", "kg/m^3", "-", "mass over volume"),
+    Field("friction", "", "float64", "-", "-",
+          "its own coefficient with hand and table; NaN: those of the configuration"),
+    Field("collision_error", "", "float64", "m", "-",
+          "largest distance between mesh and collision surface"),
     Field("combinations", "", "int64", "-", "-", "combinations of rotations that were considered"),
     Field("valid", "", "int64", "-", "-",
           "those above the table whose palm ray meets the bounding box"),

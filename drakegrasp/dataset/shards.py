@@ -36,7 +36,7 @@ class ShardHeader:
 
     Attributes:
         config_hash: `Config.simulation_hash` of the dataset.
-        mesh_sha256: Hash of the object's mesh and scale.
+        mesh_sha256: Hash of the object's mesh file and of what is said of it.
         object_name: Name of the object.
         start, stop: Range of its candidates.
     """

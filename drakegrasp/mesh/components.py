@@ -15,7 +15,18 @@ from scipy.sparse.csgraph import connected_components
 
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
-from drakegrasp.mesh.surfaces import Faces, compact, face_areas, half_edges, signed_volume
+from drakegrasp.mesh.surfaces import (
+    Faces,
+    compact,
+    face_areas,
+    half_edges,
+    signed_volume,
+    split_faces,
+)
+
+#: Two touching edges of one face share the faces between their new vertices, which are parted in
+#: a second turn; a third was never needed.
+MAX_PARTINGS = 4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -120,6 +131,35 @@ def count_parts(vertices: Array, faces: Faces) -> int:
     if count == 1:
         return 1
     return sum(signed_volume(vertices, faces[piece == index]) > 0.0 for index in range(count))
+
+
+def part_touching_edges(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
+    """Return the same surface with as few edges of four or more faces as possible.
+
+    Where a surface touches itself along an edge, the two faces that bound the same wedge of solid
+    get a vertex of their own in its middle, so that each half of the edge has two faces again.
+
+    Args:
+        vertices: (n, 3) [m].
+        faces: (m, 3).
+    """
+    for _ in range(MAX_PARTINGS):
+        # The pairs of half-edges at such edges; each pair is taken once.
+        ids, counts = edge_ids(faces)
+        if not (counts > 2).any():
+            break
+        twins = pair_half_edges(vertices, faces, radial=True)
+        halves = np.arange(len(twins))
+        first = halves[(counts[ids] > 2) & (halves < twins)]
+
+        # A vertex for each pair, on both of its half-edges.
+        ends = half_edges(faces)[first]
+        midpoints = np.full(len(twins), -1, dtype=np.int64)
+        midpoints[first] = midpoints[twins[first]] = len(vertices) + np.arange(len(first))
+        new = (vertices[ends[:, 0]] + vertices[ends[:, 1]]) / 2.0
+        vertices = np.vstack((vertices, new))
+        faces = split_faces(vertices, faces, midpoints.reshape(-1, 3))
+    return vertices, faces
 
 
 # Half-edges

@@ -21,7 +21,13 @@ from scipy.spatial import cKDTree
 
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
-from drakegrasp.mesh.components import edge_ids, face_components, find_components, pair_half_edges
+from drakegrasp.mesh.components import (
+    edge_ids,
+    face_components,
+    find_components,
+    pair_half_edges,
+    part_touching_edges,
+)
 from drakegrasp.mesh.hole_filling import close_rims
 from drakegrasp.mesh.surfaces import (
     Faces,
@@ -90,8 +96,22 @@ def repair_solid(vertices: Array, faces: Faces) -> Solid:
     Raises:
         MeshError: If the surface cannot become a solid without inventing shape.
     """
+    try:
+        return _repair(vertices, faces, [])
+    except MeshError as reason:
+        # Scans touch themselves along edges, where rims then cross; part these, and try again.
+        touching = int((edge_ids(faces)[1] > 2).sum())
+        if not touching:
+            raise
+        note = f"the surface touched itself along {touching} edges and was parted there"
+        try:
+            return _repair(*part_touching_edges(vertices, faces), [note])
+        except MeshError:
+            raise reason from None
+
+
+def _repair(vertices: Array, faces: Faces, notes: list[str]) -> Solid:
     # Make one surface of it, while neighbours are still known.
-    notes: list[str] = []
     size = diagonal(vertices)
     vertices, faces = _stitch(vertices, faces, notes)
     faces, walls = _drop_inner_walls(vertices, faces)

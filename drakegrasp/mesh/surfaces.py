@@ -201,6 +201,40 @@ def compact(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
     return vertices[used], inverse.reshape(-1, 3).astype(np.int64)
 
 
+def split_faces(vertices: Array, faces: Faces, midpoints: Faces) -> Faces:
+    """Return faces (k, 3), each split at the midpoints of its edges.
+
+    Args:
+        vertices: (n, 3) [m], midpoints among them.
+        faces: (m, 3).
+        midpoints: (m, 3), the vertex amid the edge that leaves each corner, or -1.
+    """
+    # Turn each face so that a lone midpoint is on its first edge, and a lone whole edge is its
+    # last.
+    split = midpoints >= 0
+    number = split.sum(axis=1)
+    turn = np.where(number == 1, split.argmax(axis=1), 0)
+    turn = np.where(number == 2, (split.argmin(axis=1) + 1) % 3, turn)
+    order = (np.arange(3) + turn[:, None]) % 3
+    a, b, c = np.take_along_axis(faces, order, axis=1).T
+    d, e, f = np.take_along_axis(midpoints, order, axis=1).T  # amid ab, bc, ca
+
+    # Two midpoints leave a quadrilateral a d e c, which its shorter diagonal halves.
+    ae, dc = vertices[e] - vertices[a], vertices[c] - vertices[d]
+    shorter = (number == 2) & (dot(ae, ae) <= dot(dc, dc))
+    other = (number == 2) & ~shorter
+    parts = [
+        (number == 0, [(a, b, c)]),
+        (number == 1, [(a, d, c), (d, b, c)]),
+        (shorter, [(d, b, e), (a, d, e), (a, e, c)]),
+        (other, [(d, b, e), (a, d, c), (d, e, c)]),
+        (number == 3, [(a, d, f), (d, b, e), (f, e, c), (d, e, f)]),
+    ]
+    return np.vstack(
+        [np.column_stack(corners)[chosen] for chosen, pieces in parts for corners in pieces]
+    )
+
+
 def stack(parts: list[tuple[Array, Faces]]) -> Solid:
     """Return several surfaces as one, in their order; they share no vertices."""
     offsets = np.cumsum([0] + [len(vertices) for vertices, _ in parts[:-1]])

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import colorsys
 import io
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from drakegrasp.config import ObjectConfig
+from drakegrasp.config import ObjectConfig, PhysicsConfig
 from drakegrasp.errors import MeshError, one_line
 from drakegrasp.frames import Array
 from drakegrasp.mesh.components import count_parts
@@ -29,7 +29,13 @@ from drakegrasp.mesh.distance_field import DistanceField, make_distance_field
 from drakegrasp.mesh.repair import repair_solid
 from drakegrasp.mesh.subdivision import subdivide
 from drakegrasp.mesh.surfaces import Solid, diagonal, signed_volume
-from drakegrasp.objects.sources import MANIFEST_NAME, UNITS, MeshSource, load_source
+from drakegrasp.objects.sources import (
+    MANIFEST_NAME,
+    UNITS,
+    MeshSource,
+    load_source,
+    upright_vertices,
+)
 from drakegrasp.runtime.files import write_atomic
 from drakegrasp.seeding import object_key
 
@@ -48,7 +54,7 @@ class ObjectModel:
     Attributes:
         name: Unique name.
         class_name: Class.
-        mesh_sha256: Digest of the source file's bytes and its scale, hexadecimal.
+        mesh_sha256: Digest of the source file's bytes and of what is said of it, hexadecimal.
         visual_vertices: (n, 3) float64, in {O}, full resolution.
         visual_faces: (m, 3) int32, counter-clockwise seen from outside.
         collision_vertices: (k, 3) float64, in {O}.
@@ -58,6 +64,9 @@ class ObjectModel:
         I_OOcm_O: (3, 3) rotational inertia about the centre of mass, in axes of {O} [kg m^2].
         collision_error: Largest distance between visual and collision surface.
         notes: What was repaired, and what is unexpected of how it rests, in sentences.
+        friction: Its own effective coefficient with hand and table; None: the configuration's.
+        scale: Metres per unit of length of its file.
+        up: Axis of its file that is +z of {O}.
     """
 
     name: str
@@ -72,6 +81,9 @@ class ObjectModel:
     I_OOcm_O: Array
     collision_error: float
     notes: tuple[str, ...] = ()
+    friction: float | None = None
+    scale: float = 1.0
+    up: str = "+z"
 
     def __post_init__(self) -> None:
         shapes = {
@@ -99,6 +111,18 @@ class ObjectModel:
         """Volume of the solid [m^3]."""
         return signed_volume(self.visual_vertices, self.visual_faces.astype(np.int64))
 
+    @property
+    def density(self) -> float:
+        """Mass over volume [kg/m^3]."""
+        return self.mass / self.volume
+
+    def own_physics(self, physics: PhysicsConfig) -> PhysicsConfig:
+        """Return the physics with the object's own friction, if it has one."""
+        if self.friction is None:
+            return physics
+        own = {"friction_hand": self.friction, "friction_table": self.friction}
+        return physics.model_copy(update=own)
+
     @cached_property
     def visual(self) -> trimesh.Trimesh:
         """The visual surface in {O}."""
@@ -123,19 +147,21 @@ def prepare_object(source: MeshSource, config: ObjectConfig | None = None) -> Ob
 
     Args:
         source: Where the mesh is and what unit it is in.
-        config: Mass, and limits of size and faces; the defaults if None.
+        config: Mass of what has no own, and limits of size and faces; the defaults if None.
 
     Raises:
         MeshError: If the file is no mesh, its size is implausible, or it cannot be made a
             solid; the message gives the reason.
     """
     mesh, digest = load_source(source)
-    vertices, faces = np.asarray(mesh.vertices) * source.scale, np.asarray(mesh.faces)
+    config = config or ObjectConfig()
+    if source.mass is not None:
+        config = config.model_copy(update={"mass": source.mass})
     try:
-        return make_object(
-            vertices,
-            faces,
-            config or ObjectConfig(),
+        model = make_object(
+            upright_vertices(mesh, source),
+            np.asarray(mesh.faces),
+            config,
             name=source.name,
             class_name=source.class_name,
             mesh_sha256=digest,
@@ -143,6 +169,13 @@ def prepare_object(source: MeshSource, config: ObjectConfig | None = None) -> Ob
         )
     except MeshError as reason:
         raise MeshError(f"{source.path.name}: {reason}") from reason
+
+    # What its triangles do not say.
+    model = replace(model, friction=source.friction, scale=source.scale, up=source.up)
+    if source.density is None:
+        return model
+    factor = source.density / model.density
+    return replace(model, mass=factor * model.mass, I_OOcm_O=factor * model.I_OOcm_O)
 
 
 def make_object(
@@ -256,6 +289,7 @@ def save_object(model: ObjectModel, path: str | Path) -> None:
     # The same bytes for the same object: `np.savez` stores no time stamps.
     content: dict[str, Any] = {f.name: np.asarray(getattr(model, f.name)) for f in fields(model)}
     content["notes"] = np.array(model.notes, dtype=np.str_)
+    content["friction"] = np.float64(np.nan if model.friction is None else model.friction)
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **content)
     write_atomic(Path(path), buffer.getvalue())
@@ -275,8 +309,10 @@ def load_object(path: str | Path) -> ObjectModel:
         raise MeshError(
             f"{path.name}: must be an object file of drakegrasp, got: {one_line(error)}"
         ) from error
-    for key in ("name", "class_name", "mesh_sha256", "mass", "collision_error"):
+    for key in ("name", "class_name", "mesh_sha256", "mass", "collision_error", "scale", "up"):
         values[key] = values[key].item()
+    friction = values["friction"].item()
+    values["friction"] = None if np.isnan(friction) else friction
     values["notes"] = tuple(values["notes"].tolist())
     return ObjectModel(**values)
 

@@ -7,11 +7,13 @@ File names and `objects.yaml`: a mesh called `<number>_<class>_<rest>.ext` belon
 `<class>`, which may itself contain underscores: the number is dropped, and so is the last
 part if at least two parts remain (24_mug_final and 1_mug are mugs, 30_fruit_juicer_final
 is a fruit_juicer). A name without a number is its own class. A file `objects.yaml` beside the
-meshes overrides class, name and unit, for all meshes or for one:
+meshes overrides these for one mesh, and the unit for all; it also says what no file of triangles
+does:
 
     units: cm
     objects:
-      95_boots_final: {units: m, class: boots, name: boots}
+      95_boots_final: {units: m, class: boots, name: boots, mass: 0.4, friction: 0.9}
+      7_scan: {scale: 1.02, up: +y, density: 700}
 """
 
 from __future__ import annotations
@@ -21,19 +23,32 @@ import unicodedata
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import pydantic
 import trimesh
 import yaml
 
+from drakegrasp.arithmetic import multiply
 from drakegrasp.config import describe_mistake
 from drakegrasp.errors import MeshError, one_line
+from drakegrasp.frames import Array
 from drakegrasp.mesh.loading import SUFFIXES, parse_mesh, read_bytes
 
 #: Metres per unit of length of a file.
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+#: The rotation (3, 3) that turns an axis of a file to +z; +z itself turns nothing.
+UPRIGHT = {
+    "+x": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
+    "-x": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
+    "+y": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
+    "-y": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
+    "+z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    "-z": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
+}
+#: Keys of an object in the manifest.
+_KEYS = "units, scale, up, class, name, mass, density, friction"
 MANIFEST_NAME = "objects.yaml"
 #: Longest name of an object [bytes]: file systems allow 255, and we append to it.
 MAX_NAME = 200
@@ -48,12 +63,20 @@ class MeshSource:
         class_name: Class of the object.
         path: The mesh file.
         scale: Metres per unit of length of the file.
+        up: Axis of the file that points up, e.g. "+y"; it becomes +z of {O}.
+        mass: [kg]; None: that of the density, or of the configuration.
+        density: [kg/m^3], instead of the mass.
+        friction: Effective coefficient with hand and table; None: those of the configuration.
     """
 
     name: str
     class_name: str
     path: Path
     scale: float = 1.0
+    up: str = "+z"
+    mass: float | None = None
+    density: float | None = None
+    friction: float | None = None
 
     def __post_init__(self) -> None:
         for what, text in (("name", self.name), ("class", self.class_name)):
@@ -64,11 +87,25 @@ class MeshSource:
                     f"{self.path.name}: the {what} must be printable, not empty, without slashes, "
                     f"not begin with a dot, and have at most {MAX_NAME} bytes, got {text!r}"
                 )
-        if not (np.isfinite(self.scale) and self.scale > 0.0):
-            raise MeshError(f"{self.path.name}: scale must be positive, got {self.scale}")
+        for what in ("scale", "mass", "density", "friction"):
+            value = getattr(self, what)
+            if value is not None and not (np.isfinite(value) and value > 0.0):
+                raise MeshError(f"{self.path.name}: {what} must be positive, got {value}")
+        if self.up not in UPRIGHT:
+            raise MeshError(
+                f"{self.path.name}: up must be one of {', '.join(UPRIGHT)}, got {self.up!r}"
+            )
+        if self.mass is not None and self.density is not None:
+            raise MeshError(
+                f"{self.path.name}: mass must not be given with density, got {self.mass:g} kg "
+                f"and {self.density:g} kg/m^3"
+            )
 
 
 # Finding meshes
+
+
+_Factor = Annotated[float, pydantic.Field(gt=0.0, allow_inf_nan=False)]
 
 
 class _Entry(pydantic.BaseModel):
@@ -77,6 +114,17 @@ class _Entry(pydantic.BaseModel):
     units: Literal["m", "cm", "mm"] | None = None
     class_name: str | None = pydantic.Field(default=None, alias="class")
     name: str | None = None
+    scale: _Factor = 1.0
+    up: str = "+z"
+    mass: _Factor | None = None
+    density: _Factor | None = None
+    friction: _Factor | None = None
+
+    @pydantic.field_validator("scale", "mass", "density", "friction", mode="before")
+    @classmethod
+    def _no_truth_values(cls, value: object) -> object:
+        # YAML reads "yes" as true, which pydantic would accept as the number 1.
+        return str(value) if isinstance(value, bool) else value
 
 
 class _Manifest(pydantic.BaseModel):
@@ -102,7 +150,7 @@ def _read_manifest(path: Path) -> _Manifest:
         return _Manifest.model_validate({} if content is None else content)
     except pydantic.ValidationError as error:
         mistake = error.errors()[0]
-        keys = "units, class, name" if mistake["loc"][:1] == ("objects",) else "units, objects"
+        keys = _KEYS if mistake["loc"][:1] == ("objects",) else "units, objects"
         line = describe_mistake(mistake, whole="the file", legal=f"a known key ({keys})")
         raise MeshError(f"{path}: {line}") from error
 
@@ -196,7 +244,11 @@ def _source(path: Path, stem: str, table: _Manifest, units: str) -> MeshSource:
         name=stem if entry.name is None else entry.name,
         class_name=_class_of(stem) if entry.class_name is None else entry.class_name,
         path=path,
-        scale=UNITS[entry.units or table.units or units],
+        scale=UNITS[entry.units or table.units or units] * entry.scale,
+        up=entry.up,
+        mass=entry.mass,
+        density=entry.density,
+        friction=entry.friction,
     )
 
 
@@ -216,12 +268,14 @@ def _refuse_twins(directory: Path, names: dict[Path, str]) -> None:
 
 
 def source_sha256(source: MeshSource) -> str:
-    """Return the SHA-256 of a mesh file's bytes and its scale, hexadecimal.
+    """Return the SHA-256 of a mesh file's bytes and of what is said of it, hexadecimal.
+
+    Name and class do not count.
 
     Raises:
         MeshError: If the file cannot be read.
     """
-    return _sha256(read_bytes(source.path), source.scale)
+    return _sha256(read_bytes(source.path), source)
 
 
 def load_source(source: MeshSource) -> tuple[trimesh.Trimesh, str]:
@@ -233,8 +287,20 @@ def load_source(source: MeshSource) -> tuple[trimesh.Trimesh, str]:
         MeshError: If the file cannot be read or holds no finite triangles.
     """
     content = read_bytes(source.path)
-    return parse_mesh(source.path.name, content), _sha256(content, source.scale)
+    return parse_mesh(source.path.name, content), _sha256(content, source)
 
 
-def _sha256(content: bytes, scale: float) -> str:
-    return hashlib.sha256(content + f"\nscale {scale!r}".encode()).hexdigest()
+def upright_vertices(mesh: trimesh.Trimesh, source: MeshSource) -> Array:
+    """Return the vertices (n, 3) of a file [m], turned so that its axis `up` is +z."""
+    vertices = np.asarray(mesh.vertices) * source.scale
+    return vertices if source.up == "+z" else multiply(vertices, np.transpose(UPRIGHT[source.up]))
+
+
+def _sha256(content: bytes, source: MeshSource) -> str:
+    # What is not said leaves no trace.
+    said = [f"\nscale {source.scale!r}"]
+    said += [] if source.up == "+z" else [f"up {source.up}"]
+    for what in ("mass", "density", "friction"):
+        value = getattr(source, what)
+        said += [] if value is None else [f"{what} {value!r}"]
+    return hashlib.sha256(content + "\n".join(said).encode()).hexdigest()

@@ -100,11 +100,12 @@ def build_scene(
     of the hand are compliant, so that each contact with the object is hydroelastic.
 
     Args:
-        model: The object.
+        model: The object; its own friction, if it has one, wins.
         physics: Materials, solver and time step.
         hand: The hand.
         meshcat: Where to show the scene while it is simulated; the results are the same bits.
     """
+    physics = model.own_physics(physics)
     scene = _build(model, physics, hand, meshcat)
     if hand is None or physics.coarse_steps == 1:
         return scene

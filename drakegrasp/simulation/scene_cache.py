@@ -43,6 +43,7 @@ def cached_scene(model: ObjectModel, physics: PhysicsConfig, hand_name: str | No
     hand = None if hand_name is None else load_hand(hand_name)
     shape = (model.collision_vertices, model.collision_faces, model.half_extents)
     mass = (model.p_OOcm, model.I_OOcm_O, np.float64(model.mass))
+    physics = model.own_physics(physics)
     key = "scene", _digest(model.name, *shape, *mass), physics, hand
     return _cached(key, lambda: build_scene(model, physics, hand))
 

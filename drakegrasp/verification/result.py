@@ -228,7 +228,7 @@ class Verification:
 
     def _explain_margin(self) -> str:
         """Return the sentence on the friction that the contacts alone need."""
-        simulated = self.config.physics.friction_hand
+        simulated = self.placed.model.own_physics(self.config.physics).friction_hand
         if np.isfinite(self.smallest_friction):
             needed = f"need a friction coefficient of {self.smallest_friction:.2f}"
         else:

@@ -168,4 +168,4 @@ def hide_ticks(axes: Axes) -> None:
 def save_figure(figure: Figure, png: Path, *, dpi: int) -> None:
     """Write a figure as PNG, at a resolution [pixels per inch]."""
     # Without the writing software's version the same figure gives the same bytes.
-    figure.savefig(png, dpi=dpi, metadata={"Software": None})
+    figure.savefig(png, dpi=dpi, format="png", metadata={"Software": None})

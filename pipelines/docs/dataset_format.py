@@ -75,8 +75,9 @@ table then, and the forces of the fingertips need not balance.
 
 A file is read only if its `schema_version` is the one above. Every command and the reader refuse
 another one with a line that names the file and both versions: build the dataset again, in another
-directory. Version 2 had no conditions of an attempt. Version 1 had other labels, too: fingers that
-the object pushed open, and contacts anywhere on a fingertip's link.
+directory. Version 2 had no conditions of an attempt, and no mass, density, friction, scale and axis
+of each object. Version 1 had other labels, too: fingers that the object pushed open, and contacts
+anywhere on a fingertip's link.
 
 ## Seals
 

@@ -23,7 +23,7 @@ import mujoco
 
 from drakegrasp.bench import mujoco_baseline
 from drakegrasp.bench.mujoco_baseline import MujocoBaseline
-from drakegrasp.bench.mujoco_scene import TIME_STEP
+from drakegrasp.bench.mujoco_scene import TIME_STEP, build_mujoco_scene
 
 pytestmark = pytest.mark.sim
 
@@ -205,6 +205,14 @@ def test_friction_with_the_table_is_the_tables(cube: ObjectModel) -> None:
     coefficients = [contact.friction[0] for contact in data.contact[: data.ncon]]
     assert coefficients
     assert coefficients == pytest.approx([0.3] * len(coefficients))
+
+
+def test_own_friction_of_the_object_is_that_of_both_pairs(cube: ObjectModel) -> None:
+    config = load_config()
+    own = build_mujoco_scene(replace(cube, friction=0.2), load_hand(config.hand), config).model
+    body = own.body("object").id
+    assert own.geom("table").friction[0] == 0.2
+    assert set(own.geom_friction[own.geom_bodyid == body, 0].tolist()) == {0.2}
 
 
 def test_wrist_waits_while_the_object_is_released(

@@ -147,6 +147,33 @@ def test_changed_mesh_is_done_again_and_the_others_are_not(
     assert [str(v) for v in check_dataset(out)] == []
 
 
+def test_object_keeps_to_what_is_said_of_it(
+    small_meshes: Path, small_dataset: Path, small_config: Config, tmp_path: Path
+) -> None:
+    """A changed entry of objects.yaml prepares and simulates that object again, and no other."""
+    meshes = Path(shutil.copytree(small_meshes, tmp_path / "meshes"))
+    out = _copy(small_dataset, tmp_path)
+    said = "objects: {11_box_slim: {density: 600, friction: 0.9}}\n"
+    (meshes / "objects.yaml").write_text(said)
+    report = build(find_meshes(meshes), out, small_config, run_here, show=False)
+    assert (report.simulated, report.reused) == (4, 8)
+    assert [str(v) for v in check_dataset(out)] == []
+
+    # The manifest and /objects have it, and the lift is simulated with it.
+    entry = read_manifest(out).objects[1]
+    assert (entry.name, entry.friction) == ("11_box_slim", 0.9)
+    assert entry.mass == pytest.approx(600.0 * 0.065 * 0.05 * 0.14, rel=1e-6)
+    with h5py.File(out / "trials.hdf5") as file:
+        assert file["objects/mass"][1] == entry.mass
+        assert np.isnan(file["objects/friction"][0]) and file["objects/friction"][1] == 0.9
+        lifted = np.flatnonzero(
+            (file["trials/object"][()] == 1) & np.isfinite(file["trials/slip"][()])
+        )
+    assert replay_trial(out, int(lifted[0])).same
+    again = build(find_meshes(meshes), out, small_config, _nothing_runs, show=False)
+    assert again.reused == 12
+
+
 def test_max_grasps_cuts_after_the_last_wanted_one(
     small_meshes: Path, small_dataset: Path, tmp_path: Path
 ) -> None:

@@ -17,6 +17,7 @@ import pytest
 import trimesh
 from click.testing import CliRunner, Result
 from helpers.assertions import arrays_of
+from matplotlib.image import imread
 
 from drakegrasp.cli.main import main
 from drakegrasp.cli.options import parse_request
@@ -326,6 +327,37 @@ def test_audit_lists_what_would_be_refused(tmp_path: Path) -> None:
     assert result.exit_code == 0
     assert "fit" in result.stdout
     assert "refused" in result.stdout
+    assert "2 meshes: 1 fit, 0 repaired, 1 refused; 0 with a warning (!)" in result.stdout
+
+
+def test_audit_writes_findings_and_a_sheet(tmp_path: Path) -> None:
+    meshes, found, sheet = tmp_path / "m", tmp_path / "a.json", tmp_path / "pictures" / "a.png"
+    meshes.mkdir()
+    trimesh.creation.box([0.05, 0.06, 0.07]).export(meshes / "1_box_a.obj")
+    _text(meshes)
+    assert run("audit", meshes, "--json", found, "--sheet", sheet).exit_code == 0
+    rows = {row["name"]: row for row in json.loads(found.read_text())}
+    assert rows["1_box_a"]["status"] == "fit" and rows["1_box_a"]["faces"] == 12
+
+    # The picture has two places; the box is drawn in its own colour in the first.
+    picture = imread(sheet)[..., :3]
+    high, wide = picture.shape[:2]
+    assert 1.5 < wide / high < 2.0
+    left, right = picture[high // 2 :, : wide // 2], picture[high // 2 :, wide // 2 :]
+    assert np.ptp(left, axis=2).max() > 0.3
+    assert np.ptp(right, axis=2).max() < 0.3
+
+
+def test_morphs_are_told_and_bad_directories_are_refused(tmp_path: Path) -> None:
+    meshes, out = tmp_path / "m", tmp_path / "out"
+    meshes.mkdir()
+    trimesh.creation.box([0.05, 0.06, 0.07]).export(meshes / "1_box_a.obj")
+    result = run("objects", "morph", meshes, "--per-mesh", 2, "--out", out)
+    assert result.exit_code == 0
+    assert result.stdout.startswith(f"2 morphs in {out}; ")
+    again = run("objects", "morph", meshes, "--per-mesh", 2, "--out", out)
+    assert again.exit_code != 0
+    assert "must be new or an empty directory" in error_line(again)
 
 
 # Verify

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.meshes import assert_sound, prepare, write
+from helpers.scripts import load_script
 
 from drakegrasp.errors import MeshError
 from drakegrasp.mesh.decimation import decimate
@@ -32,5 +33,22 @@ def test_decimation_falls_back(tmp_path, monkeypatch):
     reduced, error = decimate(solid, 1000)
     assert is_solid_surface(reduced.faces) and len(reduced.faces) <= 1000 and 0.0 < error < 1e-3
     monkeypatch.setattr("drakegrasp.mesh.decimation._simplify_manifold", lambda *_: None)
+    reduced, error = decimate(solid, 1000)
+    assert is_solid_surface(reduced.faces) and len(reduced.faces) <= 1000 and 0.0 < error < 1e-3
+    for way in ("parted", "twice"):
+        monkeypatch.setattr(f"drakegrasp.mesh.decimation._decimate_{way}", lambda *_: None)
     with pytest.raises(MeshError, match="at most 1000 faces"):
         decimate(solid, 1000)
+
+
+def test_thin_noisy_scan_keeps_its_shape(tmp_path):
+    """Quadric decimation alone leaves edges with four faces where the wall touches itself."""
+    scans = load_script("measurements/scanned_meshes")
+    bowl = scans.scan(*scans.SCANS["bowl"], seed=2)
+    bowl.export(tmp_path / "bowl.ply")
+    model = prepare(tmp_path / "bowl.ply")
+    assert_sound(model)
+    assert 14_000 < len(model.visual_faces) < 18_000
+    assert 0.0 < model.collision_error < 2e-3
+    assert model.collision.volume == pytest.approx(model.volume, rel=0.05)
+    assert "parted" in model.notes[0]

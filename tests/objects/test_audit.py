@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import re
 
 import pytest
-from helpers.meshes import G3DB, needs_g3db
+import trimesh
+from helpers.meshes import G3DB, box, flipped, needs_g3db, open_box, write
 
-from drakegrasp.objects.audit import audit
+from drakegrasp.objects.audit import audit, guess_units
 from drakegrasp.objects.model import prepare_object
 from drakegrasp.objects.sources import find_meshes
 
@@ -31,6 +33,64 @@ def test_audit_tells_what_is_wrong(tmp_path):
     assert rows["book"].volume == pytest.approx(430e-6, rel=0.01)
     x, y, z = rows["mug"].extents
     assert (round(x, 3), round(y, 3), round(z, 3)) == (0.093, 0.093, 0.143)
+
+
+def test_row_tells_what_is_measured(tmp_path):
+    """A cup of 3 mm walls whose faces run against each other: closed forms, and what is mended."""
+    outer, inner = box((0.06, 0.06, 0.08)), flipped(box((0.054, 0.054, 0.074)))
+    write(tmp_path / "1_cup.obj", outer, inner)
+    write(tmp_path / "2_lid.obj", open_box())
+    write(tmp_path / "3_far.obj", trimesh.Trimesh(100.0 * box().vertices, box().faces))
+    (tmp_path / "objects.yaml").write_text("objects: {1_cup: {density: 1000}}")
+    cup, lid, far = audit(tmp_path)
+
+    assert (cup.status, cup.faces, cup.bodies, cup.watertight) == ("repaired", 24, 2, True)
+    assert cup.wall == pytest.approx(0.003, abs=1e-5)
+    assert cup.volume == pytest.approx(0.06**2 * 0.08 - 0.054**2 * 0.074)
+    assert (cup.volume_change, cup.crossing) == (pytest.approx(0.0, abs=1e-12), 0)
+    assert cup.mass == pytest.approx(1000.0 * cup.volume)
+    assert cup.gyration > 1.0 and cup.warnings == ()
+    assert cup.memory > 98e6 and cup.collision_error == 0.0
+
+    assert (lid.status, lid.watertight, lid.bodies) == ("repaired", False, 1)
+    assert lid.volume_change is not None and lid.volume_change > 0.0
+    assert far.status == "refused" and far.units_guess == "cm"
+    assert far.warnings == ("its lengths may be in cm",) and far.volume is None
+
+    # As JSON, without the model.
+    assert cup.model is not None and "model" not in cup.to_json()
+    assert json.loads(json.dumps(far.to_json()))["units_guess"] == "cm"
+
+
+@pytest.mark.parametrize(
+    ("said", "warning"),
+    [
+        ("{}", "! 1 kg make 31,250 kg/m^3"),
+        ("{mass: 0.0001}", "! 0.0001 kg make 3 kg/m^3"),
+        ("{mass: 0.02}", ""),
+    ],
+)
+def test_mass_that_nothing_has_is_told(tmp_path, said, warning):
+    write(tmp_path / "a.obj", box((0.04, 0.04, 0.02)))
+    (tmp_path / "objects.yaml").write_text(f"objects: {{a: {said}}}")
+    (row,) = audit(tmp_path)
+    assert [f"! {text}"[: len(warning)] for text in row.warnings] == [warning] * bool(warning)
+
+
+def test_thin_walls_and_crossing_bodies_are_told(tmp_path):
+    write(tmp_path / "a.obj", box((0.06, 0.06, 0.0015)))
+    (tmp_path / "objects.yaml").write_text("objects: {a: {density: 900}}")
+    (row,) = audit(tmp_path)
+    assert row.warnings == ("walls of 1.5 mm, thin for a fingertip (below 2 mm)",)
+    assert row.status == "fit"
+
+
+@pytest.mark.parametrize(
+    ("size", "scale", "guess"),
+    [(0.1, 1.0, None), (10.0, 1.0, "cm"), (100.0, 1.0, "mm"), (1e-3, 0.01, "m"), (1e7, 1.0, None)],
+)
+def test_unit_is_guessed_where_the_given_one_is_unlikely(size, scale, guess):
+    assert guess_units(size, scale) == guess
 
 
 @needs_g3db

@@ -9,8 +9,10 @@ from helpers.meshes import BOX, assert_sound, box, box_inertia, open_box, prepar
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drakegrasp.config import load_config
 from drakegrasp.errors import MeshError
-from drakegrasp.objects.model import load_object, save_object
+from drakegrasp.objects.model import load_object, prepare_object, save_object
+from drakegrasp.objects.sources import MeshSource
 
 
 def test_box_has_the_closed_form(tmp_path):
@@ -77,6 +79,44 @@ def test_save_and_load_keep_every_bit(tmp_path):
         load_object(first)
     with pytest.raises(MeshError, match=r"gone: must be an object file"):
         load_object(tmp_path / "gone")
+
+
+def source(path, **said) -> MeshSource:
+    return MeshSource(name="a", class_name="thing", path=path, **said)
+
+
+def test_mass_density_and_friction_of_the_mesh_win(tmp_path):
+    path, volume = write(tmp_path / "a.obj", box()), np.prod(BOX)
+    plain = prepare_object(source(path))
+    assert (plain.mass, plain.friction, plain.up, plain.scale) == (1.0, None, "+z", 1.0)
+    for model, mass in (
+        (prepare_object(source(path, mass=0.3)), 0.3),
+        (prepare_object(source(path, density=700.0)), 700.0 * volume),
+    ):
+        assert model.mass == pytest.approx(mass)
+        assert model.density == pytest.approx(mass / volume)
+        np.testing.assert_allclose(model.I_OOcm_O, mass * plain.I_OOcm_O, rtol=1e-9, atol=1e-12)
+    rough, physics = prepare_object(source(path, friction=1.2)), load_config().physics
+    own = rough.own_physics(physics)
+    assert (own.friction_hand, own.friction_table, own.solver) == (1.2, 1.2, physics.solver)
+    assert plain.own_physics(physics) is physics
+    save_object(rough, tmp_path / "rough.npz")
+    assert load_object(tmp_path / "rough.npz").friction == 1.2
+
+
+@pytest.mark.parametrize("up", ["+x", "-x", "+y", "-y", "+z", "-z"])
+def test_axis_that_points_up_becomes_z(tmp_path, up):
+    """A wedge, so that no rotation and no mirror image of it is like it."""
+    corners = np.array([[0, 0, 0], [0.02, 0, 0], [0, 0.03, 0], [0, 0, 0.05], [0.02, 0.03, 0]])
+    wedge = trimesh.convex.convex_hull(corners)
+    model = prepare_object(source(write(tmp_path / "a.obj", wedge), up=up))
+    axis = np.eye(3)["xyz".index(up[1])] * (1.0 if up[0] == "+" else -1.0)
+    heights = np.sort(wedge.vertices @ axis)
+    np.testing.assert_allclose(
+        np.sort(model.visual_vertices[:, 2]), heights - heights[[0, -1]].mean(), atol=1e-12
+    )
+    assert model.volume == pytest.approx(wedge.volume)  # a mirror image is inside out
+    assert model.notes == ()
 
 
 def test_model_is_read_only_and_knows_its_source(tmp_path):

@@ -65,14 +65,36 @@ def test_units_and_manifest_precedence(tmp_path):
     assert len(find_meshes(tmp_path, manifest=other)) == 3
 
 
+def test_what_triangles_do_not_say_is_in_the_manifest_and_in_the_digest(tmp_path):
+    write(tmp_path / "a.obj", box())
+    said, digests = "units: cm", {source_sha256(find_meshes(tmp_path, units="cm")[0])}
+    for text in ("name: b, class: c", "scale: 2", "up: +y", "mass: 2", "density: 2", "friction: 2"):
+        (tmp_path / "objects.yaml").write_text(f"{said}\nobjects: {{a: {{{text}}}}}\n")
+        (source,) = find_meshes(tmp_path)
+        digests.add(source_sha256(source))
+    assert len(digests) == 6  # name and class change nothing
+    (tmp_path / "objects.yaml").write_text(
+        "units: cm\nobjects: {a: {scale: 2, up: -x, density: 700, friction: 0.4}}\n"
+    )
+    (source,) = find_meshes(tmp_path)
+    assert (source.scale, source.up) == (0.02, "-x")
+    assert (source.mass, source.density, source.friction) == (None, 700.0, 0.4)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ("objects: {a: {mass: 0}}", r"objects\.a\.mass: .*greater than 0.*got 0"),
+        ("objects: {a: {mass: heavy}}", r"objects\.a\.mass: .*number.*got 'heavy'"),
+        ("objects: {a: {friction: yes}}", r"objects\.a\.friction: .*number"),
+        ("objects: {a: {scale: .inf}}", r"objects\.a\.scale: .*finite"),
+        ("objects: {a: {up: y}}", r"up must be one of \+x, -x, \+y, -y, \+z, -z, got 'y'"),
+        ("objects: {a: {mass: 1, density: 2}}", "mass must not be given with density, got 1 kg"),
         ("units: inch", r"units: .*'m', 'cm' or 'mm'.*got 'inch'"),
         ("unit: cm", r"unit: must be a known key \(units, objects\), got an unknown one"),
         (
             "objects: {a: {unit: cm}}",
-            r"objects\.a\.unit: must be a known key \(units, class, name\), got",
+            r"objects\.a\.unit: must be a known key \(units, scale, up, class, name, mass, ",
         ),
         ("objects: {b: {units: cm}}", r"must be names of meshes in .*: a; got b"),
         ("objects: {a: {name: ''}}", "name must be printable"),

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from helpers.objects import STANDOFF, from_above, standing
@@ -45,6 +48,24 @@ def test_least_friction_holds_and_less_does_not(cube, config):
         scene = build_scene(cube, other.physics, load_hand(other.hand))
         record = run_attempt(scene, X_TO, attempt, other)
         assert (record.outcome is Outcome.SUCCESS) == holds
+
+
+def test_own_friction_of_the_object_is_searched_and_shaken(cube, config, monkeypatch):
+    """The certificate is that of a configuration with this friction."""
+    attempt, X_TO = from_above(cube, STANDOFF), standing(cube)
+    other = override_config(config, ["physics.friction_hand=0.5", "physics.friction_table=0.5"])
+    tried = []
+
+    def hold(_scene, _X_TO, attempt, *_):
+        tried.append(attempt.conditions.materials)
+        return SimpleNamespace(outcome=Outcome.SUCCESS)
+
+    monkeypatch.setattr("drakegrasp.simulation.robustness.run_attempt", hold)
+    assert certify(replace(cube, friction=0.5), X_TO, attempt, config).friction <= 0.5
+    certify(cube, X_TO, attempt, other)
+    half = len(tried) // 2
+    assert tried[:half] == tried[half:]
+    assert len({materials.friction_hand for materials in tried}) > 4
 
 
 def test_bisection_ends_at_the_least_that_holds_or_knows_nothing():

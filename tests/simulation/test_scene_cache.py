@@ -44,6 +44,7 @@ def test_scene_of_another_mass_shape_or_physics_is_another(
         cached_scene(heavy, config.physics, None),
         cached_scene(large, config.physics, None),
         cached_scene(cube, slick, None),
+        cached_scene(replace(cube, friction=0.1), config.physics, None),
     ):
         assert other is not scene
     assert np.isclose(cached_scene(heavy, config.physics, None).model.mass, 2.0 * cube.mass)

@@ -125,7 +125,7 @@ def same_objects(trials: OpenFile, manifest: Manifest) -> Iterator[Violation]:
         values = column(trials.groups["objects"][f.name], f)[:].tolist()
         for row, (value, entry) in enumerate(zip(values, manifest.objects, strict=True)):
             expected = getattr(entry, f.name)
-            if value != expected:
+            if value != expected and not (expected is None and np.isnan(value)):
                 what = f"{f.name} must be that of {FILE_NAME}, {expected!r}"
                 yield Violation(
                     file=trials.name, group="/objects", row=row, what=what, got=repr(value)

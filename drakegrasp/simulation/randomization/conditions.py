@@ -62,6 +62,7 @@ class Conditions:
 
 def usual_materials(model: ObjectModel, physics: PhysicsConfig) -> Materials:
     """Return the friction and mass of an object's attempts where nothing is drawn."""
+    physics = model.own_physics(physics)
     return Materials(
         friction_hand=physics.friction_hand,
         friction_table=physics.friction_table,

@@ -103,7 +103,8 @@ def lift_by_forces(
     """Return what happens when forces at contact points lift the object.
 
     The object moves along `trajectory.lift_path` and then rests for `lift.hold_time`. Friction is
-    `physics.friction_hand`. The same arguments give the same bits, whatever ran before.
+    the object's own, or `physics.friction_hand`. The same arguments give the same bits, whatever
+    ran before.
 
     Args:
         scene: Of the object, without a hand.
@@ -125,7 +126,7 @@ def lift_by_forces(
         p_OQ,
         nhat_Q_O,
         scene.model.p_OOcm,
-        config.physics.friction_hand,
+        scene.model.own_physics(config.physics).friction_hand,
         force_limit=force_limit,
         torsion_radius=patch_torsion_radius(len(np.asarray(p_OQ))),
     )

@@ -178,7 +178,7 @@ def force_margin(
             p_OQ,
             nhat_Q_O,
             model.p_OOcm,
-            friction=config.physics.friction_hand,
+            friction=model.own_physics(config.physics).friction_hand,
             length=characteristic_length(model.visual_vertices, model.p_OOcm),
             torsion_radius=radius,
         ),

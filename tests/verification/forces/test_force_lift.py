@@ -96,6 +96,16 @@ def test_slippery_cube_takes_more_than_a_fingertip_can_give(scene, cube):
     assert found.steps == 0
 
 
+def test_friction_of_the_object_wins_over_the_configured_one(cube, config):
+    slippery = replace(cube, friction=0.05)
+    bare = build_scene(slippery, config.physics)
+    assert bare.physics.friction_hand == bare.physics.friction_table == 0.05
+    found = lift_by_forces(bare, standing(cube), P, N, force_limit=LIMIT, config=config)
+    assert found.planned_force == pytest.approx(heaviest(config) / 0.1, rel=1e-6)
+    margins = [force_margin(model, standing(cube), P, N, config) for model in (cube, slippery)]
+    assert margins[1].epsilon < margins[0].epsilon
+
+
 @pytest.mark.parametrize(
     ("p", "n"),
     [

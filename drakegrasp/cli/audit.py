@@ -1,0 +1,59 @@
+"""The command `drakegrasp audit`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import click
+
+from drakegrasp.cli.options import manifest_option, units_option
+
+
+@click.command()
+@click.argument("mesh_dir", type=click.Path(path_type=Path))
+@units_option
+@manifest_option
+@click.option(
+    "--json",
+    "json_file",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write all findings as JSON too.",
+)
+@click.option(
+    "--sheet",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write a picture of every object with its status (.png).",
+)
+def audit(
+    mesh_dir: Path, units: str, manifest: Path | None, json_file: Path | None, sheet: Path | None
+) -> None:
+    """Check which meshes are fit, repaired or refused.
+
+    A build also drops each object on the table, and refuses one that does not come to rest.
+    Exit code 1 if every mesh is refused.
+    """
+    from drakegrasp.cli.tables import ROOMY, audit_line, audit_table, make_console
+    from drakegrasp.objects.audit import audit as audit_meshes
+    from drakegrasp.runtime.files import atomic_path, write_atomic
+    from drakegrasp.runtime.progress import progress_bar
+
+    with progress_bar("audit", "meshes") as progress:
+        rows = audit_meshes(mesh_dir, units=units, manifest=manifest, progress=progress)
+    console = make_console()
+    console.print(audit_table(rows, compact=console.width < ROOMY))
+    click.echo(audit_line(rows))
+
+    if json_file is not None:
+        text = json.dumps([row.to_json() for row in rows], indent=1, ensure_ascii=False)
+        write_atomic(json_file, f"{text}\n".encode())
+    if sheet is not None:
+        from drakegrasp.visualization.object_sheet import object_sheet
+
+        with progress_bar("draw", "objects") as progress, atomic_path(sheet) as png:
+            object_sheet(rows, png, progress=progress)
+    if all(row.status == "refused" for row in rows):
+        sys.exit(1)

@@ -1,0 +1,65 @@
+"""The command `drakegrasp objects morph`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from drakegrasp.cli.options import manifest_option, units_option
+
+
+@click.command()
+@click.argument("mesh_dir", type=click.Path(path_type=Path))
+@click.option(
+    "--per-mesh",
+    required=True,
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Morphs of each mesh.",
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    metavar="S",
+    help="Seed of the draws.",
+)
+@click.option(
+    "--out",
+    required=True,
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Directory of the morphs; new or empty.",
+)
+@units_option
+@manifest_option
+def morph(
+    mesh_dir: Path, per_mesh: int, seed: int, out: Path, units: str, manifest: Path | None
+) -> None:
+    """Make objects of other proportions from meshes.
+
+    Each mesh of MESH_DIR is widened, bent in and stretched along an axis at random. The morphs
+    (.obj, metres, +z up) stand on the table as the mesh does, and an objects.yaml beside them
+    keeps their class. The same seed gives the same files.
+    """
+    from drakegrasp.objects.morph_set import morph_meshes
+    from drakegrasp.runtime.progress import progress_bar
+
+    with progress_bar("morph", "morphs") as progress:
+        report = morph_meshes(
+            mesh_dir,
+            out,
+            per_mesh=per_mesh,
+            seed=seed,
+            units=units,
+            manifest=manifest,
+            progress=progress,
+        )
+    for reason in report.refused:
+        click.echo(f"no morphs of {reason}", err=True)
+    for name, count in report.crossing.items():
+        click.echo(f"{name} passes through itself in {count} faces, and so do its morphs", err=True)
+    share = report.first_draws / report.morphs
+    click.echo(f"{report.morphs} morphs in {out}; {share:.0%} by the first draw")
