@@ -33,6 +33,7 @@ from drakegrasp.dataset.manifest import installed_versions
 from drakegrasp.dataset.prepared_objects import PreparedObject
 from drakegrasp.errors import DataError
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.allocator import allocator
@@ -188,7 +189,7 @@ def _measure_object(
 
 def _attempts(prepared: PreparedObject, config: Config) -> list[Attempt]:
     every = range(len(prepared.candidates))
-    name, rules = prepared.model.name, config.candidates
+    name, rules = prepared.model.name, with_hand_defaults(config).candidates
     return list(make_attempts(prepared.candidates, every, rules, name=name, seed=config.seed))
 
 

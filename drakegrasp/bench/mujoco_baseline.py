@@ -109,6 +109,8 @@ class MujocoBaseline:
         self._object_inertia = m.dof_M0[self._object_v].copy()
         closing = [finger.closing_joint for finger in hand.fingers]
         self._closing_v = [m.joint(name).dofadr[0] for name in closing]
+        coupled = [coupling for finger in hand.fingers for coupling in finger.coupled]
+        self._followers = {m.joint(c.joint).qposadr[0]: c.offset for c in coupled}
 
     def run(self, attempt: Pregrasp) -> PeerTrial:
         """Return the result of one attempt; its fingers close from the open hand."""
@@ -155,6 +157,8 @@ class MujocoBaseline:
         for spread_joint in self._spreads:
             m.body_quat[m.body(spread_joint.body).id] = spread_joint.orientation(spread)
 
+        for joint, position in self._followers.items():
+            d.qpos[joint] = position
         d.qpos[self._wrist_q] = X_WB[:3, 3]
         d.qpos[self._object_q] = [*self._X_WO[:3, 3], *quaternion(self._X_WO[:3, :3])]
         mujoco.mj_forward(m, d)
@@ -176,7 +180,7 @@ class MujocoBaseline:
             d.qpos[self._object_q], d.qvel[self._object_v] = resting, 0.0
             step += 1
             if step % CLOSING_STRIDE == 0 and d.time > STARTING:
-                speed = np.abs(d.qvel[self._closing_v]).max()
+                speed = np.abs(d.qvel[self._closing_v] / self._hand.closing_unit).max()
                 if speed < self._config.close.stop_speed:
                     return
 

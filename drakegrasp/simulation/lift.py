@@ -54,7 +54,7 @@ class Lift:
 
     Attributes:
         contacts: Contacts at the end.
-        q: Positions of the hand's joints [rad], in the plant's order.
+        q: Positions of the hand's joints [rad or m], in the plant's order.
         duration: Simulated time [s].
         X_TO: Pose of the object, (4, 4).
         X_OG: Pose of the palm, (4, 4).
@@ -176,6 +176,7 @@ class _Monitor:
         assert scene.handles is not None
         self._tips = {body.index() for body in scene.handles.fingertips}
         self._X_GO, self._angles = _object_in_hand(scene), closing_angles(scene)
+        self._unit = scene.handles.hand.closing_unit
         # Whether all fingertips touched the object at a check since which nothing moved: then
         # contacts need not be computed again.
         self._held = False
@@ -187,12 +188,13 @@ class _Monitor:
         Args:
             scene: The scene that was simulated since the last check.
             elapsed: Simulated time since then [s].
-            stop_speed: Speed of a closing joint below which it stands [rad/s].
+            stop_speed: Speed of a closing joint below which it stands, in its unit [1/s].
         """
         # Measure what moved since the last check.
         X_GO, angles = _object_in_hand(scene), closing_angles(scene)
         shift, angle = _motion(self._X_GO, X_GO)
-        standing = float(np.abs(angles - self._angles).max()) / elapsed <= stop_speed
+        closed = np.abs(angles - self._angles) / self._unit
+        standing = float(closed.max()) / elapsed <= stop_speed
         self.at_rest = standing and not (shift > COARSE_SHIFT or angle > COARSE_ANGLE)
         self._X_GO, self._angles = X_GO, angles
 

@@ -49,10 +49,10 @@ class Prediction:
     Attributes:
         outcome: `start_collision` or `screened` where the attempt is certainly lost, else None.
         clear: Whether the open hand is farther from object and table than the margin.
-        closing: (k,), closing angles up to which the fingers meet nothing [rad]; empty with an
-            outcome.
+        closing: (k,), closing angles up to which the fingers meet nothing [rad, or m where they
+            slide]; empty with an outcome.
         last: (k,), closing angles beyond which a fingertip's pad cannot meet the object any more
-            [rad]; empty with an outcome.
+            [rad or m]; empty with an outcome.
     """
 
     outcome: Outcome | None

@@ -35,7 +35,7 @@ from drakegrasp.simulation.verdict import judge_closed, judge_lifted
 #: Far below a time step, far above the rounding of a sum of them [s].
 ROUNDING = 1e-9
 #: A finger that closed this far beyond the last angle at which it can meet the object has missed
-#: it [rad].
+#: it, in the unit of its closing joint.
 BEYOND = np.deg2rad(2.0)
 
 
@@ -47,8 +47,8 @@ class TrialRecord:
         outcome: The verdict.
         X_TO, X_OG: Resting pose of the object and start pose of the palm, (4, 4).
         closed, lifted: Contacts after closing and after the lift.
-        q_closed, q_lifted: Positions of the hand's joints at these times [rad], in the plant's
-            order.
+        q_closed, q_lifted: Positions of the hand's joints at these times [rad or m], in the
+            plant's order.
         time_close, time_lift: Simulated time of the two stages [s].
         X_TO_lifted: Pose of the object after the lift, (4, 4).
         X_OG_lifted: Pose of the palm then, (4, 4).
@@ -185,8 +185,9 @@ def _close(
     end, last = config.close.max_time, np.inf
     if prediction is not None:
         assert scene.handles is not None
-        end -= float(prediction.closing.min()) / scene.handles.hand.closing_speed
-        last = prediction.last + BEYOND
+        hand = scene.handles.hand
+        end -= float((prediction.closing / hand.closing_speed).min())
+        last = prediction.last + BEYOND * hand.closing_unit
 
     # The last check may fall short of the end by rounding, never by a step.
     while end - scene.time > ROUNDING:

@@ -26,6 +26,7 @@ PINCER_SDF = """<sdf version="1.9"><model name="pincer">
     <axis><xyz>1 0 0</xyz><limit><lower>0</lower><upper>1</upper></limit></axis></joint>
 </model></sdf>"""
 PINCER: dict[str, Any] = {
+    "version": 1,
     "model": "pincer.sdf",
     "palm": {"link": "palm", "p_BG": [0.0, 0.0, 0.01]},
     "fingers": [
@@ -39,6 +40,7 @@ PINCER: dict[str, Any] = {
         for side, inward in (("left", 1.0), ("right", -1.0))
     ],
     "closing_speed_deg": 90.0,
+    "standoffs": [0.03, 0.05],
 }
 
 

@@ -40,7 +40,7 @@ def check_trials_file(trials: OpenFile, context: Context) -> None:
         trial_rules.numbers,
         objects=trials.count("objects"),
         candidates=None if objects is None else [entry.candidates for entry in objects],
-        standoffs=len(trials.config.candidates.standoffs) if trials.config else None,
+        standoffs=len(trials.config.candidates.drawn_standoffs) if trials.config else None,
     )
     last: list[Rule] = [
         trial_rules.verdicts,
