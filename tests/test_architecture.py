@@ -29,6 +29,7 @@ ORDER = (
     "simulation",
     "dataset",
     "visualization",
+    "commissioning",
     "build",
     "cluster",
     "verification",
@@ -48,7 +49,10 @@ WALLS = {
     "distributed": ("cluster",),
     "click": ("cli",),
     "matplotlib": ("visualization", "verification.figure"),
-    "pydrake": ("hand", "vision", "simulation", "visualization", "verification", "bench"),
+    "pydrake": (
+        *("hand", "vision", "simulation", "visualization", "commissioning", "verification"),
+        "bench",
+    ),
 }
 #: Modules that name a type of a library for the type checker alone: what callers give or get.
 NAMES_TYPES = {("api", "distributed"), ("verification.result", "matplotlib")}

@@ -16,6 +16,7 @@ import click
 from drakegrasp.cli.bench import bench
 from drakegrasp.cli.build import assemble, build, stats
 from drakegrasp.cli.group import main
+from drakegrasp.cli.hand import hand
 from drakegrasp.cli.options import (
     manifest_option,
     out_argument,
@@ -145,12 +146,14 @@ def replay(out: Path, trial: int, html: Path | None) -> None:
 
 
 # The help lists them in this order.
-for _command in (doctor, objects, audit, build, assemble, check, stats, replay, verify, bench):
+for _command in (
+    *(doctor, objects, audit, hand, build, assemble, check, stats, replay, verify, bench),
+):
     main.add_command(_command)
 
 
 def run() -> None:
     """Run the program; commands that may simulate in this process have jemalloc for it."""
-    if sys.argv[1:2] in (["bench"], ["verify"]):
+    if sys.argv[1:2] in (["bench"], ["verify"], ["hand"]):
         restart_with_jemalloc()
     main()

@@ -1,7 +1,7 @@
 """How the fingertips of a hand close on something between them.
 
 In: a hand. Out: its `Opposition`, two groups of fingers that close against each other, and the
-`Pinch` in which they hold something of a given width. Geometry only; Gx, Gy, Gz are the palm's axes.
+`Pinch` in which they hold something of a given width. Geometry only.
 """
 
 from __future__ import annotations
@@ -89,8 +89,8 @@ def find_pinch(hand: Hand, width: float) -> Pinch | None:
     across = np.linalg.norm(line - along[..., None] * opposition.axis, axis=-1)
     tilt = np.arctan2(across, np.maximum(along, 1e-6))
 
-    # Of those with the width, in front of the palm, the straightest in which all fingers have closed
-    # by about the same.
+    # Of those with the width, in front of the palm, the straightest in which all fingers have
+    # closed by about the same.
     share = np.linspace(0.0, 1.0, STEPS)
     cost = tilt + UNEVEN * np.abs(share[:, None] - share)
     cost[np.abs(gap - width) > WIDTH_ERROR] = np.inf
@@ -101,7 +101,9 @@ def find_pinch(hand: Hand, width: float) -> Pinch | None:
         return None
 
     p_GQ = np.where(opposition.group[:, None], front[i], front[j])
-    middle = (front[i][opposition.group].mean(axis=0) + front[j][~opposition.group].mean(axis=0)) / 2
+    middle = (
+        front[i][opposition.group].mean(axis=0) + front[j][~opposition.group].mean(axis=0)
+    ) / 2
     shift = (along_first[i] + along_second[j]) / 2.0 - middle @ opposition.axis
     return Pinch(
         closing=np.where(opposition.group, closing[i], closing[j]),
@@ -132,7 +134,7 @@ def _closing_path(hand: Hand, steps: int) -> Array:
 
 
 def _pad_point_paths(hand: Hand) -> Array:
-    """Return the pad points (steps, k, 3) in {G} on the way from the open hand to the limits [m]."""
+    """Return the pad points (steps, k, 3) in {G} from the open hand to the limits [m]."""
     X_GF = fingertip_poses(hand, spread=0.0, closing=_closing_path(hand, STEPS))
     points = np.array([finger.p_FiP for finger in hand.fingers])
     return np.einsum("nkab,kb->nka", X_GF[..., :3, :3], points) + X_GF[..., :3, 3]
@@ -149,3 +151,9 @@ def _fronts(hand: Hand, opposition: Opposition) -> tuple[Array, Array]:
             p_GQ = transform_points(X, points)
             front[n, i] = p_GQ[np.argmax(sign * p_GQ @ opposition.axis)]
     return closing, front
+
+
+def across_angle(hand: Hand) -> float:
+    """Return the direction across the opposition, as an angle about Gz from Gx [rad]."""
+    axis = find_opposition(hand).axis
+    return float(np.arctan2(-axis[0], axis[1]))

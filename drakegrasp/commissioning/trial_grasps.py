@@ -16,16 +16,18 @@ import trimesh
 from drakegrasp.commissioning.finding import Finding
 from drakegrasp.commissioning.pinch import Pinch, find_opposition, find_pinch, reach
 from drakegrasp.config import Config, ObjectConfig
-from drakegrasp.frames import X_WT, Array, invert_pose, make_pose
+from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.description import Hand
+from drakegrasp.hand.file_format import Drive
 from drakegrasp.objects.model import ObjectModel, make_object
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 
 #: Widths of the objects that are tried [m].
-WIDTHS = (0.045, 0.06, 0.03, 0.02, 0.08)
+WIDTHS = (0.045, 0.06, 0.03)
 #: Mass of the objects, at most [kg]; a smaller payload of the hand counts.
 MASS = 0.3
 #: Space between hand and table, between palm and object, and around the pads on the object [m].
@@ -53,47 +55,49 @@ class TrialGrasp:
     width: float
 
 
-def try_grasps(hand: Hand, config: Config, shape: str) -> tuple[TrialRecord, TrialGrasp] | None:
-    """Return the first attempt that holds an object, or the last if none does.
-
-    Args:
-        hand: The hand.
-        config: The rules.
-        shape: "box" or "cylinder".
-
-    Returns:
-        The record and the attempt; None if the fingers do not close on any of the widths.
-    """
-    last = None
-    for grasp in trial_grasps(hand, shape):
-        scene = build_scene(grasp.model, config.physics, hand)
-        record = run_attempt(scene, grasp.X_TO, grasp.pregrasp, config)
-        last = record, grasp
-        if record.outcome is Outcome.SUCCESS:
-            break
-    return last
-
-
 def check_grasp(hand: Hand, config: Config, shape: str) -> Finding:
-    """Return whether the hand can grasp and lift a box or a cylinder."""
+    """Return whether the hand can grasp and lift a box or a cylinder, and how far that slips.
+
+    Fingers that can be pushed open may lose what nothing centres between them. Of such a hand the
+    finding says whether it holds with locked fingers, and what becomes of that grasp without.
+    """
     # Try until one holds.
+    drive = drive_of(hand, config.lift)
+    rules = _with_drive(config, "locked" if drive == "torque" else drive)
     outcomes: Counter[str] = Counter()
     for grasp in trial_grasps(hand, shape):
         scene = build_scene(grasp.model, config.physics, hand)
-        record = run_attempt(scene, grasp.X_TO, grasp.pregrasp, config)
+        record = run_attempt(scene, grasp.X_TO, grasp.pregrasp, rules)
         outcomes[record.outcome.label] += 1
-        if record.outcome is Outcome.SUCCESS:
-            return Finding(
-                name=f"grasp of a {shape}",
-                ok=True,
-                text=f"holds {1e3 * grasp.width:.0f} mm and {grasp.model.mass:g} kg "
-                f"{grasp.approach}; slips by {1e3 * record.slip:.2f} mm "
-                f"and {np.rad2deg(record.turn):.1f}° in the lift",
-            )
+        if record.outcome is not Outcome.SUCCESS:
+            continue
+        text = (
+            f"holds {1e3 * grasp.width:.0f} mm and {grasp.model.mass:g} kg {grasp.approach}; "
+            f"{_slip(record)} with fingers that are {_HOW[rules.lift.drive or drive]}"
+        )
+        if drive == "torque":
+            free = run_attempt(scene, grasp.X_TO, grasp.pregrasp, config)
+            text += f", {_slip(free)} with its own, which are pushed open"
+        return Finding(name=f"grasp of a {shape}", ok=True, text=text)
 
     tried = ", ".join(f"{count} {label}" for label, count in outcomes.items())
     text = f"a {shape} must be held, got {tried or 'no posture that holds one'}"
     return Finding(name=f"grasp of a {shape}", ok=False, text=text)
+
+
+#: What a drive does to the fingers.
+_HOW = {"worm": "held by worms", "locked": "locked", "torque": "pushed open"}
+
+
+def _with_drive(config: Config, drive: Drive) -> Config:
+    return config.model_copy(update={"lift": config.lift.model_copy(update={"drive": drive})})
+
+
+def _slip(record: TrialRecord) -> str:
+    """Return how far an object slipped in the lift, in words."""
+    if record.outcome is not Outcome.SUCCESS:
+        return f"is {record.outcome.label}"
+    return f"slips by {1e3 * record.slip:.2f} mm and {np.rad2deg(record.turn):.1f}°"
 
 
 def trial_grasps(hand: Hand, shape: str) -> Iterator[TrialGrasp]:

@@ -48,6 +48,7 @@ class Chain:
     about the axis by an angle, or slides along it.
     """
 
+    joints: tuple[str, ...]  # (m,), their names
     X_PJ: Array  # (m, 4, 4), each joint in the moving frame of the joint before; the first in G
     axis: Array  # (m, 3), unit, in the joint's frame J
     slides: npt.NDArray[np.bool_]  # (m,)
@@ -183,6 +184,7 @@ def make_chain(
     moving = [joint for joint in path if moving_joint(joint)]
     k = len(next(iter(drives.values())).gain)
     return Chain(
+        joints=tuple(joint.name() for joint in moving),
         X_PJ=np.reshape(X_PJ, (-1, 4, 4)),
         axis=np.reshape(axes, (-1, 3)),
         slides=np.array([joint_slides(joint) for joint in moving], dtype=np.bool_),

@@ -272,7 +272,10 @@ REFUSALS = {
         {"drive": "worm", "fingers": changed_finger(holding_torque=0.5)},
         r"fingers\.0: holding_torque must be at least the torque_limit of 1 N m, got 0\.5",
     ),
-    "missing file": ({"model": "gone.sdf"}, r"model: must be an SDFormat or URDF file, got '.*gone\.sdf'"),
+    "missing file": (
+        {"model": "gone.sdf"},
+        r"model: must be an SDFormat or URDF file, got '.*gone\.sdf'",
+    ),
     "not a model": ({"model": "pincer_hand.yaml"}, r"model: must be a file of one model"),
     "missing palm": (
         {"palm": {"link": "wrist", "p_BG": [0, 0, 0]}},
