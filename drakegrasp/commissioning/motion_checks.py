@@ -16,7 +16,7 @@ from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial import ConvexHull
 
 from drakegrasp.commissioning.finding import Finding, judge
-from drakegrasp.commissioning.pinch import find_opposition, find_pinch
+from drakegrasp.commissioning.pinch import Opposition, find_opposition, find_pinch, pad_fronts
 from drakegrasp.frames import Array, transform_points
 from drakegrasp.hand.chains import Chain
 from drakegrasp.hand.description import Hand
@@ -127,7 +127,10 @@ def check_pads(hand: Hand) -> Finding:
 
         # The pad must face the way that it moves.
         if facing[i] <= 0.0:
-            faults.append(f"the pad of finger {finger.name!r} must face where the finger closes")
+            faults.append(
+                f"the pad of finger {finger.name!r} must face where the finger closes, got its "
+                "back: check the pad_region, and the axis of the closing joint"
+            )
         areas.append(1e6 * float(trimesh.triangles.area(pad).sum()))
     return judge("pads", faults, f"{', '.join(f'{area:.0f}' for area in areas)} mm²")
 
@@ -145,21 +148,25 @@ def check_meeting(hand: Hand) -> Finding:
             "the axes of the closing joints",
         )
 
-    # The nearest that a pad of one group comes to one of the other.
-    gap = _least_gap(hand, opposition.group)
+    # Some pads touch, each comes as far as those opposite, and something fits between them.
     text = f"{' and '.join(first)} against {' and '.join(second)}"
-    holds = find_pinch(hand, WIDTH) is not None
-    if gap <= MEETING and holds:
+    gap, short = _least_gap(hand, opposition.group), _shortfall(hand, opposition)
+    if gap <= MEETING and (short <= MEETING).all() and find_pinch(hand, WIDTH) is not None:
         return Finding(name="fingertips", ok=True, text=f"{text} meet within {1e3 * gap:.1f} mm")
+    text = f"pads of {text} must meet when they close"
+    for finger, missing in zip(hand.fingers, short, strict=True):
+        if missing > MEETING:
+            text += f", got that of {finger.name} {1e3 * missing:.0f} mm short"
+    if (short <= MEETING).all():
+        text += f", got {1e3 * gap:.0f} mm between them, or no posture that pinches"
 
     # Perhaps a coupling has the wrong sign.
-    got = f"got {1e3 * gap:.0f} mm between them" if gap > MEETING else "got none that pinches"
-    text = f"pads of {text} must meet when they close, {got}"
     for i, finger in enumerate(hand.fingers):
         for n, coupling in enumerate(finger.coupled):
-            if _least_gap(_with_other_sign(hand, i, n), opposition.group) <= min(MEETING, gap):
+            other = _shortfall(_with_other_sign(hand, i, n), opposition)
+            if short[i] > MEETING and other[i] <= MEETING:
                 text += (
-                    f"; they do with the other sign of fingers.{i}.coupled.{n}.ratio "
+                    f"; it does with the other sign of fingers.{i}.coupled.{n}.ratio "
                     f"({coupling.joint} {coupling.ratio:+g})"
                 )
     return Finding(name="fingertips", ok=False, text=text)
@@ -295,6 +302,15 @@ def _least_gap(hand: Hand, group: npt.NDArray[np.bool_]) -> float:
                 between = clouds[a][i][:, None] - clouds[b][j][None]
                 least = min(least, float(np.linalg.norm(between, axis=2).min()))
     return least
+
+
+def _shortfall(hand: Hand, opposition: Opposition) -> Array:
+    """Return by how much each pad (k,) does not come to those opposite, along their line [m]."""
+    _, front = pad_fronts(hand, opposition)
+    sign = np.where(opposition.group, 1.0, -1.0)
+    reached = (front @ opposition.axis * sign).max(axis=0)
+    opposite = [-reached[opposition.group != own].max() for own in opposition.group]
+    return np.asarray(opposite - reached)
 
 
 def _with_other_sign(hand: Hand, finger: int, coupling: int) -> Hand:

@@ -77,7 +77,7 @@ def find_pinch(hand: Hand, width: float) -> Pinch | None:
     opposition = find_opposition(hand)
     if opposition.group.all() or not opposition.group.any():
         return None
-    closing, front = _fronts(hand, opposition)
+    closing, front = pad_fronts(hand, opposition)
 
     # All pairs of a posture of the first group and one of the second.
     first, second = front[:, opposition.group], front[:, ~opposition.group]
@@ -140,8 +140,11 @@ def _pad_point_paths(hand: Hand) -> Array:
     return np.einsum("nkab,kb->nka", X_GF[..., :3, :3], points) + X_GF[..., :3, 3]
 
 
-def _fronts(hand: Hand, opposition: Opposition) -> tuple[Array, Array]:
-    """Return closing positions (n, k), and the foremost point of each pad there (n, k, 3) [m]."""
+def pad_fronts(hand: Hand, opposition: Opposition) -> tuple[Array, Array]:
+    """Return closing positions (n, k), and the foremost point of each pad there (n, k, 3) [m].
+
+    The positions go from the open hand to the limits; foremost is along the opposition, in {G}.
+    """
     closing = _closing_path(hand, STEPS)
     X_GF = fingertip_poses(hand, spread=0.0, closing=closing)
     front = np.zeros((len(closing), hand.num_fingers, 3))

@@ -81,8 +81,14 @@ def _findings(name_or_yaml: str | Path, config: Config) -> Iterator[Finding]:
 
 
 def _geometry(hand: Hand) -> Iterator[Finding]:
+    # Seen from behind, fingers run the other way round.
+    palm = motion_checks.check_palm(hand)
+    yield palm
+    if not palm.ok:
+        return
     yield motion_checks.check_order(hand)
-    yield motion_checks.check_palm(hand)
-    yield motion_checks.check_pads(hand)
-    yield motion_checks.check_meeting(hand)
+    pads = motion_checks.check_pads(hand)
+    yield pads
+    if pads.ok:
+        yield motion_checks.check_meeting(hand)
     yield motion_checks.check_overlaps(hand)

@@ -1,4 +1,4 @@
-"""Hands of two fingers, which turn or slide: what works for them is not made for the Barrett Hand."""
+"""Hands of two fingers, which turn or slide: no code is made for the Barrett Hand alone."""
 
 from __future__ import annotations
 
