@@ -65,6 +65,12 @@ class BuildEvents:
             self._pool.on_change = self.workers_changed
             self._pool.on_none = self.no_worker
 
+    def notice(self, text: str) -> None:
+        """Log what the user should know before the simulation begins, and tell it at once."""
+        self._log("notice", text=text)
+        if self._show:
+            sys.stderr.write(f"{text}\n")
+
     def workers_changed(self, joined: set[str], left: set[str]) -> None:
         """Log the addresses of workers that joined and of those that left."""
         assert self._pool is not None

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from drakegrasp.build.counts import NAMED, Counts
 from drakegrasp.build.events import BuildEvents
+from drakegrasp.build.payload import too_heavy
 from drakegrasp.build.prepare import PrepareTask, prepare_one
 from drakegrasp.build.work_unit import WorkUnit, find_outcomes, run_unit
 from drakegrasp.config import Config
@@ -182,6 +183,8 @@ def _build(
         reasons = "; ".join(f"{entry.name}: {entry.reason}" for entry in manifest.refused)
         raise DataError(f"no mesh can be simulated: {reasons}")
     write_manifest(manifest, out)
+    if heavy := too_heavy(manifest):
+        job.events.notice(heavy)
 
     # Simulate the work units that are not done; killed workers leave temporary files.
     with progress_bar("simulate", "attempts", show=job.show) as report:
