@@ -127,7 +127,9 @@ class MujocoBaseline:
         # Close on the clamped object and judge the contacts.
         self._close()
         closed = self._contacts()
-        verdict = judge_closed(closed.touching, closed.other_links, closed.hand_on_table)
+        verdict = judge_closed(
+            closed.touching, closed.other_links, closed.hand_on_table, required=self._hand.required
+        )
         if verdict != Outcome.SUCCESS:
             return PeerTrial(outcome=Outcome(int(verdict)))
 
@@ -135,7 +137,12 @@ class MujocoBaseline:
         X_GO = self._object_in_hand()
         self._lift(X_WG)
         lifted = self._contacts()
-        verdict = judge_lifted(lifted.touching, lifted.other_links, lifted.object_on_table)
+        verdict = judge_lifted(
+            lifted.touching,
+            lifted.other_links,
+            lifted.object_on_table,
+            required=self._hand.required,
+        )
         motion = invert_pose(X_GO) @ self._object_in_hand()
         return PeerTrial(
             outcome=Outcome(int(verdict)),

@@ -25,6 +25,7 @@ from drakegrasp.dataset.manifest import (
     ObjectEntry,
     RefusedMesh,
     claim_directory,
+    finger_names,
     installed_versions,
     release_directory,
     write_manifest,
@@ -168,7 +169,7 @@ def _build(
     out, start = job.out, time.monotonic()
 
     # The manifest comes first: without one a directory holds no dataset.
-    new = Manifest(config=config, versions=installed_versions(config))
+    new = Manifest(config=config, versions=installed_versions(config), fingers=finger_names(config))
     manifest = replace(known or new, config=config)
     write_manifest(manifest, out)
     notices += job.events.kernel_notice()

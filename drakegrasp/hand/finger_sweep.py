@@ -50,6 +50,7 @@ class FingerPath:
         pad: Number of points of the pad.
         tip: Number of points of the fingertip, the pad included.
         travel: (n,), largest distance that each moves from one angle to the next [m].
+        required: Whether a grasp needs this fingertip on the object.
     """
 
     angles: Array
@@ -57,6 +58,7 @@ class FingerPath:
     pad: int
     tip: int
     travel: Points
+    required: bool = True
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -139,6 +141,7 @@ def _finger_path(
         pad=int(np.count_nonzero(moving[: int(on_pad.sum())])),
         tip=int(np.count_nonzero(moving[: tip.shape[1]])),
         travel=travel[moving],
+        required=hand.fingers[i].required,
     )
 
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from pydrake.multibody.tree import RigidBody
 
 from drakegrasp.arithmetic import multiply, norm
 from drakegrasp.config import Config
@@ -174,7 +175,7 @@ class _Monitor:
 
     def __init__(self, scene: Scene) -> None:
         assert scene.handles is not None
-        self._tips = {body.index() for body in scene.handles.fingertips}
+        self._tips = {body.index() for body in _required_tips(scene)}
         self._X_GO, self._angles = _object_in_hand(scene), closing_angles(scene)
         self._unit = scene.handles.hand.closing_unit
         # Whether all fingertips touched the object at a check since which nothing moved: then
@@ -215,16 +216,26 @@ class _Monitor:
 
 
 def _has_lost_tip(scene: Scene) -> bool:
-    """Return whether the pad of some fingertip has lost the object for good."""
+    """Return whether the pad of some required fingertip has lost the object for good."""
     assert scene.handles is not None
     field, X_OW = scene.model.field, invert_pose(scene.pose(scene.object))
     pads = pad_points(scene.handles.hand)
-    for tip, p_FiQ in zip(scene.handles.fingertips, pads, strict=True):
+    tips = zip(scene.handles.fingertips, scene.handles.hand.required, pads, strict=True)
+    for tip, required, p_FiQ in tips:
+        if not required:
+            continue
         p_OQ = transform_points(multiply(X_OW, scene.pose(tip)), p_FiQ)
         distance = field.interpolate(*p_OQ.astype(np.float32).T)
         if distance.min() > LOST + extra_margin(field):
             return True
     return False
+
+
+def _required_tips(scene: Scene) -> list[RigidBody]:
+    """Return the fingertips that a grasp needs on the object."""
+    assert scene.handles is not None
+    pairs = zip(scene.handles.fingertips, scene.handles.hand.required, strict=True)
+    return [tip for tip, required in pairs if required]
 
 
 def _object_in_hand(scene: Scene) -> Array:

@@ -200,11 +200,12 @@ def _closing_angles(
     lookup: _PointLookup, paths: HandPaths, rows: Counts, config: ScreenConfig
 ) -> dict[int, tuple[Array, Array]]:
     """Return `Prediction.closing` and `last` by attempt, where all fingertips may arrive."""
-    # One finger that does not arrive decides, so the next finger skips these attempts.
+    # One required finger that does not arrive decides, so the next finger skips these attempts.
     sweeps = []
     for path in paths.fingers:
         sweeps.append(_sweep_finger(lookup, path, rows, config))
-        rows = rows[sweeps[-1].arrives]
+        if path.required:
+            rows = rows[sweeps[-1].arrives]
 
     # Collect the fingers of each attempt that is left, as indices (n, k) into their paths.
     places = [np.searchsorted(sweep.rows, rows) for sweep in sweeps]

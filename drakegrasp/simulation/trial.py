@@ -100,8 +100,10 @@ def run_attempt(
         MemoryError: If the machine runs out of memory.
         OSError: If a file of the hand cannot be read.
     """
+    required: npt.ArrayLike = True
     if scene.handles is not None:
         drive_of(scene.handles.hand, config.lift)
+        required = scene.handles.hand.required
     X_TO = np.asarray(X_TO, dtype=float)
     start = TrialRecord(outcome=Outcome.RAY_MISS, X_TO=X_TO, X_OG=attempt.X_OG)
     X_WO = multiply(X_WT, X_TO)
@@ -138,7 +140,9 @@ def run_attempt(
         )
 
         # Judge the closed hand: it lifts only what it holds with all fingertips and nothing else.
-        verdict = judge_closed(closed.touching, closed.other_links, closed.hand_on_table)
+        verdict = judge_closed(
+            closed.touching, closed.other_links, closed.hand_on_table, required=required
+        )
         if verdict != Outcome.SUCCESS:
             return replace(record, outcome=Outcome(int(verdict)))
 
@@ -147,7 +151,9 @@ def run_attempt(
 
         # Judge the lifted object: all fingertips must still hold it, clear of the table.
         lifted = end.contacts
-        verdict = judge_lifted(lifted.touching, lifted.other_links, lifted.object_on_table)
+        verdict = judge_lifted(
+            lifted.touching, lifted.other_links, lifted.object_on_table, required=required
+        )
         return replace(
             record,
             outcome=Outcome(int(verdict)),
@@ -182,12 +188,13 @@ def _close(
 ) -> None:
     """Close the fingers on the static object until they stop, or one has missed it."""
     # Closing that geometry skipped counts as time, and an angle beyond its last contact as a miss.
-    end, last = config.close.max_time, np.inf
+    end, last = config.close.max_time, np.array(np.inf)
     if prediction is not None:
         assert scene.handles is not None
         hand = scene.handles.hand
         end -= float((prediction.closing / hand.closing_speed).min())
-        last = prediction.last + BEYOND * hand.closing_unit
+        # A fingertip that need not touch ends nothing by missing the object.
+        last = np.where(hand.required, prediction.last + BEYOND * hand.closing_unit, np.inf)
 
     # The last check may fall short of the end by rounding, never by a step.
     while end - scene.time > ROUNDING:

@@ -38,7 +38,7 @@ def test_objects_beyond_the_payload_are_named_in_one_line() -> None:
         "heavier than the payload of the hand allegro, 0.5 kg: 2 of 3 objects (0_thing, 2_thing); "
         "objects.mass makes them lighter"
     )
-    assert too_heavy(manifest("allegro", *[1.0] * 30)).count("thing") < 10
+    assert too_heavy(manifest("allegro", *[1.0] * 30)).count("thing") == 10
     assert too_heavy(manifest("allegro", 0.5)) == ""
     assert too_heavy(manifest("barrett", 1.0)) == ""
 
