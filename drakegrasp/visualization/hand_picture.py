@@ -37,14 +37,12 @@ from drakegrasp.hand.kinematics import coordinate_limits, joint_positions, link_
 from drakegrasp.hand.parsing import add_model
 from drakegrasp.hand.shapes import pad_surfaces
 from drakegrasp.mesh.wavefront import obj_text
-from drakegrasp.vision.rendering import BLANK, ENGINE
+from drakegrasp.vision.rendering import BLANK, ENGINE, LIGHTS
 from drakegrasp.visualization.style import FINGER_COLOURS, INK, add_axes, hide_ticks, save_figure
 from drakegrasp.visualization.third_person import (
     BACKGROUND,
     FOV_Y_DEG,
-    LIGHTS,
     OVERSAMPLING,
-    SHADOW_MAP,
     camera_pose,
 )
 
@@ -55,6 +53,8 @@ PAD_LIFT = 4e-4
 #: Length and radius of the axes of the palm frame [m], and their colours.
 AXIS, AXIS_RADIUS = 0.05, 0.0012
 AXIS_COLOURS = {"Gx": "#CC3333", "Gy": "#339933", "Gz": "#3355CC"}
+#: Colour of links without one: Drake's own is that of a pad.
+GREY = np.array([0.70, 0.71, 0.73, 1.0])
 #: Edge of a panel [px] and its size in the figure [inch].
 PIXELS, INCHES = 480, 2.4
 #: Where the camera stands: beside the line along which fingers close, and above [rad].
@@ -117,10 +117,7 @@ def _build(hand: Hand) -> _Scene:
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.0), builder)
     parameters = RenderEngineVtkParams(
-        default_clear_color=BACKGROUND,
-        lights=list(LIGHTS),
-        cast_shadows=True,
-        shadow_map_size=SHADOW_MAP,
+        default_clear_color=BACKGROUND, default_diffuse=GREY, lights=list(LIGHTS)
     )
     scene_graph.AddRenderer(ENGINE, MakeRenderEngineVtk(parameters))
     instance = add_model(plant, hand.model)
@@ -156,12 +153,10 @@ def _build(hand: Hand) -> _Scene:
 
 def _lifted(pad: Array) -> tuple[Array, Array]:
     """Return vertices and faces of a pad's triangles (t, 3, 3), in front of it and facing out."""
-    # The triangles of a hull have no order; its middle is behind all of them.
+    # The triangles of a hull have no order: draw each on both sides, one is hidden.
     normals = np.cross(pad[:, 1] - pad[:, 0], pad[:, 2] - pad[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    inward = np.einsum("ij,ij->i", normals, pad.mean(axis=1) - pad.mean(axis=(0, 1))) < 0.0
     both = np.concatenate([pad + PAD_LIFT * normals[:, None], pad - PAD_LIFT * normals[:, None]])
-    del inward
     faces = np.arange(3 * len(both)).reshape(-1, 3)
     return both.reshape(-1, 3), np.concatenate([faces[: len(pad)], faces[len(pad) :, ::-1]])
 
