@@ -156,6 +156,8 @@ def command_lines(page: Path) -> Iterator[tuple[click.Command, list[str]]]:
 
 def options_of(command: click.Command) -> set[str]:
     options = {o for p in command.params for o in p.opts if isinstance(p, click.Option)}
+    if isinstance(command, click.Group):
+        options |= {o for below in command.commands.values() for o in options_of(below)}
     return options | {"--help", "-h"}
 
 
