@@ -20,6 +20,8 @@ from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses, link_
 STEPS = 60
 #: What it costs if one group has closed fully and the other not at all [rad].
 UNEVEN = 1.0
+#: Points this close behind the foremost one are as far in front [m].
+FLAT = 2e-4
 #: Largest difference between the width of a pinch and the one that is asked for [m].
 WIDTH_ERROR = 0.004
 
@@ -152,7 +154,9 @@ def pad_fronts(hand: Hand, opposition: Opposition) -> tuple[Array, Array]:
         sign = 1.0 if opposition.group[i] else -1.0
         for n, X in enumerate(X_GF[:, i]):
             p_GQ = transform_points(X, points)
-            front[n, i] = p_GQ[np.argmax(sign * p_GQ @ opposition.axis)]
+            along = sign * p_GQ @ opposition.axis
+            # A flat pad has many foremost points: their middle counts.
+            front[n, i] = p_GQ[along >= along.max() - FLAT].mean(axis=0)
     return closing, front
 
 

@@ -69,7 +69,9 @@ def engage(scene: Scene, drive: Drive) -> None:
     for joint, angle, (_, upper) in zip(
         handles.closing_joints, closing_angles(scene), handles.closing_limits, strict=True
     ):
-        _set_limits(joint, angle, angle if drive == "locked" else upper)
+        # A joint that closed up to its limit may be a little beyond.
+        least = angle if drive == "locked" else min(angle, upper)
+        _set_limits(joint, least, angle if drive == "locked" else upper)
     if drive == "worm":
         _start_worms(scene)
 
