@@ -207,6 +207,33 @@ def test_lift_leaves_the_hand_as_it_was(
     assert limits() == before
 
 
+@pytest.mark.sim
+def test_lift_cut_off_in_coarse_steps_leaves_their_scene_as_it_was(
+    scene: Scene, cube: ObjectModel, config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    coarse = scene.coarse_scene()
+    hand = coarse.handles.hand
+    updates = []
+
+    def rest_then_fail(monitor: lifting._Monitor, current: Scene, *_: object) -> bool:
+        updates.append(current)
+        if current is coarse:
+            raise TrialTimeout
+        monitor.at_rest = True
+        return False
+
+    monkeypatch.setattr(lifting._Monitor, "update", rest_then_fail)
+    _closed_on(scene, cube)
+    with pytest.raises(TrialTimeout):
+        lifting.lift(scene, start_limits(config), config)
+    assert updates == [scene, coarse]
+    lower = [float(joint.position_lower_limits()[0]) for joint in coarse.handles.closing_joints]
+    assert lower == [limits[0] for limits in coarse.handles.closing_limits]
+    efforts = [motor.effort_limit() for motor in coarse.handles.motors]
+    assert efforts == [finger.torque_limit for finger in hand.fingers]
+    assert coarse.simulator.get_monitor() is None
+
+
 #: Pulls the cube towards fingers 1 and 2 [N]; their motors hold what finger 3 pushes with.
 FORCE = 40.0
 
