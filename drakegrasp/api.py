@@ -26,6 +26,7 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import ConfigError, GraspError
 from drakegrasp.frames import as_numbers
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.builtin.catalog import builtin_sources
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.runtime.environment import available_cores
@@ -141,6 +142,7 @@ def build_on(
             simulated.
         MachineError: If a worker would give other results than this machine.
     """
+    config = with_hand_defaults(config)
     with (
         build_lock(out) as dead,
         cluster as client,

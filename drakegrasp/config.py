@@ -132,10 +132,24 @@ class CandidateConfig(_Section):
     local_y_deg: Angles = tuple(range(0, 360, 20))
     local_z_deg: Angles = tuple(range(0, 360, 45))
     jitter_deg: NonNegative = 0.0  # each angle gets a whole number of degrees below this
-    standoffs: Annotated[tuple[Positive, ...], Field(min_length=1)] = (0.06, 0.09, 0.12)  # [m]
-    spreads_deg: Annotated[
-        tuple[Annotated[float, Field(ge=0.0, le=180.0)], ...], Field(min_length=1)
-    ] = (0.0, 11.25, 22.5)  # one is drawn per attempt (released code)
+    # [m] of the palm from the surface, an attempt each; None: the hand's own (paper)
+    standoffs: Annotated[tuple[Positive, ...], Field(min_length=1)] | None = None
+    # One is drawn per attempt; None: the hand's own (released code).
+    spreads_deg: (
+        Annotated[tuple[Annotated[float, Field(ge=0.0, le=180.0)], ...], Field(min_length=1)] | None
+    ) = None
+
+    @property
+    def drawn_standoffs(self) -> tuple[float, ...]:
+        """The stand-offs, which `hand.file_format.with_hand_defaults` has filled in."""
+        assert self.standoffs is not None
+        return self.standoffs
+
+    @property
+    def drawn_spreads_deg(self) -> tuple[float, ...]:
+        """The spreads, which `hand.file_format.with_hand_defaults` has filled in."""
+        assert self.spreads_deg is not None
+        return self.spreads_deg
 
 
 class ScreenConfig(_Section):
@@ -158,7 +172,7 @@ class CloseConfig(_Section):
     """Closing the fingers on the static object."""
 
     max_time: Positive = 2.5  # [s], a little more than 140 degrees at 60 degrees per second
-    stop_speed: Positive = 0.01  # [rad/s], slower fingers have stopped
+    stop_speed: Positive = 0.01  # [rad/s, or 0.1 m/s], slower fingers have stopped
     check_period: Positive = 0.1  # [s] of simulation between two checks
 
 
@@ -276,7 +290,7 @@ class VerifyConfig(_Section):
     max_residual: Positive = 0.008  # [m], of a fingertip from its point before closing
     max_normal_error_deg: Positive = 45.0  # between a pad's normal and the predicted one
     max_contact_error: Positive = 0.01  # [m], of a contact after closing from its point
-    open_margin_deg: Positive = 20.0  # by which fingers are opened before they close
+    open_margin_deg: Positive = 20.0  # by which fingers are opened first; 1 rad as 0.1 m of a slide
     max_tries: Annotated[int, Field(ge=1, le=5)] = 5  # wrist poses simulated before it fails
     max_position_error: Positive = 0.01  # [m], of an object lifted by forces alone
     max_angle_error_deg: Positive = 5.0  # of an object lifted by forces alone

@@ -29,6 +29,7 @@ ORDER = (
     "simulation",
     "dataset",
     "visualization",
+    "commissioning",
     "build",
     "cluster",
     "verification",
@@ -49,7 +50,10 @@ WALLS = {
     "distributed": ("cluster",),
     "click": ("cli",),
     "matplotlib": ("visualization", "verification.figure"),
-    "pydrake": ("hand", "vision", "simulation", "visualization", "verification", "bench"),
+    "pydrake": (
+        *("hand", "vision", "simulation", "visualization", "commissioning", "verification"),
+        "bench",
+    ),
     "pyarrow": ("exchange",),
 }
 #: Modules that name a type of a library for the type checker alone: what callers give or get.

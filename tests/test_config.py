@@ -15,6 +15,7 @@ from pydantic import BaseModel, ValidationError
 
 from drakegrasp.config import Config, load_config, override_config, parse_config, preset_names
 from drakegrasp.errors import ConfigError, DrakegraspError
+from drakegrasp.hand.file_format import with_hand_defaults
 
 DEFAULTS = "Defaults: {}"
 
@@ -252,7 +253,8 @@ def test_presets_are_listed() -> None:
 
 def test_paper_is_the_default_and_states_the_papers_numbers() -> None:
     assert load_config() == load_config("paper") == Config()
-    assert {key: DEFAULT_VALUES[key] for key in PAPER} == PAPER
+    values = dict(leaves(with_hand_defaults(load_config()).to_dict()))
+    assert {key: values[key] for key in PAPER} == PAPER
 
 
 def test_released_differs_from_the_paper_in_exactly_the_published_numbers() -> None:

@@ -113,6 +113,8 @@ class MujocoBaseline:
         self._weights = {name: getattr(m, name)[at].copy() for name, at in self._weighed()}
         closing = [finger.closing_joint for finger in hand.fingers]
         self._closing_v = [m.joint(name).dofadr[0] for name in closing]
+        coupled = [coupling for finger in hand.fingers for coupling in finger.coupled]
+        self._followers = {m.joint(c.joint).qposadr[0]: c.offset for c in coupled}
 
     def _weighed(self) -> Iterator[tuple[str, int | slice]]:
         """Yield MuJoCo's arrays that are in proportion to the object's mass, and its place there.
@@ -152,7 +154,9 @@ class MujocoBaseline:
         # Close on the clamped object and judge the contacts.
         self._close()
         closed = self._contacts()
-        verdict = judge_closed(closed.touching, closed.other_links, closed.hand_on_table)
+        verdict = judge_closed(
+            closed.touching, closed.other_links, closed.hand_on_table, required=self._hand.required
+        )
         if verdict != Outcome.SUCCESS:
             return PeerTrial(outcome=Outcome(int(verdict)))
 
@@ -160,7 +164,12 @@ class MujocoBaseline:
         X_GO = self._object_in_hand()
         self._lift(X_WG)
         lifted = self._contacts()
-        verdict = judge_lifted(lifted.touching, lifted.other_links, lifted.object_on_table)
+        verdict = judge_lifted(
+            lifted.touching,
+            lifted.other_links,
+            lifted.object_on_table,
+            required=self._hand.required,
+        )
         motion = invert_pose(X_GO) @ self._object_in_hand()
         return PeerTrial(
             outcome=Outcome(int(verdict)),
@@ -182,6 +191,8 @@ class MujocoBaseline:
         for spread_joint in self._spreads:
             m.body_quat[m.body(spread_joint.body).id] = spread_joint.orientation(spread)
 
+        for joint, position in self._followers.items():
+            d.qpos[joint] = position
         d.qpos[self._wrist_q] = X_WB[:3, 3]
         d.qpos[self._object_q] = [*self._X_WO[:3, 3], *quaternion(self._X_WO[:3, :3])]
         mujoco.mj_forward(m, d)
@@ -203,7 +214,7 @@ class MujocoBaseline:
             d.qpos[self._object_q], d.qvel[self._object_v] = resting, 0.0
             step += 1
             if step % CLOSING_STRIDE == 0 and d.time > STARTING:
-                speed = np.abs(d.qvel[self._closing_v]).max()
+                speed = np.abs(d.qvel[self._closing_v] / self._hand.closing_unit).max()
                 if speed < self._config.close.stop_speed:
                     return
 

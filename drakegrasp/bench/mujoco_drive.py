@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 
 from drakegrasp.frames import Array
-from drakegrasp.hand.description import Drive, Hand
+from drakegrasp.hand.description import Hand
+from drakegrasp.hand.file_format import Drive
 
 
 class FingerDrive:
@@ -34,8 +35,8 @@ class FingerDrive:
             for coupling in finger.coupled:
                 self._gain[i, model.joint(coupling.joint).dofadr[0]] = coupling.ratio
         self._range = model.jnt_range[self._joints].copy()
-        self._torque = np.array([finger.torque_limit for finger in hand.fingers])
-        self._holding = np.array([finger.holding_torque or np.inf for finger in hand.fingers])
+        self._torque = np.array([finger.effort_limit for finger in hand.fingers])
+        self._holding = np.array([finger.holding_effort or np.inf for finger in hand.fingers])
         self._yields = np.zeros(len(self._joints), dtype=np.bool_)
 
     def disengage(self) -> None:
@@ -73,7 +74,7 @@ class FingerDrive:
         self._set_torques()
 
     def loads(self, data: mujoco.MjData) -> Array:
-        """Return the torque (k,) [N m] by which contacts pushed each finger open in the last step.
+        """Return by how much contacts pushed each finger open in the last step, (k,) [N m or N].
 
         Torques that a caller applies to joints count as contacts. Reactions of motors and limits do
         not: where a finger runs into its limit they are larger for a step.

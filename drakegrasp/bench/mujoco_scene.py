@@ -9,10 +9,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import coacd
 import mujoco
 import numpy as np
+from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.geometry import (
     Box,
     Capsule,
@@ -22,14 +24,15 @@ from pydrake.geometry import (
     SceneGraphInspector,
     Sphere,
 )
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import RevoluteJoint, RigidBody
+from pydrake.multibody.tree import RigidBody
 
 from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, Array
-from drakegrasp.hand.description import Hand
-from drakegrasp.hand.parsing import make_parser
+from drakegrasp.hand.chains import joint_axis, joint_slides, moving_joint
+from drakegrasp.hand.description import SLIDE, Hand
+from drakegrasp.hand.parsing import add_model
 from drakegrasp.hand.shapes import hull_corners
 from drakegrasp.objects.model import ObjectModel
 
@@ -46,7 +49,8 @@ RIGID = (0.999, 0.9999, 0.001, 0.5, 2.0)
 #: Friction is this much stiffer than the normal direction, and is solved again until it is exact
 #: (`noslip`): MuJoCo's regularized friction lets what is held creep.
 FRICTION_STIFFNESS, NOSLIP_ITERATIONS = 10.0, 20
-#: Gain of the fingers' speed [N m s/rad].
+#: Gain of the fingers' speed [N m s/rad]; for those that slide it follows from
+#: `description.SLIDE`.
 FINGER_DAMPING = 5.0
 #: Mass [kg] and inertia [kg m^2] of the bodies that carry the wrist, and a small inertia of the
 #: rotors [kg m^2] that keeps joints stable.
@@ -175,10 +179,10 @@ def _add_object(
 
 def _add_hand(spec: mujoco.MjSpec, hand: Hand, config: Config) -> list[SpreadJoint]:
     """Add the hand on its wrist; return its spread joints."""
-    # Drake reads the SDFormat file.
+    # Drake reads the model.
     plant, scene_graph = MultibodyPlant(0.0), SceneGraph()
     plant.RegisterAsSourceForSceneGraph(scene_graph)
-    (instance,) = make_parser(plant).AddModels(hand.sdf_path)
+    instance = add_model(plant, hand.model)
     inspector = scene_graph.model_inspector()
     add = partial(_add_link, spec, plant, inspector, config.physics.friction_hand)
 
@@ -188,36 +192,47 @@ def _add_hand(spec: mujoco.MjSpec, hand: Hand, config: Config) -> list[SpreadJoi
     bodies[hand.palm_link] = add(
         bodies["wrist_z"], plant.GetBodyByName(hand.palm_link, instance), RigidTransform()
     )
-    spreads = []
+    spreads, kinds = [], mujoco.mjtJoint
     for index in plant.GetJointIndices(instance):
         joint = plant.get_joint(index)
         parent, child = joint.parent_body().name(), joint.child_body()
         X_PF = joint.frame_on_parent().GetFixedPoseInBodyFrame()
         X_CM = joint.frame_on_child().GetFixedPoseInBodyFrame()
-        X_PC = X_PF @ X_CM.inverse()
+        # A joint of the preshape is none in MuJoCo: its body stands where the joint would put it.
+        X_PC = X_PF @ _fixed_motion(joint, hand) @ X_CM.inverse()
         body = bodies[child.name()] = add(bodies[parent], child, X_PC)
-        if not isinstance(joint, RevoluteJoint):
+        if not moving_joint(joint) or joint.name() in hand.preshape:
             continue
 
-        axis = X_CM.rotation().matrix() @ joint.revolute_axis()
+        axis = X_CM.rotation().matrix() @ joint_axis(joint)
         if joint.name() in hand.spread.joints:
             zero = quaternion(X_PC.rotation().matrix())
             spreads.append(SpreadJoint(body=child.name(), axis=axis, quaternion=zero))
             continue
         body.add_joint(
             name=joint.name(),
-            type=mujoco.mjtJoint.mjJNT_HINGE,
+            type=kinds.mjJNT_SLIDE if joint_slides(joint) else kinds.mjJNT_HINGE,
             axis=axis,
             pos=X_CM.translation(),
             limited=True,
             range=[joint.position_lower_limit(), joint.position_upper_limit()],
             damping=joint.default_damping(),
-            armature=ARMATURE,
+            armature=ARMATURE / (SLIDE**2 if joint_slides(joint) else 1.0),
             solref_limit=STIFF,
             solimp_limit=RIGID,
         )
     _add_drives(spec, hand)
     return spreads
+
+
+def _fixed_motion(joint: Any, hand: Hand) -> RigidTransform:
+    """Return the motion of a joint that is fixed, or keeps its position in the hand's preshape."""
+    if not moving_joint(joint):
+        return joint.X_FM()
+    position, axis = hand.preshape.get(joint.name(), 0.0), joint_axis(joint)
+    if joint_slides(joint):
+        return RigidTransform(position * axis)
+    return RigidTransform(RotationMatrix(AngleAxis(position, axis)), np.zeros(3))
 
 
 def _add_wrist(spec: mujoco.MjSpec) -> dict[str, mujoco.MjsBody]:
@@ -239,9 +254,9 @@ def _add_wrist(spec: mujoco.MjSpec) -> dict[str, mujoco.MjsBody]:
 
 def _add_drives(spec: mujoco.MjSpec, hand: Hand) -> None:
     """Give each finger its motor, with a limited torque, and its coupled joints."""
-    for finger in hand.fingers:
+    for finger, unit in zip(hand.fingers, hand.closing_unit.tolist(), strict=True):
         spec.joint(finger.closing_joint).armature = finger.rotor_inertia * finger.gear_ratio**2
-        limit = finger.torque_limit
+        limit = finger.effort_limit
         motor = spec.add_actuator(
             name=finger.name,
             trntype=mujoco.mjtTrn.mjTRN_JOINT,
@@ -249,7 +264,7 @@ def _add_drives(spec: mujoco.MjSpec, hand: Hand) -> None:
             forcelimited=True,
             forcerange=[-limit, limit],
         )
-        motor.set_to_velocity(kv=FINGER_DAMPING)
+        motor.set_to_velocity(kv=FINGER_DAMPING / unit**2)
 
         for coupling in finger.coupled:
             spec.add_equality(
@@ -257,7 +272,7 @@ def _add_drives(spec: mujoco.MjSpec, hand: Hand) -> None:
                 objtype=mujoco.mjtObj.mjOBJ_JOINT,
                 name1=coupling.joint,
                 name2=finger.closing_joint,
-                data=np.eye(1, mujoco.mjNEQDATA, 1)[0] * coupling.ratio,
+                data=[coupling.offset, coupling.ratio, *np.zeros(mujoco.mjNEQDATA - 2)],
                 solref=STIFF,
                 solimp=RIGID,
             )

@@ -46,7 +46,7 @@ class Counts:
 
         # Progress: all attempts, by outcome, and those that were there before.
         self._pool, self._report = pool, report
-        standoffs = len(manifest.config.candidates.standoffs)
+        standoffs = len(manifest.config.candidates.drawn_standoffs)
         self._total = standoffs * sum(entry.candidates for entry in manifest.objects)
         self._outcomes: Counter[Outcome] = Counter()
         self._reused_attempts = 0

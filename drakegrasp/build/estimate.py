@@ -13,6 +13,7 @@ from drakegrasp.build.request import BUILTIN, BuildRequest
 from drakegrasp.build.stage_times import MEASURED, StageTimes
 from drakegrasp.config import Config
 from drakegrasp.errors import ConfigError
+from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.builtin.classes import CLASSES
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.environment import available_cores
@@ -74,6 +75,7 @@ def plan_build(objects: int, config: Config, workers: int, times: StageTimes) ->
 
     Raises:
         ConfigError: If there is no object or no worker.
+        HandError: If the hand's file cannot be read.
     """
     for name, count in (("objects", objects), ("workers", workers)):
         if count < 1:
@@ -82,7 +84,8 @@ def plan_build(objects: int, config: Config, workers: int, times: StageTimes) ->
     # How much there is to do.
     per_object = math.ceil(config.candidates.max / config.unit_candidates)
     units = objects * per_object
-    attempts = objects * config.candidates.max * len(config.candidates.standoffs)
+    standoffs = len(with_hand_defaults(config).candidates.drawn_standoffs)
+    attempts = objects * config.candidates.max * standoffs
     successes = attempts * times.successes
     samples = successes * times.samples
 

@@ -67,7 +67,7 @@ class BuildEvents:
             self._pool.on_none = self.no_worker
 
     def warn(self, text: str) -> None:
-        """Log what the user should know before the work begins, and say it."""
+        """Log what the user should know before the simulation begins, and say it."""
         self._log("notice", text=text)
         if self._show:
             sys.stderr.write(f"{text}\n")

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from drakegrasp.build.counts import NAMED, Counts
 from drakegrasp.build.events import BuildEvents
+from drakegrasp.build.payload import too_heavy
 from drakegrasp.build.prepare import PrepareTask, prepare_one
 from drakegrasp.build.work_unit import WorkUnit, find_outcomes, run_unit
 from drakegrasp.config import Config, SplitConfig
@@ -26,6 +27,7 @@ from drakegrasp.dataset.manifest import (
     ObjectEntry,
     RefusedMesh,
     claim_directory,
+    finger_names,
     installed_versions,
     release_directory,
     write_manifest,
@@ -34,6 +36,7 @@ from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.errors import DataError, DrakegraspError
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.sources import MeshSource, source_sha256
 from drakegrasp.runtime.executor import Executor, WorkerPool
 from drakegrasp.runtime.files import disk_full_named, sweep_temporary
@@ -107,6 +110,7 @@ def build(
         DiskFullError: If there is no room; the same call goes on when there is.
         MachineError: If the workers cannot do the work.
     """
+    config = with_hand_defaults(config)
     drive_of(load_hand(config.hand), config.lift)
     with build_lock(out) as dead:
         return build_locked(sources, out, config, execute, dead=dead, pool=pool, show=show)
@@ -127,7 +131,7 @@ def build_locked(
     Args:
         sources: The meshes.
         out: Directory; new, empty, or of this configuration.
-        config: All the rules.
+        config: All the rules, with the stand-offs and spreads of the hand filled in.
         execute: Does the work.
         dead: Who held the lock before and died, as `build_lock` yields it.
         pool: The executor's processes, as for `build`.
@@ -167,7 +171,7 @@ def _build(
     out, start = job.out, time.monotonic()
 
     # The manifest comes first: without one a directory holds no dataset.
-    new = Manifest(config=config, versions=installed_versions(config))
+    new = Manifest(config=config, versions=installed_versions(config), fingers=finger_names(config))
     manifest = replace(known or new, config=config)
     write_manifest(manifest, out)
     notices += job.events.kernel_notice()
@@ -184,6 +188,8 @@ def _build(
         reasons = "; ".join(f"{entry.name}: {entry.reason}" for entry in manifest.refused)
         raise DataError(f"no mesh can be simulated: {reasons}")
     write_manifest(manifest, out)
+    if heavy := too_heavy(manifest):
+        job.events.warn(heavy)
 
     # Simulate the work units that are not done; killed workers leave temporary files.
     with progress_bar("simulate", "attempts", show=job.show) as report:

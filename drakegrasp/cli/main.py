@@ -18,6 +18,7 @@ from drakegrasp.cli.bench import bench
 from drakegrasp.cli.build import assemble, build, stats
 from drakegrasp.cli.export import export
 from drakegrasp.cli.group import main
+from drakegrasp.cli.hand import hand
 from drakegrasp.cli.morph import morph
 from drakegrasp.cli.options import (
     builtin_overrides,
@@ -145,13 +146,13 @@ objects.add_command(morph)
 
 # The help lists them in this order.
 for _command in (
-    *(doctor, objects, audit, build, assemble, check, stats, replay, verify, export, bench),
+    *(doctor, objects, audit, hand, build, assemble, check, stats, replay, verify, export, bench),
 ):
     main.add_command(_command)
 
 
 def run() -> None:
     """Run the program; commands that may simulate in this process have jemalloc for it."""
-    if sys.argv[1:2] in (["bench"], ["verify"]):
+    if sys.argv[1:2] in (["bench"], ["verify"], ["hand"]):
         restart_with_jemalloc()
     main()

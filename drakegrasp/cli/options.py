@@ -149,19 +149,22 @@ def parse_request(
     Raises:
         click.UsageError: If options of the built-in objects are given with other meshes.
         ConfigError: If a value of the configuration cannot be used.
+        HandError: If the hand's file cannot be read.
     """
     # Loading pydantic takes a while, and `--help` must answer at once.
     from drakegrasp.config import load_config
+    from drakegrasp.hand.file_format import with_hand_defaults
 
     chosen = [*overrides, *builtin_overrides(objects, per_class, objects_seed)]
     if candidates is not None:
         chosen.append(f"candidates.max={candidates}")
     if certify is not None:
         chosen.append(f"certify.repeats={certify}")
+    resolved = load_config(config, chosen, seed=seed, max_grasps=max_grasps)
     return BuildRequest(
         objects=objects,
         out=out.absolute(),
-        config=load_config(config, chosen, seed=seed, max_grasps=max_grasps),
+        config=with_hand_defaults(resolved),
         units=units,
         manifest=manifest,
         show=not quiet,

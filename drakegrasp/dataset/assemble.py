@@ -205,7 +205,7 @@ def _signature(manifest: Manifest) -> str:
 
 def _write_attributes(file: h5py.File, manifest: Manifest) -> None:
     camera = manifest.config.camera
-    write_origin(file, manifest.config, manifest.versions)
+    write_origin(file, manifest.config, manifest.versions, manifest.fingers)
     file.attrs["signature"] = _signature(manifest)
     file.attrs["K"] = intrinsics(camera)
     file.attrs["near"], file.attrs["far"] = camera.near, camera.far

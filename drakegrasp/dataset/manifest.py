@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,8 @@ from drakegrasp.dataset.paths import FILE_NAME, OWN_FILES, OWN_FOLDERS
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, refuse_other_schema
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.errors import ConfigError, DataError
-from drakegrasp.hand.files import hand_digest
+from drakegrasp.hand.file_format import read_hand_file
+from drakegrasp.hand.files import hand_digest, hand_file
 from drakegrasp.runtime.files import probe_folder, write_atomic
 
 #: Packages whose versions may change a result.
@@ -128,12 +129,14 @@ class Manifest:
         objects: The objects, in the order of the dataset's rows.
         refused: The meshes that were refused.
         versions: Versions of the packages that made the dataset, and a hash of the hand's files.
+        fingers: Name of each finger in grasp order, and whether a grasp needs its fingertip.
     """
 
     config: Config
     objects: tuple[ObjectEntry, ...] = ()
     refused: tuple[RefusedMesh, ...] = ()
     versions: dict[str, str]
+    fingers: dict[str, bool] = field(default_factory=dict)
 
     def headers(self) -> Iterator[ShardHeader]:
         """Yield the work units of the dataset in the order of its rows."""
@@ -155,20 +158,29 @@ class Manifest:
         return sum(-(-entry.candidates // step) for entry in self.objects)
 
 
+def finger_names(config: Config) -> dict[str, bool]:
+    """Return the name of each finger in grasp order, and whether a grasp needs its fingertip."""
+    fingers = read_hand_file(hand_file(config.hand)).fingers
+    return {finger.name: finger.required for finger in fingers}
+
+
 def installed_versions(config: Config) -> dict[str, str]:
     """Return the versions of all that may change a result: packages, and the hand's files."""
     packages = {name: metadata.version(name) for name in VERSIONED}
     return {**packages, "hand": hand_digest(config.hand)}
 
 
-def write_origin(file: h5py.File, config: Config, versions: dict[str, str]) -> None:
-    """Write the attributes that every file has: conventions, configuration and versions."""
+def write_origin(
+    file: h5py.File, config: Config, versions: dict[str, str], fingers: Mapping[str, bool]
+) -> None:
+    """Write the attributes that every file has: conventions, configuration, versions, fingers."""
     file.attrs.update({f"convention_{key}": text for key, text in CONVENTIONS.items()})
     file.attrs["schema_version"] = SCHEMA_VERSION
     file.attrs["config"] = json.dumps(config.to_dict(), sort_keys=True)
     file.attrs["config_hash"] = config.simulation_hash()
     file.attrs["seed"] = config.seed
     file.attrs["versions"] = json.dumps(versions, sort_keys=True)
+    file.attrs["fingers"] = json.dumps(dict(fingers))
 
 
 def write_manifest(manifest: Manifest, out: Path) -> None:
@@ -179,6 +191,7 @@ def write_manifest(manifest: Manifest, out: Path) -> None:
         "seed": manifest.config.seed,
         "config": manifest.config.to_dict(),
         "versions": manifest.versions,
+        "fingers": manifest.fingers,
         "objects": [entry.to_json() for entry in manifest.objects],
         "refused": [entry.to_json() for entry in manifest.refused],
     }
@@ -203,6 +216,7 @@ def read_manifest(out: Path) -> Manifest:
             objects=tuple(ObjectEntry.from_json(entry) for entry in content["objects"]),
             refused=tuple(RefusedMesh.from_json(entry) for entry in content["refused"]),
             versions=content["versions"],
+            fingers=content.get("fingers", {}),
         )
 
     # A missing file is another mistake than a broken one.

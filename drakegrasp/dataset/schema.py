@@ -138,7 +138,7 @@ def _verdict(outcomes: list[Outcome]) -> Field:
 # A row per field on at most two lines is what makes this a table.
 # fmt: off
 
-_JOINTS = Field("q", "j", "float64", "rad", "-", "positions of the hand's joints")
+_JOINTS = Field("q", "j", "float64", "rad or m", "-", "positions of the hand's joints")
 
 #: What `simulation.contacts.Contacts` says of one instant, by its names.
 _CONTACTS: tuple[Field, ...] = (
@@ -234,9 +234,9 @@ DATA_FIELDS: tuple[Field, ...] = (
           "pose of the palm at the start and while closing, in this file's camera"),
     Field("grasp_props/X_CG_held", "12", "float32", "m, -", "C",
           "pose of the palm after the lift, relative to the resting object"),
-    Field("grasp_props/q", "j", "float32", "rad", "-",
+    Field("grasp_props/q", "j", "float32", "rad or m", "-",
           "positions of the hand's joints after closing"),
-    Field("grasp_props/q_held", "j", "float32", "rad", "-",
+    Field("grasp_props/q_held", "j", "float32", "rad or m", "-",
           "positions of the hand's joints after the lift"),
     Field("grasp_props/f_Q_C", "k 3", "float32", "N", "C",
           "forces of the fingertips on the object after closing"),
@@ -395,8 +395,8 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
           "contacts hold the object; inf if none does"),
     Field("X_OG", "12", "float64", "m, -", "O", "pose of the palm that was found"),
     _SPREAD,
-    Field("closing", "k", "float64", "rad", "-",
-          "closing angles at which the fingertips meet the predicted points"),
+    Field("closing", "k", "float64", "rad or m", "-",
+          "closing positions at which the fingertips meet the predicted points"),
     Field("residual", "k", "float64", "m", "-",
           "distance of the predicted points from the fingertips then"),
     Field("normal_error", "k", "float64", "rad", "-",
@@ -405,8 +405,8 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
           "exit mode of SLSQP, 0 for success; -1 where it was not asked"),
     Field("solver_iterations", "", "uint16", "-", "-", "iterations of SLSQP"),
     Field("tries", "", "uint16", "-", "-", "number of palm poses that were simulated"),
-    Field("closing_start", "k", "float64", "rad", "-",
-          "closing angles from which the simulated fingers close"),
+    Field("closing_start", "k", "float64", "rad or m", "-",
+          "closing positions from which the simulated fingers close"),
     *_since(
         Stage.CLOSED,
         _TIME_CLOSE,

@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import yaml
 
 from drakegrasp.errors import HandError
 
 #: Folder of the table and of the hands that come with the package, as `<name>_hand.yaml`.
 MODELS = Path(__file__).resolve().parent.parent / "models"
+#: The files that a model names: meshes in SDFormat, and in URDF.
+_URIS = re.compile(rb"<uri>\s*(.*?)\s*</uri>|<mesh\b[^>]*\bfilename\s*=\s*[\"'](.*?)[\"']")
+_PACKAGE = "package://"
 
 
 def hand_names() -> list[str]:
@@ -32,8 +40,34 @@ def hand_file(name_or_yaml: str | Path) -> Path:
     return path
 
 
+def find_packages(folder: Path, model: str, packages: Mapping[str, str]) -> dict[str, Path]:
+    """Return the folder of each package whose files a hand's model may name.
+
+    Those are the packages that the hand file names, and those in which the model lies: the folders
+    above it with a `package.xml`, by the name that this file gives.
+
+    Args:
+        folder: Of the hand file.
+        model: Path of the model, relative to it.
+        packages: Folders by name, relative to it.
+
+    Raises:
+        HandError: If a package is not a folder.
+    """
+    found: dict[str, Path] = {}
+    for above in (folder / model).resolve().parents:
+        manifest = above / "package.xml"
+        if manifest.is_file():
+            found.setdefault(_package_name(manifest), above)
+    for name, place in packages.items():
+        if not (folder / place).is_dir():
+            raise HandError(f"packages.{name}: must be a folder, got {place!r}")
+        found[name] = folder / place
+    return found
+
+
 def hand_digest(name_or_yaml: str | Path) -> str:
-    """Return a hash (16 hex digits) of a hand's YAML, its SDFormat model and the meshes in it.
+    """Return a hash (16 hex digits) of a hand's YAML, its model and the meshes in it.
 
     It distinguishes two hands of the same name. A missing file counts as empty; refusing it is
     left to `description.load_hand`.
@@ -41,13 +75,48 @@ def hand_digest(name_or_yaml: str | Path) -> str:
     Raises:
         HandError: If there is no such hand.
     """
+    # The hand file, and the model that it names.
     path = hand_file(name_or_yaml)
     digest = hashlib.sha256(path.read_bytes())
-    (model,) = re.findall(rb"^model:\s*([^\s#]+)", path.read_bytes(), flags=re.MULTILINE) or [b""]
-    sdf = path.parent / model.strip(b"\"'").decode()
-    text = sdf.read_bytes() if sdf.is_file() else b""
+    described = _described(path)
+    name = str(described.get("model", ""))
+    model = path.parent / name
+    text = model.read_bytes() if model.is_file() else b""
     digest.update(text)
-    for uri in sorted(set(re.findall(rb"<uri>\s*(.*?)\s*</uri>", text))):
-        mesh = sdf.parent / uri.decode()
+
+    # The files that the model names, in the order of their names.
+    packages = described.get("packages")
+    named = packages.items() if isinstance(packages, dict) else ()
+    folders = {str(k): path.parent / str(v) for k, v in named}
+    if _PACKAGE.encode() in text:
+        folders = find_packages(path.parent, name, {}) | folders
+    for uri in sorted({(one or other).decode() for one, other in _URIS.findall(text)}):
+        mesh = _mesh_file(uri, model.parent, folders)
         digest.update(mesh.read_bytes() if mesh.is_file() else b"")
     return digest.hexdigest()[:16]
+
+
+def _mesh_file(uri: str, folder: Path, packages: Mapping[str, Path]) -> Path:
+    """Return the file of a URI in a model, which may not exist."""
+    if not uri.startswith(_PACKAGE):
+        return folder / uri.removeprefix("file://")
+    package, _, rest = uri.removeprefix(_PACKAGE).partition("/")
+    return packages.get(package, folder / package) / rest
+
+
+def _described(path: Path) -> Mapping[str, Any]:
+    """Return the keys of a hand file; none if it is not one."""
+    try:
+        tree = yaml.safe_load(path.read_bytes())
+    except (yaml.YAMLError, UnicodeDecodeError):
+        return {}
+    return tree if isinstance(tree, dict) else {}
+
+
+def _package_name(manifest: Path) -> str:
+    """Return the name that a package.xml gives; its folder's name if it gives none."""
+    try:
+        name = ElementTree.parse(manifest).findtext("name")
+    except ElementTree.ParseError:
+        name = None
+    return (name or manifest.parent.name).strip()

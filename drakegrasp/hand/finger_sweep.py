@@ -1,8 +1,9 @@
 """Paths of points on a hand's surface while its fingers close, at one angle of the spread.
 
 In: a `Hand` and a spread. Out: `HandPaths`, in the palm frame: points of the links that closing
-does not move, and for each finger the points of the links that it moves, at closing angles half a
-degree apart, from the open hand to the limit. This is geometry only, without a simulation.
+does not move, and for each finger the points of the links that it moves, at closing positions half
+a degree (or 0.9 mm, of a joint that slides) apart, from the open hand to the limit. This is
+geometry only, without a simulation. Closing angles are lengths where the closing joint slides.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from scipy.spatial import ConvexHull
 
 from drakegrasp.arithmetic import dot, multiply, norm
 from drakegrasp.frames import Array, invert_pose
-from drakegrasp.hand.description import Finger, Hand
+from drakegrasp.hand.description import Hand
+from drakegrasp.hand.file_format import Finger
 from drakegrasp.hand.kinematics import coordinate_limits, link_poses
 from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.mesh.distance_field import DistanceField, make_distance_field
@@ -24,7 +26,8 @@ from drakegrasp.mesh.surfaces import cover_triangles
 
 Points = npt.NDArray[np.float32]
 
-#: Step between two closing angles of a path [rad]; a fingertip moves by about 1 mm.
+#: Step between two closing angles of a path, in `Hand.closing_unit`; a fingertip moves by about
+#: 1 mm.
 ANGLE_STEP = np.deg2rad(0.5)
 #: Approximate spacing of the points of a fingertip link, and of another link [m].
 TIP_SPACING, LINK_SPACING = 0.003, 0.005
@@ -41,12 +44,13 @@ class FingerPath:
     """The links that one finger's closing moves, at m closing angles.
 
     Attributes:
-        angles: (m,), closing angles from 0 to the limit [rad].
+        angles: (m,), closing angles from 0 to the limit [rad or m].
         points: (m, n, 3), points of the links in {G} [m]; those of the fingertip's pad come first,
             then those of the rest of the fingertip.
         pad: Number of points of the pad.
         tip: Number of points of the fingertip, the pad included.
         travel: (n,), largest distance that each moves from one angle to the next [m].
+        required: Whether a grasp needs this fingertip on the object.
     """
 
     angles: Array
@@ -54,6 +58,7 @@ class FingerPath:
     pad: int
     tip: int
     travel: Points
+    required: bool = True
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -111,7 +116,8 @@ def _finger_path(
     hand: Hand, i: int, rest: list[str], spread: float, limit: float, surfaces: dict[str, Array]
 ) -> FingerPath:
     """Return the path of finger i, from its fingertip and the rest of its links."""
-    angles = np.linspace(0.0, limit, int(np.ceil(limit / ANGLE_STEP)) + 1)
+    step = ANGLE_STEP * hand.closing_unit[i]
+    angles = np.linspace(0.0, limit, int(np.ceil(limit / step)) + 1)
     closing = np.zeros((len(angles), hand.num_fingers))
     closing[:, i] = angles
 
@@ -135,6 +141,7 @@ def _finger_path(
         pad=int(np.count_nonzero(moving[: int(on_pad.sum())])),
         tip=int(np.count_nonzero(moving[: tip.shape[1]])),
         travel=travel[moving],
+        required=hand.fingers[i].required,
     )
 
 

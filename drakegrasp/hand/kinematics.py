@@ -1,7 +1,8 @@
 """Forward kinematics of a hand.
 
-In: a `Hand` and its coordinates, the spread and the closing of each finger. Out: joint angles,
-poses of the links, limits of the coordinates. NumPy only.
+In: a `Hand` and its coordinates, the spread and the closing of each finger. Out: positions of the
+joints, poses of the links, limits of the coordinates. NumPy only. Positions of joints that turn are
+angles [rad], those of joints that slide are lengths [m].
 """
 
 from __future__ import annotations
@@ -11,32 +12,35 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array, multiply
 from drakegrasp.frames import rotation_about
-from drakegrasp.hand.description import Chain, Hand
+from drakegrasp.hand.chains import Chain
+from drakegrasp.hand.description import Hand
 
 
 def coordinate_limits(hand: Hand) -> Array:
-    """Return the lower and upper limit of each coordinate, (1 + k, 2) [rad].
+    """Return the lower and upper limit of each coordinate, (1 + k, 2) [rad or m].
 
     Row 0 is the spread, row 1 + i the closing of finger i. A coordinate keeps the limits of all
     joints that it drives, coupled joints included. Without spread joints row 0 is 0, 0.
     """
     limits = np.tile([-np.inf, np.inf], (1 + hand.num_fingers, 1))
-    for gain, joint_limits in zip(hand.joint_gain, hand.joint_limits, strict=True):
-        (column,) = np.flatnonzero(gain)
-        lower, upper = np.sort(joint_limits / gain[column])
-        limits[column] = max(limits[column, 0], lower), min(limits[column, 1], upper)
+    joints = zip(hand.joint_gain, hand.joint_offset, hand.joint_limits, strict=True)
+    for gain, offset, joint_limits in joints:
+        # A joint of the preshape is driven by none.
+        for column in np.flatnonzero(gain):
+            lower, upper = np.sort((joint_limits - offset) / gain[column])
+            limits[column] = max(limits[column, 0], lower), min(limits[column, 1], upper)
     if not hand.spread.joints:
         limits[0] = 0.0
     return limits
 
 
 def joint_positions(hand: Hand, spread: float, closing: npt.ArrayLike) -> dict[str, float]:
-    """Return each revolute joint's angle [rad] at a spread and closing angles (k,) [rad].
+    """Return each joint's position at a spread [rad] and closing positions (k,) [rad or m].
 
     Raises:
-        ValueError: If `closing` is not one angle per finger.
+        ValueError: If `closing` is not one position per finger.
     """
-    q = multiply(hand.joint_gain, _coordinates(hand, spread, closing))
+    q = multiply(hand.joint_gain, _coordinates(hand, spread, closing)) + hand.joint_offset
     return dict(zip(hand.joint_names, q.tolist(), strict=True))
 
 
@@ -48,11 +52,11 @@ def fingertip_poses(hand: Hand, *, spread: npt.ArrayLike, closing: npt.ArrayLike
     Args:
         hand: The hand.
         spread: Angle of the spread joints [rad]; any shape (...,).
-        closing: Angle of each finger's closing joint (k,) [rad]; for many postures
+        closing: Position of each finger's closing joint (k,) [rad or m]; for many postures
             (..., k), and the result is (..., k, 4, 4).
 
     Raises:
-        ValueError: If `closing` is not one angle per finger.
+        ValueError: If `closing` is not one position per finger.
     """
     c = _coordinates(hand, spread, closing)
     return np.stack([_chain_pose(chain, c) for chain in hand.chains], axis=-3)
@@ -68,57 +72,61 @@ def link_poses(hand: Hand, link: str, *, spread: npt.ArrayLike, closing: npt.Arr
         closing: See `fingertip_poses`.
 
     Raises:
-        ValueError: If `closing` is not one angle per finger.
+        ValueError: If `closing` is not one position per finger.
     """
     return _chain_pose(hand.link_chains[link], _coordinates(hand, spread, closing))
 
 
 def joint_frames(hand: Hand, finger: int, *, spread: float, closing: npt.ArrayLike) -> Array:
-    """Return the poses X_GJ (m, 4, 4) of the joints from the palm to a fingertip, before they turn.
+    """Return the poses X_GJ (m, 4, 4) of the joints from the palm to a fingertip, before they move.
 
     Args:
         hand: The hand.
         finger: Index of the finger.
         spread: Angle of the spread joints [rad].
-        closing: (k,), angle of each finger's closing joint [rad].
+        closing: (k,), position of each finger's closing joint [rad or m].
 
     Raises:
-        ValueError: If `closing` is not one angle per finger.
+        ValueError: If `closing` is not one position per finger.
     """
     chain = hand.chains[finger]
-    q = multiply(chain.gain, _coordinates(hand, spread, closing))
+    q = multiply(chain.gain, _coordinates(hand, spread, closing)) + chain.offset
     X, frames = np.eye(4), []
-    for X_PJ, axis, angle in zip(chain.X_PJ, chain.axis, q, strict=True):
+    for j, X_PJ in enumerate(chain.X_PJ):
         frames.append(multiply(X, X_PJ))
-        X = multiply(frames[-1], _turn(axis, angle))
+        X = multiply(frames[-1], _motion(chain, j, q[j]))
     return np.array(frames)
 
 
 def _coordinates(hand: Hand, spread: npt.ArrayLike, closing: npt.ArrayLike) -> Array:
-    """Return coordinates (..., 1 + k) from a spread (...,) and closing angles (..., k)."""
-    angles = np.asarray(closing, dtype=float)
+    """Return coordinates (..., 1 + k) from a spread (...,) and closing positions (..., k)."""
+    positions = np.asarray(closing, dtype=float)
     k = hand.num_fingers
-    if angles.shape[-1:] != (k,):
-        raise ValueError(f"closing must have shape (..., {k}), got {angles.shape}")
+    if positions.shape[-1:] != (k,):
+        raise ValueError(f"closing must have shape (..., {k}), got {positions.shape}")
     first = np.asarray(spread, dtype=float)
-    shape = np.broadcast_shapes(first.shape, angles.shape[:-1])
+    shape = np.broadcast_shapes(first.shape, positions.shape[:-1])
     return np.concatenate(
-        [np.broadcast_to(first, shape)[..., None], np.broadcast_to(angles, (*shape, k))], axis=-1
+        [np.broadcast_to(first, shape)[..., None], np.broadcast_to(positions, (*shape, k))], axis=-1
     )
 
 
 def _chain_pose(chain: Chain, c: Array) -> Array:
     """Return the poses (..., 4, 4) of a chain's link in {G} at coordinates (..., 1 + k)."""
-    q = multiply(c[..., None, :], chain.gain.T)[..., 0, :]
+    q = multiply(c[..., None, :], chain.gain.T)[..., 0, :] + chain.offset
     X = np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))
-    for j, (X_PJ, axis) in enumerate(zip(chain.X_PJ, chain.axis, strict=True)):
-        X = multiply(multiply(X, X_PJ), _turn(axis, q[..., j]))
+    for j, X_PJ in enumerate(chain.X_PJ):
+        X = multiply(multiply(X, X_PJ), _motion(chain, j, q[..., j]))
     return multiply(X, chain.X_JFi)
 
 
-def _turn(axis: Array, angle: Array) -> Array:
-    """Return the poses (..., 4, 4) that rotate by angles (...,) about an axis."""
-    X = np.zeros((*np.shape(angle), 4, 4))
-    X[..., :3, :3] = rotation_about(axis, angle)
+def _motion(chain: Chain, j: int, position: Array) -> Array:
+    """Return the poses (..., 4, 4) by which joint j of a chain moves at positions (...,)."""
+    X = np.zeros((*np.shape(position), 4, 4))
     X[..., 3, 3] = 1.0
+    if chain.slides[j]:
+        X[..., :3, :3] = np.eye(3)
+        X[..., :3, 3] = chain.axis[j] * np.asarray(position)[..., None]
+    else:
+        X[..., :3, :3] = rotation_about(chain.axis[j], position)
     return X

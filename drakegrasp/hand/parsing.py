@@ -1,11 +1,33 @@
-"""A Drake parser that needs no network."""
+"""Parsing the model of a hand with Drake.
+
+In: an SDFormat or URDF file. Out: its links and joints in a plant, and nothing else of it: motors
+and couplings come from the hand file.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
+
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex
 
+from drakegrasp.errors import HandError, first_line
 from drakegrasp.runtime.environment import allow_network
+
+
+@dataclass(frozen=True)
+class ModelFile:
+    """The model of a hand.
+
+    Attributes:
+        path: The SDFormat or URDF file.
+        packages: Name and folder of each package of a package:// URI.
+    """
+
+    path: Path
+    packages: tuple[tuple[str, Path], ...] = ()
 
 
 def make_parser(plant: MultibodyPlant) -> Parser:
@@ -16,3 +38,36 @@ def make_parser(plant: MultibodyPlant) -> Parser:
     """
     with allow_network("package_map"):
         return Parser(plant)
+
+
+def add_model(plant: MultibodyPlant, model: ModelFile) -> ModelInstanceIndex:
+    """Add the links and joints of a hand's model to a plant; return its model instance.
+
+    Motors and couplings (`<mimic>`) of the file are left out: those of the hand file replace them.
+
+    Args:
+        plant: Not finalized. Shapes are added if it is a source of a scene graph.
+        model: The file.
+
+    Raises:
+        HandError: If the file cannot be read, e.g. as a mesh is missing.
+    """
+    # Read the file; package:// URIs are resolved in the packages that are known.
+    if not model.path.is_file():
+        raise HandError(f"model: must be an SDFormat or URDF file, got {str(model.path)!r}")
+    parser = make_parser(plant)
+    for name, folder in model.packages:
+        parser.package_map().Add(name, str(folder))
+    actuators = set(plant.GetJointActuatorIndices())
+    constraints = set(plant.GetConstraintIds())
+    try:
+        (instance,) = parser.AddModels(model.path)
+    except (RuntimeError, ValueError) as error:
+        raise HandError(f"model: must be a file of one model, got {first_line(error)}") from None
+
+    # Leave out its motors and couplings.
+    for index in set(plant.GetJointActuatorIndices()) - actuators:
+        plant.RemoveJointActuator(plant.get_joint_actuator(index))
+    for constraint in set(plant.GetConstraintIds()) - constraints:
+        plant.RemoveConstraint(constraint)
+    return instance

@@ -7,7 +7,6 @@ Every shape of a hand is convex (`models/README.md`), so its corners describe it
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,10 +25,11 @@ from scipy.spatial import ConvexHull
 from drakegrasp.arithmetic import dot, norm, sin_cos
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, transform_points
-from drakegrasp.hand.parsing import make_parser
+from drakegrasp.hand.file_format import HalfSpace
+from drakegrasp.hand.parsing import ModelFile, add_model
 
 if TYPE_CHECKING:
-    from drakegrasp.hand.description import HalfSpace, Hand
+    from drakegrasp.hand.description import Hand
 
 #: Corners of the polygon that replaces a circle and encloses it.
 CIRCLE = 16
@@ -43,14 +43,14 @@ def link_shapes(hand: Hand) -> dict[str, tuple[Array, ...]]:
     Raises:
         HandError: If a shape is not a box, cylinder, capsule, sphere or convex mesh.
     """
-    return _link_shapes(hand.sdf_path)
+    return _link_shapes(hand.model)
 
 
 @cache
-def _link_shapes(sdf_path: Path) -> dict[str, tuple[Array, ...]]:
+def _link_shapes(model: ModelFile) -> dict[str, tuple[Array, ...]]:
     plant, scene_graph = MultibodyPlant(0.0), SceneGraph()
     plant.RegisterAsSourceForSceneGraph(scene_graph)
-    (instance,) = make_parser(plant).AddModels(sdf_path)
+    instance = add_model(plant, model)
     inspector = scene_graph.model_inspector()
     shapes = {}
     for index in plant.GetBodyIndices(instance):

@@ -11,60 +11,62 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array, multiply, norm
 from drakegrasp.frames import transform_points
-from drakegrasp.hand.description import Drive, Hand
+from drakegrasp.hand.description import Hand
+from drakegrasp.hand.file_format import Drive
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses, joint_frames
 
 
 def fingertip_forces(hand: Hand, drive: Drive) -> Array:
     """Return the largest force that each fingertip carries at its pad point, (k,) [N].
 
-    It is the torque that the finger carries at its closing joint over the lever of the pad point,
-    `closing_levers`, in the middle of the closing joint's range. At the ends of the range the
-    Barrett Hand's differs by -10 and +19 %.
+    It is the torque (or force, of a joint that slides) that the finger carries at its closing joint
+    over the lever of the pad point, `closing_levers`, in the middle of the closing joint's range.
+    At the ends of the range the Barrett Hand's differs by -10 and +19 %.
 
     Only motors press. What a worm carries beyond its own motor's torque comes from the motors of
     the other fingers, which press on it through the object: so a finger carries at most what they
-    give together, and never more than its `holding_torque`.
+    give together, and never more than its `holding_effort`.
 
     Args:
         hand: Of k fingers.
         drive: What keeps the closing joints from being pushed open. A motor alone carries its
-            `torque_limit`. A locked joint carries what a worm does, without a `holding_torque` any
-            torque of the others.
+            `effort_limit`. A locked joint carries what a worm does, without a `holding_effort` any
+            load by the others.
     """
     # A joint without a limit counts as limited by 0, the open hand.
     limits = coordinate_limits(hand)[1:]
     middle = np.where(np.isfinite(limits), limits, 0.0).mean(axis=1)
     levers = closing_levers(hand, middle)
-    motors = np.array([finger.torque_limit for finger in hand.fingers]) / levers
+    motors = np.array([finger.effort_limit for finger in hand.fingers]) / levers
     if drive == "torque":
         return motors
 
     # The other motors' forces, up to what the finger can hold.
-    strongest = [np.inf if f.holding_torque is None else f.holding_torque for f in hand.fingers]
+    strongest = [np.inf if f.holding_effort is None else f.holding_effort for f in hand.fingers]
     return np.minimum(np.maximum(motors, motors.sum() - motors), np.array(strongest) / levers)
 
 
 def closing_levers(hand: Hand, closing: npt.ArrayLike) -> Array:
-    """Return how far each pad point moves per angle of its closing joint, (k,) [m/rad].
+    """Return how far each pad point moves with its closing joint, (k,) [m/rad, or m/m].
 
     By virtual work this is the lever of a force along that motion, coupled joints included: the
     same torque that `simulation.drive.opening_torques` measures, over the force.
 
     Args:
         hand: Of k fingers.
-        closing: (k,), closing angles [rad]. The spread does not matter.
+        closing: (k,), closing positions [rad or m]. The spread does not matter.
 
     Raises:
-        ValueError: If `closing` is not one angle per finger.
+        ValueError: If `closing` is not one position per finger.
     """
     X_GF = fingertip_poses(hand, spread=0.0, closing=closing)
     levers = []
     for i, (finger, chain) in enumerate(zip(hand.fingers, hand.chains, strict=True)):
-        # Each joint turns the pad point about its axis, by its share of the closing angle.
+        # Each joint turns the pad point about its axis or slides it along, by its gain.
         p_GP = transform_points(X_GF[i], finger.p_FiP[None])[0]
         X_GJ = joint_frames(hand, i, spread=0.0, closing=closing)
         axes = multiply(X_GJ[:, :3, :3], chain.axis[:, :, None])[..., 0]
-        velocity = chain.gain[:, 1 + i, None] * np.cross(axes, p_GP - X_GJ[:, :3, 3])
-        levers.append(norm(velocity.sum(axis=0)))
+        turned = np.cross(axes, p_GP - X_GJ[:, :3, 3])
+        moved = np.where(chain.slides[:, None], axes, turned)
+        levers.append(norm((chain.gain[:, 1 + i, None] * moved).sum(axis=0)))
     return np.array(levers)

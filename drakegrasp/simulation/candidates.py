@@ -70,7 +70,8 @@ class Pregrasp:
     Attributes:
         X_OG: Pose of the palm (4, 4); the candidate's own where its ray misses.
         spread: Angle of the spread joints [rad].
-        closing: Angles of the closing joints (k,) [rad] at the start; None is the open hand.
+        closing: Positions of the closing joints (k,) [rad or m] at the start; None is the open
+            hand.
         ray_hits: Whether the palm ray meets the object; true if no ray places the palm.
         conditions: Friction, mass, looks and cameras; None are the usual ones.
     """
@@ -245,19 +246,19 @@ def make_attempts(
     Args:
         candidates: Of the object.
         indices: The range.
-        config: Stand-offs and spreads.
+        config: Stand-offs and spreads, see `hand.file_format.with_hand_defaults`.
         name: The object's name.
         seed: Of the dataset; with name and candidate it decides the spreads.
     """
-    spreads = np.deg2rad(config.spreads_deg)
+    spreads, standoffs = np.deg2rad(config.drawn_spreads_deg), config.drawn_standoffs
     for i in indices:
         # Each candidate has its own stream, so ranges do not depend on each other.
         stream = Stream(seed, object_key(name), i)
-        drawn = stream.integers(len(spreads), len(config.standoffs))
+        drawn = stream.integers(len(spreads), len(standoffs))
 
         # Move the palm along its ray to each stand-off from the surface.
         distance = candidates.distance[i]
-        for j, standoff in enumerate(config.standoffs):
+        for j, standoff in enumerate(standoffs):
             X_OG = candidates.X_OG[i].copy()
             if np.isfinite(distance):
                 X_OG[:3, 3] += (distance - standoff) * X_OG[:3, 2]

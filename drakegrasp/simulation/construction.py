@@ -59,7 +59,7 @@ from drakegrasp.config import PhysicsConfig
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.files import MODELS
-from drakegrasp.hand.parsing import make_parser
+from drakegrasp.hand.parsing import add_model, make_parser
 from drakegrasp.hand.shapes import hull_corners
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import ObjectModel, object_colour
@@ -69,10 +69,10 @@ from drakegrasp.simulation.scene import HandHandles, Scene
 WRIST_BODY_MASS = 0.02
 #: Wrist gains [N/m], [N s/m]: under 2 kg the wrist sags by 0.02 mm.
 WRIST_STIFFNESS, WRIST_DAMPING = 1e6, 1e4
-#: Gain of the velocity-controlled fingers [N m s/rad]: a finger that is 0.1 rad/s too slow gets
-#: its full torque.
+#: Gain of the velocity-controlled fingers [N m s/rad]: a finger that is 0.1 rad/s too slow gets a
+#: torque of 2 N m. That of fingers that slide follows from `description.SLIDE`.
 FINGER_DAMPING = 20.0
-#: Drake requires a positive stiffness; this one adds less than a millionth of the torque.
+#: Drake requires a positive stiffness [N m/rad]; this one adds less than a millionth of the torque.
 FINGER_STIFFNESS = 1e-6
 #: Distance above the table at which the solver knows of a contact before it has a force [m]: a flat
 #: base on a stiff table jitters without it (RobotLocomotion/drake#21514). An edge or a tip sinks in
@@ -265,7 +265,7 @@ def _add_hand(
     # Weld the palm to the wrist by frames whose poses are parameters of the context.
     wrist_instance = plant.AddModelInstance("wrist")
     joints = _add_wrist(plant, wrist_instance)
-    (instance,) = make_parser(plant).AddModels(hand.sdf_path)
+    instance = add_model(plant, hand.model)
     base = plant.GetBodyByName(hand.palm_link, instance)
     # Links of any name may be in the hand's model: ours must not be one of them.
     palm = plant.AddFrame(
@@ -337,23 +337,21 @@ def _add_wrist(plant: MultibodyPlant, instance: ModelInstanceIndex) -> tuple[Pri
 
 
 def _add_actuation(plant: MultibodyPlant, hand: Hand, instance: ModelInstanceIndex) -> None:
-    for finger in hand.fingers:
+    for finger, unit in zip(hand.fingers, hand.closing_unit.tolist(), strict=True):
         joint = plant.GetJointByName(finger.closing_joint, instance)
-        actuator = plant.AddJointActuator(finger.name, joint, finger.torque_limit)
+        actuator = plant.AddJointActuator(finger.name, joint, finger.effort_limit)
         actuator.set_default_rotor_inertia(finger.rotor_inertia)
         actuator.set_default_gear_ratio(finger.gear_ratio)
-        actuator.set_controller_gains(PdControllerGains(p=FINGER_STIFFNESS, d=FINGER_DAMPING))
+        gains = PdControllerGains(p=FINGER_STIFFNESS / unit**2, d=FINGER_DAMPING / unit**2)
+        actuator.set_controller_gains(gains)
         for coupling in finger.coupled:
-            plant.AddCouplerConstraint(
-                plant.GetJointByName(coupling.joint, instance), joint, coupling.ratio
-            )
+            follower = plant.GetJointByName(coupling.joint, instance)
+            plant.AddCouplerConstraint(follower, joint, coupling.ratio, coupling.offset)
 
 
 def _closing_command(hand: Hand) -> Array:
     """Return the constant [q_d; v_d] that closes all fingers at the hand's speed."""
-    return np.concatenate(
-        [np.zeros(hand.num_fingers), np.full(hand.num_fingers, hand.closing_speed)]
-    )
+    return np.concatenate([np.zeros(hand.num_fingers), hand.closing_speed])
 
 
 def _make_compliant_hand(

@@ -5,9 +5,11 @@ with each of them:
 
 * `torque`: nothing else holds the joint; what pushes harder than the motor pushes it open.
 * `worm`: the joint never opens. After each step its angle becomes the joint's lower limit. Where
-  the contacts load a finger by more than its `holding_torque`, the worm yields: the joint opens
+  the contacts load a finger by more than its `holding_effort`, the worm yields: the joint opens
   against that torque, until it stands or closes again.
 * `locked`: the joint keeps its angle, whatever the load.
+
+Of a closing joint that slides, angles are lengths [m] and torques are forces [N].
 
 Limits of joints and actuators belong to the plant, not to its context: `disengage` restores them
 after a lift, and `hand_over` carries them to the scene that continues one.
@@ -18,16 +20,22 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
-from pydrake.multibody.tree import RevoluteJoint
 from pydrake.systems.framework import Context, EventStatus
 
 from drakegrasp.config import LiftConfig
 from drakegrasp.errors import ConfigError
 from drakegrasp.frames import Array
-from drakegrasp.hand.description import Drive, Hand
-from drakegrasp.simulation.scene import Scene, closing_angles, closing_rates, hand_handles
+from drakegrasp.hand.description import Hand
+from drakegrasp.hand.file_format import Drive
+from drakegrasp.simulation.scene import (
+    ClosingJoint,
+    Scene,
+    closing_angles,
+    closing_rates,
+    hand_handles,
+)
 
-#: A finger that opens more slowly than this stands [rad/s].
+#: A finger that opens more slowly than this stands, in the unit of its closing joint [1/s].
 STANDING = 1e-4
 
 
@@ -35,14 +43,15 @@ def drive_of(hand: Hand, config: LiftConfig) -> Drive:
     """Return the drive of a hand's fingers under a configuration.
 
     Raises:
-        ConfigError: If `lift.drive` is `worm`, and a finger of the hand has no `holding_torque`.
+        ConfigError: If `lift.drive` is `worm`, and a finger of the hand has no
+            `holding_effort`.
     """
     drive = hand.drive if config.drive is None else config.drive
-    without = [finger.name for finger in hand.fingers if finger.holding_torque is None]
+    without = [finger for finger in hand.fingers if finger.holding_effort is None]
     if drive == "worm" and without:
         raise ConfigError(
-            "lift.drive: must be torque or locked for a hand whose fingers have no "
-            f"holding_torque ({', '.join(without)}), got 'worm'"
+            "lift.drive: must be torque or locked for a hand whose fingers have no holding_torque "
+            f"or holding_force ({', '.join(finger.name for finger in without)}), got 'worm'"
         )
     return drive
 
@@ -60,7 +69,9 @@ def engage(scene: Scene, drive: Drive) -> None:
     for joint, angle, (_, upper) in zip(
         handles.closing_joints, closing_angles(scene), handles.closing_limits, strict=True
     ):
-        _set_limits(joint, angle, angle if drive == "locked" else upper)
+        # A joint that closed up to its limit may be a little beyond.
+        least = angle if drive == "locked" else min(angle, upper)
+        _set_limits(joint, least, angle if drive == "locked" else upper)
     if drive == "worm":
         _start_worms(scene)
 
@@ -71,7 +82,7 @@ def disengage(scene: Scene) -> None:
     scene.simulator.clear_monitor()
     for i, joint in enumerate(handles.closing_joints):
         _set_limits(joint, *handles.closing_limits[i])
-        handles.motors[i].set_effort_limit(handles.hand.fingers[i].torque_limit)
+        handles.motors[i].set_effort_limit(handles.hand.fingers[i].effort_limit)
 
 
 def hand_over(scene: Scene, before: Scene) -> None:
@@ -93,14 +104,14 @@ def hand_over(scene: Scene, before: Scene) -> None:
 
 
 def opening_torques(scene: Scene) -> Array:
-    """Return the torque (k,) [N m] by which contacts push each closing joint open now."""
+    """Return the torque (k,) [N m or N] by which contacts push each closing joint open now."""
     # Contact forces in the coordinates of all joints of the hand.
     handles, plant = hand_handles(scene), scene.plant
     port = plant.get_generalized_contact_forces_output_port(handles.instance)
     torques = np.zeros(plant.num_velocities())
     plant.SetVelocitiesInArray(handles.instance, port.Eval(scene.context), torques)
 
-    # A motor turns its joints at fixed ratios, so it carries their torques by the same ratios.
+    # A motor moves its joints at fixed ratios, so it carries their torques by the same ratios.
     return np.array(
         [
             -sum(ratio * torques[joint.velocity_start()] for joint, ratio in driven.items())
@@ -125,10 +136,10 @@ def _turn_worms(scene: Scene, _: Context) -> EventStatus:
     for i, finger in enumerate(handles.hand.fingers):
         joint, motor = handles.closing_joints[i], handles.motors[i]
         lower, upper = _limits(joint)
-        yields = motor.effort_limit() > finger.torque_limit
+        yields = motor.effort_limit() > finger.effort_limit
         if yields and rates[i] >= -STANDING:
             # A finger that yielded stands again: from now on the worm holds it here.
-            motor.set_effort_limit(finger.torque_limit)
+            motor.set_effort_limit(finger.effort_limit)
             _set_limits(joint, min(angles[i], upper), upper)
         elif not yields and angles[i] > lower:
             _set_limits(joint, min(angles[i], upper), upper)
@@ -136,11 +147,11 @@ def _turn_worms(scene: Scene, _: Context) -> EventStatus:
     # A finger whose load exceeds what its worm holds opens against just that torque.
     loads, overloaded = opening_torques(scene), False
     for i, finger in enumerate(handles.hand.fingers):
-        assert finger.holding_torque is not None
+        assert finger.holding_effort is not None
         motor = handles.motors[i]
-        if loads[i] > finger.holding_torque and motor.effort_limit() <= finger.torque_limit:
+        if loads[i] > finger.holding_effort and motor.effort_limit() <= finger.effort_limit:
             _set_limits(handles.closing_joints[i], *handles.closing_limits[i])
-            motor.set_effort_limit(finger.holding_torque)
+            motor.set_effort_limit(finger.holding_effort)
             overloaded = True
 
     # What Drake has solved for this state is void then: a new state makes it solve again.
@@ -149,9 +160,9 @@ def _turn_worms(scene: Scene, _: Context) -> EventStatus:
     return EventStatus.DidNothing()
 
 
-def _limits(joint: RevoluteJoint) -> tuple[float, float]:
+def _limits(joint: ClosingJoint) -> tuple[float, float]:
     return float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0])
 
 
-def _set_limits(joint: RevoluteJoint, lower: float, upper: float) -> None:
+def _set_limits(joint: ClosingJoint, lower: float, upper: float) -> None:
     joint.set_position_limits(np.array([lower]), np.array([upper]))

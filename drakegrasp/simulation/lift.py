@@ -16,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from pydrake.multibody.tree import RigidBody
 
 from drakegrasp.arithmetic import multiply, norm
 from drakegrasp.config import Config
@@ -55,7 +56,7 @@ class Lift:
 
     Attributes:
         contacts: Contacts at the end.
-        q: Positions of the hand's joints [rad], in the plant's order.
+        q: Positions of the hand's joints [rad or m], in the plant's order.
         duration: Simulated time [s].
         X_TO: Pose of the object, (4, 4).
         X_OG: Pose of the palm, (4, 4).
@@ -176,8 +177,9 @@ class _Monitor:
 
     def __init__(self, scene: Scene) -> None:
         assert scene.handles is not None
-        self._tips = {body.index() for body in scene.handles.fingertips}
+        self._tips = {body.index() for body in _required_tips(scene)}
         self._X_GO, self._angles = _object_in_hand(scene), closing_angles(scene)
+        self._unit = scene.handles.hand.closing_unit
         # Whether all fingertips touched the object at a check since which nothing moved: then
         # contacts need not be computed again.
         self._held = False
@@ -189,12 +191,13 @@ class _Monitor:
         Args:
             scene: The scene that was simulated since the last check.
             elapsed: Simulated time since then [s].
-            stop_speed: Speed of a closing joint below which it stands [rad/s].
+            stop_speed: Speed of a closing joint below which it stands, in its unit [1/s].
         """
         # Measure what moved since the last check.
         X_GO, angles = _object_in_hand(scene), closing_angles(scene)
         shift, angle = _motion(self._X_GO, X_GO)
-        standing = float(np.abs(angles - self._angles).max()) / elapsed <= stop_speed
+        closed = np.abs(angles - self._angles) / self._unit
+        standing = float(closed.max()) / elapsed <= stop_speed
         self.at_rest = standing and not (shift > COARSE_SHIFT or angle > COARSE_ANGLE)
         self._X_GO, self._angles = X_GO, angles
 
@@ -215,16 +218,26 @@ class _Monitor:
 
 
 def _has_lost_tip(scene: Scene) -> bool:
-    """Return whether the pad of some fingertip has lost the object for good."""
+    """Return whether the pad of some required fingertip has lost the object for good."""
     assert scene.handles is not None
     field, X_OW = scene.model.field, invert_pose(scene.pose(scene.object))
     pads = pad_points(scene.handles.hand)
-    for tip, p_FiQ in zip(scene.handles.fingertips, pads, strict=True):
+    tips = zip(scene.handles.fingertips, scene.handles.hand.required, pads, strict=True)
+    for tip, required, p_FiQ in tips:
+        if not required:
+            continue
         p_OQ = transform_points(multiply(X_OW, scene.pose(tip)), p_FiQ)
         distance = field.interpolate(*p_OQ.astype(np.float32).T)
         if distance.min() > LOST + extra_margin(field):
             return True
     return False
+
+
+def _required_tips(scene: Scene) -> list[RigidBody]:
+    """Return the fingertips that a grasp needs on the object."""
+    assert scene.handles is not None
+    pairs = zip(scene.handles.fingertips, scene.handles.hand.required, strict=True)
+    return [tip for tip, required in pairs if required]
 
 
 def _object_in_hand(scene: Scene) -> Array:

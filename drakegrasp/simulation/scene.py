@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -35,6 +36,9 @@ from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.objects.model import ObjectModel
 
+#: A joint that turns or slides.
+ClosingJoint: TypeAlias = RevoluteJoint | PrismaticJoint
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HandHandles:
@@ -47,9 +51,9 @@ class HandHandles:
     wrist_frame: FixedOffsetFrame
     wrist_trajectory: TrajectorySource
     fingertips: tuple[RigidBody, ...]
-    closing_joints: tuple[RevoluteJoint, ...]
-    closing_limits: tuple[tuple[float, float], ...]  # of the closing joints' angles [rad]
-    driven: tuple[dict[RevoluteJoint, float], ...]  # joints that each motor turns, and their ratios
+    closing_joints: tuple[ClosingJoint, ...]
+    closing_limits: tuple[tuple[float, float], ...]  # of the closing joints [rad or m]
+    driven: tuple[dict[ClosingJoint, float], ...]  # joints that each motor moves, and their ratios
     motors: tuple[JointActuator, ...]  # of the closing joints
     parts: tuple[tuple[GeometryId, Array], ...]  # each shape of the hand with a point inside it
 
@@ -111,14 +115,14 @@ def reset_attempt(
     spread: float,
     closing: npt.ArrayLike | None = None,
 ) -> None:
-    """Put hand and object at the start of an attempt; wrist, spread and object are locked.
+    """Put hand and object at the start of an attempt; only the fingers are not locked.
 
     Args:
         scene: A scene with a hand.
         X_WO: Pose of the object (4, 4).
         X_WG: Pose of the palm (4, 4).
         spread: Angle of the spread joints [rad].
-        closing: Angle of each finger's closing joint (k,) [rad]; None is the open hand.
+        closing: Position of each finger's closing joint (k,) [rad or m]; None is the open hand.
     """
     # Unlock the wrist before positions are set, then place the object.
     handles = hand_handles(scene)
@@ -132,14 +136,17 @@ def reset_attempt(
     R_WG = RotationMatrix(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]))
     handles.wrist_frame.SetPoseInParentFrame(context, RigidTransform(R_WG, np.zeros(3)))
     angles = np.zeros(handles.hand.num_fingers) if closing is None else closing
-    for name, angle in joint_positions(handles.hand, spread, angles).items():
-        plant.GetJointByName(name, handles.instance).set_angle(context, angle)
+    for name, position in joint_positions(handles.hand, spread, angles).items():
+        joint = plant.GetJointByName(name, handles.instance)
+        slides = isinstance(joint, PrismaticJoint)
+        (joint.set_translation if slides else joint.set_angle)(context, position)
     for joint, p in zip(handles.wrist_joints, X[:3, 3], strict=True):
         joint.set_translation(context, float(p))
         joint.Lock(context)
 
-    # The spread keeps its angle: one motor drives it, and the released code locks it too.
-    for name in handles.hand.spread.joints:
+    # The spread keeps its angle: one motor drives it, and the released code locks it too. So do
+    # the joints of the preshape.
+    for name in handles.hand.locked_joints:
         plant.GetJointByName(name, handles.instance).Lock(context)
 
     # Only the fingers move while the hand closes.
@@ -250,8 +257,8 @@ def transfer_state(scene: Scene, before: Scene, time: float, motion: WristMotion
     state = before.plant.GetPositionsAndVelocities(before.context)
     scene.plant.SetPositionsAndVelocities(scene.context, state)
 
-    # Lock the spread, and follow the same path of the wrist.
-    for name in target.hand.spread.joints:
+    # Lock spread and preshape, and follow the same path of the wrist.
+    for name in target.hand.locked_joints:
         scene.plant.GetJointByName(name, target.instance).Lock(scene.context)
     _follow(scene, motion)
     scene.simulator.Initialize()
@@ -263,25 +270,29 @@ def advance(scene: Scene, duration: float) -> None:
 
 
 def closing_rates(scene: Scene) -> Array:
-    """Return the speed of each finger's closing joint (k,) [rad/s]; positive closes."""
-    joints = hand_handles(scene).closing_joints
-    return np.array([joint.get_angular_rate(scene.context) for joint in joints])
+    """Return the speed of each finger's closing joint (k,), in its unit [1/s]; positive closes.
+
+    The unit is `Hand.closing_unit`: one speed limit serves joints that turn and joints that slide.
+    """
+    handles = hand_handles(scene)
+    rates = [joint.GetOneVelocity(scene.context) for joint in handles.closing_joints]
+    return np.array(rates) / handles.hand.closing_unit
 
 
 def finger_speed(scene: Scene) -> float:
-    """Return the largest speed of a closing joint [rad/s]."""
+    """Return the largest speed of a closing joint, in its unit [1/s]."""
     return float(np.abs(closing_rates(scene)).max())
 
 
 def closing_angles(scene: Scene) -> Array:
-    """Return the angle of each finger's closing joint (k,) [rad]."""
+    """Return the position of each finger's closing joint (k,) [rad or m]."""
     return np.array(
-        [joint.get_angle(scene.context) for joint in hand_handles(scene).closing_joints]
+        [joint.GetOnePosition(scene.context) for joint in hand_handles(scene).closing_joints]
     )
 
 
 def hand_positions(scene: Scene) -> Array:
-    """Return the positions of all joints of the hand in the plant's order [rad]."""
+    """Return the positions of all joints of the hand in the plant's order [rad or m]."""
     return scene.plant.GetPositions(scene.context, hand_handles(scene).instance)
 
 

@@ -49,10 +49,10 @@ class Prediction:
     Attributes:
         outcome: `start_collision` or `screened` where the attempt is certainly lost, else None.
         clear: Whether the open hand is farther from object and table than the margin.
-        closing: (k,), closing angles up to which the fingers meet nothing [rad]; empty with an
-            outcome.
+        closing: (k,), closing angles up to which the fingers meet nothing [rad, or m where they
+            slide]; empty with an outcome.
         last: (k,), closing angles beyond which a fingertip's pad cannot meet the object any more
-            [rad]; empty with an outcome.
+            [rad or m]; empty with an outcome.
     """
 
     outcome: Outcome | None
@@ -200,11 +200,12 @@ def _closing_angles(
     lookup: _PointLookup, paths: HandPaths, rows: Counts, config: ScreenConfig
 ) -> dict[int, tuple[Array, Array]]:
     """Return `Prediction.closing` and `last` by attempt, where all fingertips may arrive."""
-    # One finger that does not arrive decides, so the next finger skips these attempts.
+    # One required finger that does not arrive decides, so the next finger skips these attempts.
     sweeps = []
     for path in paths.fingers:
         sweeps.append(_sweep_finger(lookup, path, rows, config))
-        rows = rows[sweeps[-1].arrives]
+        if path.required:
+            rows = rows[sweeps[-1].arrives]
 
     # Collect the fingers of each attempt that is left, as indices (n, k) into their paths.
     places = [np.searchsorted(sweep.rows, rows) for sweep in sweeps]

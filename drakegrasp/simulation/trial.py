@@ -37,7 +37,7 @@ from drakegrasp.simulation.verdict import judge_closed, judge_lifted
 #: Far below a time step, far above the rounding of a sum of them [s].
 ROUNDING = 1e-9
 #: A finger that closed this far beyond the last angle at which it can meet the object has missed
-#: it [rad].
+#: it, in the unit of its closing joint.
 BEYOND = np.deg2rad(2.0)
 
 
@@ -49,8 +49,8 @@ class TrialRecord:
         outcome: The verdict.
         X_TO, X_OG: Resting pose of the object and start pose of the palm, (4, 4).
         closed, lifted: Contacts after closing and after the lift.
-        q_closed, q_lifted: Positions of the hand's joints at these times [rad], in the plant's
-            order.
+        q_closed, q_lifted: Positions of the hand's joints at these times [rad or m], in the
+            plant's order.
         time_close, time_lift: Simulated time of the two stages [s].
         X_TO_lifted: Pose of the object after the lift, (4, 4).
         X_OG_lifted: Pose of the palm then, (4, 4).
@@ -102,8 +102,10 @@ def run_attempt(
         MemoryError: If the machine runs out of memory.
         OSError: If a file of the hand cannot be read.
     """
+    required: npt.ArrayLike = True
     if scene.handles is not None:
         drive_of(scene.handles.hand, config.lift)
+        required = scene.handles.hand.required
     X_TO = np.asarray(X_TO, dtype=float)
     start = TrialRecord(outcome=Outcome.RAY_MISS, X_TO=X_TO, X_OG=attempt.X_OG)
     X_WO = multiply(X_WT, X_TO)
@@ -141,7 +143,9 @@ def run_attempt(
         )
 
         # Judge the closed hand: it lifts only what it holds with all fingertips and nothing else.
-        verdict = judge_closed(closed.touching, closed.other_links, closed.hand_on_table)
+        verdict = judge_closed(
+            closed.touching, closed.other_links, closed.hand_on_table, required=required
+        )
         if verdict != Outcome.SUCCESS:
             return replace(record, outcome=Outcome(int(verdict)))
 
@@ -150,7 +154,9 @@ def run_attempt(
 
         # Judge the lifted object: all fingertips must still hold it, clear of the table.
         lifted = end.contacts
-        verdict = judge_lifted(lifted.touching, lifted.other_links, lifted.object_on_table)
+        verdict = judge_lifted(
+            lifted.touching, lifted.other_links, lifted.object_on_table, required=required
+        )
         return replace(
             record,
             outcome=Outcome(int(verdict)),
@@ -192,11 +198,13 @@ def _close(
 ) -> None:
     """Close the fingers on the static object until they stop, or one has missed it."""
     # Closing that geometry skipped counts as time, and an angle beyond its last contact as a miss.
-    end, last = config.close.max_time, np.inf
+    end, last = config.close.max_time, np.array(np.inf)
     if prediction is not None:
         assert scene.handles is not None
-        end -= float(prediction.closing.min()) / scene.handles.hand.closing_speed
-        last = prediction.last + BEYOND
+        hand = scene.handles.hand
+        end -= float((prediction.closing / hand.closing_speed).min())
+        # A fingertip that need not touch ends nothing by missing the object.
+        last = np.where(hand.required, prediction.last + BEYOND * hand.closing_unit, np.inf)
 
     # The last check may fall short of the end by rounding, never by a step.
     while end - scene.time > ROUNDING:

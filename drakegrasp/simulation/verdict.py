@@ -20,7 +20,11 @@ STABLE_SLIP, STABLE_TURN = 5e-3, float(np.deg2rad(5.0))
 
 
 def judge_closed(
-    touching: npt.ArrayLike, other_links: npt.ArrayLike, hand_on_table: npt.ArrayLike
+    touching: npt.ArrayLike,
+    other_links: npt.ArrayLike,
+    hand_on_table: npt.ArrayLike,
+    *,
+    required: npt.ArrayLike = True,
 ) -> Outcomes:
     """Return the outcomes (...,) of closed hands: `SUCCESS` where the hand may lift.
 
@@ -30,17 +34,21 @@ def judge_closed(
         touching: (..., k), whether each fingertip touches the object.
         other_links: (...,), number of other links of the hand that touch the object.
         hand_on_table: (...,), whether the hand touches the table.
+        required: (k,), whether each fingertip must touch the object; all if one value.
     """
-    touching = np.asarray(touching)
     return _first(
-        (~touching.all(axis=-1), Outcome.MISSING_FINGERTIP),
+        (_misses(touching, required), Outcome.MISSING_FINGERTIP),
         (np.asarray(other_links) > 0, Outcome.HAND_CONTACT),
         (hand_on_table, Outcome.TABLE_CONTACT),
     )
 
 
 def judge_lifted(
-    touching: npt.ArrayLike, other_links: npt.ArrayLike, object_on_table: npt.ArrayLike
+    touching: npt.ArrayLike,
+    other_links: npt.ArrayLike,
+    object_on_table: npt.ArrayLike,
+    *,
+    required: npt.ArrayLike = True,
 ) -> Outcomes:
     """Return the outcomes (...,) of attempts after the lift.
 
@@ -50,11 +58,12 @@ def judge_lifted(
         touching: (..., k), whether each fingertip touches the object.
         other_links: (...,), number of other links of the hand that touch the object.
         object_on_table: (...,), whether the object touches the table.
+        required: (k,), whether each fingertip must touch the object; all if one value.
     """
     touching = np.asarray(touching)
     return _first(
         (~touching.any(axis=-1) & (np.asarray(other_links) == 0), Outcome.DROPPED),
-        (~touching.all(axis=-1), Outcome.SLIPPED),
+        (_misses(touching, required), Outcome.SLIPPED),
         (object_on_table, Outcome.TABLE_CONTACT),
     )
 
@@ -87,6 +96,11 @@ def is_stable(
     """
     still = (np.asarray(slip) < STABLE_SLIP) & (np.asarray(turn) < STABLE_TURN)
     return is_precision(outcome, other_links) & still
+
+
+def _misses(touching: npt.ArrayLike, required: npt.ArrayLike) -> Flags:
+    """Return (...,) whether a required fingertip does not touch, of (..., k)."""
+    return np.asarray((~np.asarray(touching) & np.asarray(required)).any(axis=-1))
 
 
 def _first(*rules: tuple[npt.ArrayLike, Outcome]) -> Outcomes:

@@ -264,21 +264,24 @@ def _as_tried(
         rows: (n,), the row of each grasp, by its index.
         rules: What was drawn for the dataset.
     """
-    # The drawn values by row.
+    # The values in use by row; where one coefficient was drawn, both count.
+    drawn_friction = rules.friction_hand is not None or rules.friction_table is not None
     frictions = {
         name: dataset.column(f"conditions/{name}")[rows].astype(float)
         for name in ("friction_hand", "friction_table")
-        if getattr(rules, name) is not None
+        if drawn_friction
     }
     masses = dataset.column("object_props/work2mass")[rows, 0].astype(float)
 
     tried = []
     for grasp in grasps:
         i, placed, config = grasp.index, grasp.placed, grasp.config
-        if frictions:
-            drawn = {name: float(values[i]) for name, values in frictions.items()}
-            physics = config.physics.model_copy(update=drawn)
+        if drawn_friction:
+            used = {name: float(values[i]) for name, values in frictions.items()}
+            physics = config.physics.model_copy(update=used)
             config = config.model_copy(update={"physics": physics})
+            # They come from the object's own, which would win otherwise.
+            placed = replace(placed, model=replace(placed.model, friction=None))
         if rules.mass is not None:
             mass, known = float(masses[i]), placed.model
             inertia = mass / known.mass * known.I_OOcm_O

@@ -19,7 +19,7 @@ import numpy as np
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.hdf5 import AnyArray, write_field
-from drakegrasp.dataset.manifest import installed_versions, write_origin
+from drakegrasp.dataset.manifest import finger_names, installed_versions, write_origin
 from drakegrasp.dataset.schema import CONTACT_NAMES, VERIFICATION_FIELDS, Field, sizes
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, pack_pose
@@ -230,7 +230,7 @@ def write_results(results: Sequence[Verification], path: Path, config: Config) -
     shape = sizes(fingers=hand.num_fingers, joints=len(hand.joint_names), image=0)
     rows = [_row(result) for result in results]
     with atomic_hdf5(path) as file:
-        write_origin(file, config, installed_versions(config))
+        write_origin(file, config, installed_versions(config), finger_names(config))
         group = file.create_group(GROUP)
         for field in VERIFICATION_FIELDS:
             write_field(group, field, _column(field, rows, shape))

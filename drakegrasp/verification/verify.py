@@ -234,9 +234,10 @@ def _try(
         What the trial started from, and what happened.
     """
     scene = cached_scene(placed.model, config.physics, config.hand)
-    least = coordinate_limits(load_hand(config.hand))[1:, 0]
+    hand = load_hand(config.hand)
+    least = coordinate_limits(hand)[1:, 0]
     for share in MARGINS:
-        margin = share * np.deg2rad(config.verify.open_margin_deg)
+        margin = share * np.deg2rad(config.verify.open_margin_deg) * hand.closing_unit
         closing = np.maximum(fit.closing - margin, least)
         pregrasp = Pregrasp(X_OG=fit.X_OG, spread=fit.spread, closing=closing)
         trial = run_attempt(scene, X_TO, pregrasp, config)

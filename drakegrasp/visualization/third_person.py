@@ -33,7 +33,7 @@ from pydrake.systems.sensors import CameraInfo
 from drakegrasp.errors import MachineError
 from drakegrasp.frames import X_WT, Array, make_pose, transform_points
 from drakegrasp.hand.description import Hand
-from drakegrasp.hand.parsing import make_parser
+from drakegrasp.hand.parsing import add_model
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.vision.camera import Picture
 from drakegrasp.vision.rendering import BLANK, ENGINE, add_drawn_object
@@ -76,7 +76,8 @@ class Snapshot:
     Attributes:
         X_WG: (4, 4), pose of the palm.
         X_WO: (4, 4), pose of the object.
-        q: (n,), positions of the hand's joints, in the order of `RenderScene.joint_names` [rad].
+        q: (n,), positions of the hand's joints [rad or m], in the order of
+            `RenderScene.joint_names`.
     """
 
     X_WG: Array
@@ -153,7 +154,7 @@ def build_render_scene(
 
     # The hand, welded by its palm to a frame whose pose is a parameter of the context: the palm
     # can be put anywhere without a joint.
-    (instance,) = make_parser(plant).AddModels(hand.sdf_path)
+    instance = add_model(plant, hand.model)
     base = plant.GetBodyByName(hand.palm_link, instance)
     palm = plant.AddFrame(
         FixedOffsetFrame("palm", base.body_frame(), RigidTransform(hand.X_BG), instance)

@@ -20,6 +20,7 @@ from drakegrasp.config import load_config
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.prepared_objects import PreparedObject
 from drakegrasp.frames import Array
+from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.builtin.catalog import export_builtin
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.simulation.candidates import sample_candidates
@@ -69,12 +70,13 @@ def palm_rays(prepared: PreparedObject, method: str, count: int) -> Array:
     Returns:
         (n, 2, 3) in {O}: the palm's origin and the point on the surface [m].
     """
-    config = load_config(None, [f"candidates.method={method}", f"candidates.max={10 * count}"])
+    overrides = [f"candidates.method={method}", f"candidates.max={10 * count}"]
+    config = with_hand_defaults(load_config(None, overrides))
     candidates = sample_candidates(prepared.model, prepared.X_TO, config.candidates, config.seed)
     hits = np.flatnonzero(np.isfinite(candidates.distance))[:count]
     z_O = candidates.X_OG[hits, :3, 2]
     p_OS = candidates.X_OG[hits, :3, 3] + candidates.distance[hits, None] * z_O
-    return np.stack([p_OS - max(config.candidates.standoffs) * z_O, p_OS], axis=1)
+    return np.stack([p_OS - max(config.candidates.drawn_standoffs) * z_O, p_OS], axis=1)
 
 
 if __name__ == "__main__":

@@ -8,8 +8,9 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 
 from drakegrasp.frames import Array
-from drakegrasp.hand.description import Hand, make_parser
+from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses, joint_positions
+from drakegrasp.hand.parsing import add_model
 
 #: The palm's surface above the base [m]; the table below is given from there.
 PALM_SURFACE = 0.0793
@@ -48,7 +49,7 @@ TABLE = """
 
 def parsed_plant(hand: Hand) -> MultibodyPlant:
     plant = MultibodyPlant(0.0)
-    make_parser(plant).AddModels(str(hand.sdf_path))
+    add_model(plant, hand.model)
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(hand.palm_link))
     plant.Finalize()
     return plant

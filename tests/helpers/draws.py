@@ -23,6 +23,7 @@ from drakegrasp.build.prepare import prepare
 from drakegrasp.config import BuiltinConfig, SplitConfig, load_config
 from drakegrasp.dataset.filters import split_samples
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.builtin.catalog import export_builtin
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.seeding import Stream
@@ -59,7 +60,7 @@ def objects(folder: Path, meshes: Path | None) -> Iterator[MeshSource]:
 
 def object_draws(source: MeshSource) -> Iterator[tuple[str, str]]:
     """Yield the draws of one object under the preset `paper`."""
-    config = load_config(overrides=["candidates.max=1000"])
+    config = with_hand_defaults(load_config(overrides=["candidates.max=1000"]))
     hand = load_hand(config.hand)
     prepared = prepare(source, config)
     model, candidates = prepared.model, prepared.candidates

@@ -1,11 +1,19 @@
-"""A hand of two fingers without spread: what must work for it is not made for the Barrett Hand."""
+"""Hands of two fingers, which turn or slide: no code is made for the Barrett Hand alone."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+
+from drakegrasp.frames import Array
+from drakegrasp.hand.description import Hand
+from drakegrasp.hand.kinematics import joint_positions
+from drakegrasp.hand.parsing import add_model
 
 #: A gripper whose two fingers face each other along y, hinged at y = -+0.04, length 0.1.
 PINCER_SDF = """<sdf version="1.9"><model name="pincer">
@@ -26,6 +34,7 @@ PINCER_SDF = """<sdf version="1.9"><model name="pincer">
     <axis><xyz>1 0 0</xyz><limit><lower>0</lower><upper>1</upper></limit></axis></joint>
 </model></sdf>"""
 PINCER: dict[str, Any] = {
+    "version": 1,
     "model": "pincer.sdf",
     "palm": {"link": "palm", "p_BG": [0.0, 0.0, 0.01]},
     "fingers": [
@@ -39,6 +48,7 @@ PINCER: dict[str, Any] = {
         for side, inward in (("left", 1.0), ("right", -1.0))
     ],
     "closing_speed_deg": 90.0,
+    "standoffs": [0.03, 0.05],
 }
 
 
@@ -53,3 +63,69 @@ def write_pincer(folder: Path, sdf: str = PINCER_SDF, **changes: object) -> Path
 def changed_finger(**changes: object) -> list[object]:
     """Return the gripper's fingers, the first one with changes."""
     return [{**PINCER["fingers"][0], **changes}, PINCER["fingers"][1]]
+
+
+#: A gripper in URDF whose fingers slide along y, 80 mm apart. Its model has efforts and a mimic.
+SLIDER = """<robot name="slider">
+  <link name="palm"><inertial><mass value="0.5"/>
+    <inertia ixx="1e-3" iyy="1e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><geometry><box size="0.04 0.12 0.02"/></geometry></collision></link>
+  <link name="left"><inertial><origin xyz="0 -0.01 0.055"/><mass value="0.05"/>
+    <inertia ixx="4e-5" iyy="4e-5" izz="4e-6" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><origin xyz="0 -0.01 0.055"/>
+    <geometry><box size="0.02 0.02 0.09"/></geometry></collision></link>
+  <link name="right"><inertial><origin xyz="0 0.01 0.055"/><mass value="0.05"/>
+    <inertia ixx="4e-5" iyy="4e-5" izz="4e-6" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><origin xyz="0 0.01 0.055"/>
+    <geometry><box size="0.02 0.02 0.09"/></geometry></collision></link>
+  <joint name="left_slide" type="prismatic"><parent link="palm"/><child link="left"/>
+    <origin xyz="0 -0.04 0.01"/><axis xyz="0 1 0"/>
+    <limit lower="0" upper="0.04" effort="20" velocity="1"/></joint>
+  <joint name="right_slide" type="prismatic"><parent link="palm"/><child link="right"/>
+    <origin xyz="0 0.04 0.01"/><axis xyz="0 -1 0"/>
+    <limit lower="0" upper="0.04" effort="20" velocity="1"/>
+    <mimic joint="left_slide" multiplier="1" offset="0"/></joint>
+</robot>"""
+
+
+def write_slider(folder: Path, urdf: str = SLIDER, **changes: object) -> Path:
+    """Write the gripper that slides, the YAML with changes, and return the YAML's path."""
+    fingers = [
+        {
+            "name": side,
+            "fingertip": side,
+            "closing_joint": f"{side}_slide",
+            "force_limit": 20.0,
+            "pad_point": [0.0, 0.0, 0.09],
+        }
+        for side in ("left", "right")
+    ]
+    described: dict[str, Any] = {
+        "version": 1,
+        "model": "slider.urdf",
+        "palm": {"link": "palm", "p_BG": [0.0, 0.0, 0.01]},
+        "fingers": fingers,
+        "closing_speed": 0.1,
+        "standoffs": [0.02],
+    }
+    (folder / "slider.urdf").write_text(urdf)
+    path = folder / "slider_hand.yaml"
+    path.write_text(yaml.safe_dump({**described, **changes}))
+    return path
+
+
+def drake_fingertip_poses(hand: Hand, spread: float, closing: Array) -> Array:
+    """Return the poses X_GFi (k, 4, 4) of the fingertips as Drake computes them."""
+    plant = MultibodyPlant(0.0)
+    instance = add_model(plant, hand.model)
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(hand.palm_link))
+    plant.Finalize()
+    context = plant.CreateDefaultContext()
+    q = joint_positions(hand, spread, closing)
+    names = plant.GetPositionNames(
+        instance, add_model_instance_prefix=False, always_add_suffix=False
+    )
+    plant.SetPositions(context, [q[name] for name in names])
+    X_GB = RigidTransform(hand.X_BG).inverse()
+    bodies = [plant.GetBodyByName(name) for name in hand.fingertip_links]
+    return np.array([(X_GB @ body.EvalPoseInWorld(context)).GetAsMatrix4() for body in bodies])

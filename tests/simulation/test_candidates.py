@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial import cKDTree
 
-from drakegrasp.config import CandidateConfig, load_config
+from drakegrasp.config import CandidateConfig, Config, load_config
 from drakegrasp.frames import Array, make_pose
+from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.seeding import Stream, object_key
@@ -466,7 +467,7 @@ def some_candidates(n: int = 30) -> Candidates:
 
 
 def attempts(indices: range, *, name: str = "thing", seed: int = 0) -> list[Attempt]:
-    config = CandidateConfig()
+    config = with_hand_defaults(Config()).candidates
     return list(make_attempts(some_candidates(), indices, config, name=name, seed=seed))
 
 

@@ -9,7 +9,7 @@ import pytest
 from helpers.objects import STANDOFF, from_above, standing
 
 from drakegrasp.frames import X_WT, invert_pose, transform_points
-from drakegrasp.hand.description import HalfSpace
+from drakegrasp.hand.file_format import HalfSpace
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.contacts import Contacts, read_contacts
 from drakegrasp.simulation.scene import Scene, advance, reset_attempt

@@ -12,9 +12,9 @@ from helpers.objects import STANDOFF, box_model, from_above, standing
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce
 
-from drakegrasp.config import Config, override_config
+from drakegrasp.config import Config, load_config, override_config
 from drakegrasp.errors import ConfigError
-from drakegrasp.frames import X_WT
+from drakegrasp.frames import X_WT, make_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
@@ -269,3 +269,17 @@ def _pushed(scene: Scene, force: float, *, steps: int) -> np.ndarray:
     applied.F_Bq_W = SpatialForce(np.zeros(3), np.zeros(3))
     scene.plant.get_applied_spatial_force_input_port().FixValue(scene.context, [applied])
     return np.array(angles)
+
+
+def test_worm_holds_a_finger_that_is_a_little_beyond_its_limit(tmp_path: Path) -> None:
+    """A joint limit gives way by some micrometres; limits that cross would end Drake."""
+    hand = load_hand("franka")
+    scene = build_scene(box_model(tmp_path, [0.03] * 3), load_config().physics, hand)
+    X_WG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 1.2])
+    reset_attempt(scene, X_WT, X_WG, spread=0.0, closing=[0.04 + 1e-5, 0.03])
+    engage(scene, "worm")
+    handles = scene.handles
+    assert handles is not None
+    assert [j.position_lower_limits()[0] for j in handles.closing_joints] == [0.04, 0.03]
+    disengage(scene)
+    assert [j.position_lower_limits()[0] for j in handles.closing_joints] == [0.0, 0.0]

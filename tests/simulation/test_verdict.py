@@ -94,3 +94,12 @@ def test_stable_is_a_precision_grasp_that_stays(
     assert is_precision(outcome, other_links) == precision
     assert is_stable(outcome, other_links, slip, turn) == stable
     assert STABLE_SLIP == 5e-3
+
+
+def test_a_fingertip_that_is_not_required_may_miss() -> None:
+    """The second of three."""
+    touching, required = [[True, False, True], [False, True, True]], [True, False, True]
+    closed = judge_closed(touching, [0, 0], [False, False], required=required)
+    assert closed.tolist() == [Outcome.SUCCESS, Outcome.MISSING_FINGERTIP]
+    lifted = judge_lifted(touching, [0, 0], [False, False], required=required)
+    assert lifted.tolist() == [Outcome.SUCCESS, Outcome.SLIPPED]

@@ -95,13 +95,24 @@ def stages(batch: Batch) -> Iterator[Violation]:
         yield from batch.broken(what, bad, lambda i: _outcome(batch, i))
 
 
-def verdicts(batch: Batch) -> Iterator[Violation]:
-    """The outcome is what follows from the recorded contacts (`simulation.verdict`)."""
+def verdicts(batch: Batch, required: Sequence[bool]) -> Iterator[Violation]:
+    """The outcome is what follows from the recorded contacts (`simulation.verdict`).
+
+    Args:
+        batch: Rows of `/trials`.
+        required: Whether a grasp needs each fingertip on the object.
+    """
     closed = judge_closed(
-        batch["closed_touching"], batch["closed_other_links"], batch["closed_hand_on_table"]
+        batch["closed_touching"],
+        batch["closed_other_links"],
+        batch["closed_hand_on_table"],
+        required=required,
     )
     lifted = judge_lifted(
-        batch["lifted_touching"], batch["lifted_other_links"], batch["lifted_object_on_table"]
+        batch["lifted_touching"],
+        batch["lifted_other_links"],
+        batch["lifted_object_on_table"],
+        required=required,
     )
     expected = np.where(closed != Outcome.SUCCESS, closed, lifted)
     judged = _stages(batch) >= Stage.CLOSED

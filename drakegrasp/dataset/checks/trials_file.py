@@ -6,6 +6,7 @@ findings of the context.
 
 from __future__ import annotations
 
+import json
 from functools import partial
 
 import numpy as np
@@ -37,14 +38,16 @@ def check_trials_file(trials: OpenFile, context: Context) -> None:
 
     # The rules whose limits depend on the dataset.
     objects = dataset.manifest.objects if dataset else None
+    standoffs = trials.config.candidates.standoffs if trials.config else None
     numbers = partial(
         trial_rules.numbers,
         objects=trials.count("objects"),
         candidates=None if objects is None else [entry.candidates for entry in objects],
-        standoffs=len(trials.config.candidates.standoffs) if trials.config else None,
+        standoffs=None if standoffs is None else len(standoffs),
     )
+    fingers = json.loads(str(trials.file.attrs.get("fingers", "{}")))
     last: list[Rule] = [
-        trial_rules.verdicts,
+        partial(trial_rules.verdicts, required=list(fingers.values()) or [True]),
         trial_rules.words,
         trial_rules.contacts,
         trial_rules.poses,

@@ -28,30 +28,39 @@ class HandConstants:
     Attributes:
         X_PJ: (m, k, 4, 4), pose of each joint in the moving frame of the joint before it; that
             of the first joint is in {G}.
-        axis: (m, k, 3), unit axis in the joint's frame.
-        cross, cross2: (m, k, 4, 4), matrix of the cross product by the axis, and its square.
-        gain: (m, k, 1 + k), joint angle per coordinate.
-        finger_gain: (k, m, 1 + k), the same by finger.
-        closing_gain: (m, k), joint angle per closing angle of the joint's own finger.
+        axis: (m, k, 3), unit axis in the joint's frame; zero if the joint slides.
+        slide: (m, k, 3), unit direction in the joint's frame; zero if the joint turns.
+        slides: (m, k), whether the joint slides.
+        twist, twist2: (m, k, 4, 4), matrix of the joint's motion per position, and its square: of
+            the cross product by its axis, or of its direction.
+        gain: (m, k, 1 + k), joint position per coordinate.
+        offset: (m, k), joint positions at zero coordinates [rad or m].
+        finger_gain: (k, m, 1 + k), the gain by finger.
+        closing_gain: (m, k), joint position per closing position of the joint's own finger.
         X_JFi: (k, 4, 4), pose of the fingertip link in the moving frame of the last joint.
         pads: The fingertips' surfaces.
         pad_points: (k, 3), nominal contact points in {Fi} [m].
-        limits: (1 + k, 2), of the coordinates [rad].
+        limits: (1 + k, 2), of the coordinates [rad or m].
+        units: (1 + k,), what counts as a radian of each coordinate [rad or m].
         fingertips: (k, n, 3), corners of the fingertips in {Fi} [m].
         palm: (n, 3), corners of the palm link in {G} [m].
     """
 
     X_PJ: Array
     axis: Array
-    cross: Array
-    cross2: Array
+    slide: Array
+    slides: Array
+    twist: Array
+    twist2: Array
     gain: Array
+    offset: Array
     finger_gain: Array
     closing_gain: Array
     X_JFi: Array
     pads: Pads
     pad_points: Array
     limits: Array
+    units: Array
     fingertips: Array
     palm: Array
 
@@ -67,7 +76,9 @@ def hand_constants(hand: Hand) -> HandConstants:
     shapes = link_shapes(hand)
     for link in (hand.palm_link, *hand.fingertip_links):
         if not shapes[link]:
-            raise HandError(f"{hand.sdf_path}: link {link!r} must have a collision shape, got none")
+            raise HandError(
+                f"{hand.model.path}: link {link!r} must have a collision shape, got none"
+            )
 
     # Corners of the fingertips, stacked.
     corners = [np.concatenate(shapes[finger.fingertip]) for finger in hand.fingers]
@@ -85,6 +96,7 @@ def hand_constants(hand: Hand) -> HandConstants:
         pads=make_pads(corners, [finger.pad_region for finger in hand.fingers], pad_surfaces(hand)),
         pad_points=np.array([finger.p_FiP for finger in hand.fingers]),
         limits=coordinate_limits(hand),
+        units=np.r_[1.0, hand.closing_unit],
         fingertips=padded,
         palm=palm,
     )
@@ -94,25 +106,34 @@ def _stack_chains(hand: Hand) -> dict[str, Array]:
     """Return the attributes of `HandConstants` that describe the joints, by name."""
     # Pad all chains to the length of the longest.
     m = max(len(chain.axis) for chain in hand.chains)
-    X_PJ, axis, gain = [], [], []
+    X_PJ, axis, slides, gain, offset = [], [], [], [], []
     for chain in hand.chains:
         # Padding joints come last and do not move, so they have no effect.
         missing = m - len(chain.axis)
         X_PJ.append(np.concatenate([chain.X_PJ, np.tile(np.eye(4), (missing, 1, 1))]))
         axis.append(np.concatenate([chain.axis, np.tile([0.0, 0.0, 1.0], (missing, 1))]))
+        slides.append(np.pad(chain.slides, (0, missing)))
         gain.append(np.pad(chain.gain, ((0, missing), (0, 0))))
+        offset.append(np.pad(chain.offset, (0, missing)))
 
-    # The matrices of the cross products by the axes, with room for a position.
-    a, k = np.stack(axis, axis=1), len(hand.chains)
-    cross = np.zeros((m, k, 4, 4))
-    cross[..., :3, :3] = skew(a)
+    # The motions of the joints as matrices: the cross product by an axis, or a translation.
+    along, sliding = np.stack(axis, axis=1), np.stack(slides, axis=1)
+    turn = np.where(sliding[..., None], 0.0, along)
+    slide = np.where(sliding[..., None], along, 0.0)
+    k = len(hand.chains)
+    twist = np.zeros((m, k, 4, 4))
+    twist[..., :3, :3] = skew(turn)
+    twist[..., :3, 3] = slide
 
     return {
         "X_PJ": np.stack(X_PJ, axis=1),
-        "axis": a,
-        "cross": cross,
-        "cross2": cross @ cross,
+        "axis": turn,
+        "slide": slide,
+        "slides": sliding,
+        "twist": twist,
+        "twist2": twist @ twist,
         "gain": np.stack(gain, axis=1),
+        "offset": np.stack(offset, axis=1),
         "finger_gain": np.stack(gain),
         "closing_gain": np.stack(gain, axis=1)[:, range(k), 1 + np.arange(k)],
         "X_JFi": np.stack([chain.X_JFi for chain in hand.chains]),

@@ -21,8 +21,11 @@ from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses
 from drakegrasp.verification.wrist.hand_constants import hand_constants
 from drakegrasp.verification.wrist.pads import signed_distance
 
-#: Steps of the table's angles [rad]; closing steps are longer for hands with many fingers.
+#: Steps of the table's angles [rad]; closing steps are longer for hands with many fingers. Closing
+#: joints that slide count in `Hand.closing_unit`.
 SPREAD_STEP, CLOSING_STEP = np.deg2rad(11.25), np.deg2rad(8.0)
+#: Least number of closing steps from the open hand to the limit: some fingers move by little.
+LEAST_STEPS = 5
 #: Most closing postures in the table.
 MAX_CLOSINGS = 5000
 #: Largest angles in the table [rad]: spread fingers point sideways, closed fingers make almost a
@@ -43,7 +46,7 @@ class Start:
 
     Attributes:
         X_OG: (4, 4), palm pose.
-        coordinates: (1 + k,), spread and closing angles [rad].
+        coordinates: (1 + k,), spread and closing positions [rad, or m where a finger slides].
     """
 
     X_OG: Array
@@ -55,13 +58,15 @@ class Postures:
     """N postures of a hand.
 
     Attributes:
-        coordinates: (N, 1 + k), spread and closing angles [rad].
+        coordinates: (N, 1 + k), spread and closing positions [rad or m].
         p_GP: (N, k, 3), nominal contact points in {G} [m].
         n_G: (N, k, 3), outward pad normals there, in {G}.
+        units: (1 + k,), what counts as a radian of each coordinate [rad or m].
         tree: Of their features, see `_features`.
     """
 
     coordinates: Array
+    units: Array
     p_GP: Array
     n_G: Array
     tree: KDTree
@@ -73,13 +78,12 @@ def make_postures(hand: Hand) -> Postures:
     # A grid of coordinates.
     constants = hand_constants(hand)
     lower, upper = coordinate_limits(hand).T
-    most = np.r_[MAX_SPREAD, np.full(hand.num_fingers, MAX_CLOSING)]
+    most = np.r_[MAX_SPREAD, MAX_CLOSING * hand.closing_unit]
+    upper = np.minimum(upper, most)
     fewest = MAX_CLOSINGS ** (1.0 / hand.num_fingers) - 1.0
-    step = np.r_[SPREAD_STEP, np.full(hand.num_fingers, max(CLOSING_STEP, MAX_CLOSING / fewest))]
-    axes = [
-        np.arange(low, min(high, limit) + 1e-9, s)
-        for low, high, limit, s in zip(lower, upper, most, step, strict=True)
-    ]
+    step = np.r_[SPREAD_STEP, max(CLOSING_STEP, MAX_CLOSING / fewest) * hand.closing_unit]
+    step[1:] = np.minimum(step[1:], (upper - lower)[1:] / min(LEAST_STEPS, fewest))
+    axes = [np.arange(low, high + 1e-9, s) for low, high, s in zip(lower, upper, step, strict=True)]
     c = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 1 + hand.num_fingers)
 
     # The contacts of each posture: the points of the pads next to the pad points.
@@ -88,7 +92,8 @@ def make_postures(hand: Hand) -> Postures:
     on_pad = constants.pad_points - contact.distance[:, None] * contact.normal
     p_GP = np.einsum("nkab,kb->nka", X_GF[..., :3, :3], on_pad) + X_GF[..., :3, 3]
     n_G = np.einsum("nkab,kb->nka", X_GF[..., :3, :3], contact.normal)
-    return Postures(coordinates=c, p_GP=p_GP, n_G=n_G, tree=KDTree(_features(p_GP, n_G)))
+    tree = KDTree(_features(p_GP, n_G))
+    return Postures(coordinates=c, units=constants.units, p_GP=p_GP, n_G=n_G, tree=tree)
 
 
 def find_starts(postures: Postures, p_OQ: Array, nhat_Q_O: Array, count: int) -> list[Start]:
@@ -109,7 +114,8 @@ def find_starts(postures: Postures, p_OQ: Array, nhat_Q_O: Array, count: int) ->
     starts: list[Start] = []
     for i in np.argsort(misfit, kind="stable"):
         c = postures.coordinates[rows[i]]
-        if all(np.abs(start.coordinates - c).max() > DIFFERENT for start in starts):
+        distance = [np.abs((start.coordinates - c) / postures.units).max() for start in starts]
+        if all(d > DIFFERENT for d in distance):
             starts.append(Start(X_OG=X_OG[i], coordinates=c))
         if len(starts) == count:
             break

@@ -24,7 +24,7 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from drakegrasp.frames import Array
-from drakegrasp.hand.description import HalfSpace
+from drakegrasp.hand.file_format import HalfSpace
 
 #: Rounding s of the edges [m]: about the unevenness of the pads themselves.
 ROUNDING = 0.7e-3

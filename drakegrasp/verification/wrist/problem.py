@@ -51,7 +51,7 @@ class WristProblem:
         height: Height of the origin of {O} above the table [m].
         X_OS: (4, 4), palm pose of the start: that of zero angles and translations.
         posture: (1 + k,), coordinates of the start, which the solution stays near to where the
-            contacts leave them open [rad].
+            contacts leave them open [rad, or m where a finger slides].
     """
 
     constants: HandConstants
@@ -109,12 +109,13 @@ def evaluate(problem: WristProblem, x: Array) -> Evaluation:
     pad point, c_S the coordinates of the start, and o_i how far Q_i is outside of each half-space
     of the pad region of finger i. The weights are `NORMAL_WEIGHT` (w_n),
     `CLOSING_WEIGHT` (w_v), `PAD_WEIGHT` (w_p) and `POSTURE_WEIGHT` (w_c). The residuals are the
-    terms in this order, unsquared. The constraints are that the clearances, the smooth minima of
+    terms in this order, unsquared. Coordinates of fingers that slide are weighed in
+    `Hand.closing_unit`. The constraints are that the clearances, the smooth minima of
     the heights of palm and fingertips over the table, are not negative.
 
     Args:
         problem: The contacts and the start.
-        x: (n,), angles [rad], translation [m], coordinates [rad].
+        x: (n,), angles [rad], translation [m], coordinates [rad or m].
     """
     # The palm, the contacts in {G}, and the fingers.
     constants, coordinates = problem.constants, x[POSE:]
@@ -123,13 +124,13 @@ def evaluate(problem: WristProblem, x: Array) -> Evaluation:
     X_OG = problem.X_OS @ make_pose(R_SG, x[3:POSE])
     R_OG = X_OG[:3, :3]
     p_GQ, n_G = (problem.p_OQ - X_OG[:3, 3]) @ R_OG, problem.nhat_Q_O @ R_OG
-    X_GF, axes, origins = _forward(constants, coordinates)
+    X_GF, axes, slides, origins = _forward(constants, coordinates)
     R_GF = X_GF[:, :3, :3]
     R_FG = R_GF.transpose(0, 2, 1)
 
     # Per unknown: angular velocity of the fingertips, and velocity of their material points at
     # Q, seen from {O} and expressed in {G}.
-    arms = _cross(axes, p_GQ - origins)  # (m, k, 3)
+    arms = _cross(axes, p_GQ - origins) + slides  # (m, k, 3)
     spin, velocity = np.zeros((k, 3, n)), np.empty((k, 3, n))
     spin[:, :, :3] = spin_G
     spin[:, :, POSE:] = np.matmul(axes.transpose(1, 2, 0), constants.finger_gain)
@@ -157,7 +158,7 @@ def evaluate(problem: WristProblem, x: Array) -> Evaluation:
             NORMAL_WEIGHT * (pad_G + n_G).ravel(),
             CLOSING_WEIGHT * (closing + n_G).ravel(),
             PAD_WEIGHT * (p_FQ - constants.pad_points).ravel(),
-            POSTURE_WEIGHT * (coordinates - problem.posture),
+            POSTURE_WEIGHT * (coordinates - problem.posture) / constants.units,
             contact.outside.ravel(),
         ]
     )
@@ -166,11 +167,13 @@ def evaluate(problem: WristProblem, x: Array) -> Evaluation:
     jacobian[k : 4 * k] = NORMAL_WEIGHT * dpad_G.reshape(-1, n)
     jacobian[4 * k : 7 * k] = CLOSING_WEIGHT * dclosing.reshape(-1, n)
     jacobian[7 * k : 10 * k] = PAD_WEIGHT * dp_F.reshape(-1, n)
-    jacobian[10 * k : 10 * k + n - POSE, POSE:] = POSTURE_WEIGHT * np.eye(n - POSE)
+    jacobian[10 * k : 10 * k + n - POSE, POSE:] = POSTURE_WEIGHT * np.diag(1.0 / constants.units)
     jacobian[10 * k + n - POSE :] = np.matmul(contact.outside_gradient, dp_F).reshape(-1, n)
 
     # The heights over the table.
-    clearance, clearance_jacobian = _clearance(problem, X_OG, R_SG, spin_G, X_GF, axes, origins)
+    clearance, clearance_jacobian = _clearance(
+        problem, X_OG, R_SG, spin_G, X_GF, (axes, slides, origins)
+    )
 
     return Evaluation(
         X_OG=X_OG,
@@ -201,21 +204,28 @@ def _rotation(angles: Array) -> tuple[Array, Array]:
     return Rx @ Ryz, spin
 
 
-def _forward(constants: HandConstants, coordinates: Array) -> tuple[Array, Array, Array]:
-    """Return X_GFi (k, 4, 4), and the axis and the origin (m, k, 3) of each joint in {G}."""
+def _forward(constants: HandConstants, coordinates: Array) -> tuple[Array, Array, Array, Array]:
+    """Return X_GFi (k, 4, 4), and each joint's axis, direction and origin (m, k, 3) in {G}.
+
+    A joint that slides has no axis, and one that turns no direction: they are zero.
+    """
     # Rodrigues' formula R = 1 + sin(q) K + (1 - cos(q)) K K, as poses. `frames.rotation_about` has
-    # one axis for all angles; here each joint has its own, and K K is computed once per hand.
-    angles = (constants.gain @ coordinates)[..., None, None]  # (m, k, 1, 1)
-    turn = np.eye(4) + np.sin(angles) * constants.cross + (1.0 - np.cos(angles)) * constants.cross2
+    # one axis for all angles; here each joint has its own, and K K is computed once per hand. The
+    # square of a translation's matrix is zero.
+    q = (constants.gain @ coordinates + constants.offset)[..., None, None]  # (m, k, 1, 1)
+    first = np.where(constants.slides[..., None, None], q, np.sin(q))
+    motion = np.eye(4) + first * constants.twist + (1.0 - np.cos(q)) * constants.twist2
 
     # From the palm outwards, all fingers at once.
     before = np.empty_like(constants.X_PJ)
     X = np.eye(4)
     for j, X_PJ in enumerate(constants.X_PJ):
         before[j] = X @ X_PJ
-        X = before[j] @ turn[j]
-    axes = np.matmul(before[..., :3, :3], constants.axis[..., None])[..., 0]
-    return X @ constants.X_JFi, axes, before[..., :3, 3]
+        X = before[j] @ motion[j]
+    R = before[..., :3, :3]
+    axes = np.matmul(R, constants.axis[..., None])[..., 0]
+    slides = np.matmul(R, constants.slide[..., None])[..., 0]
+    return X @ constants.X_JFi, axes, slides, before[..., :3, 3]
 
 
 def _closing_direction(
@@ -226,14 +236,14 @@ def _closing_direction(
     Args:
         constants: Of the hand.
         p_GQ: (k, 3), the predicted points in {G} [m].
-        axes: (m, k, 3), of the joints in {G}.
-        arms: (m, k, 3), velocity at Q per angle of each joint, in {G} [m/rad].
+        axes: (m, k, 3), of the joints in {G}; zero where they slide.
+        arms: (m, k, 3), velocity at Q per position of each joint, in {G} [m/rad, or -].
         velocity: (k, 3, n), of the fingertips' material points at Q per unknown, in {G}.
 
     Returns:
         Directions (k, 3) in {G}, and their derivatives (k, 3, n) as seen from {G}.
     """
-    # Screw of each fingertip per closing angle: the sum over the joints of its finger.
+    # Screw of each fingertip per closing position: the sum over the joints of its finger.
     own = constants.closing_gain[..., None]  # (m, k, 1)
     turning, motion = own * axes, own * arms
     total_turning, total_motion = turning.sum(axis=0), motion.sum(axis=0)
@@ -243,7 +253,7 @@ def _closing_direction(
     derivative[:, :, :POSE] = -np.matmul(skew(total_turning), velocity[:, :, :POSE])
 
     # By the coordinates: joint j carries the screws of all later joints. A velocity field v that
-    # turns about an axis a changes at a fixed point by a x v - (dv/dp) (a x arm).
+    # turns about an axis a changes at a fixed point by a x v - (dv/dp) arm.
     later_turning = total_turning - turning.cumsum(axis=0)
     later_motion = total_motion - motion.cumsum(axis=0)
     carried = _cross(axes, later_motion) - _cross(later_turning, arms)
@@ -263,8 +273,7 @@ def _clearance(
     R_SG: Array,
     spin_G: Array,
     X_GF: Array,
-    axes: Array,
-    origins: Array,
+    joints: tuple[Array, Array, Array],
 ) -> tuple[Array, Array]:
     """Return the smooth heights (1 + k,) of palm and fingertips over the table [m].
 
@@ -274,8 +283,7 @@ def _clearance(
         R_SG: (3, 3), its rotation from the start.
         spin_G: (3, 3), angular velocities per angle, as columns.
         X_GF: (k, 4, 4), poses of the fingertips.
-        axes: (m, k, 3), of the joints in {G}.
-        origins: (m, k, 3), of the joints in {G} [m].
+        joints: Axes, directions and origins (m, k, 3) of the joints in {G}, see `_forward`.
 
     Returns:
         The heights, and their derivatives (1 + k, n).
@@ -294,7 +302,8 @@ def _clearance(
     jacobian = np.zeros((1 + len(tips), POSE + len(tips) + 1))
     jacobian[:, :3] = _cross(np.concatenate([p_palm, p_tips]), up_G) @ spin_G
     jacobian[:, 3:POSE] = R_SG @ up_G
-    arms = _cross(axes, p_tips - origins) @ up_G  # (m, k)
+    axes, slides, origins = joints
+    arms = (_cross(axes, p_tips - origins) + slides) @ up_G  # (m, k)
     jacobian[1:, POSE:] = np.matmul(arms.T[:, None, :], constants.finger_gain)[:, 0]
     return base + np.concatenate([palm, tips + X_GF[:, :3, 3] @ up_G]), jacobian
 

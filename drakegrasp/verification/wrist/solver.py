@@ -32,8 +32,8 @@ DAMPING = 3e-4
 MAX_ITERATIONS, TOLERANCE = 50, 1e-3
 #: Steps of Newton's method that bring each pad onto its point.
 REFINEMENTS = 3
-#: A closing angle is refined only if the distance changes with it by more than this [m/rad]: a pad
-#: that slides along its point cannot be brought nearer by closing.
+#: A closing position is refined only if the distance changes with it by more than this [m per
+#: `Hand.closing_unit`]: a pad that slides along its point cannot be brought nearer by closing.
 MIN_SLOPE = 0.01
 
 
@@ -44,7 +44,7 @@ class WristFit:
     Attributes:
         X_OG: (4, 4), palm pose.
         spread: Angle of the spread joints [rad].
-        closing: (k,), closing angles at which the pads meet the points [rad].
+        closing: (k,), closing positions at which the pads meet the points [rad or m].
         objective: Sum of squared residuals where SLSQP ended, before each finger was brought onto
             its point [m^2].
         residual: (k,), distance of each predicted point from its fingertip's surface [m].
@@ -137,7 +137,7 @@ def _refine(problem: WristProblem, coordinates: Array) -> tuple[Evaluation, Arra
 
     Args:
         problem: With its start at the palm's pose.
-        coordinates: (1 + k,), spread and closing angles to begin with [rad].
+        coordinates: (1 + k,), spread and closing positions to begin with [rad or m].
 
     Returns:
         The problem at the refined coordinates, and these.
@@ -150,7 +150,7 @@ def _refine(problem: WristProblem, coordinates: Array) -> tuple[Evaluation, Arra
         # A step of each closing angle, within the limits.
         distance = best.contact.distance
         slope = best.jacobian[own, POSE + 1 + own]
-        moves = np.abs(slope) > MIN_SLOPE
+        moves = np.abs(slope) * problem.constants.units[1:] > MIN_SLOPE
         step = np.where(moves, distance / np.where(moves, slope, 1.0), 0.0)
         trial = np.clip(c - np.concatenate([[0.0], step]), lower, upper)
 

@@ -16,7 +16,7 @@ from drakegrasp.errors import HandError
 from drakegrasp.frames import Array
 from drakegrasp.hand import shapes
 from drakegrasp.hand.description import Hand, load_hand
-from drakegrasp.hand.parsing import make_parser
+from drakegrasp.hand.parsing import add_model
 from drakegrasp.hand.shapes import hull_triangles, link_shapes, pad_surfaces
 from drakegrasp.verification.wrist.pads import (
     ROUNDING,
@@ -296,7 +296,7 @@ def assert_reaches_as_far_as_drakes(hand: Hand, *, atol: float) -> None:
     far, rng = 1e3, np.random.default_rng(0)
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.01), builder)
-    make_parser(plant).AddModels(str(hand.sdf_path))
+    add_model(plant, hand.model)
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(hand.palm_link))
     plant.Finalize()
     diagram = builder.Build()

@@ -1,4 +1,4 @@
-"""The wrist problem: its kinematics, gradients and clearances, for two hands."""
+"""The wrist problem: its kinematics, gradients and clearances, for hands of all kinds."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ def hand_of(name: str) -> Hand:
     return load_hand(name)
 
 
-@pytest.fixture(scope="module", params=["barrett", "pincer"])
+@pytest.fixture(scope="module", params=["barrett", "pincer", "allegro", "franka"])
 def name(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The Barrett Hand, and one of two fingers, with one joint each and without spread."""
-    if request.param == "barrett":
-        return "barrett"
+    """Hands with a spread, with one joint per finger, with a preshape, with fingers that slide."""
+    if request.param != "pincer":
+        return str(request.param)
     return str(write_pincer(tmp_path_factory.mktemp("pincer"), fingers=with_regions()))
 
 

@@ -1,0 +1,267 @@
+"""The keys of a hand file, version 1. Does not import Drake.
+
+In: a YAML file. Out: a `HandFile`, in which every value is possible by itself; `description` checks
+it against the model. docs/how-to/add-a-hand.md lists the keys.
+
+A joint turns, and its positions are angles [rad], or it slides, and they are lengths [m].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+    with_config,
+)
+
+from drakegrasp.config import Config, describe_mistake
+from drakegrasp.errors import HandError, one_line
+from drakegrasp.frames import Array
+from drakegrasp.hand.files import hand_file
+
+#: Version of the keys that this module reads.
+VERSION = 1
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Name = Annotated[str, Field(min_length=1)]
+Vector = tuple[Finite, Finite, Finite]
+#: Normal and offset (nx, ny, nz, d) of the points p with n.p >= d; the normal need not be unit.
+HalfSpace = tuple[Finite, Finite, Finite, Finite]
+#: What a closing joint does when it is pushed open; see docs/explanation/physics.md, "Drive".
+Drive = Literal["worm", "torque", "locked"]
+_STRICT = ConfigDict(frozen=True, extra="forbid")
+
+
+@with_config(_STRICT)
+@dataclass(frozen=True, kw_only=True)
+class Coupling:
+    """A joint that follows a finger's closing joint: its position is ratio * closing + offset."""
+
+    joint: Name
+    ratio: Finite  # not zero
+    offset: Finite = 0.0  # its position in the open hand [rad or m]
+
+    def __post_init__(self) -> None:
+        if self.ratio == 0.0:
+            raise ValueError("ratio must not be zero, got 0.0")
+
+
+@with_config(_STRICT)
+@dataclass(frozen=True, kw_only=True)
+class Finger:
+    """A finger; its kinematics is its `chains.Chain`.
+
+    A finger with a `torque_limit` closes by turning, one with a `force_limit` by sliding.
+    """
+
+    name: Name
+    fingertip: Name  # link, frame Fi
+    closing_joint: Name  # the driven joint; a positive position closes
+    torque_limit: Positive | None = None  # of the motor, at a turning closing joint [N m]
+    force_limit: Positive | None = None  # of the motor, at a sliding closing joint [N]
+    rotor_inertia: NonNegative = 0.0  # of the motor [kg m^2]
+    gear_ratio: Positive = 1.0  # motor angle / closing position [-, or rad/m]
+    holding_torque: Positive | None = None  # what a stalled worm holds, turning [N m]
+    holding_force: Positive | None = None  # what it holds, sliding [N]
+    coupled: tuple[Coupling, ...] = ()
+    pad_region: tuple[HalfSpace, ...] = ()  # in Fi [m]; only there a contact is a fingertip's
+    pad_point: Vector  # usual contact point, in Fi [m]
+    required: bool = True  # whether a grasp needs this fingertip on the object
+
+    def __post_init__(self) -> None:
+        # A finger either turns or slides.
+        if (self.torque_limit is None) == (self.force_limit is None):
+            raise ValueError(
+                "torque_limit must be given if the closing joint turns, else force_limit, "
+                f"got {'none' if self.torque_limit is None else 'both'}"
+            )
+        key, wrong = ("force", "torque") if self.slides else ("torque", "force")
+        if getattr(self, f"holding_{wrong}") is not None:
+            raise ValueError(f"holding_{wrong} must be holding_{key} beside {key}_limit")
+
+        # A worm holds at least what its motor gives.
+        holding = self.holding_effort
+        if holding is not None and holding < self.effort_limit:
+            raise ValueError(
+                f"holding_{key} must be at least the {key}_limit of {self.effort_limit:g} "
+                f"{self.effort_unit}, got {holding:g}"
+            )
+
+        # The pad.
+        for i, (*normal, _) in enumerate(self.pad_region):
+            if not any(normal):
+                raise ValueError(f"pad_region.{i} must have a normal that is not zero, got zero")
+        if not self.on_pad(self.p_FiP):
+            raise ValueError(f"pad_point must lie in the pad_region, got {list(self.pad_point)}")
+
+    @property
+    def slides(self) -> bool:
+        """Whether the closing joint slides."""
+        return self.force_limit is not None
+
+    @property
+    def effort_limit(self) -> float:
+        """Largest torque [N m] or force [N] of the motor at the closing joint."""
+        limit = self.force_limit if self.torque_limit is None else self.torque_limit
+        assert limit is not None
+        return limit
+
+    @property
+    def holding_effort(self) -> float | None:
+        """Torque [N m] or force [N] that a stalled worm holds; None if it is not known."""
+        return self.holding_force if self.slides else self.holding_torque
+
+    @property
+    def effort_unit(self) -> str:
+        """Unit of torques or forces at the closing joint."""
+        return "N" if self.slides else "N m"
+
+    @property
+    def p_FiP(self) -> Array:
+        """Usual contact point (3,) in the fingertip link's frame [m]."""
+        return np.array(self.pad_point)
+
+    def on_pad(self, p_FiQ: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Return (...,) whether points (..., 3) of the fingertip link [m] belong to the pad."""
+        points = np.asarray(p_FiQ, dtype=float)
+        inside = np.ones(points.shape[:-1], dtype=np.bool_)
+        for nx, ny, nz, d in self.pad_region:
+            inside &= nx * points[..., 0] + ny * points[..., 1] + nz * points[..., 2] >= d
+        return inside
+
+
+@with_config(_STRICT)
+@dataclass(frozen=True, kw_only=True)
+class Spread:
+    """The joints that keep the spread angle during an attempt; a hand may have none."""
+
+    joints: tuple[Name, ...] = ()
+
+
+class Palm(BaseModel):
+    """The palm frame G in the palm link's frame B."""
+
+    model_config = _STRICT
+    link: Name
+    p_BG: Vector  # [m]
+    rpy_deg: Vector = (0.0, 0.0, 0.0)
+
+
+class HandFile(BaseModel):
+    """The YAML file."""
+
+    model_config = _STRICT
+    version: int
+    model: Name  # the SDFormat or URDF file, relative to the YAML file
+    packages: dict[Name, Name] = {}  # folders of package:// URIs, relative to the YAML file
+    palm: Palm
+    fingers: Annotated[tuple[Finger, ...], Field(min_length=1)]
+    drive: Literal["worm", "torque"] = "torque"
+    spread: Spread = Spread()
+    preshape: dict[Name, Finite] = {}  # joints that keep one position [rad or m]
+    closing_speed_deg: Positive | None = None  # of turning closing joints [deg/s]
+    closing_speed: Positive | None = None  # of sliding closing joints [m/s]
+    standoffs: Annotated[tuple[Positive, ...], Field(min_length=1)]  # palm to surface [m]
+    spreads_deg: Annotated[
+        tuple[Annotated[float, Field(ge=0.0, le=180.0)], ...], Field(min_length=1)
+    ] = (0.0,)
+    payload: Positive | None = None  # largest mass that the hand is made for [kg]
+
+    @model_validator(mode="after")
+    def _check_worms(self) -> HandFile:
+        """Refuse worms of unknown strength."""
+        for i, finger in enumerate(self.fingers):
+            if self.drive == "worm" and finger.holding_effort is None:
+                key = "holding_force" if finger.slides else "holding_torque"
+                raise ValueError(f"fingers.{i}.{key} must be given where drive is worm, got none")
+        return self
+
+    @model_validator(mode="after")
+    def _check_speeds(self) -> HandFile:
+        """Demand the speed of each kind of closing joint, and no other."""
+        for key, slides, how in (
+            ("closing_speed_deg", False, "turns"),
+            ("closing_speed", True, "slides"),
+        ):
+            used = any(finger.slides == slides for finger in self.fingers)
+            if used != (getattr(self, key) is not None):
+                must = f"be given where a closing joint {how}, got none"
+                raise ValueError(
+                    f"{key} must {must}"
+                    if used
+                    else f"{key} must be left out: no closing joint {how}"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _check_spreads(self) -> HandFile:
+        """Refuse angles of a spread that the hand does not have."""
+        if not self.spread.joints and set(self.spreads_deg) != {0.0}:
+            raise ValueError(
+                f"spreads_deg must be [0] without spread.joints, got {list(self.spreads_deg)}"
+            )
+        return self
+
+    def closing_speeds(self) -> Array:
+        """Return the speed (k,) of each closing joint [rad/s or m/s]."""
+        turning, sliding = self.closing_speed_deg, self.closing_speed
+        return np.array(
+            [sliding if f.slides else np.deg2rad(turning or 0.0) for f in self.fingers],
+            dtype=float,
+        )
+
+
+def read_hand_file(path: Path) -> HandFile:
+    """Return the contents of a hand file.
+
+    Raises:
+        HandError: If a key or a value cannot be used, in one line.
+    """
+    try:
+        tree: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise HandError(f"{path}: must be YAML, got text that is not ({one_line(error)})") from None
+
+    # Another version may have other keys: its mistake is the version alone.
+    version = tree.get("version", VERSION) if isinstance(tree, dict) else VERSION
+    if version != VERSION:
+        raise HandError(
+            f"{path}: version: must be {VERSION}, the hand files that are read, got {version!r}"
+        )
+    try:
+        return HandFile.model_validate(tree)
+    except ValidationError as error:
+        lines = [
+            describe_mistake(mistake, whole="hand", legal="a key of a hand file")
+            for mistake in error.errors()
+        ]
+        raise HandError(f"{path}: {'; '.join(lines)}") from None
+
+
+def with_hand_defaults(config: Config) -> Config:
+    """Return a configuration whose stand-offs and spreads are numbers: its own, or the hand's.
+
+    Raises:
+        HandError: If the hand's file cannot be read.
+    """
+    candidates = config.candidates
+    if candidates.standoffs is not None and candidates.spreads_deg is not None:
+        return config
+    described = read_hand_file(hand_file(config.hand))
+    changes = {
+        "standoffs": candidates.standoffs or described.standoffs,
+        "spreads_deg": candidates.spreads_deg or described.spreads_deg,
+    }
+    return config.model_copy(update={"candidates": candidates.model_copy(update=changes)})

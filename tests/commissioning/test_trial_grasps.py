@@ -1,0 +1,62 @@
+"""Trial grasps: how far what is pinched slips, by hand and drive."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.hands import write_slider
+
+from drakegrasp.commissioning.pinch import find_opposition, find_pinch, reach
+from drakegrasp.commissioning.trial_grasps import check_grasp, trial_grasps
+from drakegrasp.config import load_config
+from drakegrasp.hand.description import load_hand
+from drakegrasp.outcomes import Outcome
+from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.scene import hand_positions
+from drakegrasp.simulation.trial import run_attempt
+
+
+def test_a_pinch_is_where_the_pads_leave_its_width(tmp_path) -> None:
+    """Fingers slide along y from 40 mm to the middle; pads end 110 mm above the palm link."""
+    hand = load_hand(write_slider(tmp_path))
+    np.testing.assert_allclose(find_opposition(hand).axis, [0.0, 1.0, 0.0], atol=1e-9)
+    assert find_opposition(hand).group.tolist() == [True, False]
+    pinch = find_pinch(hand, 0.05)
+    assert pinch is not None
+    np.testing.assert_allclose(pinch.closing, 0.015, atol=0.002)
+    assert pinch.width == pytest.approx(0.05, abs=0.004)
+    assert pinch.tilt < np.deg2rad(3.0)
+    assert pinch.p_GM[1] == pytest.approx(0.0, abs=1e-3)
+    assert find_pinch(hand, 0.1) is None
+    assert reach(hand, np.array([0.0, 0.0, 1.0])) == pytest.approx(0.1, abs=1e-9)
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["allegro", "franka"])
+@pytest.mark.parametrize("drive", ["worm", "locked"])
+def test_a_pinched_box_slips_by_less_than_a_millimetre(name: str, drive: str) -> None:
+    """Within the payload; joints of the preshape keep their positions."""
+    hand, config = load_hand(name), load_config(overrides=[f"lift.drive={drive}"])
+    grasp = next(trial_grasps(hand, "box"))
+    assert grasp.model.mass <= hand.payload
+    scene = build_scene(grasp.model, config.physics, hand)
+    record = run_attempt(scene, grasp.X_TO, grasp.pregrasp, config)
+    assert record.outcome is Outcome.SUCCESS
+    assert record.closed.touching.all()
+    assert record.slip < 1e-3
+    assert record.turn < np.deg2rad(1.0)
+    q = dict(zip(hand.joint_names, hand_positions(scene), strict=True))
+    for joint, position in hand.preshape.items():
+        assert q[joint] == position
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_slip_of_fingers_that_are_pushed_open_is_told() -> None:
+    finding = check_grasp(load_hand("allegro"), load_config(overrides=["lift.drive=torque"]), "box")
+    assert finding.ok
+    locked, own = finding.text.split(" with fingers that are locked, ")
+    assert "slips by 0.1" in locked
+    assert own.startswith("slips by 3.")
+    assert own.endswith("with its own, which are pushed open")

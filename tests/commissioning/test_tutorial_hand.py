@@ -1,0 +1,69 @@
+"""The hand of docs/how-to/add-a-hand.md is complete, and does what the page says."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from helpers.machine import needs_egl
+
+from drakegrasp.cli.main import main
+from drakegrasp.hand.file_format import Coupling, Finger, HandFile, Palm, Spread
+
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "how-to" / "add-a-hand.md").read_text()
+
+
+@pytest.fixture
+def tongs(tmp_path: Path) -> Path:
+    """Write the two files of the page as a reader would, and return the hand file."""
+    for name, language in (("tongs.urdf", "xml"), ("tongs_hand.yaml", "yaml")):
+        assert f"Write this as `{name}`" in PAGE
+        (block,) = re.findall(rf"^```{language}\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
+        (tmp_path / name).write_text(block)
+    return tmp_path / "tongs_hand.yaml"
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+@needs_egl
+def test_the_tutorial_hand_passes_every_check_of_the_page(tongs: Path) -> None:
+    picture = tongs.parent / "tongs.png"
+    result = CliRunner().invoke(main, ["hand", "check", str(tongs), "--picture", str(picture)])
+    assert result.exit_code == 0, result.output
+    lines = [line.split(None, 1)[1] for line in result.output.splitlines()[:-1]]
+    assert lines[0] == "files                2 fingers, 4 joints, 5 shapes in tongs.urdf"
+    table = PAGE[PAGE.index("| check | what") : PAGE.index("The picture shows")]
+    names = re.findall(r"^\| ([a-z].*?) \|", table, re.MULTILINE)[1:]
+    assert [re.split(r"  +", line)[0] for line in lines] == [*names[:-1], *GRASPS]
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+GRASPS = ("grasp of a box", "grasp of a cylinder")
+
+
+def test_a_fault_ends_the_command_with_one(tongs: Path) -> None:
+    tongs.write_text(tongs.read_text().replace("left_tip ", "left_nail "))
+    result = CliRunner().invoke(main, ["hand", "check", str(tongs)])
+    assert result.exit_code == 1
+    assert result.output.startswith("FAIL  files")
+
+
+def test_the_page_has_every_key_of_a_hand_file() -> None:
+    """And no other."""
+    rows = re.findall(r"^\| (`[^|]*) \|", PAGE[: PAGE.index("## 3.")], re.MULTILINE)
+    named = {key.split(".")[0] for row in rows for key in re.findall(r"`([\w.\[\]]+)`", row)}
+    fingers = {
+        key
+        for row in rows
+        if "fingers[]" in row
+        for key in re.findall(r"`(?:fingers\[\]\.)?(\w+)`", row)
+    }
+    top = {key for key in named if "[" not in key} - fingers
+    assert top == set(HandFile.model_fields)
+    assert fingers == set(Finger.__dataclass_fields__)
+    for section in (Coupling, Spread):
+        for key in section.__dataclass_fields__:
+            assert key in PAGE
+    assert all(f"palm.{key}" in PAGE for key in Palm.model_fields)
