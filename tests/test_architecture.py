@@ -30,6 +30,7 @@ ORDER = (
     "dataset",
     "visualization",
     "build",
+    "inspection",
     "cluster",
     "verification",
     "bench",
@@ -47,6 +48,9 @@ WALLS = {
     "dask": ("cluster",),
     "distributed": ("cluster",),
     "click": ("cli",),
+    "starlette": ("inspection",),
+    "uvicorn": ("inspection",),
+    "jinja2": ("inspection",),
     "matplotlib": ("visualization", "verification.figure"),
     "pydrake": ("hand", "vision", "simulation", "visualization", "verification", "bench"),
 }

@@ -16,6 +16,7 @@ import click
 from drakegrasp.cli.bench import bench
 from drakegrasp.cli.build import assemble, build, stats
 from drakegrasp.cli.group import main
+from drakegrasp.cli.inspect import inspect_
 from drakegrasp.cli.options import (
     manifest_option,
     out_argument,
@@ -145,7 +146,19 @@ def replay(out: Path, trial: int, html: Path | None) -> None:
 
 
 # The help lists them in this order.
-for _command in (doctor, objects, audit, build, assemble, check, stats, replay, verify, bench):
+for _command in (
+    doctor,
+    objects,
+    audit,
+    build,
+    assemble,
+    check,
+    stats,
+    inspect_,
+    replay,
+    verify,
+    bench,
+):
     main.add_command(_command)
 
 
