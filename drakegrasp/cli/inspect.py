@@ -44,10 +44,11 @@ def inspect_(out: Path, port: int, folder: Path | None, no_browser: bool) -> Non
         from drakegrasp.inspection.serve import serve
         from drakegrasp.inspection.static_site import write_site
     except ModuleNotFoundError as error:
-        if error.name not in ("starlette", "uvicorn", "jinja2"):
+        library = (error.name or "").partition(".")[0]
+        if library not in ("starlette", "uvicorn", "jinja2"):
             raise
         raise DataError(
-            f"inspect needs {error.name}, which is missing: pip install 'drakegrasp[inspect]'"
+            f"inspect needs {library}, which is missing: pip install 'drakegrasp[inspect]'"
         ) from None
 
     if folder is None:

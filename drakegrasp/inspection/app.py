@@ -11,7 +11,8 @@ import json
 import secrets
 import threading
 from collections import OrderedDict
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -125,7 +126,13 @@ def make_app(inspection: Inspection) -> Starlette:
     def post(path: str, answer: Callable[[Inspection, dict[str, Any]], Response]) -> Route:
         return Route(path, partial(_post, inspection, answer), methods=["POST"])
 
-    return Starlette(
+    @asynccontextmanager
+    async def lifespan(app: Starlette) -> AsyncIterator[None]:
+        yield
+        inspection.recordings.close()
+
+    app = Starlette(
+        lifespan=lifespan,
         routes=[
             route("/", _gallery),
             route("/grasp/{label}", _grasp),
@@ -149,6 +156,8 @@ def make_app(inspection: Inspection) -> Starlette:
             OSError: _data_error,
         },
     )
+    app.state.inspection = inspection
+    return app
 
 
 class SecurityHeaders:

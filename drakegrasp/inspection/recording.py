@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -25,7 +26,7 @@ class Recordings:
 
     def __init__(self, out: Path) -> None:
         self._out = out
-        self._folder = tempfile.TemporaryDirectory(prefix="drakegrasp-inspect-")
+        self._folder: Path | None = None
         self._lock = threading.Lock()
 
     def make(self, label: str, trial: int) -> None:
@@ -38,11 +39,13 @@ class Recordings:
         Raises:
             DataError: If it cannot be run again; the reason is the last line of `replay`.
         """
-        path = self._path(label)
         code = "from drakegrasp.cli.main import run; run()"
         command = [sys.executable, "-c", code, "replay", str(self._out), "--trial", str(trial)]
         # One at a time: each takes a core for some seconds.
         with self._lock:
+            if self._folder is None:
+                self._folder = Path(tempfile.mkdtemp(prefix="drakegrasp-inspect-"))
+            path = self._path(label)
             if path.is_file():
                 return
             try:
@@ -62,10 +65,18 @@ class Recordings:
 
     def read(self, label: str) -> bytes | None:
         """Return the recording of an attempt, or None if none was made."""
+        if self._folder is None:
+            return None
         path = self._path(label)
         return path.read_bytes() if path.is_file() else None
 
+    def close(self) -> None:
+        """Remove the recordings."""
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
     def _path(self, label: str) -> Path:
         """Return the path of a recording; a label is three numbers, and nothing else is a name."""
+        assert self._folder is not None
         safe = "".join(c for c in label if c in "0123456789-")
-        return Path(self._folder.name) / f"{safe}.html"
+        return self._folder / f"{safe}.html"

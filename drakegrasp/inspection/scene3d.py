@@ -69,10 +69,13 @@ class HandView:
         Raises:
             IndexError: If there is no link of that number.
         """
-        return self._glbs[self.links[number]]
+        link = self.links[number]  # first, since it may load them
+        return self._glbs[link]
 
     def poses(self, X_TG: Array, q: Array | None, spread: float) -> list[list[float]]:
-        """Return the poses of the links, column by column as three.js has them.
+        """Return the poses of the links, column by column as for three.js; none without a hand.
+
+        A dataset that was made with other files of the hand may have another number of joints.
 
         Args:
             X_TG: (4, 4), pose of the palm.
@@ -83,7 +86,10 @@ class HandView:
         if self._hand is None:
             return []
         with self._lock:
-            positions = self._hand.open_positions(spread) if q is None else q
+            rest = self._hand.open_positions(spread)
+            positions = rest if q is None else q
+            if len(positions) != len(rest):
+                return []
             poses = self._hand.link_poses(X_TG, positions)
         return [_columns(poses[link]) for link in self._glbs]
 

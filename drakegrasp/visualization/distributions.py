@@ -25,22 +25,23 @@ MAX_OBJECTS = 60
 BINS, SHOWN = 40, 0.98
 
 
-def draw_outcomes(counts: Mapping[str, int]) -> Figure:
-    """Return how many attempts ended in which way, as bars on a logarithmic scale.
+def draw_counts(counts: Mapping[str, int], what: str) -> Figure:
+    """Return how many there are of each kind, as bars on a logarithmic scale.
 
     Args:
-        counts: Numbers of attempts by outcome, in the order of the bars.
+        counts: Numbers by kind, in the order of the bars; the first is the one that is wanted.
+        what: What is counted, e.g. "attempts".
     """
     names, numbers = list(counts), np.array(list(counts.values()))
     figure = Figure(figsize=(8.0, 0.9 + 0.3 * len(names)), layout="constrained")
     axes = figure.add_subplot()
-    colours = [STABLE if name == "success" else FAILED for name in names]
+    colours = [STABLE if i == 0 else FAILED for i in range(len(names))]
     bars = axes.barh(range(len(names)), np.maximum(numbers, 0.8), color=colours, height=0.72)
     axes.bar_label(bars, [f"{n:,}" for n in numbers], padding=3, color=INK, fontsize=9)
     _name_bars(axes, [name.replace("_", " ") for name in names])
     axes.set_xscale("log")
     axes.set_xlim(0.8, 6.0 * max(10, numbers.max(initial=0)))
-    axes.set_xlabel("attempts")
+    axes.set_xlabel(what)
     return figure
 
 

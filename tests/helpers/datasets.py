@@ -55,7 +55,7 @@ SUCCESS, MISSING, BELOW, SLIPPED, HAND, AFTER_LIFT = 0, 1, 2, 4, 6, 10
 SLIP = 2e-3
 
 
-SIZES = sizes(fingers=3, joints=4, image=32)
+SIZES = sizes(fingers=3, joints=8, image=32)
 
 
 def ray_box(origin: Array, rays: Array, half: Array) -> Array:
@@ -97,7 +97,7 @@ def contacts(model: ObjectModel, touching: np.ndarray, z: float = 0.0) -> dict[s
         "f_Q_O": np.where(gone, 0.0, -10.0 * n),
         "area": np.where(touching, 1e-5, 0.0),
         "penetration": np.where(touching, 1e-4, 0.0),
-        "q": np.full(4, 0.5),
+        "q": np.full(8, 0.5),
     }
 
 
@@ -145,7 +145,7 @@ def trial_row(model: ObjectModel, number: int, X_TO: Array) -> dict[str, Any]:
         touch = touch & (outcome is not Outcome.DROPPED)
         touch[0] &= outcome is not Outcome.SLIPPED
         row |= {f"lifted_{k}": v for k, v in contacts(model, touch, SLIP).items()}
-        row["lifted_q"] = np.full(4, 0.6)
+        row["lifted_q"] = np.full(8, 0.6)
         row |= {"time_lift": 1.0, "lifted_object_on_table": after_lift}
         row |= {"X_TO_lifted": pack_pose(X_TO), "surface_distance": np.zeros(3)}
         row |= {"normal_angle": np.zeros(3), **hold(row)}

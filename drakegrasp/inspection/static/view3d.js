@@ -28,9 +28,9 @@
   scene.add(sun);
   const table = new THREE.Mesh(
     new THREE.CircleGeometry(0.35, 64),
-    new THREE.MeshStandardMaterial({ color: "#c9c0b2", roughness: 1 }),
+    new THREE.MeshStandardMaterial({ color: "#b9afa0", roughness: 1 }),
   );
-  table.position.z = -0.0005;
+  table.position.z = -0.001;
   scene.add(table);
   scene.add(new THREE.AxesHelper(0.05));
 
@@ -86,6 +86,7 @@
   function show(name) {
     const state = data.states[name];
     state.links.forEach((columns, i) => place(links[i], columns));
+    links.forEach((link, i) => { link.visible = i < state.links.length; });
     contacts.clear();
     forces.clear();
     for (const contact of state.contacts) {
