@@ -119,7 +119,7 @@ def make_cards(
                 "strip": links.strip(label, "oto") if success else "",
                 "dots": contact_dots(snapshot, row, "oto") if success else [],
                 "words": words_of(snapshot, i),
-                "suspicion": QUANTITIES["suspicion"].text(table.features["suspicion"][i]),
+                "suspicion": QUANTITIES["suspicion"].text(table.value("suspicion", i)),
                 "reasons": _reasons(snapshot, i),
                 "decision": decisions.of(key),
                 "values": _plain_values(snapshot, i) if links.static else {},
@@ -152,11 +152,12 @@ def words_of(snapshot: Snapshot, i: int) -> list[str]:
 
 def _reasons(snapshot: Snapshot, i: int) -> list[str]:
     """Return the largest parts of an attempt's suspicion, as text."""
-    features = snapshot.table.features
-    shares = [(float(features[part.name][i]) / part.scale, part.name) for part in PARTS]
+    table = snapshot.table
+    shares = [(table.value(part.name, i) / part.scale, part.name) for part in PARTS]
     large = sorted((s for s in shares if s[0] >= REASON_SHARE), reverse=True)[:REASONS]
     return [
-        f"{QUANTITIES[name].title} {QUANTITIES[name].text(features[name][i])}" for _, name in large
+        f"{QUANTITIES[name].title} {QUANTITIES[name].text(table.value(name, i))}"
+        for _, name in large
     ]
 
 
@@ -164,7 +165,7 @@ def _plain_values(snapshot: Snapshot, i: int) -> dict[str, str]:
     """Return what a page without a server filters and sorts by, as attributes of its card."""
     table = snapshot.table
     words = words_of(snapshot, i)
-    values = {name: f"{float(table.features[name][i]) * q.factor:.6g}" for name, q in
+    values = {name: f"{table.value(name, i) * q.factor:.6g}" for name, q in
               QUANTITIES.items()}  # fmt: skip
     return values | {
         "object": snapshot.names[table.object[i]],
@@ -289,7 +290,7 @@ def grasp_page(
         gallery=links.gallery(query.params()),
         views=views if success else [],
         size=snapshot.config.camera.size,
-        score=QUANTITIES["suspicion"].text(table.features["suspicion"][i]),
+        score=QUANTITIES["suspicion"].text(table.value("suspicion", i)),
         parts=_parts(snapshot, i, row),
         facts=_facts(snapshot, i, row),
         fingers=_fingers(row),

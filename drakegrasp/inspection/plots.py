@@ -105,7 +105,7 @@ def _distributions(snapshot: Snapshot) -> Any:
     quantities = []
     for name, quantity in QUANTITIES.items():
         unit = f" [{quantity.unit}]" if quantity.unit else ""
-        values = table.features[name][held].astype(float) * quantity.factor
+        values = table.feature(name)[held].astype(float) * quantity.factor
         quantities.append((quantity.title + unit, values))
     groups = {
         "held": np.ones(int(held.sum()), dtype=bool),

@@ -196,7 +196,7 @@ def select(snapshot: Snapshot, query: Query, decisions: Decisions) -> npt.NDArra
     (places,) = np.nonzero(chosen)
     if query.sort == "row":
         return places if not query.ascending else places[::-1]
-    values = snapshot.table.features[query.sort][places]
+    values = snapshot.table.feature(query.sort)[places]
     keys = values if query.ascending else -values
     return places[np.argsort(np.where(np.isnan(keys), np.inf, keys), kind="stable")]
 
@@ -228,7 +228,7 @@ def _matches(snapshot: Snapshot, query: Query) -> npt.NDArray[np.bool_]:
 
     # Numbers; an attempt without one is in no range.
     for name, (least, largest) in query.ranges.items():
-        values = table.features[name] * QUANTITIES[name].factor
+        values = table.feature(name) * QUANTITIES[name].factor
         if least is not None:
             chosen &= values >= least
         if largest is not None:

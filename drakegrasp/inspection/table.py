@@ -1,7 +1,8 @@
 """The attempts of a dataset as columns in memory: what filters and sorting need.
 
 In: trials.hdf5 with the data files, or, while a build runs, the shards that are done. Out: an
-`AttemptTable`, some eighty bytes per attempt. Images and poses stay in the files.
+`AttemptTable`, some twenty bytes per attempt and fifty more where the hand closed. Images and
+poses stay in the files.
 """
 
 from __future__ import annotations
@@ -49,7 +50,8 @@ class AttemptTable:
         split: (n,) uint8, index into SPLITS; NONE for what is no sample.
         precision, stable: (n,) bool, see the schema.
         source, row: (n,) int32, number of the file that holds the attempt, and row in it.
-        features: By the names of FEATURES, (n,) float32; NaN where an attempt has no value.
+        closed: (m,) int32, places of the attempts whose hand closed, in rising order.
+        features: By the names of FEATURES, (m,) float32, of these; the others have no values.
     """
 
     object: npt.NDArray[np.int32]
@@ -62,10 +64,23 @@ class AttemptTable:
     stable: npt.NDArray[np.bool_]
     source: npt.NDArray[np.int32]
     row: npt.NDArray[np.int32]
+    closed: npt.NDArray[np.int32]
     features: Mapping[str, npt.NDArray[np.float32]]
 
     def __len__(self) -> int:
         return len(self.outcome)
+
+    def feature(self, name: str) -> npt.NDArray[np.float32]:
+        """Return a feature of all attempts (n,); NaN where an attempt has no value."""
+        values = np.full(len(self), np.nan, dtype=np.float32)
+        values[self.closed] = self.features[name]
+        return values
+
+    def value(self, name: str, i: int) -> float:
+        """Return a feature of one attempt; NaN if it has no value."""
+        k = int(np.searchsorted(self.closed, i))
+        there = k < len(self.closed) and self.closed[k] == i
+        return float(self.features[name][k]) if there else float("nan")
 
     def find(self, object_: int, candidate: int, standoff_index: int) -> int | None:
         """Return the place of an attempt, or None if it is not there."""
@@ -96,10 +111,9 @@ def read_trials_table(path: Path, masses: Sequence[float]) -> AttemptTable:
             for start in range(0, len(objects), BLOCK):
                 rows = slice(start, start + BLOCK)
                 columns = {name: trials[name][rows] for name in READ}
-                count = len(columns["outcome"])
-                place = np.arange(start, start + count, dtype=np.int32)
-                parts.append(_part(columns, objects[rows], masses, np.int32(0), place))
-            table = join(parts)
+                place = np.arange(start, start + len(columns["outcome"]), dtype=np.int32)
+                parts.append(_part(columns, objects[rows], masses, 0, place))
+            table = join(parts) if parts else empty_table()
             table.removal[file["successes/trial_id"][:]] = file["successes/removal"][:]
     except (OSError, KeyError, IndexError) as error:
         raise DataError(f"{path}: must be the trials of a dataset, got none ({error})") from None
@@ -128,7 +142,7 @@ def read_shard_part(
     count = len(columns["outcome"])
     objects = np.full(count, object_, dtype=np.int32)
     masses = np.full(object_ + 1, mass)
-    return _part(columns, objects, masses, np.int32(number), np.arange(count, dtype=np.int32))
+    return _part(columns, objects, masses, number, np.arange(count, dtype=np.int32))
 
 
 def read_sample_ids(out: Path) -> dict[str, npt.NDArray[np.int64]]:
@@ -144,9 +158,12 @@ def read_sample_ids(out: Path) -> dict[str, npt.NDArray[np.int64]]:
 
 def join(parts: Sequence[AttemptTable]) -> AttemptTable:
     """Return tables one after the other as one."""
-    plain = [f.name for f in fields(AttemptTable) if f.name != "features"]
+    plain = [f.name for f in fields(AttemptTable) if f.name not in ("closed", "features")]
+    starts = np.cumsum([0, *(len(part) for part in parts[:-1])], dtype=np.int32)
+    closed = [part.closed + start for part, start in zip(parts, starts, strict=True)]
     return AttemptTable(
         **{name: np.concatenate([getattr(part, name) for part in parts]) for name in plain},
+        closed=np.concatenate(closed),
         features={
             name: np.concatenate([part.features[name] for part in parts]) for name in FEATURES
         },
@@ -167,18 +184,22 @@ def _part(
     columns: Mapping[str, AnyArray],
     objects: AnyArray,
     masses: Sequence[float] | AnyArray,
-    source: np.int32,
+    source: int,
     row: npt.NDArray[np.int32],
 ) -> AttemptTable:
     """Return the table of some rows of `/trials`."""
+    # Most attempts never close the hand: only those that do have numbers.
     count = len(row)
-    doubts = suspicion(columns, np.asarray(masses, dtype=float)[objects])
+    (closed,) = np.nonzero(np.isfinite(columns["time_close"]))
+    few = {name: values[closed] for name, values in columns.items()}
+    doubts = suspicion(few, np.asarray(masses, dtype=float)[objects[closed]])
 
     # The largest force of a fingertip, after the lift if there was one.
-    lifted = np.isfinite(columns["time_lift"])[:, None, None]
-    forces = np.where(lifted, columns["lifted_f_Q_O"], columns["closed_f_Q_O"])
+    lifted = np.isfinite(few["time_lift"])[:, None, None]
+    forces = np.where(lifted, few["lifted_f_Q_O"], few["closed_f_Q_O"])
     extra = {"suspicion": doubts.score, "force": norm(forces).max(axis=1, initial=-np.inf)}
 
+    features = {name: v.astype(np.float32) for name, v in (extra | dict(doubts.values)).items()}
     return AttemptTable(
         object=objects.astype(np.int32),
         candidate=columns["candidate"].astype(np.int32),
@@ -190,8 +211,6 @@ def _part(
         stable=columns["stable"].astype(bool),
         source=np.full(count, source, dtype=np.int32),
         row=row,
-        features={
-            name: values.astype(np.float32)
-            for name, values in (extra | dict(doubts.values)).items()
-        },
+        closed=closed.astype(np.int32),
+        features=features,
     )

@@ -39,8 +39,13 @@ def test_table_is_what_the_files_say(boxes: Path) -> None:
             np.testing.assert_array_equal(ids, data[split]["trial_id"][:])
     assert (table.removal != NONE).sum() == (table.split != NONE).sum() == 9
     assert set(table.features) == set(FEATURES)
-    np.testing.assert_allclose(table.features["slip"][table.precision], SLIP)
-    np.testing.assert_allclose(table.features["force"][0], 10.0)
+    np.testing.assert_allclose(table.feature("slip")[table.precision], SLIP)
+    assert table.value("force", 0) == 10.0
+    # The second attempt misses a finger, the third is below the table.
+    assert np.isnan(table.feature("slip")[[1, 2]]).all()
+    assert np.isnan(table.value("force", 2))
+    assert table.value("force", 1) == 10.0
+    assert np.isfinite(table.feature("force")[table.closed]).all()
 
 
 def test_attempts_are_found_by_their_label(boxes: Path) -> None:

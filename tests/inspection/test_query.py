@@ -80,7 +80,7 @@ def test_ranges_are_in_the_units_that_are_shown(snapshot: Snapshot) -> None:
 def test_order_is_by_the_quantity_and_those_without_come_last(snapshot: Snapshot) -> None:
     table = snapshot.table
     score = table.features["suspicion"].copy()
-    score[[0, 3, 11]] = [5.0, np.nan, 7.0]
+    score[np.searchsorted(table.closed, [0, 3, 11])] = [5.0, np.nan, 7.0]
     changed = replace(
         snapshot, table=replace(table, features={**table.features, "suspicion": score})
     )
