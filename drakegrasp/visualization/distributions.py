@@ -65,7 +65,9 @@ def draw_objects(names: Sequence[str], counts: Mapping[str, Sequence[int]]) -> F
         axes.barh(range(len(order)), numbers, color=colour, height=0.78, label=group)
     _name_bars(axes, [names[i] for i in order])
     axes.set_xlabel("grasps")
-    axes.legend(loc="lower right", frameon=False, labelcolor=INK, title=_left_out(names))
+    figure.legend(
+        loc="outside upper center", ncols=3, frameon=False, labelcolor=INK, title=_left_out(names)
+    )
     return figure
 
 
