@@ -60,7 +60,7 @@ def repeat_dataset(out: Path, large: Path, grasps: int) -> int:
     with h5py.File(out / TRIALS_FILE) as source, h5py.File(large / TRIALS_FILE, "w") as target:
         # As many copies as it takes.
         count = len(source["trials/outcome"]) // COLUMN_CHUNK * COLUMN_CHUNK
-        hits = np.count_nonzero(source["trials/outcome"][:count] == Outcome.SUCCESS)
+        hits = int(np.count_nonzero(source["trials/outcome"][:count] == Outcome.SUCCESS))
         if not hits:
             raise click.UsageError(f"{out}: the first {count} attempts must have a success")
         copies = -(-grasps // hits)
