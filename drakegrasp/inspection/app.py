@@ -46,7 +46,7 @@ from drakegrasp.visualization.thumbnails import strip_png
 
 ASSETS = Path(__file__).parent / "static"
 #: Names of this machine that a browser may have asked for.
-HOSTS = ("127.0.0.1", "localhost", "[::1]")
+HOSTS = ("127.0.0.1", "localhost")
 TOKEN_HEADER = "x-drakegrasp-token"
 HEADERS = {
     "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
@@ -87,18 +87,23 @@ class Inspection:
         self.links = ServerLinks()
         self._lock = threading.Lock()
         self._selections: OrderedDict[Any, npt.NDArray[np.int64]] = OrderedDict()
+        self._selected_from: Snapshot | None = None
 
     def selection(self, snapshot: Snapshot, query: Query) -> npt.NDArray[np.int64]:
         """Return the attempts that a query selects; the last selections are remembered."""
         decisions = self.decisions.read()
-        key = (id(snapshot), query.identity, decisions if query.decision else None)
+        key = (query.identity, decisions if query.decision else None)
         with self._lock:
+            if self._selected_from is not snapshot:
+                self._selections.clear()
+                self._selected_from = snapshot
             if key in self._selections:
                 self._selections.move_to_end(key)
                 return self._selections[key]
         places = select(snapshot, query, decisions)
         with self._lock:
-            self._selections[key] = places
+            if self._selected_from is snapshot:
+                self._selections[key] = places
             while len(self._selections) > KEPT_SELECTIONS:
                 self._selections.popitem(last=False)
         return places

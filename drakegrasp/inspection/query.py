@@ -71,6 +71,8 @@ HOLDS = ("held", "precision", "stable")
 DECISIONS = ("rejected", "kept", "open")
 #: Cards on a page of the gallery.
 PAGE = 24
+#: Makes one number of object, palm pose and stand-off, whose type has eight bits.
+_CODE = np.array([1 << 40, 1 << 8, 1], dtype=np.int64)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -237,15 +239,22 @@ def _matches(snapshot: Snapshot, query: Query) -> npt.NDArray[np.bool_]:
 
 
 def _decided(snapshot: Snapshot, decision: str, decisions: Decisions) -> npt.NDArray[np.bool_]:
-    """Return which attempts (n,) are rejected, kept, or still open."""
+    """Return which attempts (n,) are rejected, kept, or still open; only successes are decided."""
     keys = {"rejected": decisions.rejected, "kept": decisions.kept}.get(
         decision, decisions.rejected | decisions.kept
     )
     numbers = {name: i for i, name in enumerate(snapshot.names)}
-    found = np.zeros(len(snapshot.table), dtype=bool)
-    for key in keys:
-        if key.object in numbers:
-            place = snapshot.table.find(numbers[key.object], key.candidate, key.standoff_index)
-            if place is not None:
-                found[place] = True
+    wanted = [
+        (numbers[key.object], key.candidate, key.standoff_index)
+        for key in keys
+        if key.object in numbers
+    ]
+
+    # Compare identities as single numbers: there may be thousands of decisions.
+    table = snapshot.table
+    (hits,) = np.nonzero(table.outcome == Outcome.SUCCESS)
+    columns = (table.object[hits], table.candidate[hits], table.standoff_index[hits])
+    codes = np.array(wanted, dtype=np.int64).reshape(-1, 3) @ _CODE
+    found = np.zeros(len(table), dtype=bool)
+    found[hits[np.isin(np.stack(columns, axis=1).astype(np.int64) @ _CODE, codes)]] = True
     return ~found if decision == "open" else found
