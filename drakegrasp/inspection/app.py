@@ -64,8 +64,10 @@ RECORDING_POLICY = (
     "'unsafe-inline'; img-src data: blob:; connect-src data: blob:; worker-src blob:; "
     "sandbox allow-scripts"
 )
-#: Longest text that a POST may have [B], and selections that are kept in memory.
-MAX_BODY, KEPT_SELECTIONS = 4096, 16
+#: Longest text that a POST may have [B].
+MAX_BODY = 4096
+#: Selections that are kept in memory, and attempts in all of them together: four bytes each.
+KEPT_SELECTIONS, KEPT_PLACES = 16, 10_000_000
 
 
 class Inspection:
@@ -86,10 +88,10 @@ class Inspection:
         self.token = secrets.token_urlsafe(24)
         self.links = ServerLinks()
         self._lock = threading.Lock()
-        self._selections: OrderedDict[Any, npt.NDArray[np.int64]] = OrderedDict()
+        self._selections: OrderedDict[Any, npt.NDArray[np.int32]] = OrderedDict()
         self._selected_from: Snapshot | None = None
 
-    def selection(self, snapshot: Snapshot, query: Query) -> npt.NDArray[np.int64]:
+    def selection(self, snapshot: Snapshot, query: Query) -> npt.NDArray[np.int32]:
         """Return the attempts that a query selects; the last selections are remembered."""
         decisions = self.decisions.read()
         key = (query.identity, decisions if query.decision else None)
@@ -104,7 +106,9 @@ class Inspection:
         with self._lock:
             if self._selected_from is snapshot:
                 self._selections[key] = places
-            while len(self._selections) > KEPT_SELECTIONS:
+            while len(self._selections) > KEPT_SELECTIONS or (
+                len(self._selections) > 1 and sum(map(len, self._selections.values())) > KEPT_PLACES
+            ):
                 self._selections.popitem(last=False)
         return places
 

@@ -34,7 +34,7 @@ from drakegrasp.inspection.table import NONE
 from drakegrasp.outcomes import Outcome
 from drakegrasp.visualization.style import FINGER_COLOURS
 
-Places = npt.NDArray[np.int64]
+Places = npt.NDArray[np.int32]
 #: Reasons of suspicion that a card names, and the share from which on it names one.
 REASONS, REASON_SHARE = 2, 0.75
 

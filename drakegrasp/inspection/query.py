@@ -187,7 +187,7 @@ def _number(params: Mapping[str, str], name: str) -> float | None:
     return value
 
 
-def select(snapshot: Snapshot, query: Query, decisions: Decisions) -> npt.NDArray[np.int64]:
+def select(snapshot: Snapshot, query: Query, decisions: Decisions) -> npt.NDArray[np.int32]:
     """Return the places of the attempts that a query asks for, in its order.
 
     Attempts without a value of what is sorted by come last; ties are in the order of the rows.
@@ -195,12 +195,14 @@ def select(snapshot: Snapshot, query: Query, decisions: Decisions) -> npt.NDArra
     chosen = _matches(snapshot, query)
     if query.decision:
         chosen &= _decided(snapshot, query.decision, decisions)
-    (places,) = np.nonzero(chosen)
+    places = np.flatnonzero(chosen).astype(np.int32)
     if query.sort == "row":
         return places if not query.ascending else places[::-1]
     values = snapshot.table.feature(query.sort)[places]
-    keys = values if query.ascending else -values
-    return places[np.argsort(np.where(np.isnan(keys), np.inf, keys), kind="stable")]
+    if not query.ascending:
+        np.negative(values, out=values)
+    # NaN is sorted last.
+    return places[np.argsort(values, kind="stable")]
 
 
 def _matches(snapshot: Snapshot, query: Query) -> npt.NDArray[np.bool_]:

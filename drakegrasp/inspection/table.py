@@ -8,7 +8,7 @@ poses stay in the files.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,19 @@ READ = (
     *COLUMNS,
     *("candidate", "standoff_index", "precision", "stable", "closed_f_Q_O"),
 )
+#: Columns of a table with a value per attempt.
+_DTYPES: dict[str, type[np.generic]] = {
+    "object": np.int32,
+    "candidate": np.int32,
+    "standoff_index": np.uint8,
+    "outcome": np.uint8,
+    "removal": np.uint8,
+    "split": np.uint8,
+    "precision": np.bool_,
+    "stable": np.bool_,
+    "source": np.int32,
+    "row": np.int32,
+}
 #: Rows that are read at once: 32 chunks of a column.
 BLOCK = 65_536
 
@@ -102,22 +115,26 @@ def read_trials_table(path: Path, masses: Sequence[float]) -> AttemptTable:
     Raises:
         DataError: If the file cannot be read.
     """
-    # Block by block: the columns of a large file as float64 do not fit into memory.
-    parts = []
+    # Block by block into arrays for all: the float64 columns of a large file fill the memory.
     try:
         with h5py.File(path, "r") as file:
             trials = file["trials"]
-            objects = trials["object"][:]
-            for start in range(0, len(objects), BLOCK):
-                rows = slice(start, start + BLOCK)
+            count = len(trials["outcome"])
+            whole = _zeros(count)
+            ends = []
+            for start in range(0, count, BLOCK):
+                rows = slice(start, min(start + BLOCK, count))
                 columns = {name: trials[name][rows] for name in READ}
-                place = np.arange(start, start + len(columns["outcome"]), dtype=np.int32)
-                parts.append(_part(columns, objects[rows], masses, 0, place))
-            table = join(parts) if parts else empty_table()
-            table.removal[file["successes/trial_id"][:]] = file["successes/removal"][:]
+                place = np.arange(rows.start, rows.stop, dtype=np.int32)
+                part = _part(columns, trials["object"][rows], masses, 0, place)
+                for name, values in whole.items():
+                    values[rows] = getattr(part, name)
+                ends.append((part.closed + np.int32(start), part.features))
+            whole["removal"][file["successes/trial_id"][:]] = file["successes/removal"][:]
     except (OSError, KeyError, IndexError) as error:
         raise DataError(f"{path}: must be the trials of a dataset, got none ({error})") from None
 
+    table = _with_features(whole, ends)
     for number, ids in enumerate(read_sample_ids(path.parent).values()):
         table.split[ids[ids < len(table)]] = number
     return table
@@ -158,25 +175,39 @@ def read_sample_ids(out: Path) -> dict[str, npt.NDArray[np.int64]]:
 
 def join(parts: Sequence[AttemptTable]) -> AttemptTable:
     """Return tables one after the other as one."""
-    plain = [f.name for f in fields(AttemptTable) if f.name not in ("closed", "features")]
-    starts = np.cumsum([0, *(len(part) for part in parts[:-1])], dtype=np.int32)
-    closed = [part.closed + start for part, start in zip(parts, starts, strict=True)]
-    return AttemptTable(
-        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in plain},
-        closed=np.concatenate(closed),
-        features={
-            name: np.concatenate([part.features[name] for part in parts]) for name in FEATURES
-        },
-    )
+    starts = np.cumsum([0, *(len(part) for part in parts)], dtype=np.int32)
+    ends = [(p.closed + start, p.features) for p, start in zip(parts, starts, strict=False)]
+    none = _zeros(0)
+    whole = {
+        name: np.concatenate([none[name], *(getattr(part, name) for part in parts)])
+        for name in _DTYPES
+    }
+    return _with_features(whole, ends)
 
 
 def empty_table() -> AttemptTable:
     """Return a table without attempts."""
-    kinds = {f.name: str(f.type) for f in fields(AttemptTable) if f.name != "features"}
-    dtypes = {name: np.dtype(kind.partition("np.")[2].rstrip("]")) for name, kind in kinds.items()}
+    return _with_features(_zeros(0), [])
+
+
+def _zeros(count: int) -> dict[str, AnyArray]:
+    """Return the columns with a value per attempt."""
+    return {name: np.zeros(count, dtype) for name, dtype in _DTYPES.items()}
+
+
+def _with_features(
+    plain: dict[str, AnyArray],
+    parts: Sequence[tuple[npt.NDArray[np.int32], Mapping[str, npt.NDArray[np.float32]]]],
+) -> AttemptTable:
+    """Return the table of columns with a value per attempt, and of features in parts."""
+    none, nothing = np.zeros(0, np.int32), np.zeros(0, np.float32)
     return AttemptTable(
-        **{name: np.zeros(0, dtype) for name, dtype in dtypes.items()},
-        features={name: np.zeros(0, np.float32) for name in FEATURES},
+        **plain,
+        closed=np.concatenate([none, *(closed for closed, _ in parts)]),
+        features={
+            name: np.concatenate([nothing, *(features[name] for _, features in parts)])
+            for name in FEATURES
+        },
     )
 
 

@@ -141,7 +141,10 @@ def measure(out: Path) -> dict[str, Any]:
     assert server.stdout is not None
     try:
         address = server.stdout.readline().strip()
-        result: dict[str, Any] = {"start": round(time.perf_counter() - start, 2)}
+        result: dict[str, Any] = {
+            "start_wall": round(time.perf_counter() - start, 2),
+            "start_cpu": _cpu_seconds(server.pid),
+        }
 
         def ask(paths: list[str]) -> dict[str, float]:
             """Return the largest seconds of the requests, wall-clock and CPU."""
