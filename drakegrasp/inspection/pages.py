@@ -100,8 +100,11 @@ def make_cards(
     snapshot: Snapshot, decisions: Decisions, query: Query, places: Places, links: Links
 ) -> list[dict[str, Any]]:
     """Return the values of the cards of attempts."""
+    # Only the columns of the dots are read: a page must be quick.
     table, cards = snapshot.table, []
     rows = read_rows(snapshot, places.tolist(), THUMBNAIL)
+
+    # Failures have no images.
     for i, row in zip(places.tolist(), rows, strict=True):
         label, key = snapshot.label(i), snapshot.key(i)
         outcome = Outcome(int(table.outcome[i]))

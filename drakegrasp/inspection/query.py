@@ -198,11 +198,12 @@ def select(snapshot: Snapshot, query: Query, decisions: Decisions) -> npt.NDArra
     places = np.flatnonzero(chosen).astype(np.int32)
     if query.sort == "row":
         return places if not query.ascending else places[::-1]
+    # Most attempts have no values: they need no sorting.
     values = snapshot.table.feature(query.sort)[places]
-    if not query.ascending:
-        np.negative(values, out=values)
-    # NaN is sorted last.
-    return places[np.argsort(values, kind="stable")]
+    there = ~np.isnan(values)
+    few = values[there] if query.ascending else -values[there]
+    ordered = places[there][np.argsort(few, kind="stable")]
+    return np.concatenate([ordered, places[~there]])
 
 
 def _matches(snapshot: Snapshot, query: Query) -> npt.NDArray[np.bool_]:

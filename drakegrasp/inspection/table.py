@@ -47,8 +47,8 @@ _DTYPES: dict[str, type[np.generic]] = {
     "source": np.int32,
     "row": np.int32,
 }
-#: Rows that are read at once: 32 chunks of a column.
-BLOCK = 65_536
+#: Rows that are read at once: 8 chunks of a column.
+BLOCK = 16_384
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -127,8 +127,9 @@ def read_trials_table(path: Path, masses: Sequence[float]) -> AttemptTable:
                 columns = {name: trials[name][rows] for name in READ}
                 place = np.arange(rows.start, rows.stop, dtype=np.int32)
                 part = _part(columns, trials["object"][rows], masses, 0, place)
-                for name, values in whole.items():
-                    values[rows] = getattr(part, name)
+                # The only source is 0: memory that is never written costs nothing.
+                for name in _DTYPES.keys() - {"source"}:
+                    whole[name][rows] = getattr(part, name)
                 ends.append((part.closed + np.int32(start), part.features))
             whole["removal"][file["successes/trial_id"][:]] = file["successes/removal"][:]
     except (OSError, KeyError, IndexError) as error:
