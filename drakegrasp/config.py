@@ -273,6 +273,12 @@ class FilterConfig(_Section):
     max_surface_distance: Positive = 2e-3  # [m], of a contact point from the object's surface
     # Between a contact's mean normal and the object's nearest face; the paper removed by eye.
     max_normal_angle_deg: Positive | None = 30.0
+    # Limits of the suspicion score and of parts of it, see dataset/suspicion.py; off: as thresholds
+    # they also remove sound grasps.
+    max_suspicion: Positive | None = None
+    max_penetration: Positive | None = None  # [m], of the object in a fingertip
+    max_imbalance: Positive | None = None  # of the fingertips' forces, as a share of the weight
+    max_normal_sum: Positive | None = None  # of the contact normals, per finger: 0 balanced, 1 not
 
 
 class SplitConfig(_Section):

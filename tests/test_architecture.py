@@ -31,6 +31,7 @@ ORDER = (
     "visualization",
     "commissioning",
     "build",
+    "inspection",
     "cluster",
     "verification",
     "exchange",
@@ -49,6 +50,9 @@ WALLS = {
     "dask": ("cluster",),
     "distributed": ("cluster",),
     "click": ("cli",),
+    "starlette": ("inspection",),
+    "uvicorn": ("inspection",),
+    "jinja2": ("inspection",),
     "matplotlib": ("visualization", "verification.figure"),
     "pydrake": (
         *("hand", "vision", "simulation", "visualization", "commissioning", "verification"),

@@ -119,6 +119,10 @@ filters:
   max_turn_deg: 20.0
   other_links: 1
   max_normal_angle_deg: 20.0
+  max_suspicion: 3.0
+  max_penetration: 0.004
+  max_imbalance: 0.1
+  max_normal_sum: 0.5
 split:
   valid_fraction: 0.2
   train_classes: [mug, bottle]

@@ -70,7 +70,8 @@ def build(
     "--reject",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
     metavar="FILE",
-    help="File with ids of trials that must not become samples, one per line; # starts a comment.",
+    help="Trials that must not become samples: the reject.json of an inspection, or a text file "
+    "with an id per line; # starts a comment.",
 )
 @click.option(
     "--set",
@@ -86,11 +87,11 @@ def assemble(out: Path, reject: Path | None, overrides: tuple[str, ...]) -> None
     The command writes trials.hdf5 and both data files again from the shards in OUT.
     """
     from drakegrasp.dataset.assemble import assemble as assemble_files
-    from drakegrasp.dataset.assemble import read_reject_list
     from drakegrasp.dataset.manifest import change_postprocessing
+    from drakegrasp.dataset.rejections import read_rejected
     from drakegrasp.runtime.progress import progress_bar
 
-    rejected = () if reject is None else read_reject_list(reject)
+    rejected = () if reject is None else read_rejected(reject)
     if overrides:
         change_postprocessing(out, overrides)
     with progress_bar("assemble", "shards") as progress:

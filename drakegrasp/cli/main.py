@@ -19,6 +19,7 @@ from drakegrasp.cli.build import assemble, build, stats
 from drakegrasp.cli.export import export
 from drakegrasp.cli.group import main
 from drakegrasp.cli.hand import hand
+from drakegrasp.cli.inspect import inspect_
 from drakegrasp.cli.morph import morph
 from drakegrasp.cli.options import (
     builtin_overrides,
@@ -146,7 +147,8 @@ objects.add_command(morph)
 
 # The help lists them in this order.
 for _command in (
-    *(doctor, objects, audit, hand, build, assemble, check, stats, replay, verify, export, bench),
+    *(doctor, objects, audit, hand, build, assemble, check, stats, inspect_, replay, verify),
+    *(export, bench),
 ):
     main.add_command(_command)
 

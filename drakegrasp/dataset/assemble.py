@@ -24,6 +24,7 @@ from drakegrasp.dataset.hdf5 import AnyArray, create_field, write_field
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import Manifest, read_manifest, write_origin
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
+from drakegrasp.dataset.rejections import AttemptKey, find_ids
 from drakegrasp.dataset.samples import ShardSlice, create_splits, walk_shards, write_samples
 from drakegrasp.dataset.schema import (
     CAMERAS,
@@ -34,6 +35,7 @@ from drakegrasp.dataset.schema import (
     TRIAL_FIELDS,
 )
 from drakegrasp.dataset.shards import Shard, trial_columns
+from drakegrasp.dataset.suspicion import suspicion
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, invert_pose, transform_points, unpack_pose
 from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp
@@ -59,17 +61,19 @@ class Assembly:
     samples: dict[str, int]
 
 
-def assemble(out: Path, *, rejected: Sequence[int] = (), progress: Report = silent) -> Assembly:
+def assemble(
+    out: Path, *, rejected: Sequence[int | AttemptKey] = (), progress: Report = silent
+) -> Assembly:
     """Write the three files of a dataset whose work units are all done.
 
     Args:
         out: Directory of the dataset.
-        rejected: Ids of trials that an inspection rejects; they become no samples.
+        rejected: Trials that an inspection rejects, by id or identity; they become no samples.
         progress: Called with the number of shards read and to read.
 
     Raises:
-        DataError: If a shard is missing or damaged, or another process builds in the directory;
-            the old files stay.
+        DataError: If a shard is missing or damaged, what is rejected is no success, or another
+            process builds in the directory; the old files stay.
         DiskFullError: If there is no room; the old files stay.
     """
     read_manifest(out)  # before the lock, which would make a missing directory
@@ -78,7 +82,7 @@ def assemble(out: Path, *, rejected: Sequence[int] = (), progress: Report = sile
 
 
 def assemble_locked(
-    out: Path, *, rejected: Sequence[int] = (), progress: Report = silent
+    out: Path, *, rejected: Sequence[int | AttemptKey] = (), progress: Report = silent
 ) -> Assembly:
     """Write the three files, as `assemble`, in a directory whose lock the caller holds."""
     manifest = read_manifest(out)
@@ -88,8 +92,8 @@ def assemble_locked(
         slices, successes = _write_trials(trials, out, manifest, progress)
 
         # Decide which successes are samples, and in which split.
-        _refuse_unknown(out, rejected, successes)
-        removal = judge_successes(successes, manifest.config.filters, rejected)
+        ids_rejected = find_ids(rejected, _keys(manifest, successes), out)
+        removal = judge_successes(successes, manifest.config.filters, ids_rejected)
         _write_removal(trials, successes, removal)
         ids = _split_ids(manifest, successes, removal)
 
@@ -121,22 +125,19 @@ def _write_trials(
     for shard_slice, shard in walk_shards(out, manifest):
         _append_trials(file, shard_slice, shard)
         slices.append(shard_slice)
-        successes.append(_successes(shard_slice, shard, K))
+        mass = manifest.objects[shard_slice.object].mass
+        successes.append(_successes(shard_slice, shard, K, mass))
         progress(len(slices), 2 * manifest.units)
     if not slices:
         raise DataError(f"{out}: no object has a palm pose to try")
     return slices, _concatenate(successes)
 
 
-def _refuse_unknown(out: Path, rejected: Sequence[int], successes: Successes) -> None:
-    """Refuse rejected trials that are no successes.
-
-    Raises:
-        DataError: If there is one.
-    """
-    unknown = sorted(set(rejected) - set(successes.trial_id.tolist()))
-    if unknown:
-        raise DataError(f"{out}: rejected trials must be successes, got trial {unknown[0]}")
+def _keys(manifest: Manifest, successes: Successes) -> dict[AttemptKey, int]:
+    """Return the trial id of each success, by its identity."""
+    columns = (successes.object, successes.candidate, successes.standoff_index, successes.trial_id)
+    rows = zip(*(column.tolist() for column in columns), strict=True)
+    return {AttemptKey(manifest.objects[i].name, c, s): t for i, c, s, t in rows}
 
 
 def summarise(out: Path) -> Assembly:
@@ -160,26 +161,6 @@ def summarise(out: Path) -> Assembly:
             )
     except (OSError, KeyError) as error:
         raise DataError(f"{out}: must hold the files of a dataset, got none ({error})") from None
-
-
-def read_reject_list(path: Path) -> list[int]:
-    """Return the trial ids in a text file: one per line; # starts a comment.
-
-    Raises:
-        DataError: If the file is no text, or a line is no id.
-    """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError:
-        raise DataError(f"{path}: must be a text file of trial ids, got a binary file") from None
-    ids = []
-    for number, line in enumerate(lines, start=1):
-        text = line.partition("#")[0].strip()
-        if text and not text.isdecimal():
-            raise DataError(f"{path}, line {number}: must be the id of a trial, got {text!r}")
-        if text:
-            ids.append(int(text))
-    return ids
 
 
 def is_assembled(out: Path) -> bool:
@@ -239,8 +220,8 @@ def _append_trials(file: h5py.File, shard_slice: ShardSlice, shard: Shard) -> No
         dataset[first:] = values
 
 
-def _successes(shard_slice: ShardSlice, shard: Shard, K: Array) -> Successes:
-    """Return what the filters need of a shard's successes."""
+def _successes(shard_slice: ShardSlice, shard: Shard, K: Array, mass: float) -> Successes:
+    """Return what the filters need of a shard's successes, whose object has a mass [kg]."""
     taken = shard.looks["row"] < shard_slice.rows
     rows = shard.looks["row"][taken]
     trials = {name: values[rows] for name, values in shard.trials.items()}
@@ -258,7 +239,10 @@ def _successes(shard_slice: ShardSlice, shard: Shard, K: Array) -> Successes:
         for i, grasp in enumerate(grasps)
     ]
 
+    doubts = suspicion(trials, mass)
     return Successes(
+        candidate=trials["candidate"],
+        standoff_index=trials["standoff_index"],
         trial_id=shard_slice.first + rows.astype(np.int64),
         object=np.full(len(rows), shard_slice.object, dtype=np.int32),
         grasp_T=np.array(grasps).reshape(-1, length),
@@ -279,6 +263,8 @@ def _successes(shard_slice: ShardSlice, shard: Shard, K: Array) -> Successes:
         depth_variance=looks["image_otm"][:, 3].astype(float).var(axis=(1, 2)),
         surface_distance=trials["surface_distance"].max(axis=1, initial=0.0),
         normal_angle=trials["normal_angle"].max(axis=1, initial=0.0),
+        suspicion=doubts.score,
+        **{name: doubts.values[name] for name in ("penetration", "imbalance", "normal_sum")},
         **{field.name: looks[field.name] for field in CERTIFICATE_FIELDS},
     )
 

@@ -20,7 +20,7 @@ from drakegrasp.seeding import Stream, object_key
 
 
 class Removal(IntEnum):
-    """Why a success is not a sample, in the order of the filters."""
+    """Why a success is not a sample, in the order of the filters but for the last."""
 
     KEPT = 0
     OTHER_LINKS = 1  # after the lift more than fingertips touch the object
@@ -33,7 +33,9 @@ class Removal(IntEnum):
     OFF_SURFACE = 8  # a contact's centre is off the surface: its patches span an edge
     NORMAL_OFF = 9  # a contact's mean normal is not that of the surface: its patches span an edge
     OUTLIER = 10  # a component of the grasp is too far from the mean of its object's grasps
-    REJECTED = 11  # an inspection rejected it
+    REJECTED = 11  # an inspection rejected it; the last of the filters
+    # Values are stored in files: a filter that came later has the next number, not the next place.
+    SUSPICIOUS = 12  # the suspicion score or a part of it is too high; before OUTLIER
 
     @property
     def label(self) -> str:
@@ -48,6 +50,7 @@ class Successes:
     Attributes:
         trial_id: (n,) int64, row of /trials.
         object: (n,) int32, row of /objects.
+        candidate, standoff_index: (n,), which of the object's palm poses, and of the stand-offs.
         grasp_T: (n, 6k), grasps in the table-top frame [m, -].
         held_O: (n, 6k), contacts at the end of the lift in {O} [m, -].
         other_links: (n,), number of other links that touch the object after the lift.
@@ -58,11 +61,15 @@ class Successes:
         depth_variance: (n,), of the otm depth image [m^2].
         surface_distance: (n,), largest of the contacts' distances from the surface [m].
         normal_angle: (n,), largest angle of the contacts' normals from those of the surface [rad].
+        suspicion: (n,), score of `dataset.suspicion`.
+        penetration, imbalance, normal_sum: (n,), parts of it [m], [-], [-].
         certified_share, certified_friction: (n,), see the schema; no filter uses them.
     """
 
     trial_id: npt.NDArray[np.int64]
     object: npt.NDArray[np.int32]
+    candidate: npt.NDArray[np.integer]
+    standoff_index: npt.NDArray[np.integer]
     grasp_T: Array
     held_O: Array
     other_links: npt.NDArray[np.integer]
@@ -74,6 +81,10 @@ class Successes:
     depth_variance: Array
     surface_distance: Array
     normal_angle: Array
+    suspicion: Array
+    penetration: Array
+    imbalance: Array
+    normal_sum: Array
     certified_share: Array
     certified_friction: Array
 
@@ -100,6 +111,7 @@ def judge_successes(
         (Removal.OFF_SURFACE, ~np.isfinite(successes.grasp_T).all(axis=1)),
         (Removal.OFF_SURFACE, ~np.isfinite(successes.held_O).all(axis=1)),
         *breaks_surface(config, successes.surface_distance, successes.normal_angle),
+        *((Removal.SUSPICIOUS, bad) for bad in _breaks_suspicion(config, successes)),
     ):
         removal[bad & (removal == Removal.KEPT)] = reason
 
@@ -153,6 +165,17 @@ def breaks_surface(
         (Removal.NORMAL_OFF, np.degrees(normal_angle), config.max_normal_angle_deg),
     )
     return [(reason, ~(values <= limit)) for reason, values, limit in rules if limit is not None]
+
+
+def _breaks_suspicion(config: FilterConfig, successes: Successes) -> list[npt.NDArray[np.bool_]]:
+    """Return which successes (n,) break each limit of the suspicion that is on."""
+    rules = (
+        (successes.suspicion, config.max_suspicion),
+        (successes.penetration, config.max_penetration),
+        (successes.imbalance, config.max_imbalance),
+        (successes.normal_sum, config.max_normal_sum),
+    )
+    return [~(values <= limit) for values, limit in rules if limit is not None]
 
 
 def is_outlier(values: Array, sigma: float) -> npt.NDArray[np.bool_]:

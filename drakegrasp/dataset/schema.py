@@ -348,7 +348,7 @@ SUCCESS_FIELDS: tuple[Field, ...] = (
     Field("removal", "", "uint8", "-", "-",
           "why it is no sample: 0 kept, 1 other_links, 2 slid, 3 turned, 4 not_seen, "
           "5 out_of_view, 6 bisects_table, 7 flat_depth, 8 off_surface, 9 normal_off, 10 outlier, "
-          "11 rejected"),
+          "11 rejected, 12 suspicious"),
     *CERTIFICATE_FIELDS,
 )
 

@@ -29,11 +29,10 @@ from drakegrasp.dataset.paths import model_path
 from drakegrasp.exchange.closed_grasps import ClosedGrasp, read_closed_grasps
 from drakegrasp.frames import Array, invert_pose, make_pose
 from drakegrasp.hand.description import Hand, load_hand
-from drakegrasp.hand.kinematics import joint_positions
-from drakegrasp.hand.posture import Posture
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import load_object
 from drakegrasp.runtime.progress import Report
+from drakegrasp.visualization.posed_hand import PosedHand
 
 #: By how much of their angle the fingers are commanded to close further.
 SQUEEZE = 0.1
@@ -42,7 +41,7 @@ SQUEEZE = 0.1
 def write_dexgraspbench(out: Path, folder: Path, progress: Report) -> int:
     """Write a file per sample and return their number; see `export.export_dataset`."""
     hand = load_hand(read_manifest(out).config.hand)
-    joints, grasps = Posture(hand).joints, list(read_closed_grasps(out))
+    posed, grasps = PosedHand(hand), list(read_closed_grasps(out))
     progress(0, len(grasps))
     done = 0
     for name, same in groupby(grasps, key=lambda grasp: grasp.object_name):
@@ -56,26 +55,25 @@ def write_dexgraspbench(out: Path, folder: Path, progress: Report) -> int:
 
         (folder / "grasps" / name).mkdir(parents=True)
         for grasp in same:
-            content: Any = grasp_dictionary(hand, joints, grasp)
+            content: Any = grasp_dictionary(hand, posed, grasp)
             np.save(folder / "grasps" / name / f"{grasp.trial_id}.npy", content)
             done += 1
             progress(done, len(grasps))
     return done
 
 
-def grasp_dictionary(hand: Hand, joints: tuple[str, ...], grasp: ClosedGrasp) -> dict[str, Any]:
+def grasp_dictionary(hand: Hand, posed: PosedHand, grasp: ClosedGrasp) -> dict[str, Any]:
     """Return what the file of a grasp holds, see the module.
 
     Args:
         hand: The hand.
-        joints: Names of its joints in the order of `grasp.q`.
+        posed: The same hand, which knows the order of its joints.
         grasp: The sample.
     """
     # The palm link's pose, and the joints at the three instants.
     X_TB = multiply(grasp.X_TG, invert_pose(hand.X_BG))
-    angles = joint_positions(hand, grasp.spread, np.zeros(hand.num_fingers))
-    start = np.array([angles[joint] for joint in joints])
-    spread = np.isin(joints, hand.spread.joints)
+    start = posed.open_positions(grasp.spread)
+    spread = np.isin(posed.joints, hand.spread.joints)
     squeezed = grasp.q + SQUEEZE * np.where(spread, 0.0, grasp.q - start)
 
     return {
@@ -85,7 +83,7 @@ def grasp_dictionary(hand: Hand, joints: tuple[str, ...], grasp: ClosedGrasp) ->
         "pregrasp_qpos": np.concatenate([pose_vector(X_TB), start]),
         "grasp_qpos": np.concatenate([pose_vector(X_TB), grasp.q]),
         "squeeze_qpos": np.concatenate([pose_vector(X_TB), squeezed]),
-        "joint_names": list(joints),
+        "joint_names": list(posed.joints),
     }
 
 

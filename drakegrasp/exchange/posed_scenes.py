@@ -19,10 +19,10 @@ from drakegrasp.dataset.paths import model_path
 from drakegrasp.exchange.closed_grasps import ClosedGrasp, read_closed_grasps
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.description import Hand, load_hand
-from drakegrasp.hand.posture import Posture
 from drakegrasp.hand.shapes import hull_triangles, link_shapes
 from drakegrasp.objects.model import ObjectModel, load_object, object_colour
 from drakegrasp.runtime.progress import Report
+from drakegrasp.visualization.posed_hand import PosedHand
 
 #: Pose of {T} in the frame U of the file, whose +Y is up.
 X_UT = make_pose(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.zeros(3))
@@ -33,7 +33,7 @@ TIP_COLOUR, LINK_COLOUR = (0.93, 0.55, 0.20, 1.0), (0.45, 0.48, 0.52, 1.0)
 def write_glb(out: Path, folder: Path, progress: Report) -> int:
     """Write a scene per sample and return their number; see `export.export_dataset`."""
     hand = load_hand(read_manifest(out).config.hand)
-    posture, links = Posture(hand), link_meshes(hand)
+    posed, links = PosedHand(hand), link_meshes(hand)
     grasps = list(read_closed_grasps(out))
     progress(0, len(grasps))
     done = 0
@@ -41,7 +41,7 @@ def write_glb(out: Path, folder: Path, progress: Report) -> int:
         model = load_object(model_path(out, name))
         (folder / name).mkdir()
         for grasp in same:
-            scene = posed_scene(model, posture, links, grasp)
+            scene = posed_scene(model, posed, links, grasp)
             (folder / name / f"{grasp.trial_id}.glb").write_bytes(scene.export(file_type="glb"))
             done += 1
             progress(done, len(grasps))
@@ -49,13 +49,13 @@ def write_glb(out: Path, folder: Path, progress: Report) -> int:
 
 
 def posed_scene(
-    model: ObjectModel, posture: Posture, links: dict[str, trimesh.Trimesh], grasp: ClosedGrasp
+    model: ObjectModel, posed: PosedHand, links: dict[str, trimesh.Trimesh], grasp: ClosedGrasp
 ) -> trimesh.Scene:
     """Return object and hand as they are when the fingers have closed.
 
     Args:
         model: The object.
-        posture: The hand.
+        posed: The hand.
         links: The links' meshes by name, each in its link's frame.
         grasp: The sample.
     """
@@ -63,9 +63,9 @@ def posed_scene(
     body = model.visual.copy()
     body.visual = _paint(body, (*object_colour(model.name), 1.0))
     _add(scene, model.name, body, grasp.X_TO)
-    for link, X_GL in posture.link_poses(grasp.q).items():
+    for link, X_TL in posed.link_poses(grasp.X_TG, grasp.q).items():
         if link in links:
-            _add(scene, link, links[link], multiply(grasp.X_TG, X_GL))
+            _add(scene, link, links[link], X_TL)
     return scene
 
 

@@ -41,6 +41,7 @@ OUT/
   grasping_oto.hdf5        samples, camera rolled with the palm
   grasping_otm.hdf5        the same samples, image up is world up
   log.jsonl                what happened while it was built, and when: a line of JSON per event
+  reject.json              grasps that an inspection rejects; only if there was one
   build.lock               while a build runs: by which process
 ```
 

@@ -26,6 +26,8 @@ def good(count: int) -> Successes:
     return Successes(
         trial_id=np.arange(count, dtype=np.int64) * 3,
         object=np.zeros(count, dtype=np.int32),
+        candidate=np.arange(count, dtype=np.int32),
+        standoff_index=np.zeros(count, dtype=np.uint8),
         grasp_T=rng.normal(size=(count, 18)),
         held_O=rng.normal(size=(count, 18)),
         other_links=np.zeros(count, dtype=np.uint8),
@@ -37,6 +39,10 @@ def good(count: int) -> Successes:
         depth_variance=np.full(count, 0.01),
         surface_distance=np.full(count, 1e-4),
         normal_angle=np.full(count, np.deg2rad(29.0)),
+        suspicion=np.full(count, 1.0),
+        penetration=np.full(count, 1e-3),
+        imbalance=np.full(count, 0.01),
+        normal_sum=np.full(count, 0.3),
         certified_share=np.full(count, np.nan),
         certified_friction=np.full(count, np.nan),
     )
@@ -93,6 +99,23 @@ def test_null_switches_a_limit_off(field: str, value: float, limit: str) -> None
     off = FilterConfig.model_validate({limit: None})
     assert np.all(judge_successes(successes, FilterConfig()) != Removal.KEPT)
     assert np.all(judge_successes(successes, off) == Removal.KEPT)
+
+
+@pytest.mark.parametrize(
+    ("field", "limit"),
+    [
+        ("suspicion", "max_suspicion"),
+        ("penetration", "max_penetration"),
+        ("imbalance", "max_imbalance"),
+        ("normal_sum", "max_normal_sum"),
+    ],
+)
+def test_limits_of_suspicion_are_off_until_they_are_set(field: str, limit: str) -> None:
+    values = np.array([0.1, 0.3, np.nan])
+    successes = replace(good(3), **{field: values})
+    assert np.all(judge_successes(successes, FilterConfig()) == Removal.KEPT)
+    removal = judge_successes(successes, FilterConfig(**{limit: 0.2}))
+    assert removal.tolist() == [Removal.KEPT, Removal.SUSPICIOUS, Removal.SUSPICIOUS]
 
 
 def test_held_asks_nothing_of_the_hold_and_the_same_of_the_contacts() -> None:

@@ -12,7 +12,7 @@ from drakegrasp.exchange.closed_grasps import ClosedGrasp
 from drakegrasp.exchange.dexgraspbench import SQUEEZE, pose_of_vector
 from drakegrasp.exchange.export import export_dataset
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.posture import Posture
+from drakegrasp.visualization.posed_hand import PosedHand
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def test_poses_and_joints_come_back(folder: Path, grasps: list[ClosedGrasp]) -> 
             X_TG = pose_of_vector(content[key][:7]) @ hand.X_BG
             assert pytest.approx(grasp.X_TG, abs=1e-9) == X_TG
         assert (content["grasp_qpos"][7:] == grasp.q).all()
-        assert content["joint_names"] == list(Posture(hand).joints)
+        assert content["joint_names"] == list(PosedHand(hand).joints)
 
 
 def test_fingers_begin_open_and_squeeze_further(folder: Path, grasps: list[ClosedGrasp]) -> None:

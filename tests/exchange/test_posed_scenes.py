@@ -13,7 +13,7 @@ from drakegrasp.exchange.export import export_dataset
 from drakegrasp.exchange.posed_scenes import X_UT
 from drakegrasp.frames import invert_pose
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.posture import Posture
+from drakegrasp.visualization.posed_hand import PosedHand
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def folder(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_bodies_are_where_they_are(folder: Path, grasps: list[ClosedGrasp]) -> None:
     hand = load_hand()
-    posture = Posture(hand)
+    posed = PosedHand(hand)
     assert len(list(folder.rglob("*.glb"))) == len(grasps)
     for grasp in grasps:
         scene = trimesh.load_scene(folder / grasp.object_name / f"{grasp.trial_id}.glb")
@@ -34,10 +34,10 @@ def test_bodies_are_where_they_are(folder: Path, grasps: list[ClosedGrasp]) -> N
             for name in scene.graph.nodes_geometry
         }
         assert poses.pop(grasp.object_name) == pytest.approx(grasp.X_TO, abs=1e-6)
-        links = posture.link_poses(grasp.q)
+        links = posed.link_poses(grasp.X_TG, grasp.q)
         assert set(hand.fingertip_links) <= set(poses) <= set(links)
         for name, X_TL in poses.items():
-            assert pytest.approx(grasp.X_TG @ links[name], abs=1e-6) == X_TL
+            assert pytest.approx(links[name], abs=1e-6) == X_TL
 
 
 def test_up_is_y(folder: Path, grasps: list[ClosedGrasp]) -> None:

@@ -1,0 +1,167 @@
+"""Decisions of an inspection: `reject.json`, and text lists of trials.
+
+`drakegrasp inspect` writes `reject.json` into a dataset's directory, a new file for every decision;
+`drakegrasp assemble --reject` reads it. An attempt is named by its object, palm pose and stand-off,
+which hold while a build still runs and after other attempts were added. A text list names trials by
+their id, which is known once the dataset is assembled.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from drakegrasp.errors import DataError
+from drakegrasp.runtime.files import write_atomic
+
+FILE_NAME = "reject.json"
+#: Version of the file's layout.
+VERSION = 1
+
+
+@dataclass(frozen=True, order=True)
+class AttemptKey:
+    """The identity of an attempt in a dataset.
+
+    Attributes:
+        object: Name of its object.
+        candidate: Index of its palm pose among the object's candidates.
+        standoff_index: Index into the configuration's stand-offs.
+    """
+
+    object: str
+    candidate: int
+    standoff_index: int
+
+    def __str__(self) -> str:
+        return f"{self.object}, palm pose {self.candidate}, stand-off {self.standoff_index}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Decisions:
+    """What an inspection decided.
+
+    Attributes:
+        rejected: Attempts that must not become samples.
+        kept: Attempts that were looked at and found good; they are listed for people only.
+    """
+
+    rejected: frozenset[AttemptKey] = field(default_factory=frozenset)
+    kept: frozenset[AttemptKey] = field(default_factory=frozenset)
+
+    def of(self, key: AttemptKey) -> str:
+        """Return `rejected`, `kept`, or an empty text if nothing was decided."""
+        return "rejected" if key in self.rejected else "kept" if key in self.kept else ""
+
+    def with_decision(self, key: AttemptKey, decision: str) -> Decisions:
+        """Return the decisions with another one for an attempt; empty text withdraws it.
+
+        Raises:
+            ValueError: If the decision is none.
+        """
+        if decision not in ("rejected", "kept", ""):
+            raise ValueError(f"decision must be rejected, kept or empty, got {decision!r}")
+        rejected, kept = self.rejected - {key}, self.kept - {key}
+        if decision == "rejected":
+            rejected |= {key}
+        elif decision == "kept":
+            kept |= {key}
+        return Decisions(rejected=rejected, kept=kept)
+
+
+def read_decisions(path: Path) -> Decisions:
+    """Return the decisions in a `reject.json`; none if there is no such file.
+
+    Raises:
+        DataError: If the file is something else.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if content["version"] != VERSION:
+            raise DataError(f"{path}: version must be {VERSION}, got {content['version']!r}")
+        return Decisions(
+            rejected=frozenset(_key(entry) for entry in content["rejected"]),
+            kept=frozenset(_key(entry) for entry in content["kept"]),
+        )
+    except FileNotFoundError:
+        return Decisions()
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(
+            f"{path}: must be a list of rejections of drakegrasp inspect, got none ({error})"
+        ) from None
+
+
+def write_decisions(path: Path, decisions: Decisions) -> None:
+    """Write a `reject.json`, atomically; equal decisions give equal bytes."""
+    content = {
+        "version": VERSION,
+        "rejected": [_entry(key) for key in sorted(decisions.rejected)],
+        "kept": [_entry(key) for key in sorted(decisions.kept)],
+    }
+    write_atomic(path, (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode())
+
+
+def read_rejected(path: Path) -> list[int] | list[AttemptKey]:
+    """Return what a file rejects: `reject.json`, or a text of trial ids.
+
+    Text has an id per line; # starts a comment. A file whose name ends in `.json` is a
+    `reject.json`.
+
+    Raises:
+        DataError: If the file is neither.
+    """
+    if path.suffix == ".json":
+        return sorted(read_decisions(path).rejected)
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError:
+        raise DataError(f"{path}: must be a text file of trial ids, got a binary file") from None
+    ids = []
+    for number, line in enumerate(lines, start=1):
+        text = line.partition("#")[0].strip()
+        if text and not text.isdecimal():
+            raise DataError(f"{path}, line {number}: must be the id of a trial, got {text!r}")
+        if text:
+            ids.append(int(text))
+    return ids
+
+
+def find_ids(
+    rejected: Sequence[int | AttemptKey], ids: Mapping[AttemptKey, int], out: Path
+) -> list[int]:
+    """Return the trial ids of what is rejected.
+
+    Args:
+        rejected: Ids of trials, or keys of attempts.
+        ids: Of all successes.
+        out: Directory of the dataset, for the message.
+
+    Raises:
+        DataError: If one of them is no success of the dataset.
+    """
+    known, found = set(ids.values()), []
+    for entry in rejected:
+        number = ids.get(entry) if isinstance(entry, AttemptKey) else entry
+        if number not in known or number is None:
+            name = f"trial {entry}" if isinstance(entry, int) else str(entry)
+            raise DataError(f"{out}: rejected trials must be successes, got {name}")
+        found.append(number)
+    return found
+
+
+def _key(entry: Any) -> AttemptKey:
+    name, candidate, standoff = (entry[key] for key in ("object", "candidate", "standoff_index"))
+    if not isinstance(name, str) or type(candidate) is not int or type(standoff) is not int:
+        raise TypeError(f"an attempt must be a name and two numbers, got {entry!r}")
+    return AttemptKey(name, candidate, standoff)
+
+
+def _entry(key: AttemptKey) -> dict[str, Any]:
+    return {
+        "object": key.object,
+        "candidate": key.candidate,
+        "standoff_index": key.standoff_index,
+    }

@@ -1,0 +1,369 @@
+"""The web application: addresses, and what keeps other sites and machines out.
+
+Every answer forbids scripts, styles and requests other than to the server itself. The Host header
+must name this machine, so a foreign name that resolves to it (DNS rebinding) gets nothing. What
+changes a file is a POST with the token of this run, which only our own pages know.
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+import threading
+from collections import OrderedDict
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, JSONResponse, Response
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from drakegrasp.dataset.paths import model_path
+from drakegrasp.errors import DataError, DrakegraspError
+from drakegrasp.inspection.catalog import Catalog, Snapshot
+from drakegrasp.inspection.decisions import DecisionFile
+from drakegrasp.inspection.links import ServerLinks
+from drakegrasp.inspection.pages import gallery_page, grasp_page, render
+from drakegrasp.inspection.plots import plot_svg, plots_values
+from drakegrasp.inspection.query import Query, parse_query, select
+from drakegrasp.inspection.recording import Recordings
+from drakegrasp.inspection.rows import read_look, read_rows
+from drakegrasp.inspection.scene3d import HandView, object_mesh, scene_of
+from drakegrasp.outcomes import Outcome
+from drakegrasp.visualization.thumbnails import strip_png
+
+ASSETS = Path(__file__).parent / "static"
+#: Names of this machine that a browser may have asked for.
+HOSTS = ("127.0.0.1", "localhost")
+TOKEN_HEADER = "x-drakegrasp-token"
+HEADERS = {
+    "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self'; connect-src 'self'; form-action 'self'; base-uri 'none'; "
+    "frame-ancestors 'none'",
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cross-origin-resource-policy": "same-origin",
+    "cross-origin-opener-policy": "same-origin",
+    "cache-control": "no-store",
+}
+#: A recording holds its own scripts; it runs without access to this server or any other.
+RECORDING_POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' data: blob:; style-src "
+    "'unsafe-inline'; img-src data: blob:; connect-src data: blob:; worker-src blob:; "
+    "sandbox allow-scripts"
+)
+#: Longest text that a POST may have [B].
+MAX_BODY = 4096
+#: Selections that are kept in memory, and attempts in all of them together: four bytes each.
+KEPT_SELECTIONS, KEPT_PLACES = 16, 10_000_000
+
+
+class Inspection:
+    """The state of a running inspection.
+
+    Args:
+        out: Directory of the dataset.
+
+    Raises:
+        DataError: If the directory holds no dataset, or its `reject.json` cannot be read.
+    """
+
+    def __init__(self, out: Path) -> None:
+        self.catalog = Catalog(out)
+        self.decisions = DecisionFile(out)
+        self.hand = HandView(self.catalog.current().config)
+        self.recordings = Recordings(out)
+        self.token = secrets.token_urlsafe(24)
+        self.links = ServerLinks()
+        self._lock = threading.Lock()
+        self._selections: OrderedDict[Any, npt.NDArray[np.int32]] = OrderedDict()
+        self._selected_from: Snapshot | None = None
+
+    def selection(self, snapshot: Snapshot, query: Query) -> npt.NDArray[np.int32]:
+        """Return the attempts that a query selects; the last selections are remembered."""
+        decisions = self.decisions.read()
+        key = (query.identity, decisions if query.decision else None)
+        with self._lock:
+            if self._selected_from is not snapshot:
+                self._selections.clear()
+                self._selected_from = snapshot
+            if key in self._selections:
+                self._selections.move_to_end(key)
+                return self._selections[key]
+        places = select(snapshot, query, decisions)
+        with self._lock:
+            if self._selected_from is snapshot:
+                self._selections[key] = places
+            while len(self._selections) > KEPT_SELECTIONS or (
+                len(self._selections) > 1 and sum(map(len, self._selections.values())) > KEPT_PLACES
+            ):
+                self._selections.popitem(last=False)
+        return places
+
+    def warm_up(self) -> None:
+        """Load what the first page would have to wait for."""
+        # The hand loads Drake, the first picture Matplotlib, the first page its templates.
+        _ = self.hand.links
+        image, mask = np.zeros((4, 2, 2), np.float32), np.zeros((2, 2), np.uint8)
+        strip_png(image, mask, far=1.0)
+        snapshot, query = self.catalog.current(), Query()
+        places, decisions = self.selection(snapshot, query), self.decisions.read()
+        gallery_page(snapshot, decisions, query, places, self.links, self.token)
+
+
+def make_app(inspection: Inspection) -> Starlette:
+    """Return the web application of an inspection."""
+
+    def route(path: str, answer: Callable[[Inspection, Request], Response]) -> Route:
+        async def endpoint(request: Request) -> Response:
+            return await run_in_threadpool(answer, inspection, request)
+
+        return Route(path, endpoint)
+
+    def post(path: str, answer: Callable[[Inspection, dict[str, Any]], Response]) -> Route:
+        return Route(path, partial(_post, inspection, answer), methods=["POST"])
+
+    @asynccontextmanager
+    async def lifespan(app: Starlette) -> AsyncIterator[None]:
+        yield
+        inspection.recordings.close()
+
+    app = Starlette(
+        lifespan=lifespan,
+        routes=[
+            route("/", _gallery),
+            route("/grasp/{label}", _grasp),
+            route("/strip/{label}-{camera:str}.png", _strip),
+            route("/mesh/{kind}-{number:int}.glb", _mesh),
+            route("/plots", _plots),
+            route("/plot/{name}.svg", _plot),
+            route("/recording/{label}.html", _recording),
+            post("/decide", _decide),
+            post("/undo", _undo),
+            post("/record", _record),
+            Mount("/static", StaticFiles(directory=ASSETS)),
+        ],
+        middleware=[
+            Middleware(SecurityHeaders),
+            Middleware(TrustedHostMiddleware, allowed_hosts=list(HOSTS), www_redirect=False),
+        ],
+        exception_handlers={
+            HTTPException: _http_error,
+            DrakegraspError: _data_error,
+            OSError: _data_error,
+        },
+    )
+    app.state.inspection = inspection
+    return app
+
+
+class SecurityHeaders:
+    """Adds HEADERS to every answer that does not have them."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request."""
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                there = {name.lower() for name, _ in message["headers"]}
+                new = [(k.encode(), v.encode()) for k, v in HEADERS.items()]
+                message["headers"] = [*message["headers"], *(h for h in new if h[0] not in there)]
+            await send(message)
+
+        await self._app(scope, receive, send_with_headers)
+
+
+# Pages
+
+
+def _gallery(inspection: Inspection, request: Request) -> Response:
+    snapshot, query = inspection.catalog.current(), parse_query(request.query_params)
+    places = inspection.selection(snapshot, query)
+    decisions = inspection.decisions.read()
+    return HTMLResponse(
+        gallery_page(snapshot, decisions, query, places, inspection.links, inspection.token)
+    )
+
+
+def _grasp(inspection: Inspection, request: Request) -> Response:
+    snapshot, query = inspection.catalog.current(), parse_query(request.query_params)
+    i = _place(snapshot, request)
+    places = inspection.selection(snapshot, query)
+    (row,) = read_rows(snapshot, [i])
+    scene = scene_of(snapshot, i, row, inspection.hand)
+    return HTMLResponse(
+        grasp_page(
+            snapshot,
+            inspection.decisions.read(),
+            query,
+            places,
+            i,
+            scene,
+            inspection.hand.problem,
+            inspection.links,
+            inspection.token,
+        )
+    )
+
+
+def _plots(inspection: Inspection, request: Request) -> Response:
+    snapshot = inspection.catalog.current()
+    values = plots_values(snapshot)
+    return HTMLResponse(render("plots.html", inspection.links, token="", **values))
+
+
+# Pictures and meshes
+
+
+def _strip(inspection: Inspection, request: Request) -> Response:
+    snapshot = inspection.catalog.current()
+    label, _, camera = f"{request.path_params['label']}-{request.path_params['camera']}".rpartition(
+        "-"
+    )
+    i = snapshot.find(label)
+    look = None if i is None else read_look(snapshot, i, camera)
+    if look is None:
+        raise HTTPException(404, "there is no such image")
+    png = strip_png(look.image, look.mask, far=snapshot.config.camera.far)
+    return Response(png, media_type="image/png")
+
+
+def _mesh(inspection: Inspection, request: Request) -> Response:
+    snapshot, number = inspection.catalog.current(), request.path_params["number"]
+    kind = request.path_params["kind"]
+    try:
+        if kind == "link":
+            return Response(inspection.hand.glb(number), media_type="model/gltf-binary")
+        if kind == "object":
+            path = model_path(snapshot.out, snapshot.names[number])
+            content = object_mesh(path, path.stat().st_mtime_ns)
+            return Response(content, media_type="model/gltf-binary")
+    except (IndexError, FileNotFoundError):
+        pass
+    raise HTTPException(404, "there is no such mesh")
+
+
+def _plot(inspection: Inspection, request: Request) -> Response:
+    svg = plot_svg(inspection.catalog.current(), request.path_params["name"])
+    if svg is None:
+        raise HTTPException(404, "there is no such plot")
+    # A picture of its own: what it may do is nothing but show its own styles.
+    policy = "default-src 'none'; style-src 'unsafe-inline'"
+    return Response(svg, media_type="image/svg+xml", headers={"content-security-policy": policy})
+
+
+def _recording(inspection: Inspection, request: Request) -> Response:
+    content = inspection.recordings.read(request.path_params["label"])
+    if content is None:
+        raise HTTPException(404, "there is no such recording")
+    return HTMLResponse(content, headers={"content-security-policy": RECORDING_POLICY})
+
+
+# Decisions
+
+
+async def _post(
+    inspection: Inspection,
+    answer: Callable[[Inspection, dict[str, Any]], Response],
+    request: Request,
+) -> Response:
+    """Answer a POST of JSON that has the token."""
+    given = request.headers.get(TOKEN_HEADER, "")
+    if not secrets.compare_digest(given.encode(), inspection.token.encode()):
+        raise HTTPException(403, "the token must be that of this page; load it again")
+    body = b""
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > MAX_BODY:
+            raise HTTPException(413, f"the request must be at most {MAX_BODY} bytes")
+    try:
+        content = json.loads(body or b"{}")
+    except ValueError:
+        content = None
+    if not isinstance(content, dict):
+        raise HTTPException(400, "the request must be JSON with names and values")
+    return await run_in_threadpool(answer, inspection, content)
+
+
+def _decide(inspection: Inspection, content: dict[str, Any]) -> Response:
+    snapshot = inspection.catalog.current()
+    i, decision = _success(snapshot, content), content.get("decision")
+    try:
+        inspection.decisions.decide(snapshot.key(i), str(decision))
+    except ValueError as error:
+        raise HTTPException(400, str(error)) from None
+    return JSONResponse({"label": snapshot.label(i), "decision": decision})
+
+
+def _undo(inspection: Inspection, content: dict[str, Any]) -> Response:
+    key = inspection.decisions.undo()
+    if key is None:
+        return JSONResponse({"label": None})
+    snapshot = inspection.catalog.current()
+    place = None
+    if key.object in snapshot.names:
+        number = snapshot.names.index(key.object)
+        place = snapshot.table.find(number, key.candidate, key.standoff_index)
+    label = None if place is None else snapshot.label(place)
+    return JSONResponse({"label": label, "decision": inspection.decisions.read().of(key)})
+
+
+def _record(inspection: Inspection, content: dict[str, Any]) -> Response:
+    snapshot = inspection.catalog.current()
+    i = snapshot.find(str(content.get("label")))
+    trial = None if i is None else snapshot.trial_id(i)
+    if trial is None:
+        raise HTTPException(404, "the attempt must be a row of trials.hdf5")
+    label = str(content.get("label"))
+    inspection.recordings.make(label, trial)
+    return JSONResponse({"url": f"/recording/{label}.html"})
+
+
+def _success(snapshot: Snapshot, content: dict[str, Any]) -> int:
+    """Return the place of a success that a request names."""
+    i = snapshot.find(str(content.get("label")))
+    if i is None or snapshot.table.outcome[i] != Outcome.SUCCESS:
+        raise HTTPException(404, "the attempt must be a success of the dataset")
+    return i
+
+
+def _place(snapshot: Snapshot, request: Request) -> int:
+    i = snapshot.find(request.path_params["label"])
+    if i is None:
+        raise HTTPException(404, "there is no such attempt")
+    return i
+
+
+# Errors
+
+
+def _http_error(request: Request, error: Exception) -> Response | Awaitable[Response]:
+    assert isinstance(error, HTTPException)
+    return _error(request, error.status_code, str(error.detail))
+
+
+def _data_error(request: Request, error: Exception) -> Response | Awaitable[Response]:
+    return _error(request, 400 if isinstance(error, DataError) else 500, str(error))
+
+
+def _error(request: Request, status: int, text: str) -> Response:
+    """Return an error as JSON to a script, and as a page to a person."""
+    if request.method == "POST":
+        return JSONResponse({"error": text}, status_code=status)
+    page = render("error.html", ServerLinks(), token="", title="error", text=text)
+    return HTMLResponse(page, status_code=status)

@@ -1,0 +1,110 @@
+"""Addresses of pages, pictures and meshes: of the server, and of files that open without one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+
+class Links(Protocol):
+    """Where a page finds the others."""
+
+    @property
+    def static(self) -> bool:
+        """Whether the pages are files, without a server."""
+
+    def asset(self, name: str) -> str:
+        """Return the address of a script or style sheet."""
+
+    def gallery(self, params: str = "") -> str:
+        """Return that of the gallery, with a query."""
+
+    def grasp(self, label: str, params: str = "") -> str:
+        """Return that of an attempt's page, with the query that next and previous go through."""
+
+    def strip(self, label: str, camera: str) -> str:
+        """Return that of an attempt's images."""
+
+    def mesh(self, kind: str, number: int) -> str:
+        """Return that of a mesh: kind `object` or `link`."""
+
+    def plots(self) -> str:
+        """Return that of the page of plots."""
+
+    def plot(self, name: str) -> str:
+        """Return that of a plot."""
+
+
+@dataclass(frozen=True)
+class ServerLinks:
+    """Addresses of the server."""
+
+    static: bool = False
+
+    def asset(self, name: str) -> str:
+        """See `Links`."""
+        return f"/static/{name}"
+
+    def gallery(self, params: str = "") -> str:
+        """See `Links`."""
+        return f"/?{params}" if params else "/"
+
+    def grasp(self, label: str, params: str = "") -> str:
+        """See `Links`."""
+        return f"/grasp/{label}" + f"?{params}" * bool(params)
+
+    def strip(self, label: str, camera: str) -> str:
+        """See `Links`."""
+        return f"/strip/{label}-{camera}.png"
+
+    def mesh(self, kind: str, number: int) -> str:
+        """See `Links`."""
+        return f"/mesh/{kind}-{number}.glb"
+
+    def plots(self) -> str:
+        """See `Links`."""
+        return "/plots"
+
+    def plot(self, name: str) -> str:
+        """See `Links`."""
+        return f"/plot/{name}.svg"
+
+
+@dataclass(frozen=True)
+class FileLinks:
+    """Addresses among files, relative to the page.
+
+    Attributes:
+        up: From the page to the folder of all: empty, or "../".
+    """
+
+    up: str = ""
+    static: bool = True
+
+    def asset(self, name: str) -> str:
+        """See `Links`."""
+        return f"{self.up}static/{name}"
+
+    def gallery(self, params: str = "") -> str:
+        """See `Links`; without a server a query has no effect."""
+        return f"{self.up}index.html"
+
+    def grasp(self, label: str, params: str = "") -> str:
+        """See `Links`; without a server next and previous go through the order of the files."""
+        return f"{self.up}grasp/{label}.html"
+
+    def strip(self, label: str, camera: str) -> str:
+        """See `Links`."""
+        return f"{self.up}strip/{label}-{camera}.png"
+
+    def mesh(self, kind: str, number: int) -> str:
+        """See `Links`: a script that holds the mesh, since a page of a file may read no file."""
+        return f"{self.up}mesh/{kind}-{number}.js"
+
+    def plots(self) -> str:
+        """See `Links`."""
+        return f"{self.up}plots.html"
+
+    def plot(self, name: str) -> str:
+        """See `Links`."""
+        return f"{self.up}plot/{name}.svg"

@@ -1,0 +1,263 @@
+"""Which attempts a page shows, and in which order.
+
+In: the parameters of an address. Out: a `Query`, and the places of the attempts that it selects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from urllib.parse import urlencode
+
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.dataset.filters import Removal
+from drakegrasp.dataset.rejections import Decisions
+from drakegrasp.dataset.schema import SPLITS
+from drakegrasp.errors import DataError
+from drakegrasp.inspection.catalog import Snapshot
+from drakegrasp.inspection.table import NONE
+from drakegrasp.outcomes import Outcome
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A feature of an attempt as people read it.
+
+    Attributes:
+        name: Of the feature in the table.
+        title: In words.
+        unit: Of what is shown, e.g. "mm"; empty for a plain number.
+        factor: From SI to that unit.
+        digits: After the decimal point.
+    """
+
+    name: str
+    title: str
+    unit: str
+    factor: float
+    digits: int
+
+    def text(self, value: float) -> str:
+        """Return a value in SI as text with its unit; a dash if there is none."""
+        if not np.isfinite(value):
+            return "–"
+        space = "" if self.unit in ("", "°") else " "
+        return f"{value * self.factor:.{self.digits}f}{space}{self.unit}"
+
+
+DEGREES = float(np.rad2deg(1.0))
+QUANTITIES = {
+    q.name: q
+    for q in (
+        Quantity("suspicion", "suspicion", "", 1.0, 2),
+        Quantity("penetration", "penetration", "mm", 1e3, 1),
+        Quantity("slip", "slip", "mm", 1e3, 1),
+        Quantity("turn", "turn", "°", DEGREES, 1),
+        Quantity("force", "largest force", "N", 1.0, 1),
+        Quantity("normal_angle", "normal angle", "°", DEGREES, 1),
+        Quantity("surface_distance", "off surface", "mm", 1e3, 2),
+        Quantity("other_links", "other links", "", 1.0, 0),
+        Quantity("imbalance", "force imbalance", "", 1.0, 3),
+        Quantity("normal_sum", "sum of normals", "", 1.0, 2),
+    )
+}
+#: Quantities with a range among the filters.
+RANGES = ("suspicion", "penetration", "slip", "turn", "force", "normal_angle")
+#: Orders by name: the quantities, and the order of the rows.
+SORTS = (*QUANTITIES, "row")
+HOLDS = ("held", "precision", "stable")
+DECISIONS = ("rejected", "kept", "open")
+#: Cards on a page of the gallery.
+PAGE = 24
+#: Makes one number of object, palm pose and stand-off, whose type has eight bits.
+_CODE = np.array([1 << 40, 1 << 8, 1], dtype=np.int64)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Query:
+    """What is asked for; an empty text asks for anything.
+
+    Attributes:
+        object_name, class_name, outcome, split, hold, removal, decision: The filters.
+        ranges: Least and largest value of quantities, in the units that are shown.
+        sort: One of SORTS.
+        ascending: Whether the smallest come first.
+        page: Number of the gallery's page, from 1.
+    """
+
+    object_name: str = ""
+    class_name: str = ""
+    outcome: str = "success"
+    split: str = ""
+    hold: str = ""
+    removal: str = ""
+    decision: str = ""
+    ranges: Mapping[str, tuple[float | None, float | None]] = field(default_factory=dict)
+    sort: str = "suspicion"
+    ascending: bool = False
+    page: int = 1
+
+    def params(self, **changes: object) -> str:
+        """Return the query as part of an address, with some values changed; defaults are left out.
+
+        Args:
+            changes: Values by the names of the parameters.
+        """
+        values: dict[str, object] = {
+            "object": self.object_name,
+            "class": self.class_name,
+            "outcome": self.outcome or "any",
+            "split": self.split,
+            "hold": self.hold,
+            "removal": self.removal,
+            "decision": self.decision,
+            "sort": self.sort,
+            "order": "up" if self.ascending else "",
+            "page": self.page,
+        }
+        for name, limits in self.ranges.items():
+            for bound, value in zip(("min", "max"), limits, strict=True):
+                values[f"{bound}_{name}"] = "" if value is None else f"{value:g}"
+        values |= changes
+        default = {"outcome": "success", "sort": "suspicion", "page": 1}
+        return urlencode({k: v for k, v in values.items() if v != "" and v != default.get(k)})
+
+    @property
+    def identity(self) -> str:
+        """The query without its page, as text."""
+        return self.params(page=1)
+
+
+def parse_query(params: Mapping[str, str]) -> Query:
+    """Return the query of an address.
+
+    Raises:
+        DataError: If a value is none that can be asked for.
+    """
+    # Texts that must be one of a few; names of objects may be any.
+    choices = {
+        "outcome": ("any", *(o.label for o in Outcome)),
+        "split": (*SPLITS, "none"),
+        "hold": HOLDS,
+        "removal": tuple(r.label for r in Removal),
+        "decision": DECISIONS,
+        "sort": SORTS,
+        "order": ("up", "down"),
+    }
+    for name, allowed in choices.items():
+        if params.get(name, "") not in ("", *allowed):
+            raise DataError(f"{name} must be one of {', '.join(allowed)}, got {params[name]!r}")
+
+    ranges = {}
+    for name in RANGES:
+        limits = (_number(params, f"min_{name}"), _number(params, f"max_{name}"))
+        if limits != (None, None):
+            ranges[name] = limits
+    outcome = params.get("outcome", "") or "success"
+    page = params.get("page", "") or "1"
+    if not (page.isascii() and page.isdecimal() and len(page) < 9):
+        raise DataError(f"page must be a number, got {page!r}")
+    return Query(
+        object_name=params.get("object", ""),
+        class_name=params.get("class", ""),
+        outcome="" if outcome == "any" else outcome,
+        split=params.get("split", ""),
+        hold=params.get("hold", ""),
+        removal=params.get("removal", ""),
+        decision=params.get("decision", ""),
+        ranges=ranges,
+        sort=params.get("sort", "") or "suspicion",
+        ascending=params.get("order", "") == "up",
+        page=max(1, int(page)),
+    )
+
+
+def _number(params: Mapping[str, str], name: str) -> float | None:
+    text = params.get(name, "").strip()
+    if not text:
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise DataError(f"{name} must be a number, got {text!r}")
+    return value
+
+
+def select(snapshot: Snapshot, query: Query, decisions: Decisions) -> npt.NDArray[np.int32]:
+    """Return the places of the attempts that a query asks for, in its order.
+
+    Attempts without a value of what is sorted by come last; ties are in the order of the rows.
+    """
+    chosen = _matches(snapshot, query)
+    if query.decision:
+        chosen &= _decided(snapshot, query.decision, decisions)
+    places = np.flatnonzero(chosen).astype(np.int32)
+    if query.sort == "row":
+        return places if not query.ascending else places[::-1]
+    # Most attempts have no values: they need no sorting.
+    values = snapshot.table.feature(query.sort)[places]
+    there = ~np.isnan(values)
+    few = values[there] if query.ascending else -values[there]
+    ordered = places[there][np.argsort(few, kind="stable")]
+    return np.concatenate([ordered, places[~there]])
+
+
+def _matches(snapshot: Snapshot, query: Query) -> npt.NDArray[np.bool_]:
+    """Return which attempts (n,) the filters let through, but for that of decisions."""
+    # Names first: a class is all of its objects.
+    table = snapshot.table
+    wanted = np.array(
+        [
+            query.object_name in ("", name) and query.class_name in ("", class_name)
+            for name, class_name in zip(snapshot.names, snapshot.classes, strict=True)
+        ],
+        dtype=bool,
+    )
+    chosen = wanted[table.object] if len(wanted) else np.zeros(len(table), dtype=bool)
+
+    # Verdicts.
+    if query.outcome:
+        chosen &= table.outcome == Outcome[query.outcome.upper()]
+    if query.split:
+        number = NONE if query.split == "none" else SPLITS.index(query.split)
+        chosen &= table.split == number
+    if query.hold:
+        held = table.outcome == Outcome.SUCCESS
+        chosen &= {"held": held, "precision": table.precision, "stable": table.stable}[query.hold]
+    if query.removal:
+        chosen &= table.removal == Removal[query.removal.upper()]
+
+    # Numbers; an attempt without one is in no range.
+    for name, (least, largest) in query.ranges.items():
+        values = table.feature(name) * QUANTITIES[name].factor
+        if least is not None:
+            chosen &= values >= least
+        if largest is not None:
+            chosen &= values <= largest
+    return chosen
+
+
+def _decided(snapshot: Snapshot, decision: str, decisions: Decisions) -> npt.NDArray[np.bool_]:
+    """Return which attempts (n,) are rejected, kept, or still open; only successes are decided."""
+    keys = {"rejected": decisions.rejected, "kept": decisions.kept}.get(
+        decision, decisions.rejected | decisions.kept
+    )
+    numbers = {name: i for i, name in enumerate(snapshot.names)}
+    wanted = [
+        (numbers[key.object], key.candidate, key.standoff_index)
+        for key in keys
+        if key.object in numbers
+    ]
+
+    # Compare identities as single numbers: there may be thousands of decisions.
+    table = snapshot.table
+    (hits,) = np.nonzero(table.outcome == Outcome.SUCCESS)
+    columns = (table.object[hits], table.candidate[hits], table.standoff_index[hits])
+    codes = np.array(wanted, dtype=np.int64).reshape(-1, 3) @ _CODE
+    found = np.zeros(len(table), dtype=bool)
+    found[hits[np.isin(np.stack(columns, axis=1).astype(np.int64) @ _CODE, codes)]] = True
+    return ~found if decision == "open" else found

@@ -1,0 +1,152 @@
+"""Rows of single attempts: their numbers, poses and images, read from the files when asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.arithmetic import multiply
+from drakegrasp.dataset.paths import DATA_FILES
+from drakegrasp.dataset.schema import SPLITS, TRIAL_FIELDS
+from drakegrasp.dataset.shards import ASSEMBLED_FIELDS
+from drakegrasp.errors import DataError
+from drakegrasp.frames import invert_pose, rotate_vectors, transform_points, unpack_pose
+from drakegrasp.inspection.catalog import Snapshot
+from drakegrasp.inspection.table import NONE
+from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, intrinsics, project
+
+#: Columns that the dots on a thumbnail need.
+THUMBNAIL = ("X_TO", "X_OG", "closed_p_OQ", "closed_nhat_Q_O")
+#: Length of the arrows along the normals [m].
+ARROW = 0.03
+_CAMERA_POSES = {"oto": camera_pose_oto, "otm": camera_pose_otm}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Look:
+    """The images of a success by one camera.
+
+    Attributes:
+        image: (4, S, S) float32: R, G, B in 0..1 and depth [m].
+        mask: (S, S) uint8, 1 where the object is seen.
+    """
+
+    image: npt.NDArray[np.float32]
+    mask: npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Dot:
+    """A contact on an image: its pixel, and that of the tip of its normal."""
+
+    finger: int
+    u: float
+    v: float
+    tip_u: float
+    tip_v: float
+
+
+def read_rows(
+    snapshot: Snapshot, places: Sequence[int], names: Sequence[str] | None = None
+) -> list[dict[str, Any]]:
+    """Return what `/trials` says of attempts.
+
+    Args:
+        snapshot: State of the files.
+        places: Of the attempts in the table.
+        names: Of the columns; all that a shard has if None.
+
+    Raises:
+        DataError: If a file was replaced meanwhile.
+    """
+    columns = names or [f.name for f in TRIAL_FIELDS if f.name not in ASSEMBLED_FIELDS]
+    table, rows = snapshot.table, []
+    files: dict[int, h5py.File] = {}
+    try:
+        for i in places:
+            number = int(table.source[i])
+            if number not in files:
+                files[number] = h5py.File(snapshot.sources[number], "r")
+            trials = files[number]["trials"]
+            rows.append({name: np.asarray(trials[name][table.row[i]]) for name in columns})
+    except (OSError, KeyError, ValueError, IndexError) as error:
+        raise DataError(f"{snapshot.out}: files have changed meanwhile ({error})") from None
+    finally:
+        for file in files.values():
+            file.close()
+    return rows
+
+
+def read_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
+    """Return the images of an attempt, or None if there are none.
+
+    A sample's are in the data file. Those of other successes are in their shard.
+    """
+    try:
+        if snapshot.table.split[i] != NONE:
+            return _sample_look(snapshot, i, camera)
+        return _shard_look(snapshot, i, camera)
+    except (OSError, KeyError, ValueError, IndexError):
+        return None
+
+
+def _sample_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
+    split = SPLITS[snapshot.table.split[i]]
+    row = int(np.searchsorted(snapshot.sample_ids[split], snapshot.table.row[i]))
+    path = snapshot.out / DATA_FILES[camera]
+    if not path.is_file():
+        return _shard_look(snapshot, i, camera)
+    with h5py.File(path, "r") as file:
+        return Look(image=file[split]["images"][row], mask=file[split]["masks"][row])
+
+
+def _shard_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
+    key = snapshot.key(i)
+    with h5py.File(_shard_path(snapshot, i), "r") as file:
+        # The row of the attempt in its shard, then that of its images.
+        trials, looks = file["trials"], file["looks"]
+        here = trials["candidate"][:] == key.candidate
+        (rows,) = np.nonzero(here & (trials["standoff_index"][:] == key.standoff_index))
+        (found,) = np.nonzero(looks["row"][:] == rows[0])
+        if not len(found):
+            return None
+        k = int(found[0])
+        return Look(image=looks[f"image_{camera}"][k], mask=looks[f"mask_{camera}"][k])
+
+
+def _shard_path(snapshot: Snapshot, i: int) -> Path:
+    """Return the path of the shard that holds an attempt; its end is that of the object's poses."""
+    key, step = snapshot.key(i), snapshot.config.unit_candidates
+    start = key.candidate // step * step
+    (path,) = (snapshot.out / "shards" / key.object).glob(f"{start:07d}-*.h5")
+    return path
+
+
+def contact_dots(snapshot: Snapshot, row: dict[str, Any], camera: str) -> list[Dot]:
+    """Return where a camera sees the contacts after closing; those behind it are left out.
+
+    Args:
+        snapshot: With the configuration of the cameras.
+        row: With the columns THUMBNAIL.
+        camera: `oto` or `otm`.
+    """
+    # The contacts and the tips of their normals in {C}.
+    config = snapshot.config.camera
+    X_TO, X_OG = unpack_pose(row["X_TO"]), unpack_pose(row["X_OG"])
+    X_TC = _CAMERA_POSES[camera](multiply(X_TO, X_OG), config)
+    X_CO = multiply(invert_pose(X_TC), X_TO)
+    p_CQ = transform_points(X_CO, row["closed_p_OQ"])
+    p_CE = p_CQ + ARROW * np.nan_to_num(rotate_vectors(X_CO, row["closed_nhat_Q_O"]))
+
+    K, dots = intrinsics(config), []
+    for finger, (point, tip) in enumerate(zip(p_CQ, p_CE, strict=True)):
+        if np.isfinite(point).all() and min(point[2], tip[2]) > config.near:
+            (u, v), (tip_u, tip_v) = project(K, np.array([point, tip])).tolist()
+            dots.append(Dot(finger, u, v, tip_u, tip_v))
+    return dots

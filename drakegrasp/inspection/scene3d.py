@@ -1,0 +1,160 @@
+"""What the 3D view of an attempt shows: poses of links, contacts, the table.
+
+In: a row of `/trials` and the hand. Out: plain lists for JSON. Everything is in {T}, on the object
+in its resting pose: what was lifted is moved back with the object, as in the dataset's `_held`
+fields, so that a slip in the hand shows as another place of the hand.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drakegrasp.arithmetic import multiply
+from drakegrasp.config import Config
+from drakegrasp.dataset.paths import model_path
+from drakegrasp.errors import DrakegraspError
+from drakegrasp.frames import Array, rotate_vectors, transform_points, unpack_pose
+from drakegrasp.inspection.catalog import Snapshot
+from drakegrasp.outcomes import Outcome
+
+#: Object meshes that are kept in memory.
+KEPT_MESHES = 32
+
+
+class HandView:
+    """The hand of a dataset for the 3D view; Drake is loaded when it is first asked.
+
+    Args:
+        config: Configuration of the dataset.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._name = config.hand
+        self._lock = threading.Lock()
+        self._hand: Any = None
+        self._glbs: dict[str, bytes] = {}
+        #: Why there is no hand to show, in words; empty if there is one.
+        self.problem = ""
+
+    def load(self) -> None:
+        """Load the hand; a hand that cannot be loaded here is a `problem`, and no error."""
+        with self._lock:
+            if self._hand is not None or self.problem:
+                return
+            from drakegrasp.hand.description import load_hand
+            from drakegrasp.visualization.posed_hand import PosedHand
+
+            try:
+                hand = PosedHand(load_hand(self._name))
+                self._glbs = {link: hand.link_glb(link) for link in hand.links}
+                self._hand = hand
+            except (DrakegraspError, RuntimeError, OSError) as error:
+                self.problem = f"the hand cannot be shown: {str(error).splitlines()[0]}"
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """Names of the links with a shape, in the order of their numbers in addresses."""
+        self.load()
+        return tuple(self._glbs)
+
+    def glb(self, number: int) -> bytes:
+        """Return a link's mesh as a GLB file.
+
+        Raises:
+            IndexError: If there is no link of that number.
+        """
+        link = self.links[number]  # first, since it may load them
+        return self._glbs[link]
+
+    def poses(self, X_TG: Array, q: Array | None, spread: float) -> list[list[float]]:
+        """Return the poses of the links, column by column as for three.js; none without a hand.
+
+        A dataset that was made with other files of the hand may have another number of joints.
+
+        Args:
+            X_TG: (4, 4), pose of the palm.
+            q: (j,), positions of the joints [rad]; None for the open hand.
+            spread: Angle of the spread joints of the open hand [rad].
+        """
+        self.load()
+        if self._hand is None:
+            return []
+        with self._lock:
+            rest = self._hand.open_positions(spread)
+            positions = rest if q is None else q
+            if len(positions) != len(rest):
+                return []
+            poses = self._hand.link_poses(X_TG, positions)
+        return [_columns(poses[link]) for link in self._glbs]
+
+
+def scene_of(snapshot: Snapshot, i: int, row: Mapping[str, Any], hand: HandView) -> dict[str, Any]:
+    """Return the 3D view of an attempt as JSON types.
+
+    Args:
+        snapshot: State of the files.
+        i: Place of the attempt in the table.
+        row: All its columns.
+        hand: Of the dataset.
+    """
+    # The start always; closed and lifted as far as the attempt got.
+    X_TO = unpack_pose(row["X_TO"])
+    X_TG = multiply(X_TO, unpack_pose(row["X_OG"]))
+    spread = float(row["spread"])
+    states: dict[str, Any] = {"start": {"links": hand.poses(X_TG, None, spread), "contacts": []}}
+    if np.isfinite(row["time_close"]):
+        links = hand.poses(X_TG, row["closed_q"], spread)
+        states["closed"] = {"links": links, "contacts": _contacts(row, "closed", X_TO)}
+    if np.isfinite(row["time_lift"]) and np.isfinite(row["X_OG_lifted"]).all():
+        X_TG_held = multiply(X_TO, unpack_pose(row["X_OG_lifted"]))
+        links = hand.poses(X_TG_held, row["lifted_q"], spread)
+        states["lifted"] = {"links": links, "contacts": _contacts(row, "lifted", X_TO)}
+
+    return {
+        "object": _columns(X_TO),
+        "objectNumber": int(snapshot.table.object[i]),
+        "hasObject": model_path(snapshot.out, snapshot.names[snapshot.table.object[i]]).is_file(),
+        "links": len(hand.links),
+        "states": states,
+        "success": bool(snapshot.table.outcome[i] == Outcome.SUCCESS),
+    }
+
+
+def _contacts(row: Mapping[str, Any], when: str, X_TO: Array) -> list[dict[str, Any]]:
+    """Return the contacts of one instant in {T}; a finger that does not touch has none."""
+    p_TQ = transform_points(X_TO, row[f"{when}_p_OQ"])
+    nhat_T = rotate_vectors(X_TO, row[f"{when}_nhat_Q_O"])
+    f_T = rotate_vectors(X_TO, row[f"{when}_f_Q_O"])
+    return [
+        {"finger": k, "p": p.tolist(), "n": np.nan_to_num(n).tolist(), "f": f.tolist()}
+        for k, (p, n, f) in enumerate(zip(p_TQ, nhat_T, f_T, strict=True))
+        if np.isfinite(p).all() and np.isfinite(f).all()
+    ]
+
+
+def _columns(X: Array) -> list[float]:
+    """Return a pose as sixteen numbers, column by column, to a micrometre and a microradian."""
+    return [round(value, 6) for value in X.T.ravel().tolist()]
+
+
+@lru_cache(maxsize=KEPT_MESHES)
+def object_mesh(path: Path, modified: int) -> bytes:
+    """Return the mesh of an object's file as a GLB file.
+
+    Args:
+        path: Of the object's .npz.
+        modified: When the file was written [ns]; another time reads it again.
+
+    Raises:
+        MeshError: If the file cannot be read.
+    """
+    from drakegrasp.objects.model import load_object
+    from drakegrasp.visualization.posed_hand import object_glb
+
+    return object_glb(load_object(path))

@@ -1,0 +1,70 @@
+"""Serving an inspection on this machine, to this machine."""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+
+import uvicorn
+
+from drakegrasp.errors import DataError
+from drakegrasp.inspection.app import Inspection, make_app
+
+#: The only address that is listened on.
+LOOPBACK = "127.0.0.1"
+
+
+def serve(out: Path, *, port: int, browser: bool, announce: Callable[[str], None]) -> None:
+    """Serve the pages of a dataset until Ctrl-C.
+
+    Args:
+        out: Directory of the dataset.
+        port: TCP port; 0 takes any that is free.
+        browser: Whether to open a browser.
+        announce: Is given the address as soon as it answers.
+
+    Raises:
+        DataError: If there is no dataset, or the port is taken.
+    """
+    # First what can be refused; the page must be quick from its first request on.
+    inspection = Inspection(out)
+    listener = listen(port)
+    inspection.warm_up()
+
+    address = f"http://{LOOPBACK}:{listener.getsockname()[1]}/"
+    config = uvicorn.Config(make_app(inspection), log_level="warning", access_log=False)
+    announce(address)
+    if browser and has_screen():
+        webbrowser.open(address)
+    uvicorn.Server(config).run(sockets=[listener])
+
+
+def listen(port: int) -> socket.socket:
+    """Return a socket that listens on the loopback address.
+
+    Raises:
+        DataError: If the port is taken, or needs rights that we do not have.
+    """
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((LOOPBACK, port))
+        listener.listen()
+    except OSError as error:
+        listener.close()
+        raise DataError(
+            f"--port must be free on this machine, got {port} ({error.strerror}); "
+            "--port 0 takes any that is"
+        ) from None
+    return listener
+
+
+def has_screen() -> bool:
+    """Return whether a browser would open a window, and not take over the terminal."""
+    if sys.platform == "darwin":
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -1,0 +1,181 @@
+// The 3D view of one attempt: table, object, links of the hand, contacts. Needs three.js (r147).
+"use strict";
+(() => {
+  const box = document.getElementById("view3d");
+  const note = box.querySelector(".loading");
+  const { scene: data, meshes, colours } = JSON.parse(document.getElementById("scene").textContent);
+  const NORMAL = 0.03, PER_NEWTON = 0.001, DOT = 0.003;
+
+  let renderer;
+  try {
+    renderer = new THREE.WebGLRenderer({ antialias: true, preserveDrawingBuffer: true });
+  } catch (error) {
+    note.textContent = "This browser has no WebGL: no 3D view.";
+    return;
+  }
+  renderer.outputEncoding = THREE.sRGBEncoding;
+  renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+
+  // Colours are given as a screen shows them.
+  THREE.ColorManagement.legacyMode = false;
+  // Z is up, as on the table.
+  THREE.Object3D.DefaultUp.set(0, 0, 1);
+  const scene = new THREE.Scene();
+  scene.background = new THREE.Color("#eef1f4");
+  scene.add(new THREE.HemisphereLight("#ffffff", "#9aa0a8", 0.9));
+  const sun = new THREE.DirectionalLight("#ffffff", 0.75);
+  sun.position.set(0.6, -0.8, 1.4);
+  scene.add(sun);
+  const table = new THREE.Mesh(
+    new THREE.CircleGeometry(0.35, 64),
+    new THREE.MeshStandardMaterial({ color: "#b9afa0", roughness: 1 }),
+  );
+  table.position.z = -0.001;
+  scene.add(table);
+  scene.add(new THREE.AxesHelper(0.05));
+
+  const camera = new THREE.PerspectiveCamera(35, 1, 0.01, 20);
+  const controls = new THREE.OrbitControls(camera, renderer.domElement);
+  const object = new THREE.Group();
+  const hand = new THREE.Group();
+  const contacts = new THREE.Group();
+  const forces = new THREE.Group();
+  scene.add(object, hand, contacts, forces);
+  const place = (group, columns) => {
+    group.matrixAutoUpdate = false;
+    group.matrix.fromArray(columns);
+  };
+  place(object, data.object);
+  const links = meshes.links.map(() => new THREE.Group());
+  links.forEach((link) => hand.add(link));
+
+  function draw() {
+    renderer.render(scene, camera);
+  }
+
+  function resize() {
+    const width = box.clientWidth, height = box.clientHeight;
+    renderer.setSize(width, height, false);
+    camera.aspect = width / height;
+    camera.updateProjectionMatrix();
+    draw();
+  }
+
+  // Contacts lie between finger and object: they are drawn over both.
+  function mark(colour) {
+    return new THREE.MeshBasicMaterial({ color: colour, depthTest: false, transparent: true });
+  }
+
+  function arrow(group, from, vector, colour, radius) {
+    const length = vector.length();
+    if (length < 1e-4) return;
+    const material = mark(colour);
+    const head = Math.min(0.4 * length, 5 * radius);
+    const shaft = new THREE.Mesh(new THREE.CylinderGeometry(radius, radius, length - head, 12), material);
+    const tip = new THREE.Mesh(new THREE.ConeGeometry(2.4 * radius, head, 16), material);
+    shaft.position.y = (length - head) / 2;
+    tip.position.y = length - head / 2;
+    const whole = new THREE.Group();
+    whole.add(shaft, tip);
+    whole.position.copy(from);
+    whole.quaternion.setFromUnitVectors(new THREE.Vector3(0, 1, 0), vector.clone().normalize());
+    whole.traverse((part) => { part.renderOrder = 2; });
+    group.add(whole);
+  }
+
+  function show(name) {
+    const state = data.states[name];
+    state.links.forEach((columns, i) => place(links[i], columns));
+    links.forEach((link, i) => { link.visible = i < state.links.length; });
+    contacts.clear();
+    forces.clear();
+    for (const contact of state.contacts) {
+      const colour = colours[contact.finger % colours.length];
+      const p = new THREE.Vector3(...contact.p), n = new THREE.Vector3(...contact.n);
+      const dot = new THREE.Mesh(new THREE.SphereGeometry(DOT, 24, 16), mark(colour));
+      dot.position.copy(p);
+      dot.renderOrder = 3;
+      contacts.add(dot);
+      arrow(contacts, p, n.multiplyScalar(NORMAL), colour, 0.0006);
+      // A force pushes into the object: its arrow ends at the contact.
+      const f = new THREE.Vector3(...contact.f).multiplyScalar(PER_NEWTON);
+      arrow(forces, p.clone().sub(f), f, colour, 0.0016);
+    }
+    for (const button of document.querySelectorAll("[data-state]")) button.classList.toggle("on", button.dataset.state === name);
+    box.dataset.state = name;
+    draw();
+  }
+
+  // A page that is a file may not read other files: there a mesh is a script.
+  window.drakegraspMeshes = window.drakegraspMeshes || {};
+  async function bytes(url) {
+    if (url.endsWith(".glb")) {
+      const answer = await fetch(url);
+      if (!answer.ok) throw new Error(`${url}: ${answer.status}`);
+      return answer.arrayBuffer();
+    }
+    await new Promise((done, failed) => {
+      const script = document.createElement("script");
+      script.src = url;
+      script.onload = done;
+      script.onerror = () => failed(new Error(`${url} is missing`));
+      document.head.append(script);
+    });
+    const name = url.split("/").pop().replace(/\.js$/, "");
+    return Uint8Array.from(atob(window.drakegraspMeshes[name]), (c) => c.charCodeAt(0)).buffer;
+  }
+
+  async function load(url, group) {
+    const content = await bytes(url);
+    const gltf = await new Promise((done, failed) => new THREE.GLTFLoader().parse(content, "", done, failed));
+    if (group.parent === hand) gltf.scene.traverse((part) => {
+      if (part.material) Object.assign(part.material, { transparent: true, opacity: 0.8, side: THREE.FrontSide });
+    });
+    group.add(gltf.scene);
+  }
+
+  // glTF's files say y is up and mean nothing by it here: our meshes are in their own frames.
+  function aim() {
+    const bounds = new THREE.Box3().setFromObject(object);
+    if (bounds.isEmpty()) bounds.set(new THREE.Vector3(-0.05, -0.05, 0), new THREE.Vector3(0.05, 0.05, 0.1));
+    const all = new THREE.Box3().setFromObject(hand).union(bounds);
+    const middle = bounds.getCenter(new THREE.Vector3()).lerp(all.getCenter(new THREE.Vector3()), 0.5);
+    const radius = all.getSize(new THREE.Vector3()).length() / 2;
+    // From beside the palm, so that the hand does not hide the object.
+    const palm = links.length ? new THREE.Vector3().setFromMatrixPosition(links[0].matrix).sub(middle) : new THREE.Vector3(1, 0, 0);
+    const azimuth = Math.atan2(palm.y, palm.x) + 1.1;
+    const towards = new THREE.Vector3(Math.cos(azimuth), Math.sin(azimuth), 0.45).normalize();
+    camera.position.copy(middle).addScaledVector(towards, 1.05 * radius / Math.sin((camera.fov * Math.PI) / 360));
+    controls.target.copy(middle);
+    controls.update();
+  }
+
+  const names = Object.keys(data.states);
+  const first = names.includes("closed") ? "closed" : names[0];
+  const jobs = meshes.links.map((url, i) => load(url, links[i]));
+  if (data.hasObject) jobs.push(load(meshes.object, object));
+  Promise.allSettled(jobs).then((results) => {
+    const failed = results.find((result) => result.status === "rejected");
+    if (failed) note.textContent = `A mesh cannot be shown: ${failed.reason.message}`;
+    else note.remove();
+    box.append(renderer.domElement);
+    show(first);
+    scene.updateMatrixWorld(true);
+    aim();
+    resize();
+    controls.addEventListener("change", draw);
+    new ResizeObserver(resize).observe(box);
+    box.dataset.ready = failed ? "partly" : "yes";
+  });
+
+  document.addEventListener("click", (event) => {
+    const button = event.target.closest("[data-state]");
+    if (button) show(button.dataset.state);
+  });
+  for (const [id, group] of [["showhand", hand], ["showforces", forces]]) {
+    document.getElementById(id).addEventListener("change", (event) => {
+      group.visible = event.target.checked;
+      draw();
+    });
+  }
+})();

@@ -1,0 +1,108 @@
+"""The pages as files that a browser opens without a server.
+
+In: a dataset. Out: a folder with `index.html`, a page per success, their images and meshes. A page
+of a file may load no other file but scripts, styles and pictures, so each mesh is a script that
+holds the GLB file as text. Decisions are shown and cannot be changed.
+"""
+
+from __future__ import annotations
+
+import base64
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from drakegrasp.dataset.paths import model_path
+from drakegrasp.dataset.rejections import FILE_NAME, read_decisions
+from drakegrasp.dataset.schema import CAMERAS
+from drakegrasp.errors import DataError
+from drakegrasp.inspection.app import ASSETS
+from drakegrasp.inspection.catalog import Catalog, Snapshot
+from drakegrasp.inspection.links import FileLinks
+from drakegrasp.inspection.pages import gallery_page, grasp_page, render
+from drakegrasp.inspection.plots import PLOTS, plot_svg, plots_values
+from drakegrasp.inspection.query import Query, select
+from drakegrasp.inspection.rows import read_look, read_rows
+from drakegrasp.inspection.scene3d import HandView, object_mesh, scene_of
+from drakegrasp.runtime.files import write_atomic
+from drakegrasp.runtime.progress import Report, silent
+from drakegrasp.visualization.thumbnails import strip_png
+
+#: Grasps that are written at most, the most suspicious: a browser must show all cards at once.
+MAX_GRASPS = 2000
+
+
+def write_site(out: Path, folder: Path, *, progress: Report = silent) -> int:
+    """Write the pages of a dataset's successes as files, and return their number.
+
+    Args:
+        out: Directory of the dataset.
+        folder: Where to write; it must be new or empty.
+        progress: Called with the number of grasps written and to write.
+
+    Raises:
+        DataError: If there is no dataset, it has no success, or the folder holds other files.
+    """
+    # Refuse what cannot be done before anything is written.
+    catalog = Catalog(out)
+    snapshot, query = catalog.current(), Query()
+    decisions = read_decisions(out / FILE_NAME)
+    places = select(snapshot, query, decisions)[:MAX_GRASPS]
+    if not len(places):
+        raise DataError(f"{out}: must hold at least one success to show, got none")
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise DataError(f"--static must be a new or empty directory, got {folder}")
+
+    # What all pages share.
+    hand = HandView(snapshot.config)
+    shutil.copytree(ASSETS, folder / "static", ignore=shutil.ignore_patterns("__pycache__"))
+    _write_meshes(snapshot, folder, hand, places)
+    for name in PLOTS:
+        write_atomic(folder / "plot" / f"{name}.svg", plot_svg(snapshot, name) or b"")
+    plots = render("plots.html", FileLinks(), token="", **plots_values(snapshot))
+    _write_text(folder / "plots.html", plots)
+
+    # The pages of the grasps with their images, and the gallery last.
+    links = FileLinks("../")
+    for done, i in enumerate(places.tolist(), start=1):
+        label = snapshot.label(i)
+        (row,) = read_rows(snapshot, [i])
+        scene = scene_of(snapshot, i, row, hand)
+        page = grasp_page(
+            snapshot, decisions, query, places, i, scene, hand.problem, links, token=""
+        )
+        _write_text(folder / "grasp" / f"{label}.html", page)
+        for camera in CAMERAS:
+            look = read_look(snapshot, i, camera)
+            if look is not None:
+                png = strip_png(look.image, look.mask, far=snapshot.config.camera.far)
+                _write(folder / "strip" / f"{label}-{camera}.png", png)
+        progress(done, len(places))
+    gallery = gallery_page(snapshot, decisions, query, places, FileLinks(), token="")
+    _write_text(folder / "index.html", gallery)
+    return len(places)
+
+
+def _write_meshes(snapshot: Snapshot, folder: Path, hand: HandView, places: np.ndarray) -> None:
+    """Write the meshes of the hand's links and of the objects of attempts, each as a script."""
+    for number in range(len(hand.links)):
+        _write_mesh(folder, f"link-{number}", hand.glb(number))
+    for number in np.unique(snapshot.table.object[places]).tolist():
+        path = model_path(snapshot.out, snapshot.names[number])
+        if path.is_file():
+            _write_mesh(folder, f"object-{number}", object_mesh(path, path.stat().st_mtime_ns))
+
+
+def _write_mesh(folder: Path, name: str, glb: bytes) -> None:
+    text = base64.b64encode(glb).decode()
+    _write_text(folder / "mesh" / f"{name}.js", f'window.drakegraspMeshes["{name}"] = "{text}";\n')
+
+
+def _write_text(path: Path, text: str) -> None:
+    _write(path, text.encode())
+
+
+def _write(path: Path, content: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content)

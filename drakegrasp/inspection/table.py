@@ -1,0 +1,248 @@
+"""The attempts of a dataset as columns in memory: what filters and sorting need.
+
+In: trials.hdf5 with the data files, or, while a build runs, the shards that are done. Out: an
+`AttemptTable`, some twenty bytes per attempt and fifty more where the hand closed. Images and
+poses stay in the files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.arithmetic import norm
+from drakegrasp.dataset.paths import DATA_FILES
+from drakegrasp.dataset.schema import CAMERAS, SPLITS
+from drakegrasp.dataset.shards import ShardHeader, read_trials
+from drakegrasp.dataset.suspicion import COLUMNS, PARTS, suspicion
+from drakegrasp.errors import DataError
+
+AnyArray = npt.NDArray[Any]
+#: Number of a removal or a split that an attempt does not have.
+NONE = 255
+#: Quantities that can be filtered and sorted by, besides the parts of the suspicion.
+EXTRA = ("suspicion", "force")
+FEATURES = (*EXTRA, *(part.name for part in PARTS))
+#: Columns of `/trials` that a table is made from.
+READ = (
+    *COLUMNS,
+    *("candidate", "standoff_index", "precision", "stable", "closed_f_Q_O"),
+)
+#: Columns of a table with a value per attempt.
+_DTYPES: dict[str, type[np.generic]] = {
+    "object": np.int32,
+    "candidate": np.int32,
+    "standoff_index": np.uint8,
+    "outcome": np.uint8,
+    "removal": np.uint8,
+    "split": np.uint8,
+    "precision": np.bool_,
+    "stable": np.bool_,
+    "source": np.int32,
+    "row": np.int32,
+}
+#: Rows that are read at once: 8 chunks of a column.
+BLOCK = 16_384
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AttemptTable:
+    """Columns of n attempts, in the order of the dataset's rows.
+
+    Attributes:
+        object: (n,) int32, number of the object.
+        candidate, standoff_index: (n,), which of the object's palm poses, and of the stand-offs.
+        outcome: (n,) uint8, `Outcome`.
+        removal: (n,) uint8, `Removal` of a success; NONE for others, or where none is decided.
+        split: (n,) uint8, index into SPLITS; NONE for what is no sample.
+        precision, stable: (n,) bool, see the schema.
+        source, row: (n,) int32, number of the file that holds the attempt, and row in it.
+        closed: (m,) int32, places of the attempts whose hand closed, in rising order.
+        features: By the names of FEATURES, (m,) float32, of these; the others have no values.
+    """
+
+    object: npt.NDArray[np.int32]
+    candidate: npt.NDArray[np.int32]
+    standoff_index: npt.NDArray[np.uint8]
+    outcome: npt.NDArray[np.uint8]
+    removal: npt.NDArray[np.uint8]
+    split: npt.NDArray[np.uint8]
+    precision: npt.NDArray[np.bool_]
+    stable: npt.NDArray[np.bool_]
+    source: npt.NDArray[np.int32]
+    row: npt.NDArray[np.int32]
+    closed: npt.NDArray[np.int32]
+    features: Mapping[str, npt.NDArray[np.float32]]
+
+    def __len__(self) -> int:
+        return len(self.outcome)
+
+    def feature(self, name: str) -> npt.NDArray[np.float32]:
+        """Return a feature of all attempts (n,); NaN where an attempt has no value."""
+        values = np.full(len(self), np.nan, dtype=np.float32)
+        values[self.closed] = self.features[name]
+        return values
+
+    def value(self, name: str, i: int) -> float:
+        """Return a feature of one attempt; NaN if it has no value."""
+        k = int(np.searchsorted(self.closed, i))
+        there = k < len(self.closed) and self.closed[k] == i
+        return float(self.features[name][k]) if there else float("nan")
+
+    def find(self, object_: int, candidate: int, standoff_index: int) -> int | None:
+        """Return the place of an attempt, or None if it is not there."""
+        (found,) = np.nonzero(
+            (self.object == object_)
+            & (self.candidate == candidate)
+            & (self.standoff_index == standoff_index)
+        )
+        return int(found[0]) if len(found) else None
+
+
+def read_trials_table(path: Path, masses: Sequence[float]) -> AttemptTable:
+    """Return the attempts in a trials.hdf5, with the splits of the data file beside it.
+
+    Args:
+        path: Of the file.
+        masses: Of the objects [kg].
+
+    Raises:
+        DataError: If the file cannot be read.
+    """
+    # Block by block into arrays for all: the float64 columns of a large file fill the memory.
+    try:
+        with h5py.File(path, "r") as file:
+            trials = file["trials"]
+            count = len(trials["outcome"])
+            whole = _zeros(count)
+            ends = []
+            for start in range(0, count, BLOCK):
+                rows = slice(start, min(start + BLOCK, count))
+                columns = {name: trials[name][rows] for name in READ}
+                place = np.arange(rows.start, rows.stop, dtype=np.int32)
+                part = _part(columns, trials["object"][rows], masses, 0, place)
+                # The only source is 0: memory that is never written costs nothing.
+                for name in _DTYPES.keys() - {"source"}:
+                    whole[name][rows] = getattr(part, name)
+                ends.append((part.closed + np.int32(start), part.features))
+            whole["removal"][file["successes/trial_id"][:]] = file["successes/removal"][:]
+    except (OSError, KeyError, IndexError) as error:
+        raise DataError(f"{path}: must be the trials of a dataset, got none ({error})") from None
+
+    table = _with_features(whole, ends)
+    for number, ids in enumerate(read_sample_ids(path.parent).values()):
+        table.split[ids[ids < len(table)]] = number
+    return table
+
+
+def read_shard_part(
+    out: Path, header: ShardHeader, number: int, object_: int, mass: float
+) -> AttemptTable:
+    """Return the attempts in one shard.
+
+    Args:
+        out: Directory of the dataset.
+        header: Of the shard.
+        number: That the shard gets as a source.
+        object_: Number of its object.
+        mass: Of its object [kg].
+
+    Raises:
+        DataError: If it is missing or damaged.
+    """
+    columns = read_trials(header.path(out), header, READ, verify_seal=False)
+    count = len(columns["outcome"])
+    objects = np.full(count, object_, dtype=np.int32)
+    masses = np.full(object_ + 1, mass)
+    return _part(columns, objects, masses, number, np.arange(count, dtype=np.int32))
+
+
+def read_sample_ids(out: Path) -> dict[str, npt.NDArray[np.int64]]:
+    """Return the trial ids of the samples by split, in rising order; none without data files."""
+    for camera in CAMERAS:
+        try:
+            with h5py.File(out / DATA_FILES[camera], "r") as file:
+                return {split: file[split]["trial_id"][:] for split in SPLITS}
+        except (OSError, KeyError):
+            continue
+    return {split: np.zeros(0, dtype=np.int64) for split in SPLITS}
+
+
+def join(parts: Sequence[AttemptTable]) -> AttemptTable:
+    """Return tables one after the other as one."""
+    starts = np.cumsum([0, *(len(part) for part in parts)], dtype=np.int32)
+    ends = [(p.closed + start, p.features) for p, start in zip(parts, starts, strict=False)]
+    none = _zeros(0)
+    whole = {
+        name: np.concatenate([none[name], *(getattr(part, name) for part in parts)])
+        for name in _DTYPES
+    }
+    return _with_features(whole, ends)
+
+
+def empty_table() -> AttemptTable:
+    """Return a table without attempts."""
+    return _with_features(_zeros(0), [])
+
+
+def _zeros(count: int) -> dict[str, AnyArray]:
+    """Return the columns with a value per attempt."""
+    return {name: np.zeros(count, dtype) for name, dtype in _DTYPES.items()}
+
+
+def _with_features(
+    plain: dict[str, AnyArray],
+    parts: Sequence[tuple[npt.NDArray[np.int32], Mapping[str, npt.NDArray[np.float32]]]],
+) -> AttemptTable:
+    """Return the table of columns with a value per attempt, and of features in parts."""
+    none, nothing = np.zeros(0, np.int32), np.zeros(0, np.float32)
+    return AttemptTable(
+        **plain,
+        closed=np.concatenate([none, *(closed for closed, _ in parts)]),
+        features={
+            name: np.concatenate([nothing, *(features[name] for _, features in parts)])
+            for name in FEATURES
+        },
+    )
+
+
+def _part(
+    columns: Mapping[str, AnyArray],
+    objects: AnyArray,
+    masses: Sequence[float] | AnyArray,
+    source: int,
+    row: npt.NDArray[np.int32],
+) -> AttemptTable:
+    """Return the table of some rows of `/trials`."""
+    # Most attempts never close the hand: only those that do have numbers.
+    count = len(row)
+    (closed,) = np.nonzero(np.isfinite(columns["time_close"]))
+    few = {name: values[closed] for name, values in columns.items()}
+    doubts = suspicion(few, np.asarray(masses, dtype=float)[objects[closed]])
+
+    # The largest force of a fingertip, after the lift if there was one.
+    lifted = np.isfinite(few["time_lift"])[:, None, None]
+    forces = np.where(lifted, few["lifted_f_Q_O"], few["closed_f_Q_O"])
+    extra = {"suspicion": doubts.score, "force": norm(forces).max(axis=1, initial=-np.inf)}
+
+    features = {name: v.astype(np.float32) for name, v in (extra | dict(doubts.values)).items()}
+    return AttemptTable(
+        object=objects.astype(np.int32),
+        candidate=columns["candidate"].astype(np.int32),
+        standoff_index=columns["standoff_index"].astype(np.uint8),
+        outcome=columns["outcome"].astype(np.uint8),
+        removal=np.full(count, NONE, dtype=np.uint8),
+        split=np.full(count, NONE, dtype=np.uint8),
+        precision=columns["precision"].astype(bool),
+        stable=columns["stable"].astype(bool),
+        source=np.full(count, source, dtype=np.int32),
+        row=row,
+        closed=closed.astype(np.int32),
+        features=features,
+    )

@@ -1,0 +1,92 @@
+"""Decisions of an inspection: their file, and what assembly makes of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from helpers.datasets import make_dataset
+
+from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.filters import Removal
+from drakegrasp.dataset.rejections import (
+    AttemptKey,
+    Decisions,
+    read_decisions,
+    read_rejected,
+    write_decisions,
+)
+from drakegrasp.errors import DataError
+
+A, B = AttemptKey("1_box_a", 0, 0), AttemptKey("3_brick", 1, 0)
+
+
+def test_decisions_are_read_as_they_were_written(tmp_path: Path) -> None:
+    path = tmp_path / "reject.json"
+    assert read_decisions(path) == Decisions()
+    decisions = Decisions().with_decision(B, "rejected").with_decision(A, "kept")
+    write_decisions(path, decisions)
+    assert read_decisions(path) == decisions
+    assert read_rejected(path) == [B]
+    assert [p.name for p in tmp_path.iterdir()] == ["reject.json"]
+
+
+def test_a_decision_replaces_the_one_before() -> None:
+    rejected = Decisions().with_decision(A, "rejected")
+    assert rejected.of(A) == "rejected"
+    assert rejected.with_decision(A, "kept") == Decisions(kept=frozenset([A]))
+    assert rejected.with_decision(A, "") == Decisions()
+    assert rejected.of(B) == ""
+    with pytest.raises(ValueError, match="decision must be rejected, kept or empty, got 'no'"):
+        rejected.with_decision(A, "no")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "[]",
+        "3",
+        '{"version": 2, "rejected": [], "kept": []}',
+        '{"version": 1, "rejected": [{"object": "a"}], "kept": []}',
+        '{"version": 1, "rejected": [{"object": "a", "candidate": true, "standoff_index": 0}], '
+        '"kept": []}',
+    ],
+)
+def test_another_file_is_refused(content: str, tmp_path: Path) -> None:
+    path = tmp_path / "reject.json"
+    path.write_text(content, encoding="utf-8")
+    with pytest.raises(DataError, match="must be"):
+        read_rejected(path)
+
+
+def test_text_has_an_id_per_line(tmp_path: Path) -> None:
+    path = tmp_path / "list.txt"
+    path.write_text("# bad ones\n3\n\n12 # slides\n", encoding="utf-8")
+    assert read_rejected(path) == [3, 12]
+    path.write_text("3\nx\n", encoding="utf-8")
+    with pytest.raises(DataError, match="line 2: must be the id of a trial, got 'x'"):
+        read_rejected(path)
+    path.write_bytes(b"\xff\xfe")
+    with pytest.raises(DataError, match="must be a text file"):
+        read_rejected(path)
+
+
+def test_assembly_drops_exactly_what_is_rejected(tmp_path: Path) -> None:
+    out = make_dataset(tmp_path / "out", tmp_path)
+    path = out / "reject.json"
+    write_decisions(path, Decisions(rejected=frozenset([A, B]), kept=frozenset([A])))
+    assembly = assemble(out, rejected=read_rejected(path))
+    assert assembly.removed == {Removal.KEPT: 7, Removal.REJECTED: 2}
+
+
+def test_rejecting_what_is_no_success_changes_nothing(tmp_path: Path) -> None:
+    out = make_dataset(tmp_path / "out", tmp_path)
+    before = (out / "trials.hdf5").read_bytes()
+    stranger = AttemptKey("1_box_a", 0, 1)
+    write_decisions(out / "reject.json", Decisions(rejected=frozenset([stranger])))
+    assert json.loads((out / "reject.json").read_text())["rejected"][0]["standoff_index"] == 1
+    with pytest.raises(DataError, match="got 1_box_a, palm pose 0, stand-off 1"):
+        assemble(out, rejected=read_rejected(out / "reject.json"))
+    assert (out / "trials.hdf5").read_bytes() == before

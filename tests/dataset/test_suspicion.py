@@ -1,0 +1,116 @@
+"""The suspicion score: each part is of its own columns, and known cases have known values."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from drakegrasp.dataset import suspicion as module
+from drakegrasp.dataset.suspicion import CAP, COLUMNS, PARTS, suspicion
+from drakegrasp.frames import make_pose, pack_pose, rotation_about
+from drakegrasp.outcomes import Outcome
+from drakegrasp.simulation import settle
+
+#: Three unit normals that add up to nothing.
+BALANCED = np.array([[1.0, 0.0, 0.0], [-0.5, np.sqrt(0.75), 0.0], [-0.5, -np.sqrt(0.75), 0.0]])
+SCALES = {part.name: part.scale for part in PARTS}
+
+
+def firm(count: int = 2, mass: float = 1.0) -> dict[str, npt.NDArray[Any]]:
+    """Columns of grasps of which no part is suspicious; the lifted object is turned."""
+    R_TO = rotation_about([0.0, 0.0, 1.0], 0.3) @ rotation_about([1.0, 0.0, 0.0], 2.0)
+    pull_T = np.array([[3.0, 0.0, 0.0], [-3.0, 0.0, 0.0], [0.0, 0.0, mass * module.GRAVITY]])
+    rows: dict[str, Any] = {
+        "outcome": np.uint8(Outcome.SUCCESS),
+        "closed_penetration": np.zeros(3),
+        "lifted_penetration": np.zeros(3),
+        "normal_angle": np.zeros(3),
+        "surface_distance": np.zeros(3),
+        "slip": 0.0,
+        "turn": 0.0,
+        "lifted_other_links": np.uint8(0),
+        "lifted_f_Q_O": pull_T @ R_TO,
+        "X_TO_lifted": pack_pose(make_pose(R_TO, [0.0, 0.1, 0.5])),
+        "closed_nhat_Q_O": BALANCED,
+        "time_close": 0.8,
+        "time_lift": 2.0,
+    }
+    return {name: np.array([value] * count) for name, value in rows.items()}
+
+
+def test_a_firm_grasp_is_not_suspicious() -> None:
+    found = suspicion(firm(), 1.0)
+    assert set(COLUMNS) == set(firm())
+    np.testing.assert_allclose(found.score, 0.0, atol=1e-12)
+    assert list(found.values) == list(found.shares) or set(found.values) == set(found.shares)
+
+
+@pytest.mark.parametrize(
+    ("part", "column", "value"),
+    [
+        ("penetration", "closed_penetration", [0.0, 2e-3, 0.0]),
+        ("penetration", "lifted_penetration", [0.0, 0.0, 2e-3]),
+        ("normal_angle", "normal_angle", [0.0, 0.25, 0.1]),
+        ("surface_distance", "surface_distance", [1e-3, 0.0, 0.0]),
+        ("slip", "slip", 4e-3),
+        ("turn", "turn", 0.1),
+        ("other_links", "lifted_other_links", 1),
+        ("normal_sum", "closed_nhat_Q_O", np.array([[0.0, 0.0, 1.0], [1, 0, 0], [-1, 0, 0]])),
+    ],
+)
+def test_each_part_is_of_its_own_column(part: str, column: str, value: Any) -> None:
+    columns = firm()
+    columns[column][1] = value
+    found = suspicion(columns, 1.0)
+    expected = 1.0 / 3.0 if part == "normal_sum" else np.max(value)
+    assert found.values[part][1] == pytest.approx(expected)
+    assert found.score[1] == pytest.approx(expected / SCALES[part])
+    assert found.score[0] == pytest.approx(0.0, abs=1e-12)
+    for name in set(SCALES) - {part}:
+        assert found.shares[name][1] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_forces_must_carry_the_weight_upwards() -> None:
+    """Without forces the whole weight is unexplained; sideways 1 N of 2 kg is 1/19.62 of it."""
+    columns = firm(3, mass=2.0)
+    columns["lifted_f_Q_O"][1] = 0.0
+    R_TO = columns["X_TO_lifted"][2].reshape(3, 4)[:, :3]
+    columns["lifted_f_Q_O"][2, 0] += R_TO.T @ [0.0, 1.0, 0.0]
+    found = suspicion(columns, np.array([2.0, 2.0, 2.0])).values["imbalance"]
+    np.testing.assert_allclose(found, [0.0, 1.0, 1.0 / 19.62], atol=1e-12)
+
+
+def test_parts_add_up_in_squares_and_are_capped() -> None:
+    columns = firm(2)
+    columns["slip"][:] = [0.010, 1.0]
+    columns["lifted_other_links"][:] = [2, 0]
+    np.testing.assert_allclose(suspicion(columns, 1.0).score, [np.sqrt(5.0), CAP])
+
+
+def test_an_attempt_is_judged_by_the_stages_that_it_reached() -> None:
+    columns = firm(3)
+    columns["outcome"][:] = [Outcome.RAY_MISS, Outcome.MISSING_FINGERTIP, Outcome.SUCCESS]
+    columns["time_close"][0] = columns["time_lift"][0] = columns["time_lift"][1] = np.nan
+    columns["closed_penetration"][:] = 1e-3
+    columns["closed_nhat_Q_O"][1, 2] = np.nan  # the finger that does not touch
+    found = suspicion(columns, 1.0)
+    assert np.isnan(found.score).tolist() == [True, False, False]
+    assert np.isnan(found.values["slip"]).tolist() == [True, True, False]
+    assert found.values["penetration"][1] == 1e-3
+    assert found.values["normal_sum"][1] == pytest.approx(1.0 / 3.0)
+
+
+def test_a_success_without_a_normal_is_most_suspicious_by_it() -> None:
+    columns = firm(2)
+    columns["closed_nhat_Q_O"][1, 0] = np.nan
+    columns["normal_angle"][1, 0] = np.nan
+    found = suspicion(columns, 1.0)
+    assert found.shares["normal_sum"][1] == found.shares["normal_angle"][1] == CAP
+    assert found.score[1] == pytest.approx(np.sqrt(2.0) * CAP)
+
+
+def test_gravity_is_the_simulators() -> None:
+    assert module.GRAVITY == settle.GRAVITY

@@ -1,0 +1,282 @@
+"""The pages, what they contain, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import re
+from io import BytesIO
+from pathlib import Path
+
+import pytest
+import trimesh
+from helpers.pages import ATTACK, Tags
+from matplotlib.image import imread
+from starlette.testclient import TestClient
+
+from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.filters import Removal
+from drakegrasp.dataset.rejections import AttemptKey, read_decisions, read_rejected
+from drakegrasp.errors import DataError
+from drakegrasp.inspection.app import HEADERS, TOKEN_HEADER, Inspection, make_app
+from drakegrasp.inspection.query import PAGE
+
+PAGES = ("/", "/?outcome=any&page=2", "/grasp/0-0-0", "/grasp/0-0-1", "/plots")
+
+
+def token(client: TestClient) -> str:
+    found = re.search(r'name="token" content="([^"]+)"', client.get("/").text)
+    assert found is not None
+    return found[1]
+
+
+def decide(client: TestClient, label: str, decision: str) -> int:
+    content = {"label": label, "decision": decision}
+    answer = client.post("/decide", json=content, headers={TOKEN_HEADER: token(client)})
+    return answer.status_code
+
+
+def test_gallery_shows_what_is_selected_page_by_page(client: TestClient) -> None:
+    everything = Tags(client.get("/").text)
+    labels = [a["data-label"] for tag, a in everything.tags if tag == "li"]
+    assert len(labels) == 9
+    assert "9 of 36 attempts" in " ".join(everything.text.split())
+    first = Tags(client.get("/?outcome=any&sort=row").text)
+    second = Tags(client.get("/?outcome=any&sort=row&page=2").text)
+    both = [a["data-label"] for p in (first, second) for tag, a in p.tags if tag == "li"]
+    assert len(both) == len(set(both)) == 36
+    assert len([tag for tag, _ in first.tags if tag == "li"]) == PAGE
+    # A page beyond the last is the last.
+    assert "page 2 of 2" in client.get("/?outcome=any&page=99").text
+    assert "No attempt fits" in client.get("/?object=nothing").text
+
+
+def test_contacts_are_drawn_in_all_three_images(client: TestClient) -> None:
+    card = client.get("/?object=1_box_a&sort=row").text.partition("</li>")[0]
+    assert card.count("<circle") == 9
+    assert "/strip/0-0-0-oto.png" in card
+    strip = imread(BytesIO(client.get("/strip/0-0-0-oto.png").content))
+    assert strip.shape[:2] == (32, 96)
+    for address in ("0-0-1-oto", "0-0-0-out", "9-9-9-oto", "x-oto"):
+        assert client.get(f"/strip/{address}.png").status_code == 404
+
+
+def test_next_and_previous_go_through_the_selection(client: TestClient) -> None:
+    query = "object=2_box_b&sort=row"
+    page = client.get(f"/grasp/1-1-0?{query}").text
+    assert "2 of 3" in page
+    links = {a.get("id"): a.get("href") for tag, a in Tags(page).tags if tag == "a"}
+    assert links["previous"] == f"/grasp/1-0-0?{query}"
+    assert links["next"] == f"/grasp/1-3-2?{query}"
+    assert links["gallery"] == f"/?{query}"
+    assert "not in the selection" in client.get(f"/grasp/0-0-0?{query}").text
+
+
+def test_page_of_a_grasp_has_numbers_and_a_scene(client: TestClient) -> None:
+    page = client.get("/grasp/0-0-0").text
+    for text in ("2.0 mm", "10.0", "camera otm", "--trial 0", "stable"):
+        assert text in page
+    found = re.search(r'<script type="application/json" id="scene">(.*?)</script>', page, re.S)
+    assert found is not None
+    content = json.loads(found[1])
+    scene = content["scene"]
+    assert set(scene["states"]) == {"start", "closed", "lifted"}
+    closed = scene["states"]["closed"]
+    assert len(closed["contacts"]) == 3
+    assert len(closed["links"]) == scene["links"] == len(content["meshes"]["links"]) == 9
+    # The first contact is on the box's side, half of 6 cm from its centre, 5 cm above the table.
+    assert closed["contacts"][0]["p"] == pytest.approx([0.03, 0.0, 0.05])
+    assert closed["contacts"][0]["f"] == pytest.approx([-10.0, 0.0, 0.0])
+    assert scene["states"]["lifted"]["contacts"][0]["p"] == pytest.approx([0.03, 0.0, 0.052])
+
+
+def test_failed_attempt_is_shown_as_far_as_it_got(client: TestClient) -> None:
+    page = client.get("/grasp/0-2-1").text
+    assert "ray miss" in page
+    assert 'data-state="start"' in page
+    assert 'data-state="closed"' not in page
+    assert "data-decide" not in page
+    assert "Only successes have images" in page
+
+
+def test_meshes_are_glb_files(client: TestClient) -> None:
+    for address in ("object-0", "link-0", "link-8"):
+        answer = client.get(f"/mesh/{address}.glb")
+        scene = trimesh.load(BytesIO(answer.content), file_type="glb")
+        assert len(scene.geometry) > 0
+    box = trimesh.load(BytesIO(client.get("/mesh/object-0.glb").content), file_type="glb")
+    assert (box.bounds[1] - box.bounds[0]).tolist() == pytest.approx([0.06, 0.05, 0.10])
+    for address in ("object-9", "link-99", "other-0"):
+        assert client.get(f"/mesh/{address}.glb").status_code == 404
+
+
+def test_plots_are_there(client: TestClient) -> None:
+    page = client.get("/plots").text
+    sources = [a["src"] for tag, a in Tags(page).tags if tag == "img"]
+    assert len(sources) == 4
+    for source in sources:
+        answer = client.get(str(source))
+        assert answer.content.startswith(b"<?xml")
+        assert answer.headers["content-type"] == "image/svg+xml"
+    assert client.get("/plot/other.svg").status_code == 404
+
+
+# Decisions
+
+
+def test_decisions_are_on_disk_at_once_and_undone_in_turn(client: TestClient, out: Path) -> None:
+    path = out / "reject.json"
+    assert not path.exists()
+    assert decide(client, "0-0-0", "rejected") == 200
+    assert decide(client, "1-1-0", "rejected") == 200
+    assert decide(client, "1-1-0", "kept") == 200
+    a, b = AttemptKey("1_box_a", 0, 0), AttemptKey("2_box_b", 1, 0)
+    assert (read_decisions(path).rejected, read_decisions(path).kept) == ({a}, {b})
+    assert "card rejected" in client.get("/").text
+    assert 'data-decision="kept"' in client.get("/grasp/1-1-0").text
+
+    headers = {TOKEN_HEADER: token(client)}
+    expected = [("1-1-0", "rejected"), ("1-1-0", ""), ("0-0-0", ""), (None, None)]
+    for label, decision in expected:
+        result = client.post("/undo", headers=headers).json()
+        assert (result["label"], result.get("decision")) == (label, decision)
+    assert not read_decisions(path).rejected
+
+
+def test_assembly_drops_exactly_the_rejected(client: TestClient, out: Path) -> None:
+    for label in ("0-0-0", "2-3-2"):
+        decide(client, label, "rejected")
+    decide(client, "1-1-0", "kept")
+    assembly = assemble(out, rejected=read_rejected(out / "reject.json"))
+    assert assembly.removed == {Removal.KEPT: 7, Removal.REJECTED: 2}
+    page = " ".join(Tags(client.get("/?removal=rejected").text).text.split())
+    assert "2 of 36 attempts" in page
+
+
+def test_an_edited_file_is_not_overwritten(client: TestClient, out: Path) -> None:
+    decide(client, "0-0-0", "rejected")
+    (out / "reject.json").write_text('{"version": 1, "rejected": [], "kept": []}')
+    decide(client, "1-1-0", "rejected")
+    assert read_decisions(out / "reject.json").rejected == {AttemptKey("2_box_b", 1, 0)}
+    (out / "reject.json").write_text("mine")
+    assert decide_raw(client, {"label": "0-0-0", "decision": "kept"}, token_of(client)) == 400
+    assert (out / "reject.json").read_text() == "mine"
+
+
+def token_of(client: TestClient) -> str:
+    """The token when no page can be shown."""
+    inspection: Inspection = client.app.state.inspection  # type: ignore[attr-defined]
+    return inspection.token
+
+
+def decide_raw(client: TestClient, content: object, with_token: str | None) -> int:
+    headers = {} if with_token is None else {TOKEN_HEADER: with_token}
+    return client.post("/decide", json=content, headers=headers).status_code
+
+
+@pytest.mark.parametrize(
+    ("content", "status"),
+    [
+        ({"label": "0-0-1", "decision": "rejected"}, 404),
+        ({"label": "9-9-9", "decision": "rejected"}, 404),
+        ({"label": None}, 404),
+        ({"label": "0-0-0", "decision": "perhaps"}, 400),
+        ({"label": "0-0-0"}, 400),
+        ([1], 400),
+        ({"label": "0-0-0", "decision": "rejected", "more": "x" * 5000}, 413),
+    ],
+)
+def test_what_cannot_be_decided_is_refused(
+    client: TestClient, out: Path, content: object, status: int
+) -> None:
+    assert decide_raw(client, content, token(client)) == status
+    assert not (out / "reject.json").exists()
+
+
+# What keeps others out
+
+
+def test_changes_need_the_token_of_the_page(client: TestClient, out: Path) -> None:
+    content = {"label": "0-0-0", "decision": "rejected"}
+    for wrong in (None, "", "x", "ü"):
+        headers = {} if wrong is None else {TOKEN_HEADER: wrong.encode()}
+        assert client.post("/decide", json=content, headers=headers).status_code == 403
+        assert client.post("/undo", headers=headers).status_code == 403
+        assert client.post("/record", json=content, headers=headers).status_code == 403
+    for path in ("/decide", "/undo", "/record"):
+        assert client.get(path).status_code == 405
+    assert not (out / "reject.json").exists()
+
+
+def test_a_foreign_host_gets_nothing(client: TestClient) -> None:
+    """A name of another site that resolves to this machine (DNS rebinding)."""
+    for host in ("evil.example", "evil.example:8321", "127.0.0.1.evil.example", "", "10.0.0.1"):
+        answer = client.get("/", headers={"host": host})
+        assert answer.status_code == 400, host
+        assert "token" not in answer.text
+    for host in ("localhost:8321", "127.0.0.1", "127.0.0.1:99"):
+        assert client.get("/", headers={"host": host}).status_code == 200
+
+
+@pytest.mark.parametrize("path", [*PAGES, "/static/inspect.js", "/strip/0-0-0-oto.png", "/nothing"])
+def test_every_answer_has_the_strictest_policy(client: TestClient, path: str) -> None:
+    answer = client.get(path)
+    for name, value in HEADERS.items():
+        assert answer.headers[name] == value
+    policy = answer.headers["content-security-policy"]
+    assert "default-src 'none'" in policy
+    assert "unsafe" not in policy
+
+
+@pytest.mark.parametrize("path", PAGES)
+def test_pages_ask_nothing_of_other_hosts_and_run_no_script_of_their_own(
+    client: TestClient, path: str
+) -> None:
+    for tag, attributes in Tags(client.get(path).text).tags:
+        for name in ("src", "href", "action"):
+            address = attributes.get(name) or "/"
+            assert address.startswith(("/", "?")) and not address.startswith("//"), (tag, address)
+        assert not [name for name in attributes if name.startswith("on") or name == "style"], tag
+        if tag == "script":
+            assert attributes.get("src") or attributes.get("type") == "application/json"
+        assert tag != "style"
+
+
+@pytest.mark.parametrize("path", ["/", "/grasp/0-0-0", f"/?object={ATTACK}", "/plots"])
+def test_names_stay_text(hostile: Path, path: str) -> None:
+    with TestClient(make_app(Inspection(hostile)), base_url="http://localhost") as client:
+        page = client.get(path).text
+        assert "<script>alert" not in page
+        if path != "/plots":
+            assert ATTACK in Tags(page).text
+        assert client.get("/plot/objects.svg").text.count("<script>alert") == 0
+
+
+@pytest.mark.parametrize(
+    ("path", "status"),
+    [
+        ("/?sort=<b>x</b>", 400),
+        ("/grasp/9-9-9", 404),
+        ("/grasp/<b>x</b>", 404),
+        ("/static/../app.py", 404),
+        ("/static/%2e%2e/app.py", 404),
+        ("/recording/0-0-0.html", 404),
+    ],
+)
+def test_errors_are_pages_without_foreign_tags(client: TestClient, path: str, status: int) -> None:
+    answer = client.get(path)
+    assert answer.status_code == status
+    assert "<b>x</b>" not in answer.text
+
+
+def test_page_works_while_the_files_are_replaced(client: TestClient, out: Path) -> None:
+    before = client.get("/?sort=row").text
+    assemble(out, rejected=[0])
+    after = client.get("/?sort=row").text
+    assert "no sample: rejected" in after
+    assert "no sample: rejected" not in before
+
+
+def test_broken_rejections_are_refused_at_the_start(out: Path) -> None:
+    (out / "reject.json").write_text("{}")
+    with pytest.raises(DataError, match="must be a list of rejections"):
+        Inspection(out)

@@ -1,0 +1,269 @@
+"""The pages in a real browser: Chromium of the system, driven by Playwright.
+
+They skip where there is no Chromium; `make test-browser` installs it on Debian. Screenshots are
+written to the folder that DRAKEGRASP_SCREENSHOTS names, if it is set.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+import uvicorn
+from helpers.pages import ATTACK
+from matplotlib.image import imread
+
+from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.filters import Removal
+from drakegrasp.dataset.rejections import AttemptKey, read_decisions, read_rejected
+from drakegrasp.inspection.app import Inspection, make_app
+from drakegrasp.inspection.serve import listen
+from drakegrasp.inspection.static_site import write_site
+
+playwright = pytest.importorskip("playwright.sync_api")
+Browser, Page = playwright.Browser, playwright.Page
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
+#: As root Chromium has no sandbox; WebGL is computed by the CPU.
+OPTIONS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+#: Longest wait for anything on a page [ms]; shared machines stall.
+PATIENCE = 60_000.0
+SIZES = {"wide": (1280, 900), "narrow": (390, 844)}
+
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed: make test-browser"),
+]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with playwright.sync_playwright() as driver:
+        chromium = driver.chromium.launch(executable_path=CHROMIUM, args=list(OPTIONS))
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def page(browser: Browser) -> Iterator[Page]:
+    """A page that fails the test if a script does, or if a request leaves its host."""
+    context = browser.new_context(viewport={"width": 1280, "height": 900})
+    context.set_default_timeout(PATIENCE)
+    faults: list[str] = []
+    page = context.new_page()
+    page.on("pageerror", lambda error: faults.append(f"script: {error}"))
+    page.on("console", lambda m: faults.append(m.text) if m.type in ("error", "warning") else None)
+    # A page that is left before it has loaded gives up its requests.
+    page.on(
+        "requestfailed",
+        lambda r: None if "ABORTED" in str(r.failure) else faults.append(f"failed: {r.url}"),
+    )
+    page.on("dialog", lambda dialog: faults.append(f"dialog: {dialog.message}"))
+    page.on("request", lambda r: None if _is_ours(r.url) else faults.append(f"leaves: {r.url}"))
+    yield page
+    context.close()
+    assert not [fault for fault in faults if "GPU stall" not in fault]
+
+
+def _is_ours(url: str) -> bool:
+    return url.startswith(("http://127.0.0.1:", "file:///", "blob:"))
+
+
+@pytest.fixture
+def address(out: Path) -> Iterator[str]:
+    yield from serve(out)
+
+
+def serve(out: Path) -> Iterator[str]:
+    """Serve a dataset from a thread; yield its address."""
+    listener = listen(0)
+    config = uvicorn.Config(make_app(Inspection(out)), log_level="error")
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
+    thread.start()
+    yield f"http://127.0.0.1:{listener.getsockname()[1]}"
+    server.should_exit = True
+    thread.join(timeout=30.0)
+    listener.close()
+
+
+def wait_for_view(page: Page) -> None:
+    page.wait_for_selector("#view3d[data-ready]")
+
+
+def colours_of(page: Page) -> int:
+    """Return how many colours the 3D view shows, counted on a coarse scale."""
+    png = page.locator("#view3d").screenshot()
+    pixels = (imread(BytesIO(png))[..., :3] * 15.0).astype(int).reshape(-1, 3)
+    return len(np.unique(pixels, axis=0))
+
+
+def keep_screenshot(page: Page, name: str) -> None:
+    folder = os.environ.get("DRAKEGRASP_SCREENSHOTS")
+    if folder:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        page.screenshot(path=str(Path(folder) / f"{name}.png"), full_page="narrow" in name)
+
+
+def labels(page: Page) -> list[str]:
+    found = page.locator("#cards li").evaluate_all("cards => cards.map(c => c.dataset.label)")
+    return list(found)
+
+
+def wait_for_decision(out: Path, key: AttemptKey, decision: str) -> None:
+    """Wait until the file on disk says what was decided."""
+    end = time.monotonic() + PATIENCE / 1e3
+    while read_decisions(out / "reject.json").of(key) != decision:
+        assert time.monotonic() < end, f"{key} must be {decision!r} on disk"
+        time.sleep(0.05)
+
+
+def test_gallery_filters_and_sorts(page: Page, address: str) -> None:
+    page.goto(address)
+    assert len(labels(page)) == 9
+    page.select_option("select[name=object]", "2_box_b")
+    page.select_option("select[name=sort]", "row")
+    page.click("form button")
+    page.wait_for_url("**object=2_box_b**")
+    assert labels(page) == ["1-0-0", "1-1-0", "1-3-2"]
+    # What was chosen stays chosen, and empty fields are not in the address.
+    assert page.input_value("select[name=object]") == "2_box_b"
+    assert "min_slip" not in page.url
+    page.fill("input[name=min_slip]", "3")
+    page.click("form button")
+    page.wait_for_selector(".empty")
+    page.click("text=Reset")
+    page.wait_for_selector("#cards")
+    assert len(labels(page)) == 9
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_pages_fit_and_their_pictures_load(page: Page, address: str, size: str) -> None:
+    width, height = SIZES[size]
+    page.set_viewport_size({"width": width, "height": height})
+    for name, path in (
+        ("gallery", "/"),
+        ("failures", "/?outcome=any&sort=row"),
+        ("grasp", "/grasp/0-0-0"),
+        ("plots", "/plots"),
+    ):
+        page.goto(address + path)
+        if name == "grasp":
+            wait_for_view(page)
+        page.wait_for_load_state("networkidle")
+        assert page.evaluate("document.documentElement.scrollWidth") <= width, name
+        keep_screenshot(page, f"{name}_{size}")
+
+
+def test_3d_view_draws_each_state(page: Page, address: str) -> None:
+    page.goto(f"{address}/grasp/0-0-0")
+    wait_for_view(page)
+    assert page.get_attribute("#view3d", "data-ready") == "yes"
+    # A blank canvas has one colour; hand, object, table and contacts in light have many.
+    assert colours_of(page) > 30
+    shots = set()
+    for state in ("start", "closed", "lifted"):
+        page.click(f"[data-state={state}]")
+        shots.add(page.locator("#view3d").screenshot())
+    assert len(shots) == 3
+    page.uncheck("#showhand")
+    assert page.locator("#view3d").screenshot() not in shots
+
+
+def test_keyboard_moves_rejects_keeps_and_undoes(page: Page, address: str, out: Path) -> None:
+    keys = [AttemptKey("1_box_a", *numbers) for numbers in ((0, 0), (1, 0), (3, 2))]
+    page.goto(f"{address}/grasp/0-0-0?sort=row")
+    page.keyboard.press("r")  # rejects, and goes on to the next
+    page.wait_for_url("**/grasp/0-1-0?sort=row")
+    wait_for_decision(out, keys[0], "rejected")
+    page.keyboard.press("k")
+    page.wait_for_url("**/grasp/0-3-2?sort=row")
+    wait_for_decision(out, keys[1], "kept")
+    page.keyboard.press("ArrowLeft")
+    page.wait_for_url("**/grasp/0-1-0?sort=row")
+    assert page.inner_text("#decision") == "kept"
+    page.keyboard.press("p")
+    page.wait_for_url("**/grasp/0-0-0?sort=row")
+    assert page.inner_text("#decision") == "rejected"
+    page.keyboard.press("ArrowRight")
+    page.wait_for_url("**/grasp/0-1-0?sort=row")
+
+    # Undo shows what was undone.
+    page.keyboard.press("u")
+    wait_for_decision(out, keys[1], "")
+    page.keyboard.press("u")
+    page.wait_for_url("**/grasp/0-0-0?sort=row")
+    wait_for_decision(out, keys[0], "")
+    page.keyboard.press("g")
+    page.wait_for_selector("#cards")
+
+
+def test_buttons_reject_and_assembly_drops_exactly_these(
+    page: Page, address: str, out: Path
+) -> None:
+    page.goto(address)
+    page.click("[data-label='1-1-0'] [data-decide=rejected]")
+    page.wait_for_selector("[data-label='1-1-0'].rejected")
+    assert read_decisions(out / "reject.json").of(AttemptKey("2_box_b", 1, 0)) == "rejected"
+    page.click("[data-label='2-0-0'] [data-decide=rejected]")
+    page.wait_for_selector("[data-label='2-0-0'].rejected")
+    # The same button again withdraws the decision.
+    page.click("[data-label='1-1-0'] [data-decide=rejected]")
+    wait_for_decision(out, AttemptKey("2_box_b", 1, 0), "")
+    assembly = assemble(out, rejected=read_rejected(out / "reject.json"))
+    assert assembly.removed == {Removal.KEPT: 8, Removal.REJECTED: 1}
+
+
+def test_a_server_that_has_ended_is_named(browser: Browser, out: Path) -> None:
+    page = browser.new_page()
+    served = serve(out)
+    page.goto(next(served))
+    next(served, None)
+    page.click("[data-label='0-0-0'] [data-decide=rejected]")
+    page.wait_for_selector("#message:not([hidden])", timeout=PATIENCE)
+    assert "does not answer" in page.inner_text("#message")
+    page.close()
+
+
+def test_a_name_that_is_a_script_stays_text(page: Page, hostile: Path) -> None:
+    for address in serve(hostile):
+        page.goto(address)
+        assert page.locator("#cards h2", has_text=ATTACK).count() == 3
+        page.goto(f"{address}/grasp/0-0-0")
+        wait_for_view(page)
+        assert ATTACK in page.inner_text("h1")
+        assert page.locator("h1 script").count() == 0
+        page.goto(f"{address}/plots")
+        page.wait_for_load_state("networkidle")
+
+
+def test_files_open_without_a_server(page: Page, boxes: Path, tmp_path: Path) -> None:
+    write_site(boxes, tmp_path / "site")
+    page.goto((tmp_path / "site" / "index.html").as_uri())
+    page.wait_for_selector("#pages button")
+    assert len(labels(page)) == 9
+    page.select_option("select[name=object]", "2_box_b")
+    page.select_option("select[name=sort]", "row")
+    page.click("form button")
+    assert labels(page) == ["1-0-0", "1-1-0", "1-3-2"]
+    assert page.inner_text("#count") == "3"
+    page.fill("input[name=max_slip]", "1")
+    page.click("form button")
+    assert labels(page) == []
+    page.click("text=Reset")
+    page.wait_for_selector("#cards li")
+    page.locator("[data-label='0-0-0'] a").click()
+    wait_for_view(page)
+    assert page.get_attribute("#view3d", "data-ready") == "yes"
+    assert colours_of(page) > 30
+    page.keyboard.press("ArrowRight")
+    page.wait_for_url("**/grasp/0-1-0.html")
+    page.goto((tmp_path / "site" / "plots.html").as_uri())
+    page.wait_for_load_state("networkidle")

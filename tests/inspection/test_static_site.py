@@ -1,0 +1,79 @@
+"""The pages as files: every file that a page names is there, and none is a server's."""
+
+from __future__ import annotations
+
+import base64
+import re
+from pathlib import Path
+
+import pytest
+from helpers.pages import ATTACK, Tags
+
+from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
+from drakegrasp.errors import DataError
+from drakegrasp.inspection.static_site import write_site
+
+
+@pytest.fixture(scope="module")
+def site(boxes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site") / "pages"
+    assert write_site(boxes, folder) == 9
+    return folder
+
+
+def test_every_address_is_a_file_of_the_folder(site: Path) -> None:
+    pages = sorted(site.rglob("*.html"))
+    assert len(pages) == 11
+    for page in pages:
+        for _, attributes in Tags(page.read_text(encoding="utf-8")).tags:
+            for name in ("src", "href"):
+                address = attributes.get(name)
+                if address:
+                    assert not address.startswith(("/", "http")), address
+                    assert (page.parent / address).is_file(), f"{page.name}: {address}"
+
+
+def test_meshes_of_a_page_are_scripts_that_hold_glb_files(site: Path) -> None:
+    page = (site / "grasp" / "0-0-0.html").read_text(encoding="utf-8")
+    addresses = re.findall(r'"(\.\./mesh/[^"]+)"', page)
+    assert len(addresses) == 10
+    for address in addresses:
+        script = (site / "grasp" / address).read_text(encoding="utf-8")
+        name, text = re.findall(r'drakegraspMeshes\["(.+)"\] = "(.+)"', script)[0]
+        assert name == Path(address).stem
+        assert base64.b64decode(text).startswith(b"glTF")
+
+
+def test_cards_carry_what_filters_need(site: Path) -> None:
+    tags = Tags((site / "index.html").read_text(encoding="utf-8")).tags
+    cards = [a for tag, a in tags if tag == "li"]
+    assert len(cards) == 9
+    first = next(a for a in cards if a["data-label"] == "0-0-0")
+    assert first["data-object"] == "1_box_a"
+    assert first["data-slip"] == "2"
+    assert first["data-hold"] is not None
+    assert set(first["data-hold"].split()) == {"held", "precision", "stable"}
+
+
+def test_files_cannot_decide_but_show_decisions(out: Path, tmp_path: Path) -> None:
+    key = AttemptKey("1_box_a", 0, 0)
+    write_decisions(out / "reject.json", Decisions(rejected=frozenset([key])))
+    write_site(out, tmp_path / "site")
+    index = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
+    assert index.count("card rejected") == 1
+    for page in (tmp_path / "site").rglob("*.html"):
+        assert "<button data-" not in page.read_text(encoding="utf-8").replace("data-state", "")
+
+
+def test_names_stay_text(hostile: Path, tmp_path: Path) -> None:
+    write_site(hostile, tmp_path / "site")
+    for page in (tmp_path / "site").rglob("*.html"):
+        assert "<script>alert" not in page.read_text(encoding="utf-8")
+    assert ATTACK in Tags((tmp_path / "site" / "index.html").read_text(encoding="utf-8")).text
+
+
+def test_a_folder_with_files_is_refused_and_left_alone(boxes: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(DataError, match="--static must be a new or empty directory"):
+        write_site(boxes, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
