@@ -404,7 +404,7 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
     Field("solver_status", "", "int16", "-", "-",
           "exit mode of SLSQP, 0 for success; -1 where it was not asked"),
     Field("solver_iterations", "", "uint16", "-", "-", "iterations of SLSQP"),
-    Field("tries", "", "uint16", "-", "-", "number of palm poses that were simulated"),
+    Field("tries", "", "uint16", "-", "-", "number of palm poses that were tried"),
     Field("closing_start", "k", "float64", "rad or m", "-",
           "closing positions from which the simulated fingers close"),
     *_since(

@@ -36,7 +36,7 @@ class Verification:
         p_OQ, nhat_Q_O: (k, 3), the predicted contact points [m] and unit normals in {O}.
         surface_distance: (k,), of the points from the object's surface [m].
         fit: Palm pose and joints of the reported trial, or of the best fit if none was simulated.
-        tries: Number of palm poses that were simulated.
+        tries: Number of palm poses that were tried.
         pregrasp: Palm and opened fingers that the trial started from.
         trial: What happened in the simulator.
         contact_error: (k,), distance of each contact after closing from its prediction [m].

@@ -156,24 +156,29 @@ def _lift_by_hand(base: Verification, config: Config) -> Verification:
             up_O=X_TO[2, :3],
             height=float(X_TO[2, 3]),
         )
-    near = [fit for fit in fits if not _misfit(fit, config)][: rules.max_tries]
+    near = [fit for fit in fits if not _misfit(fit, config)]
     if not near:
         reason = _misfit(fits[0], config)
         return replace(base, outcome=Outcome.UNREACHABLE, reason=reason, fit=fits[0])
 
-    # A trial from each, until one holds.
+    # A trial from each, until one holds or enough were simulated; a collision at the start is
+    # geometry alone.
     results: list[Verification] = []
-    for tries, fit in enumerate(near, start=1):
+    simulated = 0
+    for fit in near:
         with timed(base.seconds, "simulate"):
             pregrasp, trial = _try(base.placed, X_TO, fit, config)
         results.append(_judge(replace(base, fit=fit, pregrasp=pregrasp, trial=trial), config))
         if results[-1].success:
-            return replace(results[-1], tries=tries)
+            return replace(results[-1], tries=len(results))
+        simulated += trial.outcome is not Outcome.START_COLLISION
+        if simulated == rules.max_tries:
+            break
 
     # If one of them has no verdict, the grasp has none: that one might have held.
     unknown = [result for result in results if result.outcome.inconclusive]
     farthest = max(unknown or results, key=lambda result: _RANK.index(result.outcome))
-    return replace(farthest, tries=len(near))
+    return replace(farthest, tries=len(results))
 
 
 def _lift_by_forces(base: Verification, config: Config) -> Verification:

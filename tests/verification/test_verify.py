@@ -21,6 +21,7 @@ from drakegrasp.simulation.candidates import R_OG0, Pregrasp
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
+from drakegrasp.verification import verify as verifying
 from drakegrasp.verification.verify import verify_contacts
 
 pytestmark = pytest.mark.sim
@@ -205,6 +206,23 @@ def test_without_a_verdict_on_one_try_there_is_none(
     assert found.tries > 1
     assert found.outcome is Outcome.TIMEOUT
     assert "says nothing about the grasp" in found.explain()
+
+
+def test_palm_poses_that_collide_at_the_start_do_not_count(
+    held: dg.Verification,
+    cube: PlacedObject,
+    grasp: tuple[np.ndarray, np.ndarray],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert held.trial is not None
+    hits = replace(held.trial, outcome=Outcome.START_COLLISION, closed=None, lifted=None)
+    trials = [hits] * (CONFIG.verify.max_tries + 1) + [held.trial]
+    monkeypatch.setattr(verifying, "fit_wrist", lambda *_, **__: [held.fit] * len(trials))
+    remaining = iter(trials)
+    monkeypatch.setattr(verifying, "_try", lambda *_: (held.pregrasp, next(remaining)))
+    found = verify(cube, *grasp)
+    assert found.success
+    assert found.tries == len(trials)
 
 
 def test_lift_by_forces_has_a_wall_clock_limit(

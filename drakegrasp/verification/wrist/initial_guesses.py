@@ -8,14 +8,15 @@ aligned with the contacts (our own construction).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import combinations
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from drakegrasp.frames import Array
+from drakegrasp.frames import Array, make_pose, rotation_about
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses
 from drakegrasp.verification.wrist.hand_constants import hand_constants
@@ -120,6 +121,27 @@ def find_starts(postures: Postures, p_OQ: Array, nhat_Q_O: Array, count: int) ->
         if len(starts) == count:
             break
     return starts
+
+
+def turned_starts(starts: Sequence[Start], p_OQ: Array, count: int) -> list[Start]:
+    """Return starts turned about the line through two contacts, which leaves both where they are.
+
+    Two contacts leave that turn open, and most of these palm poses would be within the object or
+    the table. Those of one turn come together, the starts as they are first.
+
+    Args:
+        starts: For a hand of two fingers.
+        p_OQ: (2, 3), the contact points [m].
+        count: Number of turns, evenly over a full one.
+    """
+    centre, line = p_OQ.mean(axis=0), p_OQ[1] - p_OQ[0]
+    axis = line / max(float(np.linalg.norm(line)), 1e-9)
+    turned = []
+    for angle in 2.0 * np.pi * np.arange(count) / count:
+        R = rotation_about(axis, angle)
+        X_OO = make_pose(R, centre - R @ centre)
+        turned += [replace(start, X_OG=X_OO @ start.X_OG) for start in starts]
+    return turned
 
 
 def _features(p: Array, n: Array) -> Array:

@@ -15,12 +15,18 @@ from scipy.optimize import minimize
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import Hand
 from drakegrasp.verification.wrist.hand_constants import hand_constants
-from drakegrasp.verification.wrist.initial_guesses import find_starts, make_postures
+from drakegrasp.verification.wrist.initial_guesses import (
+    find_starts,
+    make_postures,
+    turned_starts,
+)
 from drakegrasp.verification.wrist.pads import nearest_on_pads
 from drakegrasp.verification.wrist.problem import POSE, Evaluation, WristProblem, evaluate
 
 #: Number of starts, and so of solutions.
 STARTS = 5
+#: Two contacts leave the palm's turn about their line open: number of turns that are tried.
+TURNS = 36
 #: Unit of the objective [m^2]: residuals of a few millimetres give values of order one.
 UNIT = 0.005**2
 #: Unit of the clearance over the table [m].
@@ -79,7 +85,10 @@ def fit_wrist(
         height: Height of the origin of {O} above the table [m].
     """
     constants, fits = hand_constants(hand), []
-    for start in find_starts(make_postures(hand), p_OQ, nhat_Q_O, STARTS):
+    starts = find_starts(make_postures(hand), p_OQ, nhat_Q_O, STARTS)
+    if hand.num_fingers == 2:
+        starts = turned_starts(starts[:1], p_OQ, TURNS)
+    for start in starts:
         problem = WristProblem(
             constants=constants,
             p_OQ=p_OQ,

@@ -390,3 +390,16 @@ def test_search_by_shape_finds_what_laying_over_every_posture_finds(
     (best,) = find_starts(postures, made.p_OQ, made.nhat_Q_O, 1)
     least = misfit("barrett", best.X_OG, best.coordinates, made)
     assert misfit("barrett", quick.X_OG, quick.coordinates, made) < 1.2 * least
+
+
+def test_two_contacts_are_reached_from_all_around_their_line() -> None:
+    p_OQ, outward = (
+        np.array([[0.0, 0.02, 0.0], [0.0, -0.02, 0.0]]),
+        np.array([[0.0, 1, 0], [0, -1, 0]]),
+    )
+    fits = fit_wrist(load_hand("franka"), p_OQ, outward, up_O=UP, height=HIGH)
+    assert max(fit.residual.max() for fit in fits) < 1e-3
+    directions = np.array([fit.X_OG[:3, 2] for fit in fits])
+    angles = np.sort(np.arctan2(directions[:, 2], directions[:, 0]))
+    gaps = np.diff(np.r_[angles, angles[0] + 2.0 * np.pi])
+    assert np.rad2deg(gaps.max()) < 15.0
