@@ -35,9 +35,10 @@ def list_hands() -> None:
     help="Write a picture of the hand, open and closed, with pads and palm frame.",
 )
 def check_hand_file(hand_file: str, picture: Path | None) -> None:
-    """Check a hand before it is used: files, motion, and trial grasps in simulation.
+    """Check a hand before it is used, with trial grasps.
 
-    NAME is a hand that comes with the package, YAML a hand file. Exit code 1 if anything is wrong.
+    Files, motion, strength and trial grasps in simulation are checked. NAME is a hand that comes
+    with the package, YAML a hand file. Exit code 1 if anything is wrong.
     """
     from drakegrasp.commissioning.run import check_hand
 

@@ -421,7 +421,7 @@ def test_hand_is_simulated_by_default(cube: Path, tmp_path: Path) -> None:
     assert (result.exit_code, result.stderr) == (0, "")
     (line,) = map(json.loads, result.stdout.splitlines())
     assert line["method"] == "hand"
-    assert line["tries"] == 1 or line["outcome"] == "unreachable"
+    assert line["tries"] >= 1 or line["outcome"] == "unreachable"
 
 
 @pytest.mark.sim

@@ -18,6 +18,7 @@ from drakegrasp.dataset.prepared_objects import PreparedObject, save_prepared
 from drakegrasp.dataset.schema import LOOK_FIELDS, sizes
 from drakegrasp.dataset.shards import Shard, ShardHeader, trial_columns, write_shard
 from drakegrasp.frames import Array, invert_pose, make_pose, pack_pose, rotation_about, unpack_pose
+from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.outcomes import Outcome, Stage
@@ -196,14 +197,16 @@ def resting(model: ObjectModel, X_TO: Array) -> PreparedObject:
 
 
 def make_dataset(out: Path, meshes: Path, *overrides: str) -> Path:
-    config = load_config(
-        overrides=[
-            "camera.size=32",
-            "unit_candidates=2",
-            "filters.min_depth_variance=0",
-            "split.valid_fraction=0.34",
-            *overrides,
-        ]
+    config = with_hand_defaults(
+        load_config(
+            overrides=[
+                "camera.size=32",
+                "unit_candidates=2",
+                "filters.min_depth_variance=0",
+                "split.valid_fraction=0.34",
+                *overrides,
+            ]
+        )
     )
     models, entries = [], []
     (out / "objects").mkdir(parents=True)
