@@ -73,7 +73,7 @@ def test_dry_run_says_what_would_run_and_makes_nothing(
     result = plan_only(out, *arguments)
     assert result.exit_code == 0, result.output
     assert words in result.stdout
-    assert "1,260,000 attempts" in result.stdout
+    assert "3,840,000 attempts" in result.stdout
     assert "on 3 workers" in result.stdout
     assert "core-hours" in result.stdout
     assert not out.exists()

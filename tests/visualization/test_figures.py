@@ -211,8 +211,9 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 values[1] = Outcome.RAY_MISS
             write_field(file.require_group("trials"), field, values)
         for field in OBJECT_FIELDS:
-            value = np.array([objects.get(field.name, 0)], dtype=object)
-            dtype = object if field.dtype == "str" else field.dtype
+            text = field.dtype == "str"
+            value = np.array([objects.get(field.name, "" if text else 0)], dtype=object)
+            dtype = object if text else field.dtype
             write_field(file.require_group("objects"), field, value.astype(dtype))
     for name in ("grasping_oto.hdf5", "grasping_otm.hdf5"):
         write_data_file(out / name, [BOX], first_id=0)

@@ -102,6 +102,7 @@ def verdicts(batch: Batch, required: Sequence[bool]) -> Iterator[Violation]:
         batch: Rows of `/trials`.
         required: Whether a grasp needs each fingertip on the object.
     """
+    # What the contacts of each stage say.
     closed = judge_closed(
         batch["closed_touching"],
         batch["closed_other_links"],
@@ -114,6 +115,8 @@ def verdicts(batch: Batch, required: Sequence[bool]) -> Iterator[Violation]:
         batch["lifted_object_on_table"],
         required=required,
     )
+
+    # A hand that may not lift has no second verdict.
     expected = np.where(closed != Outcome.SUCCESS, closed, lifted)
     judged = _stages(batch) >= Stage.CLOSED
     yield from batch.broken(
