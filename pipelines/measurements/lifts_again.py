@@ -5,7 +5,7 @@
 Prints JSON: how many lifts end with the same outcome, how many are held and stable then and now,
 and by how much closing joints opened between the end of closing and the end of the lift. A joint
 that opened is tried once more with a drive of unlimited strength: if it stays closed there, the
-load was beyond the drive's strength.
+load was beyond the drive's strength. Trials with such joints are listed, with both angles.
 """
 
 from __future__ import annotations
@@ -142,6 +142,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             for name, q in (("median", 0.5), ("99 %", 0.99), ("largest", 1.0))
         },
         "opened": int(np.sum(opened[:, 0] > OPENED)),
+        "opened_trials": {
+            int(row): [
+                Outcome(then).label,
+                *(round(float(each), 3) for each in np.rad2deg([angle, strong_angle])),
+            ]
+            for row, then, (angle, strong_angle) in zip(rows, outcomes, opened, strict=True)
+            if angle > OPENED
+        },
         "opened_with_a_strong_drive": int(np.sum(opened[:, 1] > OPENED)),
         "opening_with_a_strong_drive_deg": float(np.rad2deg(opened[:, 1].max())),
     }
