@@ -74,11 +74,11 @@ def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
         return [f"{int(cell):,}" for cell in (*cells, removals[Removal.KEPT])]
 
     for i, name in enumerate(funnel.names):
-        counts = (funnel.outcomes[i], funnel.removals[i], int(funnel.candidates[i]))
-        table.add_row(escape(name), *row(*counts))
+        outcomes, removals = funnel.outcomes[i].tolist(), funnel.removals[i].tolist()
+        table.add_row(escape(name), *row(outcomes, removals, int(funnel.candidates[i])))
     table.add_section()
-    totals = (funnel.outcomes.sum(0), funnel.removals.sum(0), int(funnel.candidates.sum()))
-    table.add_row("all", *row(*totals))
+    outcomes, removals = funnel.outcomes.sum(0).tolist(), funnel.removals.sum(0).tolist()
+    table.add_row("all", *row(outcomes, removals, int(funnel.candidates.sum())))
     return table
 
 
