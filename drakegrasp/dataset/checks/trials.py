@@ -32,6 +32,8 @@ MOTION_TOLERANCE = 1e-4
 #: are separate averages: where a fingertip is about to lose the object they may disagree, by no
 #: more than the force from which on a contact counts.
 PULL = 0.05
+#: With more friction a force may leave the object's side of a mean normal: a cone of 45 degrees.
+MAX_FRICTION = 1.0
 
 
 def numbers(
@@ -132,10 +134,12 @@ def verdicts(batch: Batch, required: Sequence[bool]) -> Iterator[Violation]:
 def contacts(batch: Batch) -> Iterator[Violation]:
     """Fingertips that touch have a patch and a unit normal, and push into an object that is held.
 
-    A patch may span a thin rim, with faces in opposite directions: their mean normal then does not
-    tell the direction of the force. So that rule is for successes only.
+    A patch may span an edge or a thin rim: its mean normal then does not tell the direction of the
+    force. So that rule is for successes only, and only where friction turns a force by less than
+    `MAX_FRICTION` does.
     """
     success = batch["outcome"] == Outcome.SUCCESS.value
+    judged = success & (batch["friction_hand"] <= MAX_FRICTION)
     for stage in ("closed", "lifted"):
         touching = batch[f"{stage}_touching"]
         normals, forces = batch[f"{stage}_nhat_Q_O"], batch[f"{stage}_f_Q_O"]
@@ -149,7 +153,7 @@ def contacts(batch: Batch) -> Iterator[Violation]:
             touches = touching[:, k]
             yield from batch.broken(
                 f"{stage}_f_Q_O of finger {k + 1} must push into the object [N]",
-                success & touches & ~(push[:, k] < PULL),
+                judged & touches & ~(push[:, k] < PULL),
                 push[:, k],
             )
             yield from batch.broken(

@@ -19,6 +19,7 @@ from helpers.datasets import (
     Edit,
     change,
     found,
+    make_dataset,
     mirrored,
     moved,
     must_find,
@@ -124,3 +125,14 @@ def test_certificates_are_checked(out: Path) -> None:
         (TRIALS, "/successes", 1, "certified_share must be 0..1 or NaN"),
         (TRIALS, "/successes", 1, "certified_friction must be 0..inf or NaN"),
     )
+
+
+@pytest.mark.parametrize(("friction", "reported"), [(0.71, True), (7.1, False)])
+def test_force_that_pulls_at_a_mean_normal_is_wrong_where_friction_is_usual(
+    tmp_path: Path, friction: float, reported: bool
+) -> None:
+    (tmp_path / "meshes").mkdir()
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes", f"physics.friction_hand={friction}")
+    change(out, TRIALS, "trials/lifted_f_Q_O", SUCCESS, lambda f: -f)
+    said = [what for *_, what in found(out)]
+    assert any("must push into the object" in what for what in said) == reported
