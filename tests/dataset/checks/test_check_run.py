@@ -30,6 +30,7 @@ from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.paths import model_path, plan_path
 from drakegrasp.dataset.shards import read_shard, write_shard
 from drakegrasp.errors import DataError
+from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.model import load_object, save_object
 
 
@@ -105,10 +106,12 @@ def test_files_are_of_the_manifests_configuration(out: Path) -> None:
     manifest = read_manifest(out)
     files = (OTO, OTM, TRIALS)
     overrides = ["camera.size=32", "unit_candidates=2", "split.valid_fraction=0.34"]
-    write_manifest(replace(manifest, config=load_config(overrides=overrides)), out)
+    other = with_hand_defaults(load_config(overrides=overrides))
+    write_manifest(replace(manifest, config=other), out)
     what = "filters, split and limits must be those of manifest.json"
     must_find(out, *((name, "", None, what) for name in files))
-    write_manifest(replace(manifest, config=load_config(overrides=[*overrides, "seed=1"])), out)
+    other = with_hand_defaults(load_config(overrides=[*overrides, "seed=1"]))
+    write_manifest(replace(manifest, config=other), out)
     hits = {h for h in found(out) if not h[0].startswith("shards")}
     assert {h[0] for h in hits} == set(files)
     assert all(h[3].startswith("configuration must be that of manifest.json") for h in hits)
