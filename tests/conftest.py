@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import trimesh
-from helpers.meshes import write_fixed
+from helpers.meshes import SMALL, write_fixed
 from hypothesis import settings
 
 from drakegrasp.build.pipeline import build
@@ -31,13 +31,6 @@ def g3db() -> Path:
     if not folder.is_dir():
         pytest.skip("the real meshes are not beside the project")
     return folder
-
-
-#: Palm poses per object of the small dataset; enough for samples to train and to test on.
-SMALL = [
-    *("candidates.max=40", "unit_candidates=10"),
-    *("filters.outlier_sigma=0", "filters.require=held", "filters.max_normal_angle_deg=null"),
-]
 
 
 @pytest.fixture(scope="session")

@@ -8,8 +8,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from conftest import SMALL
 from helpers.assertions import assert_same_dataset
+from helpers.meshes import SMALL
 
 from drakegrasp.api import verify_grasps
 from drakegrasp.build.pipeline import build

@@ -88,3 +88,10 @@ def assert_sound(model: ObjectModel) -> None:
     low, high = model.visual_vertices.min(axis=0), model.visual_vertices.max(axis=0)
     np.testing.assert_allclose(low + high, 0.0, atol=1e-12)
     np.testing.assert_allclose(model.half_extents, high, atol=1e-12)
+
+
+#: Palm poses per object of the small dataset; enough for samples to train and to test on.
+SMALL = [
+    *("candidates.max=40", "unit_candidates=10"),
+    *("filters.outlier_sigma=0", "filters.require=held", "filters.max_normal_angle_deg=null"),
+]

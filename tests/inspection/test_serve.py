@@ -19,7 +19,12 @@ from drakegrasp.cli.main import main
 from drakegrasp.inspection.app import ASSETS
 from drakegrasp.inspection.serve import LOOPBACK, listen
 
-CODE = "from drakegrasp.cli.main import run; run()"
+#: The program, with Ctrl-C as at a terminal: a test that runs in the background inherits a shell's
+#: choice to ignore it.
+CODE = (
+    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    "from drakegrasp.cli.main import run; run()"
+)
 
 
 def test_only_the_loopback_address_is_listened_on() -> None:
