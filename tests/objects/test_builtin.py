@@ -84,7 +84,7 @@ def test_surface_does_not_cross_itself(mesh: trimesh.Trimesh) -> None:
 def test_mesh_has_sound_triangles(mesh: trimesh.Trimesh) -> None:
     longest = np.linalg.norm(mesh.triangles - np.roll(mesh.triangles, 1, axis=1), axis=2).max(1)
     thin = longest**2 / (2.0 * mesh.area_faces) > 40.0
-    assert mesh.area_faces[thin].sum() < 0.02 * mesh.area
+    assert mesh.area_faces[thin].sum() < 0.01 * mesh.area
     assert np.median(mesh.edges_unique_length) < 0.016
 
 

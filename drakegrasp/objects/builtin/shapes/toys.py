@@ -125,14 +125,14 @@ def trophy(*, base: float, cup: float, height: float) -> trimesh.Trimesh:
 def house(*, width: float, depth: float, wall: float, roof: float) -> trimesh.Trimesh:
     """Return a toy house: heights of `wall` and `roof`, a door towards -y, a chimney."""
     eaves = 0.012
-    body = pillar([(0.0, width, depth), (wall + 0.004, width, depth)], corner=0.002, edge=LARGE)
+    body = pillar([(0.0, width, depth), (wall + 0.004, width, depth)], corner=0.004, edge=LARGE)
     gable = pillar(
         [
             (wall - 0.004, width + 2.0 * eaves, depth + eaves),
             (wall, width + 2.0 * eaves, depth + eaves),
             (wall + roof, 0.010, depth + eaves),
         ],
-        corner=0.002,
+        corner=0.004,
         edge=LARGE,
     )
 
