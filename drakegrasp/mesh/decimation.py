@@ -136,8 +136,10 @@ def _decimate_parted(solid: Solid, max_faces: int) -> Solid | None:
 
 def _decimate_twice(solid: Solid, max_faces: int) -> Solid | None:
     """Return what `_decimate_parted` makes of a surface with somewhat more faces."""
-    first = _parted(solid, int(FIRST * max_faces), DECIMATION_STEPS[0])
-    return _decimate_parted(first, max_faces)
+    between = int(FIRST * max_faces)
+    if len(solid.faces) <= between:
+        return None  # fast_simplification refuses to aim at more faces than there are
+    return _decimate_parted(_parted(solid, between, DECIMATION_STEPS[0]), max_faces)
 
 
 def _parted(solid: Solid, target: int, aggressiveness: float) -> Solid:

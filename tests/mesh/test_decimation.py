@@ -41,6 +41,16 @@ def test_decimation_falls_back(tmp_path, monkeypatch):
         decimate(solid, 1000)
 
 
+def test_mesh_with_few_faces_too_many_is_not_decimated_twice(monkeypatch):
+    """The first of two decimations aims at more faces than are allowed, or than there are."""
+    ball = trimesh.creation.icosphere(4, radius=0.05)
+    solid = Solid(vertices=np.array(ball.vertices), faces=np.array(ball.faces, dtype=np.int64))
+    for way in ("decimate_quadric", "simplify_manifold", "decimate_parted"):
+        monkeypatch.setattr(f"drakegrasp.mesh.decimation._{way}", lambda *_: None)
+    with pytest.raises(MeshError, match="at most 4000 faces, got a broken one from 5120"):
+        decimate(solid, 4000)
+
+
 def test_thin_noisy_scan_keeps_its_shape(tmp_path):
     """Quadric decimation alone leaves edges with four faces where the wall touches itself."""
     scans = load_script("measurements/scanned_meshes")
