@@ -200,7 +200,7 @@ def _build(
     # Assemble the shards, unless the files are of these very shards already.
     if counts.simulated or not is_assembled(out):
         with progress_bar("assemble", "shards", show=job.show) as report:
-            assemble_locked(out, progress=report)
+            assemble_locked(out, manifest, progress=report)
 
     # Report.
     if counts.damaged:

@@ -87,15 +87,12 @@ def assemble(out: Path, reject: Path | None, overrides: tuple[str, ...]) -> None
     The command writes trials.hdf5 and both data files again from the shards in OUT.
     """
     from drakegrasp.dataset.assemble import assemble as assemble_files
-    from drakegrasp.dataset.manifest import change_postprocessing
     from drakegrasp.dataset.rejections import read_rejected
     from drakegrasp.runtime.progress import progress_bar
 
     rejected = () if reject is None else read_rejected(reject)
-    if overrides:
-        change_postprocessing(out, overrides)
     with progress_bar("assemble", "shards") as progress:
-        assemble_files(out, rejected=rejected, progress=progress)
+        assemble_files(out, overrides=overrides, rejected=rejected, progress=progress)
     print_stats(out)
 
 

@@ -22,7 +22,13 @@ import numpy.typing as npt
 from drakegrasp.dataset.filters import Removal, Successes, judge_successes, split_samples
 from drakegrasp.dataset.hdf5 import AnyArray, create_field, write_field
 from drakegrasp.dataset.lock import build_lock
-from drakegrasp.dataset.manifest import Manifest, read_manifest, write_origin
+from drakegrasp.dataset.manifest import (
+    Manifest,
+    read_manifest,
+    with_postprocessing,
+    write_manifest,
+    write_origin,
+)
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.rejections import AttemptKey, find_ids
 from drakegrasp.dataset.samples import ShardSlice, create_splits, walk_shards, write_samples
@@ -62,30 +68,48 @@ class Assembly:
 
 
 def assemble(
-    out: Path, *, rejected: Sequence[int | AttemptKey] = (), progress: Report = silent
+    out: Path,
+    *,
+    overrides: Sequence[str] = (),
+    rejected: Sequence[int | AttemptKey] = (),
+    progress: Report = silent,
 ) -> Assembly:
     """Write the three files of a dataset whose work units are all done.
 
     Args:
         out: Directory of the dataset.
+        overrides: `key=value` texts that change the filters or the split of the dataset.
         rejected: Trials that an inspection rejects, by id or identity; they become no samples.
         progress: Called with the number of shards read and to read.
 
     Raises:
+        ConfigError: If an override cannot be used; nothing is changed.
         DataError: If a shard is missing or damaged, what is rejected is no success, or another
-            process builds in the directory; the old files stay.
-        DiskFullError: If there is no room; the old files stay.
+            process builds in the directory; the old files and filters stay.
+        DiskFullError: If there is no room; the old files and filters stay.
     """
-    read_manifest(out)  # before the lock, which would make a missing directory
+    # Before the lock, which would make a missing directory, and again when nobody can change it.
+    with_postprocessing(read_manifest(out), overrides)
     with build_lock(out):
-        return assemble_locked(out, rejected=rejected, progress=progress)
+        manifest = with_postprocessing(read_manifest(out), overrides)
+        return assemble_locked(out, manifest, rejected=rejected, progress=progress)
 
 
 def assemble_locked(
-    out: Path, *, rejected: Sequence[int | AttemptKey] = (), progress: Report = silent
+    out: Path,
+    manifest: Manifest,
+    *,
+    rejected: Sequence[int | AttemptKey] = (),
+    progress: Report = silent,
 ) -> Assembly:
-    """Write the three files, as `assemble`, in a directory whose lock the caller holds."""
-    manifest = read_manifest(out)
+    """Write the three files and the manifest, in a directory whose lock the caller holds.
+
+    Args:
+        out: Directory of the dataset.
+        manifest: Of the dataset; it may have other filters or another split than the one there.
+        rejected: As for `assemble`.
+        progress: As for `assemble`.
+    """
     with disk_full_named(out), ExitStack() as stack:
         # First pass: copy the trials, and learn of each success what the filters need.
         trials = stack.enter_context(atomic_hdf5(out / TRIALS_FILE))
@@ -107,6 +131,9 @@ def assemble_locked(
         for done, shard_slice in enumerate(slices, start=len(slices) + 1):
             write_samples(files, out, shard_slice, ids)
             progress(done, 2 * len(slices))
+
+        # Everything is known to be right: now the manifest may change, too.
+        write_manifest(manifest, out)
     return summarise(out)
 
 

@@ -301,25 +301,23 @@ def release_directory(out: Path) -> None:
             folder.rmdir()
 
 
-def change_postprocessing(out: Path, overrides: Sequence[str]) -> None:
-    """Change values of the filters or the split in a dataset's manifest.
+def with_postprocessing(manifest: Manifest, overrides: Sequence[str]) -> Manifest:
+    """Return a manifest with other values of the filters or the split.
 
     Args:
-        out: Directory of the dataset.
+        manifest: Of the dataset.
         overrides: `key=value` texts, e.g. "split.valid_fraction=0.2".
 
     Raises:
         ConfigError: If a value cannot be used, or would change what was simulated.
-        DataError: If the directory holds no dataset.
     """
-    manifest = read_manifest(out)
     config = override_config(manifest.config, overrides)
     if config.simulation_hash() != manifest.config.simulation_hash():
         raise ConfigError(
             "assemble may change values of filters and split only, got one that changes what was "
             f"simulated: {_differences(manifest.config, config)}"
         )
-    write_manifest(replace(manifest, config=config), out)
+    return replace(manifest, config=config)
 
 
 def _differences(theirs: Config, ours: Config) -> str:

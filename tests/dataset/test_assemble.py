@@ -16,7 +16,7 @@ from drakegrasp.dataset import shards
 from drakegrasp.dataset.assemble import assemble, assemble_locked, summarise
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.lock import FILE_NAME, build_lock
-from drakegrasp.dataset.manifest import change_postprocessing
+from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import DataError
 from drakegrasp.frames import invert_pose, transform_points, unpack_pose
@@ -64,7 +64,7 @@ def test_shard_without_a_success_has_trials_only(tmp_path: Path) -> None:
 
 def test_holder_of_the_lock_assembles_in_it(out: Path) -> None:
     with build_lock(out):
-        assert assemble_locked(out) == summarise(out)
+        assert assemble_locked(out, read_manifest(out)) == summarise(out)
         assert (out / FILE_NAME).exists()
 
 
@@ -88,10 +88,8 @@ def test_palm_and_contacts_of_a_sample_are_as_far_apart_as_in_its_trial(
 
 
 def test_limits_of_the_hold_change_without_a_simulation(out: Path) -> None:
-    change_postprocessing(out, [f"filters.max_slip={SLIP / 2}"])
-    assert assemble(out).removed == {Removal.SLID: 9}
-    change_postprocessing(out, ["filters.require=held"])
-    assert assemble(out).removed == {Removal.KEPT: 9}
+    assert assemble(out, overrides=[f"filters.max_slip={SLIP / 2}"]).removed == {Removal.SLID: 9}
+    assert assemble(out, overrides=["filters.require=held"]).removed == {Removal.KEPT: 9}
 
 
 def test_rejected_trials_become_no_samples(out: Path) -> None:
