@@ -56,6 +56,7 @@ class BuildReport:
         refused: Name and reason of each mesh that was refused.
         errors: Number of solver errors by message, of the units that were run now.
         notices: What the user should know: damage that was repaired, leftovers that were removed.
+        assembled: Whether the files were written now, or were those of all shards already.
         assembly: What the files hold.
     """
 
@@ -66,6 +67,7 @@ class BuildReport:
     refused: tuple[RefusedMesh, ...]
     errors: dict[str, int]
     notices: tuple[str, ...]
+    assembled: bool
     assembly: Assembly
 
 
@@ -198,7 +200,8 @@ def _build(
         sweep_temporary(out)
 
     # Assemble the shards, unless the files are of these very shards already.
-    if counts.simulated or not is_assembled(out):
+    stale = not is_assembled(out, verify_shards=True)
+    if stale:
         with progress_bar("assemble", "shards", show=job.show) as report:
             assemble_locked(out, manifest, progress=report)
 
@@ -216,6 +219,7 @@ def _build(
         refused=manifest.refused,
         errors=dict(counts.errors),
         notices=tuple(notices),
+        assembled=stale,
         assembly=summarise(out),
     )
 
@@ -287,11 +291,15 @@ def _prepare_all(
         job.events.mesh_done(entry)
         report(len(entries), len(sources), found=known)
 
+    # A rejected grasp of another mesh was another grasp.
     ordered = [entries[source.name] for source in sources]
+    before = {entry.name: entry.mesh_sha256 for entry in manifest.objects}
+    same = {entry.name for entry in ordered if before.get(entry.name) == entry.mesh_sha256}
     return replace(
         manifest,
         objects=tuple(entry for entry in ordered if isinstance(entry, ObjectEntry)),
         refused=tuple(entry for entry in ordered if isinstance(entry, RefusedMesh)),
+        rejected=tuple(key for key in manifest.rejected if key.object in same),
     )
 
 

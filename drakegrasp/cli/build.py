@@ -153,7 +153,10 @@ def print_report(report: BuildReport) -> None:
         reused = f" ({report.reused} had been done before)" if report.reused else ""
         click.echo(f"{report.simulated} work units simulated{reused}")
     else:
-        click.echo(f"all {report.reused} work units had been done before: nothing was simulated")
+        again = "; the files were written again" * report.assembled
+        click.echo(
+            f"all {report.reused} work units had been done before: nothing was simulated{again}"
+        )
     for message, count in report.errors.items():
         click.echo(f"solver error in {count} attempts: {message}")
     for notice in report.notices:

@@ -26,6 +26,7 @@ from drakegrasp.cli.options import (
     objects_seed_option,
     out_argument,
     per_class_option,
+    tidied,
 )
 from drakegrasp.cli.verify import verify
 from drakegrasp.runtime.allocator import restart_with_jemalloc
@@ -90,7 +91,7 @@ def export_objects(directory: Path, per_class: int | None, objects_seed: int | N
 
 
 @click.command()
-@click.argument("path", type=click.Path(path_type=Path), metavar="OUT|FILE")
+@click.argument("path", type=click.Path(path_type=Path), metavar="OUT|FILE", callback=tidied)
 def check(path: Path) -> None:
     """Check every invariant of a dataset.
 

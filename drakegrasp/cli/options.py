@@ -103,7 +103,18 @@ _OPTIONS = (
 )
 
 
-out_argument = click.argument("out", type=click.Path(path_type=Path), metavar="OUT")
+def tidied(context: click.Context, parameter: click.Parameter, out: Path) -> Path:
+    """Put in order what a dead process left in a dataset, before a command looks at it."""
+    from drakegrasp.dataset.lock import tidy
+
+    if not context.resilient_parsing and out.is_dir():
+        tidy(out)
+    return out
+
+
+out_argument = click.argument(
+    "out", type=click.Path(path_type=Path), metavar="OUT", callback=tidied
+)
 workers_option = click.option(
     "--workers",
     type=int,

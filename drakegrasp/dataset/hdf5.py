@@ -1,7 +1,8 @@
-"""Writing a field of the schema into an HDF5 file."""
+"""HDF5 files of a dataset: opening one to read, and writing a field of the schema into one."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import h5py
@@ -9,10 +10,22 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.schema import Field
+from drakegrasp.runtime.file_set import refuse_half_replaced
 
 AnyArray = npt.NDArray[Any]
 #: Rows in a chunk of a column of small values.
 COLUMN_CHUNK = 2048
+
+
+def open_hdf5(path: Path) -> h5py.File:
+    """Open a file of a dataset to read it; close it after use.
+
+    Raises:
+        OSError: If it cannot be read.
+        DataError: If a process died while it replaced the files beside it.
+    """
+    refuse_half_replaced(path.parent)
+    return h5py.File(path, "r")
 
 
 def create_field(group: h5py.Group, field: Field, shape: tuple[int, ...]) -> h5py.Dataset:

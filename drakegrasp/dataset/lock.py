@@ -27,6 +27,8 @@ from io import FileIO
 from pathlib import Path
 
 from drakegrasp.errors import DataError
+from drakegrasp.runtime.file_set import LIST_NAME, complete_replacement
+from drakegrasp.runtime.files import stale_temporary, sweep_temporary
 from drakegrasp.runtime.processes import Process, lock_file, this_process
 
 FILE_NAME = "build.lock"
@@ -54,8 +56,8 @@ class Holder:
 def build_lock(out: Path) -> Iterator[Holder | None]:
     """Hold a directory while the block runs.
 
-    Yields the dead holder from whom the lock was taken over, or None. One function of a command
-    takes the lock, and what it calls relies on it.
+    Yields the dead holder from whom the lock was taken over, or None. Files that it was replacing
+    are all new then. One function of a command takes the lock, and what it calls relies on it.
 
     Args:
         out: The directory; made if it is missing, and removed again if it stays empty.
@@ -66,6 +68,7 @@ def build_lock(out: Path) -> Iterator[Holder | None]:
     made = _make_directory(out)
     file, before = _take(out / FILE_NAME)
     try:
+        complete_replacement(out)
         yield before
     finally:
         (out / FILE_NAME).unlink(missing_ok=True)
@@ -73,6 +76,18 @@ def build_lock(out: Path) -> Iterator[Holder | None]:
         if made:
             with suppress(OSError):  # not empty: something was built
                 out.rmdir()
+
+
+def tidy(out: Path) -> None:
+    """Put in order what a process that died left in a directory, if somebody did.
+
+    For commands that only read. Nothing happens where a process builds, or where this one may not
+    write.
+    """
+    leftovers = (out / FILE_NAME, out / LIST_NAME)
+    if any(map(os.path.lexists, leftovers)) or any(stale_temporary(out)):
+        with suppress(DataError, OSError), build_lock(out):
+            sweep_temporary(out)
 
 
 def _make_directory(out: Path) -> bool:

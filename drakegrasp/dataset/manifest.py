@@ -7,6 +7,7 @@ machine and no number of workers in it: the same command gives the same bytes.
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -20,11 +21,13 @@ import h5py
 from drakegrasp.config import POSTPROCESSING_KEYS, Config, override_config, parse_config
 from drakegrasp.dataset import log as build_log
 from drakegrasp.dataset.paths import FILE_NAME, OWN_FILES, OWN_FOLDERS
+from drakegrasp.dataset.rejections import AttemptKey, key_from_json, key_to_json
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, refuse_other_schema
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_digest, hand_file
+from drakegrasp.runtime.file_set import refuse_half_replaced
 from drakegrasp.runtime.files import probe_folder, write_atomic
 
 #: Packages whose versions may change a result.
@@ -128,6 +131,7 @@ class Manifest:
         config: Resolved configuration, with the seed.
         objects: The objects, in the order of the dataset's rows.
         refused: The meshes that were refused.
+        rejected: Attempts that an inspection rejects: successes that are no samples.
         versions: Versions of the packages that made the dataset, and a hash of the hand's files.
         fingers: Name of each finger in grasp order, and whether a grasp needs its fingertip.
     """
@@ -135,6 +139,7 @@ class Manifest:
     config: Config
     objects: tuple[ObjectEntry, ...] = ()
     refused: tuple[RefusedMesh, ...] = ()
+    rejected: tuple[AttemptKey, ...] = ()
     versions: dict[str, str]
     fingers: dict[str, bool] = field(default_factory=dict)
 
@@ -156,6 +161,11 @@ class Manifest:
         """Number of work units."""
         step = self.config.unit_candidates
         return sum(-(-entry.candidates // step) for entry in self.objects)
+
+    def signature(self) -> str:
+        """Return a hash of all in it that decides a row of the dataset, hexadecimal."""
+        content = {name: value for name, value in _content(self).items() if name != "refused"}
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def finger_names(config: Config) -> dict[str, bool]:
@@ -185,6 +195,15 @@ def write_origin(
 
 def write_manifest(manifest: Manifest, out: Path) -> None:
     """Write the manifest into a dataset's directory, atomically."""
+    write_atomic(out / FILE_NAME, manifest_text(manifest))
+
+
+def manifest_text(manifest: Manifest) -> bytes:
+    """Return the bytes of a manifest's file."""
+    return (json.dumps(_content(manifest), indent=1, ensure_ascii=False) + "\n").encode()
+
+
+def _content(manifest: Manifest) -> dict[str, Any]:
     content = {
         "schema_version": SCHEMA_VERSION,
         "config_hash": manifest.config.simulation_hash(),
@@ -195,17 +214,21 @@ def write_manifest(manifest: Manifest, out: Path) -> None:
         "objects": [entry.to_json() for entry in manifest.objects],
         "refused": [entry.to_json() for entry in manifest.refused],
     }
-    text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
-    write_atomic(out / FILE_NAME, text.encode())
+    # Most datasets have none.
+    if manifest.rejected:
+        content["rejected"] = [key_to_json(key) for key in manifest.rejected]
+    return content
 
 
 def read_manifest(out: Path) -> Manifest:
     """Return the manifest of a dataset's directory.
 
     Raises:
-        DataError: If there is none, it cannot be read, or it is of another schema.
+        DataError: If there is none, it cannot be read, it is of another schema, or a process died
+            while it replaced the files.
     """
     path = out / FILE_NAME
+    refuse_half_replaced(out)
     try:
         # The version first: another schema may have other keys.
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -215,6 +238,7 @@ def read_manifest(out: Path) -> Manifest:
             config=parse_config(content["config"]),
             objects=tuple(ObjectEntry.from_json(entry) for entry in content["objects"]),
             refused=tuple(RefusedMesh.from_json(entry) for entry in content["refused"]),
+            rejected=tuple(key_from_json(entry) for entry in content.get("rejected", ())),
             versions=content["versions"],
             fingers=content.get("fingers", {}),
         )

@@ -5,10 +5,9 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-import h5py
-
 from drakegrasp.dataset import lock as build_lock
 from drakegrasp.dataset import log as build_log
+from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import DataError
 from drakegrasp.runtime.files import refuse_broken_seal
@@ -17,6 +16,8 @@ from drakegrasp.runtime.files import refuse_broken_seal
 TRIALS_FILE = "trials.hdf5"
 DATA_FILES = {camera: f"grasping_{camera}.hdf5" for camera in CAMERAS}
 FILE_NAME = "manifest.json"
+#: What assembling writes: these files are of one state.
+ASSEMBLED_FILES = (TRIALS_FILE, *DATA_FILES.values())
 #: Folder of the meshes of the built-in objects, in a dataset that is built from them.
 BUILTIN_FOLDER = "builtin"
 #: Folders that a build makes.
@@ -50,7 +51,7 @@ def refuse_changed_object(out: Path, name: str) -> None:
     """
     path, model = plan_path(out, name), model_path(out, name)
     refuse_broken_seal(path, "plan of an object")
-    with h5py.File(path, "r") as file:
+    with open_hdf5(path) as file:
         expected = str(file.attrs["model_sha256"])
     if not model.is_file() or model_file_sha256(out, name) != expected:
         got = "other content" if model.is_file() else "none"

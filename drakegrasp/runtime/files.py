@@ -113,13 +113,24 @@ def atomic_hdf5(path: Path, *, sealed: bool = False) -> Iterator[h5py.File]:
             temporary.write_bytes(content.getbuffer())
             seal(temporary)
         else:
-            with _PatientFile(temporary) as patient:
-                try:
-                    with h5py.File(patient, "w") as file:
-                        yield file
-                finally:
-                    # Other errors follow from this one.
-                    patient.refuse_failure()
+            with new_hdf5(temporary) as file:
+                yield file
+
+
+@contextmanager
+def new_hdf5(path: Path) -> Iterator[h5py.File]:
+    """Open a new HDF5 file that the block writes; after an error it is of no use.
+
+    Raises:
+        OSError: If there is a file, the disk is full or the folder cannot be written.
+    """
+    with _PatientFile(path) as patient:
+        try:
+            with h5py.File(patient, "w") as file:
+                yield file
+        finally:
+            # Other errors follow from this one.
+            patient.refuse_failure()
 
 
 class _PatientFile(FileIO):
@@ -174,6 +185,16 @@ def seal(path: Path) -> None:
         file.write(text)
 
 
+def read_seal(path: Path) -> bytes:
+    """Return the seal of a file, which tells it from every other file; it is not verified.
+
+    Raises:
+        OSError: If the file cannot be read.
+    """
+    with path.open("rb", buffering=0) as file:
+        return file.read(SEAL_SIZE)
+
+
 def refuse_broken_seal(path: Path, what: str = "shard") -> None:
     """Refuse a sealed file in which any bit has changed.
 
@@ -202,15 +223,24 @@ def _seal_of(file: BufferedReader | BufferedRandom) -> bytes:
 
 def sync_and_rename(temporary: Path, path: Path) -> None:
     """Make a finished file durable and give it its name, in one step for readers."""
-    _sync(temporary)
+    sync(temporary)
     temporary.replace(path)
-    _sync(path.parent)
+    sync(path.parent)
 
 
 def temporary_name(path: Path) -> Path:
     """Return a name beside a file under which it may be written, unlike any other process's."""
     writer = f"{host_label()}~{os.getpid()}~{secrets.token_hex(6)}"
     return path.with_name(f".{path.name}.{writer}{TEMPORARY_SUFFIX}")
+
+
+def is_temporary_of(temporary: str, name: str) -> bool:
+    """Return whether a name is one that `temporary_name` gives for a file of another name."""
+    prefix = f".{name}"
+    return (
+        temporary.startswith(prefix)
+        and _TEMPORARY.fullmatch(temporary.removeprefix(prefix)) is not None
+    )
 
 
 def probe_folder(folder: Path) -> None:
@@ -224,12 +254,17 @@ def probe_folder(folder: Path) -> None:
     probe.unlink()
 
 
-def sweep_temporary(out: Path) -> list[Path]:
-    """Remove temporary files of dead processes from a dataset's directory; return their paths.
+def stale_temporary(out: Path) -> Iterator[Path]:
+    """Yield the temporary files of dead processes in a dataset's directory.
 
-    Whether another machine's process still runs is unknown: its files are removed when old.
+    Whether another machine's process still runs is unknown: its files count when they are old.
     """
-    return [path for path in _temporary_files(out) if _is_stale(path) and _remove(path)]
+    return (path for path in _temporary_files(out) if _is_stale(path))
+
+
+def sweep_temporary(out: Path) -> list[Path]:
+    """Remove temporary files of dead processes from a dataset's directory; return their paths."""
+    return [path for path in stale_temporary(out) if _remove(path)]
 
 
 def _temporary_files(out: Path) -> Iterator[Path]:
@@ -285,7 +320,8 @@ def _is_no_room(error: BaseException) -> bool:
     )
 
 
-def _sync(path: Path) -> None:
+def sync(path: Path) -> None:
+    """Make a file, or the names in a folder, durable."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -85,7 +85,8 @@ anywhere on a fingertip's link.
 Shards and the files in `objects/` are sealed: a changed bit in one of them is found when it is
 used, and by `drakegrasp check`. The three main files have no seal: `check` finds what breaks an
 invariant, not every changed bit of an image. `drakegrasp assemble` makes them again from the
-shards; a list of rejected trials (`--reject`) holds until then.
+shards; a build does so by itself if they are not of the present shards and manifest. A list of
+rejected trials (`assemble --reject`) is kept in the manifest until the next `assemble`.
 
 ## Missing values
 
@@ -101,8 +102,8 @@ say that the simulator failed: never count them as failed grasps.
 
 _ATTRIBUTES = """
 Further attributes: `schema_version`, `camera`, camera matrix `K` [px], `near` and `far` [m],
-`config` and `versions` (JSON), `config_hash`, `seed`, `signature` (of what the file was assembled
-from).
+`config` and `versions` (JSON), `config_hash`, `seed`, and of what the file was assembled from:
+`signature`, a hash of all in the manifest that decides a row, and `shards`, a hash of their seals.
 """
 
 _DATA = """## grasping_oto.hdf5 and grasping_otm.hdf5
