@@ -27,6 +27,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from drakegrasp.errors import ConfigError, one_line
+from drakegrasp.yaml_text import parse_yaml
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -435,7 +436,7 @@ def _read_source(source: str | Path) -> dict[str, Any]:
 
     # The text must be a YAML mapping; an empty file is one without keys.
     try:
-        tree = yaml.safe_load(text)
+        tree = parse_yaml(text)
     except yaml.YAMLError as error:
         raise ConfigError(
             f"{name}: must be YAML, got text that is not ({one_line(error)})"
@@ -467,7 +468,7 @@ def _apply_override(tree: dict[str, Any], text: str) -> None:
             raise ConfigError(f"{path}: {key} must be a section, got the value {child!r}")
         node = child
     try:
-        node[keys[-1]] = yaml.safe_load(value)
+        node[keys[-1]] = parse_yaml(value)
     except yaml.YAMLError:
         raise ConfigError(f"{path}: must be a YAML value, got {value!r}") from None
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.filters import Removal
-from drakegrasp.dataset.hdf5 import open_hdf5
+from drakegrasp.dataset.hdf5 import open_hdf5, read_names
 from drakegrasp.dataset.manifest import installed_versions, read_manifest
 from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.prepared_objects import load_prepared
@@ -183,7 +183,7 @@ def _read_lifts(out: Path) -> list[StoredLift]:
     try:
         with open_hdf5(path) as file:
             trials, successes = file["trials"], file["successes"]
-            names = [name.decode() for name in file["objects/name"][:]]
+            names = read_names(file["objects/name"])
             objects, outcomes = trials["object"][:], trials["outcome"][:]
             X_OG, spreads = trials["X_OG"][:], trials["spread"][:]
             materials = {f.name: trials[f.name][:] for f in fields(Materials)}

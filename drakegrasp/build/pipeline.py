@@ -156,7 +156,7 @@ def build_locked(
             return _build(sources, config, known, notices, job)
         except BaseException as error:
             # The log says why a build stopped; a second error would hide the first.
-            with suppress(OSError):
+            with suppress(OSError, DataError):
                 if (out / "manifest.json").exists():
                     events.stopped(error)
             raise

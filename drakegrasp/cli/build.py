@@ -16,6 +16,7 @@ from drakegrasp.cli.options import (
     times_option,
     workers_option,
 )
+from drakegrasp.cli.output import say
 
 if TYPE_CHECKING:
     from drakegrasp.build.pipeline import BuildReport
@@ -133,7 +134,7 @@ def print_stats(out: Path) -> None:
     if unfinished is None:
         console.print(split_table(count_splits(out)))
     else:
-        click.echo(f"{out}: {unfinished_line(unfinished)}")
+        say(f"{out}: {unfinished_line(unfinished)}")
 
 
 def print_plan(request: BuildRequest, workers: int | None, times: Path | None) -> None:
@@ -143,7 +144,7 @@ def print_plan(request: BuildRequest, workers: int | None, times: Path | None) -
 
     logged = logged_times(request.out, request.config)
     measured = logged if times is None else read_times(times)
-    click.echo("\n".join(plan_lines(plan_request(request, workers, measured))))
+    say("\n".join(plan_lines(plan_request(request, workers, measured))))
 
 
 def print_report(report: BuildReport) -> None:
@@ -151,17 +152,15 @@ def print_report(report: BuildReport) -> None:
     print_stats(report.out)
     if report.simulated:
         reused = f" ({report.reused} had been done before)" if report.reused else ""
-        click.echo(f"{report.simulated} work units simulated{reused}")
+        say(f"{report.simulated} work units simulated{reused}")
     else:
         again = "; the files were written again" * report.assembled
-        click.echo(
-            f"all {report.reused} work units had been done before: nothing was simulated{again}"
-        )
+        say(f"all {report.reused} work units had been done before: nothing was simulated{again}")
     for message, count in report.errors.items():
-        click.echo(f"solver error in {count} attempts: {message}")
+        say(f"solver error in {count} attempts: {message}")
     for notice in report.notices:
-        click.echo(notice)
+        say(notice)
     for entry in report.refused:
-        click.echo(f"refused: {entry.name}: {entry.reason}")
+        say(f"refused: {entry.name}: {entry.reason}")
     for name in ("grasping_oto.hdf5", "grasping_otm.hdf5", "trials.hdf5"):
-        click.echo(str(report.out / name))
+        say(str(report.out / name))

@@ -12,6 +12,7 @@ from typing import Any, NoReturn
 
 import click
 
+from drakegrasp.cli.output import say
 from drakegrasp.errors import ConfigError, DrakegraspError, GraspError, HandError, MeshError
 
 #: Errors in what the user asked for. All other errors are failures of the work.
@@ -82,7 +83,7 @@ def one_line_errors(resumable: Callable[[], bool] = lambda: False) -> Iterator[N
 
 def _end(line: str, code: int) -> NoReturn:
     """Print a line and have click end the program; click's own errors take four lines."""
-    click.echo(line, err=True)
+    say(line, err=True)
     raise click.exceptions.Exit(code)
 
 

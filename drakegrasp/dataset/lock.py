@@ -28,10 +28,12 @@ from pathlib import Path
 
 from drakegrasp.errors import DataError
 from drakegrasp.runtime.file_set import LIST_NAME, complete_replacement
-from drakegrasp.runtime.files import stale_temporary, sweep_temporary
+from drakegrasp.runtime.files import open_own, stale_temporary, sweep_temporary
 from drakegrasp.runtime.processes import Process, lock_file, this_process
 
 FILE_NAME = "build.lock"
+#: Folders that a build makes in the directory.
+FOLDERS = ("builtin", "objects", "shards")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +70,7 @@ def build_lock(out: Path) -> Iterator[Holder | None]:
     made = _make_directory(out)
     file, before = _take(out / FILE_NAME)
     try:
+        _refuse_linked_folders(out)
         complete_replacement(out)
         yield before
     finally:
@@ -88,6 +91,22 @@ def tidy(out: Path) -> None:
     if any(map(os.path.lexists, leftovers)) or any(stale_temporary(out)):
         with suppress(DataError, OSError), build_lock(out):
             sweep_temporary(out)
+
+
+def _refuse_linked_folders(out: Path) -> None:
+    """Refuse a directory some of whose folders lie elsewhere: nobody's files are written there.
+
+    Raises:
+        DataError: If one is a link.
+    """
+    inner = out / "shards"
+    folders = [out / name for name in FOLDERS]
+    if inner.is_dir() and not inner.is_symlink():
+        with os.scandir(inner) as entries:
+            folders += [inner / entry.name for entry in entries if entry.is_symlink()]
+    for folder in folders:
+        if folder.is_symlink():
+            raise DataError(f"{folder}: must be a folder in the dataset, got a link")
 
 
 def _make_directory(out: Path) -> bool:
@@ -112,7 +131,7 @@ def _take(path: Path) -> tuple[FileIO, Holder | None]:
     """
     while True:
         try:
-            file = FileIO(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666), "r+")
+            file = FileIO(open_own(path, os.O_RDWR | os.O_CREAT), "r+")
         except OSError as error:
             raise _unwritable(path.parent, error) from None
         try:

@@ -29,6 +29,7 @@ from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_digest, hand_file
 from drakegrasp.runtime.file_set import refuse_half_replaced
 from drakegrasp.runtime.files import probe_folder, write_atomic
+from drakegrasp.runtime.names import NAME_RULE, is_name
 
 #: Packages whose versions may change a result.
 VERSIONED = ("drakegrasp", "drake", "numpy", "scipy", "trimesh", "manifold3d", "h5py")
@@ -88,11 +89,23 @@ class ObjectEntry:
             "notes": tuple(content["notes"]),
         }
         plain = {key: value for key, value in content.items() if key not in ("class", *converted)}
+        for name in (content["name"], content["class"]):
+            _refuse_no_name(name)
         return cls(**converted, **plain)
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry as JSON types, in the order of the manifest."""
         return {"class" if key == "class_name" else key: v for key, v in asdict(self).items()}
+
+
+def _refuse_no_name(text: Any) -> None:
+    """Refuse what would lead out of the directory as a file's name, or steer a terminal.
+
+    Raises:
+        TypeError: If it is no name.
+    """
+    if not isinstance(text, str) or not is_name(text):
+        raise TypeError(f"a name must be {NAME_RULE}, got {text!r}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,8 +127,9 @@ class RefusedMesh:
         """Return the entry that `to_json` gave.
 
         Raises:
-            TypeError: If the content is not an entry.
+            KeyError, TypeError: If the content is not an entry.
         """
+        _refuse_no_name(content["name"])
         return cls(**content)
 
     def to_json(self) -> dict[str, str]:

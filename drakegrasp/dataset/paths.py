@@ -11,6 +11,7 @@ from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import DataError
 from drakegrasp.runtime.files import refuse_broken_seal
+from drakegrasp.runtime.names import NAME_RULE, is_name
 
 #: The file of all attempts, the two files of samples by camera, and the manifest.
 TRIALS_FILE = "trials.hdf5"
@@ -21,19 +22,30 @@ ASSEMBLED_FILES = (TRIALS_FILE, *DATA_FILES.values())
 #: Folder of the meshes of the built-in objects, in a dataset that is built from them.
 BUILTIN_FOLDER = "builtin"
 #: Folders that a build makes.
-OWN_FOLDERS = (BUILTIN_FOLDER, "objects", "shards")
+OWN_FOLDERS = build_lock.FOLDERS
 #: Files that a build writes besides the manifest.
 OWN_FILES = (build_lock.FILE_NAME, build_log.FILE_NAME)
 
 
 def model_path(out: Path, name: str) -> Path:
     """Return the path of an object's meshes and mass properties."""
-    return out / "objects" / f"{name}.npz"
+    return out / "objects" / f"{_file_name(name)}.npz"
 
 
 def plan_path(out: Path, name: str) -> Path:
     """Return the path of an object's resting pose and palm poses."""
-    return out / "objects" / f"{name}.plan.h5"
+    return out / "objects" / f"{_file_name(name)}.plan.h5"
+
+
+def _file_name(name: str) -> str:
+    """Return a name that leads to no other folder.
+
+    Raises:
+        DataError: If it might.
+    """
+    if not is_name(name):
+        raise DataError(f"the name of an object must be {NAME_RULE}, got {name!r}")
+    return name
 
 
 def model_file_sha256(out: Path, name: str) -> str:

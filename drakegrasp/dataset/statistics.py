@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from drakegrasp.dataset.assemble import is_assembled
 from drakegrasp.dataset.filters import Removal
-from drakegrasp.dataset.hdf5 import open_hdf5
+from drakegrasp.dataset.hdf5 import open_hdf5, read_names
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.schema import SPLITS, refuse_other_schema
@@ -127,6 +127,7 @@ def count_funnel(out: Path) -> Funnel:
         with open_hdf5(out / TRIALS_FILE) as file:
             refuse_other_schema(out / TRIALS_FILE, file.attrs["schema_version"])
             objects = {name: values[:] for name, values in file["objects"].items()}
+            names, classes = (read_names(file["objects"][key]) for key in ("name", "class_name"))
             index = file["trials/object"][:]
             outcome = file["trials/outcome"][:]
             words = {word: file[f"trials/{word}"][:] for word in WORDS}
@@ -137,8 +138,8 @@ def count_funnel(out: Path) -> Funnel:
 
     count = len(objects["name"])
     return Funnel(
-        names=tuple(name.decode() for name in objects["name"]),
-        classes=tuple(name.decode() for name in objects["class_name"]),
+        names=names,
+        classes=classes,
         candidates=objects["candidates"],
         distinct=objects["distinct"],
         valid=objects["valid"],

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drakegrasp.dataset.hdf5 import open_hdf5
+from drakegrasp.dataset.hdf5 import open_hdf5, read_names
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import SPLITS
@@ -59,7 +59,7 @@ def read_closed_grasps(out: Path) -> Iterator[ClosedGrasp]:
     try:
         with open_hdf5(path) as file:
             trials = file["trials"]
-            names = file["objects/name"].asstr()[:]
+            names = read_names(file["objects/name"])
             objects, X_TO, X_OG, q, spread = (
                 trials[key][:][rows] for key in ("object", "X_TO", "X_OG", "closed_q", "spread")
             )

@@ -13,6 +13,7 @@ import os
 import re
 import secrets
 import shutil
+import stat
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -254,6 +255,32 @@ def probe_folder(folder: Path) -> None:
     probe.unlink()
 
 
+def open_own(path: Path, flags: int) -> int:
+    """Open a file to write it in place; return its descriptor. No link is followed.
+
+    Args:
+        path: Of the file.
+        flags: As for `os.open`; a new file has the rights that the umask leaves.
+
+    Raises:
+        OSError: If it cannot be opened.
+        DataError: If it is a link, has another name elsewhere, or is no plain file.
+    """
+    refusal = DataError(f"{path}: must be a file of its own, got a link or no file")
+    try:
+        safe = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        descriptor = os.open(path, flags | safe, 0o666)
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.ENXIO):
+            raise refusal from None
+        raise
+    status = os.fstat(descriptor)
+    if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
+        os.close(descriptor)
+        raise refusal
+    return descriptor
+
+
 def stale_temporary(out: Path) -> Iterator[Path]:
     """Yield the temporary files of dead processes in a dataset's directory.
 
@@ -270,6 +297,8 @@ def sweep_temporary(out: Path) -> list[Path]:
 def _temporary_files(out: Path) -> Iterator[Path]:
     for pattern in ("", "objects", "shards/*"):
         for folder in out.glob(pattern) if pattern else [out]:
+            if folder != out and (folder.is_symlink() or folder.parent.is_symlink()):
+                continue
             with suppress(FileNotFoundError, NotADirectoryError), os.scandir(folder) as entries:
                 for entry in entries:
                     if entry.name.startswith(".") and entry.name.endswith(TEMPORARY_SUFFIX):
@@ -281,7 +310,7 @@ def _is_stale(path: Path) -> bool:
     if match is not None and match["host"] == host_label():
         return not is_running(int(match["pid"]))
     try:
-        return time.time() - path.stat().st_mtime > STALE_SECONDS
+        return time.time() - path.lstat().st_mtime > STALE_SECONDS
     except FileNotFoundError:
         return False
 
