@@ -313,7 +313,7 @@ class Config(_Section):
     hand: str = "barrett"  # a hand in drakegrasp/models, or a path to a hand's YAML
     seed: Annotated[int, Field(ge=0)] = 0
     unit_candidates: Count = 50  # candidates in a work unit
-    attempt_seconds: Positive = 60.0  # [s] of wall clock before an attempt is a `timeout`
+    attempt_seconds: Positive = 60.0  # [s] of computing (CPU time) before an attempt is a `timeout`
     objects: ObjectConfig = ObjectConfig()
     builtin: BuiltinConfig = BuiltinConfig()
     physics: PhysicsConfig = PhysicsConfig()

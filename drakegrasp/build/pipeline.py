@@ -56,6 +56,8 @@ class BuildReport:
         refused: Name and reason of each mesh that was refused.
         errors: Number of solver errors by message, of the units that were run now.
         notices: What the user should know: damage that was repaired, leftovers that were removed.
+        unexplained: A line for each object so many of whose attempts crashed or timed out that the
+            machine must be at fault; the dataset is complete, but its labels are wrong there.
         assembled: Whether the files were written now, or were those of all shards already.
         assembly: What the files hold.
     """
@@ -67,6 +69,7 @@ class BuildReport:
     refused: tuple[RefusedMesh, ...]
     errors: dict[str, int]
     notices: tuple[str, ...]
+    unexplained: tuple[str, ...]
     assembled: bool
     assembly: Assembly
 
@@ -209,6 +212,9 @@ def _build(
     if counts.damaged:
         damaged = _count(counts.named, "shard", counts.damaged)
         notices.append(f"{damaged}: damaged, and simulated again")
+    unexplained = tuple(counts.unexplained())
+    for line in unexplained:
+        job.events.warn(line)
     seconds = time.monotonic() - start
     job.events.finished(simulated=counts.simulated, reused=counts.reused, seconds=seconds)
     return BuildReport(
@@ -219,6 +225,7 @@ def _build(
         refused=manifest.refused,
         errors=dict(counts.errors),
         notices=tuple(notices),
+        unexplained=unexplained,
         assembled=stale,
         assembly=summarise(out),
     )

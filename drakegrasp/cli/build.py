@@ -148,7 +148,12 @@ def print_plan(request: BuildRequest, workers: int | None, times: Path | None) -
 
 
 def print_report(report: BuildReport) -> None:
-    """Print what a build did, and the paths of its files."""
+    """Print what a build did, and the paths of its files.
+
+    Raises:
+        click.exceptions.Exit: With code 1 if the machine must have spoiled labels; a line on
+            standard error has said so.
+    """
     print_stats(report.out)
     if report.simulated:
         reused = f" ({report.reused} had been done before)" if report.reused else ""
@@ -164,3 +169,5 @@ def print_report(report: BuildReport) -> None:
         say(f"refused: {entry.name}: {entry.reason}")
     for name in ("grasping_oto.hdf5", "grasping_otm.hdf5", "trials.hdf5"):
         say(str(report.out / name))
+    if report.unexplained:
+        raise click.exceptions.Exit(1)

@@ -190,10 +190,13 @@ def read_seal(path: Path) -> bytes:
     """Return the seal of a file, which tells it from every other file; it is not verified.
 
     Raises:
-        OSError: If the file cannot be read.
+        DataError: If the file cannot be read.
     """
-    with path.open("rb", buffering=0) as file:
-        return file.read(SEAL_SIZE)
+    try:
+        with path.open("rb", buffering=0) as file:
+            return file.read(SEAL_SIZE)
+    except OSError as error:
+        raise DataError(f"{path}: must be a complete shard, got none ({error.strerror})") from None
 
 
 def refuse_broken_seal(path: Path, what: str = "shard") -> None:

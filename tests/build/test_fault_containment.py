@@ -269,8 +269,8 @@ def test_fault_costs_what_is_guilty_and_nothing_else(
     trimesh.creation.box([0.05, 0.05, 0.1]).export(more / "3_box_c.obj")
     faults = "crash:1_box_a:3:1 hang:1_box_a:5:0 freeze:2_box_b:4:2 crash:3_box_c"
     out = tmp_path / "out"
-    # Long enough for the innocent on a busy machine.
-    limit = ("--set", "attempt_seconds=8")
+    # A hang that does not compute takes several times as long.
+    limit = ("--set", "attempt_seconds=4")
     said, errors = finish(start_build(more, out, 2, *limit, fault=faults))
     assert "refused: 3_box_c: 3_box_c: preparing it crashed its process" in said
     assert errors == ""
@@ -291,6 +291,27 @@ def test_fault_costs_what_is_guilty_and_nothing_else(
             assert b["trials/outcome"][places.index(place)] == outcome
             assert np.isnan(b["trials/closed_q"][places.index(place)]).all()
     assert_clean(out)
+
+
+@pytest.mark.cluster
+@pytest.mark.sim
+@pytest.mark.slow
+def test_suspended_worker_changes_nothing(meshes: Path, undisturbed: Path, tmp_path: Path) -> None:
+    """As SLURM suspends a job: for longer than an attempt may take, also by the wall clock."""
+    out = tmp_path / "out"
+    process = start_build(meshes, out, 1, "--set", "attempt_seconds=1")
+    for shards, seconds in ((2, 3.0), (8, 8.0)):
+        wait_for_shards(out, shards)
+        (worker,) = workers_of(process.pid)
+        os.kill(worker, signal.SIGSTOP)
+        time.sleep(seconds)
+        os.kill(worker, signal.SIGCONT)
+    finish(process)
+    with h5py.File(out / "trials.hdf5") as file:
+        assert Outcome.TIMEOUT not in file["trials/outcome"][:]
+    for name in ("trials/outcome", "trials/X_TO_lifted"):
+        with h5py.File(undisturbed / "trials.hdf5") as a, h5py.File(out / "trials.hdf5") as b:
+            assert a[name][:].tobytes() == b[name][:].tobytes()
 
 
 # Faults found on start

@@ -3,23 +3,33 @@
 from __future__ import annotations
 
 import os
-import signal
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import pytest
+import trimesh
 from click.testing import CliRunner, Result
 from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
 
+from drakegrasp.build.counts import Counts
+from drakegrasp.build.pipeline import build
 from drakegrasp.cli.main import main
+from drakegrasp.config import Config
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError
+from drakegrasp.objects.sources import find_meshes
+from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime import file_set
+from drakegrasp.runtime.executor import run_here
+from drakegrasp.runtime.progress import silent
+from drakegrasp.simulation.trial import TrialRecord
 
 FILES = (OTO, OTM, TRIALS)
 #: A filter that would remove every sample.
@@ -35,10 +45,17 @@ def state(out: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()}
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Read only: copy it to change it."""
+    folder = tmp_path_factory.mktemp("whole")
+    (folder / "meshes").mkdir()
+    return make_dataset(folder / "out", folder / "meshes")
+
+
 @pytest.fixture
-def out(tmp_path: Path) -> Path:
-    (tmp_path / "meshes").mkdir()
-    return make_dataset(tmp_path / "out", tmp_path / "meshes")
+def out(whole: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(whole, tmp_path / "out"))
 
 
 def _cut_shard(out: Path) -> None:
@@ -92,26 +109,37 @@ def test_assemble_that_works_keeps_its_filters(out: Path) -> None:
     assert read_manifest(out).config.filters.max_slip == SLIP / 2
 
 
-#: Assembles without samples, and dies at one of the renames.
+#: Assembles copies of a dataset without samples, and dies at the first rename, the second, ...
 DIE = """
 import os, signal, sys
+from drakegrasp.build.counts import Counts
+from drakegrasp.build.pipeline import build
 from drakegrasp.cli.main import main
-rename, left = os.replace, int(sys.argv[1])
-def replace(*names, **options):
-    global left
-    if not left:
-        os.kill(os.getpid(), signal.SIGKILL)
-    left -= 1
-    rename(*names, **options)
-os.replace = replace
-main(sys.argv[2:])
+from drakegrasp.config import Config
+rename, (setting, *copies) = os.replace, sys.argv[1:]
+for left, copy in enumerate(copies):
+    def replace(*names, **options):
+        global left
+        if not left:
+            os.kill(os.getpid(), signal.SIGKILL)
+        left -= 1
+        rename(*names, **options)
+    child = os.fork()
+    if not child:
+        os.replace = replace
+        main(["assemble", copy, "--set", setting])
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
 """
 
 
-def die_at(rename: int, *arguments: str | Path) -> None:
-    """Run a command that is killed at one of its renames."""
-    command = [sys.executable, "-c", DIE, str(rename), *map(str, arguments)]
-    assert subprocess.run(command, capture_output=True).returncode == -signal.SIGKILL
+@pytest.fixture(scope="module")
+def killed(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """A dataset whose assembling was killed at each of its five renames."""
+    folder = tmp_path_factory.mktemp("killed")
+    copies = [Path(shutil.copytree(whole, folder / str(k))) for k in range(5)]
+    command = [sys.executable, "-c", DIE, SLIPPED[1], *map(str, copies)]
+    subprocess.run(command, check=True, capture_output=True)
+    return copies
 
 
 def samples(out: Path) -> list[int]:
@@ -128,23 +156,22 @@ def samples(out: Path) -> list[int]:
 @pytest.mark.parametrize("command", ["stats", "check", "assemble"])
 @pytest.mark.parametrize("rename", range(5))
 def test_files_appear_together_whenever_assembling_is_killed(
-    out: Path, rename: int, command: str, monkeypatch: pytest.MonkeyPatch
+    killed: list[Path], tmp_path: Path, rename: int, command: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A reader refuses what is half done, and the next command completes it."""
     monkeypatch.setattr(file_set, "PATIENCE", 0.1)
-    before = samples(out)
-    die_at(rename, "assemble", out, *SLIPPED)
+    out = Path(shutil.copytree(killed[rename], tmp_path / "out"))
 
     # Before the list of new files has its name (the first rename), the old files count.
     if rename:
         with pytest.raises(DataError, match=r"drakegrasp stats .* completes this"):
             GraspDataset(out / OTO)
     else:
-        assert samples(out) == before == [9] * 4
+        assert samples(out) == [9] * 4
 
     # The next command leaves files of one state, and nothing else.
     assert run(command, out).exit_code == 0
-    assert samples(out) == ([0] * 4 if rename else before)
+    assert samples(out) == ([0] * 4 if rename else [9] * 4)
     assert sorted(os.listdir(out)) == sorted(["manifest.json", "objects", "shards", *FILES])
 
 
@@ -156,3 +183,37 @@ def test_files_of_two_states_are_a_finding(out: Path) -> None:
     result = run("check", out)
     assert result.exit_code == 1
     assert "the three files must be of one assembly" in result.stdout
+
+
+def _crash(*arguments: object) -> TrialRecord:
+    setup, attempt = arguments[:2]
+    return TrialRecord(outcome=Outcome.CRASHED, X_TO=setup.prepared.X_TO, X_OG=attempt.X_OG)
+
+
+@pytest.mark.sim
+def test_crashes_that_no_physics_explains_end_the_build_with_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All attempts crash; the same command says so again, though it has nothing left to do."""
+
+    def build_here(objects: Path, out: Path, *, config: Config, show: bool, **_: Any) -> Any:
+        return build(find_meshes(objects), out, config, run_here, show=show)
+
+    monkeypatch.setattr("drakegrasp.build.work_unit._try_step", _crash)
+    monkeypatch.setattr("drakegrasp.api.build_dataset", build_here)
+    (tmp_path / "meshes").mkdir()
+    trimesh.creation.box([0.06, 0.05, 0.12]).export(tmp_path / "meshes" / "1_box.obj")
+    few = ("--set", "candidates.max=1")
+    for _ in range(2):
+        result = run("build", "--objects", tmp_path / "meshes", "--out", tmp_path / "out", *few)
+        assert result.exit_code == 1
+        line = "1_box: 3 of 3 attempts crashed or timed out, which is no property of grasps."
+        assert line in result.stderr
+
+
+def test_few_crashes_are_no_error(whole: Path) -> None:
+    counts = Counts(read_manifest(whole), None, silent)
+    header = next(read_manifest(whole).headers())
+    for crashed, said in ((9, 0), (1, 1)):
+        counts.add(header, {Outcome.SUCCESS: 100, Outcome.CRASHED: crashed})
+        assert len(counts.unexplained()) == said
