@@ -14,6 +14,8 @@ from drakegrasp.cli.options import (
     scheduler_file_option,
     scheduler_option,
     times_option,
+    tls_files,
+    tls_options,
     workers_option,
 )
 from drakegrasp.cli.output import say
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
 @workers_option
 @scheduler_option
 @scheduler_file_option
+@tls_options
 @click.option(
     "--plan", is_flag=True, help="Only print the hours and bytes that the build would take."
 )
@@ -36,6 +39,9 @@ def build(
     workers: int | None,
     scheduler: str | None,
     scheduler_file: Path | None,
+    tls_ca_file: Path | None,
+    tls_cert: Path | None,
+    tls_key: Path | None,
     plan: bool,
     times: Path | None,
     **options: Any,
@@ -48,6 +54,7 @@ def build(
     from drakegrasp.api import build_dataset
 
     request = parse_request(**options)
+    files = tls_files(tls_ca_file, tls_cert, tls_key)
     if plan:
         print_plan(request, workers, times)
         return
@@ -60,6 +67,7 @@ def build(
         workers=workers,
         scheduler=scheduler,
         scheduler_file=scheduler_file,
+        tls_files=files,
         show=request.show,
     )
     print_report(report)

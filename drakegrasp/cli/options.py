@@ -130,6 +130,47 @@ scheduler_file_option = click.option(
     metavar="FILE",
     help="Use the running Dask scheduler that wrote this file.",
 )
+_TLS_OPTIONS = (
+    click.option(
+        "--tls-ca-file",
+        type=click.Path(path_type=Path, exists=True, dir_okay=False),
+        metavar="FILE",
+        help="Encrypt, with your own certificate authority (PEM); needs the next two options.",
+    ),
+    click.option(
+        "--tls-cert",
+        type=click.Path(path_type=Path, exists=True, dir_okay=False),
+        metavar="FILE",
+        help="Certificate of client, scheduler and workers, signed by that authority.",
+    ),
+    click.option(
+        "--tls-key",
+        type=click.Path(path_type=Path, exists=True, dir_okay=False),
+        metavar="FILE",
+        help="The certificate's private key.",
+    ),
+)
+
+
+def tls_options(command: F) -> F:
+    """Give a command the files of TLS; it passes them on to `tls_files`."""
+    for option in reversed(_TLS_OPTIONS):
+        command = option(command)
+    return command
+
+
+def tls_files(*paths: Path | None) -> tuple[Path, Path, Path] | None:
+    """Return the authority, the certificate and its key, or None if none of them is given.
+
+    Raises:
+        click.UsageError: If only some are given.
+    """
+    match paths:
+        case (None, None, None):
+            return None
+        case (Path() as ca, Path() as cert, Path() as key):
+            return ca, cert, key
+    raise click.UsageError("--tls-ca-file, --tls-cert and --tls-key must be given together")
 
 
 def build_options(command: F) -> F:

@@ -19,6 +19,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
@@ -34,6 +35,9 @@ from drakegrasp.runtime.processes import Process, lock_file, this_process
 FILE_NAME = "build.lock"
 #: Folders that a build makes in the directory.
 FOLDERS = ("builtin", "objects", "shards")
+#: Directories that a thread of this process holds, and the lock of this set.
+_held: set[str] = set()
+_claiming = threading.Lock()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +72,12 @@ def build_lock(out: Path) -> Iterator[Holder | None]:
         DataError: If another process builds in the directory, or it cannot be written.
     """
     made = _make_directory(out)
-    file, before = _take(out / FILE_NAME)
+    key = _claim(out)
+    try:
+        file, before = _take(out / FILE_NAME)
+    except BaseException:
+        _held.discard(key)
+        raise
     try:
         _refuse_linked_folders(out)
         complete_replacement(out)
@@ -76,9 +85,26 @@ def build_lock(out: Path) -> Iterator[Holder | None]:
     finally:
         (out / FILE_NAME).unlink(missing_ok=True)
         file.close()
+        _held.discard(key)
         if made:
             with suppress(OSError):  # not empty: something was built
                 out.rmdir()
+
+
+def _claim(out: Path) -> str:
+    """Take a directory for one thread of this process; return by what `_held` names it.
+
+    On network file systems the kernel's lock belongs to a process, with all its threads.
+
+    Raises:
+        DataError: If another thread has it.
+    """
+    key = os.path.realpath(out)
+    with _claiming:
+        if key in _held:
+            raise _refusal(out / FILE_NAME, None, certain=True, who="another thread of this one")
+        _held.add(key)
+    return key
 
 
 def tidy(out: Path) -> None:
@@ -179,8 +205,10 @@ def _write(file: FileIO) -> None:
     os.pwrite(file.fileno(), json.dumps(asdict(holder)).encode() + b"\n", 0)
 
 
-def _refusal(path: Path, holder: Holder | None, *, certain: bool) -> DataError:
-    who = "another process" if holder is None else str(holder)
+def _refusal(
+    path: Path, holder: Holder | None, *, certain: bool, who: str = "another process"
+) -> DataError:
+    who = who if holder is None else str(holder)
     advice = "wait for it or choose another --out"
     if not certain:
         advice = f"wait for it, or remove {path.name} there if it is dead"

@@ -56,8 +56,9 @@ and how often the build was interrupted: nothing in these files depends on the c
 machine's name. `time_close` and `time_lift` are simulated seconds. This holds on one machine with
 one set of library versions (`manifest.json` names them); another CPU or another version of Drake
 may round differently. The exceptions are the outcomes `timeout` and `crashed`: an attempt that
-computes for longer than `attempt_seconds` (60 s, where a usual one takes about one), or ends its process
-again and again, says more about the machine than about the grasp, and may end otherwise elsewhere.
+computes for longer than `attempt_seconds` (60 s, where a usual one takes about one), or ends its
+process again and again, says more about the machine than about the grasp, and may end otherwise
+elsewhere.
 `screened` is an attempt that geometry has decided: it was not simulated, and would have been a
 `missing_fingertip`, see [screening](../explanation/screening.md).
 

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 import pytest
 import trimesh
 from click.testing import CliRunner, Result
+from distributed.security import Security
+from helpers.builds import start_build, workers_of
 from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
 
 from drakegrasp.build.counts import Counts
@@ -23,7 +29,7 @@ from drakegrasp.config import Config
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.errors import DataError
+from drakegrasp.errors import DataError, MachineError
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime import file_set
@@ -217,3 +223,63 @@ def test_few_crashes_are_no_error(whole: Path) -> None:
     for crashed, said in ((9, 0), (1, 1)):
         counts.add(header, {Outcome.SUCCESS: 100, Outcome.CRASHED: crashed})
         assert len(counts.unexplained()) == said
+
+
+@pytest.mark.parametrize("address", ["", " "])
+@pytest.mark.parametrize("command", ["build", "verify"])
+def test_empty_address_of_a_scheduler_is_refused(
+    tmp_path: Path, address: str, command: str
+) -> None:
+    trimesh.creation.box([0.06, 0.05, 0.12]).export(tmp_path / "1_box.obj")
+    np.save(tmp_path / "grasps.npy", np.tile(np.eye(3)[[0, 1, 0, 1, 0, 1]].ravel(), (9, 1)))
+    arguments = {
+        "build": ["--objects", tmp_path, "--out", tmp_path / "out"],
+        "verify": [tmp_path / "grasps.npy", "--object", tmp_path / "1_box.obj"],
+    }
+    result = run(command, *arguments[command], "--scheduler", address)
+    assert result.exit_code == 2
+    assert f"scheduler must be an address like tcp://host:8786, got {address!r}" in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_build_connects_with_the_certificates_that_it_is_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @contextmanager
+    def connect(*_: Any, security: Security) -> Iterator[None]:
+        assert security.require_encryption
+        for key in ("tls_client_cert", "tls_client_key", "tls_ca_file"):
+            assert getattr(security, key) == str(tmp_path / key.split("_")[-1])
+        raise MachineError("connected")
+        yield
+
+    monkeypatch.setattr("drakegrasp.api.connect", connect)
+    (tmp_path / "meshes").mkdir()
+    trimesh.creation.box([0.06, 0.05, 0.12]).export(tmp_path / "meshes" / "1_box.obj")
+    build = ["build", "--objects", tmp_path / "meshes", "--out", tmp_path / "out"]
+    build += ["--scheduler", "tls://10.0.0.1:8786"]
+    for name, file in (("ca-file", "file"), ("cert", "cert"), ("key", "key")):
+        (tmp_path / file).touch()
+        build += [f"--tls-{name}", tmp_path / file]
+        if name != "key":
+            assert "must be given together" in run(*build).stderr
+    result = run(*build)
+    assert (result.exit_code, result.stderr) == (1, "error: connected\n")
+
+
+@pytest.mark.cluster
+@pytest.mark.slow
+@pytest.mark.parametrize("seconds", [0.0, 1.0, 3.0])
+def test_ctrl_c_while_workers_start_is_one_line(tmp_path: Path, seconds: float) -> None:
+    """It reaches every process of the terminal, also those that have just begun."""
+    (tmp_path / "meshes").mkdir()
+    trimesh.creation.box([0.06, 0.05, 0.12]).export(tmp_path / "meshes" / "1_box.obj")
+    process = start_build(tmp_path / "meshes", tmp_path / "out", 2, new_session=True)
+    while not workers_of(process.pid):
+        assert process.poll() is None
+        time.sleep(0.05)
+    time.sleep(seconds)
+    os.killpg(process.pid, signal.SIGINT)
+    said, errors = process.communicate(timeout=240)
+    assert (process.returncode, said) == (130, "")
+    assert errors == "stopped; the same command goes on from here\n"
