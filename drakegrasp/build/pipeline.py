@@ -315,7 +315,7 @@ def _known_entry(
 ) -> ObjectEntry | RefusedMesh | None:
     """Return a mesh's entry in the manifest if it still holds, else None."""
     for refusal in manifest.refused:
-        if (refusal.name, refusal.mesh_sha256) == (source.name, digest):
+        if (refusal.name, refusal.mesh_sha256) == (source.name, digest) and not refusal.again:
             return refusal
     for entry in manifest.objects:
         known = (entry.name, entry.class_name, entry.mesh_sha256)

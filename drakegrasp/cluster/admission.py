@@ -18,17 +18,23 @@ from typing import Any
 
 from distributed import Client, Nanny, NannyPlugin, Scheduler, Worker, WorkerPlugin
 
+from drakegrasp.build.prepare import PREPARE_SECONDS
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import REQUIRED_VERSIONS, installed_versions
 from drakegrasp.errors import MachineError, printable
 from drakegrasp.runtime import kernels
 from drakegrasp.runtime.blas import running_kernel
+from drakegrasp.runtime.journal import WALL_FACTOR
 from drakegrasp.runtime.kernels import KERNELS, agreed_kernel, common_kernel, supported_kernel
 from drakegrasp.vision.probe_image import probe_image
 
 #: Tasks that the scheduler gives to a worker, per thread: a task that waits behind another would
 #: be blamed, too, when that one kills the worker.
 SATURATION = 1.0
+#: Time without a sign of life after which the scheduler gives a worker up [s]: longer than the
+#: limits of every step (see `runtime.journal`). A step that holds the interpreter gives none, and
+#: its journal tells more than the scheduler knows. A lost connection is noticed at once.
+SILENCE_SECONDS = 2.0 * WALL_FACTOR * PREPARE_SECONDS
 #: Topic of the messages from workers that join later.
 _TOPIC = "drakegrasp-admission"
 _MAY_DIFFER = "last bits of simulated values may differ"
@@ -237,6 +243,8 @@ def _set_kernel(client: Client) -> str | None:
 def _saturate(dask_scheduler: Scheduler) -> None:
     """Set what a scheduler that was started by hand has not read from this program's settings."""
     dask_scheduler.WORKER_SATURATION = SATURATION
+    if dask_scheduler.worker_ttl:
+        dask_scheduler.worker_ttl = max(dask_scheduler.worker_ttl, SILENCE_SECONDS)
 
 
 def _print_message(event: tuple[float, Any]) -> None:

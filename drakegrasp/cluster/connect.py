@@ -16,7 +16,7 @@ from distributed.security import Security
 from distributed.utils import LoopRunner
 from tornado.ioloop import IOLoop
 
-from drakegrasp.cluster.admission import SATURATION, worker_environment
+from drakegrasp.cluster.admission import SATURATION, SILENCE_SECONDS, worker_environment
 from drakegrasp.errors import MachineError
 from drakegrasp.runtime.allocator import own_environment
 from drakegrasp.runtime.environment import available_cores
@@ -39,6 +39,7 @@ def dask_settings() -> dict[str, Any]:
         # The profiler costs time.
         "distributed.worker.profile.enabled": False,
         "distributed.scheduler.worker-saturation": SATURATION,
+        "distributed.scheduler.worker-ttl": f"{SILENCE_SECONDS:g}s",
         "distributed.nanny.pre-spawn-environ": worker_environment(),
         "distributed.nanny.preload": [NANNY_PRELOAD],
         # On a busy machine a worker takes long to start again; Dask would close its nanny.

@@ -116,11 +116,13 @@ class RefusedMesh:
         name: Of the object.
         mesh_sha256: Hash of the mesh file and of what `objects.yaml` says of it, hexadecimal.
         reason: Why it was refused, in words.
+        again: Whether the machine may be at fault, so that the next build tries it again.
     """
 
     name: str
     mesh_sha256: str
     reason: str
+    again: bool = False
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> RefusedMesh:
@@ -132,9 +134,9 @@ class RefusedMesh:
         _refuse_no_name(content["name"])
         return cls(**content)
 
-    def to_json(self) -> dict[str, str]:
+    def to_json(self) -> dict[str, Any]:
         """Return the entry as JSON types, in the order of the manifest."""
-        return asdict(self)
+        return {key: value for key, value in asdict(self).items() if key != "again" or value}
 
 
 @dataclass(frozen=True, kw_only=True)

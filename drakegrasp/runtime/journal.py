@@ -8,8 +8,9 @@ file that is there when a unit starts shows that an earlier run died, and in whi
 
 * a step that passed its time limit `HUNG_DEATHS` times in a row is not tried again;
 * a step in which the process crashed `NATIVE_DEATHS` times in a row is not tried again;
-* an attempt in which the process vanished `SILENT_DEATHS` times in a row (the kernel or the nanny
-  kills a process that takes too much memory) is not tried again.
+* a step in which the process vanished `SILENT_DEATHS` times in a row (the kernel or the nanny
+  kills a process that takes too much memory) is not tried again; a mesh that is prepared has fewer
+  chances, `PREPARE_DEATHS`, because each of them takes longer.
 
 Unresolved steps, in which a process died but not often enough, run first: a failing step then costs
 a start of the process and not the whole unit, and a step that passes is cleared. A process must
@@ -50,16 +51,20 @@ NATIVE_DEATHS = 2
 HUNG_DEATHS = 2
 #: The limit of wall-clock time of a step, as a multiple of its limit of computing time.
 WALL_FACTOR = 3.0
-#: Deaths without a mark in a row in one attempt after which it is not tried again.
+#: Deaths without a mark in a row in one step after which it is not tried again.
 SILENT_DEATHS = 8
+#: The same for preparing a mesh, which is one step.
+PREPARE_DEATHS = 5
 #: Deaths of a unit since the last verdict after which it is in a crash loop.
 GIVE_UP_DEATHS = 20
 #: Bytes of the record.
 _RECORD_SIZE = 32
 #: How the text of faulthandler begins, for a crash and for a passed limit of either time.
 _CRASH_MARK, _TIME_MARKS = b"Fatal Python error", (b"Timeout (", b"hread 0x")
-#: How the names of steps that are attempts begin.
-ATTEMPT = "try"
+#: How the names of steps that are attempts begin; the step that prepares a mesh.
+ATTEMPT, PREPARE = "try", "prepare"
+#: What the record says before the first step.
+_START = "start"
 
 
 class Verdict(Enum):
@@ -103,9 +108,9 @@ class _History:
             return Verdict.HUNG
         if deaths.native >= NATIVE_DEATHS:
             return Verdict.CRASHED
-        # A random SIGKILL hits long steps most often; an object is not given up for that.
-        vanished = deaths.silent >= SILENT_DEATHS and step.startswith(ATTEMPT)
-        return Verdict.VANISHED if vanished else None
+        # Before its first step a process dies of nothing that the unit does.
+        most = PREPARE_DEATHS if step == PREPARE else SILENT_DEATHS
+        return Verdict.VANISHED if deaths.silent >= most and step != _START else None
 
     def unresolved(self) -> list[str]:
         return [step for step in self.deaths if self.verdict(step) is None]
@@ -227,7 +232,7 @@ def open_journal(path: Path, identity: Mapping[str, Any]) -> Iterator[Journal]:
     # not synced.
     temporary = temporary_name(path)
     try:
-        temporary.write_bytes(line + b"\n" + _record("start", 0))
+        temporary.write_bytes(line + b"\n" + _record(_START, 0))
         with temporary.open("r+b", buffering=0) as file:
             lock_file(file)
             file.seek(0, os.SEEK_END)  # faulthandler writes here

@@ -20,22 +20,27 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
+from dask.utils import parse_timedelta
 from distributed import Client, LocalCluster, get_worker
 from helpers.assertions import assert_same_dataset
 from helpers.builds import FAST, finish, start_build, wait_for_shards, workers_of
 
 from drakegrasp.build import attempts
 from drakegrasp.build.pipeline import build
+from drakegrasp.build.prepare import PREPARE_SECONDS
+from drakegrasp.build.work_unit import WorkUnit, run_unit
 from drakegrasp.cluster import executor as tasks
-from drakegrasp.cluster.connect import connect
+from drakegrasp.cluster.connect import connect, dask_settings
 from drakegrasp.cluster.executor import DaskExecutor
 from drakegrasp.config import Config, load_config
+from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import PreparedObject
 from drakegrasp.dataset.statistics import count_funnel
 from drakegrasp.errors import BlankImageError, DiskFullError, MachineError
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
+from drakegrasp.runtime.journal import WALL_FACTOR, Journal, Verdict
 from drakegrasp.runtime.processes import host_label
 from drakegrasp.vision import rendering
 
@@ -223,6 +228,48 @@ def test_suspended_worker_changes_nothing(meshes: Path, undisturbed: Path, tmp_p
     for name in ("trials/outcome", "trials/X_TO_lifted"):
         with h5py.File(undisturbed / "trials.hdf5") as a, h5py.File(out / "trials.hdf5") as b:
             assert a[name][:].tobytes() == b[name][:].tobytes()
+
+
+@pytest.mark.cluster
+@pytest.mark.sim
+@pytest.mark.slow
+def test_mesh_that_takes_too_much_memory_is_refused_and_the_others_go_on(
+    meshes: Path, tmp_path: Path
+) -> None:
+    """The kernel kills its process each time; with more memory the next build has it."""
+    out = tmp_path / "out"
+    few = ("--set", "candidates.max=1")
+    said, errors = finish(start_build(meshes, out, 1, *few, fault="exit:1_box_a"))
+    line = "refused: 1_box_a: 1_box_a: preparing it was at work whenever its process vanished"
+    assert line in said
+    assert errors == "" or "nothing will train" in errors
+    assert [entry.name for entry in read_manifest(out).objects] == ["2_box_b"]
+    assert_clean(out)
+    build(find_meshes(meshes), out, load_config(overrides=[*FAST, few[1]]), run_here, show=False)
+    assert [entry.name for entry in read_manifest(out).objects] == ["1_box_a", "2_box_b"]
+    assert not read_manifest(out).refused
+
+
+def test_scheduler_is_more_patient_than_the_limits_of_steps() -> None:
+    """A step may hold the interpreter, so that its worker gives no sign of life."""
+    patience = parse_timedelta(dask_settings()["distributed.scheduler.worker-ttl"])
+    assert patience > WALL_FACTOR * PREPARE_SECONDS
+
+
+@pytest.mark.parametrize("step", ["build", "predict", "measure", "write"])
+def test_every_step_of_a_unit_is_in_its_journal(
+    undisturbed: Path, tmp_path: Path, step: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So that a hang in it meets its limit, and the user is told of which step it was."""
+    out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
+    header = next(read_manifest(out).headers())
+    header.path(out).unlink()
+    monkeypatch.setattr(
+        Journal, "verdict", lambda self, name: Verdict.HUNG if name == step else None
+    )
+    config = read_manifest(out).config.to_dict()
+    with pytest.raises(MachineError, match=r"1_box_a: .*passed its time limit"):
+        run_unit(WorkUnit(out=str(out), header=header, config=config, restartable=True))
 
 
 # Faults found on start

@@ -17,6 +17,7 @@ from drakegrasp.runtime.journal import (
     HUNG_DEATHS,
     NATIVE_DEATHS,
     NO_JOURNAL,
+    PREPARE_DEATHS,
     SILENT_DEATHS,
     WALL_FACTOR,
     Verdict,
@@ -216,10 +217,22 @@ def test_random_kills_convict_nobody(seed: int) -> None:
         assert not any(history.verdict(step) for step in history.deaths)
 
 
-def test_unit_that_dies_for_nothing_is_given_up(tmp_path: Path) -> None:
-    """As when there is not even the memory to build its scene: no attempt is at fault."""
+def test_unit_that_dies_for_nothing_is_given_up() -> None:
+    """Before its first step no step is at fault."""
     history = _History()
     for _ in range(GIVE_UP_DEATHS):
-        history.add("build", 0, b"")
-        assert history.verdict("build") is None
+        history.add("start", 0, b"")
+        assert history.verdict("start") is None
     assert history.crash_loop == GIVE_UP_DEATHS
+
+
+@pytest.mark.parametrize(
+    ("step", "deaths"), [("prepare", PREPARE_DEATHS), ("build", SILENT_DEATHS)]
+)
+def test_vanishing_counts_in_every_step(step: str, deaths: int) -> None:
+    """As when there is not the memory to prepare a mesh, or to build its scene."""
+    history = _History()
+    for _ in range(deaths):
+        assert history.verdict(step) is None
+        history.add(step, 0, b"")
+    assert history.verdict(step) is Verdict.VANISHED
