@@ -121,8 +121,20 @@ workers_option = click.option(
     metavar="N",
     help="Processes on this machine.  [default: one per core]",
 )
+
+
+def _address(context: click.Context, parameter: click.Parameter, text: str | None) -> str | None:
+    """Refuse an empty address, as of a variable that is not set."""
+    if text is not None and not text.strip():
+        raise click.UsageError(f"--scheduler must be an address like tcp://host:8786, got {text!r}")
+    return text
+
+
 scheduler_option = click.option(
-    "--scheduler", metavar="ADDRESS", help="Use the running Dask scheduler at this address."
+    "--scheduler",
+    metavar="ADDRESS",
+    callback=_address,
+    help="Use the running Dask scheduler at this address.",
 )
 scheduler_file_option = click.option(
     "--scheduler-file",

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import numpy as np
 import pytest
 import trimesh
 from click.testing import CliRunner, Result
@@ -231,10 +230,10 @@ def test_empty_address_of_a_scheduler_is_refused(
     tmp_path: Path, address: str, command: str
 ) -> None:
     trimesh.creation.box([0.06, 0.05, 0.12]).export(tmp_path / "1_box.obj")
-    np.save(tmp_path / "grasps.npy", np.tile(np.eye(3)[[0, 1, 0, 1, 0, 1]].ravel(), (9, 1)))
+    (tmp_path / "grasps.csv").touch()
     arguments = {
         "build": ["--objects", tmp_path, "--out", tmp_path / "out"],
-        "verify": [tmp_path / "grasps.npy", "--object", tmp_path / "1_box.obj"],
+        "verify": [tmp_path / "grasps.csv", "--object", tmp_path / "1_box.obj"],
     }
     result = run(command, *arguments[command], "--scheduler", address)
     assert result.exit_code == 2
