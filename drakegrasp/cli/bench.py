@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from drakegrasp.build.request import BUILTIN
+from drakegrasp.cli.errors import say
 from drakegrasp.cli.options import (
     builtin_overrides,
     manifest_option,
@@ -17,7 +18,6 @@ from drakegrasp.cli.options import (
     set_option,
     units_option,
 )
-from drakegrasp.cli.output import say
 
 
 @click.command()

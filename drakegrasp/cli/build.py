@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from drakegrasp.cli.errors import say
 from drakegrasp.cli.options import (
     build_options,
     out_argument,
@@ -18,7 +19,6 @@ from drakegrasp.cli.options import (
     tls_options,
     workers_option,
 )
-from drakegrasp.cli.output import say
 
 if TYPE_CHECKING:
     from drakegrasp.build.pipeline import BuildReport

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
+from drakegrasp.cli.errors import say
 from drakegrasp.cli.options import out_argument
-from drakegrasp.cli.output import say
 
 #: The formats as the help lists them; loading them would take longer than printing the help.
 FORMATS = ("hub", "original", "dexgraspbench", "glb")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
-    from drakegrasp.cli.output import say
+    from drakegrasp.cli.errors import say
 from drakegrasp.commissioning.finding import Finding
 from drakegrasp.errors import printable
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
+from drakegrasp.cli.errors import say
 from drakegrasp.cli.options import out_argument
-from drakegrasp.cli.output import say
 
 #: Port without --port; the same every time, so that a tunnel to another machine can stay.
 PORT = 8321

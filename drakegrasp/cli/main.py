@@ -16,6 +16,7 @@ import click
 from drakegrasp.cli.audit import audit
 from drakegrasp.cli.bench import bench
 from drakegrasp.cli.build import assemble, build, stats
+from drakegrasp.cli.errors import say
 from drakegrasp.cli.export import export
 from drakegrasp.cli.group import main
 from drakegrasp.cli.hand import hand
@@ -28,7 +29,6 @@ from drakegrasp.cli.options import (
     per_class_option,
     tidied,
 )
-from drakegrasp.cli.output import say
 from drakegrasp.cli.verify import verify
 from drakegrasp.runtime.allocator import restart_with_jemalloc
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
+from drakegrasp.cli.errors import say
 from drakegrasp.cli.options import manifest_option, units_option
-from drakegrasp.cli.output import say
 
 
 @click.command()

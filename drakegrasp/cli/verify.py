@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from drakegrasp.cli.errors import say
 from drakegrasp.cli.options import (
     scheduler_file_option,
     scheduler_option,
     set_option,
     workers_option,
 )
-from drakegrasp.cli.output import say
 
 if TYPE_CHECKING:
     from drakegrasp.verification.result import Verification
