@@ -89,6 +89,16 @@ invariant, not every changed bit of an image. `drakegrasp assemble` makes them a
 shards; a build does so by itself if they are not of the present shards and manifest. A list of
 rejected trials (`assemble --reject`) is kept in the manifest until the next `assemble`.
 
+The three files and the manifest are replaced together: while `replacement.json` is in the directory
+they are of two states, and every reader refuses them. The next command with OUT completes this.
+
+## A stranger's dataset
+
+A dataset may come from anywhere. No link in its directory is followed when something is written or
+deleted. An HDF5 file that has soft or external links, or values in another file, is refused. Names
+of objects are names: printable, without slashes. Control characters reach no terminal, log or page.
+
+
 ## Missing values
 
 The two data files hold no NaN. In `trials.hdf5` a value that does not exist for a row is NaN
