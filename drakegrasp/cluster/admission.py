@@ -199,6 +199,8 @@ def _rendering_hosts(client: Client) -> frozenset[str]:
     addresses: dict[str, list[str]] = {}
     for address, host in client.run(socket.gethostname).items():
         addresses.setdefault(host, []).append(address)
+    if not addresses:
+        return frozenset()  # those that join are asked then
     found = client.run(_image_fault, workers=[workers[0] for workers in addresses.values()])
     faults = {host: found.get(workers[0]) for host, workers in addresses.items()}
 

@@ -98,7 +98,6 @@ A dataset may come from anywhere. No link in its directory is followed when some
 deleted. An HDF5 file that has soft or external links, or values in another file, is refused. Names
 of objects are names: printable, without slashes. Control characters reach no terminal, log or page.
 
-
 ## Missing values
 
 The two data files hold no NaN. In `trials.hdf5` a value that does not exist for a row is NaN
