@@ -16,6 +16,7 @@ import numpy.typing as npt
 from drakegrasp.build.pipeline import BuildReport, build_locked
 from drakegrasp.build.request import BUILTIN
 from drakegrasp.cluster.admission import admitted_workers
+from drakegrasp.cluster.certificates import security_of
 from drakegrasp.cluster.connect import connect, dashboard_line, has_dashboard
 from drakegrasp.cluster.executor import RESUBMISSIONS, DaskExecutor
 from drakegrasp.config import Config, load_config
@@ -61,6 +62,7 @@ def build_dataset(
     workers: int | None = None,
     scheduler: str | None = None,
     scheduler_file: str | Path | None = None,
+    tls_files: tuple[Path, Path, Path] | None = None,
     show: bool = True,
 ) -> BuildReport:
     """Build the dataset of a directory of meshes; the same as `drakegrasp build`.
@@ -77,11 +79,12 @@ def build_dataset(
         workers: Processes on this machine; one per core if None.
         scheduler: Address of a running Dask scheduler to use instead.
         scheduler_file: Its JSON file, instead of the address.
+        tls_files: To encrypt: certificate authority, certificate and private key (PEM).
         show: Whether to show progress on standard error.
 
     Raises:
         MeshError: If there is no mesh.
-        ConfigError: If both workers and a scheduler are given.
+        ConfigError: If both workers and a scheduler are given, or the address is empty.
         DataError: If `out` cannot be used, another process builds there, or no mesh can be
             simulated.
         MachineError: If there is no scheduler, the workers cannot do the work, or no room is
@@ -91,7 +94,8 @@ def build_dataset(
     out, config = Path(out).absolute(), config or load_config()
     drive_of(load_hand(config.hand), config.lift)
     sources = find_sources(objects, units, manifest)
-    cluster = _announced(connect(workers, scheduler, scheduler_file), show)
+    security = None if tls_files is None else security_of(tls_files)
+    cluster = _announced(connect(workers, scheduler, scheduler_file, security=security), show)
     return build_on(cluster, sources, out, config, show=show)
 
 
@@ -348,6 +352,8 @@ def _refuse_workers(
     Raises:
         ConfigError: If so.
     """
+    if scheduler is not None and not scheduler.strip():
+        raise ConfigError(f"scheduler must be an address like tcp://host:8786, got {scheduler!r}")
     if workers is not None and (scheduler or scheduler_file):
         raise ConfigError("workers must not be given with a scheduler, which has its own")
     if workers is not None and workers < 1:

@@ -27,6 +27,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from drakegrasp.errors import ConfigError, one_line
+from drakegrasp.yaml_text import parse_yaml
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -312,7 +313,7 @@ class Config(_Section):
     hand: str = "barrett"  # a hand in drakegrasp/models, or a path to a hand's YAML
     seed: Annotated[int, Field(ge=0)] = 0
     unit_candidates: Count = 50  # candidates in a work unit
-    attempt_seconds: Positive = 60.0  # [s] of wall clock before an attempt is a `timeout`
+    attempt_seconds: Positive = 60.0  # [s] of computing (CPU time) before an attempt is a `timeout`
     objects: ObjectConfig = ObjectConfig()
     builtin: BuiltinConfig = BuiltinConfig()
     physics: PhysicsConfig = PhysicsConfig()
@@ -435,7 +436,7 @@ def _read_source(source: str | Path) -> dict[str, Any]:
 
     # The text must be a YAML mapping; an empty file is one without keys.
     try:
-        tree = yaml.safe_load(text)
+        tree = parse_yaml(text)
     except yaml.YAMLError as error:
         raise ConfigError(
             f"{name}: must be YAML, got text that is not ({one_line(error)})"
@@ -467,7 +468,7 @@ def _apply_override(tree: dict[str, Any], text: str) -> None:
             raise ConfigError(f"{path}: {key} must be a section, got the value {child!r}")
         node = child
     try:
-        node[keys[-1]] = yaml.safe_load(value)
+        node[keys[-1]] = parse_yaml(value)
     except yaml.YAMLError:
         raise ConfigError(f"{path}: must be a YAML value, got {value!r}") from None
 

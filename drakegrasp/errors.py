@@ -13,7 +13,8 @@
 
 Failures of the physics are not here: they are values, see `drakegrasp.outcomes`.
 Messages about an argument follow one pattern: which argument, what it must be, what it was.
-`first_line` and `one_line` quote errors of other libraries in our messages.
+`first_line` and `one_line` quote errors of other libraries in our messages; `printable` makes
+texts of strangers safe to show.
 """
 
 from __future__ import annotations
@@ -60,6 +61,13 @@ class DiskFullError(MachineError):
 
 class BlankImageError(MachineError):
     """OpenGL rendered a blank image, which must never become data."""
+
+
+def printable(text: str) -> str:
+    r"""Return a text whose control characters are shown as codes, e.g. \x1b, and do nothing."""
+    return "".join(
+        c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text
+    )
 
 
 def first_line(error: BaseException) -> str:

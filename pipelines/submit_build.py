@@ -25,11 +25,16 @@ from distributed import Client
 from drakegrasp.api import build_on, find_sources
 from drakegrasp.cli.build import print_plan, print_report
 from drakegrasp.cli.errors import OneCommand
-from drakegrasp.cli.options import build_options, parse_request, times_option
+from drakegrasp.cli.options import (
+    build_options,
+    parse_request,
+    times_option,
+    tls_files,
+    tls_options,
+)
 from drakegrasp.cluster.connect import dashboard_line
 from drakegrasp.cluster.launch import start_cluster
 from drakegrasp.cluster.request import KINDS, ClusterRequest, describe, worker_count
-from drakegrasp.errors import ConfigError
 
 
 @click.command(
@@ -59,21 +64,7 @@ from drakegrasp.errors import ConfigError
 )
 @click.option("--host", metavar="ADDRESS", help="Address on which the scheduler listens, instead.")
 @click.option("--tls", is_flag=True, help="Encrypt, with certificates made for this run.")
-@click.option(
-    "--tls-ca-file",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="Encrypt, with your own certificate authority (PEM); needs the next two options.",
-)
-@click.option(
-    "--tls-cert",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="Certificate of client, scheduler and workers, signed by that authority.",
-)
-@click.option(
-    "--tls-key",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="The certificate's private key.",
-)
+@tls_options
 @times_option
 @click.option("--dry-run", is_flag=True, help="Only print what would run.")
 def main(
@@ -105,7 +96,7 @@ def main(
         host=host,
         interface=interface,
         tls=tls,
-        tls_files=_tls_files(tls_ca_file, tls_cert, tls_key),
+        tls_files=tls_files(tls_ca_file, tls_cert, tls_key),
     )
 
     # Say what will run before anything starts.
@@ -137,15 +128,6 @@ def _count(cluster: ClusterRequest, out: Path) -> int | None:
         return worker_count(cluster)
     with start_cluster(cluster, out) as client:
         return max(1, len(client.nthreads()))
-
-
-def _tls_files(*paths: Path | None) -> tuple[Path, Path, Path] | None:
-    match paths:
-        case (None, None, None):
-            return None
-        case (Path() as ca, Path() as cert, Path() as key):
-            return ca, cert, key
-    raise ConfigError("--tls-ca-file, --tls-cert and --tls-key must be given together")
 
 
 if __name__ == "__main__":

@@ -17,11 +17,11 @@ from pathlib import Path
 from statistics import NormalDist
 from typing import Any, Literal, TypeVar, get_args
 
-import h5py
 import numpy as np
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.filters import Removal
+from drakegrasp.dataset.hdf5 import open_hdf5, read_names
 from drakegrasp.dataset.manifest import installed_versions, read_manifest
 from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.prepared_objects import load_prepared
@@ -181,9 +181,9 @@ def _read_lifts(out: Path) -> list[StoredLift]:
     """Return all lifts of a dataset, in the order of its rows: objects are together."""
     path = out / TRIALS_FILE
     try:
-        with h5py.File(path, "r") as file:
+        with open_hdf5(path) as file:
             trials, successes = file["trials"], file["successes"]
-            names = [name.decode() for name in file["objects/name"][:]]
+            names = read_names(file["objects/name"])
             objects, outcomes = trials["object"][:], trials["outcome"][:]
             X_OG, spreads = trials["X_OG"][:], trials["spread"][:]
             materials = {f.name: trials[f.name][:] for f in fields(Materials)}

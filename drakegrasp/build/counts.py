@@ -16,6 +16,11 @@ from drakegrasp.runtime.progress import Report
 
 #: A line that lists many things names this many of them.
 NAMED = 10
+#: Outcomes of attempts that the machine, or an error of the simulator, ended.
+ENDED = (Outcome.CRASHED, Outcome.TIMEOUT)
+#: Share of an object's attempts that may end so, and a number that always may. Of the millions of
+#: attempts behind the benchmarks none did.
+ENDED_SHARE, FEW_ENDED = 0.02, 10
 
 
 class Counts:
@@ -51,6 +56,10 @@ class Counts:
         self._outcomes: Counter[Outcome] = Counter()
         self._reused_attempts = 0
 
+        # By object: all attempts, and those that the machine ended and not the physics.
+        self._attempts: Counter[str] = Counter()
+        self._ended: Counter[str] = Counter()
+
         # For `max_grasps`, by object: grasps before the first gap, where it is, and those beyond.
         self._max_grasps = manifest.config.max_grasps
         self._unit_candidates = manifest.config.unit_candidates
@@ -69,10 +78,25 @@ class Counts:
     ) -> None:
         """Count the attempts of a unit that is done, now or before (`reused`)."""
         self._outcomes.update(outcomes)
+        self._attempts[header.object_name] += sum(outcomes.values())
+        self._ended[header.object_name] += sum(outcomes.get(outcome, 0) for outcome in ENDED)
         self._reused_attempts += reused * sum(outcomes.values())
         if self._max_grasps is not None:
             self._close_gap(header, outcomes.get(Outcome.SUCCESS, 0))
         self.show()
+
+    def unexplained(self) -> list[str]:
+        """Return a line for each object of whose attempts no physics explains so many ends."""
+        lines = []
+        for name, ended in self._ended.items():
+            attempts = self._attempts[name]
+            if ended and (ended == attempts or ended >= max(FEW_ENDED, ENDED_SHARE * attempts)):
+                lines.append(
+                    f"{name}: {ended:,} of {attempts:,} attempts crashed or timed out, which is no "
+                    f"property of grasps. See `drakegrasp doctor`; remove shards/{name} there, and "
+                    "the same command tries them again"
+                )
+        return lines
 
     def show(self) -> None:
         """Report what is done, and by how many workers."""

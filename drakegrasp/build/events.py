@@ -13,6 +13,7 @@ from pathlib import Path
 from drakegrasp.build.work_unit import UnitSummary
 from drakegrasp.dataset.log import BuildLog, read_log
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry, RefusedMesh
+from drakegrasp.errors import printable
 from drakegrasp.runtime.blas import running_kernel
 from drakegrasp.runtime.executor import WorkerPool
 
@@ -70,7 +71,7 @@ class BuildEvents:
         """Log what the user should know before the simulation begins, and say it."""
         self._log("notice", text=text)
         if self._show:
-            sys.stderr.write(f"{text}\n")
+            sys.stderr.write(f"{printable(text)}\n")
 
     def workers_changed(self, joined: set[str], left: set[str]) -> None:
         """Log the addresses of workers that joined and of those that left."""

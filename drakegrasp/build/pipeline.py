@@ -56,6 +56,9 @@ class BuildReport:
         refused: Name and reason of each mesh that was refused.
         errors: Number of solver errors by message, of the units that were run now.
         notices: What the user should know: damage that was repaired, leftovers that were removed.
+        unexplained: A line for each object so many of whose attempts crashed or timed out that the
+            machine must be at fault; the dataset is complete, but its labels are wrong there.
+        assembled: Whether the files were written now, or were those of all shards already.
         assembly: What the files hold.
     """
 
@@ -66,6 +69,8 @@ class BuildReport:
     refused: tuple[RefusedMesh, ...]
     errors: dict[str, int]
     notices: tuple[str, ...]
+    unexplained: tuple[str, ...]
+    assembled: bool
     assembly: Assembly
 
 
@@ -154,7 +159,7 @@ def build_locked(
             return _build(sources, config, known, notices, job)
         except BaseException as error:
             # The log says why a build stopped; a second error would hide the first.
-            with suppress(OSError):
+            with suppress(OSError, DataError):
                 if (out / "manifest.json").exists():
                     events.stopped(error)
             raise
@@ -198,14 +203,18 @@ def _build(
         sweep_temporary(out)
 
     # Assemble the shards, unless the files are of these very shards already.
-    if counts.simulated or not is_assembled(out):
+    stale = not is_assembled(out, verify_shards=True)
+    if stale:
         with progress_bar("assemble", "shards", show=job.show) as report:
-            assemble_locked(out, progress=report)
+            assemble_locked(out, manifest, progress=report)
 
     # Report.
     if counts.damaged:
         damaged = _count(counts.named, "shard", counts.damaged)
         notices.append(f"{damaged}: damaged, and simulated again")
+    unexplained = tuple(counts.unexplained())
+    for line in unexplained:
+        job.events.warn(line)
     seconds = time.monotonic() - start
     job.events.finished(simulated=counts.simulated, reused=counts.reused, seconds=seconds)
     return BuildReport(
@@ -216,6 +225,8 @@ def _build(
         refused=manifest.refused,
         errors=dict(counts.errors),
         notices=tuple(notices),
+        unexplained=unexplained,
+        assembled=stale,
         assembly=summarise(out),
     )
 
@@ -287,11 +298,15 @@ def _prepare_all(
         job.events.mesh_done(entry)
         report(len(entries), len(sources), found=known)
 
+    # A rejected grasp of another mesh was another grasp.
     ordered = [entries[source.name] for source in sources]
+    before = {entry.name: entry.mesh_sha256 for entry in manifest.objects}
+    same = {entry.name for entry in ordered if before.get(entry.name) == entry.mesh_sha256}
     return replace(
         manifest,
         objects=tuple(entry for entry in ordered if isinstance(entry, ObjectEntry)),
         refused=tuple(entry for entry in ordered if isinstance(entry, RefusedMesh)),
+        rejected=tuple(key for key in manifest.rejected if key.object in same),
     )
 
 
@@ -300,7 +315,7 @@ def _known_entry(
 ) -> ObjectEntry | RefusedMesh | None:
     """Return a mesh's entry in the manifest if it still holds, else None."""
     for refusal in manifest.refused:
-        if (refusal.name, refusal.mesh_sha256) == (source.name, digest):
+        if (refusal.name, refusal.mesh_sha256) == (source.name, digest) and not refusal.again:
             return refusal
     for entry in manifest.objects:
         known = (entry.name, entry.class_name, entry.mesh_sha256)

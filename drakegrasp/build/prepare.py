@@ -21,11 +21,11 @@ from drakegrasp.runtime.blas import one_thread
 from drakegrasp.runtime.environment import release_memory
 from drakegrasp.runtime.fault_injection import inject_fault
 from drakegrasp.runtime.files import disk_full_named
-from drakegrasp.runtime.journal import GIVE_UP_DEATHS, Journal, open_journal
+from drakegrasp.runtime.journal import GIVE_UP_DEATHS, PREPARE, Journal, Verdict, open_journal
 from drakegrasp.simulation.candidates import sample_candidates
 from drakegrasp.simulation.settle import settle
 
-#: Wall clock after which preparing a mesh hangs [s].
+#: Computing time after which preparing a mesh hangs [s].
 PREPARE_SECONDS = 1800.0
 
 
@@ -94,15 +94,17 @@ def _entry_there(task: PrepareTask, config: Config) -> ObjectEntry | None:
 
 def _prepared_or_refused(task: PrepareTask, journal: Journal) -> ObjectEntry | RefusedMesh:
     name = task.source.name
-    verdict = journal.verdict("prepare")
+    verdict = journal.verdict(PREPARE)
     if verdict is not None:
-        return _refused(task, f"{name}: preparing it {verdict.value}")
+        # More memory may help, so the next build tries again.
+        reason = f"{name}: preparing it {verdict.value}"
+        return _refused(task, reason, again=verdict is Verdict.VANISHED)
     if journal.in_crash_loop:
         raise MachineError(
             f"{name}: the worker died {GIVE_UP_DEATHS} times in a row while preparing it; is "
             "there enough memory? The same command goes on from here"
         )
-    with journal.step("prepare", PREPARE_SECONDS):
+    with journal.step(PREPARE, PREPARE_SECONDS):
         inject_fault(name)
         return _prepared_entry(task)
 
@@ -121,8 +123,9 @@ def _prepared_entry(task: PrepareTask) -> ObjectEntry | RefusedMesh:
     return prepared.entry()
 
 
-def _refused(task: PrepareTask, reason: str) -> RefusedMesh:
-    return RefusedMesh(name=task.source.name, mesh_sha256=task.mesh_sha256, reason=reason)
+def _refused(task: PrepareTask, reason: str, *, again: bool = False) -> RefusedMesh:
+    name, digest = task.source.name, task.mesh_sha256
+    return RefusedMesh(name=name, mesh_sha256=digest, reason=reason, again=again)
 
 
 def prepare(source: MeshSource, config: Config) -> PreparedObject:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from drakegrasp.build.attempts import TrialSetup, measure_contacts, try_attempt
 from drakegrasp.build.columns import trial_rows
 from drakegrasp.build.work_unit import unit_attempts
+from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.manifest import Manifest, installed_versions, read_manifest
 from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
@@ -135,7 +135,7 @@ def _stored_trial(out: Path, trial_id: int) -> _StoredTrial:
 def _stored_row(out: Path, trial_id: int) -> tuple[dict[str, np.ndarray], str]:
     path = out / TRIALS_FILE
     try:
-        with h5py.File(path, "r") as file:
+        with open_hdf5(path) as file:
             count = len(file["trials/outcome"])
             if not 0 <= trial_id < count:
                 raise DataError(f"{path}: trial must be 0 to {count - 1}, got {trial_id}")

@@ -53,13 +53,14 @@ from drakegrasp.simulation.trial import TrialRecord
 
 #: An attempt that takes this many times its wall-clock limit hangs: it never checks the clock.
 HANG_FACTOR = 1.5
-#: Wall clock after which any other step of a unit hangs [s].
+#: Computing time after which any other step of a unit hangs [s].
 STAGE_SECONDS = 600.0
 #: A certificate hangs when it takes this many times the limit of all its simulations.
 CERTIFY_FACTOR = 2.0
 #: What each step of a unit that is no attempt does, for error messages.
 _STEPS = {
     "build": "building its scene",
+    "predict": "predicting its attempts",
     "look": "rendering its images",
     "measure": "measuring its contacts",
     "write": "writing its shard",
@@ -147,7 +148,7 @@ def _run_experiment(unit: WorkUnit, journal: Journal) -> UnitSummary:
 
     # Try each attempt: what geometry already decides is not simulated.
     with timed(seconds, "try"):
-        predictions = predict_attempts(setup, attempts)
+        predictions = _predict_all(setup, attempts, journal)
         records = _try_all(setup, attempts, predictions, journal)
 
     # Measure how the contacts of each lift lie on the object's true surface.
@@ -236,6 +237,19 @@ def _build_setup(out: Path, header: ShardHeader, config: Config) -> TrialSetup:
     # A failed assertion within Drake arrives as SystemExit, which would end the worker.
     except SystemExit as error:
         raise DataError(f"{header.object_name}: Drake cannot build its scene: {error}") from None
+
+
+def _predict_all(
+    setup: TrialSetup, attempts: Sequence[Attempt], journal: Journal
+) -> list[Prediction | None]:
+    """Return what geometry says of attempts; the first time it measures the object's distances.
+
+    Raises:
+        MachineError: If this ended the process before.
+    """
+    _refuse_failing(journal, "predict", setup.prepared.model.name)
+    with journal.step("predict", STAGE_SECONDS):
+        return list(predict_attempts(setup, attempts))
 
 
 def _try_all(

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import click
 
+from drakegrasp.cli.errors import say
 from drakegrasp.cli.options import manifest_option, units_option
 
 
@@ -45,7 +46,7 @@ def audit(
         rows = audit_meshes(mesh_dir, units=units, manifest=manifest, progress=progress)
     console = make_console()
     console.print(audit_table(rows, compact=console.width < ROOMY))
-    click.echo(audit_line(rows))
+    say(audit_line(rows))
 
     if json_file is not None:
         text = json.dumps([row.to_json() for row in rows], indent=1, ensure_ascii=False)

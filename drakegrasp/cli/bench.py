@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from drakegrasp.build.request import BUILTIN
+from drakegrasp.cli.errors import say
 from drakegrasp.cli.options import (
     builtin_overrides,
     manifest_option,
@@ -152,17 +153,17 @@ def bench(
 
     print_table(bench_table(report))
     for line in bench_lines(report):
-        click.echo(line)
+        say(line)
     if fidelity:
         print_table(fidelity_table(report["all"]["fidelity"]))
-        click.echo(drive_line(report["all"]["drive"]))
+        say(drive_line(report["all"]["drive"]))
     if earlier is not None:
         report["ratio"] = measuring.compare(report, earlier)
         for key, ratio in report["ratio"].items():
             times = "none to compare with" if ratio is None else f"{ratio:.2f} times that"
-            click.echo(f"{key.replace('_', ' ')}: {times} of {compare}")
+            say(f"{key.replace('_', ' ')}: {times} of {compare}")
     out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    click.echo(str(out))
+    say(str(out))
 
 
 def _cross_check(dataset: Path, count: int, out: Path, quiet: bool) -> None:
@@ -178,9 +179,9 @@ def _cross_check(dataset: Path, count: int, out: Path, quiet: bool) -> None:
         report = cross_check(dataset, count, progress=progress)
     print_table(cross_check_table(report["groups"]))
     for line in cross_check_lines(report):
-        click.echo(line)
+        say(line)
     out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    click.echo(str(out))
+    say(str(out))
 
 
 def _refuse_other_options(context: click.Context) -> None:

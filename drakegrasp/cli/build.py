@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from drakegrasp.cli.errors import say
 from drakegrasp.cli.options import (
     build_options,
     out_argument,
@@ -14,6 +15,8 @@ from drakegrasp.cli.options import (
     scheduler_file_option,
     scheduler_option,
     times_option,
+    tls_files,
+    tls_options,
     workers_option,
 )
 
@@ -27,6 +30,7 @@ if TYPE_CHECKING:
 @workers_option
 @scheduler_option
 @scheduler_file_option
+@tls_options
 @click.option(
     "--plan", is_flag=True, help="Only print the hours and bytes that the build would take."
 )
@@ -35,6 +39,9 @@ def build(
     workers: int | None,
     scheduler: str | None,
     scheduler_file: Path | None,
+    tls_ca_file: Path | None,
+    tls_cert: Path | None,
+    tls_key: Path | None,
     plan: bool,
     times: Path | None,
     **options: Any,
@@ -47,6 +54,7 @@ def build(
     from drakegrasp.api import build_dataset
 
     request = parse_request(**options)
+    files = tls_files(tls_ca_file, tls_cert, tls_key)
     if plan:
         print_plan(request, workers, times)
         return
@@ -59,6 +67,7 @@ def build(
         workers=workers,
         scheduler=scheduler,
         scheduler_file=scheduler_file,
+        tls_files=files,
         show=request.show,
     )
     print_report(report)
@@ -87,15 +96,12 @@ def assemble(out: Path, reject: Path | None, overrides: tuple[str, ...]) -> None
     The command writes trials.hdf5 and both data files again from the shards in OUT.
     """
     from drakegrasp.dataset.assemble import assemble as assemble_files
-    from drakegrasp.dataset.manifest import change_postprocessing
     from drakegrasp.dataset.rejections import read_rejected
     from drakegrasp.runtime.progress import progress_bar
 
     rejected = () if reject is None else read_rejected(reject)
-    if overrides:
-        change_postprocessing(out, overrides)
     with progress_bar("assemble", "shards") as progress:
-        assemble_files(out, rejected=rejected, progress=progress)
+        assemble_files(out, overrides=overrides, rejected=rejected, progress=progress)
     print_stats(out)
 
 
@@ -136,7 +142,7 @@ def print_stats(out: Path) -> None:
     if unfinished is None:
         console.print(split_table(count_splits(out)))
     else:
-        click.echo(f"{out}: {unfinished_line(unfinished)}")
+        say(f"{out}: {unfinished_line(unfinished)}")
 
 
 def print_plan(request: BuildRequest, workers: int | None, times: Path | None) -> None:
@@ -146,22 +152,30 @@ def print_plan(request: BuildRequest, workers: int | None, times: Path | None) -
 
     logged = logged_times(request.out, request.config)
     measured = logged if times is None else read_times(times)
-    click.echo("\n".join(plan_lines(plan_request(request, workers, measured))))
+    say("\n".join(plan_lines(plan_request(request, workers, measured))))
 
 
 def print_report(report: BuildReport) -> None:
-    """Print what a build did, and the paths of its files."""
+    """Print what a build did, and the paths of its files.
+
+    Raises:
+        click.exceptions.Exit: With code 1 if the machine must have spoiled labels; a line on
+            standard error has said so.
+    """
     print_stats(report.out)
     if report.simulated:
         reused = f" ({report.reused} had been done before)" if report.reused else ""
-        click.echo(f"{report.simulated} work units simulated{reused}")
+        say(f"{report.simulated} work units simulated{reused}")
     else:
-        click.echo(f"all {report.reused} work units had been done before: nothing was simulated")
+        again = "; the files were written again" * report.assembled
+        say(f"all {report.reused} work units had been done before: nothing was simulated{again}")
     for message, count in report.errors.items():
-        click.echo(f"solver error in {count} attempts: {message}")
+        say(f"solver error in {count} attempts: {message}")
     for notice in report.notices:
-        click.echo(notice)
+        say(notice)
     for entry in report.refused:
-        click.echo(f"refused: {entry.name}: {entry.reason}")
+        say(f"refused: {entry.name}: {entry.reason}")
     for name in ("grasping_oto.hdf5", "grasping_otm.hdf5", "trials.hdf5"):
-        click.echo(str(report.out / name))
+        say(str(report.out / name))
+    if report.unexplained:
+        raise click.exceptions.Exit(1)

@@ -1,8 +1,7 @@
 """Checks whether this machine meets every need of drakegrasp, and says how to meet it.
 
 This module imports no library that might be missing: a library that cannot be loaded is a
-finding, not an error. A child process renders the test image, because a broken OpenGL kills
-its process, and because the first thread that renders in a process owns its GL context.
+finding, not an error.
 """
 
 from __future__ import annotations
@@ -12,8 +11,6 @@ import os
 import platform
 import re
 import shutil
-import signal
-import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass
@@ -21,6 +18,7 @@ from importlib import metadata
 from pathlib import Path
 
 from drakegrasp.runtime.environment import available_cores
+from drakegrasp.vision.probe_image import probe_image
 
 PYTHON = (3, 11)
 #: Drake's wheels are built for this C library (manylinux_2_34).
@@ -34,8 +32,6 @@ DRAKE_REQUIREMENT = "drake>=1.51.1,!=1.52.0"
 EGL_LIBRARY = "libEGL.so.1"
 EGL_PACKAGES = "apt-get install libegl1 libgl1-mesa-dri"
 JEMALLOC_PACKAGE = "apt-get install libjemalloc2"
-#: Time for the test image [s]: the first one may compile shaders on a slow file system.
-IMAGE_SECONDS = 60.0
 #: Room for about 3,500 successes: two images of 128 x 128 pixels of 17 bytes, uncompressed [B].
 FREE_BYTES = 2e9
 #: Memory of a worker, which holds the scenes of a few objects [B].
@@ -46,11 +42,6 @@ CGROUP_LIMITS = (
     Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
 )
 MEMINFO = Path("/proc/meminfo")
-
-#: The test box's edge and its front's distance from the camera [m].
-BOX_EDGE, BOX_DISTANCE = 0.1, 0.25
-#: What the child process runs; its last line of output is `object pixels, expected pixels`.
-_CHILD = "from drakegrasp.cli.doctor import render_test_image; print(*render_test_image())"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,41 +143,10 @@ def check_egl() -> Finding:
 
 def check_image() -> Finding:
     """Return whether a child process can render a box."""
-    # The child imports from the same paths, but not from its working directory.
-    paths = os.pathsep.join(str(Path(p).resolve()) for p in sys.path if p)
-    try:
-        child = subprocess.run(
-            [sys.executable, "-P", "-c", _CHILD],
-            env={**os.environ, "PYTHONPATH": paths},
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=IMAGE_SECONDS,
-        )
-    except subprocess.TimeoutExpired:
-        return _bad_image(f"no image within {IMAGE_SECONDS:g} s")
-    except OSError as error:
-        return _bad_image(f"no child process: {error}")
-
-    # A signal, an error and unexpected output have remedies of their own.
-    if child.returncode < 0:
-        return _bad_image(f"the renderer crashed with {_signal_name(-child.returncode)}")
-    lines = (child.stderr if child.returncode else child.stdout).strip().splitlines()
-    last = lines[-1] if lines else "nothing"
-    if child.returncode:
-        missing = last.startswith("ModuleNotFoundError")
-        return _bad_image(last, f"pip install '{DRAKE_REQUIREMENT}' drakegrasp" if missing else "")
-    match = re.fullmatch(r"(\d+) (\d+)", last)
-    if match is None:
-        return _bad_image(f"the renderer must print two numbers, got {last!r}")
-
-    # An edge of the mask may be off by a pixel at either end.
-    seen, expected = int(match[1]), int(match[2])
-    what = f"{seen} pixels of a box that has {expected}"
-    if not 0.9 * expected <= seen <= 1.1 * expected:
-        return _bad_image(what if seen else f"blank image: {what}")
-    return Finding(name="test image", ok=True, what=what)
+    ok, what = probe_image()
+    missing = what.startswith("ModuleNotFoundError")
+    remedy = f"pip install '{DRAKE_REQUIREMENT}' drakegrasp" if missing else EGL_PACKAGES
+    return _finding("test image", ok, what, remedy)
 
 
 def check_writing(directory: Path) -> Finding:
@@ -235,51 +195,8 @@ def check_memory() -> Finding:
     )
 
 
-def render_test_image() -> tuple[int, int]:
-    """Render a box from above; return how many pixels show it, and how many should.
-
-    Call it in a process of its own: it needs Drake and may crash.
-    """
-    import numpy as np
-    import trimesh
-
-    from drakegrasp.config import CameraConfig
-    from drakegrasp.frames import make_pose
-    from drakegrasp.objects.model import ObjectModel
-    from drakegrasp.vision.camera import intrinsics
-    from drakegrasp.vision.rendering import build_renderer, render
-
-    # A cube of 1 kg.
-    config = CameraConfig()
-    box = trimesh.creation.box((BOX_EDGE,) * 3)
-    model = ObjectModel(
-        name="box",
-        class_name="box",
-        mesh_sha256="",
-        visual_vertices=box.vertices,
-        visual_faces=box.faces,
-        collision_vertices=box.vertices,
-        collision_faces=box.faces,
-        mass=1.0,
-        p_OOcm=np.zeros(3),
-        I_OOcm_O=np.eye(3) * BOX_EDGE**2 / 6.0,
-        collision_error=0.0,
-    )
-
-    # It stands on the table, and the camera looks straight down on it.
-    X_TO = make_pose(np.eye(3), [0.0, 0.0, BOX_EDGE / 2.0])
-    X_TC = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, BOX_EDGE + BOX_DISTANCE])
-    seen = render(build_renderer(model, config), X_TO, X_TC)
-    edge = intrinsics(config)[0, 0] * BOX_EDGE / BOX_DISTANCE
-    return int(seen.mask.sum()), round(edge**2)
-
-
 def _finding(name: str, ok: bool, what: str, remedy: str) -> Finding:
     return Finding(name=name, ok=ok, what=what, remedy="" if ok else remedy)
-
-
-def _bad_image(what: str, remedy: str = "") -> Finding:
-    return _finding("test image", False, what, remedy or EGL_PACKAGES)
 
 
 def _existing(directory: Path) -> Path:
@@ -305,13 +222,6 @@ def _numbers(version: str) -> tuple[int, ...]:
 
 def _dotted(version: tuple[int, ...]) -> str:
     return ".".join(map(str, version))
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
 
 
 def _memory() -> int | None:

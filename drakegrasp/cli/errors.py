@@ -1,4 +1,6 @@
-"""How commands end: every error is one line on standard error and an exit code.
+"""How commands speak and end: every error is one line on standard error and an exit code.
+
+What they print has no control characters, whatever names are in it.
 
 0 done, 1 the work failed, 2 wrong usage, 130 Ctrl-C, 143 SIGTERM.
 """
@@ -12,10 +14,27 @@ from typing import Any, NoReturn
 
 import click
 
-from drakegrasp.errors import ConfigError, DrakegraspError, GraspError, HandError, MeshError
+from drakegrasp.errors import (
+    ConfigError,
+    DrakegraspError,
+    GraspError,
+    HandError,
+    MeshError,
+    printable,
+)
 
 #: Errors in what the user asked for. All other errors are failures of the work.
 WRONG_USAGE = (ConfigError, GraspError, HandError, MeshError)
+
+
+def say(text: str, *, err: bool = False) -> None:
+    """Print a text; what would steer the terminal is shown as its code.
+
+    Args:
+        text: One line or more.
+        err: Whether to print to standard error.
+    """
+    click.echo("\n".join(map(printable, text.split("\n"))), err=err)
 
 
 class Commands(click.Group):
@@ -82,7 +101,7 @@ def one_line_errors(resumable: Callable[[], bool] = lambda: False) -> Iterator[N
 
 def _end(line: str, code: int) -> NoReturn:
     """Print a line and have click end the program; click's own errors take four lines."""
-    click.echo(line, err=True)
+    say(line, err=True)
     raise click.exceptions.Exit(code)
 
 

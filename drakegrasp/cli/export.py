@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from drakegrasp.cli.errors import say
 from drakegrasp.cli.options import out_argument
 
 #: The formats as the help lists them; loading them would take longer than printing the help.
@@ -43,4 +44,4 @@ def export(out: Path, directory: Path, form: str, licence: str, quiet: bool) -> 
 
     with progress_bar("export", "sample", show=not quiet) as progress:
         count = export_dataset(out, directory, form, licence=licence, progress=progress)  # type: ignore[arg-type]
-    click.echo(f"{count:,} samples in {directory}")
+    say(f"{count:,} samples in {directory}")

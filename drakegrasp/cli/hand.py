@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
-    from drakegrasp.commissioning.finding import Finding
+    from drakegrasp.cli.errors import say
+from drakegrasp.commissioning.finding import Finding
+from drakegrasp.errors import printable
 
 
 @click.group()
@@ -23,7 +25,7 @@ def list_hands() -> None:
     from drakegrasp.hand.files import hand_names
 
     for name in hand_names():
-        click.echo(name)
+        say(name)
 
 
 @hand.command("check")
@@ -52,11 +54,11 @@ def check_hand_file(hand_file: str, picture: Path | None) -> None:
 
         loaded = load_hand(hand_file)
         picture_hand(loaded, picture, across=across_angle(loaded))
-        click.echo(str(picture))
+        say(str(picture))
     if not all(finding.ok for finding in findings):
         sys.exit(1)
 
 
 def _print(finding: Finding) -> None:
     mark = click.style("ok  ", fg="green") if finding.ok else click.style("FAIL", fg="red")
-    click.echo(f"{mark}  {finding.name:<20} {finding.text}")
+    click.echo(f"{mark}  {finding.name:<20} {printable(finding.text)}")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from drakegrasp.cli.errors import say
 from drakegrasp.cli.options import out_argument
 
 #: Port without --port; the same every time, so that a tunnel to another machine can stay.
@@ -52,10 +53,10 @@ def inspect_(out: Path, port: int, folder: Path | None, no_browser: bool) -> Non
         ) from None
 
     if folder is None:
-        serve(out, port=port, browser=not no_browser, announce=click.echo)
+        serve(out, port=port, browser=not no_browser, announce=say)
         return
     from drakegrasp.runtime.progress import progress_bar
 
     with progress_bar("inspect", "grasps") as progress:
         count = write_site(out, folder, progress=progress)
-    click.echo(f"{count:,} grasps in {folder / 'index.html'}")
+    say(f"{count:,} grasps in {folder / 'index.html'}")

@@ -16,6 +16,7 @@ import click
 from drakegrasp.cli.audit import audit
 from drakegrasp.cli.bench import bench
 from drakegrasp.cli.build import assemble, build, stats
+from drakegrasp.cli.errors import say
 from drakegrasp.cli.export import export
 from drakegrasp.cli.group import main
 from drakegrasp.cli.hand import hand
@@ -26,6 +27,7 @@ from drakegrasp.cli.options import (
     objects_seed_option,
     out_argument,
     per_class_option,
+    tidied,
 )
 from drakegrasp.cli.verify import verify
 from drakegrasp.runtime.allocator import restart_with_jemalloc
@@ -66,7 +68,7 @@ def list_objects() -> None:
 
     for item in CLASSES:
         sizes = ", ".join(f"{name} {span}" for name, span in item.parameters.items())
-        click.echo(f"{item.number:>2} {item.name:<15} {sizes}")
+        say(f"{item.number:>2} {item.name:<15} {sizes}")
 
 
 @objects.command("export")
@@ -86,11 +88,11 @@ def export_objects(directory: Path, per_class: int | None, objects_seed: int | N
     config = load_config(overrides=builtin_overrides(BUILTIN, per_class, objects_seed))
     with progress_bar("objects", "meshes") as progress:
         paths = export_builtin(directory, config=config.builtin, progress=progress)
-    click.echo(f"{len(paths)} meshes in {directory}")
+    say(f"{len(paths)} meshes in {directory}")
 
 
 @click.command()
-@click.argument("path", type=click.Path(path_type=Path), metavar="OUT|FILE")
+@click.argument("path", type=click.Path(path_type=Path), metavar="OUT|FILE", callback=tidied)
 def check(path: Path) -> None:
     """Check every invariant of a dataset.
 
@@ -103,8 +105,8 @@ def check(path: Path) -> None:
     with progress_bar("check", "steps") as progress:
         violations = check_dataset(path, progress=progress)
     for violation in violations:
-        click.echo(str(violation))
-    click.echo(f"{path}: {len(violations) or 'no'} broken invariants")
+        say(str(violation))
+    say(f"{path}: {len(violations) or 'no'} broken invariants")
     if violations:
         sys.exit(1)
 
@@ -127,18 +129,16 @@ def replay(out: Path, trial: int, html: Path | None) -> None:
 
     # Whatever differs is printed: values first, then versions, which may explain them.
     again = replay_trial(out, trial)
-    click.echo(
-        f"trial {trial} of {again.object_name}: was {again.recorded.label}, is {again.found.label}"
-    )
+    say(f"trial {trial} of {again.object_name}: was {again.recorded.label}, is {again.found.label}")
     for name, difference in again.differences.items():
         how = "is missing in one" if math.isnan(difference) else f"by up to {difference:.3g}"
-        click.echo(f"  {name} differs: {how}")
+        say(f"  {name} differs: {how}")
     for package, change in again.versions.items():
-        click.echo(f"  {package}: {change}")
+        say(f"  {package}: {change}")
 
     if html is not None:
         record_trial(out, trial, html)
-        click.echo(str(html))
+        say(str(html))
     if not again.same:
         sys.exit(1)
 

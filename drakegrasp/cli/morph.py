@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from drakegrasp.cli.errors import say
 from drakegrasp.cli.options import manifest_option, units_option
 
 
@@ -58,8 +59,8 @@ def morph(
             progress=progress,
         )
     for reason in report.refused:
-        click.echo(f"no morphs of {reason}", err=True)
+        say(f"no morphs of {reason}", err=True)
     for name, count in report.crossing.items():
-        click.echo(f"{name} passes through itself in {count} faces, and so do its morphs", err=True)
+        say(f"{name} passes through itself in {count} faces, and so do its morphs", err=True)
     share = report.first_draws / report.morphs
-    click.echo(f"{report.morphs} morphs in {out}; {share:.0%} by the first draw")
+    say(f"{report.morphs} morphs in {out}; {share:.0%} by the first draw")

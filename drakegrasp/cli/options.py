@@ -103,15 +103,38 @@ _OPTIONS = (
 )
 
 
-out_argument = click.argument("out", type=click.Path(path_type=Path), metavar="OUT")
+def tidied(context: click.Context, parameter: click.Parameter, out: Path) -> Path:
+    """Put in order what a dead process left in a dataset, before a command looks at it."""
+    from drakegrasp.dataset.lock import tidy
+
+    if not context.resilient_parsing and out.is_dir():
+        tidy(out)
+    return out
+
+
+out_argument = click.argument(
+    "out", type=click.Path(path_type=Path), metavar="OUT", callback=tidied
+)
 workers_option = click.option(
     "--workers",
     type=int,
     metavar="N",
     help="Processes on this machine.  [default: one per core]",
 )
+
+
+def _address(context: click.Context, parameter: click.Parameter, text: str | None) -> str | None:
+    """Refuse an empty address, as of a variable that is not set."""
+    if text is not None and not text.strip():
+        raise click.UsageError(f"--scheduler must be an address like tcp://host:8786, got {text!r}")
+    return text
+
+
 scheduler_option = click.option(
-    "--scheduler", metavar="ADDRESS", help="Use the running Dask scheduler at this address."
+    "--scheduler",
+    metavar="ADDRESS",
+    callback=_address,
+    help="Use the running Dask scheduler at this address.",
 )
 scheduler_file_option = click.option(
     "--scheduler-file",
@@ -119,6 +142,47 @@ scheduler_file_option = click.option(
     metavar="FILE",
     help="Use the running Dask scheduler that wrote this file.",
 )
+_TLS_OPTIONS = (
+    click.option(
+        "--tls-ca-file",
+        type=click.Path(path_type=Path, exists=True, dir_okay=False),
+        metavar="FILE",
+        help="Encrypt, with your own certificate authority (PEM); needs the next two options.",
+    ),
+    click.option(
+        "--tls-cert",
+        type=click.Path(path_type=Path, exists=True, dir_okay=False),
+        metavar="FILE",
+        help="Certificate of client, scheduler and workers, signed by that authority.",
+    ),
+    click.option(
+        "--tls-key",
+        type=click.Path(path_type=Path, exists=True, dir_okay=False),
+        metavar="FILE",
+        help="The certificate's private key.",
+    ),
+)
+
+
+def tls_options(command: F) -> F:
+    """Give a command the files of TLS; it passes them on to `tls_files`."""
+    for option in reversed(_TLS_OPTIONS):
+        command = option(command)
+    return command
+
+
+def tls_files(*paths: Path | None) -> tuple[Path, Path, Path] | None:
+    """Return the authority, the certificate and its key, or None if none of them is given.
+
+    Raises:
+        click.UsageError: If only some are given.
+    """
+    match paths:
+        case (None, None, None):
+            return None
+        case (Path() as ca, Path() as cert, Path() as key):
+            return ca, cert, key
+    raise click.UsageError("--tls-ca-file, --tls-cert and --tls-key must be given together")
 
 
 def build_options(command: F) -> F:

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.statistics import Funnel, SplitCount, Unfinished
+from drakegrasp.errors import printable
 from drakegrasp.objects.audit import AuditRow
 from drakegrasp.outcomes import Outcome
 
@@ -75,7 +76,7 @@ def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
 
     for i, name in enumerate(funnel.names):
         outcomes, removals = funnel.outcomes[i].tolist(), funnel.removals[i].tolist()
-        table.add_row(escape(name), *row(outcomes, removals, int(funnel.candidates[i])))
+        table.add_row(_safe(name), *row(outcomes, removals, int(funnel.candidates[i])))
     table.add_section()
     outcomes, removals = funnel.outcomes.sum(0).tolist(), funnel.removals.sum(0).tolist()
     table.add_row("all", *row(outcomes, removals, int(funnel.candidates.sum())))
@@ -97,7 +98,7 @@ def hold_table(funnel: Funnel) -> Table:
         funnel.stable,
         funnel.removals[:, Removal.KEPT],
     )
-    rows = [(escape(name), [int(c[i]) for c in columns]) for i, name in enumerate(funnel.names)]
+    rows = [(_safe(name), [int(c[i]) for c in columns]) for i, name in enumerate(funnel.names)]
     rows.append(("all", [int(c.sum()) for c in columns]))
     for i, (name, (attempts, held, precision, stable, samples)) in enumerate(rows):
         if i == len(rows) - 1:
@@ -161,7 +162,7 @@ def audit_table(rows: Sequence[AuditRow], *, compact: bool = False) -> Table:
     for row in rows:
         size = "-" if row.extents is None else "x".join(f"{1e3 * e:.0f}" for e in row.extents)
         cells = [
-            escape(row.name),
+            _safe(row.name),
             f"[{colours[row.status]}]{row.status}[/]",
             "-" if row.faces is None else f"{row.faces:,}",
             size,
@@ -175,8 +176,13 @@ def audit_table(rows: Sequence[AuditRow], *, compact: bool = False) -> Table:
                 "-" if row.memory is None else f"{row.memory / 1e6:.0f}",
             ]
         words = [*row.notes, *(f"! {text}" for text in row.warnings)]
-        table.add_row(*cells, escape("\n".join(words)))
+        table.add_row(*cells, "\n".join(map(_safe, words)))
     return table
+
+
+def _safe(text: str) -> str:
+    """Return a text that neither styles the table nor steers the terminal."""
+    return escape(printable(text))
 
 
 def audit_line(rows: Sequence[AuditRow]) -> str:
@@ -229,7 +235,7 @@ def bench_table(report: Mapping[str, Any]) -> Table:
         ]
         if with_mujoco:
             cells += [f"{mujoco['grasps_per_core_hour']:,.0f}", f"{ratio:.2f}" if ratio else "-"]
-        table.add_row(escape(name), *cells)
+        table.add_row(_safe(name), *cells)
 
     for rates in report["objects"]:
         row(rates["name"], rates)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from drakegrasp.cli.errors import say
 from drakegrasp.cli.options import (
     scheduler_file_option,
     scheduler_option,
@@ -143,10 +144,10 @@ def verify(
                 write_results(results, result_paths(out)[1], results[0].config)
     except BaseException:
         if out is not None and part_path(out).exists():
-            click.echo(f"{part_path(out)}: the verdicts so far", err=True)
+            say(f"{part_path(out)}: the verdicts so far", err=True)
         raise
 
     for path in () if out is None else result_paths(out):
-        click.echo(str(path))
+        say(str(path))
     if not quiet:
         make_console(stderr=True).print(verdict_table([result.outcome for result in results]))

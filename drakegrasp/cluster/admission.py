@@ -1,7 +1,8 @@
 """Which workers may do the work: checked at the start of a build, and when a worker joins later.
 
-In: a Dask client. Out: workers that give the results of this machine. A worker with several
-threads, or with another version of Drake, drakegrasp or the hand, is refused: at the start with an
+In: a Dask client. Out: workers that give the results of this machine. A worker that cannot render a
+test image is closed. One with several threads, or with another version of Drake, drakegrasp or the
+hand, is refused: at the start with an
 error, later by closing it before its first task. All workers get the same BLAS kernel; one whose
 kernel cannot be set still works, with a line on standard error.
 """
@@ -9,6 +10,7 @@ kernel cannot be set still works, with a line on standard error.
 from __future__ import annotations
 
 import os
+import socket
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -16,16 +18,23 @@ from typing import Any
 
 from distributed import Client, Nanny, NannyPlugin, Scheduler, Worker, WorkerPlugin
 
+from drakegrasp.build.prepare import PREPARE_SECONDS
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import REQUIRED_VERSIONS, installed_versions
-from drakegrasp.errors import MachineError
+from drakegrasp.errors import MachineError, printable
 from drakegrasp.runtime import kernels
 from drakegrasp.runtime.blas import running_kernel
+from drakegrasp.runtime.journal import WALL_FACTOR
 from drakegrasp.runtime.kernels import KERNELS, agreed_kernel, common_kernel, supported_kernel
+from drakegrasp.vision.probe_image import probe_image
 
 #: Tasks that the scheduler gives to a worker, per thread: a task that waits behind another would
 #: be blamed, too, when that one kills the worker.
 SATURATION = 1.0
+#: Time without a sign of life after which the scheduler gives a worker up [s]: longer than the
+#: limits of every step (see `runtime.journal`). A step that holds the interpreter gives none, and
+#: its journal tells more than the scheduler knows. A lost connection is noticed at once.
+SILENCE_SECONDS = 2.0 * WALL_FACTOR * PREPARE_SECONDS
 #: Topic of the messages from workers that join later.
 _TOPIC = "drakegrasp-admission"
 _MAY_DIFFER = "last bits of simulated values may differ"
@@ -96,14 +105,23 @@ class Admission(WorkerPlugin):  # type: ignore[misc]
 
     name = "drakegrasp-admission"
 
-    def __init__(self, config: Config, kernel: str | None) -> None:
-        self._config, self._kernel = config, kernel
+    def __init__(self, config: Config, kernel: str | None, hosts: frozenset[str]) -> None:
+        """Know what is fit.
+
+        Args:
+            config: Of the build.
+            kernel: The BLAS kernel of the workers; None if they have none in common.
+            hosts: Names of the machines that are known to render.
+        """
+        self._config, self._kernel, self._hosts = config, kernel, hosts
         self._versions = installed_versions(config)
 
     def setup(self, worker: Worker) -> None:
         """Check and set up the worker; Dask calls this before it gives it any task."""
         os.environ.update(worker_environment())  # for a worker that was started by hand
         fault = unfitness(worker.state.nthreads, installed_versions(self._config), self._versions)
+        if fault is None and socket.gethostname() not in self._hosts:
+            fault = _image_fault()
         if fault is not None:
             worker.log_event(_TOPIC, f"not used: worker {worker.address}: {fault}")
             # Its nanny is closed, too: a new process would not be fitter.
@@ -128,7 +146,7 @@ def admitted_workers(client: Client, config: Config) -> Iterator[str | None]:
 
     Raises:
         MachineError: If a worker that is there has several threads, or another version of
-            drakegrasp, Drake or the hand.
+            drakegrasp, Drake or the hand, or none of them can render.
     """
     # Refuse what the user must change.
     versions = installed_versions(config)
@@ -138,12 +156,15 @@ def admitted_workers(client: Client, config: Config) -> Iterator[str | None]:
         if fault is not None:
             raise MachineError(f"worker {address}: {fault}")
 
+    # Do without machines that cannot render, if there are others.
+    hosts = _rendering_hosts(client)
+
     # Set what this program can change: for the workers that are there and for later ones.
     client.run_on_scheduler(_saturate)
     client.subscribe_topic(_TOPIC, _print_message)
     try:
         kernel = _set_kernel(client)
-        client.register_plugin(Admission(config, kernel))
+        client.register_plugin(Admission(config, kernel, hosts))
         yield kernel
     finally:
         # A scheduler of the user's lives on; its later workers are not ours to check.
@@ -165,6 +186,38 @@ def unfitness(threads: int, theirs: Mapping[str, str], ours: Mapping[str, str]) 
         if theirs[name] != ours[name]:
             return f"must have {name} {ours[name]} like the client, got {theirs[name]}"
     return None
+
+
+def _rendering_hosts(client: Client) -> frozenset[str]:
+    """Return the names of the workers' machines that can render; close the others' workers.
+
+    One worker of each machine finds it out.
+
+    Raises:
+        MachineError: If there are workers, and none can render.
+    """
+    addresses: dict[str, list[str]] = {}
+    for address, host in client.run(socket.gethostname).items():
+        addresses.setdefault(host, []).append(address)
+    if not addresses:
+        return frozenset()  # those that join are asked then
+    found = client.run(_image_fault, workers=[workers[0] for workers in addresses.values()])
+    faults = {host: found.get(workers[0]) for host, workers in addresses.items()}
+
+    # A machine without OpenGL may be one of hundreds.
+    bad = [host for host, fault in faults.items() if fault is not None]
+    if bad and len(bad) == len(faults):
+        raise MachineError(f"worker {addresses[bad[0]][0]}: {faults[bad[0]]}")
+    for host in bad:
+        sys.stderr.write(f"not used: workers on {host}: {printable(str(faults[host]))}\n")
+        client.retire_workers(addresses[host], close_workers=True)
+    return frozenset(host for host in faults if host not in bad)
+
+
+def _image_fault() -> str | None:
+    """Return why this machine's workers cannot render, or None if they can."""
+    ok, what = probe_image()
+    return None if ok else f"must render a test image, got {what}; see `drakegrasp doctor` there"
 
 
 def _set_kernel(client: Client) -> str | None:
@@ -192,6 +245,8 @@ def _set_kernel(client: Client) -> str | None:
 def _saturate(dask_scheduler: Scheduler) -> None:
     """Set what a scheduler that was started by hand has not read from this program's settings."""
     dask_scheduler.WORKER_SATURATION = SATURATION
+    if dask_scheduler.worker_ttl:
+        dask_scheduler.worker_ttl = max(dask_scheduler.worker_ttl, SILENCE_SECONDS)
 
 
 def _print_message(event: tuple[float, Any]) -> None:

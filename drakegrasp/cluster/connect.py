@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -12,8 +13,10 @@ from typing import Any
 import dask
 from distributed import Client, LocalCluster, SpecCluster
 from distributed.security import Security
+from distributed.utils import LoopRunner
+from tornado.ioloop import IOLoop
 
-from drakegrasp.cluster.admission import SATURATION, worker_environment
+from drakegrasp.cluster.admission import SATURATION, SILENCE_SECONDS, worker_environment
 from drakegrasp.errors import MachineError
 from drakegrasp.runtime.allocator import own_environment
 from drakegrasp.runtime.environment import available_cores
@@ -36,6 +39,7 @@ def dask_settings() -> dict[str, Any]:
         # The profiler costs time.
         "distributed.worker.profile.enabled": False,
         "distributed.scheduler.worker-saturation": SATURATION,
+        "distributed.scheduler.worker-ttl": f"{SILENCE_SECONDS:g}s",
         "distributed.nanny.pre-spawn-environ": worker_environment(),
         "distributed.nanny.preload": [NANNY_PRELOAD],
         # On a busy machine a worker takes long to start again; Dask would close its nanny.
@@ -110,16 +114,39 @@ def _connect_remote(
 def _start_local(
     workers: int | None, security: Security | None, memory: str | None
 ) -> Iterator[Client]:
-    cluster = LocalCluster(
-        n_workers=workers or available_cores(),
-        threads_per_worker=1,
-        dashboard_address="127.0.0.1:0",
-        silence_logs=logging.CRITICAL,
-        security=security,
-        memory_limit=memory or "auto",
-    )
-    with closing_cluster(cluster), Client(cluster) as client:
-        yield client
+    with _undisturbed_loop() as loop:
+        cluster = LocalCluster(
+            loop=loop,
+            n_workers=workers or available_cores(),
+            threads_per_worker=1,
+            dashboard_address="127.0.0.1:0",
+            silence_logs=logging.CRITICAL,
+            security=security,
+            memory_limit=memory or "auto",
+        )
+        with closing_cluster(cluster), Client(cluster) as client:
+            yield client
+
+
+@contextmanager
+def _undisturbed_loop() -> Iterator[IOLoop]:
+    """Run an event loop in a thread that no Ctrl-C reaches, nor the processes that it starts.
+
+    At a terminal Ctrl-C goes to every process. The client stops then, and its workers with it; one
+    that has just begun to start would print a traceback instead.
+    """
+    runner = LoopRunner()
+    runner.start()
+    try:
+        runner.run_sync(_block_interrupts)
+        yield runner.loop
+    finally:
+        runner.stop()
+
+
+async def _block_interrupts() -> None:
+    # Threads and processes that this thread starts inherit the mask.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
 
 
 class _RemoteClient(Client):

@@ -108,6 +108,7 @@ def _running(make: Callable[[], SpecCluster]) -> Iterator[Client]:
 def _ssh(request: ClusterRequest, security: Security | None) -> SpecCluster:
     # SSHCluster sends Dask's settings with every command that it runs on another machine.
     listening = scheduler_listening(request)
+    _refuse_quotes(security)
     worker = {
         "n_workers": cores_per_host(request),
         "nthreads": 1,
@@ -134,14 +135,28 @@ def _ssh(request: ClusterRequest, security: Security | None) -> SpecCluster:
     )
 
 
+def _refuse_quotes(security: Security | None) -> None:
+    """Refuse paths of certificates that Dask cannot send to another machine's shell.
+
+    Raises:
+        ConfigError: If one has a quotation mark: Dask puts its commands between two of them.
+    """
+    for path in server_options(security).get("security", {}).values():
+        if "'" in str(path):
+            raise ConfigError(f"--out must be a path without ' for --tls over ssh, got {path}")
+
+
 def _slurm(request: ClusterRequest, security: Security | None) -> SpecCluster:
     from dask_jobqueue import SLURMCluster
+
+    from drakegrasp.cluster.slurm_job import QuotedJob
 
     # Whatever is None or not named here is as the user's jobqueue.yaml says.
     cores, listening = cores_per_job(request), scheduler_listening(request)
     jobs = math.ceil((request.workers or 0) / cores)
     memory = request.memory or (None if jobqueue("memory") else WORKER_MEMORY)
     cluster = SLURMCluster(
+        job_cls=QuotedJob,
         cores=cores,
         processes=cores,
         memory=None if memory is None else f"{cores * memory_bytes(memory)}B",

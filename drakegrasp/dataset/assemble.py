@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import h5py
@@ -20,12 +19,24 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.filters import Removal, Successes, judge_successes, split_samples
-from drakegrasp.dataset.hdf5 import AnyArray, create_field, write_field
+from drakegrasp.dataset.hdf5 import AnyArray, create_field, open_hdf5, write_field
 from drakegrasp.dataset.lock import build_lock
-from drakegrasp.dataset.manifest import Manifest, read_manifest, write_origin
-from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
-from drakegrasp.dataset.rejections import AttemptKey, find_ids
-from drakegrasp.dataset.samples import ShardSlice, create_splits, walk_shards, write_samples
+from drakegrasp.dataset.manifest import (
+    Manifest,
+    manifest_text,
+    read_manifest,
+    with_postprocessing,
+    write_origin,
+)
+from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRIALS_FILE
+from drakegrasp.dataset.rejections import AttemptKey, find_keys
+from drakegrasp.dataset.samples import (
+    ShardSlice,
+    create_splits,
+    used_headers,
+    walk_shards,
+    write_samples,
+)
 from drakegrasp.dataset.schema import (
     CAMERAS,
     CERTIFICATE_FIELDS,
@@ -39,7 +50,8 @@ from drakegrasp.dataset.suspicion import suspicion
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, invert_pose, transform_points, unpack_pose
 from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp
-from drakegrasp.runtime.files import atomic_hdf5, disk_full_named
+from drakegrasp.runtime.file_set import replaced_together
+from drakegrasp.runtime.files import disk_full_named, new_hdf5, read_seal, sweep_temporary
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.vision.camera import intrinsics, project
 
@@ -62,51 +74,79 @@ class Assembly:
 
 
 def assemble(
-    out: Path, *, rejected: Sequence[int | AttemptKey] = (), progress: Report = silent
+    out: Path,
+    *,
+    overrides: Sequence[str] = (),
+    rejected: Sequence[int | AttemptKey] = (),
+    progress: Report = silent,
 ) -> Assembly:
     """Write the three files of a dataset whose work units are all done.
 
     Args:
         out: Directory of the dataset.
+        overrides: `key=value` texts that change the filters or the split of the dataset.
         rejected: Trials that an inspection rejects, by id or identity; they become no samples.
         progress: Called with the number of shards read and to read.
 
     Raises:
+        ConfigError: If an override cannot be used; nothing is changed.
         DataError: If a shard is missing or damaged, what is rejected is no success, or another
-            process builds in the directory; the old files stay.
-        DiskFullError: If there is no room; the old files stay.
+            process builds in the directory; the old files and filters stay.
+        DiskFullError: If there is no room; the old files and filters stay.
     """
-    read_manifest(out)  # before the lock, which would make a missing directory
+    # The lock would make a missing directory.
+    if not out.is_dir():
+        read_manifest(out)
     with build_lock(out):
-        return assemble_locked(out, rejected=rejected, progress=progress)
+        manifest = with_postprocessing(read_manifest(out), overrides)
+        return assemble_locked(out, manifest, rejected=rejected, progress=progress)
 
 
 def assemble_locked(
-    out: Path, *, rejected: Sequence[int | AttemptKey] = (), progress: Report = silent
+    out: Path,
+    manifest: Manifest,
+    *,
+    rejected: Sequence[int | AttemptKey] | None = None,
+    progress: Report = silent,
 ) -> Assembly:
-    """Write the three files, as `assemble`, in a directory whose lock the caller holds."""
-    manifest = read_manifest(out)
-    with disk_full_named(out), ExitStack() as stack:
-        # First pass: copy the trials, and learn of each success what the filters need.
-        trials = stack.enter_context(atomic_hdf5(out / TRIALS_FILE))
-        slices, successes = _write_trials(trials, out, manifest, progress)
+    """Write the three files and the manifest, in a directory whose lock the caller holds.
 
-        # Decide which successes are samples, and in which split.
-        ids_rejected = find_ids(rejected, _keys(manifest, successes), out)
-        removal = judge_successes(successes, manifest.config.filters, ids_rejected)
-        _write_removal(trials, successes, removal)
-        ids = _split_ids(manifest, successes, removal)
+    Args:
+        out: Directory of the dataset.
+        manifest: Of the dataset; it may have other filters or another split than the one there.
+        rejected: As for `assemble`; those of the manifest if None, as far as they are successes.
+        progress: As for `assemble`.
+    """
+    sweep_temporary(out)
+    with disk_full_named(out), replaced_together(out) as new:
+        # First pass: copy the trials, and learn of each success what the filters need.
+        with new_hdf5(new(TRIALS_FILE)) as trials:
+            slices, successes = _write_trials(trials, out, manifest, progress)
+
+            # Decide which successes are samples, and in which split.
+            known = _keys(manifest, successes)
+            if rejected is not None:
+                manifest = replace(manifest, rejected=find_keys(rejected, known, out))
+            ids_rejected = [known[key] for key in manifest.rejected if key in known]
+            removal = judge_successes(successes, manifest.config.filters, ids_rejected)
+            _write_removal(trials, successes, removal)
+            ids = _split_ids(manifest, successes, removal)
+            origin = {"signature": manifest.signature(), "shards": _shards_sha256(out, manifest)}
+            _write_attributes(trials, manifest, origin)
 
         # Second pass: copy the samples. It reads the shards again, because the split of a sample
         # depends on the successes of all shards, and their images do not fit into memory.
-        files = {c: stack.enter_context(atomic_hdf5(out / DATA_FILES[c])) for c in CAMERAS}
-        for camera, file in files.items():
-            _write_attributes(file, manifest)
-            file.attrs["camera"] = camera
-            create_splits(file, ids, slices[0].shapes)
-        for done, shard_slice in enumerate(slices, start=len(slices) + 1):
-            write_samples(files, out, shard_slice, ids)
-            progress(done, 2 * len(slices))
+        with ExitStack() as stack:
+            files = {c: stack.enter_context(new_hdf5(new(DATA_FILES[c]))) for c in CAMERAS}
+            for camera, file in files.items():
+                _write_attributes(file, manifest, {**origin, "camera": camera})
+                create_splits(file, ids, slices[0].shapes)
+            for done, shard_slice in enumerate(slices, start=len(slices) + 1):
+                write_samples(files, out, shard_slice, ids)
+                progress(done, 2 * len(slices))
+
+        # Filters, split and rejections change with the files that they made.
+        new(FILE_NAME).write_bytes(manifest_text(manifest))
     return summarise(out)
 
 
@@ -119,7 +159,6 @@ def _write_trials(
         DataError: If a shard is missing or damaged, or there is none.
     """
     K = intrinsics(manifest.config.camera)
-    _write_attributes(file, manifest)
     _write_objects(file, manifest)
     slices, successes = [], []
     for shard_slice, shard in walk_shards(out, manifest):
@@ -148,8 +187,8 @@ def summarise(out: Path) -> Assembly:
     """
     try:
         with (
-            h5py.File(out / TRIALS_FILE, "r") as trials,
-            h5py.File(out / DATA_FILES["oto"], "r") as data,
+            open_hdf5(out / TRIALS_FILE) as trials,
+            open_hdf5(out / DATA_FILES["oto"]) as data,
         ):
             removal = trials["successes/removal"][:]
             reasons, counts = np.unique(removal, return_counts=True)
@@ -163,31 +202,42 @@ def summarise(out: Path) -> Assembly:
         raise DataError(f"{out}: must hold the files of a dataset, got none ({error})") from None
 
 
-def is_assembled(out: Path) -> bool:
-    """Return whether the three files exist and are of the manifest's configuration and units."""
-    signature = _signature(read_manifest(out))
+def is_assembled(out: Path, *, verify_shards: bool = False) -> bool:
+    """Return whether the three files exist and are what assembling would write now.
+
+    Args:
+        out: Directory of the dataset.
+        verify_shards: Whether to compare the shards, too, which looks into each of them.
+
+    Raises:
+        DataError: If a file has values that lie elsewhere, or a shard is missing.
+    """
+    manifest = read_manifest(out)
+    expected = {"signature": manifest.signature()}
+    if verify_shards:
+        expected["shards"] = _shards_sha256(out, manifest)
     try:
-        for name in (TRIALS_FILE, *DATA_FILES.values()):
-            with h5py.File(out / name, "r") as file:
-                if file.attrs["signature"] != signature:
+        for name in ASSEMBLED_FILES:
+            with open_hdf5(out / name) as file:
+                if any(file.attrs[key] != value for key, value in expected.items()):
                     return False
     except (OSError, KeyError):
         return False
     return True
 
 
-def _signature(manifest: Manifest) -> str:
-    """Return a hash of what decides the content of the files, without the rejected trials."""
-    digest = hashlib.sha256(json.dumps(manifest.config.to_dict(), sort_keys=True).encode())
-    for header in manifest.headers():
-        digest.update(f"\n{header}".encode())
+def _shards_sha256(out: Path, manifest: Manifest) -> str:
+    """Return a hash of the seals of all shards that the files are made from."""
+    digest = hashlib.sha256()
+    for header in used_headers(out, manifest):
+        digest.update(read_seal(header.path(out)))
     return digest.hexdigest()
 
 
-def _write_attributes(file: h5py.File, manifest: Manifest) -> None:
+def _write_attributes(file: h5py.File, manifest: Manifest, origin: Mapping[str, str]) -> None:
     camera = manifest.config.camera
     write_origin(file, manifest.config, manifest.versions, manifest.fingers)
-    file.attrs["signature"] = _signature(manifest)
+    file.attrs.update(origin)
     file.attrs["K"] = intrinsics(camera)
     file.attrs["near"], file.attrs["far"] = camera.near, camera.far
 

@@ -1,7 +1,8 @@
-"""Writing a field of the schema into an HDF5 file."""
+"""HDF5 files of a dataset: opening one to read, and writing a field of the schema into one."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import h5py
@@ -9,10 +10,81 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.schema import Field
+from drakegrasp.errors import DataError, printable
+from drakegrasp.runtime.file_set import refuse_half_replaced
+from drakegrasp.runtime.names import NAME_RULE, is_name
 
 AnyArray = npt.NDArray[Any]
 #: Rows in a chunk of a column of small values.
 COLUMN_CHUNK = 2048
+
+
+def open_hdf5(path: Path) -> h5py.File:
+    """Open a file of a dataset to read it; close it after use.
+
+    A stranger's file can name any other file as the place of its values. Ours hold all of theirs.
+
+    Raises:
+        OSError: If it cannot be read.
+        DataError: If a process died while it replaced the files beside it, or it has links or
+            values that lie elsewhere.
+    """
+    refuse_half_replaced(path.parent)
+    file = h5py.File(path, "r")
+    try:
+        elsewhere = _found_elsewhere(file)
+    except BaseException as error:
+        file.close()
+        if isinstance(error, RuntimeError):
+            raise OSError(str(error)) from None  # what HDF5 says of a damaged file
+        raise
+    if elsewhere is not None:
+        file.close()
+        raise DataError(f"{path}: must hold its own values, got {printable(elsewhere)}")
+    return file
+
+
+def _found_elsewhere(file: h5py.File) -> str | None:
+    """Return in words what in a file leads elsewhere, or None."""
+    groups, seen = [(file.id, "")], set()
+    while groups:
+        group, place = groups.pop()
+        for key in group:
+            name = f"{place}/{key.decode(errors='replace')}"
+            if group.links.get_info(key).type != h5py.h5l.TYPE_HARD:
+                return f"a link at {name}"
+
+            # An object may have several names, and a group may be within itself.
+            item = h5py.h5o.open(group, key)
+            address = h5py.h5o.get_info(item).addr
+            if isinstance(item, h5py.h5g.GroupID) and address not in seen:
+                groups.append((item, name))
+            elif isinstance(item, h5py.h5d.DatasetID) and _is_elsewhere(item):
+                return f"values outside of it at {name}"
+            seen.add(address)
+    return None
+
+
+def _is_elsewhere(dataset: h5py.h5d.DatasetID) -> bool:
+    """Return whether the values of a dataset are in other files."""
+    made = dataset.get_create_plist()
+    return made.get_external_count() > 0 or made.get_layout() == h5py.h5d.VIRTUAL
+
+
+def read_names(dataset: h5py.Dataset) -> tuple[str, ...]:
+    """Return the names of objects or classes in a dataset of texts.
+
+    Raises:
+        DataError: If one of them is none.
+    """
+    try:
+        names = tuple(dataset.asstr()[:].tolist())
+    except (TypeError, UnicodeDecodeError) as error:
+        raise DataError(f"{dataset.file.filename}: must hold names, got others ({error})") from None
+    for name in names:
+        if not is_name(name):
+            raise DataError(f"{dataset.file.filename}: a name must be {NAME_RULE}, got {name!r}")
+    return names
 
 
 def create_field(group: h5py.Group, field: Field, shape: tuple[int, ...]) -> h5py.Dataset:

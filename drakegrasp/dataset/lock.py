@@ -19,6 +19,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
@@ -27,9 +28,16 @@ from io import FileIO
 from pathlib import Path
 
 from drakegrasp.errors import DataError
+from drakegrasp.runtime.file_set import LIST_NAME, complete_replacement
+from drakegrasp.runtime.files import open_own, stale_temporary, sweep_temporary
 from drakegrasp.runtime.processes import Process, lock_file, this_process
 
 FILE_NAME = "build.lock"
+#: Folders that a build makes in the directory.
+FOLDERS = ("builtin", "objects", "shards")
+#: Directories that a thread of this process holds, and the lock of this set.
+_held: set[str] = set()
+_claiming = threading.Lock()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,8 +62,8 @@ class Holder:
 def build_lock(out: Path) -> Iterator[Holder | None]:
     """Hold a directory while the block runs.
 
-    Yields the dead holder from whom the lock was taken over, or None. One function of a command
-    takes the lock, and what it calls relies on it.
+    Yields the dead holder from whom the lock was taken over, or None. Files that it was replacing
+    are all new then. One function of a command takes the lock, and what it calls relies on it.
 
     Args:
         out: The directory; made if it is missing, and removed again if it stays empty.
@@ -64,15 +72,67 @@ def build_lock(out: Path) -> Iterator[Holder | None]:
         DataError: If another process builds in the directory, or it cannot be written.
     """
     made = _make_directory(out)
-    file, before = _take(out / FILE_NAME)
+    key = _claim(out)
     try:
+        file, before = _take(out / FILE_NAME)
+    except BaseException:
+        _held.discard(key)
+        raise
+    try:
+        _refuse_linked_folders(out)
+        complete_replacement(out)
         yield before
     finally:
         (out / FILE_NAME).unlink(missing_ok=True)
         file.close()
+        _held.discard(key)
         if made:
             with suppress(OSError):  # not empty: something was built
                 out.rmdir()
+
+
+def _claim(out: Path) -> str:
+    """Take a directory for one thread of this process; return by what `_held` names it.
+
+    On network file systems the kernel's lock belongs to a process, with all its threads.
+
+    Raises:
+        DataError: If another thread has it.
+    """
+    key = os.path.realpath(out)
+    with _claiming:
+        if key in _held:
+            raise _refusal(out / FILE_NAME, None, certain=True, who="another thread of this one")
+        _held.add(key)
+    return key
+
+
+def tidy(out: Path) -> None:
+    """Put in order what a process that died left in a directory, if somebody did.
+
+    For commands that only read. Nothing happens where a process builds, or where this one may not
+    write.
+    """
+    leftovers = (out / FILE_NAME, out / LIST_NAME)
+    if any(map(os.path.lexists, leftovers)) or any(stale_temporary(out)):
+        with suppress(DataError, OSError), build_lock(out):
+            sweep_temporary(out)
+
+
+def _refuse_linked_folders(out: Path) -> None:
+    """Refuse a directory some of whose folders lie elsewhere: nobody's files are written there.
+
+    Raises:
+        DataError: If one is a link.
+    """
+    inner = out / "shards"
+    folders = [out / name for name in FOLDERS]
+    if inner.is_dir() and not inner.is_symlink():
+        with os.scandir(inner) as entries:
+            folders += [inner / entry.name for entry in entries if entry.is_symlink()]
+    for folder in folders:
+        if folder.is_symlink():
+            raise DataError(f"{folder}: must be a folder in the dataset, got a link")
 
 
 def _make_directory(out: Path) -> bool:
@@ -97,7 +157,7 @@ def _take(path: Path) -> tuple[FileIO, Holder | None]:
     """
     while True:
         try:
-            file = FileIO(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666), "r+")
+            file = FileIO(open_own(path, os.O_RDWR | os.O_CREAT), "r+")
         except OSError as error:
             raise _unwritable(path.parent, error) from None
         try:
@@ -145,8 +205,10 @@ def _write(file: FileIO) -> None:
     os.pwrite(file.fileno(), json.dumps(asdict(holder)).encode() + b"\n", 0)
 
 
-def _refusal(path: Path, holder: Holder | None, *, certain: bool) -> DataError:
-    who = "another process" if holder is None else str(holder)
+def _refusal(
+    path: Path, holder: Holder | None, *, certain: bool, who: str = "another process"
+) -> DataError:
+    who = who if holder is None else str(holder)
     advice = "wait for it or choose another --out"
     if not certain:
         advice = f"wait for it, or remove {path.name} there if it is dead"

@@ -13,6 +13,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from drakegrasp.runtime.files import open_own
+
 FILE_NAME = "log.jsonl"
 
 
@@ -35,10 +37,14 @@ class BuildLog:
 
         Raises:
             OSError: If the file cannot be written.
+            DataError: If it is a link.
         """
         now = datetime.now(UTC).isoformat(timespec="milliseconds")
-        line = json.dumps({"time": now, "event": event, **facts}, ensure_ascii=False) + "\n"
-        descriptor = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+        line = json.dumps({"time": now, "event": event, **facts}, ensure_ascii=False)
+
+        # Other alphabets stay readable; what would steer a terminal becomes its code.
+        line = "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in line) + "\n"
+        descriptor = open_own(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
         try:
             os.write(descriptor, line.encode())
         finally:

@@ -7,6 +7,7 @@ machine and no number of workers in it: the same command gives the same bytes.
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -20,12 +21,15 @@ import h5py
 from drakegrasp.config import POSTPROCESSING_KEYS, Config, override_config, parse_config
 from drakegrasp.dataset import log as build_log
 from drakegrasp.dataset.paths import FILE_NAME, OWN_FILES, OWN_FOLDERS
+from drakegrasp.dataset.rejections import AttemptKey, key_from_json, key_to_json
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, refuse_other_schema
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_digest, hand_file
+from drakegrasp.runtime.file_set import refuse_half_replaced
 from drakegrasp.runtime.files import probe_folder, write_atomic
+from drakegrasp.runtime.names import NAME_RULE, is_name
 
 #: Packages whose versions may change a result.
 VERSIONED = ("drakegrasp", "drake", "numpy", "scipy", "trimesh", "manifold3d", "h5py")
@@ -85,11 +89,23 @@ class ObjectEntry:
             "notes": tuple(content["notes"]),
         }
         plain = {key: value for key, value in content.items() if key not in ("class", *converted)}
+        for name in (content["name"], content["class"]):
+            _refuse_no_name(name)
         return cls(**converted, **plain)
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry as JSON types, in the order of the manifest."""
         return {"class" if key == "class_name" else key: v for key, v in asdict(self).items()}
+
+
+def _refuse_no_name(text: Any) -> None:
+    """Refuse what would lead out of the directory as a file's name, or steer a terminal.
+
+    Raises:
+        TypeError: If it is no name.
+    """
+    if not isinstance(text, str) or not is_name(text):
+        raise TypeError(f"a name must be {NAME_RULE}, got {text!r}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,24 +116,27 @@ class RefusedMesh:
         name: Of the object.
         mesh_sha256: Hash of the mesh file and of what `objects.yaml` says of it, hexadecimal.
         reason: Why it was refused, in words.
+        again: Whether the machine may be at fault, so that the next build tries it again.
     """
 
     name: str
     mesh_sha256: str
     reason: str
+    again: bool = False
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> RefusedMesh:
         """Return the entry that `to_json` gave.
 
         Raises:
-            TypeError: If the content is not an entry.
+            KeyError, TypeError: If the content is not an entry.
         """
+        _refuse_no_name(content["name"])
         return cls(**content)
 
-    def to_json(self) -> dict[str, str]:
+    def to_json(self) -> dict[str, Any]:
         """Return the entry as JSON types, in the order of the manifest."""
-        return asdict(self)
+        return {key: value for key, value in asdict(self).items() if key != "again" or value}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,6 +147,7 @@ class Manifest:
         config: Resolved configuration, with the seed.
         objects: The objects, in the order of the dataset's rows.
         refused: The meshes that were refused.
+        rejected: Attempts that an inspection rejects: successes that are no samples.
         versions: Versions of the packages that made the dataset, and a hash of the hand's files.
         fingers: Name of each finger in grasp order, and whether a grasp needs its fingertip.
     """
@@ -135,6 +155,7 @@ class Manifest:
     config: Config
     objects: tuple[ObjectEntry, ...] = ()
     refused: tuple[RefusedMesh, ...] = ()
+    rejected: tuple[AttemptKey, ...] = ()
     versions: dict[str, str]
     fingers: dict[str, bool] = field(default_factory=dict)
 
@@ -156,6 +177,11 @@ class Manifest:
         """Number of work units."""
         step = self.config.unit_candidates
         return sum(-(-entry.candidates // step) for entry in self.objects)
+
+    def signature(self) -> str:
+        """Return a hash of all in it that decides a row of the dataset, hexadecimal."""
+        content = {name: value for name, value in _content(self).items() if name != "refused"}
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def finger_names(config: Config) -> dict[str, bool]:
@@ -185,6 +211,15 @@ def write_origin(
 
 def write_manifest(manifest: Manifest, out: Path) -> None:
     """Write the manifest into a dataset's directory, atomically."""
+    write_atomic(out / FILE_NAME, manifest_text(manifest))
+
+
+def manifest_text(manifest: Manifest) -> bytes:
+    """Return the bytes of a manifest's file."""
+    return (json.dumps(_content(manifest), indent=1, ensure_ascii=False) + "\n").encode()
+
+
+def _content(manifest: Manifest) -> dict[str, Any]:
     content = {
         "schema_version": SCHEMA_VERSION,
         "config_hash": manifest.config.simulation_hash(),
@@ -195,17 +230,21 @@ def write_manifest(manifest: Manifest, out: Path) -> None:
         "objects": [entry.to_json() for entry in manifest.objects],
         "refused": [entry.to_json() for entry in manifest.refused],
     }
-    text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
-    write_atomic(out / FILE_NAME, text.encode())
+    # Most datasets have none.
+    if manifest.rejected:
+        content["rejected"] = [key_to_json(key) for key in manifest.rejected]
+    return content
 
 
 def read_manifest(out: Path) -> Manifest:
     """Return the manifest of a dataset's directory.
 
     Raises:
-        DataError: If there is none, it cannot be read, or it is of another schema.
+        DataError: If there is none, it cannot be read, it is of another schema, or a process died
+            while it replaced the files.
     """
     path = out / FILE_NAME
+    refuse_half_replaced(out)
     try:
         # The version first: another schema may have other keys.
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -215,6 +254,7 @@ def read_manifest(out: Path) -> Manifest:
             config=parse_config(content["config"]),
             objects=tuple(ObjectEntry.from_json(entry) for entry in content["objects"]),
             refused=tuple(RefusedMesh.from_json(entry) for entry in content["refused"]),
+            rejected=tuple(key_from_json(entry) for entry in content.get("rejected", ())),
             versions=content["versions"],
             fingers=content.get("fingers", {}),
         )
@@ -301,25 +341,23 @@ def release_directory(out: Path) -> None:
             folder.rmdir()
 
 
-def change_postprocessing(out: Path, overrides: Sequence[str]) -> None:
-    """Change values of the filters or the split in a dataset's manifest.
+def with_postprocessing(manifest: Manifest, overrides: Sequence[str]) -> Manifest:
+    """Return a manifest with other values of the filters or the split.
 
     Args:
-        out: Directory of the dataset.
+        manifest: Of the dataset.
         overrides: `key=value` texts, e.g. "split.valid_fraction=0.2".
 
     Raises:
         ConfigError: If a value cannot be used, or would change what was simulated.
-        DataError: If the directory holds no dataset.
     """
-    manifest = read_manifest(out)
     config = override_config(manifest.config, overrides)
     if config.simulation_hash() != manifest.config.simulation_hash():
         raise ConfigError(
             "assemble may change values of filters and split only, got one that changes what was "
             f"simulated: {_differences(manifest.config, config)}"
         )
-    write_manifest(replace(manifest, config=config), out)
+    return replace(manifest, config=config)
 
 
 def _differences(theirs: Config, ours: Config) -> str:

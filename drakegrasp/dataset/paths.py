@@ -5,34 +5,47 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-import h5py
-
 from drakegrasp.dataset import lock as build_lock
 from drakegrasp.dataset import log as build_log
+from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import DataError
 from drakegrasp.runtime.files import refuse_broken_seal
+from drakegrasp.runtime.names import NAME_RULE, is_name
 
 #: The file of all attempts, the two files of samples by camera, and the manifest.
 TRIALS_FILE = "trials.hdf5"
 DATA_FILES = {camera: f"grasping_{camera}.hdf5" for camera in CAMERAS}
 FILE_NAME = "manifest.json"
+#: What assembling writes: these files are of one state.
+ASSEMBLED_FILES = (TRIALS_FILE, *DATA_FILES.values())
 #: Folder of the meshes of the built-in objects, in a dataset that is built from them.
 BUILTIN_FOLDER = "builtin"
 #: Folders that a build makes.
-OWN_FOLDERS = (BUILTIN_FOLDER, "objects", "shards")
+OWN_FOLDERS = build_lock.FOLDERS
 #: Files that a build writes besides the manifest.
 OWN_FILES = (build_lock.FILE_NAME, build_log.FILE_NAME)
 
 
 def model_path(out: Path, name: str) -> Path:
     """Return the path of an object's meshes and mass properties."""
-    return out / "objects" / f"{name}.npz"
+    return out / "objects" / f"{_file_name(name)}.npz"
 
 
 def plan_path(out: Path, name: str) -> Path:
     """Return the path of an object's resting pose and palm poses."""
-    return out / "objects" / f"{name}.plan.h5"
+    return out / "objects" / f"{_file_name(name)}.plan.h5"
+
+
+def _file_name(name: str) -> str:
+    """Return a name that leads to no other folder.
+
+    Raises:
+        DataError: If it might.
+    """
+    if not is_name(name):
+        raise DataError(f"the name of an object must be {NAME_RULE}, got {name!r}")
+    return name
 
 
 def model_file_sha256(out: Path, name: str) -> str:
@@ -50,7 +63,7 @@ def refuse_changed_object(out: Path, name: str) -> None:
     """
     path, model = plan_path(out, name), model_path(out, name)
     refuse_broken_seal(path, "plan of an object")
-    with h5py.File(path, "r") as file:
+    with open_hdf5(path) as file:
         expected = str(file.attrs["model_sha256"])
     if not model.is_file() or model_file_sha256(out, name) != expected:
         got = "other content" if model.is_file() else "none"

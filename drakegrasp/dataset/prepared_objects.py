@@ -10,10 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from drakegrasp.config import Config
+from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.manifest import ObjectEntry
 from drakegrasp.dataset.paths import model_file_sha256, model_path, plan_path, refuse_changed_object
 from drakegrasp.errors import DataError
@@ -101,7 +101,7 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
     # Both files must be as they were written, and of this configuration.
     refuse_changed_object(out, name)
     try:
-        with h5py.File(path, "r") as file:
+        with open_hdf5(path) as file:
             attributes = dict(file.attrs)
             arrays = {key: file[key][:] for key in ("X_TO", "X_OG", "distance")}
     except (OSError, KeyError) as error:

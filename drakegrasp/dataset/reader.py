@@ -18,6 +18,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.schema import DATA_FIELDS, SPLITS, refuse_other_schema
 from drakegrasp.errors import DataError
 
@@ -76,7 +77,7 @@ class GraspDataset:
         self._file: h5py.File | None = None
         self._process = -1
         try:
-            with h5py.File(self.path, "r") as file:
+            with open_hdf5(self.path) as file:
                 # The version first: another schema may have other fields.
                 refuse_other_schema(self.path, file.attrs["schema_version"])
                 self._length = len(file[split]["grasps"])
@@ -145,7 +146,7 @@ class GraspDataset:
     def _open(self) -> h5py.File:
         # An open HDF5 file must not cross a fork: each process opens its own.
         if self._file is None or self._process != os.getpid():
-            self._file = h5py.File(self.path, "r")
+            self._file = open_hdf5(self.path)
             self._process = os.getpid()
         return self._file
 

@@ -83,8 +83,8 @@ def read_decisions(path: Path) -> Decisions:
         if content["version"] != VERSION:
             raise DataError(f"{path}: version must be {VERSION}, got {content['version']!r}")
         return Decisions(
-            rejected=frozenset(_key(entry) for entry in content["rejected"]),
-            kept=frozenset(_key(entry) for entry in content["kept"]),
+            rejected=frozenset(key_from_json(entry) for entry in content["rejected"]),
+            kept=frozenset(key_from_json(entry) for entry in content["kept"]),
         )
     except FileNotFoundError:
         return Decisions()
@@ -98,8 +98,8 @@ def write_decisions(path: Path, decisions: Decisions) -> None:
     """Write a `reject.json`, atomically; equal decisions give equal bytes."""
     content = {
         "version": VERSION,
-        "rejected": [_entry(key) for key in sorted(decisions.rejected)],
-        "kept": [_entry(key) for key in sorted(decisions.kept)],
+        "rejected": [key_to_json(key) for key in sorted(decisions.rejected)],
+        "kept": [key_to_json(key) for key in sorted(decisions.kept)],
     }
     write_atomic(path, (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode())
 
@@ -129,10 +129,10 @@ def read_rejected(path: Path) -> list[int] | list[AttemptKey]:
     return ids
 
 
-def find_ids(
+def find_keys(
     rejected: Sequence[int | AttemptKey], ids: Mapping[AttemptKey, int], out: Path
-) -> list[int]:
-    """Return the trial ids of what is rejected.
+) -> tuple[AttemptKey, ...]:
+    """Return the identities of what is rejected, in order and each once.
 
     Args:
         rejected: Ids of trials, or keys of attempts.
@@ -142,24 +142,31 @@ def find_ids(
     Raises:
         DataError: If one of them is no success of the dataset.
     """
-    known, found = set(ids.values()), []
+    keys = {number: key for key, number in ids.items()}
+    found = set()
     for entry in rejected:
-        number = ids.get(entry) if isinstance(entry, AttemptKey) else entry
-        if number not in known or number is None:
+        key = entry if isinstance(entry, AttemptKey) else keys.get(entry)
+        if key is None or key not in ids:
             name = f"trial {entry}" if isinstance(entry, int) else str(entry)
             raise DataError(f"{out}: rejected trials must be successes, got {name}")
-        found.append(number)
-    return found
+        found.add(key)
+    return tuple(sorted(found))
 
 
-def _key(entry: Any) -> AttemptKey:
+def key_from_json(entry: Any) -> AttemptKey:
+    """Return the attempt that `key_to_json` gave.
+
+    Raises:
+        KeyError, TypeError: If the content is none.
+    """
     name, candidate, standoff = (entry[key] for key in ("object", "candidate", "standoff_index"))
     if not isinstance(name, str) or type(candidate) is not int or type(standoff) is not int:
         raise TypeError(f"an attempt must be a name and two numbers, got {entry!r}")
     return AttemptKey(name, candidate, standoff)
 
 
-def _entry(key: AttemptKey) -> dict[str, Any]:
+def key_to_json(key: AttemptKey) -> dict[str, Any]:
+    """Return the identity of an attempt as JSON types."""
     return {
         "object": key.object,
         "candidate": key.candidate,

@@ -20,7 +20,13 @@ from drakegrasp.dataset.hdf5 import create_field
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import model_path
 from drakegrasp.dataset.schema import CAMERAS, CONDITION_FIELDS, DATA_FIELDS, SPLITS, sizes
-from drakegrasp.dataset.shards import Shard, ShardHeader, read_shard, trial_columns
+from drakegrasp.dataset.shards import (
+    Shard,
+    ShardHeader,
+    read_outcomes,
+    read_shard,
+    trial_columns,
+)
 from drakegrasp.frames import (
     X_WT,
     Array,
@@ -76,6 +82,23 @@ def walk_shards(out: Path, manifest: Manifest) -> Iterator[tuple[ShardSlice, Sha
         )
         yield shard_slice, shard
         first += rows
+
+
+def used_headers(out: Path, manifest: Manifest) -> Iterator[ShardHeader]:
+    """Yield the work units whose shards `walk_shards` yields, without reading images.
+
+    Raises:
+        DataError: If `max_grasps` is set and a shard is missing or of something else.
+    """
+    wanted = dict.fromkeys((e.name for e in manifest.objects), manifest.config.max_grasps)
+    for header in manifest.headers():
+        left = wanted[header.object_name]
+        if left is None:
+            yield header
+        elif left > 0:
+            yield header
+            outcomes = read_outcomes(header.path(out), header, verify_seal=False)
+            wanted[header.object_name] = left - int(np.count_nonzero(outcomes == Outcome.SUCCESS))
 
 
 def rows_within(shard: Shard, wanted: int | None) -> tuple[int, int | None]:

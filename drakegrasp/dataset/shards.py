@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.hdf5 import AnyArray, write_field
+from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, write_field
 from drakegrasp.dataset.schema import (
     LOOK_FIELDS,
     SCHEMA_VERSION,
@@ -160,7 +160,7 @@ def _open_shard(
     if verify_seal:
         refuse_broken_seal(path)
     try:
-        with h5py.File(path, "r") as file:
+        with open_hdf5(path) as file:
             # The version first: another schema may have other attributes.
             refuse_other_schema(path, file.attrs["schema_version"])
 

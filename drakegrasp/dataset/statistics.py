@@ -8,12 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import h5py
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.assemble import is_assembled
 from drakegrasp.dataset.filters import Removal
+from drakegrasp.dataset.hdf5 import open_hdf5, read_names
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.schema import SPLITS, refuse_other_schema
@@ -124,9 +124,10 @@ def count_funnel(out: Path) -> Funnel:
     """
     # The columns that are counted, whole: a few bytes per trial.
     try:
-        with h5py.File(out / TRIALS_FILE, "r") as file:
+        with open_hdf5(out / TRIALS_FILE) as file:
             refuse_other_schema(out / TRIALS_FILE, file.attrs["schema_version"])
             objects = {name: values[:] for name, values in file["objects"].items()}
+            names, classes = (read_names(file["objects"][key]) for key in ("name", "class_name"))
             index = file["trials/object"][:]
             outcome = file["trials/outcome"][:]
             words = {word: file[f"trials/{word}"][:] for word in WORDS}
@@ -137,8 +138,8 @@ def count_funnel(out: Path) -> Funnel:
 
     count = len(objects["name"])
     return Funnel(
-        names=tuple(name.decode() for name in objects["name"]),
-        classes=tuple(name.decode() for name in objects["class_name"]),
+        names=names,
+        classes=classes,
         candidates=objects["candidates"],
         distinct=objects["distinct"],
         valid=objects["valid"],
@@ -157,7 +158,7 @@ def count_splits(out: Path) -> list[SplitCount]:
     """
     path = out / DATA_FILES["oto"]
     try:
-        with h5py.File(path, "r") as file:
+        with open_hdf5(path) as file:
             refuse_other_schema(path, file.attrs["schema_version"])
             return [
                 SplitCount(

@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import h5py
 import numpy as np
 
+from drakegrasp.dataset.hdf5 import open_hdf5, read_names
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import SPLITS
@@ -57,9 +57,9 @@ def read_closed_grasps(out: Path) -> Iterator[ClosedGrasp]:
     # Their postures, from the file of all trials.
     path = out / TRIALS_FILE
     try:
-        with h5py.File(path, "r") as file:
+        with open_hdf5(path) as file:
             trials = file["trials"]
-            names = file["objects/name"].asstr()[:]
+            names = read_names(file["objects/name"])
             objects, X_TO, X_OG, q, spread = (
                 trials[key][:][rows] for key in ("object", "X_TO", "X_OG", "closed_q", "spread")
             )

@@ -28,6 +28,7 @@ from drakegrasp.config import Config, describe_mistake
 from drakegrasp.errors import HandError, one_line
 from drakegrasp.frames import Array
 from drakegrasp.hand.files import hand_file
+from drakegrasp.yaml_text import parse_yaml
 
 #: Version of the keys that this module reads.
 VERSION = 1
@@ -230,7 +231,7 @@ def read_hand_file(path: Path) -> HandFile:
         HandError: If a key or a value cannot be used, in one line.
     """
     try:
-        tree: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+        tree: Any = parse_yaml(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise HandError(f"{path}: must be YAML, got text that is not ({one_line(error)})") from None
 

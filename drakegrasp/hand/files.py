@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import yaml
 
 from drakegrasp.errors import HandError
+from drakegrasp.yaml_text import parse_yaml
 
 #: Folder of the table and of the hands that come with the package, as `<name>_hand.yaml`.
 MODELS = Path(__file__).resolve().parent.parent / "models"
@@ -107,7 +108,7 @@ def _mesh_file(uri: str, folder: Path, packages: Mapping[str, Path]) -> Path:
 def _described(path: Path) -> Mapping[str, Any]:
     """Return the keys of a hand file; none if it is not one."""
     try:
-        tree = yaml.safe_load(path.read_bytes())
+        tree = parse_yaml(path.read_bytes())
     except (yaml.YAMLError, UnicodeDecodeError):
         return {}
     return tree if isinstance(tree, dict) else {}

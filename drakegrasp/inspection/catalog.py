@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import Config, parse_config
+from drakegrasp.dataset.hdf5 import open_hdf5, read_names
 from drakegrasp.dataset.manifest import Manifest, read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, FILE_NAME, TRIALS_FILE, model_path
 from drakegrasp.dataset.rejections import AttemptKey
@@ -166,12 +166,10 @@ def _read_assembled(out: Path) -> Snapshot:
     # Objects and configuration.
     path = out / TRIALS_FILE
     try:
-        with h5py.File(path, "r") as file:
+        with open_hdf5(path) as file:
             refuse_other_schema(path, file.attrs["schema_version"])
             config = parse_config(json.loads(file.attrs["config"]))
-            names, classes = (
-                tuple(file["objects"][key].asstr()[:].tolist()) for key in ("name", "class_name")
-            )
+            names, classes = (read_names(file["objects"][key]) for key in ("name", "class_name"))
     except (OSError, KeyError, ValueError, ConfigError) as error:
         raise DataError(f"{path}: must be the trials of a dataset, got none ({error})") from None
 

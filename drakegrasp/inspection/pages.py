@@ -17,6 +17,7 @@ from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.rejections import Decisions
 from drakegrasp.dataset.schema import CAMERAS, SPLITS
 from drakegrasp.dataset.suspicion import PARTS, suspicion
+from drakegrasp.errors import printable
 from drakegrasp.inspection.catalog import Snapshot
 from drakegrasp.inspection.links import Links
 from drakegrasp.inspection.query import (
@@ -38,10 +39,17 @@ Places = npt.NDArray[np.int32]
 #: Reasons of suspicion that a card names, and the share from which on it names one.
 REASONS, REASON_SHARE = 2, 0.75
 
+
+def _shown(value: Any) -> Any:
+    """Return a value of a template as it is shown: texts without control characters."""
+    return printable(value) if type(value) is str else value
+
+
 TEMPLATES = Environment(
     loader=PackageLoader("drakegrasp.inspection"),
     autoescape=select_autoescape(default=True, default_for_string=True),
     undefined=StrictUndefined,
+    finalize=_shown,
     trim_blocks=True,
     lstrip_blocks=True,
 )

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
+from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.schema import SPLITS, TRIAL_FIELDS
 from drakegrasp.dataset.shards import ASSEMBLED_FIELDS
@@ -72,7 +73,7 @@ def read_rows(
         for i in places:
             number = int(table.source[i])
             if number not in files:
-                files[number] = h5py.File(snapshot.sources[number], "r")
+                files[number] = open_hdf5(snapshot.sources[number])
             trials = files[number]["trials"]
             rows.append({name: np.asarray(trials[name][table.row[i]]) for name in columns})
     except (OSError, KeyError, ValueError, IndexError) as error:
@@ -102,13 +103,13 @@ def _sample_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
     path = snapshot.out / DATA_FILES[camera]
     if not path.is_file():
         return _shard_look(snapshot, i, camera)
-    with h5py.File(path, "r") as file:
+    with open_hdf5(path) as file:
         return Look(image=file[split]["images"][row], mask=file[split]["masks"][row])
 
 
 def _shard_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
     key = snapshot.key(i)
-    with h5py.File(_shard_path(snapshot, i), "r") as file:
+    with open_hdf5(_shard_path(snapshot, i)) as file:
         # The row of the attempt in its shard, then that of its images.
         trials, looks = file["trials"], file["looks"]
         here = trials["candidate"][:] == key.candidate

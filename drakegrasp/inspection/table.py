@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import norm
+from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.schema import CAMERAS, SPLITS
 from drakegrasp.dataset.shards import ShardHeader, read_trials
@@ -117,7 +117,7 @@ def read_trials_table(path: Path, masses: Sequence[float]) -> AttemptTable:
     """
     # Block by block into arrays for all: the float64 columns of a large file fill the memory.
     try:
-        with h5py.File(path, "r") as file:
+        with open_hdf5(path) as file:
             trials = file["trials"]
             count = len(trials["outcome"])
             whole = _zeros(count)
@@ -167,7 +167,7 @@ def read_sample_ids(out: Path) -> dict[str, npt.NDArray[np.int64]]:
     """Return the trial ids of the samples by split, in rising order; none without data files."""
     for camera in CAMERAS:
         try:
-            with h5py.File(out / DATA_FILES[camera], "r") as file:
+            with open_hdf5(out / DATA_FILES[camera]) as file:
                 return {split: file[split]["trial_id"][:] for split in SPLITS}
         except (OSError, KeyError):
             continue

@@ -35,6 +35,8 @@ from drakegrasp.config import describe_mistake
 from drakegrasp.errors import MeshError, one_line
 from drakegrasp.frames import Array
 from drakegrasp.mesh.loading import SUFFIXES, parse_mesh, read_bytes
+from drakegrasp.runtime.names import NAME_RULE, is_name
+from drakegrasp.yaml_text import parse_yaml
 
 #: Metres per unit of length of a file.
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -50,8 +52,6 @@ UPRIGHT = {
 #: Keys of an object in the manifest.
 _KEYS = "units, scale, up, class, name, mass, density, friction"
 MANIFEST_NAME = "objects.yaml"
-#: Longest name of an object [bytes]: file systems allow 255, and we append to it.
-MAX_NAME = 200
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,13 +80,8 @@ class MeshSource:
 
     def __post_init__(self) -> None:
         for what, text in (("name", self.name), ("class", self.class_name)):
-            # Names are used as names of folders and files.
-            bad = any(c in "/\\" or not c.isprintable() for c in text) or text.startswith(".")
-            if not text.strip() or bad or len(text.encode()) > MAX_NAME:
-                raise MeshError(
-                    f"{self.path.name}: the {what} must be printable, not empty, without slashes, "
-                    f"not begin with a dot, and have at most {MAX_NAME} bytes, got {text!r}"
-                )
+            if not is_name(text):
+                raise MeshError(f"{self.path.name}: the {what} must be {NAME_RULE}, got {text!r}")
         for what in ("scale", "mass", "density", "friction"):
             value = getattr(self, what)
             if value is not None and not (np.isfinite(value) and value > 0.0):
@@ -143,7 +138,7 @@ class _Manifest(pydantic.BaseModel):
 def _read_manifest(path: Path) -> _Manifest:
     """Return the content of an `objects.yaml`."""
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = parse_yaml(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise MeshError(f"{path}: must be a readable YAML file, got: {one_line(error)}") from error
     try:

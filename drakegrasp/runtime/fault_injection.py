@@ -47,6 +47,9 @@ def _cause(kind: str) -> None:
             ctypes.CDLL(None).pause()
     elif kind == "freeze":
         ctypes.PyDLL(None).pause()  # in C, with the interpreter's lock
+    elif kind == "spin":
+        while True:  # computes; the others only wait
+            pass
     elif kind == "memory":
         raise MemoryError
     elif kind == "blank":

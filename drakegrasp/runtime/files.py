@@ -13,6 +13,7 @@ import os
 import re
 import secrets
 import shutil
+import stat
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -113,13 +114,24 @@ def atomic_hdf5(path: Path, *, sealed: bool = False) -> Iterator[h5py.File]:
             temporary.write_bytes(content.getbuffer())
             seal(temporary)
         else:
-            with _PatientFile(temporary) as patient:
-                try:
-                    with h5py.File(patient, "w") as file:
-                        yield file
-                finally:
-                    # Other errors follow from this one.
-                    patient.refuse_failure()
+            with new_hdf5(temporary) as file:
+                yield file
+
+
+@contextmanager
+def new_hdf5(path: Path) -> Iterator[h5py.File]:
+    """Open a new HDF5 file that the block writes; after an error it is of no use.
+
+    Raises:
+        OSError: If there is a file, the disk is full or the folder cannot be written.
+    """
+    with _PatientFile(path) as patient:
+        try:
+            with h5py.File(patient, "w") as file:
+                yield file
+        finally:
+            # Other errors follow from this one.
+            patient.refuse_failure()
 
 
 class _PatientFile(FileIO):
@@ -174,6 +186,19 @@ def seal(path: Path) -> None:
         file.write(text)
 
 
+def read_seal(path: Path) -> bytes:
+    """Return the seal of a file, which tells it from every other file; it is not verified.
+
+    Raises:
+        DataError: If the file cannot be read.
+    """
+    try:
+        with path.open("rb", buffering=0) as file:
+            return file.read(SEAL_SIZE)
+    except OSError as error:
+        raise DataError(f"{path}: must be a complete shard, got none ({error.strerror})") from None
+
+
 def refuse_broken_seal(path: Path, what: str = "shard") -> None:
     """Refuse a sealed file in which any bit has changed.
 
@@ -202,15 +227,24 @@ def _seal_of(file: BufferedReader | BufferedRandom) -> bytes:
 
 def sync_and_rename(temporary: Path, path: Path) -> None:
     """Make a finished file durable and give it its name, in one step for readers."""
-    _sync(temporary)
+    sync(temporary)
     temporary.replace(path)
-    _sync(path.parent)
+    sync(path.parent)
 
 
 def temporary_name(path: Path) -> Path:
     """Return a name beside a file under which it may be written, unlike any other process's."""
     writer = f"{host_label()}~{os.getpid()}~{secrets.token_hex(6)}"
     return path.with_name(f".{path.name}.{writer}{TEMPORARY_SUFFIX}")
+
+
+def is_temporary_of(temporary: str, name: str) -> bool:
+    """Return whether a name is one that `temporary_name` gives for a file of another name."""
+    prefix = f".{name}"
+    return (
+        temporary.startswith(prefix)
+        and _TEMPORARY.fullmatch(temporary.removeprefix(prefix)) is not None
+    )
 
 
 def probe_folder(folder: Path) -> None:
@@ -224,17 +258,50 @@ def probe_folder(folder: Path) -> None:
     probe.unlink()
 
 
-def sweep_temporary(out: Path) -> list[Path]:
-    """Remove temporary files of dead processes from a dataset's directory; return their paths.
+def open_own(path: Path, flags: int) -> int:
+    """Open a file to write it in place; return its descriptor. No link is followed.
 
-    Whether another machine's process still runs is unknown: its files are removed when old.
+    Args:
+        path: Of the file.
+        flags: As for `os.open`; a new file has the rights that the umask leaves.
+
+    Raises:
+        OSError: If it cannot be opened.
+        DataError: If it is a link, has another name elsewhere, or is no plain file.
     """
-    return [path for path in _temporary_files(out) if _is_stale(path) and _remove(path)]
+    refusal = DataError(f"{path}: must be a file of its own, got a link or no file")
+    try:
+        safe = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        descriptor = os.open(path, flags | safe, 0o666)
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.ENXIO):
+            raise refusal from None
+        raise
+    status = os.fstat(descriptor)
+    if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
+        os.close(descriptor)
+        raise refusal
+    return descriptor
+
+
+def stale_temporary(out: Path) -> Iterator[Path]:
+    """Yield the temporary files of dead processes in a dataset's directory.
+
+    Whether another machine's process still runs is unknown: its files count when they are old.
+    """
+    return (path for path in _temporary_files(out) if _is_stale(path))
+
+
+def sweep_temporary(out: Path) -> list[Path]:
+    """Remove temporary files of dead processes from a dataset's directory; return their paths."""
+    return [path for path in stale_temporary(out) if _remove(path)]
 
 
 def _temporary_files(out: Path) -> Iterator[Path]:
     for pattern in ("", "objects", "shards/*"):
         for folder in out.glob(pattern) if pattern else [out]:
+            if folder != out and (folder.is_symlink() or folder.parent.is_symlink()):
+                continue
             with suppress(FileNotFoundError, NotADirectoryError), os.scandir(folder) as entries:
                 for entry in entries:
                     if entry.name.startswith(".") and entry.name.endswith(TEMPORARY_SUFFIX):
@@ -246,7 +313,7 @@ def _is_stale(path: Path) -> bool:
     if match is not None and match["host"] == host_label():
         return not is_running(int(match["pid"]))
     try:
-        return time.time() - path.stat().st_mtime > STALE_SECONDS
+        return time.time() - path.lstat().st_mtime > STALE_SECONDS
     except FileNotFoundError:
         return False
 
@@ -285,7 +352,8 @@ def _is_no_room(error: BaseException) -> bool:
     )
 
 
-def _sync(path: Path) -> None:
+def sync(path: Path) -> None:
+    """Make a file, or the names in a folder, durable."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -6,15 +6,21 @@ step that passes its time limit leave a mark behind the record, which Python's `
 writes without the interpreter; SIGKILL leaves none. The file is removed when the unit is done. A
 file that is there when a unit starts shows that an earlier run died, and in which step:
 
-* a step that passed its time limit is not tried again;
+* a step that passed its time limit `HUNG_DEATHS` times in a row is not tried again;
 * a step in which the process crashed `NATIVE_DEATHS` times in a row is not tried again;
-* an attempt in which the process vanished `SILENT_DEATHS` times in a row (the kernel or the nanny
-  kills a process that takes too much memory) is not tried again.
+* a step in which the process vanished `SILENT_DEATHS` times in a row (the kernel or the nanny
+  kills a process that takes too much memory) is not tried again; a mesh that is prepared has fewer
+  chances, `PREPARE_DEATHS`, because each of them takes longer.
 
 Unresolved steps, in which a process died but not often enough, run first: a failing step then costs
 a start of the process and not the whole unit, and a step that passes is cleared. A process must
 vanish eight times in a row in the very same step: a machine that is switched off, or a random
 SIGKILL, does not do that.
+
+The limit of a step is computing time: a process that is suspended, or shares its core with many,
+computes little while hours pass. A step that hangs without computing (it waits for ever) meets a
+limit of wall-clock time that is longer. A long suspension passes that, too; so a step has a second
+chance.
 
 The file is text: a line of JSON with the unit's identity and the deaths before, the record, and
 what faulthandler wrote.
@@ -25,6 +31,7 @@ from __future__ import annotations
 import faulthandler
 import json
 import os
+import signal
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -39,16 +46,25 @@ from drakegrasp.runtime.processes import lock_file
 
 #: Crashes in a row in one step after which it is not tried again: one may be the machine's fault.
 NATIVE_DEATHS = 2
-#: Deaths without a mark in a row in one attempt after which it is not tried again.
+#: Passed time limits in a row in one step after which it is not tried again: one may be due to a
+#: process that somebody suspended.
+HUNG_DEATHS = 2
+#: The limit of wall-clock time of a step, as a multiple of its limit of computing time.
+WALL_FACTOR = 3.0
+#: Deaths without a mark in a row in one step after which it is not tried again.
 SILENT_DEATHS = 8
+#: The same for preparing a mesh, which is one step.
+PREPARE_DEATHS = 5
 #: Deaths of a unit since the last verdict after which it is in a crash loop.
 GIVE_UP_DEATHS = 20
 #: Bytes of the record.
 _RECORD_SIZE = 32
-#: How the text of faulthandler begins, for a crash and for a passed time limit.
-_CRASH_MARK, _TIME_MARK = b"Fatal Python error", b"Timeout ("
-#: How the names of steps that are attempts begin.
-ATTEMPT = "try"
+#: How the text of faulthandler begins, for a crash and for a passed limit of either time.
+_CRASH_MARK, _TIME_MARKS = b"Fatal Python error", (b"Timeout (", b"hread 0x")
+#: How the names of steps that are attempts begin; the step that prepares a mesh.
+ATTEMPT, PREPARE = "try", "prepare"
+#: What the record says before the first step.
+_START = "start"
 
 
 class Verdict(Enum):
@@ -66,12 +82,12 @@ class Deaths:
     Attributes:
         native: Number of crashes.
         silent: Number of deaths without a mark.
-        hung: Whether the step passed its time limit.
+        hung: Number of passed time limits.
     """
 
     native: int = 0
     silent: int = 0
-    hung: bool = False
+    hung: int = 0
 
 
 @dataclass
@@ -88,13 +104,13 @@ class _History:
 
     def verdict(self, step: str) -> Verdict | None:
         deaths = self.deaths.get(step, Deaths())
-        if deaths.hung:
+        if deaths.hung >= HUNG_DEATHS:
             return Verdict.HUNG
         if deaths.native >= NATIVE_DEATHS:
             return Verdict.CRASHED
-        # A random SIGKILL hits long steps most often; an object is not given up for that.
-        vanished = deaths.silent >= SILENT_DEATHS and step.startswith(ATTEMPT)
-        return Verdict.VANISHED if vanished else None
+        # Before its first step a process dies of nothing that the unit does.
+        most = PREPARE_DEATHS if step == PREPARE else SILENT_DEATHS
+        return Verdict.VANISHED if deaths.silent >= most and step != _START else None
 
     def unresolved(self) -> list[str]:
         return [step for step in self.deaths if self.verdict(step) is None]
@@ -111,10 +127,10 @@ class _History:
             if passed >> i & 1:
                 del self.deaths[cleared]
         before = self.deaths.get(step, Deaths())
-        if _TIME_MARK in marks:
-            now = replace(before, hung=True)
-        elif _CRASH_MARK in marks:
+        if _CRASH_MARK in marks:
             now = replace(before, native=before.native + 1)
+        elif any(mark in marks for mark in _TIME_MARKS):
+            now = replace(before, hung=before.hung + 1)
         else:
             now = replace(before, silent=before.silent + 1)
         self.deaths[step] = now
@@ -148,8 +164,8 @@ class Journal:
 
         Args:
             name: Name of the step, up to 14 ASCII characters.
-            seconds: Wall clock [s] after which this process ends itself, wherever it is; None
-                for a step that cannot hang.
+            seconds: Computing time [s] after which this process ends itself, wherever it is, and
+                a `WALL_FACTOR`-th of the wall-clock time; None for a step that cannot hang.
         """
         if self._file is None:
             yield
@@ -158,8 +174,9 @@ class Journal:
         # Before the step: its record, and an alarm.
         os.pwrite(self._file.fileno(), _record(name, self._passed), self._start)
         if seconds is not None:
-            # The alarm is a thread of C: it also ends a process that never returns to Python.
-            faulthandler.dump_traceback_later(seconds, exit=True, file=self._file)
+            # Both alarms are in C: they also end a process that never returns to Python.
+            signal.setitimer(signal.ITIMER_PROF, seconds)
+            faulthandler.dump_traceback_later(WALL_FACTOR * seconds, exit=True, file=self._file)
         try:
             yield
         except MemoryError:
@@ -167,6 +184,7 @@ class Journal:
             os._exit(1)
         finally:
             if seconds is not None:
+                signal.setitimer(signal.ITIMER_PROF, 0.0)
                 faulthandler.cancel_dump_traceback_later()
 
         # The next record clears it.
@@ -214,7 +232,7 @@ def open_journal(path: Path, identity: Mapping[str, Any]) -> Iterator[Journal]:
     # not synced.
     temporary = temporary_name(path)
     try:
-        temporary.write_bytes(line + b"\n" + _record("start", 0))
+        temporary.write_bytes(line + b"\n" + _record(_START, 0))
         with temporary.open("r+b", buffering=0) as file:
             lock_file(file)
             file.seek(0, os.SEEK_END)  # faulthandler writes here
@@ -233,6 +251,8 @@ def _record(step: str, passed: int) -> bytes:
 def _read_history(path: Path, identity: Mapping[str, Any]) -> _History | None:
     """Return how earlier runs died, or None if one of them is still alive."""
     history = _History()
+    if path.is_symlink():
+        return history  # it will be replaced
     try:
         with path.open("r+b") as file:  # NFS locks only files that are open for writing
             # On a file system without locks (None) nobody is known to hold one.
@@ -256,12 +276,15 @@ def _read_history(path: Path, identity: Mapping[str, Any]) -> _History | None:
 
 @contextmanager
 def _crashes_marked(file: FileIO) -> Iterator[None]:
-    """Write native crashes of this process to a file while the block runs."""
+    """Write native crashes and passed limits of this process to a file while the block runs."""
     before = faulthandler.is_enabled()
     faulthandler.enable(file=file, all_threads=False)
+    # The alarm of computing time: a mark in the file, then the signal's own effect, the end.
+    faulthandler.register(signal.SIGPROF, file=file, all_threads=True, chain=True)
     try:
         yield
     finally:
+        faulthandler.unregister(signal.SIGPROF)
         faulthandler.disable()
         if before and sys.__stderr__ is not None:
             with suppress(OSError, ValueError):  # stderr may be no real file

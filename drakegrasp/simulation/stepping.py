@@ -1,4 +1,4 @@
-"""Stepping a simulation within an attempt's limits: wall-clock time and the object's speed.
+"""Stepping a simulation within an attempt's limits: computing time and the object's speed.
 
 Both ways to stop are exceptions, which `trial.run_attempt` turns into outcomes.
 """
@@ -19,7 +19,7 @@ class StateError(Exception):
 
 
 class TrialTimeout(Exception):  # noqa: N818 - named as the outcome that it becomes
-    """The attempt ran longer than its wall-clock limit."""
+    """The attempt computed for longer than its limit."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,8 @@ class TrialLimits:
     """When an attempt is stopped.
 
     Attributes:
-        deadline: Reading of `time.monotonic` at which it times out [s].
+        deadline: Reading of `time.thread_time` at which it times out [s]. A process that was
+            suspended, or had to share its core, does not compute meanwhile.
         max_speed: Speed of the object above which the state has exploded [m/s].
     """
 
@@ -42,7 +43,7 @@ class TrialLimits:
             StateError: If the state has exploded.
         """
         advance(scene, duration)
-        if time.monotonic() > self.deadline:
+        if time.thread_time() > self.deadline:
             raise TrialTimeout
         if not np.isfinite(hand_positions(scene)).all():
             raise StateError("the positions of the hand's joints became infinite or NaN")
@@ -56,4 +57,4 @@ class TrialLimits:
 
 def start_limits(config: Config) -> TrialLimits:
     """Return the limits of an attempt that starts now."""
-    return TrialLimits(time.monotonic() + config.attempt_seconds, config.physics.max_speed)
+    return TrialLimits(time.thread_time() + config.attempt_seconds, config.physics.max_speed)

@@ -15,6 +15,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.errors import GraspError, first_line
 from drakegrasp.frames import Array, as_numbers, invert_pose, rotate_vectors, transform_points
 
@@ -247,7 +248,7 @@ def _read_hdf5(path: Path, split: str | None) -> Predictions:
     """Return the grasps of an HDF5 file, and their rows if it has them."""
     # Read both arrays.
     try:
-        with h5py.File(path, "r") as file:
+        with open_hdf5(path) as file:
             group = _choose_group(path, file, split)
             where = f"{path}: {_place(group, GRASPS)}"
             numbers = as_numbers(group[GRASPS][()], f"{where}: must hold real numbers")

@@ -56,8 +56,9 @@ and how often the build was interrupted: nothing in these files depends on the c
 machine's name. `time_close` and `time_lift` are simulated seconds. This holds on one machine with
 one set of library versions (`manifest.json` names them); another CPU or another version of Drake
 may round differently. The exceptions are the outcomes `timeout` and `crashed`: an attempt that
-takes longer than `attempt_seconds` (60 s, where a usual one takes about one), or ends its process
-again and again, says more about the machine than about the grasp, and may end otherwise elsewhere.
+computes for longer than `attempt_seconds` (60 s, where a usual one takes about one), or ends its
+process again and again, says more about the machine than about the grasp, and may end otherwise
+elsewhere.
 `screened` is an attempt that geometry has decided: it was not simulated, and would have been a
 `missing_fingertip`, see [screening](../explanation/screening.md).
 
@@ -85,7 +86,17 @@ anywhere on a fingertip's link.
 Shards and the files in `objects/` are sealed: a changed bit in one of them is found when it is
 used, and by `drakegrasp check`. The three main files have no seal: `check` finds what breaks an
 invariant, not every changed bit of an image. `drakegrasp assemble` makes them again from the
-shards; a list of rejected trials (`--reject`) holds until then.
+shards; a build does so by itself if they are not of the present shards and manifest. A list of
+rejected trials (`assemble --reject`) is kept in the manifest until the next `assemble`.
+
+The three files and the manifest are replaced together: while `replacement.json` is in the directory
+they are of two states, and every reader refuses them. The next command with OUT completes this.
+
+## A stranger's dataset
+
+A dataset may come from anywhere. No link in its directory is followed when something is written or
+deleted. An HDF5 file that has soft or external links, or values in another file, is refused. Names
+of objects are names: printable, without slashes. Control characters reach no terminal, log or page.
 
 ## Missing values
 
@@ -101,8 +112,8 @@ say that the simulator failed: never count them as failed grasps.
 
 _ATTRIBUTES = """
 Further attributes: `schema_version`, `camera`, camera matrix `K` [px], `near` and `far` [m],
-`config` and `versions` (JSON), `config_hash`, `seed`, `signature` (of what the file was assembled
-from).
+`config` and `versions` (JSON), `config_hash`, `seed`, and of what the file was assembled from:
+`signature`, a hash of all in the manifest that decides a row, and `shards`, a hash of their seals.
 """
 
 _DATA = """## grasping_oto.hdf5 and grasping_otm.hdf5

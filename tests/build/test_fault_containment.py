@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import random
-import resource
 import shutil
 import signal
 import subprocess
@@ -21,45 +20,30 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
+from dask.utils import parse_timedelta
 from distributed import Client, LocalCluster, get_worker
 from helpers.assertions import assert_same_dataset
+from helpers.builds import FAST, finish, start_build, wait_for_shards, workers_of
 
 from drakegrasp.build import attempts
 from drakegrasp.build.pipeline import build
+from drakegrasp.build.prepare import PREPARE_SECONDS
+from drakegrasp.build.work_unit import WorkUnit, run_unit
 from drakegrasp.cluster import executor as tasks
-from drakegrasp.cluster.connect import connect
+from drakegrasp.cluster.connect import connect, dask_settings
 from drakegrasp.cluster.executor import DaskExecutor
 from drakegrasp.config import Config, load_config
+from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import PreparedObject
 from drakegrasp.dataset.statistics import count_funnel
 from drakegrasp.errors import BlankImageError, DiskFullError, MachineError
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
-from drakegrasp.runtime.fault_injection import VARIABLE
+from drakegrasp.runtime.journal import WALL_FACTOR, Journal, Verdict
 from drakegrasp.runtime.processes import host_label
 from drakegrasp.vision import rendering
 
-#: Units of half a second, so that none goes with another and a build can be stopped in time; of ten
-#: attempts one succeeds.
-FAST = [
-    "screen.mode=off",
-    "candidates.max=18",
-    "candidates.global_x_deg=[0]",
-    "candidates.global_y_deg=[0]",
-    "candidates.global_z_deg=[0,45,90]",
-    "candidates.local_z_deg=[0,90]",
-    "unit_candidates=1",
-    "settle.drop_height=0.01",
-    "settle.max_linear_speed=0.1",
-    "settle.max_angular_speed=1",
-    "physics.time_step=0.002",
-    "lift.max_speed=2",
-    "lift.max_acceleration=20",
-    "lift.hold_time=0.1",
-    "camera.size=32",
-    "filters.outlier_sigma=0",
-]
 UNITS = 36
 KILLS = 20
 
@@ -84,74 +68,6 @@ def undisturbed(meshes: Path, config: Config, tmp_path_factory: pytest.TempPathF
     build(find_meshes(meshes), out, config, run_here, show=False)
     assert count_funnel(out).outcomes[:, Outcome.SUCCESS].sum() > 0
     return out
-
-
-def start_build(
-    meshes: Path,
-    out: Path,
-    workers: int,
-    *arguments: str,
-    fault: str = "",
-    largest_file: int = resource.RLIM_INFINITY,
-) -> subprocess.Popen[str]:
-    """Start the command of a build in a process of its own, which can write files up to a size."""
-
-    def prepare() -> None:
-        # A test that was started in the background of a shell ignores Ctrl-C, and so would this.
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
-
-    command = [
-        sys.executable,
-        "-c",
-        "from drakegrasp.cli.main import main; main()",
-        "build",
-        "--quiet",
-    ]
-    command += ["--objects", str(meshes), "--out", str(out), "--workers", str(workers)]
-    for value in FAST:
-        command += ["--set", value]
-    command += arguments
-    environment = {**os.environ, VARIABLE: fault} if fault else None
-    return subprocess.Popen(
-        command,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment,
-        preexec_fn=prepare,
-    )
-
-
-def finish(process: subprocess.Popen[str]) -> tuple[str, str]:
-    """Return what a build that must succeed says."""
-    said, errors = process.communicate(timeout=240)
-    assert process.returncode == 0, errors
-    return said, errors
-
-
-def wait_for_shards(out: Path, count: int, patience: float | None = None) -> None:
-    """Wait until there are some shards: as long as it takes, or for some seconds at most."""
-    end = time.monotonic() + (120.0 if patience is None else patience)
-    while len(list(out.glob("shards/*/*.h5"))) < count:
-        if time.monotonic() > end:
-            assert patience is not None, "the build must go on"
-            return
-        time.sleep(0.05)
-
-
-def workers_of(client: int) -> list[int]:
-    """Return the worker processes that a build on this machine started."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
-            spawned = b"spawn_main" in (folder / "cmdline").read_bytes()
-        except (OSError, IndexError):
-            continue
-        if parent == client and spawned:
-            found.append(int(folder.name))
-    return found
 
 
 def events(out: Path, name: str) -> list[dict[str, Any]]:
@@ -269,8 +185,8 @@ def test_fault_costs_what_is_guilty_and_nothing_else(
     trimesh.creation.box([0.05, 0.05, 0.1]).export(more / "3_box_c.obj")
     faults = "crash:1_box_a:3:1 hang:1_box_a:5:0 freeze:2_box_b:4:2 crash:3_box_c"
     out = tmp_path / "out"
-    # Long enough for the innocent on a busy machine.
-    limit = ("--set", "attempt_seconds=8")
+    # A hang that does not compute takes several times as long.
+    limit = ("--set", "attempt_seconds=4")
     said, errors = finish(start_build(more, out, 2, *limit, fault=faults))
     assert "refused: 3_box_c: 3_box_c: preparing it crashed its process" in said
     assert errors == ""
@@ -291,6 +207,69 @@ def test_fault_costs_what_is_guilty_and_nothing_else(
             assert b["trials/outcome"][places.index(place)] == outcome
             assert np.isnan(b["trials/closed_q"][places.index(place)]).all()
     assert_clean(out)
+
+
+@pytest.mark.cluster
+@pytest.mark.sim
+@pytest.mark.slow
+def test_suspended_worker_changes_nothing(meshes: Path, undisturbed: Path, tmp_path: Path) -> None:
+    """As SLURM suspends a job: for longer than an attempt may take, also by the wall clock."""
+    out = tmp_path / "out"
+    process = start_build(meshes, out, 1, "--set", "attempt_seconds=1")
+    for shards, seconds in ((2, 3.0), (8, 8.0)):
+        wait_for_shards(out, shards)
+        (worker,) = workers_of(process.pid)
+        os.kill(worker, signal.SIGSTOP)
+        time.sleep(seconds)
+        os.kill(worker, signal.SIGCONT)
+    finish(process)
+    with h5py.File(out / "trials.hdf5") as file:
+        assert Outcome.TIMEOUT not in file["trials/outcome"][:]
+    for name in ("trials/outcome", "trials/X_TO_lifted"):
+        with h5py.File(undisturbed / "trials.hdf5") as a, h5py.File(out / "trials.hdf5") as b:
+            assert a[name][:].tobytes() == b[name][:].tobytes()
+
+
+@pytest.mark.cluster
+@pytest.mark.sim
+@pytest.mark.slow
+def test_mesh_that_takes_too_much_memory_is_refused_and_the_others_go_on(
+    meshes: Path, tmp_path: Path
+) -> None:
+    """The kernel kills its process each time; with more memory the next build has it."""
+    out = tmp_path / "out"
+    few = ("--set", "candidates.max=1")
+    said, errors = finish(start_build(meshes, out, 1, *few, fault="exit:1_box_a"))
+    line = "refused: 1_box_a: 1_box_a: preparing it was at work whenever its process vanished"
+    assert line in said
+    assert errors == "" or "nothing will train" in errors
+    assert [entry.name for entry in read_manifest(out).objects] == ["2_box_b"]
+    assert_clean(out)
+    build(find_meshes(meshes), out, load_config(overrides=[*FAST, few[1]]), run_here, show=False)
+    assert [entry.name for entry in read_manifest(out).objects] == ["1_box_a", "2_box_b"]
+    assert not read_manifest(out).refused
+
+
+def test_scheduler_is_more_patient_than_the_limits_of_steps() -> None:
+    """A step may hold the interpreter, so that its worker gives no sign of life."""
+    patience = parse_timedelta(dask_settings()["distributed.scheduler.worker-ttl"])
+    assert patience > WALL_FACTOR * PREPARE_SECONDS
+
+
+@pytest.mark.parametrize("step", ["build", "predict", "measure", "write"])
+def test_every_step_of_a_unit_is_in_its_journal(
+    undisturbed: Path, tmp_path: Path, step: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So that a hang in it meets its limit, and the user is told of which step it was."""
+    out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
+    header = next(read_manifest(out).headers())
+    header.path(out).unlink()
+    monkeypatch.setattr(
+        Journal, "verdict", lambda self, name: Verdict.HUNG if name == step else None
+    )
+    config = read_manifest(out).config.to_dict()
+    with pytest.raises(MachineError, match=r"1_box_a: .*passed its time limit"):
+        run_unit(WorkUnit(out=str(out), header=header, config=config, restartable=True))
 
 
 # Faults found on start

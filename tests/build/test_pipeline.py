@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -20,8 +21,9 @@ from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.log import read_log
-from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.shards import read_shard, write_shard
 from drakegrasp.dataset.statistics import count_funnel, count_splits
 from drakegrasp.errors import ConfigError, DataError, MachineError, MeshError
 from drakegrasp.objects.sources import MeshSource, find_meshes
@@ -172,6 +174,56 @@ def test_object_keeps_to_what_is_said_of_it(
     assert replay_trial(out, int(lifted[0])).same
     again = build(find_meshes(meshes), out, small_config, _nothing_runs, show=False)
     assert again.reused == 12
+
+
+def test_changed_class_is_in_the_files_without_a_simulation(
+    small_meshes: Path, small_dataset: Path, small_config: Config, tmp_path: Path
+) -> None:
+    meshes = Path(shutil.copytree(small_meshes, tmp_path / "meshes"))
+    out = _copy(small_dataset, tmp_path)
+    (meshes / "objects.yaml").write_text("objects: {11_box_slim: {class: carton}}\n")
+    report = build(find_meshes(meshes), out, small_config, run_here, show=False)
+    assert (report.simulated, report.reused, report.assembled) == (0, 12, True)
+    assert [str(v) for v in check_dataset(out)] == []
+    with h5py.File(out / "trials.hdf5") as file:
+        assert file["objects/class_name"].asstr()[1] == "carton"
+    again = build(find_meshes(meshes), out, small_config, _nothing_runs, show=False)
+    assert not again.assembled
+
+
+def test_shard_that_is_not_the_assembled_one_is_assembled(
+    small_meshes: Path, small_dataset: Path, small_config: Config, tmp_path: Path
+) -> None:
+    """As after a build that simulated it again, and whose client died before it assembled."""
+    out = _copy(small_dataset, tmp_path)
+    path = sorted(out.glob("shards/*/*.h5"))[0]
+    shard = read_shard(path)
+    (failed,) = np.nonzero(shard.trials["outcome"] != Outcome.SUCCESS)
+    shard.trials["outcome"][failed[0]] = Outcome.CRASHED
+    write_shard(out, shard)
+    report = build(find_meshes(small_meshes), out, small_config, _nothing_runs, show=False)
+    assert (report.simulated, report.assembled) == (0, True)
+    with h5py.File(out / "trials.hdf5") as file:
+        assert Outcome.CRASHED in file["trials/outcome"][:]
+
+
+def test_build_keeps_what_an_inspection_rejected(
+    small_meshes: Path, small_dataset: Path, small_config: Config, tmp_path: Path
+) -> None:
+    """But not of a mesh that has changed since: its grasps are other ones."""
+    meshes = Path(shutil.copytree(small_meshes, tmp_path / "meshes"))
+    out = _copy(small_dataset, tmp_path)
+    assemble(out, rejected=[GraspDataset(out / "grasping_oto.hdf5", split="test")[0].trial_id])
+    (out / "trials.hdf5").unlink()
+    report = build(find_meshes(meshes), out, small_config, _nothing_runs, show=False)
+    assert report.assembly.removed[Removal.REJECTED] == 1
+
+    # No mesh is simulated again here: only its entry counts.
+    manifest = read_manifest(out)
+    changed = [replace(entry, mesh_sha256="other") for entry in manifest.objects]
+    write_manifest(replace(manifest, objects=tuple(changed)), out)
+    build(find_meshes(meshes), out, small_config, run_here, show=False)
+    assert read_manifest(out).rejected == ()
 
 
 def test_max_grasps_cuts_after_the_last_wanted_one(

@@ -13,6 +13,7 @@ from helpers.machine import needs_egl
 
 from drakegrasp.cli import doctor
 from drakegrasp.cli.doctor import Finding, diagnose
+from drakegrasp.vision import probe_image
 
 
 @pytest.fixture
@@ -127,8 +128,8 @@ def test_missing_egl_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_image_that_fails_is_told_and_kills_nobody(
     monkeypatch: pytest.MonkeyPatch, child: str, what: str
 ) -> None:
-    monkeypatch.setattr(doctor, "_CHILD", child)
-    monkeypatch.setattr(doctor, "IMAGE_SECONDS", 1.0 if "sleep" in child else 60.0)
+    monkeypatch.setattr(probe_image, "_CHILD", child)
+    monkeypatch.setattr(probe_image, "IMAGE_SECONDS", 1.0 if "sleep" in child else 60.0)
     finding = doctor.check_image()
     assert (finding.ok, finding.what) == (False, what)
     assert finding.remedy == "apt-get install libegl1 libgl1-mesa-dri"
@@ -137,14 +138,14 @@ def test_image_that_fails_is_told_and_kills_nobody(
 def test_image_that_lacks_a_library_is_mended_by_installing_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(doctor, "_CHILD", "import no_such_library")
+    monkeypatch.setattr(probe_image, "_CHILD", "import no_such_library")
     finding = doctor.check_image()
     assert finding.what == "ModuleNotFoundError: No module named 'no_such_library'"
     assert finding.remedy.startswith("pip install")
 
 
 def test_last_line_counts_so_that_warnings_do_no_harm(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "_CHILD", "print('a notice'); print('3000 3012')")
+    monkeypatch.setattr(probe_image, "_CHILD", "print('a notice'); print('3000 3012')")
     assert doctor.check_image().ok
 
 
@@ -154,7 +155,7 @@ def test_child_does_not_import_what_lies_in_the_current_directory(
     """A user's own numpy.py or test.py beside the dataset must not break the diagnosis."""
     (tmp_path / "colorsys.py").write_text("raise SystemExit('the wrong one')")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(doctor, "_CHILD", "import colorsys; print('3000 3012')")
+    monkeypatch.setattr(probe_image, "_CHILD", "import colorsys; print('3000 3012')")
     assert doctor.check_image().ok
 
 
@@ -220,7 +221,8 @@ def test_doctor_works_where_drake_and_all_else_are_missing(tmp_path: Path) -> No
         "for name in ('pydrake', 'numpy', 'trimesh', 'h5py', 'pydantic', 'dask'):\n"
         "    sys.modules[name] = None\n"
         "from drakegrasp.cli import doctor\n"
-        "doctor._CHILD = 'raise ImportError(1)'\n"
+        "from drakegrasp.vision import probe_image\n"
+        "probe_image._CHILD = 'raise ImportError(1)'\n"
         "print(*(f.name for f in doctor.diagnose() if not f.ok), sep=',')\n"
     )
     child = subprocess.run(

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 import time
 from pathlib import Path
 
 import pytest
+from distributed import get_worker
 
 from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.connect import connect
 from drakegrasp.config import load_config
+from drakegrasp.errors import MachineError
 from drakegrasp.runtime.blas import running_kernel
 from drakegrasp.runtime.kernels import KERNELS, VARIABLE, chosen_kernel
 
@@ -87,3 +90,37 @@ def test_workers_that_join_later_get_the_kernel_or_say_so(
         for process in reversed(processes):
             process.terminate()
             process.wait(60)
+
+
+#: With it the loader of OpenGL finds no driver.
+NO_DRIVER = "__EGL_VENDOR_LIBRARY_FILENAMES"
+
+
+def test_machine_that_cannot_render_is_refused_before_the_build(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv(NO_DRIVER, os.devnull)
+    with (
+        connect(workers=1) as client,
+        pytest.raises(MachineError, match=r"must render a test image, got .*`drakegrasp doctor`"),
+        admitted_workers(client, load_config()),
+    ):
+        raise AssertionError
+
+
+def _become_a_machine() -> None:
+    """Have a worker stand for a machine of its own; the second cannot render."""
+    name = get_worker().name
+    socket.gethostname = lambda: f"machine{name}"
+    if name == 1:
+        os.environ[NO_DRIVER] = os.devnull
+
+
+def test_machine_without_opengl_is_left_out_and_the_others_work(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    with connect(workers=2) as client:
+        client.run(_become_a_machine)
+        with admitted_workers(client, load_config()):
+            assert list(client.run(socket.gethostname).values()) == ["machine0"]
+    assert "not used: workers on machine1: must render a test image" in capfd.readouterr().err

@@ -16,7 +16,7 @@ from drakegrasp.dataset import shards
 from drakegrasp.dataset.assemble import assemble, assemble_locked, summarise
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.lock import FILE_NAME, build_lock
-from drakegrasp.dataset.manifest import change_postprocessing
+from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import DataError
 from drakegrasp.frames import invert_pose, transform_points, unpack_pose
@@ -64,7 +64,7 @@ def test_shard_without_a_success_has_trials_only(tmp_path: Path) -> None:
 
 def test_holder_of_the_lock_assembles_in_it(out: Path) -> None:
     with build_lock(out):
-        assert assemble_locked(out) == summarise(out)
+        assert assemble_locked(out, read_manifest(out)) == summarise(out)
         assert (out / FILE_NAME).exists()
 
 
@@ -88,10 +88,8 @@ def test_palm_and_contacts_of_a_sample_are_as_far_apart_as_in_its_trial(
 
 
 def test_limits_of_the_hold_change_without_a_simulation(out: Path) -> None:
-    change_postprocessing(out, [f"filters.max_slip={SLIP / 2}"])
-    assert assemble(out).removed == {Removal.SLID: 9}
-    change_postprocessing(out, ["filters.require=held"])
-    assert assemble(out).removed == {Removal.KEPT: 9}
+    assert assemble(out, overrides=[f"filters.max_slip={SLIP / 2}"]).removed == {Removal.SLID: 9}
+    assert assemble(out, overrides=["filters.require=held"]).removed == {Removal.KEPT: 9}
 
 
 def test_rejected_trials_become_no_samples(out: Path) -> None:
@@ -159,3 +157,51 @@ def test_full_disk_is_one_line_wherever_it_fills(out: Path) -> None:
     assert not run.stderr
     assert {name: (out / name).read_bytes() for name in FILES} == before
     assert not list(out.glob(".*"))
+
+
+#: Kills children that assemble, each a little later, until one comes to its end; prints how many.
+KILL = """
+import os, signal, sys, time
+from pathlib import Path
+from drakegrasp.dataset.assemble import assemble, is_assembled
+from drakegrasp.dataset.lock import tidy
+
+out, kills, delay, done = Path(sys.argv[1]), 0, 0.0, False
+settings = [f"filters.max_slip={sys.argv[2]}", "filters.require=held"]
+for setting in settings:  # so that the files that are there are always other ones
+    assemble(out, overrides=[setting])
+started = time.monotonic()
+assemble(out, overrides=[settings[0]])
+step = (time.monotonic() - started) / 20
+while not done:
+    child = os.fork()
+    if not child:
+        assemble(out, overrides=[settings[kills % 2]])
+        os._exit(0)
+    time.sleep(delay)
+    os.kill(child, signal.SIGKILL)
+    done = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    kills, delay = kills + (not done), delay + step
+    tidy(out)
+    assert is_assembled(out, verify_shards=True), kills
+    assert sorted(p.name for p in out.iterdir()) == sorted(sys.argv[3:]), os.listdir(out)
+print(kills)
+"""
+
+
+@pytest.mark.slow
+def test_whenever_assembling_is_killed_the_files_are_of_one_state(out: Path) -> None:
+    names = sorted(path.name for path in out.iterdir())
+    before = [(out / name).read_bytes() for name in FILES]
+    manifest = (out / "manifest.json").read_bytes()
+    run = subprocess.run(
+        [sys.executable, "-c", KILL, str(out), str(SLIP / 2), *names],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (run.returncode, run.stderr) == (0, "")
+    assert int(run.stdout) >= 10
+    (out / "manifest.json").write_bytes(manifest)
+    assemble(out)
+    assert [(out / name).read_bytes() for name in FILES] == before

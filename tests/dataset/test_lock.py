@@ -142,3 +142,18 @@ def test_without_locks_a_number_alone_is_no_process(
     else:
         with pytest.raises(DataError, match="one process at a time"), build_lock(tmp_path):
             raise AssertionError
+
+
+def test_two_threads_do_not_hold_a_directory_both(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Though the kernel of a network file system gives its lock to all threads of a process."""
+    monkeypatch.setattr(fcntl, "flock", lambda file, operation: None)
+    link = tmp_path / "link"
+    link.symlink_to(tmp_path / "out")
+    with build_lock(tmp_path / "out"):
+        for name in (tmp_path / "out", link):
+            with pytest.raises(DataError, match="got another thread"), build_lock(name):
+                raise AssertionError
+    with build_lock(tmp_path / "out"):
+        pass

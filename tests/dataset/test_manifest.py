@@ -14,8 +14,8 @@ from drakegrasp.dataset.manifest import (
     Manifest,
     ObjectEntry,
     RefusedMesh,
-    change_postprocessing,
     read_manifest,
+    with_postprocessing,
     write_manifest,
 )
 from drakegrasp.dataset.paths import FILE_NAME
@@ -148,10 +148,9 @@ def test_file_that_is_no_manifest_is_refused(tmp_path: Path, content: bytes) -> 
         read_manifest(tmp_path)
 
 
-def test_filters_may_change_but_not_the_physics(tmp_path: Path, manifest: Manifest) -> None:
-    write_manifest(manifest, tmp_path)
-    change_postprocessing(tmp_path, ["split.valid_fraction=0.2"])
-    assert read_manifest(tmp_path).config.split.valid_fraction == 0.2
+def test_filters_may_change_but_not_the_physics(manifest: Manifest) -> None:
+    changed = with_postprocessing(manifest, ["split.valid_fraction=0.2"])
+    assert changed.config.split.valid_fraction == 0.2
+    assert changed.objects == (MUG,)
     with pytest.raises(ValueError, match=r"physics\.time_step \(0\.008 there, 0\.004 here\)"):
-        change_postprocessing(tmp_path, ["physics.time_step=0.004"])
-    assert read_manifest(tmp_path).objects == (MUG,)
+        with_postprocessing(manifest, ["physics.time_step=0.004"])

@@ -17,7 +17,7 @@ from drakegrasp.config import Config
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.filters import Removal
-from drakegrasp.dataset.manifest import change_postprocessing, claim_directory
+from drakegrasp.dataset.manifest import claim_directory
 from drakegrasp.dataset.paths import FILE_NAME
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import (
@@ -108,7 +108,6 @@ def old(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (count_funnel, TRIALS),
         (count_splits, OTO),
         (partial(claim_directory, config=Config()), FILE_NAME),
-        (partial(change_postprocessing, overrides=[]), FILE_NAME),
         (partial(replay_trial, trial_id=0), FILE_NAME),
     ],
 )

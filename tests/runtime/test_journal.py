@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 import time
@@ -13,9 +14,12 @@ import pytest
 
 from drakegrasp.runtime.journal import (
     GIVE_UP_DEATHS,
+    HUNG_DEATHS,
     NATIVE_DEATHS,
     NO_JOURNAL,
+    PREPARE_DEATHS,
     SILENT_DEATHS,
+    WALL_FACTOR,
     Verdict,
     _History,
     open_journal,
@@ -66,8 +70,8 @@ def deaths_until_done(journal: Path, *faults: str) -> tuple[int, list[str]]:
         ("abort", NATIVE_DEATHS, Verdict.CRASHED),
         ("exit", SILENT_DEATHS, Verdict.VANISHED),
         ("memory", SILENT_DEATHS, Verdict.VANISHED),
-        ("hang", 1, Verdict.HUNG),
-        ("freeze", 1, Verdict.HUNG),
+        ("hang", HUNG_DEATHS, Verdict.HUNG),
+        ("freeze", HUNG_DEATHS, Verdict.HUNG),
     ],
 )
 def test_failing_step_is_found_and_the_others_run(
@@ -84,7 +88,7 @@ def test_several_guilty_steps_are_found_one_by_one(tmp_path: Path) -> None:
     found, lines = deaths_until_done(
         tmp_path / "journal", "crash:try 0", "hang:try 3", "crash:try 9"
     )
-    assert found == 2 * NATIVE_DEATHS + 1
+    assert found == 2 * NATIVE_DEATHS + HUNG_DEATHS
     failing = [line for line in lines if not line.endswith("runs")]
     assert failing == ["try 0 CRASHED", "try 3 HUNG", "try 9 CRASHED"]
 
@@ -103,6 +107,40 @@ def test_hang_costs_its_limit(tmp_path: Path) -> None:
     start = time.monotonic()
     run(tmp_path / "journal", "freeze:try 4")
     assert 0.5 < time.monotonic() - start < 10.0
+
+
+def test_limit_is_of_computing_time(tmp_path: Path) -> None:
+    path = tmp_path / "journal"
+    endless = RUN.replace("import sys, time", "import drakegrasp.runtime.journal as j, sys")
+    endless = endless.replace("faults =", "j.WALL_FACTOR = 1e4\nfaults =")
+    command = [sys.executable, "-c", endless, path, "spin:try 4"]
+    for _ in range(HUNG_DEATHS):
+        result = subprocess.run(command, capture_output=True, timeout=240)
+        assert result.returncode == -signal.SIGPROF
+    assert "try 4 HUNG" in run(path).stdout
+
+
+@pytest.mark.parametrize("seconds", [1.0, 4.0])
+def test_suspended_process_is_not_convicted(tmp_path: Path, seconds: float) -> None:
+    """Neither a stop beyond the limit of computing time, nor one beyond that of the wall clock."""
+    path = tmp_path / "journal"
+    # The step waits for a line, so that the process is surely stopped within it.
+    wait = RUN.replace("_cause(faults[step])", "sys.stdin.readline()")
+    process = subprocess.Popen(
+        [sys.executable, "-c", wait, path, "wait:try 4"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    while "try 4" not in process.stdout.readline():
+        pass
+    process.send_signal(signal.SIGSTOP)
+    time.sleep(seconds)
+    process.send_signal(signal.SIGCONT)
+    process.communicate("\n")
+    assert (process.returncode == 0) == (seconds < WALL_FACTOR * 0.5)
+    assert deaths_until_done(path)[0] == 0
 
 
 def test_journal_says_where_it_died(tmp_path: Path) -> None:
@@ -179,10 +217,22 @@ def test_random_kills_convict_nobody(seed: int) -> None:
         assert not any(history.verdict(step) for step in history.deaths)
 
 
-def test_unit_that_dies_for_nothing_is_given_up(tmp_path: Path) -> None:
-    """As when there is not even the memory to build its scene: no attempt is at fault."""
+def test_unit_that_dies_for_nothing_is_given_up() -> None:
+    """Before its first step no step is at fault."""
     history = _History()
     for _ in range(GIVE_UP_DEATHS):
-        history.add("build", 0, b"")
-        assert history.verdict("build") is None
+        history.add("start", 0, b"")
+        assert history.verdict("start") is None
     assert history.crash_loop == GIVE_UP_DEATHS
+
+
+@pytest.mark.parametrize(
+    ("step", "deaths"), [("prepare", PREPARE_DEATHS), ("build", SILENT_DEATHS)]
+)
+def test_vanishing_counts_in_every_step(step: str, deaths: int) -> None:
+    """As when there is not the memory to prepare a mesh, or to build its scene."""
+    history = _History()
+    for _ in range(deaths):
+        assert history.verdict(step) is None
+        history.add(step, 0, b"")
+    assert history.verdict(step) is Verdict.VANISHED

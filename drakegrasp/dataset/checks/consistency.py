@@ -14,7 +14,7 @@ from drakegrasp.dataset.checks.findings import AnyArray, Violation, of_file
 from drakegrasp.dataset.checks.open_file import OpenFile, column
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.manifest import Manifest
-from drakegrasp.dataset.paths import FILE_NAME
+from drakegrasp.dataset.paths import FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.schema import OBJECT_FIELDS, SPLITS
 
 
@@ -133,9 +133,11 @@ def same_objects(trials: OpenFile, manifest: Manifest) -> Iterator[Violation]:
 
 
 def same_configuration(files: Iterable[OpenFile], manifest: Manifest) -> Iterator[Violation]:
-    """All files are of the manifest's configuration."""
+    """All files are of the manifest's configuration, and of one state of the shards."""
     expected = manifest.config.simulation_hash()
+    states = set()
     for file in files:
+        states.add(tuple(str(file.file.attrs.get(key)) for key in ("signature", "shards")))
         if file.config is None:
             continue
         own = file.config.simulation_hash()
@@ -145,3 +147,6 @@ def same_configuration(files: Iterable[OpenFile], manifest: Manifest) -> Iterato
         elif file.config != manifest.config:
             what = f"filters, split and limits must be those of {FILE_NAME}"
             yield of_file(file.name, what, "others; run `drakegrasp assemble` again")
+    if len(states) > 1:
+        what = "the three files must be of one assembly"
+        yield of_file(TRIALS_FILE, what, f"{len(states)}; run `drakegrasp assemble` again")

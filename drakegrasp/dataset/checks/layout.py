@@ -74,7 +74,7 @@ def attributes(
         return Violation(file=name, what=f"attribute {what}", got=str(got))
 
     # Texts that must be there, whatever they say.
-    required = [*(f"convention_{key}" for key in CONVENTIONS), "signature", "versions"]
+    required = [*(f"convention_{key}" for key in CONVENTIONS), "signature", "shards", "versions"]
     for key in required:
         if not str(attrs.get(key, "")).strip():
             yield broken(f"{key} must be there", "none")

@@ -14,14 +14,13 @@ from __future__ import annotations
 from contextlib import ExitStack
 from pathlib import Path
 
-import h5py
-
 from drakegrasp.dataset.checks import consistency
 from drakegrasp.dataset.checks.context import Context, Dataset
 from drakegrasp.dataset.checks.data_file import check_data_file, check_pair
 from drakegrasp.dataset.checks.findings import Findings, Violation, of_file
 from drakegrasp.dataset.checks.open_file import OpenFile, open_file
 from drakegrasp.dataset.checks.trials_file import check_trials_file
+from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.manifest import Manifest, read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE, refuse_changed_object
 from drakegrasp.dataset.schema import CAMERAS, refuse_other_schema
@@ -57,7 +56,7 @@ def check_dataset(path: str | Path, *, progress: Report | None = None) -> list[V
 def _check_file(path: Path, stack: ExitStack, findings: Findings, report: Report) -> None:
     """Check a file alone."""
     try:
-        file = stack.enter_context(h5py.File(path, "r"))
+        file = stack.enter_context(open_hdf5(path))
     except OSError as error:
         raise DataError(
             f"{path}: must be the directory of a dataset or one of its HDF5 files, "
@@ -112,7 +111,7 @@ def _open_files(out: Path, stack: ExitStack, findings: Findings) -> dict[str, Op
     files = {}
     for camera, name in (*DATA_FILES.items(), ("", TRIALS_FILE)):
         try:
-            file = stack.enter_context(h5py.File(out / name, "r"))
+            file = stack.enter_context(open_hdf5(out / name))
         except OSError as error:
             got = first_line(error) if (out / name).exists() else "none; `drakegrasp assemble`"
             findings.add([of_file(name, "the file must be there and readable", got)])

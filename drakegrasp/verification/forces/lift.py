@@ -204,9 +204,9 @@ def _simulate(fingers: _Fingers, planned: ForceLift, path: LiftPath, config: Con
     # Carry it along, until it has arrived or is lost.
     largest, done = 0.0, 0
     deviation = (0.0, 0.0)
-    end = time.monotonic() + config.attempt_seconds
+    end = time.thread_time() + config.attempt_seconds
     while done < steps and _within(deviation, config, LOST):
-        if time.monotonic() > end:
+        if time.thread_time() > end:
             return replace(planned, end=LiftEnd.TIMEOUT)
         wrench_O = _wanted_wrench(scene, path, FREQUENCY_TIMES_PERIOD / period)
         largest = max(largest, fingers.push(wrench_O))

@@ -1,0 +1,284 @@
+"""`drakegrasp build` and `assemble` as a user sees them: what is refused changes nothing."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import pytest
+import trimesh
+from click.testing import CliRunner, Result
+from distributed.security import Security
+from helpers.builds import start_build, workers_of
+from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
+
+from drakegrasp.build.counts import Counts
+from drakegrasp.build.pipeline import build
+from drakegrasp.cli.main import main
+from drakegrasp.config import Config
+from drakegrasp.dataset.lock import build_lock
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.errors import DataError, MachineError
+from drakegrasp.objects.sources import find_meshes
+from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime import file_set
+from drakegrasp.runtime.executor import run_here
+from drakegrasp.runtime.progress import silent
+from drakegrasp.simulation.trial import TrialRecord
+
+FILES = (OTO, OTM, TRIALS)
+#: A filter that would remove every sample.
+SLIPPED = ("--set", f"filters.max_slip={SLIP / 2}")
+
+
+def run(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+def state(out: Path) -> dict[str, bytes]:
+    """Return the files of a dataset's directory by their names, and of no folder."""
+    return {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Read only: copy it to change it."""
+    folder = tmp_path_factory.mktemp("whole")
+    (folder / "meshes").mkdir()
+    return make_dataset(folder / "out", folder / "meshes")
+
+
+@pytest.fixture
+def out(whole: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(whole, tmp_path / "out"))
+
+
+def _cut_shard(out: Path) -> None:
+    path = sorted(out.glob("shards/*/*.h5"))[-1]
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def _nothing(out: Path) -> None:
+    pass
+
+
+@pytest.mark.parametrize(
+    ("spoil", "arguments", "words"),
+    [
+        (_nothing, ["--reject", "ids.txt"], "rejected trials must be successes, got trial 1"),
+        (_cut_shard, [], "damaged or cut off"),
+        (_nothing, ["--set", "filters.max_slip=-1"], "must be greater than 0"),
+        (_nothing, ["--set", "lift.hold_time=9"], "values of filters and split only"),
+    ],
+    ids=["reject", "shard", "value", "key"],
+)
+def test_refused_assemble_changes_nothing(
+    out: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    spoil: Callable[[Path], None],
+    arguments: list[str],
+    words: str,
+) -> None:
+    """Neither the files nor the filters that the next build would use."""
+    monkeypatch.chdir(out.parent)
+    Path("ids.txt").write_text("1\n")
+    spoil(out)
+    before = state(out)
+    result = run("assemble", out, *SLIPPED, *arguments)
+    assert result.exit_code in (1, 2)
+    assert words in result.stderr
+    assert state(out) == before
+
+
+def test_assemble_beside_a_build_does_not_change_its_filters(out: Path) -> None:
+    with build_lock(out):
+        before = state(out)
+        result = run("assemble", out, *SLIPPED)
+        assert result.exit_code == 1
+        assert "must be built by one process at a time" in result.stderr
+        assert state(out) == before
+
+
+def test_assemble_that_works_keeps_its_filters(out: Path) -> None:
+    assert run("assemble", out, *SLIPPED).exit_code == 0
+    assert read_manifest(out).config.filters.max_slip == SLIP / 2
+
+
+#: Assembles copies of a dataset without samples, and dies at the first rename, the second, ...
+DIE = """
+import os, signal, sys
+from drakegrasp.build.counts import Counts
+from drakegrasp.build.pipeline import build
+from drakegrasp.cli.main import main
+from drakegrasp.config import Config
+rename, (setting, *copies) = os.replace, sys.argv[1:]
+for left, copy in enumerate(copies):
+    def replace(*names, **options):
+        global left
+        if not left:
+            os.kill(os.getpid(), signal.SIGKILL)
+        left -= 1
+        rename(*names, **options)
+    child = os.fork()
+    if not child:
+        os.replace = replace
+        main(["assemble", copy, "--set", setting])
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+"""
+
+
+@pytest.fixture(scope="module")
+def killed(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """A dataset whose assembling was killed at each of its five renames."""
+    folder = tmp_path_factory.mktemp("killed")
+    copies = [Path(shutil.copytree(whole, folder / str(k))) for k in range(5)]
+    command = [sys.executable, "-c", DIE, SLIPPED[1], *map(str, copies)]
+    subprocess.run(command, check=True, capture_output=True)
+    return copies
+
+
+def samples(out: Path) -> list[int]:
+    """Return the numbers of samples that the files and the filters of a dataset stand for."""
+    counts = []
+    for name in (OTO, OTM):
+        with h5py.File(out / name) as file:
+            counts.append(sum(len(file[split]["trial_id"]) for split in file))
+    with h5py.File(out / TRIALS) as file:
+        counts.append(int((file["successes/removal"][:] == 0).sum()))
+    return [*counts, 0 if read_manifest(out).config.filters.max_slip == SLIP / 2 else 9]
+
+
+@pytest.mark.parametrize("command", ["stats", "check", "assemble"])
+@pytest.mark.parametrize("rename", range(5))
+def test_files_appear_together_whenever_assembling_is_killed(
+    killed: list[Path], tmp_path: Path, rename: int, command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A reader refuses what is half done, and the next command completes it."""
+    monkeypatch.setattr(file_set, "PATIENCE", 0.1)
+    out = Path(shutil.copytree(killed[rename], tmp_path / "out"))
+
+    # Before the list of new files has its name (the first rename), the old files count.
+    if rename:
+        with pytest.raises(DataError, match=r"drakegrasp stats .* completes this"):
+            GraspDataset(out / OTO)
+    else:
+        assert samples(out) == [9] * 4
+
+    # The next command leaves files of one state, and nothing else.
+    assert run(command, out).exit_code == 0
+    assert samples(out) == ([0] * 4 if rename else [9] * 4)
+    assert sorted(os.listdir(out)) == sorted(["manifest.json", "objects", "shards", *FILES])
+
+
+def test_files_of_two_states_are_a_finding(out: Path) -> None:
+    old = (out / OTM).read_bytes()
+    assert run("assemble", out, *SLIPPED).exit_code == 0
+    assert run("check", out).exit_code == 0
+    (out / OTM).write_bytes(old)
+    result = run("check", out)
+    assert result.exit_code == 1
+    assert "the three files must be of one assembly" in result.stdout
+
+
+def _crash(*arguments: object) -> TrialRecord:
+    setup, attempt = arguments[:2]
+    return TrialRecord(outcome=Outcome.CRASHED, X_TO=setup.prepared.X_TO, X_OG=attempt.X_OG)
+
+
+@pytest.mark.sim
+def test_crashes_that_no_physics_explains_end_the_build_with_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All attempts crash; the same command says so again, though it has nothing left to do."""
+
+    def build_here(objects: Path, out: Path, *, config: Config, show: bool, **_: Any) -> Any:
+        return build(find_meshes(objects), out, config, run_here, show=show)
+
+    monkeypatch.setattr("drakegrasp.build.work_unit._try_step", _crash)
+    monkeypatch.setattr("drakegrasp.api.build_dataset", build_here)
+    (tmp_path / "meshes").mkdir()
+    trimesh.creation.box([0.06, 0.05, 0.12]).export(tmp_path / "meshes" / "1_box.obj")
+    few = ("--set", "candidates.max=1")
+    for _ in range(2):
+        result = run("build", "--objects", tmp_path / "meshes", "--out", tmp_path / "out", *few)
+        assert result.exit_code == 1
+        line = "1_box: 3 of 3 attempts crashed or timed out, which is no property of grasps."
+        assert line in result.stderr
+
+
+def test_few_crashes_are_no_error(whole: Path) -> None:
+    counts = Counts(read_manifest(whole), None, silent)
+    header = next(read_manifest(whole).headers())
+    for crashed, said in ((9, 0), (1, 1)):
+        counts.add(header, {Outcome.SUCCESS: 100, Outcome.CRASHED: crashed})
+        assert len(counts.unexplained()) == said
+
+
+@pytest.mark.parametrize("address", ["", " "])
+@pytest.mark.parametrize("command", ["build", "verify"])
+def test_empty_address_of_a_scheduler_is_refused(
+    tmp_path: Path, address: str, command: str
+) -> None:
+    trimesh.creation.box([0.06, 0.05, 0.12]).export(tmp_path / "1_box.obj")
+    (tmp_path / "grasps.csv").touch()
+    arguments = {
+        "build": ["--objects", tmp_path, "--out", tmp_path / "out"],
+        "verify": [tmp_path / "grasps.csv", "--object", tmp_path / "1_box.obj"],
+    }
+    result = run(command, *arguments[command], "--scheduler", address)
+    assert result.exit_code == 2
+    assert f"scheduler must be an address like tcp://host:8786, got {address!r}" in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_build_connects_with_the_certificates_that_it_is_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @contextmanager
+    def connect(*_: Any, security: Security) -> Iterator[None]:
+        assert security.require_encryption
+        for key in ("tls_client_cert", "tls_client_key", "tls_ca_file"):
+            assert getattr(security, key) == str(tmp_path / key.split("_")[-1])
+        raise MachineError("connected")
+        yield
+
+    monkeypatch.setattr("drakegrasp.api.connect", connect)
+    (tmp_path / "meshes").mkdir()
+    trimesh.creation.box([0.06, 0.05, 0.12]).export(tmp_path / "meshes" / "1_box.obj")
+    build = ["build", "--objects", tmp_path / "meshes", "--out", tmp_path / "out"]
+    build += ["--scheduler", "tls://10.0.0.1:8786"]
+    for name, file in (("ca-file", "file"), ("cert", "cert"), ("key", "key")):
+        (tmp_path / file).touch()
+        build += [f"--tls-{name}", tmp_path / file]
+        if name != "key":
+            assert "must be given together" in run(*build).stderr
+    result = run(*build)
+    assert (result.exit_code, result.stderr) == (1, "error: connected\n")
+
+
+@pytest.mark.cluster
+@pytest.mark.slow
+@pytest.mark.parametrize("seconds", [0.0, 1.0, 3.0])
+def test_ctrl_c_while_workers_start_is_one_line(tmp_path: Path, seconds: float) -> None:
+    """It reaches every process of the terminal, also those that have just begun."""
+    (tmp_path / "meshes").mkdir()
+    trimesh.creation.box([0.06, 0.05, 0.12]).export(tmp_path / "meshes" / "1_box.obj")
+    process = start_build(tmp_path / "meshes", tmp_path / "out", 2, new_session=True)
+    while not workers_of(process.pid):
+        assert process.poll() is None
+        time.sleep(0.05)
+    time.sleep(seconds)
+    os.killpg(process.pid, signal.SIGINT)
+    said, errors = process.communicate(timeout=240)
+    assert (process.returncode, said) == (130, "")
+    assert errors == "stopped; the same command goes on from here\n"
