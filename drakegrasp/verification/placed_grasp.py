@@ -15,13 +15,14 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from drakegrasp.config import Config, RandomizeConfig, override_config, parse_config
+from drakegrasp.config import Config, RandomizeConfig, absolute_hand, override_config, parse_config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.errors import GraspError
+from drakegrasp.errors import GraspError, HandError
 from drakegrasp.frames import Array, read_pose, unpack_pose
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.files import hand_digest
 from drakegrasp.simulation.placement import (
     Placed,
     PlacedObject,
@@ -208,16 +209,34 @@ def chosen_config(arguments: VerifyArguments) -> Config:
 
     Raises:
         ConfigError: If a dataset's objects were prepared with other values.
+        HandError: If a dataset's hand has other files now, and the caller names none.
         DataError: If the dataset cannot be used.
     """
     known = _known_config(arguments)
     config = known if arguments.config is None else arguments.config
     config = override_config(config, arguments.overrides) if arguments.overrides else config
     if arguments.hand is not None:
-        config = parse_config({**config.to_dict(), "hand": str(arguments.hand)})
+        config = parse_config({**config.to_dict(), "hand": absolute_hand(arguments.hand)})
     if arguments.dataset is not None:
         refuse_other_objects(config, known, "as in the dataset, whose objects are prepared")
+        if arguments.hand is None and config.hand == known.hand:
+            _refuse_other_hand(arguments.dataset, config.hand)
     return config
+
+
+def _refuse_other_hand(dataset: GraspDataset, hand: str) -> None:
+    """Refuse the hand of a dataset if its files have changed since.
+
+    Raises:
+        HandError: If so, or if they are gone.
+    """
+    known = read_manifest(dataset.path.parent).versions.get("hand")
+    found = hand_digest(hand)
+    if known not in (None, found):
+        raise HandError(
+            f"{hand}: files of the hand must be those of the dataset ({known}), got others "
+            f"({found}); name the hand to verify with it as it is now"
+        )
 
 
 def _frame(arguments: VerifyArguments) -> str:

@@ -7,11 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.datasets import OTO, make_dataset
+from helpers.hands import write_with_optional_fingers
 
 from drakegrasp.cli.verify_request import VerifyRequest, place_requested
 from drakegrasp.config import load_config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.errors import HandError
+from drakegrasp.hand.description import load_hand
 
 DRAWN = [
     "randomize.friction_hand=[0.7, 1.3]",
@@ -67,3 +70,35 @@ def test_a_given_configuration_draws_nothing(drawn: Path) -> None:
     assert {grasp.config for grasp in grasps} == {config}
     masses = [e.mass for e in read_manifest(drawn).objects]
     assert all(np.isclose(masses, grasp.placed.model.mass).any() for grasp in grasps)
+
+
+def test_a_hand_whose_files_have_changed_is_refused_unless_it_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The hand file is named relative to a folder; the dataset is used from another."""
+    (tmp_path / "meshes").mkdir()
+    hand = write_with_optional_fingers(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    config = load_config(overrides=[f"hand={hand.name}"])
+    assert config.hand == str(hand) == load_config(hand=hand.name).hand
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes", f"hand={hand.name}")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    grasps, used = place_requested(request(out))
+    assert grasps and used.hand == str(hand)
+
+    # A change since then.
+    hand.write_text(f"{hand.read_text()}\n# changed\n")
+    with pytest.raises(HandError, match="files of the hand must be those of the dataset"):
+        place_requested(request(out))
+    grasps, used = place_requested(request(out, hand=f"../{hand.name}"))
+    assert grasps and load_hand(used.hand).name == "optional"
+
+
+def test_a_hand_of_the_package_keeps_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "franka").write_text("a file of that name")
+    monkeypatch.chdir(tmp_path)
+    assert load_config(hand="franka").hand == "franka"
+    assert load_config(hand="missing.yaml").hand == "missing.yaml"
