@@ -379,7 +379,7 @@ def load_config(
     for text in overrides:
         _apply_override(tree, text)
     tree.update({key: value for key, value in values.items() if value is not None})
-    return parse_config(tree)
+    return parse_config(_with_absolute_hand(tree))
 
 
 def override_config(config: Config, overrides: Sequence[str]) -> Config:
@@ -391,7 +391,23 @@ def override_config(config: Config, overrides: Sequence[str]) -> Config:
     tree = config.to_dict()
     for text in overrides:
         _apply_override(tree, text)
-    return parse_config(tree)
+    return parse_config(_with_absolute_hand(tree) if tree["hand"] != config.hand else tree)
+
+
+def absolute_hand(name_or_yaml: str | Path) -> str:
+    """Return the absolute path of a hand's file; the name of a hand of the package as it is.
+
+    What is stored must name the same file in whatever directory it is read.
+    """
+    name, folder = str(name_or_yaml), resources.files("drakegrasp") / "models"
+    own = (folder / f"{name}_hand.yaml").is_file()
+    return name if own or not Path(name).is_file() else str(Path(name).absolute())
+
+
+def _with_absolute_hand(tree: dict[str, Any]) -> dict[str, Any]:
+    """Return a tree of values whose hand, if it is a file, is an absolute path."""
+    hand = tree.get("hand")
+    return {**tree, "hand": absolute_hand(hand)} if isinstance(hand, str) and hand else tree
 
 
 def parse_config(tree: dict[str, Any]) -> Config:

@@ -34,7 +34,8 @@ def audit(
 ) -> None:
     """Check which meshes are fit, repaired or refused.
 
-    A build also drops each object on the table, and refuses one that does not come to rest.
+    Meshes are prepared as in a build with the default configuration. A build also drops each
+    object on the table, and refuses one that does not come to rest.
     Exit code 1 if every mesh is refused.
     """
     from drakegrasp.cli.tables import ROOMY, audit_line, audit_table, make_console

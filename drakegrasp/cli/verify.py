@@ -119,7 +119,7 @@ def verify(
     from drakegrasp.verification.verify import refuse_off_surface
 
     # All input is read and checked before anything is simulated.
-    grasps = place_requested(VerifyRequest(**options, out=out))
+    grasps, config = place_requested(VerifyRequest(**options, out=out))
 
     def print_line(index: int, result: Verification) -> None:
         write_json_line(index, result, sys.stdout)
@@ -141,7 +141,7 @@ def verify(
                 show=not quiet,
             )
             if out is not None:
-                write_results(results, result_paths(out)[1], results[0].config)
+                write_results(results, result_paths(out)[1], config)
     except BaseException:
         if out is not None and part_path(out).exists():
             say(f"{part_path(out)}: the verdicts so far", err=True)

@@ -9,11 +9,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from drakegrasp.config import Config, load_config, override_config
-from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.config import Config, load_config
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError, GraspError
-from drakegrasp.verification.placed_grasp import PlacedGrasp, VerifyArguments, place_grasps
+from drakegrasp.verification.placed_grasp import (
+    PlacedGrasp,
+    VerifyArguments,
+    chosen_config,
+    place_grasps,
+)
 from drakegrasp.verification.prediction import HDF5_SUFFIXES, read_numbers, read_predictions
 from drakegrasp.verification.result_files import refuse_unwritable
 
@@ -39,8 +43,10 @@ class VerifyRequest:
     out: Path | None = None
 
 
-def place_requested(request: VerifyRequest) -> list[PlacedGrasp]:
-    """Return the grasps of a request on their objects, at least one.
+def place_requested(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
+    """Return the grasps of a request on their objects, at least one, and its configuration.
+
+    The configuration of a grasp is another one where friction was drawn for its row.
 
     Raises:
         GraspError, MeshError, ConfigError, HandError: If a file or an option cannot be used.
@@ -51,7 +57,7 @@ def place_requested(request: VerifyRequest) -> list[PlacedGrasp]:
         raise GraspError(str(error)) from None
 
 
-def _place(request: VerifyRequest) -> list[PlacedGrasp]:
+def _place(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
     # Refuse results that could not be written, and options without effect.
     if request.out is not None:
         refuse_unwritable(request.out)
@@ -63,6 +69,12 @@ def _place(request: VerifyRequest) -> list[PlacedGrasp]:
     data = None if path is None else GraspDataset(path, split=split or DEFAULT_SPLIT)
     predicted = read_predictions(request.grasps, split=split)
 
+    # A configuration that is given is used as it is; that of a dataset with what its rows drew.
+    if path is None or request.config is not None:
+        config, overrides = load_config(request.config, request.overrides), ()
+    else:
+        config, overrides = None, request.overrides
+
     arguments = VerifyArguments(
         mesh=request.mesh,
         frame=request.frame,
@@ -70,11 +82,12 @@ def _place(request: VerifyRequest) -> list[PlacedGrasp]:
         units=request.units,
         hand=request.hand,
         method=request.method,
-        config=_config(request, path),
+        config=config,
+        overrides=overrides,
         dataset=data,
         rows=None if predicted.rows is None else predicted.rows.tolist(),
     )
-    return place_grasps(predicted.grasps, arguments)
+    return place_grasps(predicted.grasps, arguments), chosen_config(arguments)
 
 
 def _dataset_path(request: VerifyRequest) -> Path | None:
@@ -110,10 +123,3 @@ def _refuse_idle(request: VerifyRequest, dataset: Path | None) -> None:
         raise GraspError(
             f"--camera must be given with --object and --frame camera only, got {request.camera}"
         )
-
-
-def _config(request: VerifyRequest, dataset: Path | None) -> Config:
-    """Return the given configuration or that of the dataset, with the overrides."""
-    if dataset is None or request.config is not None:
-        return load_config(request.config, request.overrides)
-    return override_config(read_manifest(dataset.parent).config, request.overrides)

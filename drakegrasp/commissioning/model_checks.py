@@ -9,7 +9,7 @@ import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 
 from drakegrasp.commissioning.finding import Finding, judge
-from drakegrasp.commissioning.model_text import declared_masses, declared_mimics
+from drakegrasp.commissioning.model_text import Mimic, declared_masses, declared_mimics
 from drakegrasp.config import Config
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import coordinate_limits
@@ -57,6 +57,12 @@ def check_limits(hand: Hand) -> Finding:
                 f"joint {finger.closing_joint!r} must reach from 0, the open hand, to a positive "
                 f"limit, got {_range(*own)}"
             )
+        elif lower > SAME * unit:
+            offsets = ", ".join(f"{c.joint} by {c.offset:g}" for c in finger.coupled)
+            faults.append(
+                f"finger {finger.name!r} must be open at 0, but with their offsets ({offsets}) "
+                f"limits of its coupled joints leave {_range(lower, upper)}"
+            )
         elif upper < LEAST_RANGE * unit:
             ratios = ", ".join(f"{c.joint} by {c.ratio:g}" for c in finger.coupled)
             faults.append(
@@ -77,27 +83,40 @@ def check_couplings(hand: Hand) -> Finding:
     """Return whether the couplings agree with those of the model, where it has any."""
     # Position of each joint by closing joint, as the hand file has it.
     own = {c.joint: (f.closing_joint, c) for f in hand.fingers for c in f.coupled}
-    closing = {finger.closing_joint for finger in hand.fingers}
     faults = []
     for mimic in declared_mimics(hand.model.path):
+        if _moves_as(hand, mimic):
+            continue
         if mimic.joint not in own:
-            # Two fingers that the model moves together may each have a motor here.
-            if mimic.joint in closing and mimic.leader in closing and mimic.ratio > 0.0:
-                continue
             faults.append(
-                f"joint {mimic.joint!r} must be coupled to {mimic.leader!r}, as in the model"
+                f"joint {mimic.joint!r} must be coupled to {mimic.leader!r} by {mimic.ratio:g} and "
+                f"{mimic.offset:g}, as in the model"
             )
             continue
         leader, coupling = own[mimic.joint]
-        offset = abs(coupling.offset - mimic.offset)
-        if leader != mimic.leader or abs(coupling.ratio - mimic.ratio) > SAME or offset > SAME:
-            faults.append(
-                f"joint {mimic.joint!r} must follow {mimic.leader!r} by {mimic.ratio:g} and "
-                f"{mimic.offset:g} as in the model, got {leader!r} by {coupling.ratio:g} and "
-                f"{coupling.offset:g}"
-            )
+        faults.append(
+            f"joint {mimic.joint!r} must follow {mimic.leader!r} by {mimic.ratio:g} and "
+            f"{mimic.offset:g} as in the model, got {leader!r} by {coupling.ratio:g} and "
+            f"{coupling.offset:g}"
+        )
     joints = ", ".join(f"{joint} {c.ratio:+g}" for joint, (_, c) in own.items())
     return judge("couplings", faults, joints or "none")
+
+
+def _moves_as(hand: Hand, mimic: Mimic) -> bool:
+    """Return whether two joints of a hand move as a coupling of its model says."""
+    # Two fingers that the model moves together may each have a motor here.
+    closing = {finger.closing_joint for finger in hand.fingers}
+    if mimic.joint in closing and mimic.leader in closing and mimic.ratio > 0.0:
+        return True
+    if not {mimic.joint, mimic.leader} <= set(hand.joint_names):
+        return False
+
+    # Positions are linear in the coordinates: those of the spread, of a finger, or of none.
+    j, i = (hand.joint_names.index(name) for name in (mimic.joint, mimic.leader))
+    gain = hand.joint_gain[j] - mimic.ratio * hand.joint_gain[i]
+    offset = hand.joint_offset[j] - mimic.ratio * hand.joint_offset[i] - mimic.offset
+    return bool(np.abs(gain).max() <= SAME and abs(offset) <= SAME)
 
 
 def check_efforts(hand: Hand, config: Config) -> Finding:

@@ -26,6 +26,7 @@ from drakegrasp.hand.kinematics import (
     fingertip_poses,
     joint_positions,
     link_poses,
+    still_links,
 )
 from drakegrasp.hand.parsing import add_model
 from drakegrasp.hand.shapes import hull_triangles, link_shapes, pad_surfaces
@@ -87,6 +88,11 @@ def check_palm(hand: Hand) -> Finding:
             if depth > worst:
                 worst, blocked = depth, link
     faults = []
+    if not any(len(link_shapes(hand)[link]) for link in still_links(hand)):
+        faults.append(
+            f"link {hand.palm_link!r}, or one that is fixed to it, must have a collision shape, "
+            "got none"
+        )
     if worst > PALM_DEPTH:
         faults.append(
             f"the palm ray along +Gz must be free, got link {blocked!r} up to "
@@ -204,7 +210,8 @@ def check_overlaps(hand: Hand) -> Finding:
                 plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)).name()
                 for geometry in (pair.id_A, pair.id_B)
             ]
-            one, other = (movers[link] for link in links)
+            # What carries the palm is no link of it; the fingers do not move it.
+            one, other = (movers.get(link) for link in links)
             if one is None or other is None or one == other:
                 continue
             if set(links) <= set(hand.fingertip_links):

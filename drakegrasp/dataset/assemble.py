@@ -164,8 +164,7 @@ def _write_trials(
     for shard_slice, shard in walk_shards(out, manifest):
         _append_trials(file, shard_slice, shard)
         slices.append(shard_slice)
-        mass = manifest.objects[shard_slice.object].mass
-        successes.append(_successes(shard_slice, shard, K, mass))
+        successes.append(_successes(shard_slice, shard, K))
         progress(len(slices), 2 * manifest.units)
     if not slices:
         raise DataError(f"{out}: no object has a palm pose to try")
@@ -270,8 +269,8 @@ def _append_trials(file: h5py.File, shard_slice: ShardSlice, shard: Shard) -> No
         dataset[first:] = values
 
 
-def _successes(shard_slice: ShardSlice, shard: Shard, K: Array, mass: float) -> Successes:
-    """Return what the filters need of a shard's successes, whose object has a mass [kg]."""
+def _successes(shard_slice: ShardSlice, shard: Shard, K: Array) -> Successes:
+    """Return what the filters need of a shard's successes."""
     taken = shard.looks["row"] < shard_slice.rows
     rows = shard.looks["row"][taken]
     trials = {name: values[rows] for name, values in shard.trials.items()}
@@ -289,7 +288,7 @@ def _successes(shard_slice: ShardSlice, shard: Shard, K: Array, mass: float) -> 
         for i, grasp in enumerate(grasps)
     ]
 
-    doubts = suspicion(trials, mass)
+    doubts = suspicion(trials)
     return Successes(
         candidate=trials["candidate"],
         standoff_index=trials["standoff_index"],
@@ -303,6 +302,7 @@ def _successes(shard_slice: ShardSlice, shard: Shard, K: Array, mass: float) -> 
             ],
             axis=1,
         ),
+        complete=(trials["closed_touching"] & trials["lifted_touching"]).all(axis=1),
         other_links=trials["lifted_other_links"],
         slip=trials["slip"],
         turn=trials["turn"],

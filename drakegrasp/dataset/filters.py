@@ -36,6 +36,7 @@ class Removal(IntEnum):
     REJECTED = 11  # an inspection rejected it; the last of the filters
     # Values are stored in files: a filter that came later has the next number, not the next place.
     SUSPICIOUS = 12  # the suspicion score or a part of it is too high; before OUTLIER
+    MISSING_FINGER = 13  # a fingertip that is not required does not touch; the first of all
 
     @property
     def label(self) -> str:
@@ -53,6 +54,7 @@ class Successes:
         candidate, standoff_index: (n,), which of the object's palm poses, and of the stand-offs.
         grasp_T: (n, 6k), grasps in the table-top frame [m, -].
         held_O: (n, 6k), contacts at the end of the lift in {O} [m, -].
+        complete: (n,) bool, whether every fingertip touches, after closing and after the lift.
         other_links: (n,), number of other links that touch the object after the lift.
         slip, turn: (n,), how far the object moved [m] and turned [rad] in the hand.
         seen: (n,) bool, whether both masks have object pixels.
@@ -72,6 +74,7 @@ class Successes:
     standoff_index: npt.NDArray[np.integer]
     grasp_T: Array
     held_O: Array
+    complete: npt.NDArray[np.bool_]
     other_links: npt.NDArray[np.integer]
     slip: Array
     turn: Array
@@ -102,6 +105,8 @@ def judge_successes(
     # Filters that judge a grasp alone.
     removal = np.full(len(successes.trial_id), Removal.KEPT, dtype=np.uint8)
     for reason, bad in (
+        # A grasp vector has a contact of every finger.
+        (Removal.MISSING_FINGER, ~successes.complete),
         *breaks_hold(config, successes.other_links, successes.slip, successes.turn),
         (Removal.NOT_SEEN, ~successes.seen),
         (Removal.OUT_OF_VIEW, ~successes.in_view),

@@ -298,10 +298,11 @@ TRIAL_FIELDS: tuple[Field, ...] = (
     *_since(
         Stage.LIFTED,
         Field("surface_distance", "k", "float64", "m", "-",
-              "distance of the contact points after closing from the full mesh's surface"),
+              "distance of the contact points after closing from the full mesh's surface",
+              per_finger=True),
         Field("normal_angle", "k", "float64", "rad", "-",
               "angle of the normals after closing from the full mesh's nearest face, or from that "
-              "ahead if it agrees better"),
+              "ahead if it agrees better", per_finger=True),
         _TIME_LIFT,
         *_LIFTED,
         Field("X_TO_lifted", "12", "float64", "m, -", "T", "pose of the object after the lift"),
@@ -348,7 +349,7 @@ SUCCESS_FIELDS: tuple[Field, ...] = (
     Field("removal", "", "uint8", "-", "-",
           "why it is no sample: 0 kept, 1 other_links, 2 slid, 3 turned, 4 not_seen, "
           "5 out_of_view, 6 bisects_table, 7 flat_depth, 8 off_surface, 9 normal_off, 10 outlier, "
-          "11 rejected, 12 suspicious"),
+          "11 rejected, 12 suspicious, 13 missing_finger"),
     *CERTIFICATE_FIELDS,
 )
 

@@ -103,6 +103,7 @@ PARTS = (
 #: Columns of `/trials` that `suspicion` reads.
 COLUMNS = (
     "outcome",
+    "closed_touching",
     "closed_penetration",
     "lifted_penetration",
     "normal_angle",
@@ -115,6 +116,7 @@ COLUMNS = (
     "closed_nhat_Q_O",
     "time_close",
     "time_lift",
+    "mass",
 )
 
 
@@ -135,22 +137,22 @@ class Suspicion:
     shares: Mapping[str, Array]
 
 
-def suspicion(columns: Mapping[str, npt.NDArray[Any]], mass: npt.ArrayLike) -> Suspicion:
+def suspicion(columns: Mapping[str, npt.NDArray[Any]]) -> Suspicion:
     """Return how implausible attempts look, and why.
 
     An attempt that ended before the lift is judged by what it has. A contact without a normal
-    (patches that face each other) counts as the largest share.
+    (patches that face each other) counts as the largest share; a fingertip that does not touch
+    has no contact.
 
     Args:
         columns: Rows of `/trials` by the names of COLUMNS.
-        mass: Of the object of each attempt, (n,) or one for all [kg].
     """
     # How far each attempt got: the times have values from their stage on.
     closed, lifted = np.isfinite(columns["time_close"]), np.isfinite(columns["time_lift"])
     reached = {Stage.CLOSED: closed, Stage.LIFTED: closed & lifted}
 
     # Each part's value, and its share of the scale.
-    values = _values(columns, np.asarray(mass, dtype=float))
+    values = _values(columns)
     shares = {}
     for part in PARTS:
         there = reached[part.stage]
@@ -164,7 +166,7 @@ def suspicion(columns: Mapping[str, npt.NDArray[Any]], mass: npt.ArrayLike) -> S
     return Suspicion(score=score, values=values, shares=shares)
 
 
-def _values(columns: Mapping[str, npt.NDArray[Any]], mass: Array) -> dict[str, Array]:
+def _values(columns: Mapping[str, npt.NDArray[Any]]) -> dict[str, Array]:
     """Return the values (n,) of all parts, whatever the attempts' stage."""
     # The deepest of both instants; a finger that does not touch has none.
     depths = np.stack([columns["closed_penetration"], columns["lifted_penetration"]])
@@ -173,19 +175,23 @@ def _values(columns: Mapping[str, npt.NDArray[Any]], mass: Array) -> dict[str, A
     # Forces of the fingertips and the weight in {T}, whose z axis is vertical.
     R_TO = unpack_pose(columns["X_TO_lifted"])[:, :3, :3]
     f_O = np.nan_to_num(columns["lifted_f_Q_O"]).sum(axis=1)
-    weight = mass * GRAVITY
+    weight = np.asarray(columns["mass"], dtype=float) * GRAVITY
     rest_T = multiply(R_TO, f_O[..., None])[..., 0]
     rest_T[:, 2] -= weight
 
-    # Of a failure, the fingers that touch have normals.
-    failed = (columns["outcome"] != Outcome.SUCCESS)[:, None, None]
+    # A finger that does not touch has no contact; a finger of a failure may lack the normal, too.
+    touching = np.asarray(columns["closed_touching"], dtype=bool)
+    fits = {
+        name: np.where(touching, columns[name], 0.0).max(axis=1, initial=0.0)
+        for name in ("normal_angle", "surface_distance")
+    }
+    judged = (columns["outcome"] == Outcome.SUCCESS)[:, None] & touching
     normals = np.asarray(columns["closed_nhat_Q_O"], dtype=float)
-    normals = np.where(failed, np.nan_to_num(normals), normals)
+    normals = np.where(judged[..., None], normals, np.nan_to_num(normals))
 
     return {
         "penetration": depths,
-        "normal_angle": np.max(columns["normal_angle"], axis=1, initial=0.0),
-        "surface_distance": np.max(columns["surface_distance"], axis=1, initial=0.0),
+        **fits,
         "slip": np.asarray(columns["slip"], dtype=float),
         "turn": np.asarray(columns["turn"], dtype=float),
         "other_links": np.asarray(columns["lifted_other_links"], dtype=float),

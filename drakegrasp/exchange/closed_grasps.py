@@ -28,7 +28,7 @@ class ClosedGrasp:
         split: `train`, `valid` or `test`.
         object_name: Name of the object.
         X_TO, X_TG: Poses (4, 4) of the object and of the palm over the table.
-        q: (n,), positions of the hand's joints [rad], in the plant's order.
+        q: (n,), positions of the hand's joints [rad or m], in the plant's order.
         spread: Angle of the spread joints [rad].
     """
 

@@ -2,11 +2,12 @@
 
 In: a dataset. Out: `grasps/<object>/<trial_id>.npy`, each a dictionary with the object's pose and
 three postures of the hand, and `objects/<object>/mesh.obj`. A posture is the palm link's position
-[m] and quaternion (w, x, y, z), then the joints [rad] in the order of `joint_names`:
+[m] and quaternion (w, x, y, z), then the joints in the order of `joint_names` and the units of
+`joint_units`, rad or m:
 
 * `pregrasp_qpos`: where the attempt begins, fingers open at its spread;
 * `grasp_qpos`: after closing, as it is stored;
-* `squeeze_qpos`: the same, closing and coupled joints turned a tenth further: the command of a
+* `squeeze_qpos`: the same, closing and coupled joints moved a tenth further: the command of a
   position controller that presses, as the benchmark makes it of grasps that have none.
 
 All poses are over the table, in {T}. The benchmark evaluates a grasp with its own model of a hand,
@@ -34,7 +35,7 @@ from drakegrasp.objects.model import load_object
 from drakegrasp.runtime.progress import Report
 from drakegrasp.visualization.posed_hand import PosedHand
 
-#: By how much of their angle the fingers are commanded to close further.
+#: By how much of their path the fingers are commanded to close further.
 SQUEEZE = 0.1
 
 
@@ -84,6 +85,7 @@ def grasp_dictionary(hand: Hand, posed: PosedHand, grasp: ClosedGrasp) -> dict[s
         "grasp_qpos": np.concatenate([pose_vector(X_TB), grasp.q]),
         "squeeze_qpos": np.concatenate([pose_vector(X_TB), squeezed]),
         "joint_names": list(posed.joints),
+        "joint_units": [hand.joint_units[name] for name in posed.joints],
     }
 
 

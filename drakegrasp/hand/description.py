@@ -11,6 +11,7 @@ it, J a joint.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ from drakegrasp.hand.chains import (
     moving_joint,
 )
 from drakegrasp.hand.file_format import Drive, Finger, HandFile, Spread, read_hand_file
-from drakegrasp.hand.files import find_packages, hand_file
+from drakegrasp.hand.files import find_packages, hand_file, hand_files
 from drakegrasp.hand.parsing import ModelFile, add_model
 from drakegrasp.hand.shapes import pad_surfaces
 
@@ -86,6 +87,13 @@ class Hand:
         return np.array([SLIDE if finger.slides else 1.0 for finger in self.fingers])
 
     @property
+    def joint_units(self) -> dict[str, str]:
+        """Unit of each joint's positions, "rad" or "m", by the names of the joints."""
+        chains = self.link_chains.values()
+        slides = {n: s for chain in chains for n, s in zip(chain.joints, chain.slides, strict=True)}
+        return {name: "m" if slides[name] else "rad" for name in self.joint_names}
+
+    @property
     def required(self) -> npt.NDArray[np.bool_]:
         """(k,), whether a grasp needs each fingertip on the object."""
         return np.array([finger.required for finger in self.fingers])
@@ -105,29 +113,31 @@ def load_hand(name_or_yaml: str | Path = "barrett") -> Hand:
     # Use a hand that was loaded before, if its files did not change.
     path = hand_file(name_or_yaml)
     known = _loaded.get(path)
-    if known is not None and known[1] == _stamp(path, known[0].model.path):
+    if known is not None and known[0].model.stamp == _stamp(known[1]):
         return known[0]
 
+    files = hand_files(path)
+    stamp = _stamp(files)
     described = read_hand_file(path)
     folder = path.parent.resolve()
     try:
         packages = find_packages(folder, described.model, described.packages)
-        model = ModelFile(folder / described.model, tuple(sorted(packages.items())))
+        model = ModelFile(folder / described.model, tuple(sorted(packages.items())), stamp)
         hand = _build_hand(path.stem.removesuffix("_hand"), described, model)
         _refuse_empty_pads(hand)
     except HandError as error:
         raise HandError(f"{path}: {error}") from None
-    _loaded[path] = hand, _stamp(path, model.path)
+    _loaded[path] = hand, files
     return hand
 
 
-#: Loaded hands, with the sizes and times of their two files: parsing takes 40 ms.
-_loaded: dict[Path, tuple[Hand, tuple[int, ...]]] = {}
+#: Loaded hands with their files: parsing takes 40 ms.
+_loaded: dict[Path, tuple[Hand, list[Path]]] = {}
 
 
-def _stamp(*paths: Path) -> tuple[int, ...]:
+def _stamp(files: Sequence[Path]) -> tuple[int, ...]:
     """Return sizes [byte] and modification times [ns] of the files that exist."""
-    stats = [path.stat() for path in paths if path.exists()]
+    stats = [path.stat() for path in files if path.exists()]
     return tuple(number for s in stats for number in (s.st_size, s.st_mtime_ns))
 
 

@@ -181,6 +181,14 @@ class HandFile(BaseModel):
     payload: Positive | None = None  # largest mass that the hand is made for [kg]
 
     @model_validator(mode="after")
+    def _check_names(self) -> HandFile:
+        """Refuse two fingers of one name: tables and figures tell them apart by it."""
+        names = [finger.name for finger in self.fingers]
+        if len(set(names)) < len(names):
+            raise ValueError(f"fingers must have a name each, got {', '.join(names)}")
+        return self
+
+    @model_validator(mode="after")
     def _check_worms(self) -> HandFile:
         """Refuse worms of unknown strength."""
         for i, finger in enumerate(self.fingers):

@@ -76,14 +76,24 @@ def hand_digest(name_or_yaml: str | Path) -> str:
     Raises:
         HandError: If there is no such hand.
     """
+    digest = hashlib.sha256()
+    for path in hand_files(name_or_yaml):
+        digest.update(path.read_bytes() if path.is_file() else b"")
+    return digest.hexdigest()[:16]
+
+
+def hand_files(name_or_yaml: str | Path) -> list[Path]:
+    """Return the files of a hand: its YAML, its model, and the meshes in that; some may not exist.
+
+    Raises:
+        HandError: If there is no such hand.
+    """
     # The hand file, and the model that it names.
     path = hand_file(name_or_yaml)
-    digest = hashlib.sha256(path.read_bytes())
     described = _described(path)
     name = str(described.get("model", ""))
     model = path.parent / name
     text = model.read_bytes() if model.is_file() else b""
-    digest.update(text)
 
     # The files that the model names, in the order of their names.
     packages = described.get("packages")
@@ -91,10 +101,8 @@ def hand_digest(name_or_yaml: str | Path) -> str:
     folders = {str(k): path.parent / str(v) for k, v in named}
     if _PACKAGE.encode() in text:
         folders = find_packages(path.parent, name, {}) | folders
-    for uri in sorted({(one or other).decode() for one, other in _URIS.findall(text)}):
-        mesh = _mesh_file(uri, model.parent, folders)
-        digest.update(mesh.read_bytes() if mesh.is_file() else b"")
-    return digest.hexdigest()[:16]
+    uris = sorted({(one or other).decode() for one, other in _URIS.findall(text)})
+    return [path, model, *(_mesh_file(uri, model.parent, folders) for uri in uris)]
 
 
 def _mesh_file(uri: str, folder: Path, packages: Mapping[str, Path]) -> Path:

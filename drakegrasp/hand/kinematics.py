@@ -34,6 +34,11 @@ def coordinate_limits(hand: Hand) -> Array:
     return limits
 
 
+def still_links(hand: Hand) -> list[str]:
+    """Return the links that neither spread nor closing moves: the palm and what is fixed to it."""
+    return [link for link, chain in hand.link_chains.items() if not chain.gain.any()]
+
+
 def joint_positions(hand: Hand, spread: float, closing: npt.ArrayLike) -> dict[str, float]:
     """Return each joint's position at a spread [rad] and closing positions (k,) [rad or m].
 

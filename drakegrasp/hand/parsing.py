@@ -24,10 +24,12 @@ class ModelFile:
     Attributes:
         path: The SDFormat or URDF file.
         packages: Name and folder of each package of a package:// URI.
+        stamp: Sizes and times of the hand's files: a model that has changed is another one.
     """
 
     path: Path
     packages: tuple[tuple[str, Path], ...] = ()
+    stamp: tuple[int, ...] = ()
 
 
 def make_parser(plant: MultibodyPlant) -> Parser:

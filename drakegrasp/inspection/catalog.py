@@ -44,7 +44,7 @@ class Snapshot:
     Attributes:
         out: Directory of the dataset.
         config: Its configuration.
-        names, classes, masses: Of the objects, by their number; masses in kg.
+        names, classes: Of the objects, by their number.
         table: The attempts.
         sources: Files that hold the attempts; `AttemptTable.source` counts them.
         sample_ids: Trial ids of the samples by split, in rising order.
@@ -56,7 +56,6 @@ class Snapshot:
     config: Config
     names: tuple[str, ...]
     classes: tuple[str, ...]
-    masses: tuple[float, ...]
     table: AttemptTable
     sources: tuple[Path, ...]
     sample_ids: dict[str, npt.NDArray[np.int64]]
@@ -136,8 +135,7 @@ class Catalog:
         for header in done:
             if header not in self._parts:
                 number = numbers[header.object_name]
-                mass = manifest.objects[number].mass
-                self._parts[header] = read_shard_part(self.out, header, 0, number, mass)
+                self._parts[header] = read_shard_part(self.out, header, 0, number)
 
         # Each shard's number is its place among those that are done.
         parts = [self._parts[header] for header in done]
@@ -152,7 +150,6 @@ class Catalog:
             config=manifest.config,
             names=tuple(entry.name for entry in manifest.objects),
             classes=tuple(entry.class_name for entry in manifest.objects),
-            masses=tuple(entry.mass for entry in manifest.objects),
             table=join(parts) if parts else empty_table(),
             sources=tuple(header.path(self.out) for header in done),
             sample_ids={},
@@ -183,28 +180,17 @@ def _read_assembled(out: Path) -> Snapshot:
     if gone:
         missing.append(f"{len(gone):,} of {len(names):,} objects have no mesh: no 3D view of them.")
 
-    masses = _masses(out, names, config)
     return Snapshot(
         out=out,
         config=config,
         names=names,
         classes=classes,
-        masses=masses,
-        table=read_trials_table(path, masses),
+        table=read_trials_table(path),
         sources=(path,),
         sample_ids=read_sample_ids(out),
         assembled=True,
         missing=tuple(missing),
     )
-
-
-def _masses(out: Path, names: tuple[str, ...], config: Config) -> tuple[float, ...]:
-    """Return the masses of the objects [kg], of the manifest if there is one."""
-    try:
-        known = {entry.name: entry.mass for entry in read_manifest(out).objects}
-    except DataError:
-        known = {}
-    return tuple(known.get(name, config.objects.mass) for name in names)
 
 
 def _stamp(path: Path) -> tuple[int, ...] | None:

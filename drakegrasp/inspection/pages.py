@@ -175,14 +175,14 @@ def _reasons(snapshot: Snapshot, i: int) -> list[str]:
 def _plain_values(snapshot: Snapshot, i: int) -> dict[str, str]:
     """Return what a page without a server filters and sorts by, as attributes of its card."""
     table = snapshot.table
-    words = words_of(snapshot, i)
+    holds = {"held", words_of(snapshot, i)[0]} | ({"precision"} if table.precision[i] else set())
     values = {name: f"{table.value(name, i) * q.factor:.6g}" for name, q in
               QUANTITIES.items()}  # fmt: skip
     return values | {
         "object": snapshot.names[table.object[i]],
         "class": snapshot.classes[table.object[i]],
         "split": SPLITS[table.split[i]] if table.split[i] != NONE else "none",
-        "hold": " ".join({"held", words[0], *(["precision"] if table.precision[i] else [])}),
+        "hold": " ".join(sorted(holds)),
         "removal": Removal(int(table.removal[i])).label if table.removal[i] != NONE else "",
         "row": str(i),
     }
@@ -317,7 +317,7 @@ def grasp_page(
 def _parts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[dict[str, Any]]:
     """Return the parts of an attempt's suspicion with their shares."""
     columns = {name: np.asarray(value)[None] for name, value in row.items()}
-    found = suspicion(columns, snapshot.masses[snapshot.table.object[i]])
+    found = suspicion(columns)
     parts = []
     for part in PARTS:
         value, share = float(found.values[part.name][0]), float(found.shares[part.name][0])
@@ -336,7 +336,7 @@ def _parts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[dict[str, An
 
 def _facts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[tuple[str, str]]:
     """Return further numbers of an attempt as names and texts."""
-    key, table = snapshot.key(i), snapshot.table
+    key = snapshot.key(i)
 
     def number(name: str, factor: float, unit: str, digits: int = 1) -> str:
         value = float(row[name]) * factor
@@ -354,7 +354,7 @@ def _facts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[tuple[str, s
         ("slip before the wrist moves", number("slip_released", 1e3, "mm")),
         ("turn before the wrist moves", number("turn_released", DEGREES, "°")),
         ("other links after closing", str(int(row["closed_other_links"]))),
-        ("mass", f"{snapshot.masses[table.object[i]]:g} kg"),
+        ("mass", f"{float(row['mass']):.4g} kg"),
     ]  # fmt: skip
 
 

@@ -197,7 +197,7 @@ def select(snapshot: Snapshot, query: Query, decisions: Decisions) -> npt.NDArra
         chosen &= _decided(snapshot, query.decision, decisions)
     places = np.flatnonzero(chosen).astype(np.int32)
     if query.sort == "row":
-        return places if not query.ascending else places[::-1]
+        return places if query.ascending else places[::-1]
     # Most attempts have no values: they need no sorting.
     values = snapshot.table.feature(query.sort)[places]
     there = ~np.isnan(values)
@@ -258,6 +258,7 @@ def _decided(snapshot: Snapshot, decision: str, decisions: Decisions) -> npt.NDA
     (hits,) = np.nonzero(table.outcome == Outcome.SUCCESS)
     columns = (table.object[hits], table.candidate[hits], table.standoff_index[hits])
     codes = np.array(wanted, dtype=np.int64).reshape(-1, 3) @ _CODE
+    decided = np.isin(np.stack(columns, axis=1).astype(np.int64) @ _CODE, codes)
     found = np.zeros(len(table), dtype=bool)
-    found[hits[np.isin(np.stack(columns, axis=1).astype(np.int64) @ _CODE, codes)]] = True
-    return ~found if decision == "open" else found
+    found[hits[~decided if decision == "open" else decided]] = True
+    return found

@@ -23,7 +23,7 @@ from drakegrasp.inspection.table import NONE
 from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, intrinsics, project
 
 #: Columns that the dots on a thumbnail need.
-THUMBNAIL = ("X_TO", "X_OG", "closed_p_OQ", "closed_nhat_Q_O")
+THUMBNAIL = ("X_TO", "X_OG", "X_C0C", "closed_p_OQ", "closed_nhat_Q_O")
 #: Length of the arrows along the normals [m].
 ARROW = 0.03
 _CAMERA_POSES = {"oto": camera_pose_oto, "otm": camera_pose_otm}
@@ -140,7 +140,7 @@ def contact_dots(snapshot: Snapshot, row: dict[str, Any], camera: str) -> list[D
     # The contacts and the tips of their normals in {C}.
     config = snapshot.config.camera
     X_TO, X_OG = unpack_pose(row["X_TO"]), unpack_pose(row["X_OG"])
-    X_TC = _CAMERA_POSES[camera](multiply(X_TO, X_OG), config)
+    X_TC = _CAMERA_POSES[camera](multiply(X_TO, X_OG), config, unpack_pose(row["X_C0C"]))
     X_CO = multiply(invert_pose(X_TC), X_TO)
     p_CQ = transform_points(X_CO, row["closed_p_OQ"])
     p_CE = p_CQ + ARROW * np.nan_to_num(rotate_vectors(X_CO, row["closed_nhat_Q_O"]))

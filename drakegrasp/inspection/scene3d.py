@@ -79,7 +79,7 @@ class HandView:
 
         Args:
             X_TG: (4, 4), pose of the palm.
-            q: (j,), positions of the joints [rad]; None for the open hand.
+            q: (j,), positions of the joints [rad or m]; None for the open hand.
             spread: Angle of the spread joints of the open hand [rad].
         """
         self.load()

@@ -105,12 +105,11 @@ class AttemptTable:
         return int(found[0]) if len(found) else None
 
 
-def read_trials_table(path: Path, masses: Sequence[float]) -> AttemptTable:
+def read_trials_table(path: Path) -> AttemptTable:
     """Return the attempts in a trials.hdf5, with the splits of the data file beside it.
 
     Args:
         path: Of the file.
-        masses: Of the objects [kg].
 
     Raises:
         DataError: If the file cannot be read.
@@ -126,7 +125,7 @@ def read_trials_table(path: Path, masses: Sequence[float]) -> AttemptTable:
                 rows = slice(start, min(start + BLOCK, count))
                 columns = {name: trials[name][rows] for name in READ}
                 place = np.arange(rows.start, rows.stop, dtype=np.int32)
-                part = _part(columns, trials["object"][rows], masses, 0, place)
+                part = _part(columns, trials["object"][rows], 0, place)
                 # The only source is 0: memory that is never written costs nothing.
                 for name in _DTYPES.keys() - {"source"}:
                     whole[name][rows] = getattr(part, name)
@@ -141,9 +140,7 @@ def read_trials_table(path: Path, masses: Sequence[float]) -> AttemptTable:
     return table
 
 
-def read_shard_part(
-    out: Path, header: ShardHeader, number: int, object_: int, mass: float
-) -> AttemptTable:
+def read_shard_part(out: Path, header: ShardHeader, number: int, object_: int) -> AttemptTable:
     """Return the attempts in one shard.
 
     Args:
@@ -151,7 +148,6 @@ def read_shard_part(
         header: Of the shard.
         number: That the shard gets as a source.
         object_: Number of its object.
-        mass: Of its object [kg].
 
     Raises:
         DataError: If it is missing or damaged.
@@ -159,8 +155,7 @@ def read_shard_part(
     columns = read_trials(header.path(out), header, READ, verify_seal=False)
     count = len(columns["outcome"])
     objects = np.full(count, object_, dtype=np.int32)
-    masses = np.full(object_ + 1, mass)
-    return _part(columns, objects, masses, number, np.arange(count, dtype=np.int32))
+    return _part(columns, objects, number, np.arange(count, dtype=np.int32))
 
 
 def read_sample_ids(out: Path) -> dict[str, npt.NDArray[np.int64]]:
@@ -215,7 +210,6 @@ def _with_features(
 def _part(
     columns: Mapping[str, AnyArray],
     objects: AnyArray,
-    masses: Sequence[float] | AnyArray,
     source: int,
     row: npt.NDArray[np.int32],
 ) -> AttemptTable:
@@ -224,7 +218,7 @@ def _part(
     count = len(row)
     (closed,) = np.nonzero(np.isfinite(columns["time_close"]))
     few = {name: values[closed] for name, values in columns.items()}
-    doubts = suspicion(few, np.asarray(masses, dtype=float)[objects[closed]])
+    doubts = suspicion(few)
 
     # The largest force of a fingertip, after the lift if there was one.
     lifted = np.isfinite(few["time_lift"])[:, None, None]

@@ -124,6 +124,8 @@ def audit(
 ) -> list[AuditRow]:
     """Return, mesh by mesh, whether it is fit to be simulated, needs repair, or is refused.
 
+    Objects are prepared with the default `objects` of the configuration.
+
     Args:
         directory: The meshes, as for `find_meshes`.
         units: Unit of their lengths.
@@ -167,6 +169,7 @@ def _audit_one(source: MeshSource) -> AuditRow:
         row = AuditRow(**known, status="refused", notes=(str(error),))
         return replace(row, warnings=tuple(_warnings(row)))
     known |= _measures(model, vertices, faces)
+    known["units_guess"] = guess_units(diagonal(model.visual_vertices), source.scale)
     status: Status = "repaired" if model.notes else "fit"
     row = AuditRow(**known, status=status, notes=model.notes, model=model)
     return replace(row, warnings=tuple(_warnings(row)))
@@ -211,7 +214,9 @@ def _measures(model: ObjectModel, vertices: Array, faces: Faces) -> dict[str, An
     before = abs(signed_volume(vertices, faces))
     hull = trimesh.Trimesh(own, solid, process=False).convex_hull
     round_hull = hull.moment_inertia / hull.volume
+    x, y, z = np.ptp(own, axis=0).tolist()
     return {
+        "extents": (x, y, z),
         "volume": model.volume,
         "volume_change": model.volume / before - 1.0 if model.notes and before > 0.0 else 0.0,
         "crossing": len(crossing_faces(own, solid)) if len(solid) <= MOST_CROSSED else None,

@@ -25,10 +25,10 @@ class ContactFit:
     """How n contacts lie on the full mesh.
 
     Attributes:
-        distance: (n,), of the points from the mesh [m].
+        distance: (n,), of the points from the mesh [m]; NaN for a point that is NaN.
         normal_angle: (n,), between the normals and that face's which agrees better: the one nearest
             to the point, or the one nearest to the point `AHEAD` of it [rad]; pi for a normal
-            that is NaN, which has no direction.
+            that is NaN, which has no direction, and NaN for a point that is.
     """
 
     distance: Array
@@ -40,9 +40,19 @@ def fit_contacts(model: ObjectModel, p_OQ: Array, nhat_Q_O: Array) -> ContactFit
 
     Args:
         model: The object.
-        p_OQ: (n, 3), points [m].
+        p_OQ: (n, 3), points [m]; NaN for a fingertip that does not touch.
         nhat_Q_O: (n, 3), unit normals out of the object.
     """
+    # Points that there are.
+    distance, angle = np.full((2, len(p_OQ)), np.nan)
+    there = np.asarray(np.isfinite(p_OQ).all(axis=1))
+    if there.any():
+        distance[there], angle[there] = _fit(model, p_OQ[there], nhat_Q_O[there])
+    return ContactFit(distance=distance, normal_angle=angle)
+
+
+def _fit(model: ObjectModel, p_OQ: Array, nhat_Q_O: Array) -> tuple[Array, Array]:
+    """Return distances and angles (n,), as in `ContactFit`, of contacts that all exist."""
     mesh = model.visual
     known = np.asarray(np.isfinite(nhat_Q_O).all(axis=1))
     ahead = p_OQ + AHEAD * np.where(known[:, None], nhat_Q_O, 0.0)
@@ -55,4 +65,4 @@ def fit_contacts(model: ObjectModel, p_OQ: Array, nhat_Q_O: Array) -> ContactFit
     )
 
     angle = np.where(known, np.arccos(np.clip(cosine, -1.0, 1.0)), np.pi)
-    return ContactFit(distance=np.asarray(distance), normal_angle=angle)
+    return np.asarray(distance), angle

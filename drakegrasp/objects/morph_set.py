@@ -77,7 +77,9 @@ def morph_meshes(
         for source in sources:
             try:
                 original = load_original(source)
-                for name, text, count in _morphs_of(source, original, per_mesh, seed):
+                morphs = list(_morphs_of(source, original, per_mesh, seed))
+                _refuse_known(source, {name for name, _, _ in morphs} & entries.keys())
+                for name, text, count in morphs:
                     (folder / f"{name}.obj").write_text(text, encoding="ascii")
                     entries[name] = _entry(source)
                     draws.append(count)
@@ -118,6 +120,19 @@ def _morphs_of(
         morphed = morph_object(original, source.name, number, seed)
         made.append((name, obj_text(morphed.vertices, morphed.faces, normals=False), morphed.draws))
     yield from made
+
+
+def _refuse_known(source: MeshSource, names: set[str]) -> None:
+    """Refuse a mesh whose morphs would have names of another's.
+
+    Raises:
+        MeshError: If there are such names.
+    """
+    if names:
+        raise MeshError(
+            f"{source.name} of class {source.class_name}: its morphs must have names of their own, "
+            f"got {min(names)}, which another mesh has; rename it"
+        )
 
 
 def _entry(source: MeshSource) -> dict[str, Any]:

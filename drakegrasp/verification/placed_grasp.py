@@ -15,13 +15,14 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from drakegrasp.config import Config, RandomizeConfig, parse_config
+from drakegrasp.config import Config, RandomizeConfig, absolute_hand, override_config, parse_config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.errors import GraspError
+from drakegrasp.errors import GraspError, HandError
 from drakegrasp.frames import Array, read_pose, unpack_pose
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.files import hand_digest
 from drakegrasp.simulation.placement import (
     Placed,
     PlacedObject,
@@ -46,7 +47,11 @@ Mesh: TypeAlias = str | Path | trimesh.Trimesh | Placed
 class VerifyArguments:
     """The keyword arguments of `api.verify_grasps` that say what is verified, and how; see there.
 
-    `api.verify_grasp` has the same, but for `row`, which is a list of one here.
+    `api.verify_grasp` has the same, but for `row`, which is a list of one here, and `overrides`.
+
+    Attributes:
+        overrides: `"a.b=c"` strings, applied to the configuration. Unlike a configuration they
+            leave what was drawn for a dataset's rows, but for what they name.
     """
 
     mesh: Mesh | None = None
@@ -57,6 +62,7 @@ class VerifyArguments:
     hand: str | Path | None = None
     method: str = "hand"
     config: Config | None = None
+    overrides: tuple[str, ...] = ()
     dataset: GraspDataset | None = None
     rows: Sequence[int] | None = None
 
@@ -119,8 +125,7 @@ def place_grasps(grasps: npt.ArrayLike, arguments: VerifyArguments) -> list[Plac
         ConfigError, HandError, DataError: If configuration, hand or dataset cannot be used.
     """
     _refuse_contradictions(arguments)
-    known = _known_config(arguments)
-    config = _choose_config(arguments, known)
+    known, config = _known_config(arguments), chosen_config(arguments)
     frame = _frame(arguments)
 
     # Read all grasps before any mesh: a wrong number is reported at once.
@@ -157,7 +162,8 @@ def place_grasps(grasps: npt.ArrayLike, arguments: VerifyArguments) -> list[Plac
     _refuse_other_units(placed_grasps)
     if arguments.dataset is None or arguments.config is not None:
         return placed_grasps
-    return _as_tried(placed_grasps, arguments.dataset, rows, known.randomize)
+    kept = {text.partition("=")[0].strip() for text in arguments.overrides}
+    return _as_tried(placed_grasps, arguments.dataset, rows, known.randomize, kept)
 
 
 def _refuse_contradictions(arguments: VerifyArguments) -> None:
@@ -198,18 +204,39 @@ def _known_config(arguments: VerifyArguments) -> Config:
     return config_of(arguments.mesh)
 
 
-def _choose_config(arguments: VerifyArguments, known: Config) -> Config:
-    """Return the given configuration, else the known one, with the given hand.
+def chosen_config(arguments: VerifyArguments) -> Config:
+    """Return the given configuration, else the known one, with the overrides and the given hand.
 
     Raises:
         ConfigError: If a dataset's objects were prepared with other values.
+        HandError: If a dataset's hand has other files now, and the caller names none.
+        DataError: If the dataset cannot be used.
     """
+    known = _known_config(arguments)
     config = known if arguments.config is None else arguments.config
+    config = override_config(config, arguments.overrides) if arguments.overrides else config
     if arguments.hand is not None:
-        config = parse_config({**config.to_dict(), "hand": str(arguments.hand)})
+        config = parse_config({**config.to_dict(), "hand": absolute_hand(arguments.hand)})
     if arguments.dataset is not None:
         refuse_other_objects(config, known, "as in the dataset, whose objects are prepared")
+        if arguments.hand is None and config.hand == known.hand:
+            _refuse_other_hand(arguments.dataset, config.hand)
     return config
+
+
+def _refuse_other_hand(dataset: GraspDataset, hand: str) -> None:
+    """Refuse the hand of a dataset if its files have changed since.
+
+    Raises:
+        HandError: If so, or if they are gone.
+    """
+    known = read_manifest(dataset.path.parent).versions.get("hand")
+    found = hand_digest(hand)
+    if known not in (None, found):
+        raise HandError(
+            f"{hand}: files of the hand must be those of the dataset ({known}), got others "
+            f"({found}); name the hand to verify with it as it is now"
+        )
 
 
 def _frame(arguments: VerifyArguments) -> str:
@@ -255,6 +282,7 @@ def _as_tried(
     dataset: GraspDataset,
     rows: npt.NDArray[np.int64],
     rules: RandomizeConfig,
+    overridden: set[str],
 ) -> list[PlacedGrasp]:
     """Return grasps with the friction and mass that were drawn for their rows.
 
@@ -263,13 +291,15 @@ def _as_tried(
         dataset: The data file.
         rows: (n,), the row of each grasp, by its index.
         rules: What was drawn for the dataset.
+        overridden: Paths of keys that the caller sets, e.g. "physics.friction_hand".
     """
-    # The values in use by row; where one coefficient was drawn, both count.
+    # The values in use by row; where one coefficient was drawn, both count. What the caller sets
+    # stays.
     drawn_friction = rules.friction_hand is not None or rules.friction_table is not None
     frictions = {
         name: dataset.column(f"conditions/{name}")[rows].astype(float)
         for name in ("friction_hand", "friction_table")
-        if drawn_friction
+        if drawn_friction and f"physics.{name}" not in overridden
     }
     masses = dataset.column("object_props/work2mass")[rows, 0].astype(float)
 

@@ -39,7 +39,8 @@ class Verification:
         tries: Number of palm poses that were tried.
         pregrasp: Palm and opened fingers that the trial started from.
         trial: What happened in the simulator.
-        contact_error: (k,), distance of each contact after closing from its prediction [m].
+        contact_error: (k,), distance of each contact after closing from its prediction [m]; NaN
+            for a fingertip that does not touch and need not.
         lift: What happened to the object under forces alone.
         epsilon: Ferrari-Canny measure of the predicted contacts; 0 without force closure.
         smallest_friction: Smallest friction coefficient at which forces within the hand's limit
@@ -127,7 +128,7 @@ class Verification:
 
     @property
     def closing(self) -> Array | None:
-        """Closing angles (k,) at which the fingertips meet the predicted points [rad]."""
+        """Closing positions (k,) at which the fingertips meet the predicted points [rad or m]."""
         return None if self.fit is None else self.fit.closing
 
     @property
@@ -152,12 +153,12 @@ class Verification:
 
     @property
     def q_closed(self) -> Array | None:
-        """Positions of the hand's joints after closing [rad], in the plant's order."""
+        """Positions of the hand's joints after closing [rad or m], in the plant's order."""
         return None if self.trial is None else self.trial.q_closed
 
     @property
     def q_lifted(self) -> Array | None:
-        """Positions of the hand's joints after the lift [rad], in the plant's order."""
+        """Positions of the hand's joints after the lift [rad or m], in the plant's order."""
         return None if self.trial is None else self.trial.q_lifted
 
     def save_html(self, path: str | Path) -> None:

@@ -191,7 +191,7 @@ def as_dict(index: int, result: Verification) -> dict[str, Any]:
 
 
 def _contacts_as_dict(contacts: Contacts | None, q: Array | None) -> dict[str, Any] | None:
-    """Return the JSON object of contacts with joint positions q [rad]; None without contacts."""
+    """Return the JSON object of contacts with joint positions q [rad or m]; None without."""
     if contacts is None:
         return None
     names = ("touching", "p_OQ", "nhat_Q_O", "f_Q_O", "other_links", "hand_on_table")

@@ -182,7 +182,7 @@ class _Renderer:
         return self._view(title, snapshot, choose_view(self._scene, around), marks)
 
     def positions(self, spread: float, closing: Array) -> Array:
-        """Return the positions of the hand's joints [rad], in the order of `Snapshot.q`."""
+        """Return the positions of the hand's joints [rad or m], in the order of `Snapshot.q`."""
         angles = joint_positions(self._scene.hand, spread, closing)
         return np.array([angles[name] for name in self._scene.joint_names])
 

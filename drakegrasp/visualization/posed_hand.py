@@ -80,7 +80,7 @@ class PosedHand:
 
         Args:
             X_AG: (4, 4), pose of the palm.
-            q: (j,), positions of the joints in the order of the dataset's files [rad].
+            q: (j,), positions of the joints in the order of the dataset's files [rad or m].
         """
         self._plant.SetPositions(self._context, self._instance, np.asarray(q, dtype=float))
         X_AB = multiply(X_AG, invert_pose(self._hand.X_BG))

@@ -99,7 +99,7 @@ def show_start(
         config: With the target of the lift.
         X_OG: (4, 4), pose of the palm.
         spread: Angle of the spread joints [rad].
-        closing: (k,), closing angles [rad]; the open hand if None.
+        closing: (k,), closing positions [rad or m]; the open hand if None.
     """
     # Publish the start.
     X_WO = X_WT @ np.asarray(X_TO, dtype=float)

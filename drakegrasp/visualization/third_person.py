@@ -156,8 +156,9 @@ def build_render_scene(
     # can be put anywhere without a joint.
     instance = add_model(plant, hand.model)
     base = plant.GetBodyByName(hand.palm_link, instance)
+    # Links of any name may be in the hand's model: ours must not be one of them.
     palm = plant.AddFrame(
-        FixedOffsetFrame("palm", base.body_frame(), RigidTransform(hand.X_BG), instance)
+        FixedOffsetFrame("drakegrasp_palm", base.body_frame(), RigidTransform(hand.X_BG), instance)
     )
     wrist = plant.AddFrame(FixedOffsetFrame("wrist", plant.world_frame(), RigidTransform()))
     plant.WeldFrames(wrist, palm)

@@ -8,10 +8,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from helpers.hands import write_tongs
 
 from drakegrasp.commissioning.finding import Finding
 from drakegrasp.commissioning.run import check_hand
+from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.files import MODELS, hand_names
+from drakegrasp.verification.wrist.hand_constants import hand_constants
 
 
 def copied(folder: Path, name: str = "barrett") -> Path:
@@ -46,6 +49,12 @@ def remove_mesh(path: Path) -> None:
 RATIO = "ratio: 0.333333333333"
 REGION = "pad_region: [[1, 0, 0, 0.018], [0.085, 1, 0, 0.00153]]"
 POINT = "pad_point: [0.052, 0.0063, 0.0]"
+PALM_SHAPE = (
+    '    <collision><origin xyz="0 0 -0.015"/><geometry><box size="0.06 0.14 0.03"/></geometry>'
+    "</collision>\n"
+)
+SPREAD_AXIS = "<child>finger2_spread</child>\n      <axis>\n        <xyz>0 0 1</xyz>"
+MIMIC = "<mimic joint='{}'><multiplier>{}</multiplier></mimic>"
 #: The hand, what spoils it, which check fails, and what it says.
 FAULTS: dict[str, tuple[str, Callable[[Path], None], str, str]] = {
     "missing fingertip": (
@@ -98,6 +107,13 @@ FAULTS: dict[str, tuple[str, Callable[[Path], None], str, str]] = {
         r"finger 'F1' must be able to close, but limits of its coupled joints "
         r"\(finger1_distal_joint by -0\.333333\) leave .*: check the signs of the ratios",
     ),
+    "offset that opens too far": (
+        "barrett",
+        changed(".yaml", RATIO, f"{RATIO}, offset: -0.2"),
+        "limits",
+        r"finger 'F1' must be open at 0, but with their offsets \(finger1_distal_joint by -0\.2\) "
+        r"limits of its coupled joints leave 0\.6\.\.",
+    ),
     "wrong sign of a ratio that limits allow": (
         "allegro",
         changed(".yaml", "index_pip_joint, ratio: 1.0", "index_pip_joint, ratio: -1.0"),
@@ -137,6 +153,18 @@ FAULTS: dict[str, tuple[str, Callable[[Path], None], str, str]] = {
         "efforts",
         r"payload must be at most 5 kg, which friction carries, got 25 kg",
     ),
+    "palm without a shape": (
+        "tongs",
+        changed(".urdf", PALM_SHAPE, ""),
+        "palm",
+        r"link 'palm', or one that is fixed to it, must have a collision shape, got none",
+    ),
+    "spread joints that the model turns against each other": (
+        "barrett",
+        changed(".sdf", SPREAD_AXIS, SPREAD_AXIS + MIMIC.format("finger1_spread_joint", -1.0)),
+        "couplings",
+        r"joint 'finger2_spread_joint' must be coupled to 'finger1_spread_joint' by -1 and 0, as",
+    ),
     "finger that opens": (
         "franka",
         changed(".urdf", '<axis xyz="0 1 0"/>', '<axis xyz="0 -1 0"/>'),
@@ -163,13 +191,61 @@ def test_a_spoilt_hand_fails_with_a_message_that_names_the_fault(
     """No other check fails, and none of these needs a simulation to be seen."""
     monkeypatch.setattr("drakegrasp.commissioning.run.SHAPES", ())
     name, spoil, check, message = FAULTS[fault]
-    path = copied(tmp_path, name)
-    spoil(path)
+    path = write_tongs(tmp_path) if name == "tongs" else copied(tmp_path, name)
+    spoil(path if name != "tongs" else tmp_path / "tongs.yaml")
     findings = check_hand(path)
     failed = [finding for finding in findings if not finding.ok]
     assert [finding.name for finding in failed] == [check]
     assert re.search(message, failed[0].text), failed[0].text
     assert "\n" not in failed[0].text
+
+
+#: A link that is fixed to the palm, below or above it in the model, with a shape or without.
+FIXED = """  <link name="{0}"><inertial><mass value="0.1"/>
+    <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><origin xyz="{3}"/><geometry><box size="0.06 0.14 0.03"/></geometry></collision>
+  </link>
+  <joint name="{0}_fixed" type="fixed"><parent link="{1}"/><child link="{2}"/></joint>
+</robot>"""
+SHELL = FIXED.format("shell", "palm", "shell", "0 0 -0.015")
+MOUNT = FIXED.format("mount", "mount", "palm", "0 0.05 0.015")
+#: What a sound hand may have: the hand, and changes of its files.
+SOUND: dict[str, tuple[str, tuple[Callable[[Path], None], ...]]] = {
+    "shape of the palm on a link that is fixed to it": (
+        "tongs",
+        (changed(".urdf", PALM_SHAPE, ""), changed(".urdf", "</robot>", SHELL)),
+    ),
+    "link above the palm, among the fingers": ("tongs", (changed(".urdf", "</robot>", MOUNT),)),
+    "spread joints that the model turns together": (
+        "barrett",
+        (changed(".sdf", SPREAD_AXIS, SPREAD_AXIS + MIMIC.format("finger1_spread_joint", 1.0)),),
+    ),
+    "joints of the preshape that the model ties": (
+        "allegro",
+        (
+            changed(
+                ".sdf",
+                "<child>ring_roll</child>\n      <axis>\n",
+                "<child>ring_roll</child>\n      <axis>\n" + MIMIC.format("middle_roll_joint", 1.0),
+            ),
+        ),
+    ),
+}
+
+
+@pytest.mark.parametrize("change", SOUND)
+def test_a_sound_hand_passes_whatever_else_its_model_has(
+    tmp_path: Path, change: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("drakegrasp.commissioning.run.SHAPES", ())
+    name, changes = SOUND[change]
+    path = write_tongs(tmp_path) if name == "tongs" else copied(tmp_path, name)
+    for edit in changes:
+        edit(path if name != "tongs" else tmp_path / "tongs.yaml")
+    assert [finding.text for finding in check_hand(path) if not finding.ok] == []
+    # What is checked can be used.
+    hand = load_hand(path)
+    assert len(hand_constants(hand).palm) == 8 or name != "tongs"
 
 
 @pytest.mark.sim

@@ -7,22 +7,20 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from helpers.hands import PAGE as PATH
+from helpers.hands import write_tongs
 from helpers.machine import needs_egl
 
 from drakegrasp.cli.main import main
 from drakegrasp.hand.file_format import Coupling, Finger, HandFile, Palm, Spread
 
-PAGE = (Path(__file__).resolve().parents[2] / "docs" / "how-to" / "add-a-hand.md").read_text()
+PAGE = PATH.read_text()
 
 
 @pytest.fixture
 def tongs(tmp_path: Path) -> Path:
-    """Write the two files of the page as a reader would, and return the hand file."""
-    for name, language in (("tongs.urdf", "xml"), ("tongs_hand.yaml", "yaml")):
-        assert f"Write this as `{name}`" in PAGE
-        (block,) = re.findall(rf"^```{language}\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
-        (tmp_path / name).write_text(block)
-    return tmp_path / "tongs_hand.yaml"
+    """The files of the page."""
+    return write_tongs(tmp_path)
 
 
 @pytest.mark.sim

@@ -30,6 +30,7 @@ def good(count: int) -> Successes:
         standoff_index=np.zeros(count, dtype=np.uint8),
         grasp_T=rng.normal(size=(count, 18)),
         held_O=rng.normal(size=(count, 18)),
+        complete=np.ones(count, dtype=bool),
         other_links=np.zeros(count, dtype=np.uint8),
         slip=np.full(count, 0.010),
         turn=np.full(count, np.deg2rad(9.9)),
@@ -55,6 +56,7 @@ def test_good_ones_are_kept() -> None:
 @pytest.mark.parametrize(
     ("field", "value", "reason"),
     [
+        ("complete", False, Removal.MISSING_FINGER),
         ("seen", False, Removal.NOT_SEEN),
         ("in_view", False, Removal.OUT_OF_VIEW),
         ("camera_height", 0.009, Removal.BISECTS_TABLE),
@@ -83,6 +85,8 @@ def test_first_reason_counts() -> None:
     assert np.all(judge_successes(worse, FilterConfig()) == Removal.SLID)
     worst = replace(worse, other_links=np.ones(3, np.uint8))
     assert np.all(judge_successes(worst, FilterConfig()) == Removal.OTHER_LINKS)
+    nothing = replace(worst, complete=np.zeros(3, bool), grasp_T=np.full((3, 18), np.nan))
+    assert np.all(judge_successes(nothing, FilterConfig()) == Removal.MISSING_FINGER)
 
 
 @pytest.mark.parametrize(

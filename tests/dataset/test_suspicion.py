@@ -25,6 +25,7 @@ def firm(count: int = 2, mass: float = 1.0) -> dict[str, npt.NDArray[Any]]:
     pull_T = np.array([[3.0, 0.0, 0.0], [-3.0, 0.0, 0.0], [0.0, 0.0, mass * module.GRAVITY]])
     rows: dict[str, Any] = {
         "outcome": np.uint8(Outcome.SUCCESS),
+        "closed_touching": np.ones(3, dtype=bool),
         "closed_penetration": np.zeros(3),
         "lifted_penetration": np.zeros(3),
         "normal_angle": np.zeros(3),
@@ -37,15 +38,26 @@ def firm(count: int = 2, mass: float = 1.0) -> dict[str, npt.NDArray[Any]]:
         "closed_nhat_Q_O": BALANCED,
         "time_close": 0.8,
         "time_lift": 2.0,
+        "mass": mass,
     }
     return {name: np.array([value] * count) for name, value in rows.items()}
 
 
 def test_a_firm_grasp_is_not_suspicious() -> None:
-    found = suspicion(firm(), 1.0)
+    found = suspicion(firm())
     assert set(COLUMNS) == set(firm())
     np.testing.assert_allclose(found.score, 0.0, atol=1e-12)
     assert list(found.values) == list(found.shares) or set(found.values) == set(found.shares)
+
+
+def test_a_fingertip_that_does_not_touch_has_no_contact_to_doubt() -> None:
+    """The third finger is optional; the other two oppose each other."""
+    columns = firm()
+    columns["closed_touching"][:, 2] = False
+    for name in ("normal_angle", "surface_distance"):
+        columns[name][:, 2] = np.nan
+    columns["closed_nhat_Q_O"][:] = [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [np.nan] * 3]
+    np.testing.assert_allclose(suspicion(columns).score, 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -64,7 +76,7 @@ def test_a_firm_grasp_is_not_suspicious() -> None:
 def test_each_part_is_of_its_own_column(part: str, column: str, value: Any) -> None:
     columns = firm()
     columns[column][1] = value
-    found = suspicion(columns, 1.0)
+    found = suspicion(columns)
     expected = 1.0 / 3.0 if part == "normal_sum" else np.max(value)
     assert found.values[part][1] == pytest.approx(expected)
     assert found.score[1] == pytest.approx(expected / SCALES[part])
@@ -79,7 +91,7 @@ def test_forces_must_carry_the_weight_upwards() -> None:
     columns["lifted_f_Q_O"][1] = 0.0
     R_TO = columns["X_TO_lifted"][2].reshape(3, 4)[:, :3]
     columns["lifted_f_Q_O"][2, 0] += R_TO.T @ [0.0, 1.0, 0.0]
-    found = suspicion(columns, np.array([2.0, 2.0, 2.0])).values["imbalance"]
+    found = suspicion(columns).values["imbalance"]
     np.testing.assert_allclose(found, [0.0, 1.0, 1.0 / 19.62], atol=1e-12)
 
 
@@ -87,7 +99,7 @@ def test_parts_add_up_in_squares_and_are_capped() -> None:
     columns = firm(2)
     columns["slip"][:] = [0.010, 1.0]
     columns["lifted_other_links"][:] = [2, 0]
-    np.testing.assert_allclose(suspicion(columns, 1.0).score, [np.sqrt(5.0), CAP])
+    np.testing.assert_allclose(suspicion(columns).score, [np.sqrt(5.0), CAP])
 
 
 def test_an_attempt_is_judged_by_the_stages_that_it_reached() -> None:
@@ -96,7 +108,7 @@ def test_an_attempt_is_judged_by_the_stages_that_it_reached() -> None:
     columns["time_close"][0] = columns["time_lift"][0] = columns["time_lift"][1] = np.nan
     columns["closed_penetration"][:] = 1e-3
     columns["closed_nhat_Q_O"][1, 2] = np.nan  # the finger that does not touch
-    found = suspicion(columns, 1.0)
+    found = suspicion(columns)
     assert np.isnan(found.score).tolist() == [True, False, False]
     assert np.isnan(found.values["slip"]).tolist() == [True, True, False]
     assert found.values["penetration"][1] == 1e-3
@@ -107,7 +119,7 @@ def test_a_success_without_a_normal_is_most_suspicious_by_it() -> None:
     columns = firm(2)
     columns["closed_nhat_Q_O"][1, 0] = np.nan
     columns["normal_angle"][1, 0] = np.nan
-    found = suspicion(columns, 1.0)
+    found = suspicion(columns)
     assert found.shares["normal_sum"][1] == found.shares["normal_angle"][1] == CAP
     assert found.score[1] == pytest.approx(np.sqrt(2.0) * CAP)
 

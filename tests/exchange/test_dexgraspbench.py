@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 import trimesh
 
 from drakegrasp.exchange.closed_grasps import ClosedGrasp
-from drakegrasp.exchange.dexgraspbench import SQUEEZE, pose_of_vector
+from drakegrasp.exchange.dexgraspbench import SQUEEZE, grasp_dictionary, pose_of_vector
 from drakegrasp.exchange.export import export_dataset
 from drakegrasp.hand.description import load_hand
 from drakegrasp.visualization.posed_hand import PosedHand
@@ -34,6 +35,7 @@ def test_poses_and_joints_come_back(folder: Path, grasps: list[ClosedGrasp]) -> 
             assert pytest.approx(grasp.X_TG, abs=1e-9) == X_TG
         assert (content["grasp_qpos"][7:] == grasp.q).all()
         assert content["joint_names"] == list(PosedHand(hand).joints)
+        assert set(content["joint_units"]) == {"rad"}
 
 
 def test_fingers_begin_open_and_squeeze_further(folder: Path, grasps: list[ClosedGrasp]) -> None:
@@ -47,6 +49,20 @@ def test_fingers_begin_open_and_squeeze_further(folder: Path, grasps: list[Close
     assert start == pytest.approx(np.where(spread, grasp.spread, 0.0))
     assert (squeezed[spread] == closed[spread]).all()
     assert squeezed[~spread] == pytest.approx((1.0 + SQUEEZE) * closed[~spread])
+
+
+def test_fingers_that_slide_have_lengths(grasps: list[ClosedGrasp]) -> None:
+    hand = load_hand("franka")
+    q = np.array([0.01, 0.02])
+    content = grasp_dictionary(hand, PosedHand(hand), replace(grasps[0], q=q, spread=0.0))
+    assert content["joint_units"] == ["m", "m"]
+    assert len(content["joint_names"]) == 2
+    start, closed, squeezed = (
+        content[f"{name}_qpos"][7:] for name in ("pregrasp", "grasp", "squeeze")
+    )
+    assert start == pytest.approx([0.0, 0.0])
+    assert (closed == q).all()
+    assert squeezed == pytest.approx((1.0 + SQUEEZE) * q)
 
 
 def test_meshes_are_the_objects(folder: Path, grasps: list[ClosedGrasp]) -> None:

@@ -21,6 +21,7 @@ from drakegrasp.hand.file_format import Coupling
 from drakegrasp.hand.files import MODELS, hand_digest, hand_names
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses, joint_positions
 from drakegrasp.hand.parsing import add_model
+from drakegrasp.hand.shapes import link_shapes
 
 #: Mass [kg] and bounding box of the CAD mesh [m] of each kind of link.
 LINKS = {
@@ -223,6 +224,28 @@ def test_a_coupling_that_stops_first_limits_its_finger(tmp_path: Path) -> None:
     assert pincer.fingers[0].coupled == (Coupling(joint="right_hinge", ratio=-2.0),)
     # right_hinge, 0..1, turns by -2 times the closing angle, -0.1..1.
     np.testing.assert_allclose(coordinate_limits(pincer)[1], [-0.1, 0.0])
+
+
+def test_a_hand_whose_files_have_changed_is_another(tmp_path: Path) -> None:
+    """Its shapes, too; and the files of a model are also its meshes."""
+    path = write_pincer(tmp_path)
+    first = load_hand(path)
+    assert load_hand(path) is first
+    before = link_shapes(first)["right"][0]
+    write_pincer(tmp_path, sdf=PINCER_SDF.replace("0.02 0.02 0.09", "0.02 0.03 0.09"))
+    second = load_hand(path)
+    assert second is not first
+    assert np.ptp(before, axis=0) == pytest.approx([0.02, 0.02, 0.09])
+    assert np.ptp(link_shapes(second)["right"][0], axis=0) == pytest.approx([0.02, 0.03, 0.09])
+
+    mesh = "<mesh><uri>bar.obj</uri><drake:declare_convex/></mesh>"
+    sdf = PINCER_SDF.replace("<box><size>0.02 0.02 0.09</size></box>", mesh)
+    sdf = sdf.replace("<sdf ", '<sdf xmlns:drake="http://drake.mit.edu" ')
+    write_pincer(tmp_path, sdf=sdf)
+    for edge in (0.02, 0.025):
+        trimesh.creation.box([0.02, edge, 0.09]).export(tmp_path / "bar.obj")
+        shape = link_shapes(load_hand(path))["right"][0]
+        assert np.ptp(shape, axis=0) == pytest.approx([0.02, edge, 0.09])
 
 
 def test_an_unknown_hand_is_refused_with_the_hands_there_are() -> None:

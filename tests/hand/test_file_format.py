@@ -33,6 +33,10 @@ SLIDING = {
     "force_limit": 5.0,
 }
 REFUSALS = {
+    "two fingers of one name": (
+        {"fingers": changed_finger(name="right")},
+        r"fingers must have a name each, got right, right",
+    ),
     "another version": ({"version": 2}, r"version: must be 1, .* got 2"),
     "no effort": (
         {"fingers": [{k: v for k, v in LEFT.items() if k != "torque_limit"}]},

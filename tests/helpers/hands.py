@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 
 from drakegrasp.frames import Array
-from drakegrasp.hand.description import Hand
+from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.files import hand_file
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.parsing import add_model
 
@@ -129,3 +131,28 @@ def drake_fingertip_poses(hand: Hand, spread: float, closing: Array) -> Array:
     X_GB = RigidTransform(hand.X_BG).inverse()
     bodies = [plant.GetBodyByName(name) for name in hand.fingertip_links]
     return np.array([(X_GB @ body.EvalPoseInWorld(context)).GetAsMatrix4() for body in bodies])
+
+
+#: The page of the tutorial's hand.
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "how-to" / "add-a-hand.md"
+
+
+def write_tongs(folder: Path) -> Path:
+    """Write the two files of the tutorial as a reader would, and return the hand file."""
+    page = PAGE.read_text()
+    for name, language in (("tongs.urdf", "xml"), ("tongs_hand.yaml", "yaml")):
+        assert f"Write this as `{name}`" in page
+        (block,) = re.findall(rf"^```{language}\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
+        (folder / name).write_text(block)
+    return folder / "tongs_hand.yaml"
+
+
+def write_with_optional_fingers(folder: Path, *fingers: int) -> Path:
+    """Write the Barrett Hand's YAML with fingers that need not touch, and return its path."""
+    tree = yaml.safe_load(hand_file("barrett").read_text())
+    tree["model"] = str(load_hand("barrett").model.path)
+    for k in fingers:
+        tree["fingers"][k]["required"] = False
+    path = folder / "optional_hand.yaml"
+    path.write_text(yaml.safe_dump(tree))
+    return path

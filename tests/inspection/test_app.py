@@ -40,8 +40,8 @@ def test_gallery_shows_what_is_selected_page_by_page(client: TestClient) -> None
     labels = [a["data-label"] for tag, a in everything.tags if tag == "li"]
     assert len(labels) == 9
     assert "9 of 36 attempts" in " ".join(everything.text.split())
-    first = Tags(client.get("/?outcome=any&sort=row").text)
-    second = Tags(client.get("/?outcome=any&sort=row&page=2").text)
+    first = Tags(client.get("/?outcome=any&sort=row&order=up").text)
+    second = Tags(client.get("/?outcome=any&sort=row&order=up&page=2").text)
     both = [a["data-label"] for p in (first, second) for tag, a in p.tags if tag == "li"]
     assert len(both) == len(set(both)) == 36
     assert len([tag for tag, _ in first.tags if tag == "li"]) == PAGE
@@ -51,7 +51,7 @@ def test_gallery_shows_what_is_selected_page_by_page(client: TestClient) -> None
 
 
 def test_contacts_are_drawn_in_all_three_images(client: TestClient) -> None:
-    card = client.get("/?object=1_box_a&sort=row").text.partition("</li>")[0]
+    card = client.get("/?object=1_box_a&sort=row&order=up").text.partition("</li>")[0]
     assert card.count("<circle") == 9
     assert "/strip/0-0-0-oto.png" in card
     strip = imread(BytesIO(client.get("/strip/0-0-0-oto.png").content))
@@ -61,7 +61,7 @@ def test_contacts_are_drawn_in_all_three_images(client: TestClient) -> None:
 
 
 def test_next_and_previous_go_through_the_selection(client: TestClient) -> None:
-    query = "object=2_box_b&sort=row"
+    query = "object=2_box_b&sort=row&order=up"
     page = client.get(f"/grasp/1-1-0?{query}").text
     assert "2 of 3" in page
     links = {a.get("id"): a.get("href") for tag, a in Tags(page).tags if tag == "a"}
@@ -269,9 +269,9 @@ def test_errors_are_pages_without_foreign_tags(client: TestClient, path: str, st
 
 
 def test_page_works_while_the_files_are_replaced(client: TestClient, out: Path) -> None:
-    before = client.get("/?sort=row").text
+    before = client.get("/?sort=row&order=up").text
     assemble(out, rejected=[0])
-    after = client.get("/?sort=row").text
+    after = client.get("/?sort=row&order=up").text
     assert "no sample: rejected" in after
     assert "no sample: rejected" not in before
 

@@ -129,6 +129,7 @@ def test_gallery_filters_and_sorts(page: Page, address: str) -> None:
     assert len(labels(page)) == 9
     page.select_option("select[name=object]", "2_box_b")
     page.select_option("select[name=sort]", "row")
+    page.select_option("select[name=order]", "up")
     page.click("form button")
     page.wait_for_url("**object=2_box_b**")
     assert labels(page) == ["1-0-0", "1-1-0", "1-3-2"]
@@ -149,7 +150,7 @@ def test_pages_fit_and_their_pictures_load(page: Page, address: str, size: str) 
     page.set_viewport_size({"width": width, "height": height})
     for name, path in (
         ("gallery", "/"),
-        ("failures", "/?outcome=any&sort=row"),
+        ("failures", "/?outcome=any&sort=row&order=up"),
         ("grasp", "/grasp/0-0-0"),
         ("plots", "/plots"),
     ):
@@ -178,21 +179,21 @@ def test_3d_view_draws_each_state(page: Page, address: str) -> None:
 
 def test_keyboard_moves_rejects_keeps_and_undoes(page: Page, address: str, out: Path) -> None:
     keys = [AttemptKey("1_box_a", *numbers) for numbers in ((0, 0), (1, 0), (3, 2))]
-    page.goto(f"{address}/grasp/0-0-0?sort=row")
+    page.goto(f"{address}/grasp/0-0-0?sort=row&order=up")
     page.keyboard.press("r")  # rejects, and goes on to the next
-    page.wait_for_url("**/grasp/0-1-0?sort=row")
+    page.wait_for_url("**/grasp/0-1-0?sort=row&order=up")
     wait_for_decision(out, keys[0], "rejected")
     page.keyboard.press("k")
-    page.wait_for_url("**/grasp/0-3-2?sort=row")
+    page.wait_for_url("**/grasp/0-3-2?sort=row&order=up")
     wait_for_decision(out, keys[1], "kept")
     page.keyboard.press("ArrowLeft")
-    page.wait_for_url("**/grasp/0-1-0?sort=row")
+    page.wait_for_url("**/grasp/0-1-0?sort=row&order=up")
     assert page.inner_text("#decision") == "kept"
     page.keyboard.press("p")
-    page.wait_for_url("**/grasp/0-0-0?sort=row")
+    page.wait_for_url("**/grasp/0-0-0?sort=row&order=up")
     assert page.inner_text("#decision") == "rejected"
     page.keyboard.press("ArrowRight")
-    page.wait_for_url("**/grasp/0-1-0?sort=row")
+    page.wait_for_url("**/grasp/0-1-0?sort=row&order=up")
 
     # Undo shows what was undone.
     page.keyboard.press("u")
@@ -200,7 +201,7 @@ def test_keyboard_moves_rejects_keeps_and_undoes(page: Page, address: str, out: 
     # The page takes one request at a time: a key before the answer would be lost.
     page.wait_for_function("document.querySelector('#decision').textContent === ''")
     page.keyboard.press("u")
-    page.wait_for_url("**/grasp/0-0-0?sort=row")
+    page.wait_for_url("**/grasp/0-0-0?sort=row&order=up")
     wait_for_decision(out, keys[0], "")
     page.keyboard.press("g")
     page.wait_for_selector("#cards")
@@ -252,6 +253,7 @@ def test_files_open_without_a_server(page: Page, boxes: Path, tmp_path: Path) ->
     assert len(labels(page)) == 9
     page.select_option("select[name=object]", "2_box_b")
     page.select_option("select[name=sort]", "row")
+    page.select_option("select[name=order]", "up")
     page.click("form button")
     assert labels(page) == ["1-0-0", "1-1-0", "1-3-2"]
     assert page.inner_text("#count") == "3"

@@ -51,8 +51,8 @@ def test_cards_carry_what_filters_need(site: Path) -> None:
     first = next(a for a in cards if a["data-label"] == "0-0-0")
     assert first["data-object"] == "1_box_a"
     assert first["data-slip"] == "2"
-    assert first["data-hold"] is not None
-    assert set(first["data-hold"].split()) == {"held", "precision", "stable"}
+    # In an order that is not a set's, which differs from run to run.
+    assert first["data-hold"] == "held precision stable"
 
 
 def test_files_cannot_decide_but_show_decisions(out: Path, tmp_path: Path) -> None:

@@ -62,6 +62,16 @@ def test_row_tells_what_is_measured(tmp_path):
     assert json.loads(json.dumps(far.to_json()))["units_guess"] == "cm"
 
 
+def test_size_is_the_solids_not_the_files(tmp_path):
+    """A box, and a triangle 0.8 m away, which repair removes."""
+    stray = trimesh.Trimesh([[0.8, 0, 0], [0.81, 0, 0], [0.8, 0.01, 0]], [[0, 1, 2]], process=False)
+    write(tmp_path / "1_box.obj", box((0.06, 0.05, 0.10)), stray)
+    (row,) = audit(tmp_path)
+    assert row.status == "repaired" and row.faces == 13
+    assert row.extents == pytest.approx((0.06, 0.05, 0.10))
+    assert row.units_guess is None
+
+
 @pytest.mark.parametrize(
     ("said", "warning"),
     [

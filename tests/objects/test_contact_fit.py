@@ -45,6 +45,18 @@ def test_on_a_thin_wall_the_own_side_counts_though_the_other_is_nearer(
     np.testing.assert_allclose(np.degrees(fit.normal_angle), 10.0, atol=1e-6)
 
 
+def test_a_fingertip_that_does_not_touch_has_neither(tmp_path: Path) -> None:
+    model = box(tmp_path, 0.06, 0.05, 0.10)
+    missing = [np.nan] * 3
+    fit = fit_contacts(
+        model, np.array([missing, [0.031, 0.0, 0.0]]), np.array([missing, [1.0, 0.0, 0.0]])
+    )
+    np.testing.assert_allclose(fit.distance, [np.nan, 1e-3], atol=1e-8)
+    np.testing.assert_allclose(fit.normal_angle, [np.nan, 0.0], atol=1e-6)
+    nothing = fit_contacts(model, np.full((2, 3), np.nan), np.full((2, 3), np.nan))
+    assert np.isnan([nothing.distance, nothing.normal_angle]).all()
+
+
 def test_normal_without_a_direction_agrees_with_no_face(tmp_path: Path) -> None:
     model = box(tmp_path, 0.06, 0.05, 0.10)
     fit = fit_contacts(model, np.array([[0.03, 0.0, 0.0]]), np.full((1, 3), np.nan))

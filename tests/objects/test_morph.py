@@ -140,6 +140,21 @@ def test_bad_meshes_are_told_and_leave_the_others(tmp_path: Path) -> None:
     assert [line[:12] for line in report.refused] == ["9_sheet.obj:"]
 
 
+def test_morphs_of_two_meshes_that_would_have_one_name_are_told(tmp_path: Path) -> None:
+    """`b_c` of class `a`, and `c` of class `a_b`; the first keeps its morphs."""
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    for name in ("b_c", "c"):
+        stool(meshes, name)
+    (meshes / "objects.yaml").write_text("objects: {b_c: {class: a}, c: {class: a_b}}")
+    report = morph_meshes(meshes, tmp_path / "out", per_mesh=2)
+    assert report.morphs == len(list((tmp_path / "out").glob("*.obj"))) == 2
+    assert report.refused == (
+        "c of class a_b: its morphs must have names of their own, got a_b_c_m1, which another mesh "
+        "has; rename it",
+    )
+
+
 def test_nothing_appears_unless_all_of_it_does(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

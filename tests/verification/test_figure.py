@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.hands import write_tongs
 from helpers.machine import needs_egl
 from helpers.objects import CUBE, box_model, from_above, standing
 from matplotlib.figure import Figure
@@ -98,6 +99,31 @@ def test_contacts_on_opposite_sides_are_each_seen_once(
     assert texts_of(figure) == ["1_box_a  fails: off surface", "so it is"]
     save_figure(figure, tmp_path / "figure.png", dpi=50)
     assert imread(tmp_path / "figure.png").std() > 0.1
+
+
+@needs_egl
+def test_hand_whose_link_is_called_palm_is_shown(
+    verified: Callable[..., Verification], cube: ObjectModel, tmp_path: Path
+) -> None:
+    """The hand of the tutorial, over the cube."""
+    fit = SimpleNamespace(
+        X_OG=from_above(cube, 0.06).X_OG,
+        spread=0.0,
+        closing=np.full(2, 0.1),
+        residual=np.zeros(2),
+        normal_error=np.zeros(2),
+    )
+    result = verified(
+        config=load_config(hand=str(write_tongs(tmp_path))),
+        outcome=Outcome.UNREACHABLE,
+        surface_distance=np.zeros(2),
+        p_OQ=P_OQ[:2],
+        nhat_Q_O=NHAT_Q_O[:2],
+        fit=fit,
+    )
+    figure = result.figure()
+    assert [axes.get_title(loc="left") for axes in figure.axes][2].startswith("the hand where")
+    assert figure.axes[2].images[0].get_array().std() > 1.0
 
 
 @needs_egl

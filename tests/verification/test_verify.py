@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.hands import write_with_optional_fingers
 from helpers.objects import CUBE, box_model, standing
 from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
@@ -163,6 +164,25 @@ def test_a_finger_that_touches_elsewhere_does_not_make_the_grasp(
     found = verify_contacts(cube, p, n, method="hand", config=strict)
     assert found.outcome is Outcome.UNREACHABLE and held.success
     assert "closes on the object" in found.reason
+
+
+def test_the_others_count_where_a_fingertip_that_is_not_required_misses(
+    held: dg.Verification, tmp_path: Path
+) -> None:
+    """The first finger closes 2 cm from its point, the last on nothing."""
+    assert held.trial is not None and held.trial.closed is not None
+    closed = held.trial.closed
+    p_OQ, touching = closed.p_OQ.copy(), closed.touching.copy()
+    p_OQ[2], touching[2] = np.nan, False
+    trial = replace(held.trial, closed=replace(closed, p_OQ=p_OQ, touching=touching))
+    config = load_config(hand=str(write_with_optional_fingers(tmp_path, 2)))
+    near = verifying._judge(replace(held, trial=trial), config)
+    assert near.success and near.contact_error is not None
+    assert np.isnan(near.contact_error).tolist() == [False, False, True]
+    moved = held.p_OQ + np.diag([0.02, 0.0, 0.0])
+    far = verifying._judge(replace(held, trial=trial, p_OQ=moved), config)
+    assert far.outcome is Outcome.UNREACHABLE
+    assert far.reason.startswith("fingertip 1 closes on the object")
 
 
 def test_at_little_friction_neither_method_holds(

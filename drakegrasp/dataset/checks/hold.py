@@ -26,7 +26,7 @@ from drakegrasp.simulation.verdict import is_precision, is_stable
 
 #: float32 rounds slip [m] and turn [rad] by 2e-7 at most.
 MOTION_TOLERANCE = 1e-6
-#: float32 rounds forces [N] and joint positions [rad] by this share of them.
+#: float32 rounds forces [N] and joint positions [rad or m] by this share of them.
 RELATIVE_TOLERANCE = 1e-5
 #: Fields of `grasp_props` that are a trial's values as they are, and their names there.
 COPIES = {

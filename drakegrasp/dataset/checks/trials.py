@@ -86,8 +86,10 @@ def stages(batch: Batch) -> Iterator[Violation]:
             bad = ~reached & ~all_per_row(values == 0)
             what = f"{f.name} must be 0 before the stage {f.stage.name.lower()}"
         elif f.per_finger:
-            touching = reached[:, None] & batch[f"{f.name.split('_')[0]}_touching"]
-            bad = ~all_per_row(_as_due(values, touching[:, :, None]))
+            instant = "lifted" if f.name.startswith("lifted_") else "closed"
+            touching = reached[:, None] & batch[f"{instant}_touching"]
+            due = touching.reshape(*touching.shape, *(1,) * (values.ndim - 2))
+            bad = ~all_per_row(_as_due(values, due))
             what = f"{f.name} must be finite where the finger touches and NaN elsewhere"
         else:
             due = reached.reshape(-1, *(1,) * (values.ndim - 1))

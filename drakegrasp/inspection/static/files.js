@@ -53,10 +53,9 @@
     chosen = cards.filter((card) => fits(card, values));
     const rank = (card) => {
       const x = number(card, sort);
-      return Number.isNaN(x) ? Infinity : up || sort === "row" ? x : -x;
+      return Number.isNaN(x) ? Infinity : up ? x : -x;
     };
     chosen.sort((a, b) => rank(a) - rank(b));
-    if (sort === "row" && up) chosen.reverse();
     page = 1;
     show();
   }

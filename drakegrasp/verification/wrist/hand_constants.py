@@ -11,9 +11,9 @@ from functools import lru_cache
 import numpy as np
 
 from drakegrasp.errors import HandError
-from drakegrasp.frames import Array
+from drakegrasp.frames import Array, transform_points
 from drakegrasp.hand.description import Hand
-from drakegrasp.hand.kinematics import coordinate_limits
+from drakegrasp.hand.kinematics import coordinate_limits, link_poses, still_links
 from drakegrasp.hand.shapes import link_shapes, pad_surfaces
 from drakegrasp.verification.wrist.pads import Pads, make_pads
 
@@ -43,7 +43,7 @@ class HandConstants:
         limits: (1 + k, 2), of the coordinates [rad or m].
         units: (1 + k,), what counts as a radian of each coordinate [rad or m].
         fingertips: (k, n, 3), corners of the fingertips in {Fi} [m].
-        palm: (n, 3), corners of the palm link in {G} [m].
+        palm: (n, 3), corners of the palm and of what is fixed to it, in {G} [m].
     """
 
     X_PJ: Array
@@ -72,13 +72,15 @@ def hand_constants(hand: Hand) -> HandConstants:
     Raises:
         HandError: If its palm or a fingertip has no shape, or one that is not convex.
     """
-    # The palm and the fingertips need shapes.
+    # The palm and the fingertips need shapes; those of a palm may be on links fixed to it.
     shapes = link_shapes(hand)
-    for link in (hand.palm_link, *hand.fingertip_links):
-        if not shapes[link]:
-            raise HandError(
-                f"{hand.model.path}: link {link!r} must have a collision shape, got none"
-            )
+    still = [link for link in still_links(hand) if shapes[link]]
+    missing = [] if still else [hand.palm_link]
+    missing += [link for link in hand.fingertip_links if not shapes[link]]
+    if missing:
+        raise HandError(
+            f"{hand.model.path}: link {missing[0]!r} must have a collision shape, got none"
+        )
 
     # Corners of the fingertips, stacked.
     corners = [np.concatenate(shapes[finger.fingertip]) for finger in hand.fingers]
@@ -86,9 +88,16 @@ def hand_constants(hand: Hand) -> HandConstants:
     # n copies of a corner lower the smooth minimum by at most its rounding times log n.
     padded = np.stack([np.pad(c, ((0, most - len(c)), (0, 0)), mode="edge") for c in corners])
 
-    # Corners of the palm, from its link's frame {B} to {G}.
-    X_GB = np.linalg.inv(hand.X_BG)
-    palm = np.concatenate(shapes[hand.palm_link]) @ X_GB[:3, :3].T + X_GB[:3, 3]
+    # Corners of the palm, from the links' frames to {G}.
+    open_hand = np.zeros(hand.num_fingers)
+    palm = np.concatenate(
+        [
+            transform_points(
+                link_poses(hand, link, spread=0.0, closing=open_hand), np.concatenate(shapes[link])
+            )
+            for link in still
+        ]
+    )
 
     chains = _stack_chains(hand)
     return HandConstants(

@@ -1,0 +1,104 @@
+"""What `drakegrasp verify` makes of its options: grasps of a dataset, each as it was tried."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.datasets import OTO, make_dataset
+from helpers.hands import write_with_optional_fingers
+
+from drakegrasp.cli.verify_request import VerifyRequest, place_requested
+from drakegrasp.config import load_config
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.errors import HandError
+from drakegrasp.hand.description import load_hand
+
+DRAWN = [
+    "randomize.friction_hand=[0.7, 1.3]",
+    "randomize.friction_table=[0.7, 1.3]",
+    "randomize.mass=[0.5, 1.5]",
+]
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset with drawn friction and mass. Read only."""
+    folder = tmp_path_factory.mktemp("drawn")
+    return make_dataset(folder / "out", folder, *DRAWN)
+
+
+def request(out: Path, **options: object) -> VerifyRequest:
+    return VerifyRequest(**{"grasps": out / OTO, "method": "forces", **options})
+
+
+@pytest.mark.parametrize("overrides", [(), ("verify.max_tries=1",)])
+def test_rows_are_tried_with_their_own_friction_and_mass(
+    drawn: Path, overrides: tuple[str, ...]
+) -> None:
+    data = GraspDataset(drawn / OTO, split="test")
+    grasps, config = place_requested(request(drawn, overrides=overrides))
+    assert len(grasps) == len(data) > 0
+    for grasp in grasps:
+        row = data[grasp.index]
+        assert grasp.placed.model.mass == pytest.approx(float(row.props["work2mass"][0]))
+        for name in ("friction_hand", "friction_table"):
+            assert getattr(grasp.config.physics, name) == pytest.approx(float(row.conditions[name]))
+        assert grasp.config.verify.max_tries == config.verify.max_tries
+    # The configuration of all is none of the rows'.
+    known = read_manifest(drawn).config
+    assert config.physics == known.physics
+    assert config.verify.max_tries == (1 if overrides else known.verify.max_tries)
+
+
+def test_a_value_that_is_set_wins_over_the_drawn_one(drawn: Path) -> None:
+    data = GraspDataset(drawn / OTO, split="test")
+    grasps, _ = place_requested(request(drawn, overrides=("physics.friction_hand=0.9",)))
+    for grasp in grasps:
+        assert grasp.config.physics.friction_hand == 0.9
+        assert grasp.placed.model.friction is None  # which would win
+        assert grasp.config.physics.friction_table == pytest.approx(
+            float(data[grasp.index].conditions["friction_table"])
+        )
+
+
+def test_a_given_configuration_draws_nothing(drawn: Path) -> None:
+    grasps, config = place_requested(request(drawn, config="paper"))
+    assert config == load_config("paper")
+    assert {grasp.config for grasp in grasps} == {config}
+    masses = [e.mass for e in read_manifest(drawn).objects]
+    assert all(np.isclose(masses, grasp.placed.model.mass).any() for grasp in grasps)
+
+
+def test_a_hand_whose_files_have_changed_is_refused_unless_it_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The hand file is named relative to a folder; the dataset is used from another."""
+    (tmp_path / "meshes").mkdir()
+    hand = write_with_optional_fingers(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    config = load_config(overrides=[f"hand={hand.name}"])
+    assert config.hand == str(hand) == load_config(hand=hand.name).hand
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes", f"hand={hand.name}")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    grasps, used = place_requested(request(out))
+    assert grasps and used.hand == str(hand)
+
+    # A change since then.
+    hand.write_text(f"{hand.read_text()}\n# changed\n")
+    with pytest.raises(HandError, match="files of the hand must be those of the dataset"):
+        place_requested(request(out))
+    grasps, used = place_requested(request(out, hand=f"../{hand.name}"))
+    assert grasps and load_hand(used.hand).name == "optional"
+
+
+def test_a_hand_of_the_package_keeps_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "franka").write_text("a file of that name")
+    monkeypatch.chdir(tmp_path)
+    assert load_config(hand="franka").hand == "franka"
+    assert load_config(hand="missing.yaml").hand == "missing.yaml"
