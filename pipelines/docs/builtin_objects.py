@@ -13,7 +13,7 @@ from pathlib import Path
 from drakegrasp.config import BuiltinConfig
 from drakegrasp.objects.builtin.classes import CLASSES, ObjectClass
 
-_HEAD = f"""<!-- Made by `make docs-pages` from drakegrasp/objects/builtin/classes.py: change that. -->
+_HEAD = f"""<!-- Made by `make docs-pages` from objects/builtin/classes.py: change that. -->
 
 # Built-in objects
 

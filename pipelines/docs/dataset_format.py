@@ -22,7 +22,7 @@ from drakegrasp.dataset.schema import (
     Field,
 )
 
-_HEAD = f"""<!-- Made by `make docs-pages` from drakegrasp/dataset/schema.py: change that, not this. -->
+_HEAD = f"""<!-- Made by `make docs-pages` from dataset/schema.py: change that, not this. -->
 
 # The dataset's format
 

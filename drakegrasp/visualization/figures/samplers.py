@@ -96,7 +96,7 @@ def compare_samplers(out: Path, other: Path | None = None) -> SamplerComparison:
         numbers={
             "what": "palm_rays: palm rays that meet the object; coverage: share of the directions "
             f"of the half sphere over the table that lie within {NEAR_DEG:g} deg of one of them, "
-            "mean over objects",
+            "mean over objects; attempts: those that the simulator decided",
             "object": name,
             "of_object": of_shown,
             "objects": len(names),
@@ -145,8 +145,10 @@ def _numbers(covers: dict[str, tuple[int, int, float]], funnel: Funnel | None) -
     """
     attempts = successes = rate = None
     if funnel is not None:
+        # Where the simulator failed nothing is known of the palm pose.
         rows = [funnel.names.index(name) for name in covers]
-        attempts = int(funnel.outcomes[rows].sum())
+        decided = [outcome for outcome in Outcome if not outcome.inconclusive]
+        attempts = int(funnel.outcomes[np.ix_(rows, decided)].sum())
         successes = int(funnel.outcomes[rows, Outcome.SUCCESS].sum())
         rate = round(1000.0 * successes / attempts, 3) if attempts else None
     return {
