@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -44,7 +45,7 @@ class HeldGrasps:
     """
 
     trial_ids: npt.NDArray[np.int64]
-    groups: dict[str, npt.NDArray[np.bool_]]
+    groups: dict[str, npt.NDArray[Any]]
     quantities: dict[str, Array]
 
 
@@ -56,7 +57,7 @@ def read_held(out: Path) -> HeldGrasps:
     """
     # Block by block; most rows are failures.
     ids: list[npt.NDArray[np.int64]] = []
-    parts: dict[str, list[npt.NDArray[np.generic]]] = {name: [] for name in COLUMNS}
+    parts: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in COLUMNS}
     path = out / TRIALS_FILE
     try:
         with h5py.File(path, "r") as file:
@@ -73,7 +74,9 @@ def read_held(out: Path) -> HeldGrasps:
         raise DataError(f"{path}: must be the trials of a dataset, got none ({error})") from None
     columns = {name: np.concatenate(values) for name, values in parts.items()}
 
-    degrees, none = np.rad2deg(1.0), {"axis": 1, "initial": 0.0}
+    degrees = np.rad2deg(1.0)
+    closed, lifted = (norm(columns[f"{when}_f_Q_O"]) for when in ("closed", "lifted"))
+    angles = np.nan_to_num(columns["normal_angle"])
     return HeldGrasps(
         trial_ids=np.concatenate([np.zeros(0, np.int64), *ids]),
         groups={
@@ -84,14 +87,18 @@ def read_held(out: Path) -> HeldGrasps:
         quantities={
             "slip in the hand [mm]": 1e3 * columns["slip"],
             "turn in the hand [°]": degrees * columns["turn"],
-            "largest fingertip force after closing [N]": norm(columns["closed_f_Q_O"]).max(**none),
-            "largest fingertip force after the lift [N]": norm(columns["lifted_f_Q_O"]).max(**none),
+            "largest fingertip force after closing [N]": _largest(closed),
+            "largest fingertip force after the lift [N]": _largest(lifted),
             "largest penetration after the lift [mm]": 1e3
-            * columns["lifted_penetration"].max(**none),
-            "largest angle of a contact to the mesh [°]": degrees
-            * np.nan_to_num(columns["normal_angle"]).max(**none),
+            * _largest(columns["lifted_penetration"]),
+            "largest angle of a contact to the mesh [°]": degrees * _largest(angles),
         },
     )
+
+
+def _largest(values: npt.NDArray[Any]) -> Array:
+    """Return the largest value of each row (n, k)."""
+    return np.asarray(values.max(axis=1, initial=0.0))
 
 
 def read_approaches(out: Path, number: int, name: str, config: Config) -> ObjectApproaches:

@@ -56,7 +56,7 @@ def draw_object(axes: Axes, triangles: Array) -> None:
     shade = 0.55 + 0.45 * np.clip(normals[front] @ LIGHT, 0.0, 1.0)
     colours = np.outer(shade, OBJECT_COLOUR)
     axes.add_collection(
-        PolyCollection(triangles[front, :, :2], facecolors=colours, edgecolors="face",
+        PolyCollection(list(triangles[front, :, :2]), facecolors=colours, edgecolors="face",
                        linewidths=0.4, zorder=2, rasterized=True)
     )  # fmt: skip
 

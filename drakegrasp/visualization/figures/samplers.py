@@ -62,7 +62,7 @@ def compare_samplers(out: Path, other: Path | None = None) -> SamplerComparison:
     """
     # The datasets by method.
     config = read_manifest(out).config
-    datasets = {config.candidates.method: out}
+    datasets: dict[str, Path] = {config.candidates.method: out}
     if other is not None:
         datasets[_other_method(config)] = other
         _refuse_other_configuration(other, config)
@@ -76,7 +76,9 @@ def compare_samplers(out: Path, other: Path | None = None) -> SamplerComparison:
     shown = load_prepared(out, name, config)
 
     # Palm poses of that object, and numbers.
-    candidates, of_shown, of_all = {}, {}, {}
+    candidates: dict[str, Candidates] = {}
+    of_shown: dict[str, dict[str, Any]] = {}
+    of_all: dict[str, dict[str, Any]] = {}
     for method in METHODS:
         if method in datasets:
             path, funnel = datasets[method], funnels[method]
@@ -185,7 +187,7 @@ def _refuse_other_configuration(other: Path, config: Config) -> None:
 
 def _settings(config: Config) -> dict[str, Any]:
     """Return what decides about attempts, by key: `hand`, `lift.hold_time`."""
-    settings = {}
+    settings: dict[str, Any] = {}
     for name, value in config.to_dict().items():
         if name not in (*POSTPROCESSING_KEYS, "unit_candidates"):
             parts = value if isinstance(value, dict) else {"": value}
