@@ -15,7 +15,7 @@ STAMP  := $(VENV)/.installed
 export LP_NUM_THREADS := 0
 export DRAKE_ALLOW_NETWORK := none
 
-.PHONY: FORCE help install demo test test-fast test-browser test-cluster lint format docs clean
+.PHONY: FORCE help install demo test test-fast test-browser test-cluster lint format docs docs-pages clean
 
 help:            ## what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -87,9 +87,12 @@ format: $(STAMP) ## let ruff lay out the code
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-docs: $(STAMP)   ## write the docs that are made from code
+docs: docs-pages ## the site of the docs in site/; every link must lead somewhere
+	PATH="$(abspath $(BIN)):$$PATH" NO_MKDOCS_2_WARNING=1 mkdocs build --strict --quiet
+
+docs-pages: $(STAMP)  ## write the pages of the docs that are made from code
 	$(BIN)/python pipelines/docs/dataset_format.py docs/reference/dataset-format.md
 	$(BIN)/python pipelines/docs/builtin_objects.py docs/reference/builtin-objects.md
 
 clean:           ## remove what was made here
-	rm -rf $(VENV) $(DEMO) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) $(DEMO) site build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -18,6 +18,7 @@ from drakegrasp.cli.bench import bench
 from drakegrasp.cli.build import assemble, build, stats
 from drakegrasp.cli.errors import say
 from drakegrasp.cli.export import export
+from drakegrasp.cli.figures import figures
 from drakegrasp.cli.group import main
 from drakegrasp.cli.hand import hand
 from drakegrasp.cli.inspect import inspect_
@@ -147,8 +148,8 @@ objects.add_command(morph)
 
 # The help lists them in this order.
 for _command in (
-    *(doctor, objects, audit, hand, build, assemble, check, stats, inspect_, replay, verify),
-    *(export, bench),
+    *(doctor, objects, audit, hand, build, assemble, check, stats, inspect_, figures, replay),
+    *(verify, export, bench),
 ):
     main.add_command(_command)
 

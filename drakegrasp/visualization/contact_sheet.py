@@ -93,7 +93,9 @@ def spread_over_objects(names: Sequence[str], count: int) -> list[int]:
     return sorted(chosen, key=place.__getitem__)
 
 
-def draw_sheet(samples: Sequence[Sample], K: Array, *, far: float) -> Figure:
+def draw_sheet(
+    samples: Sequence[Sample], K: Array, *, far: float, titles: Sequence[str] | None = None
+) -> Figure:
     """Return the contact sheet of samples as a figure.
 
     Its axes are colour, depth and mask of each sample in turn, then the colour bar.
@@ -102,6 +104,7 @@ def draw_sheet(samples: Sequence[Sample], K: Array, *, far: float) -> Figure:
         samples: What to draw, at least one.
         K: (3, 3), camera matrix [px].
         far: Far plane of the camera [m].
+        titles: Text above each sample; the name of its object if None.
     """
     # The page: blocks of three images, below a head with legend and colour bar.
     across = min(ACROSS, len(samples))
@@ -122,8 +125,11 @@ def draw_sheet(samples: Sequence[Sample], K: Array, *, far: float) -> Figure:
         top = head + line * (EDGE + caption) + caption
         axes = [add_axes(figure, left + k * (EDGE + gap), top, EDGE, EDGE) for k in range(3)]
         draw_sample(axes, sample, K, near=nearest, far=far, scale=0.75)
-        name = str(sample.props["object_name"]).replace("_", " ")
-        axes[0].text(0.0, 1.05, name, transform=axes[0].transAxes, fontsize=7.0, color=INK)
+        title = str(sample.props["object_name"]) if titles is None else titles[i]
+        axes[0].text(
+            0.0, 1.05, title.replace("_", " "), transform=axes[0].transAxes, fontsize=7.0,
+            color=INK, parse_math=False,
+        )  # fmt: skip
         axes[2].text(
             1.0, 1.05, f"trial {sample.trial_id}", transform=axes[2].transAxes,
             fontsize=6.0, color="#888888", ha="right",

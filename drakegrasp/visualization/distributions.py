@@ -12,6 +12,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from drakegrasp.frames import Array
 from drakegrasp.visualization.style import INK
@@ -25,17 +26,20 @@ MAX_OBJECTS = 60
 BINS, SHOWN = 40, 0.98
 
 
-def draw_counts(counts: Mapping[str, int], what: str) -> Figure:
+def draw_counts(
+    counts: Mapping[str, int], what: str, *, colours: Sequence[str] | None = None
+) -> Figure:
     """Return how many there are of each kind, as bars on a logarithmic scale.
 
     Args:
         counts: Numbers by kind, in the order of the bars; the first is the one that is wanted.
         what: What is counted, e.g. "attempts".
+        colours: Of the bars; that of the first is another if None.
     """
     names, numbers = list(counts), np.array(list(counts.values()))
     figure = Figure(figsize=(8.0, 0.9 + 0.3 * len(names)), layout="constrained")
     axes = figure.add_subplot()
-    colours = [STABLE if i == 0 else FAILED for i in range(len(names))]
+    colours = colours or [STABLE if i == 0 else FAILED for i in range(len(names))]
     bars = axes.barh(range(len(names)), np.maximum(numbers, 0.8), color=colours, height=0.72)
     axes.bar_label(bars, [f"{n:,}" for n in numbers], padding=3, color=INK, fontsize=9)
     _name_bars(axes, [name.replace("_", " ") for name in names])
@@ -90,16 +94,22 @@ def draw_distributions(
         axes.set_visible(False)
     for axes, (title, values) in zip(panels, quantities, strict=False):
         _histogram(axes, title, values, groups)
+    figure.supylabel("grasps", fontsize="medium", color=INK)
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False)
     return figure
 
 
-def svg_bytes(figure: Figure) -> bytes:
-    """Return a figure as SVG; the same figure gives the same bytes."""
+def svg_bytes(figure: Figure, *, dpi: int = 72) -> bytes:
+    """Return a figure as SVG; the same figure gives the same bytes.
+
+    Args:
+        figure: The figure.
+        dpi: Resolution of what is pixels in it [pixels per inch].
+    """
     buffer = io.BytesIO()
     with mpl.rc_context({"svg.hashsalt": "drakegrasp"}):
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+        figure.savefig(buffer, format="svg", dpi=dpi, metadata={"Date": None, "Creator": None})
     return buffer.getvalue()
 
 
@@ -113,6 +123,7 @@ def _histogram(axes: Axes, title: str, values: Array, groups: Mapping[str, Array
         counts, _ = np.histogram(shown, edges)
         axes.stairs(counts, edges, fill=True, color=GROUPS[group], label=group)
     axes.set_xlabel(title)
+    axes.yaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
     _plain(axes)
 
 

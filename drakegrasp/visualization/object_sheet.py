@@ -19,7 +19,7 @@ from drakegrasp.objects.audit import AuditRow
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.vision.rendering import build_renderer, render
-from drakegrasp.visualization.style import INK, add_axes, hide_ticks, save_figure
+from drakegrasp.visualization.style import INK, add_axes, hide_ticks, save_figure, shortened
 
 #: Objects in a row, the edge of a picture [inch], and its pixels.
 ACROSS, EDGE, PIXELS = 8, 1.45, 220
@@ -66,11 +66,12 @@ def object_sheet(rows: Sequence[AuditRow], png: Path, *, progress: Report = sile
         # Name, and status below it.
         status = row.status + (" !" if row.warnings else "")
         for text, height_above, colour in (
-            (_shortened(row.name), 1.135, INK),
+            (shortened(row.name, NAME), 1.135, INK),
             (status, 1.02, STATUS_COLOURS[row.status]),
         ):
             axes.text(
-                0.0, height_above, text, transform=axes.transAxes, fontsize=6.2, color=colour
+                0.0, height_above, text, transform=axes.transAxes, fontsize=6.2, color=colour,
+                parse_math=False,
             )  # fmt: skip
         progress(i + 1, len(rows))
     save_figure(figure, png, dpi=150)
@@ -101,11 +102,6 @@ def _looking_along(z: Array) -> Array:
     x = np.cross(z, [0.0, 0.0, 1.0])
     x = x / norm(x)
     return np.column_stack((x, np.cross(z, x), z))
-
-
-def _shortened(name: str) -> str:
-    # The end tells morphs of one mesh apart.
-    return name if len(name) <= NAME else f"{name[: NAME - 10]}…{name[-9:]}"
 
 
 def _wrapped(text: str) -> str:

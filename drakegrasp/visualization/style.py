@@ -165,6 +165,11 @@ def hide_ticks(axes: Axes) -> None:
         spine.set_visible(False)
 
 
+def shortened(name: str, most: int) -> str:
+    """Return a name in at most so many characters; its end tells morphs of one mesh apart."""
+    return name if len(name) <= most else f"{name[: most - 10]}…{name[-9:]}"
+
+
 def save_figure(figure: Figure, png: Path, *, dpi: int) -> None:
     """Write a figure as PNG, at a resolution [pixels per inch]."""
     # Without the writing software's version the same figure gives the same bytes.

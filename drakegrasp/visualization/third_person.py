@@ -222,14 +222,18 @@ def render_labels(scene: RenderScene, X_WC: Array, size: tuple[int, int]) -> npt
     return query.RenderLabelImage(camera, world, RigidTransform(X_WC)).data[:, :, 0].copy()
 
 
-def choose_view(scene: RenderScene, p_WA: Array, *, fill: float = 1.0) -> Array:
+def choose_view(
+    scene: RenderScene, p_WA: Array, *, fill: float = 1.0, azimuths: Array | None = None
+) -> Array:
     """Return the pose X_WC (4, 4) of a camera that sees given points and all fingertips.
 
     Args:
         scene: In the poses of `set_snapshot`.
         p_WA: (n, 3), points that must be in the picture [m].
         fill: The camera's distance is divided by it; above 1 the points fill more of the picture.
+        azimuths: Those to try [rad]; all around if None.
     """
+    azimuths = np.deg2rad(AZIMUTHS_DEG) if azimuths is None else azimuths
     tips = [
         int(scene.plant.GetBodyByName(name, scene.hand_instance).index())
         for name in scene.hand.fingertip_links
@@ -239,7 +243,7 @@ def choose_view(scene: RenderScene, p_WA: Array, *, fill: float = 1.0) -> Array:
     # the one with the most pixels of fingertips and object.
     best, most = np.eye(4), (-1, -1)
     for elevation in np.deg2rad(ELEVATIONS_DEG):
-        for azimuth in np.deg2rad(AZIMUTHS_DEG):
+        for azimuth in azimuths:
             X_WC = camera_pose(p_WA, azimuth, elevation, fill=fill)
             seen = render_labels(scene, X_WC, (TRIAL_SIZE, TRIAL_SIZE))
             counts = [int(np.sum(seen == tip)) for tip in tips]

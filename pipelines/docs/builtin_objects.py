@@ -13,7 +13,7 @@ from pathlib import Path
 from drakegrasp.config import BuiltinConfig
 from drakegrasp.objects.builtin.classes import CLASSES, ObjectClass
 
-_HEAD = f"""<!-- Made by `make docs` from drakegrasp/objects/builtin/classes.py: change that. -->
+_HEAD = f"""<!-- Made by `make docs-pages` from objects/builtin/classes.py: change that. -->
 
 # Built-in objects
 
@@ -50,7 +50,7 @@ In Python, `export_builtin("MESHES", ["1_mug_1", "1_mug_2"])` of
 `drakegrasp.objects.builtin.catalog` writes single objects, and `builtin_object("1_mug_2",
 seed=3).sizes` are the sizes of one. To add a class, write a function in
 `drakegrasp/objects/builtin/shapes/`, add a row at the end of the table in
-`drakegrasp/objects/builtin/classes.py`, and run `make docs`.
+`drakegrasp/objects/builtin/classes.py`, and run `make docs-pages`.
 """
 
 
@@ -80,7 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     if target.exists() and target.read_text(encoding="utf-8") == page:
         return 0
-    sys.stderr.write(f"{target}: must be what `make docs` writes, got another text\n")
+    sys.stderr.write(f"{target}: must be what `make docs-pages` writes, got another text\n")
     return 1
 
 

@@ -22,7 +22,7 @@ from drakegrasp.dataset.schema import (
     Field,
 )
 
-_HEAD = f"""<!-- Made by `make docs` from drakegrasp/dataset/schema.py: change that, not this. -->
+_HEAD = f"""<!-- Made by `make docs-pages` from dataset/schema.py: change that, not this. -->
 
 # The dataset's format
 
@@ -194,7 +194,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     if target.exists() and target.read_text(encoding="utf-8") == page:
         return 0
-    sys.stderr.write(f"{target}: must be what `make docs` writes, got another text\n")
+    sys.stderr.write(f"{target}: must be what `make docs-pages` writes, got another text\n")
     return 1
 
 

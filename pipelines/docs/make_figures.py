@@ -11,22 +11,22 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-from doc_figures import candidates_figure, frames_figure, hero_figure
+from doc_figures import frames_figure, hero_figure
 from trial_pictures import frames_panels, render_trial
 
 from drakegrasp.build.prepare import prepare
 from drakegrasp.config import load_config
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.prepared_objects import PreparedObject
-from drakegrasp.frames import Array
 from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.builtin.catalog import export_builtin
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.simulation.candidates import sample_candidates
+from drakegrasp.visualization.figures.palm_poses import palm_poses_figure
+from drakegrasp.visualization.figures.samplers import METHODS, palm_rays
+from drakegrasp.visualization.style import save_figure
 
-#: Titles of the two methods in the figure of the candidates.
-METHODS = {"normals": "along surface normals", "rotations": "global and local rotations"}
+#: The object of the figure of the candidates.
 MUG = "1_mug_1"
 
 
@@ -53,30 +53,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as folder:
         export_builtin(folder, [MUG])
         mug = prepare(find_meshes(Path(folder))[0], load_config(None, ["candidates.max=1"]))
-    rays = {title: palm_rays(mug, method, arguments.rays) for method, title in METHODS.items()}
-    model = mug.model
-    candidates_figure(model.visual_vertices, model.visual_faces, rays, images / "candidates.png")
+    draw_candidates(mug, arguments.rays, images / "candidates.png")
     return 0
 
 
-def palm_rays(prepared: PreparedObject, method: str, count: int) -> Array:
-    """Return the approach rays of palm poses, from the largest stand-off to the surface.
-
-    Args:
-        prepared: The object.
-        method: "normals" or "rotations".
-        count: Most rays to return.
-
-    Returns:
-        (n, 2, 3) in {O}: the palm's origin and the point on the surface [m].
-    """
-    overrides = [f"candidates.method={method}", f"candidates.max={10 * count}"]
-    config = with_hand_defaults(load_config(None, overrides))
-    candidates = sample_candidates(prepared.model, prepared.X_TO, config.candidates, config.seed)
-    hits = np.flatnonzero(np.isfinite(candidates.distance))[:count]
-    z_O = candidates.X_OG[hits, :3, 2]
-    p_OS = candidates.X_OG[hits, :3, 3] + candidates.distance[hits, None] * z_O
-    return np.stack([p_OS - max(config.candidates.drawn_standoffs) * z_O, p_OS], axis=1)
+def draw_candidates(prepared: PreparedObject, rays: int, png: Path) -> None:
+    """Draw palm poses of an object by both methods."""
+    drawn = {}
+    for method, title in METHODS.items():
+        overrides = [f"candidates.method={method}", f"candidates.max={10 * rays}"]
+        config = with_hand_defaults(load_config(None, overrides))
+        candidates = sample_candidates(
+            prepared.model, prepared.X_TO, config.candidates, config.seed
+        )
+        drawn[title] = palm_rays(candidates, max(config.candidates.drawn_standoffs), rays)
+    model = prepared.model
+    save_figure(palm_poses_figure(model.visual_vertices, model.visual_faces, drawn), png, dpi=130)
 
 
 if __name__ == "__main__":

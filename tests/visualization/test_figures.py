@@ -9,9 +9,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from doc_figures import candidates_figure, find_sample, frames_figure, hero_figure
+from doc_figures import find_sample, frames_figure, hero_figure
 from helpers.machine import needs_egl
-from helpers.meshes import FIXED, write_fixed
+from helpers.meshes import write_fixed
 from helpers.scripts import PIPELINES
 from matplotlib.image import imread
 
@@ -129,16 +129,6 @@ def test_samples_are_spread_over_objects() -> None:
     assert spread_over_objects(names, 5) == [7, 4, 5, 0, 1]
     assert sorted(spread_over_objects(names, 99)) == list(range(8))
     assert spread_over_objects([f"{i}_x" for i in range(9)], 3) == [0, 4, 8]
-
-
-def test_candidates_are_drawn_beside_each_other(tmp_path: Path) -> None:
-    box = FIXED[BOX]
-    rays = np.array([[[0.2, 0.0, 0.0], [0.0, 0.0, 0.0]], [[0.0, 0.0, 0.2], [0.0, 0.0, 0.1]]])
-    png = tmp_path / "candidates.png"
-    candidates_figure(box.vertices, box.faces, {"a": rays, "b": rays[:1]}, png)
-    image = imread(png)[..., :3]
-    for half in np.array_split(image, 2, axis=1):
-        assert half.std() > 0.02
 
 
 def test_sample_of_an_unknown_trial_is_refused(tmp_path: Path) -> None:
@@ -260,12 +250,11 @@ def test_figure_of_the_frames_has_them_all(dataset: Path, tmp_path: Path) -> Non
 @pytest.mark.sim
 @needs_egl
 def test_chosen_view_sees_every_fingertip(dataset: Path) -> None:
-    from trial_pictures import load_trial
-
     from drakegrasp.frames import X_WT
     from drakegrasp.hand.description import load_hand
     from drakegrasp.simulation.construction import build_scene
     from drakegrasp.simulation.scene import hand_joint_names
+    from drakegrasp.visualization.figures.trial_stages import load_trial
     from drakegrasp.visualization.third_person import (
         choose_view,
         outline_points,
@@ -299,7 +288,7 @@ def test_chosen_view_sees_every_fingertip(dataset: Path) -> None:
 
 @pytest.mark.sim
 def test_only_lifted_trials_can_be_shown(dataset: Path) -> None:
-    from trial_pictures import load_trial
+    from drakegrasp.visualization.figures.trial_stages import load_trial
 
     with pytest.raises(DataError, match="ray_miss"):
         load_trial(dataset, 1)

@@ -1,0 +1,144 @@
+"""Held grasps as arrays: numbers of all of them, and approaches by object.
+
+In: trials.hdf5. Out: arrays. It is read in blocks and by object: all of a large file would fill the
+memory.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.arithmetic import norm
+from drakegrasp.config import Config
+from drakegrasp.dataset.paths import TRIALS_FILE
+from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.dataset.schema import refuse_other_schema
+from drakegrasp.errors import DataError
+from drakegrasp.frames import Array, unpack_pose
+from drakegrasp.outcomes import Outcome
+from drakegrasp.visualization.figures.approach_map import ObjectApproaches
+from drakegrasp.visualization.figures.approach_sphere import approach_directions
+
+#: Columns of the quantities of `HeldGrasps`.
+COLUMNS = (
+    *("slip", "turn", "closed_f_Q_O", "lifted_f_Q_O", "lifted_penetration", "normal_angle"),
+    *("precision", "stable"),
+)
+#: Rows that are read at once: 8 chunks of a column.
+BLOCK = 16_384
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HeldGrasps:
+    """The successes of a dataset, h of them.
+
+    Attributes:
+        trial_ids: (h,), rows of `/trials`.
+        groups: (h,) bool each, by `held`, `precision` and `stable`.
+        quantities: (h,) each, by title with unit.
+    """
+
+    trial_ids: npt.NDArray[np.int64]
+    groups: dict[str, npt.NDArray[Any]]
+    quantities: dict[str, Array]
+
+
+def read_held(out: Path) -> HeldGrasps:
+    """Return the successes of a dataset.
+
+    Raises:
+        DataError: If trials.hdf5 is missing or damaged.
+    """
+    # Block by block; most rows are failures.
+    ids: list[npt.NDArray[np.int64]] = []
+    parts: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in COLUMNS}
+    path = out / TRIALS_FILE
+    try:
+        with h5py.File(path, "r") as file:
+            refuse_other_schema(path, file.attrs["schema_version"])
+            trials = file["trials"]
+            (rows,) = np.nonzero(trials["outcome"][:] == Outcome.SUCCESS)
+            for start in range(0, len(trials["outcome"]), BLOCK):
+                picked = rows[(rows >= start) & (rows < start + BLOCK)] - start
+                ids.append(picked + start)
+                for name in COLUMNS:
+                    if len(picked) or not start:
+                        parts[name].append(trials[name][start : start + BLOCK][picked])
+    except (OSError, KeyError) as error:
+        raise DataError(f"{path}: must be the trials of a dataset, got none ({error})") from None
+    columns = {name: np.concatenate(values) for name, values in parts.items()}
+
+    degrees = np.rad2deg(1.0)
+    closed, lifted = (norm(columns[f"{when}_f_Q_O"]) for when in ("closed", "lifted"))
+    angles = np.nan_to_num(columns["normal_angle"])
+    return HeldGrasps(
+        trial_ids=np.concatenate([np.zeros(0, np.int64), *ids]),
+        groups={
+            "held": np.ones(len(rows), dtype=np.bool_),
+            "precision": columns["precision"].astype(np.bool_),
+            "stable": columns["stable"].astype(np.bool_),
+        },
+        quantities={
+            "slip in the hand [mm]": 1e3 * columns["slip"],
+            "turn in the hand [°]": degrees * columns["turn"],
+            "largest fingertip force after closing [N]": _largest(closed),
+            "largest fingertip force after the lift [N]": _largest(lifted),
+            "largest penetration after the lift [mm]": 1e3
+            * _largest(columns["lifted_penetration"]),
+            "largest angle of a contact to the mesh [°]": degrees * _largest(angles),
+        },
+    )
+
+
+def _largest(values: npt.NDArray[Any]) -> Array:
+    """Return the largest value of each row (n, k)."""
+    return np.asarray(values.max(axis=1, initial=0.0))
+
+
+def read_approaches(out: Path, number: int, name: str, config: Config) -> ObjectApproaches:
+    """Return from where an object was approached.
+
+    Args:
+        out: Directory of the dataset.
+        number: Of the object, row of `/objects`.
+        name: Of the object.
+        config: Of the dataset.
+
+    Raises:
+        DataError: If a file is missing or damaged.
+    """
+    # The attempts of the object, which are beside each other.
+    prepared = load_prepared(out, name, config)
+    with h5py.File(out / TRIALS_FILE, "r") as file:
+        trials = file["trials"]
+        (rows,) = np.nonzero(trials["object"][:] == number)
+        part = slice(int(rows[0]), int(rows[-1]) + 1) if len(rows) else slice(0, 0)
+        own = rows - part.start
+        outcome, packed, standoff, precision, stable = (
+            trials[key][part][own]
+            for key in ("outcome", "X_OG", "standoff_index", "precision", "stable")
+        )
+    X_OG = np.array([unpack_pose(pose) for pose in packed]).reshape(-1, 4, 4)
+
+    # Attempts whose palm ray misses do not approach the object.
+    won, approached = outcome == Outcome.SUCCESS, outcome != Outcome.RAY_MISS
+    directions = approach_directions(prepared.X_TO, X_OG)
+    reach = np.array(config.candidates.drawn_standoffs)[standoff[won]]
+    p_OG, z_O = X_OG[won, :3, 3], X_OG[won, :3, 2]
+    return ObjectApproaches(
+        name=name,
+        vertices=prepared.model.visual_vertices,
+        faces=prepared.model.visual_faces,
+        R_TO=prepared.X_TO[:3, :3],
+        attempts=len(rows),
+        directions=directions[approached & ~won],
+        rays=np.stack([p_OG, p_OG + reach[:, None] * z_O], axis=1),
+        successes=directions[won],
+        groups=(precision[won].astype(np.int64) + stable[won]),
+    )

@@ -1,0 +1,129 @@
+"""A trial at its three stages as scenes to render: start, closed, lifted. Nothing is simulated.
+
+In: a dataset's directory and the number of a trial. Out: poses of hand and object from trials.hdf5,
+and a scene of Drake's renderer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from pydrake.geometry import LightParameter
+
+from drakegrasp.config import Config
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.paths import TRIALS_FILE
+from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.errors import DataError
+from drakegrasp.frames import X_WT, Array, transform_points, unpack_pose
+from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.kinematics import joint_positions
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.outcomes import Outcome, Stage
+from drakegrasp.vision.camera import unproject
+from drakegrasp.visualization.third_person import (
+    LIGHTS,
+    TABLE_SIZE,
+    RenderScene,
+    Snapshot,
+    build_render_scene,
+)
+
+#: Lights of the picture of the lift, the last without shadows: seen from that light the table is
+#: far behind the object, and VTK's shadow map is then too coarse and draws spots on the object.
+LIFT_LIGHTS = (
+    *LIGHTS[:2],
+    LightParameter(type="point", frame="camera", position=[-1.0, -1.3, 0.2], intensity=0.7),
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrialSnapshots:
+    """A trial at its three stages, and the scene to render them in.
+
+    Attributes:
+        scene: Of the trial's object and hand.
+        place, close, lift: At the start, after closing, after the lift.
+        p_OQ, nhat_Q_O: (k, 3), contacts after closing [m] and outward unit normals, in {O}.
+        model: The object.
+        config: Of the dataset.
+        row: Fields of `/trials` by name.
+    """
+
+    scene: RenderScene
+    place: Snapshot
+    close: Snapshot
+    lift: Snapshot
+    p_OQ: Array
+    nhat_Q_O: Array
+    model: ObjectModel
+    config: Config
+    row: Mapping[str, Any]
+
+
+def load_trial(out: Path, trial_id: int, *, table_size: float = TABLE_SIZE) -> TrialSnapshots:
+    """Return a trial that was lifted, ready to be rendered.
+
+    Args:
+        out: Directory of the dataset.
+        trial_id: Row of trials.hdf5.
+        table_size: Edge of the table [m].
+
+    Raises:
+        DataError: If the trial does not exist, or ended before the lift.
+    """
+    # Read the trial.
+    config = read_manifest(out).config
+    path = out / TRIALS_FILE
+    try:
+        with h5py.File(path, "r") as file:
+            trials = file["trials"]
+            if not 0 <= trial_id < len(trials["outcome"]):
+                raise DataError(
+                    f"{path}: trial must be 0 to {len(trials['outcome']) - 1}, got {trial_id}"
+                )
+            row = {name: np.asarray(values[trial_id]) for name, values in trials.items()}
+            name = file["objects/name"][int(row["object"])].decode()
+    except (OSError, KeyError) as error:
+        raise DataError(f"{path}: must be the trials of a dataset, got none ({error})") from None
+    outcome = Outcome(int(row["outcome"]))
+    if outcome.stage is not Stage.LIFTED:
+        raise DataError(f"{path}: trial {trial_id} must have been lifted, got {outcome.label}")
+
+    # Poses of palm and object at the start, and after the lift.
+    X_WO = X_WT @ unpack_pose(row["X_TO"])
+    X_WG = X_WO @ unpack_pose(row["X_OG"])
+    X_WO_lifted = X_WT @ unpack_pose(row["X_TO_lifted"])
+    X_WG_lifted = X_WO_lifted @ unpack_pose(row["X_OG_lifted"])
+
+    # The scene, and the open hand's joints in its order.
+    hand = load_hand(config.hand)
+    model = load_prepared(out, name, config).model
+    scene = build_render_scene(model, hand, table_size=table_size)
+    named = joint_positions(hand, float(row["spread"]), np.zeros(hand.num_fingers))
+    open_q = np.array([named[joint] for joint in scene.joint_names])
+    return TrialSnapshots(
+        scene=scene,
+        place=Snapshot(X_WG=X_WG, X_WO=X_WO, q=open_q),
+        close=Snapshot(X_WG=X_WG, X_WO=X_WO, q=row["closed_q"]),
+        lift=Snapshot(X_WG=X_WG_lifted, X_WO=X_WO_lifted, q=row["lifted_q"]),
+        p_OQ=row["closed_p_OQ"],
+        nhat_Q_O=row["closed_nhat_Q_O"],
+        model=model,
+        config=config,
+        row=row,
+    )
+
+
+def frustum(X_WC: Array, K: Array, size: int, depth: float) -> list[Array]:
+    """Return polylines (n, 3) in {W} around a camera's field of view, up to a depth [m]."""
+    edge = size - 0.5
+    pixels = np.array([[-0.5, -0.5], [edge, -0.5], [edge, edge], [-0.5, edge]])
+    corners = transform_points(X_WC, unproject(K, pixels, np.full(4, depth)))
+    rays = [np.vstack([X_WC[:3, 3], corner]) for corner in corners]
+    return [np.vstack([corners, corners[:1]]), *rays]

@@ -1,0 +1,48 @@
+"""`drakegrasp figures`: files, a line for what is left out, and one line for a mistake."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+from helpers.datasets import make_dataset
+
+from drakegrasp.cli.main import main
+from drakegrasp.errors import DataError
+from drakegrasp.visualization.figures import write
+
+
+def run(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(main, ["figures", *map(str, arguments)])
+
+
+def test_figures_are_written_beside_the_dataset(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(data: object, trial_id: int | None) -> None:
+        raise DataError("not in this test")
+
+    monkeypatch.setattr(write, "_phases", refuse)
+    out = make_dataset(tmp_path / "out", tmp_path)
+    result = run(out, "--quiet")
+    assert result.exit_code == 0, result.output
+    assert result.stdout.splitlines() == [
+        "phases is left out: not in this test",
+        f"7 figures in {out / 'figures'}",
+    ]
+    assert (out / "figures" / "hold.svg").is_file()
+    # A build that goes on, and a second run, are not disturbed by them.
+    assert run(out, "--out", tmp_path / "other", "--quiet").exit_code == 0
+    names = [
+        {path.name for path in folder.iterdir()} for folder in (out / "figures", tmp_path / "other")
+    ]
+    assert names[0] == names[1]
+
+
+def test_mistakes_are_one_line_and_leave_nothing(tmp_path: Path) -> None:
+    result = run(tmp_path, "--quiet")
+    assert result.exit_code == 1
+    assert result.stderr.startswith(f"error: {tmp_path}/trials.hdf5: must be the trials")
+    assert result.stderr.count("\n") == 1
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,58 @@
+"""Held grasps as arrays: block by block as at once, and the approaches of one object."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from helpers.datasets import SLIP, TRIALS, edit_file
+
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.errors import DataError
+from drakegrasp.visualization.figures import held_grasps
+from drakegrasp.visualization.figures.held_grasps import read_approaches, read_held
+
+
+@pytest.mark.parametrize("block", [1, 5, 36, 1000])
+def test_every_success_is_read_once(
+    boxes: Path, block: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(held_grasps, "BLOCK", block)
+    held = read_held(boxes)
+    assert held.trial_ids.tolist() == [0, 3, 11, 12, 15, 23, 24, 27, 35]
+    assert [int(group.sum()) for group in held.groups.values()] == [9, 9, 9]
+    np.testing.assert_allclose(held.quantities["slip in the hand [mm]"], 1e3 * SLIP)
+    np.testing.assert_allclose(held.quantities["turn in the hand [°]"], 1.0)
+    np.testing.assert_allclose(held.quantities["largest fingertip force after the lift [N]"], 10.0)
+    np.testing.assert_allclose(held.quantities["largest penetration after the lift [mm]"], 0.1)
+
+
+def test_a_file_without_successes_has_none(boxes: Path, tmp_path: Path) -> None:
+    shutil.copy(boxes / TRIALS, tmp_path)
+    edit_file(tmp_path / TRIALS, lambda f: f["trials/outcome"].write_direct(np.full(36, 9, "u1")))
+    held = read_held(tmp_path)
+    assert len(held.trial_ids) == 0
+    assert all(len(values) == 0 for values in held.quantities.values())
+
+
+def test_what_is_no_dataset_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"trials\.hdf5: must be the trials"):
+        read_held(tmp_path)
+
+
+def test_approaches_are_of_one_object(boxes: Path, tmp_path: Path) -> None:
+    config = read_manifest(boxes).config
+    found = read_approaches(boxes, 1, "2_box_b", config)
+    assert found.attempts == 12
+    assert found.groups.tolist() == [2, 2, 2]  # stable
+    # All palms are tilted by 0.25 rad; the one attempt whose ray misses approached nothing.
+    np.testing.assert_allclose(found.successes[:, 2], np.cos(0.25), atol=1e-9)
+    assert len(found.directions) == 8
+    with h5py.File(boxes / TRIALS, "r") as file:
+        standoffs = np.array(config.candidates.drawn_standoffs)
+        rows = file["trials/standoff_index"][12:24][[0, 3, 11]]
+    lengths = np.linalg.norm(found.rays[:, 1] - found.rays[:, 0], axis=1)
+    np.testing.assert_allclose(lengths, standoffs[rows])
