@@ -70,10 +70,10 @@ def _place(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
     predicted = read_predictions(request.grasps, split=split)
 
     # A configuration that is given is used as it is; that of a dataset with what its rows drew.
+    config: Config | None = None
+    overrides = request.overrides
     if path is None or request.config is not None:
-        config, overrides = load_config(request.config, request.overrides), ()
-    else:
-        config, overrides = None, request.overrides
+        config, overrides = load_config(request.config, overrides), ()
 
     arguments = VerifyArguments(
         mesh=request.mesh,

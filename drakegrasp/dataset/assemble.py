@@ -302,7 +302,7 @@ def _successes(shard_slice: ShardSlice, shard: Shard, K: Array) -> Successes:
             ],
             axis=1,
         ),
-        complete=(trials["closed_touching"] & trials["lifted_touching"]).all(axis=1),
+        complete=np.all(trials["closed_touching"] & trials["lifted_touching"], axis=1),
         other_links=trials["lifted_other_links"],
         slip=trials["slip"],
         turn=trials["turn"],

@@ -210,11 +210,13 @@ def wall_thickness(vertices: Array, faces: Faces) -> float:
 
 def _measures(model: ObjectModel, vertices: Array, faces: Faces) -> dict[str, Any]:
     """Return what is measured on an object, and on its file's surface (n, 3) [m], (m, 3)."""
+    # Volume of the file, inertia of the hull per mass, and size of the solid.
     own, solid = model.visual_vertices, model.visual_faces.astype(np.int64)
     before = abs(signed_volume(vertices, faces))
     hull = trimesh.Trimesh(own, solid, process=False).convex_hull
     round_hull = hull.moment_inertia / hull.volume
     x, y, z = np.ptp(own, axis=0).tolist()
+
     return {
         "extents": (x, y, z),
         "volume": model.volume,
