@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -56,10 +57,11 @@ def test_the_site_is_built_and_loads_nothing_from_elsewhere(tmp_path: Path) -> N
     # Docstrings are read, not imported: with a Drake that fails to load it is built all the same.
     (tmp_path / "path" / "pydrake").mkdir(parents=True)
     (tmp_path / "path" / "pydrake" / "__init__.py").write_text("raise RuntimeError('loaded')\n")
+    paths = (str(tmp_path / "path"), *filter(None, [os.environ.get("PYTHONPATH")]))
     built = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--site-dir", tmp_path / "site"],
         cwd=ROOT,
-        env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(tmp_path / "path")},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
         capture_output=True,
         text=True,
     )
