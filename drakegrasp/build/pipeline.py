@@ -19,7 +19,8 @@ from drakegrasp.build.payload import too_heavy
 from drakegrasp.build.prepare import PrepareTask, prepare_one
 from drakegrasp.build.work_unit import WorkUnit, find_outcomes, run_unit
 from drakegrasp.config import Config, SplitConfig
-from drakegrasp.dataset.assemble import Assembly, assemble_locked, is_assembled, summarise
+from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
+from drakegrasp.dataset.card.files import write_card
 from drakegrasp.dataset.filters import may_train
 from drakegrasp.dataset.lock import Holder, build_lock
 from drakegrasp.dataset.manifest import (
@@ -34,6 +35,7 @@ from drakegrasp.dataset.manifest import (
 )
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.shards import ShardHeader
+from drakegrasp.dataset.statistics import is_assembled
 from drakegrasp.errors import DataError, DrakegraspError
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import with_hand_defaults
@@ -201,6 +203,8 @@ def _build(
     if counts.simulated or not is_assembled(out):
         with progress_bar("assemble", "shards", show=job.show) as report:
             assemble_locked(out, progress=report)
+    else:
+        write_card(out)  # the licence of a mesh may be stated otherwise now
 
     # Report.
     if counts.damaged:
@@ -287,10 +291,16 @@ def _prepare_all(
         job.events.mesh_done(entry)
         report(len(entries), len(sources), found=known)
 
+    # The licence is no matter of the mesh file, and changes nothing that was done.
+    licences = {source.name: source.licence for source in sources}
     ordered = [entries[source.name] for source in sources]
     return replace(
         manifest,
-        objects=tuple(entry for entry in ordered if isinstance(entry, ObjectEntry)),
+        objects=tuple(
+            replace(entry, licence=licences[entry.name])
+            for entry in ordered
+            if isinstance(entry, ObjectEntry)
+        ),
         refused=tuple(entry for entry in ordered if isinstance(entry, RefusedMesh)),
     )
 

@@ -1,15 +1,13 @@
-"""From shards to trials.hdf5, grasping_oto.hdf5 and grasping_otm.hdf5.
+"""From shards to trials.hdf5, grasping_oto.hdf5 and grasping_otm.hdf5, and their data card.
 
-In: a directory whose work units are all done. Out: the three files, all or none. Two passes over
-the shards keep memory at the images of one shard and a few numbers per success, whatever the size
-of the dataset. Imports no Drake.
+In: a directory whose work units are all done. Out: the three files, all or none, and their card.
+Two passes over the shards keep memory at the images of one shard and a few numbers per success,
+whatever the size of the dataset. Imports no Drake.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -19,6 +17,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from drakegrasp.dataset.card.files import write_card
 from drakegrasp.dataset.filters import Removal, Successes, judge_successes, split_samples
 from drakegrasp.dataset.hdf5 import AnyArray, create_field, write_field
 from drakegrasp.dataset.lock import build_lock
@@ -107,6 +106,10 @@ def assemble_locked(
         for done, shard_slice in enumerate(slices, start=len(slices) + 1):
             write_samples(files, out, shard_slice, ids)
             progress(done, 2 * len(slices))
+
+    # What the files hold, in words and numbers.
+    with disk_full_named(out):
+        write_card(out)
     return summarise(out)
 
 
@@ -163,31 +166,10 @@ def summarise(out: Path) -> Assembly:
         raise DataError(f"{out}: must hold the files of a dataset, got none ({error})") from None
 
 
-def is_assembled(out: Path) -> bool:
-    """Return whether the three files exist and are of the manifest's configuration and units."""
-    signature = _signature(read_manifest(out))
-    try:
-        for name in (TRIALS_FILE, *DATA_FILES.values()):
-            with h5py.File(out / name, "r") as file:
-                if file.attrs["signature"] != signature:
-                    return False
-    except (OSError, KeyError):
-        return False
-    return True
-
-
-def _signature(manifest: Manifest) -> str:
-    """Return a hash of what decides the content of the files, without the rejected trials."""
-    digest = hashlib.sha256(json.dumps(manifest.config.to_dict(), sort_keys=True).encode())
-    for header in manifest.headers():
-        digest.update(f"\n{header}".encode())
-    return digest.hexdigest()
-
-
 def _write_attributes(file: h5py.File, manifest: Manifest) -> None:
     camera = manifest.config.camera
     write_origin(file, manifest.config, manifest.versions, manifest.fingers)
-    file.attrs["signature"] = _signature(manifest)
+    file.attrs["signature"] = manifest.signature()
     file.attrs["K"] = intrinsics(camera)
     file.attrs["near"], file.attrs["far"] = camera.near, camera.far
 

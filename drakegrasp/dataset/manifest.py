@@ -7,6 +7,7 @@ machine and no number of workers in it: the same command gives the same bytes.
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -53,6 +54,7 @@ class ObjectEntry:
         valid: Number of those above the table whose palm ray meets the bounding box.
         distinct: Number of different palm poses among the valid ones.
         notes: What was repaired in the mesh.
+        licence: Identifier of the mesh's licence; None: not stated.
     """
 
     name: str
@@ -71,6 +73,7 @@ class ObjectEntry:
     valid: int
     distinct: int
     notes: tuple[str, ...]
+    licence: str | None = None
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> ObjectEntry:
@@ -150,6 +153,13 @@ class Manifest:
                     start=start,
                     stop=min(start + step, entry.candidates),
                 )
+
+    def signature(self) -> str:
+        """Return a hash of what decides the content of the files, without the rejected trials."""
+        digest = hashlib.sha256(json.dumps(self.config.to_dict(), sort_keys=True).encode())
+        for header in self.headers():
+            digest.update(f"\n{header}".encode())
+        return digest.hexdigest()
 
     @property
     def units(self) -> int:

@@ -17,6 +17,8 @@ from drakegrasp.runtime.files import refuse_broken_seal
 TRIALS_FILE = "trials.hdf5"
 DATA_FILES = {camera: f"grasping_{camera}.hdf5" for camera in CAMERAS}
 FILE_NAME = "manifest.json"
+#: What the dataset is, for programs and for people.
+CARD_FILES = ("DATACARD.json", "DATACARD.md")
 #: Folder of the meshes of the built-in objects, in a dataset that is built from them.
 BUILTIN_FOLDER = "builtin"
 #: Folders that a build makes.

@@ -12,7 +12,6 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.assemble import is_assembled
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, FILE_NAME, TRIALS_FILE
@@ -72,6 +71,19 @@ class Unfinished:
     funnel: Funnel
     done: int
     total: int
+
+
+def is_assembled(out: Path) -> bool:
+    """Return whether the three files exist and are of the manifest's configuration and units."""
+    signature = read_manifest(out).signature()
+    try:
+        for name in (TRIALS_FILE, *DATA_FILES.values()):
+            with h5py.File(out / name, "r") as file:
+                if file.attrs["signature"] != signature:
+                    return False
+    except (OSError, KeyError):
+        return False
+    return True
 
 
 def count_unfinished(out: Path) -> Unfinished | None:
