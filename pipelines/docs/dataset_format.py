@@ -46,8 +46,8 @@ OUT/
   build.lock               while a build runs: by which process
 ```
 
-`drakegrasp assemble` writes the data card with the three files, and a build does; `drakegrasp check`
-compares its counts with them. It has no time and no machine in it: equal files have equal cards.
+The data card is written with the three files, and `drakegrasp check` compares its counts with
+them. It has no time and no machine in it: equal files have equal cards.
 
 Only the data files, `grasping_*.hdf5`, are needed to train. With `objects/` and `manifest.json`,
 every trial can be replayed.
