@@ -58,8 +58,11 @@ CARRIER_MASS, CARRIER_INERTIA, ARMATURE = 0.01, 1e-5, 2e-4
 #: Inertia that is added to what no contact may move [kg, kg m^2]: the wrist, which follows its path
 #: exactly, and the object while the hand closes.
 IMMOVABLE = 1e4
-#: Torsional and rolling friction [m], MuJoCo's defaults.
-TURNING, ROLLING = 0.005, 0.0001
+#: Torsional friction [m], the torsion radius of a fingertip's patch in Drake: the median of 336
+#: patches of the Barrett Hand on built-in objects (pipelines/measurements/torsion_radius.py).
+TURNING = 0.0029
+#: Rolling friction [m], MuJoCo's default.
+ROLLING = 0.0001
 #: Bits of MuJoCo's collision masks.
 _HAND, _OBJECT, _TABLE = 1, 2, 4
 

@@ -14,6 +14,7 @@ from drakegrasp.build.attempts import TrialSetup, predict_attempts, try_attempt
 from drakegrasp.build.prepare import prepare
 from drakegrasp.config import Config, load_config
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import make_attempts
@@ -34,7 +35,8 @@ def main() -> None:
     parser.add_argument("--units", default="m")
     arguments = parser.parse_args()
 
-    config = load_config(overrides=[f"candidates.max={arguments.candidates}"], seed=arguments.seed)
+    rules = load_config(overrides=[f"candidates.max={arguments.candidates}"], seed=arguments.seed)
+    config = with_hand_defaults(rules)
     for source in find_meshes(arguments.meshes, units=arguments.units):
         if not arguments.names or source.name in arguments.names:
             start = time.monotonic()

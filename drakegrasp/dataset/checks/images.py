@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import binary_erosion
 
 from drakegrasp.config import CameraConfig, Config
 from drakegrasp.dataset.checks.findings import UNIT_TOLERANCE, AnyArray, Batch, Violation
@@ -203,11 +204,18 @@ def object_pixels(batch: Batch, lens: Lens, model: ObjectModel) -> Iterator[Viol
         depth = batch["images"][i, 3]
         seen = (batch["masks"][i] == 1) & lens.has_depth(depth)
         # A corner of the mesh stands for an image whose depths are all lost.
-        p_OQ = model.visual_vertices[:1]
-        if seen.any():
-            p_OQ = _points(X_OC[i], lens, depth, seen)
-        beyond[i] = (np.abs(p_OQ) - model.half_extents).max()
-        chosen.append(p_OQ[np.linspace(0, len(p_OQ) - 1, MEASURED_PIXELS).astype(int)])
+        if not seen.any():
+            chosen.append(np.repeat(model.visual_vertices[:1], MEASURED_PIXELS, axis=0))
+            continue
+        border = _border(batch["masks"][i])
+        p_OQ = _points(X_OC[i], lens, depth, seen)
+        slack = np.where(border, depth / lens.K[0, 0], 0.0)[seen]
+        beyond[i] = _beyond_box(p_OQ, X_OC[i][:3, 3], model.half_extents, slack)
+
+        # The mesh is measured inside the border, if there is any inside.
+        inside = p_OQ[~border[seen]] if (seen & ~border).any() else p_OQ
+        measured = np.linspace(0, len(inside) - 1, MEASURED_PIXELS).astype(int)
+        chosen.append(inside[measured])
     yield from batch.broken(
         f"points in the mask must be in the object's box within {DEPTH_TOLERANCE:g} m",
         beyond > DEPTH_TOLERANCE,
@@ -222,6 +230,35 @@ def object_pixels(batch: Batch, lens: Lens, model: ObjectModel) -> Iterator[Viol
         (off > DEPTH_TOLERANCE) & (beyond <= DEPTH_TOLERANCE),
         off,
     )
+
+
+def _border(mask: AnyArray) -> AnyArray:
+    """Return which pixels of a mask (S, S) have a neighbour outside of it, (S, S) bool."""
+    return (mask == 1) & ~binary_erosion(mask, np.ones((3, 3)), border_value=1)
+
+
+def _beyond_box(p_OQ: Array, p_OC: Array, half_extents: Array, slack: Array) -> float:
+    """Return how far the worst point is outside of the object's box [m], 0 if none is.
+
+    A renderer moves corners to fractions of a pixel, so a pixel whose ray just misses the object
+    can show it. Its depth is then that of a face seen nearly from its edge, continued beyond that
+    edge. So a point may be moved along its ray, but not aside, into the box and its tolerance.
+
+    Args:
+        p_OQ: Points (m, 3) [m].
+        p_OC: The camera, (3,) [m].
+        half_extents: Of the box, (3,) [m].
+        slack: By how much each point may be moved, (m,) [m] of depth.
+    """
+    # Where the ray of each point enters the box and leaves it.
+    along = p_OQ - p_OC
+    along = along / np.linalg.norm(along, axis=1, keepdims=True)
+    along = np.where(np.abs(along) < 1e-12, 1e-12, along)
+    walls = np.stack([-1.0, 1.0])[:, None, None] * (half_extents + DEPTH_TOLERANCE)
+    cuts = (walls - p_OQ) / along
+    enters, leaves = cuts.min(axis=0).max(axis=1), cuts.max(axis=0).min(axis=1)
+    wrong = np.maximum(enters, -slack) > np.minimum(leaves, slack)
+    return float((np.abs(p_OQ) - half_extents).max(axis=1).max(where=wrong, initial=0.0))
 
 
 def _nearest_depth(depth: AnyArray, lens: Lens, pixel: Array) -> float:

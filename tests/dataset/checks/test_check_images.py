@@ -20,6 +20,7 @@ from helpers.datasets import (
     set_at,
     turned,
 )
+from scipy import ndimage
 
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.frames import invert_pose, pack_pose, unpack_pose
@@ -115,6 +116,29 @@ def test_object_pixels_are_checked_against_the_mesh(out: Path) -> None:
         (OTO, "/train", 0, "points in the mask must be in the object's box within 0.0003 m"),
         (OTO, "/train", 1, "points in the mask must be on the object's mesh within 0.0003 m"),
     )
+
+
+@pytest.mark.parametrize(("inside", "by"), [(True, -0.001), (False, -0.03)])
+def test_pixels_are_checked_against_the_box(out: Path, inside: bool, by: float) -> None:
+    """At the border of the mask a depth may be off by a pixel's width, but not by more."""
+    set_nearest_depth(out, inside, by)
+    must_find(out, (OTO, "/train", 0, "points in the mask must be in the object's box"))
+
+
+def test_border_of_the_mask_may_be_a_pixels_width_off(out: Path) -> None:
+    set_nearest_depth(out, inside=False, by=-0.001)
+    must_find(out)
+
+
+def set_nearest_depth(out: Path, inside: bool, by: float) -> None:
+    """Set the depth of a pixel inside the mask, or at its border, to the nearest and `by` [m]."""
+    with h5py.File(out / OTO, "r+") as file:
+        mask, image = file["train/masks"][0], file["train/images"][0]
+        erosion = ndimage.binary_erosion(mask, np.ones((3, 3)))
+        v, u = np.nonzero(erosion if inside else (mask == 1) & ~erosion)
+        nearest = np.argmin(image[3, v, u])
+        image[3, v[nearest], u[nearest]] += by
+        file["train/images"][0] = image
 
 
 @pytest.mark.parametrize("shift", [(0, 1), (1, 0)])
