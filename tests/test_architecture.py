@@ -59,13 +59,14 @@ WALLS = {
         "bench",
     ),
     "pyarrow": ("exchange",),
+    "torch": ("dataset.torch_samples",),
 }
 #: Modules that name a type of a library for the type checker alone: what callers give or get.
 NAMES_TYPES = {("api", "distributed"), ("verification.result", "matplotlib")}
 #: Reading data: NumPy and h5py, and nothing of these.
 HEAVY = (
     *("pydrake", "dask", "distributed", "trimesh", "scipy", "matplotlib", "rich", "pydantic"),
-    *("yaml", "click"),
+    *("yaml", "click", "torch"),
 )
 READERS = ("grasp", "dataset.schema", "dataset.shards", "dataset.reader")
 CHECKERS = ("dataset.checks.run", "dataset.assemble")

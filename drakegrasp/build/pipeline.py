@@ -19,7 +19,8 @@ from drakegrasp.build.payload import too_heavy
 from drakegrasp.build.prepare import PrepareTask, prepare_one
 from drakegrasp.build.work_unit import WorkUnit, find_outcomes, run_unit
 from drakegrasp.config import Config, SplitConfig
-from drakegrasp.dataset.assemble import Assembly, assemble_locked, is_assembled, summarise
+from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
+from drakegrasp.dataset.card.files import write_card
 from drakegrasp.dataset.filters import may_train
 from drakegrasp.dataset.lock import Holder, build_lock
 from drakegrasp.dataset.manifest import (
@@ -34,6 +35,7 @@ from drakegrasp.dataset.manifest import (
 )
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.shards import ShardHeader
+from drakegrasp.dataset.statistics import is_assembled
 from drakegrasp.errors import DataError, DrakegraspError
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import with_hand_defaults
@@ -207,6 +209,8 @@ def _build(
     if stale:
         with progress_bar("assemble", "shards", show=job.show) as report:
             assemble_locked(out, manifest, progress=report)
+    else:
+        write_card(out)  # the licence of a mesh may be stated otherwise now
 
     # Report.
     if counts.damaged:
@@ -298,13 +302,20 @@ def _prepare_all(
         job.events.mesh_done(entry)
         report(len(entries), len(sources), found=known)
 
-    # A rejected grasp of another mesh was another grasp.
+    # The licence is no matter of the mesh file, and changes nothing that was done.
+    licences = {source.name: source.licence for source in sources}
     ordered = [entries[source.name] for source in sources]
+
+    # A rejected grasp of another mesh was another grasp.
     before = {entry.name: entry.mesh_sha256 for entry in manifest.objects}
     same = {entry.name for entry in ordered if before.get(entry.name) == entry.mesh_sha256}
     return replace(
         manifest,
-        objects=tuple(entry for entry in ordered if isinstance(entry, ObjectEntry)),
+        objects=tuple(
+            replace(entry, licence=licences[entry.name])
+            for entry in ordered
+            if isinstance(entry, ObjectEntry)
+        ),
         refused=tuple(entry for entry in ordered if isinstance(entry, RefusedMesh)),
         rejected=tuple(key for key in manifest.rejected if key.object in same),
     )

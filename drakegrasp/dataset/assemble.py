@@ -1,14 +1,13 @@
-"""From shards to trials.hdf5, grasping_oto.hdf5 and grasping_otm.hdf5.
+"""From shards to trials.hdf5, grasping_oto.hdf5 and grasping_otm.hdf5, and their data card.
 
-In: a directory whose work units are all done. Out: the three files, all or none. Two passes over
-the shards keep memory at the images of one shard and a few numbers per success, whatever the size
-of the dataset. Imports no Drake.
+In: a directory whose work units are all done. Out: the three files, all or none, and their card.
+Two passes over the shards keep memory at the images of one shard and a few numbers per success,
+whatever the size of the dataset. Imports no Drake.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from drakegrasp.dataset.card.files import write_card
 from drakegrasp.dataset.filters import Removal, Successes, judge_successes, split_samples
 from drakegrasp.dataset.hdf5 import AnyArray, create_field, open_hdf5, write_field
 from drakegrasp.dataset.lock import build_lock
@@ -28,12 +28,12 @@ from drakegrasp.dataset.manifest import (
     with_postprocessing,
     write_origin,
 )
-from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRIALS_FILE
+from drakegrasp.dataset.paths import DATA_FILES, FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.rejections import AttemptKey, find_keys
 from drakegrasp.dataset.samples import (
     ShardSlice,
     create_splits,
-    used_headers,
+    shards_sha256,
     walk_shards,
     write_samples,
 )
@@ -51,7 +51,7 @@ from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, invert_pose, transform_points, unpack_pose
 from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp
 from drakegrasp.runtime.file_set import replaced_together
-from drakegrasp.runtime.files import disk_full_named, new_hdf5, read_seal, sweep_temporary
+from drakegrasp.runtime.files import disk_full_named, new_hdf5, sweep_temporary
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.vision.camera import intrinsics, project
 
@@ -131,7 +131,7 @@ def assemble_locked(
             removal = judge_successes(successes, manifest.config.filters, ids_rejected)
             _write_removal(trials, successes, removal)
             ids = _split_ids(manifest, successes, removal)
-            origin = {"signature": manifest.signature(), "shards": _shards_sha256(out, manifest)}
+            origin = {"signature": manifest.signature(), "shards": shards_sha256(out, manifest)}
             _write_attributes(trials, manifest, origin)
 
         # Second pass: copy the samples. It reads the shards again, because the split of a sample
@@ -147,6 +147,10 @@ def assemble_locked(
 
         # Filters, split and rejections change with the files that they made.
         new(FILE_NAME).write_bytes(manifest_text(manifest))
+
+    # What the files hold, in words and numbers.
+    with disk_full_named(out):
+        write_card(out)
     return summarise(out)
 
 
@@ -199,38 +203,6 @@ def summarise(out: Path) -> Assembly:
             )
     except (OSError, KeyError) as error:
         raise DataError(f"{out}: must hold the files of a dataset, got none ({error})") from None
-
-
-def is_assembled(out: Path, *, verify_shards: bool = False) -> bool:
-    """Return whether the three files exist and are what assembling would write now.
-
-    Args:
-        out: Directory of the dataset.
-        verify_shards: Whether to compare the shards, too, which looks into each of them.
-
-    Raises:
-        DataError: If a file has values that lie elsewhere, or a shard is missing.
-    """
-    manifest = read_manifest(out)
-    expected = {"signature": manifest.signature()}
-    if verify_shards:
-        expected["shards"] = _shards_sha256(out, manifest)
-    try:
-        for name in ASSEMBLED_FILES:
-            with open_hdf5(out / name) as file:
-                if any(file.attrs[key] != value for key, value in expected.items()):
-                    return False
-    except (OSError, KeyError):
-        return False
-    return True
-
-
-def _shards_sha256(out: Path, manifest: Manifest) -> str:
-    """Return a hash of the seals of all shards that the files are made from."""
-    digest = hashlib.sha256()
-    for header in used_headers(out, manifest):
-        digest.update(read_seal(header.path(out)))
-    return digest.hexdigest()
 
 
 def _write_attributes(file: h5py.File, manifest: Manifest, origin: Mapping[str, str]) -> None:

@@ -57,6 +57,7 @@ class ObjectEntry:
         valid: Number of those above the table whose palm ray meets the bounding box.
         distinct: Number of different palm poses among the valid ones.
         notes: What was repaired in the mesh.
+        licence: Identifier of the mesh's licence; None: not stated.
     """
 
     name: str
@@ -75,6 +76,7 @@ class ObjectEntry:
     valid: int
     distinct: int
     notes: tuple[str, ...]
+    licence: str | None = None
 
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> ObjectEntry:
@@ -180,7 +182,8 @@ class Manifest:
 
     def signature(self) -> str:
         """Return a hash of all in it that decides a row of the dataset, hexadecimal."""
-        content = {name: value for name, value in _content(self).items() if name != "refused"}
+        unlicensed = tuple(replace(entry, licence=None) for entry in self.objects)
+        content = _content(replace(self, objects=unlicensed, refused=()))
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 

@@ -19,6 +19,8 @@ DATA_FILES = {camera: f"grasping_{camera}.hdf5" for camera in CAMERAS}
 FILE_NAME = "manifest.json"
 #: What assembling writes: these files are of one state.
 ASSEMBLED_FILES = (TRIALS_FILE, *DATA_FILES.values())
+#: What the dataset is, for programs and for people.
+CARD_FILES = ("DATACARD.json", "DATACARD.md")
 #: Folder of the meshes of the built-in objects, in a dataset that is built from them.
 BUILTIN_FOLDER = "builtin"
 #: Folders that a build makes.

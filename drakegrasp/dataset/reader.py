@@ -1,4 +1,4 @@
-"""Reading a dataset. Imports h5py and NumPy, but no Drake, no trimesh and no Dask.
+"""Reading a dataset. Imports h5py and NumPy, but no Drake, no trimesh, no Dask and no torch.
 
 >>> data = GraspDataset("OUT/grasping_oto.hdf5", split="train")   # doctest: +SKIP
 >>> data[0].image.shape, data[0].grasp.shape                      # doctest: +SKIP
@@ -7,20 +7,29 @@
 
 from __future__ import annotations
 
+import hashlib
 import operator
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+from weakref import WeakSet
 
 import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.hdf5 import open_hdf5
+from drakegrasp.dataset.hdf5 import ImageRows, open_hdf5
 from drakegrasp.dataset.schema import DATA_FIELDS, SPLITS, refuse_other_schema
-from drakegrasp.errors import DataError
+from drakegrasp.errors import DataError, MachineError
+
+if TYPE_CHECKING:
+    from drakegrasp.dataset.torch_samples import TorchSamples
+
+#: The fields of a sample, by name.
+FIELDS = {field.name: field for field in DATA_FIELDS}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -53,8 +62,9 @@ class Sample:
 class GraspDataset:
     """One split of a data file as a sequence of samples.
 
-    Works with torch's DataLoader and any number of workers: each process opens the file when it
-    first reads from it, and a pickle holds no open file.
+    Any number of processes may read, forked or spawned: each opens the file when it first reads
+    from it, and a pickle holds no open file. A file that was written anew in the meantime is
+    refused, because its rows may be others. `to_torch` gives tensors for torch's DataLoader.
 
     Args:
         path: `grasping_oto.hdf5` or `grasping_otm.hdf5`.
@@ -75,6 +85,7 @@ class GraspDataset:
             raise DataError(f"split must be one of {', '.join(SPLITS)}, got {split!r}")
         self.path, self.split = Path(path), split
         self._file: h5py.File | None = None
+        self._fields: dict[str, h5py.Dataset | ImageRows] = {}
         self._process = -1
         try:
             with open_hdf5(self.path) as file:
@@ -84,6 +95,7 @@ class GraspDataset:
                 self.image_size = int(file[split]["images"].shape[-1])
                 self.K = np.array(file.attrs["K"])
                 self.camera = str(file.attrs["camera"])
+                self._content = _content(file, split)
         except (OSError, KeyError) as error:
             raise DataError(
                 f"{self.path}: must be a data file of drakegrasp, got none ({error})"
@@ -93,14 +105,8 @@ class GraspDataset:
         return self._length
 
     def __getitem__(self, index: int) -> Sample:
-        # As a list: negative from the end, IndexError beyond it.
-        index = operator.index(index)
-        if not -self._length <= index < self._length:
-            raise IndexError(f"index must be below {self._length}, got {index}")
-
-        group = self._open()[self.split]
-        row = index % self._length
-        values = {f.name: _value(group[f.name], row, f.dtype) for f in DATA_FIELDS}
+        row = self.row_of(index)
+        values = {field.name: self.value(field.name, row) for field in DATA_FIELDS}
         return Sample(
             image=values["images"],
             mask=values["masks"],
@@ -112,8 +118,32 @@ class GraspDataset:
             conditions=_group(values, "conditions/"),
         )
 
+    def row_of(self, index: int) -> int:
+        """Return the row of an index, which counts from the end if it is negative.
+
+        Raises:
+            IndexError: If there is no such sample, as a list says it.
+        """
+        index = operator.index(index)
+        if not -self._length <= index < self._length:
+            raise IndexError(f"index must be below {self._length}, got {index}")
+        return index % self._length
+
     def __iter__(self) -> Iterator[Sample]:
         return (self[i] for i in range(len(self)))
+
+    def value(self, name: str, row: int) -> Any:
+        """Return a field of one row; an array is a copy, text a str.
+
+        Raises:
+            KeyError: If there is no such field.
+        """
+        file = self._open()
+        if name not in self._fields:
+            field = file[self.split][name]
+            self._fields[name] = ImageRows(field) if FIELDS[name].sample else field
+        value: Any = self._fields[name][row]
+        return value.decode() if FIELDS[name].dtype == "str" else value
 
     def column(self, name: str) -> npt.NDArray[Any]:
         """Return all rows (n, ...) of a field, e.g. `grasps` or `grasp_props/stable`.
@@ -129,34 +159,83 @@ class GraspDataset:
         Raises:
             DataError: If there is no such field.
         """
-        names = {f.name: f for f in DATA_FIELDS}
-        if name not in names:
-            raise DataError(f"field must be one of {', '.join(names)}, got {name!r}")
+        _refuse_other_fields([name])
         dataset = self._open()[self.split][name]
-        if names[name].dtype == "str":
+        if FIELDS[name].dtype == "str":
             return np.asarray(dataset.asstr()[start:stop])
         return np.asarray(dataset[start:stop])
 
+    def to_torch(self, fields: Sequence[str] = ("images", "grasps")) -> TorchSamples:
+        """Return the split as a `torch.utils.data.Dataset` of tensors.
+
+        Args:
+            fields: Names of the fields of a sample, as `column` takes them.
+
+        Raises:
+            DataError: If there is no such field.
+            MachineError: If torch is not installed.
+        """
+        _refuse_other_fields(fields)
+        if find_spec("torch") is None:
+            raise MachineError("to_torch needs torch, got none: pip install 'drakegrasp[torch]'")
+        from drakegrasp.dataset.torch_samples import TorchSamples
+
+        return TorchSamples(self, fields)
+
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_file": None, "_process": -1}
+        return {**self.__dict__, "_file": None, "_fields": {}, "_process": -1}
 
     def __repr__(self) -> str:
         return f"GraspDataset({str(self.path)!r}, split={self.split!r}): {len(self)} grasps"
 
     def _open(self) -> h5py.File:
-        # An open HDF5 file must not cross a fork: each process opens its own.
-        if self._file is None or self._process != os.getpid():
-            self._file = open_hdf5(self.path)
-            self._process = os.getpid()
-        return self._file
+        """Return the file, as this process opened it."""
+        if self._process == os.getpid():
+            return self._file
+
+        # An open HDF5 file must not cross a fork. All that the parent had open is closed first:
+        # HDF5 would go on with one of its handles instead of opening the file again.
+        for reader in {self, *_open_readers}:
+            if reader._process != os.getpid():
+                reader._close()
+
+        # The rows of another file would be other samples.
+        try:
+            file = open_hdf5(self.path)
+            if _content(file, self.split) != self._content:
+                raise OSError("one with other samples")
+        except (OSError, KeyError) as error:
+            raise DataError(
+                f"{self.path}: must hold the samples that it held when the dataset was opened, "
+                f"got: {error}"
+            ) from None
+        self._file, self._process = file, os.getpid()
+        _open_readers.add(self)
+        return file
+
+    def _close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+        self._file, self._fields, self._process = None, {}, -1
+
+
+#: Those that have an open file, here or in the process from which this one was forked.
+_open_readers: WeakSet[GraspDataset] = WeakSet()
+
+
+def _content(file: h5py.File, split: str) -> str:
+    """Return a hash that says which samples a split holds, and of which dataset."""
+    digest = hashlib.sha256(str(file.attrs.get("signature")).encode())
+    digest.update(file[split]["trial_id"][:].tobytes())
+    return digest.hexdigest()
+
+
+def _refuse_other_fields(names: Sequence[str]) -> None:
+    for name in names:
+        if name not in FIELDS:
+            raise DataError(f"field must be one of {', '.join(FIELDS)}, got {name!r}")
 
 
 def _group(values: dict[str, Any], prefix: str) -> dict[str, Any]:
     """Return the values whose names begin with a prefix, without it."""
     return {k.removeprefix(prefix): v for k, v in values.items() if k.startswith(prefix)}
-
-
-def _value(dataset: h5py.Dataset, row: int, dtype: str) -> Any:
-    """Return one row of a dataset; text as str."""
-    value = dataset[row]
-    return value.decode() if dtype == "str" else value

@@ -6,6 +6,7 @@ In: the manifest, the shards and, by split, the ids of the trials that are sampl
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,6 +40,7 @@ from drakegrasp.frames import (
 from drakegrasp.grasp import pack_grasp, transform_grasp
 from drakegrasp.objects.model import ObjectModel, load_object
 from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.files import read_seal
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,6 +101,18 @@ def used_headers(out: Path, manifest: Manifest) -> Iterator[ShardHeader]:
             yield header
             outcomes = read_outcomes(header.path(out), header, verify_seal=False)
             wanted[header.object_name] = left - int(np.count_nonzero(outcomes == Outcome.SUCCESS))
+
+
+def shards_sha256(out: Path, manifest: Manifest) -> str:
+    """Return a hash of the seals of all shards that the files are made from, hexadecimal.
+
+    Raises:
+        DataError: As for `used_headers`, or if a shard has no seal.
+    """
+    digest = hashlib.sha256()
+    for header in used_headers(out, manifest):
+        digest.update(read_seal(header.path(out)))
+    return digest.hexdigest()
 
 
 def rows_within(shard: Shard, wanted: int | None) -> tuple[int, int | None]:

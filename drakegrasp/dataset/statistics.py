@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.assemble import is_assembled
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.hdf5 import open_hdf5, read_names
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.paths import DATA_FILES, FILE_NAME, TRIALS_FILE
+from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRIALS_FILE
+from drakegrasp.dataset.samples import shards_sha256
 from drakegrasp.dataset.schema import SPLITS, refuse_other_schema
 from drakegrasp.dataset.shards import read_trials
 from drakegrasp.errors import DataError
@@ -72,6 +72,30 @@ class Unfinished:
     funnel: Funnel
     done: int
     total: int
+
+
+def is_assembled(out: Path, *, verify_shards: bool = False) -> bool:
+    """Return whether the three files exist and are what assembling would write now.
+
+    Args:
+        out: Directory of the dataset.
+        verify_shards: Whether to compare the shards, too, which looks into each of them.
+
+    Raises:
+        DataError: If a file has values that lie elsewhere, or a shard is missing.
+    """
+    manifest = read_manifest(out)
+    expected = {"signature": manifest.signature()}
+    if verify_shards:
+        expected["shards"] = shards_sha256(out, manifest)
+    try:
+        for name in ASSEMBLED_FILES:
+            with open_hdf5(out / name) as file:
+                if any(file.attrs[key] != value for key, value in expected.items()):
+                    return False
+    except (OSError, KeyError):
+        return False
+    return True
 
 
 def count_unfinished(out: Path) -> Unfinished | None:

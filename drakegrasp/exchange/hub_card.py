@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.schema import CAMERAS, CONVENTIONS, SPLITS, Field
+from drakegrasp.dataset.card.content import card_content
+from drakegrasp.dataset.card.text import card_text
+from drakegrasp.dataset.schema import CAMERAS, SPLITS, Field
 
 #: Types of Croissant by NumPy's letter of a kind.
 _TYPES = {"f": "sc:Float", "i": "sc:Integer", "u": "sc:Integer", "b": "sc:Boolean"}
@@ -48,7 +49,7 @@ def card(out: Path, files: Sequence[ParquetFile], *, licence: str) -> str:
         files: The files that were written.
         licence: Identifier of the licence.
     """
-    manifest = read_manifest(out)
+    content = card_content(out)
     rows = {
         (c, s): sum(f.rows for f in files if (f.camera, f.split) == (c, s))
         for c in CAMERAS
@@ -58,7 +59,7 @@ def card(out: Path, files: Sequence[ParquetFile], *, licence: str) -> str:
     # The head, which names the files of each configuration and split.
     head = {
         "license": licence,
-        "pretty_name": f"Grasps of {len(manifest.objects)} objects",
+        "pretty_name": content["title"],
         "task_categories": ["robotics"],
         "tags": ["robotics", "grasping", "simulation", "croissant"],
         "configs": [
@@ -74,31 +75,22 @@ def card(out: Path, files: Sequence[ParquetFile], *, licence: str) -> str:
         ],
     }
 
-    # The text: what is in it, how much, in which conventions, and made by what.
+    # The text: how much is in each file, and the card of the dataset.
     counts = "\n".join(
         f"| {split} | {rows['oto', split]:,} | {rows['otm', split]:,} |" for split in SPLITS
     )
-    conventions = "\n".join(f"* **{key}**: {text}" for key, text in CONVENTIONS.items())
-    versions = ", ".join(f"{name} {version}" for name, version in manifest.versions.items())
     return f"""---
 {yaml.safe_dump(head, sort_keys=False).strip()}
 ---
 
-# Simulated grasps of {len(manifest.objects)} objects
-
-Every sample is a grasp that a simulated hand (`{Path(manifest.config.hand).name}`) closed, lifted
-and held, with colour, depth and mask as a camera behind the palm sees the object before. Made by
-drakegrasp.
+{card_text(content)}
+## These files
 
 | split | camera `oto` | camera `otm` |
 |---|---|---|
 {counts}
 
 Depth images are 16-bit PNG files in units of 0.1 mm; masks are 255 where the object is seen.
-
-{conventions}
-
-Seed {manifest.config.seed}; {versions}.
 """
 
 

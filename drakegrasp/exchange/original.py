@@ -4,9 +4,11 @@ In: a dataset. Out: `grasping_oto.hdf5` and `grasping_otm.hdf5` as its loaders e
 the first channel of an image, a grasp is 9k numbers (27 for three fingers: points, normals and
 forces), and cameras have the axes of V-REP's sensors: +X left, +Y up, +Z forward.
 
-What it has not: `unproj_z` and `unproj_y` of `object_props`, which only helped to find the image
-frame that is stored. Forces are those of the fingertips on the object; which of the two bodies
-V-REP's forces act on, the released code does not say.
+What it has no place for is left out: masks, joints, palm, the grasp at the end of the lift, and the
+conditions of an attempt, but for the mass, which is in `work2mass`. What it has and we do not:
+`unproj_z` and `unproj_y` of `object_props`, which only helped to find the image frame that is
+stored. Forces are those of the fingertips on the object; which of the two bodies V-REP's forces act
+on, the released code does not say.
 """
 
 from __future__ import annotations

@@ -137,8 +137,8 @@ def _refuse_known(source: MeshSource, names: set[str]) -> None:
 
 def _entry(source: MeshSource) -> dict[str, Any]:
     """Return what the manifest says of a morph: what is known of its original."""
-    known = {"mass": source.mass, "density": source.density, "friction": source.friction}
-    said = {key: value for key, value in known.items() if value is not None}
+    keys = ("mass", "density", "friction", "licence")
+    said = {key: getattr(source, key) for key in keys if getattr(source, key) is not None}
     return {"class": source.class_name, **said}
 
 

@@ -7,10 +7,11 @@ File names and `objects.yaml`: a mesh called `<number>_<class>_<rest>.ext` belon
 `<class>`, which may itself contain underscores: the number is dropped, and so is the last
 part if at least two parts remain (24_mug_final and 1_mug are mugs, 30_fruit_juicer_final
 is a fruit_juicer). A name without a number is its own class. A file `objects.yaml` beside the
-meshes overrides these for one mesh, and the unit for all; it also says what no file of triangles
-does:
+meshes overrides these for one mesh, and the unit for all. It also states the licence of the meshes
+and what no file of triangles says:
 
     units: cm
+    licence: CC-BY-4.0
     objects:
       95_boots_final: {units: m, class: boots, name: boots, mass: 0.4, friction: 0.9}
       7_scan: {scale: 1.02, up: +y, density: 700}
@@ -50,7 +51,7 @@ UPRIGHT = {
     "-z": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
 }
 #: Keys of an object in the manifest.
-_KEYS = "units, scale, up, class, name, mass, density, friction"
+_KEYS = "units, scale, up, class, name, mass, density, friction, licence"
 MANIFEST_NAME = "objects.yaml"
 
 
@@ -67,6 +68,7 @@ class MeshSource:
         mass: [kg]; None: that of the density, or of the configuration.
         density: [kg/m^3], instead of the mass.
         friction: Effective coefficient with hand and table; None: those of the configuration.
+        licence: Identifier of the mesh's licence, e.g. of spdx.org/licenses; None: not stated.
     """
 
     name: str
@@ -77,6 +79,7 @@ class MeshSource:
     mass: float | None = None
     density: float | None = None
     friction: float | None = None
+    licence: str | None = None
 
     def __post_init__(self) -> None:
         for what, text in (("name", self.name), ("class", self.class_name)):
@@ -103,6 +106,9 @@ class MeshSource:
 _Factor = Annotated[float, pydantic.Field(gt=0.0, allow_inf_nan=False)]
 
 
+_Line = Annotated[str, pydantic.Field(pattern=r"^[ -~]*[!-~][ -~]*$", max_length=200)]
+
+
 class _Entry(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(extra="forbid", coerce_numbers_to_str=True)
 
@@ -114,6 +120,7 @@ class _Entry(pydantic.BaseModel):
     mass: _Factor | None = None
     density: _Factor | None = None
     friction: _Factor | None = None
+    licence: _Line | None = None
 
     @pydantic.field_validator("scale", "mass", "density", "friction", mode="before")
     @classmethod
@@ -126,6 +133,7 @@ class _Manifest(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(extra="forbid", coerce_numbers_to_str=True)
 
     units: Literal["m", "cm", "mm"] | None = None
+    licence: _Line | None = None
     objects: dict[str, _Entry] = pydantic.Field(default_factory=dict)
 
     @pydantic.field_validator("objects", mode="before")
@@ -145,7 +153,7 @@ def _read_manifest(path: Path) -> _Manifest:
         return _Manifest.model_validate({} if content is None else content)
     except pydantic.ValidationError as error:
         mistake = error.errors()[0]
-        keys = _KEYS if mistake["loc"][:1] == ("objects",) else "units, objects"
+        keys = _KEYS if mistake["loc"][:1] == ("objects",) else "units, licence, objects"
         line = describe_mistake(mistake, whole="the file", legal=f"a known key ({keys})")
         raise MeshError(f"{path}: {line}") from error
 
@@ -244,6 +252,7 @@ def _source(path: Path, stem: str, table: _Manifest, units: str) -> MeshSource:
         mass=entry.mass,
         density=entry.density,
         friction=entry.friction,
+        licence=entry.licence or table.licence,
     )
 
 
@@ -265,7 +274,7 @@ def _refuse_twins(directory: Path, names: dict[Path, str]) -> None:
 def source_sha256(source: MeshSource) -> str:
     """Return the SHA-256 of a mesh file's bytes and of what is said of it, hexadecimal.
 
-    Name and class do not count.
+    Name, class and licence do not count.
 
     Raises:
         MeshError: If the file cannot be read.

@@ -40,10 +40,14 @@ OUT/
   trials.hdf5              a row per attempt, whatever its outcome
   grasping_oto.hdf5        samples, camera rolled with the palm
   grasping_otm.hdf5        the same samples, image up is world up
+  DATACARD.md, .json       what it is, how it was made, counts, licences of the meshes, known limits
   log.jsonl                what happened while it was built, and when: a line of JSON per event
   reject.json              grasps that an inspection rejects; only if there was one
   build.lock               while a build runs: by which process
 ```
+
+The data card is written with the three files, and `drakegrasp check` compares its counts with
+them. It has no time and no machine in it: equal files have equal cards.
 
 Only the data files, `grasping_*.hdf5`, are needed to train. With `objects/` and `manifest.json`,
 every trial can be replayed.

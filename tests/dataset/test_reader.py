@@ -3,41 +3,49 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import pickle
+import sys
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
-from drakegrasp.dataset.hdf5 import create_field
+from drakegrasp.dataset import hdf5
+from drakegrasp.dataset.hdf5 import ImageRows, create_field
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import DATA_FIELDS, SCHEMA_VERSION, SPLITS, sizes
-from drakegrasp.errors import DataError
+from drakegrasp.errors import DataError, MachineError
 
 LETTERS = sizes(fingers=3, joints=8, image=16)
 
 
-@pytest.fixture(scope="module")
-def data_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data file whose train split has five samples with their row in every value."""
-    path = tmp_path_factory.mktemp("data") / "grasping_oto.hdf5"
+def write_data_file(path: Path, trial_ids: range) -> Path:
+    """Write a data file whose train split has its trial's id in every value of a sample."""
     with h5py.File(path, "w") as file:
         file.attrs["schema_version"] = SCHEMA_VERSION
         file.attrs["K"] = np.eye(3)
         file.attrs["camera"] = "oto"
+        file.attrs["signature"] = "of a test"
         for split in SPLITS:
             group = file.create_group(split)
-            count = 5 if split == "train" else 0
+            ids = trial_ids if split == "train" else range(0)
             for field in DATA_FIELDS:
                 shape = field.row_shape(LETTERS)
                 dataset = create_field(group, field, shape)
-                dataset.resize(count, axis=0)
-                for row in range(count):
+                dataset.resize(len(ids), axis=0)
+                for row, number in enumerate(ids):
                     dataset[row] = (
-                        f"object {row} ü" if field.dtype == "str" else np.full(shape, row)
+                        f"object {number} ü" if field.dtype == "str" else np.full(shape, number)
                     )
     return path
+
+
+@pytest.fixture(scope="module")
+def data_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data file with five samples to train on."""
+    return write_data_file(tmp_path_factory.mktemp("data") / "grasping_oto.hdf5", range(5))
 
 
 def test_samples_come_by_index(data_file: Path) -> None:
@@ -114,3 +122,131 @@ def test_other_processes_read_after_this_one_did(data_file: Path, method: str) -
     with multiprocessing.get_context(method).Pool(2) as pool:
         assert pool.map(_trial_id, [(data, i) for i in range(5)]) == [0, 1, 2, 3, 4]
     assert pickle.loads(pickle.dumps(data))[2].trial_id == 2
+
+
+def handles(path: Path) -> list[int]:
+    """Return the descriptors by which this process has a file open."""
+    found = []
+    for name in os.listdir("/proc/self/fd"):
+        try:
+            if os.readlink(f"/proc/self/fd/{name}") == str(path.resolve()):
+                found.append(int(name))
+        except FileNotFoundError:  # that of the list itself
+            continue
+    return found
+
+
+#: A place in the file that a handle is set to; who shares the handle sees it there.
+MARK = 1234
+
+
+def _shared_handles(datasets: tuple[GraspDataset, GraspDataset]) -> list[bool]:
+    for data in datasets:
+        list(data)
+    return [os.lseek(h, 0, os.SEEK_CUR) == MARK for h in handles(datasets[0].path)]
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs the handles of Linux")
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_no_handle_is_shared_across_a_fork(data_file: Path) -> None:
+    """Also not that of another split of the same file, which HDF5 would go on with."""
+    datasets = GraspDataset(data_file), GraspDataset(data_file, split="valid")
+    assert datasets[0][0].trial_id == 0
+    assert len(datasets[1].column("grasps")) == 0
+    for handle in handles(data_file):
+        os.lseek(handle, MARK, os.SEEK_SET)
+    _inherited["datasets"] = datasets  # by no pickle: as a worker has them that is forked
+    with multiprocessing.get_context("fork").Pool(1) as pool:
+        assert pool.apply(_of_inherited) == [False]
+    assert datasets[0][1].trial_id == 1
+
+
+_inherited: dict[str, tuple[GraspDataset, GraspDataset]] = {}
+
+
+def _of_inherited() -> list[bool]:
+    return _shared_handles(_inherited["datasets"])
+
+
+def test_a_file_with_other_samples_is_refused(tmp_path: Path) -> None:
+    """A worker that opens it after it was assembled anew would give other samples, silently."""
+    path = write_data_file(tmp_path / "grasping_oto.hdf5", range(5))
+    data = GraspDataset(path)
+    path.unlink()
+    write_data_file(path, range(1, 6))
+    with pytest.raises(DataError, match=r"must hold the samples that it held when .* opened"):
+        data[0]
+    path.unlink()
+    with pytest.raises(DataError, match=r"must hold the samples that it held when .* opened"):
+        data.column("grasps")
+
+
+def test_images_inflated_here_are_those_of_hdf5(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("deflate")
+    rng = np.random.default_rng(0)
+    with h5py.File(tmp_path / "images.hdf5", "w") as file:
+        for field in DATA_FIELDS[:2]:
+            dataset = create_field(file, field, field.row_shape(LETTERS))
+            dataset.resize(4, axis=0)
+            values = rng.integers(0, 255, dataset.shape) / (1 if field.dtype == "uint8" else 7)
+            dataset[:3] = values[:3]  # the last was never written
+            rows = ImageRows(dataset)
+            for row in range(4):
+                assert rows[row].dtype == dataset.dtype
+                assert rows[row].tobytes() == dataset[row].tobytes()
+            monkeypatch.setattr(ImageRows, "_inflate", lambda *_: pytest.fail("inflated here"))
+            with pytest.raises(pytest.fail.Exception):
+                rows[0]
+            monkeypatch.undo()
+
+
+def test_a_damaged_image_is_no_image(tmp_path: Path) -> None:
+    """Neither of HDF5 nor of libdeflate: both verify a checksum."""
+    field = DATA_FIELDS[0]
+    with h5py.File(tmp_path / "images.hdf5", "w") as file:
+        dataset = create_field(file, field, field.row_shape(LETTERS))
+        dataset.resize(2, axis=0)
+        dataset[0] = np.random.default_rng(0).random(dataset.shape[1:])
+        mask, chunk = dataset.id.read_direct_chunk((0, 0, 0, 0))
+        for content in (chunk[:-1] + bytes([chunk[-1] ^ 1]), chunk[:50]):
+            dataset.id.write_direct_chunk((0, 0, 0, 0), content, mask)
+            with pytest.raises(OSError):
+                ImageRows(dataset)[0]
+
+
+def test_files_that_are_packed_otherwise_are_read_by_hdf5(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = np.arange(3 * 16, dtype=np.float32).reshape(3, 4, 2, 2)
+    with h5py.File(tmp_path / "images.hdf5", "w") as file:
+        ways = {
+            "plain": {},
+            "lzf": {"compression": "lzf", "chunks": (1, 4, 2, 2)},
+            "together": {"compression": "gzip", "shuffle": True, "chunks": (2, 4, 2, 2)},
+            "unshuffled": {"compression": "gzip", "chunks": (1, 4, 2, 2)},
+        }
+        for name, options in ways.items():
+            rows = ImageRows(file.create_dataset(name, data=values, **options))
+            assert all((rows[k] == values[k]).all() for k in range(3))
+        big = file.create_dataset(
+            "big", data=values.astype(">f4"), compression="gzip", shuffle=True, chunks=(1, 4, 2, 2)
+        )
+        assert (ImageRows(big)[1] == values[1]).all()
+        monkeypatch.setattr(hdf5, "deflate", None)
+        usual = file.create_dataset(
+            "usual", data=values, compression="gzip", shuffle=True, chunks=(1, 4, 2, 2)
+        )
+        assert (ImageRows(usual)[1] == values[1]).all()
+
+
+def test_missing_torch_is_one_line(data_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(MachineError, match=r"to_torch needs torch, got none: pip install"):
+        GraspDataset(data_file).to_torch()
+
+
+def test_unknown_fields_are_refused_whatever_is_installed(data_file: Path) -> None:
+    with pytest.raises(DataError, match=r"field must be one of images, .*, got 'image'"):
+        GraspDataset(data_file).to_torch(["image"])

@@ -88,6 +88,21 @@ def test_official_loaders_read_what_the_dataset_holds(
                 assert (np.array(row["mask"]) == 255 * sample.mask).all()
 
 
+def test_every_column_is_that_of_the_data_file(dataset: Path, folder: Path) -> None:
+    """Contacts, poses, joints, forces and all else that is no image, bit for bit."""
+    import pyarrow.parquet as pq
+
+    for camera in ("oto", "otm"):
+        for split in SPLITS:
+            data = GraspDataset(dataset / f"grasping_{camera}.hdf5", split=split)
+            (path,) = (folder / camera).glob(f"{split}-*.parquet")
+            table = pq.read_table(path)
+            assert set(table.column_names) == set(hub.columns())
+            for name, field in hub.columns().items():
+                if field is not None:
+                    assert table[name].to_pylist() == data.column(field.name).tolist(), name
+
+
 def test_card_names_licence_files_and_counts(dataset: Path, folder: Path) -> None:
     head, text = (folder / "README.md").read_text(encoding="utf-8").split("---\n")[1:]
     described = yaml.safe_load(head)
@@ -95,6 +110,7 @@ def test_card_names_licence_files_and_counts(dataset: Path, folder: Path) -> Non
     for config in described["configs"]:
         for entry in config["data_files"]:
             assert list(folder.glob(entry["path"]))
+    assert (dataset / "DATACARD.md").read_text(encoding="utf-8") in text
     for split in SPLITS:
         count = len(GraspDataset(dataset / "grasping_oto.hdf5", split=split))
         assert f"| {split} | {count} | {count} |" in text

@@ -43,14 +43,16 @@ def test_images_and_properties_are_those_of_the_dataset(
 
 
 @pytest.mark.parametrize("camera", ["oto", "otm"])
+@pytest.mark.parametrize("split", SPLITS)
 def test_grasps_are_at_the_same_place_over_the_table(
-    dataset: Path, folder: Path, camera: str
+    dataset: Path, folder: Path, camera: str, split: str
 ) -> None:
-    data = GraspDataset(dataset / f"grasping_{camera}.hdf5", split="train")
+    data = GraspDataset(dataset / f"grasping_{camera}.hdf5", split=split)
+    assert len(data) > 0
     with h5py.File(folder / f"grasping_{camera}.hdf5") as file:
-        vectors = file["train/grasps"][:].reshape(len(data), 3, 3, 3)
-        frames = unpack_pose(file[f"train/object_props/frame_work2cam_{camera}"][:])
-        back = unpack_pose(file[f"train/object_props/frame_cam2work_{camera}"][:])
+        vectors = file[f"{split}/grasps"][:].reshape(len(data), 3, 3, 3)
+        frames = unpack_pose(file[f"{split}/object_props/frame_work2cam_{camera}"][:])
+        back = unpack_pose(file[f"{split}/object_props/frame_cam2work_{camera}"][:])
     X_TC = unpack_pose(data.column(f"object_props/frame_work2cam_{camera}"))
     ours = data.column("grasps").reshape(len(data), 2, 3, 3)
     forces = data.column("grasp_props/f_Q_C")

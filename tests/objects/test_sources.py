@@ -91,7 +91,7 @@ def test_what_triangles_do_not_say_is_in_the_manifest_and_in_the_digest(tmp_path
         ("objects: {a: {up: y}}", r"up must be one of \+x, -x, \+y, -y, \+z, -z, got 'y'"),
         ("objects: {a: {mass: 1, density: 2}}", "mass must not be given with density, got 1 kg"),
         ("units: inch", r"units: .*'m', 'cm' or 'mm'.*got 'inch'"),
-        ("unit: cm", r"unit: must be a known key \(units, objects\), got an unknown one"),
+        ("unit: cm", r"unit: must be a known key \(units, licence, objects\), got an unknown one"),
         (
             "objects: {a: {unit: cm}}",
             r"objects\.a\.unit: must be a known key \(units, scale, up, class, name, mass, ",
@@ -129,6 +129,24 @@ def test_wrong_directories_are_refused(tmp_path):
         find_meshes(tmp_path)
     with pytest.raises(MeshError, match=r"gone\.yaml: must be a readable YAML"):
         find_meshes(tmp_path, manifest=tmp_path / "gone.yaml")
+
+
+def test_licences_are_stated_for_the_set_and_for_a_mesh(tmp_path):
+    for name in "ab":
+        write(tmp_path / f"{name}.obj", box())
+    unsaid = find_meshes(tmp_path)
+    (tmp_path / "objects.yaml").write_text(
+        "licence: CC-BY-4.0\nobjects: {b: {licence: LicenseRef-of-the-lab}}\n"
+    )
+    said = find_meshes(tmp_path)
+    assert [source.licence for source in unsaid] == [None, None]
+    assert [source.licence for source in said] == ["CC-BY-4.0", "LicenseRef-of-the-lab"]
+    # No licence changes what is simulated.
+    assert [*map(source_sha256, said)] == [*map(source_sha256, unsaid)]
+    for text in ("licence: ''", "licence: [MIT]", 'licence: "a\\nb"'):
+        (tmp_path / "objects.yaml").write_text(text)
+        with pytest.raises(MeshError, match="licence: "):
+            find_meshes(tmp_path)
 
 
 def test_one_mesh_is_found_whatever_lies_beside_it(tmp_path):

@@ -11,9 +11,11 @@ rules that build on it, so the check reports the cause and not all that follows 
 
 from __future__ import annotations
 
+import json
 from contextlib import ExitStack
 from pathlib import Path
 
+from drakegrasp.dataset.card.content import card_content
 from drakegrasp.dataset.checks import consistency
 from drakegrasp.dataset.checks.context import Context, Dataset
 from drakegrasp.dataset.checks.data_file import check_data_file, check_pair
@@ -22,7 +24,7 @@ from drakegrasp.dataset.checks.open_file import OpenFile, open_file
 from drakegrasp.dataset.checks.trials_file import check_trials_file
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.manifest import Manifest, read_manifest
-from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE, refuse_changed_object
+from drakegrasp.dataset.paths import CARD_FILES, DATA_FILES, TRIALS_FILE, refuse_changed_object
 from drakegrasp.dataset.schema import CAMERAS, refuse_other_schema
 from drakegrasp.dataset.shards import read_shard
 from drakegrasp.errors import DataError, first_line
@@ -104,6 +106,7 @@ def _check_directory(out: Path, stack: ExitStack, findings: Findings, report: Re
             context.add(data, consistency.kept_are_samples(data, trials))
     if len(files) == len(CAMERAS) and all(data.config for data in files.values()):
         check_pair(files[CAMERAS[0]], files[CAMERAS[1]], findings)
+    _check_card(out, findings)
 
 
 def _open_files(out: Path, stack: ExitStack, findings: Findings) -> dict[str, OpenFile]:
@@ -148,6 +151,24 @@ def _check_shards(out: Path, manifest: Manifest, context: Context) -> None:
             continue
         if left is not None:
             wanted[header.object_name] = left - int((outcome == Outcome.SUCCESS).sum())
+
+
+def _check_card(out: Path, findings: Findings) -> None:
+    """The data card counts what the files hold; a dataset of before there were cards has none."""
+    path = out / CARD_FILES[0]
+    try:
+        counts = card_content(out)["counts"]
+    except (DataError, ValueError, IndexError):
+        return  # a file is damaged, and found above
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))["counts"]
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        found = first_line(error)
+    if found != counts:
+        what = "the data card must count what the files hold"
+        findings.add([of_file(path.name, what, "others; `drakegrasp assemble` writes it anew")])
 
 
 def _rows(opened: OpenFile) -> int:

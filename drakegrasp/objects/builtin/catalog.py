@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import trimesh
@@ -23,6 +23,9 @@ from drakegrasp.objects.sources import MeshSource, find_mesh
 from drakegrasp.runtime.files import write_atomic
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.seeding import Stream, object_key
+
+#: Of the built-in objects, which are part of the package.
+LICENCE = "BSD-3-Clause"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +129,8 @@ def builtin_sources(
     folder: str | os.PathLike[str], config: BuiltinConfig, progress: Report = silent
 ) -> list[MeshSource]:
     """Return the built-in objects as meshes in a folder, which is made, sorted by name."""
-    sources = [find_mesh(path) for path in export_builtin(folder, config=config, progress=progress)]
+    paths = export_builtin(folder, config=config, progress=progress)
+    sources = [replace(find_mesh(path), licence=LICENCE) for path in paths]
     return sorted(sources, key=lambda source: source.name)
 
 

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import norm
 from drakegrasp.config import Config
+from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.schema import refuse_other_schema
@@ -60,7 +60,7 @@ def read_held(out: Path) -> HeldGrasps:
     parts: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in COLUMNS}
     path = out / TRIALS_FILE
     try:
-        with h5py.File(path, "r") as file:
+        with open_hdf5(path) as file:
             refuse_other_schema(path, file.attrs["schema_version"])
             trials = file["trials"]
             (rows,) = np.nonzero(trials["outcome"][:] == Outcome.SUCCESS)
@@ -115,7 +115,7 @@ def read_approaches(out: Path, number: int, name: str, config: Config) -> Object
     """
     # The attempts of the object, which are beside each other.
     prepared = load_prepared(out, name, config)
-    with h5py.File(out / TRIALS_FILE, "r") as file:
+    with open_hdf5(out / TRIALS_FILE) as file:
         trials = file["trials"]
         (rows,) = np.nonzero(trials["object"][:] == number)
         part = slice(int(rows[0]), int(rows[-1]) + 1) if len(rows) else slice(0, 0)

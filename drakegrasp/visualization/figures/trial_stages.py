@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from pydrake.geometry import LightParameter
 
 from drakegrasp.config import Config
+from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.prepared_objects import load_prepared
@@ -81,7 +81,7 @@ def load_trial(out: Path, trial_id: int, *, table_size: float = TABLE_SIZE) -> T
     config = read_manifest(out).config
     path = out / TRIALS_FILE
     try:
-        with h5py.File(path, "r") as file:
+        with open_hdf5(path) as file:
             trials = file["trials"]
             if not 0 <= trial_id < len(trials["outcome"]):
                 raise DataError(

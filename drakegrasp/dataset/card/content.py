@@ -1,0 +1,164 @@
+"""What a data card says, as plain data, from the manifest and the three files of a dataset.
+
+In: the directory of a dataset. Out: a dictionary of JSON types, the content of `DATACARD.json`. It
+has no time and no machine in it: the same files give the same card.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.config import Config
+from drakegrasp.dataset.filters import Removal
+from drakegrasp.dataset.hdf5 import open_hdf5
+from drakegrasp.dataset.manifest import Manifest, read_manifest
+from drakegrasp.dataset.paths import DATA_FILES
+from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, SPLITS
+from drakegrasp.dataset.statistics import Funnel, count_funnel, count_splits
+from drakegrasp.outcomes import Outcome
+
+#: What the licence is called of meshes for which none is stated.
+NOT_STATED = "not stated"
+#: Known limits, and the page of drakegrasp's docs that says more.
+LIMITS = (
+    ("Everything is simulated: no grasp was tried on a real robot.", "explanation/physics.md"),
+    (
+        "There is a free-floating hand and one rigid object of uniform density on a table: no arm, "
+        "no reachability, no clutter, no texture.",
+        "explanation/physics.md",
+    ),
+    (
+        "Labels depend on the drive of the fingers, on friction and mass, and up to three per cent "
+        "of what is simulated hangs on a hair.",
+        "benchmarks.md",
+    ),
+    (
+        "Samples are successes that passed the filters; what failed is in trials.hdf5, where "
+        "solver_error, timeout and crashed say nothing about a grasp.",
+        "reference/outcomes.md",
+    ),
+    (
+        "The palm poses are drawn: how often a region of an object is grasped says nothing about "
+        "how often people grasp it there.",
+        "explanation/physics.md",
+    ),
+    (
+        "Simulated values may differ on other machines and versions; what is drawn does not.",
+        "explanation/determinism.md",
+    ),
+)
+
+
+def card_content(out: Path) -> dict[str, Any]:
+    """Return what the card of a dataset says, as JSON types.
+
+    Args:
+        out: Directory of the dataset.
+
+    Raises:
+        DataError: If the manifest or one of the three files is missing or damaged.
+    """
+    manifest, funnel = read_manifest(out), count_funnel(out)
+    return {
+        "title": _title(manifest),
+        "hand": Path(manifest.config.hand).stem,
+        "schema_version": SCHEMA_VERSION,
+        "seed": manifest.config.seed,
+        "config_hash": manifest.config.simulation_hash(),
+        "settings": _settings(manifest.config),
+        "versions": manifest.versions,
+        "licences": licences(manifest),
+        "counts": _counts(out, funnel),
+        "refused": {mesh.name: mesh.reason for mesh in manifest.refused},
+        "conventions": CONVENTIONS,
+        "limits": [{"limit": text, "docs": f"docs/{page}"} for text, page in LIMITS],
+    }
+
+
+def licences(manifest: Manifest) -> dict[str, list[str]]:
+    """Return the objects' names by the licence of their meshes, in the order of the names."""
+    found: dict[str, list[str]] = {}
+    for entry in manifest.objects:
+        found.setdefault(entry.licence or NOT_STATED, []).append(entry.name)
+    return dict(sorted(found.items()))
+
+
+def _title(manifest: Manifest) -> str:
+    count = len(manifest.objects)
+    return f"Simulated grasps of {count} object{'s' * (count != 1)}"
+
+
+def _settings(config: Config) -> dict[str, Any]:
+    """Return the settings that a reader asks for first; the manifest has all of them."""
+    keys = {
+        "candidates": ("method", "max", "standoffs"),
+        "physics": ("friction_hand", "friction_table"),
+        "objects": ("mass",),
+        "lift": ("drive",),
+        "filters": ("require", "max_slip", "max_turn_deg"),
+        "camera": ("size",),
+    }
+    tree = config.to_dict()
+    return {f"{room}.{key}": tree[room][key] for room, names in keys.items() for key in names}
+
+
+def _counts(out: Path, funnel: Funnel) -> dict[str, Any]:
+    """Return the numbers of attempts, grasps and samples: of all, by class, object and split."""
+    samples = _samples_by_object(out)
+    rows = {name: _row(funnel, samples, [i]) for i, name in enumerate(funnel.names)}
+    members: dict[str, list[int]] = {}
+    for i, name in enumerate(funnel.classes):
+        members.setdefault(name, []).append(i)
+
+    outcomes, removals = funnel.outcomes.sum(axis=0), funnel.removals.sum(axis=0)
+    return {
+        "all": _row(funnel, samples, range(len(funnel.names))),
+        "outcomes": {o.label: int(outcomes[o]) for o in Outcome if outcomes[o]},
+        "removed": {
+            r.label: int(removals[r]) for r in Removal if r is not Removal.KEPT and removals[r]
+        },
+        "splits": {
+            row.split: {"samples": row.samples, "objects": row.objects, "classes": row.classes}
+            for row in count_splits(out)
+        },
+        "classes": {
+            name: {"objects": len(places), **_row(funnel, samples, places)}
+            for name, places in sorted(members.items())
+        },
+        "objects": {
+            name: {"class": kind, **rows[name]}
+            for name, kind in zip(funnel.names, funnel.classes, strict=True)
+        },
+    }
+
+
+def _row(
+    funnel: Funnel, samples: dict[str, dict[str, int]], objects: Iterable[int]
+) -> dict[str, int]:
+    """Return the counts of some objects together."""
+    places = list(objects)
+    names = [funnel.names[i] for i in places]
+    return {
+        "attempts": int(funnel.outcomes[places].sum()),
+        "held": int(funnel.outcomes[places, Outcome.SUCCESS].sum()),
+        "precision": int(funnel.precision[places].sum()),
+        "stable": int(funnel.stable[places].sum()),
+        "samples": int(funnel.removals[places, Removal.KEPT].sum()),
+        **{split: sum(samples[split].get(name, 0) for name in names) for split in SPLITS},
+    }
+
+
+def _samples_by_object(out: Path) -> dict[str, dict[str, int]]:
+    """Return the numbers of samples by split and object; the files were read before."""
+    found = {}
+    with open_hdf5(out / DATA_FILES["oto"]) as file:
+        for split in SPLITS:
+            names: npt.NDArray[Any] = file[split]["object_props/object_name"][:]
+            unique, counts = np.unique(names.astype(bytes), return_counts=True)
+            found[split] = {n.decode(): int(c) for n, c in zip(unique, counts, strict=True)}
+    return found

@@ -1,0 +1,118 @@
+"""The data card: its counts are those of the files, its bytes depend on nothing else."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from helpers.datasets import make_dataset
+
+from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.card.content import card_content
+from drakegrasp.dataset.card.text import card_text
+from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.manifest import read_manifest, write_manifest
+from drakegrasp.dataset.paths import CARD_FILES
+from drakegrasp.outcomes import Outcome
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("card")
+    (folder / "meshes").mkdir()
+    return make_dataset(folder / "out", folder / "meshes")
+
+
+@pytest.fixture
+def dataset(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "out"))
+
+
+def test_counts_are_those_of_the_files(dataset: Path) -> None:
+    counts = json.loads((dataset / CARD_FILES[0]).read_text(encoding="utf-8"))["counts"]
+    with (
+        h5py.File(dataset / "trials.hdf5") as trials,
+        h5py.File(dataset / "grasping_otm.hdf5") as data,
+    ):
+        names = trials["objects/name"].asstr()[:]
+        index, outcome = trials["trials/object"][:], trials["trials/outcome"][:]
+        assert list(counts["objects"]) == names.tolist()
+        for i, name in enumerate(names):
+            row, here = counts["objects"][name], index == i
+            assert row["attempts"] == here.sum()
+            assert row["held"] == (outcome[here] == Outcome.SUCCESS).sum()
+            assert row["stable"] == trials["trials/stable"][:][here].sum()
+            for split in ("train", "valid", "test"):
+                of = data[split]["object_props/object_name"].asstr()[:]
+                assert row[split] == np.count_nonzero(of == name)
+            assert row["samples"] == row["train"] + row["valid"] + row["test"]
+        assert counts["outcomes"] == {
+            o.label: int((outcome == o).sum()) for o in Outcome if (outcome == o).any()
+        }
+        for split in ("train", "valid", "test"):
+            assert counts["splits"][split]["samples"] == len(data[split]["grasps"]) > 0
+    for key in ("attempts", "held", "samples", "test"):
+        for part in ("objects", "classes"):
+            assert counts["all"][key] == sum(row[key] for row in counts[part].values()) > 0
+    assert {name: row["objects"] for name, row in counts["classes"].items()} == {
+        "box": 2,
+        "brick": 1,
+    }
+
+
+def test_text_has_the_counts_and_nothing_that_is_markup(dataset: Path) -> None:
+    content = card_content(dataset)
+    assert (dataset / CARD_FILES[1]).read_text(encoding="utf-8") == card_text(content)
+    row = content["counts"]["objects"].pop("3_brick")
+    content["counts"]["objects"]["<b>a|b"] = {**row, "attempts": 1234567}
+    text = card_text(content)
+    assert "| &lt;b&gt;a\\|b | brick | 1,234,567 |" in text
+    for each in content["limits"]:
+        assert each["limit"] in text
+
+
+def test_limits_name_pages_that_exist(dataset: Path) -> None:
+    root = Path(__file__).resolve().parents[3]
+    for each in card_content(dataset)["limits"]:
+        assert (root / each["docs"]).is_file()
+
+
+def test_the_same_dataset_has_the_same_bytes(dataset: Path) -> None:
+    before = [(dataset / name).read_bytes() for name in CARD_FILES]
+    assemble(dataset)
+    assert [(dataset / name).read_bytes() for name in CARD_FILES] == before
+
+
+def test_licences_are_those_of_the_manifest(dataset: Path) -> None:
+    manifest = read_manifest(dataset)
+    first, *others = manifest.objects
+    write_manifest(
+        replace(manifest, objects=(replace(first, licence="CC-BY-4.0"), *others)), dataset
+    )
+    assemble(dataset)
+    card = json.loads((dataset / CARD_FILES[0]).read_text(encoding="utf-8"))
+    assert card["licences"] == {
+        "CC-BY-4.0": [first.name],
+        "not stated": [entry.name for entry in others],
+    }
+
+
+def test_check_finds_the_card_of_other_files(dataset: Path) -> None:
+    assert check_dataset(dataset) == []
+    path = dataset / CARD_FILES[0]
+    content = json.loads(path.read_text(encoding="utf-8"))
+    content["counts"]["all"]["samples"] += 1
+    for text in (json.dumps(content), "[]", "{"):
+        path.write_text(text, encoding="utf-8")
+        (violation,) = check_dataset(dataset)
+        assert (violation.file, violation.what) == (
+            CARD_FILES[0],
+            "the data card must count what the files hold",
+        )
+    path.unlink()
+    assert check_dataset(dataset) == []

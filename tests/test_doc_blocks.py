@@ -1,0 +1,260 @@
+"""Every code block of README and docs is run by a test, or is in a list here that says why not."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+import yaml
+from click.testing import CliRunner
+from helpers.datasets import BOXES, make_dataset
+from helpers.meshes import write_fixed
+
+from drakegrasp.cli.main import main
+from drakegrasp.config import load_config
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.rejections import Decisions, write_decisions
+from drakegrasp.objects.sources import find_meshes
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+#: Lines of plain blocks that are not run as they stand, by how they begin, and why.
+NOT_RUN = {
+    "make ": "`make` runs this test",
+    "pip install ": "installing",
+    "ssh ": "another machine",
+    "dask ": "a cluster; tests/cluster starts one",
+    "python pipelines/submit_build.py ": "a cluster; tests/cluster/test_submit.py",
+    "python pipelines/measurements/": "measures for minutes to hours",
+    "drakegrasp build ": "simulates for minutes to hours; tests/build; with --plan it is run",
+    "drakegrasp objects export ": "makes hundreds of meshes; tests/objects/test_builtin.py",
+    "drakegrasp bench ": "measures for minutes to hours; tests/bench",
+    "drakegrasp inspect ": "serves until Ctrl-C; tests/inspection/test_serve.py",
+    "drakegrasp hand check ": "tests/commissioning/test_tutorial_hand.py runs it",
+    "pytest ": "these are tests",
+    "LD_PRELOAD=": "measures for minutes to hours",
+}
+#: Blocks that are no code, by their first lines, and what they are.
+NO_CODE = {
+    "demo/meshes/ ": "files of the demo",
+    "OUT/": "files of a dataset",
+    "OUT/manifest.json ": "files of a dataset",
+    "The grasp of 15_candlestick_short": "what `explain` says",
+    "ok    files ": "what `hand check` prints",
+    "api.py  ": "the calls of a build",
+    "f = S / (2 tan": "a formula",
+    "minimise ": "a formula",
+    "Σ_i ": "a formula",
+    "‖f_tangential‖": "a formula",
+}
+#: Blocks marked `py`: Python that is not run as it stands, by a part of it, and why.
+PY_NOT_RUN = {
+    "dg.build_dataset(": "simulates for hours; tests/test_api.py",
+    "datasets.load_dataset(": "tests/exchange/test_hub.py reads a folder so",
+    'dg.verify_grasp(grasp, "mug.obj"': "tests/verification/test_verify.py",
+    'dg.place_object("mug.obj"': "tests/verification/test_verify.py",
+}
+#: Commands that simulate, which want a dataset that was simulated.
+SIMULATED = ("replay", "verify")
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block: its page, its line there, its language and its lines."""
+
+    page: str
+    line: int
+    language: str
+    text: str
+
+    @property
+    def lines(self) -> list[str]:
+        """Without those that are empty, and with those in one that a backslash joins."""
+        joined = self.text.replace("\\\n", " ").splitlines()
+        return [line.strip() for line in joined if line.strip()]
+
+
+def blocks() -> list[Block]:
+    found = []
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        for match in re.finditer(r"^( *)```(\w*)\n(.*?)^ *```$", text, re.DOTALL | re.MULTILINE):
+            line = text[: match.start()].count("\n") + 1
+            found.append(Block(page.relative_to(ROOT).as_posix(), line, match[2], match[3]))
+    return found
+
+
+BLOCKS = blocks()
+
+
+def why_not(line: str) -> str | None:
+    """Return why a line of a plain block is not run; None if it is."""
+    if "--plan" in line and "--times" not in line:
+        return None
+    return next((why for start, why in NOT_RUN.items() if line.startswith(start)), None)
+
+
+def is_code(block: Block) -> bool:
+    return not any(block.lines[0].startswith(start) for start in NO_CODE)
+
+
+#: The lines that are run, each once, with the page and line of their block.
+LINES = {
+    shlex.join(shlex.split(line, comments=True)): f"{block.page}:{block.line}"
+    for block in BLOCKS
+    if block.language == "" and is_code(block)
+    for line in block.lines
+    if why_not(line) is None
+}
+
+
+def test_fences_are_paired() -> None:
+    """Else a block would begin where another ends."""
+    for page in PAGES:
+        fences = re.findall(r"^ *```.*$", page.read_text(encoding="utf-8"), re.MULTILINE)
+        assert len(fences) == 2 * sum(b.page == page.relative_to(ROOT).as_posix() for b in BLOCKS)
+
+
+def test_every_block_is_run_or_in_a_list() -> None:
+    assert len(BLOCKS) > 60
+    for block in BLOCKS:
+        where = f"{block.page}:{block.line}"
+        # Python: test_docs.py runs the blocks of a page. XML: the hand of the tutorial.
+        if block.language == "py":
+            assert any(part in block.text for part in PY_NOT_RUN), where
+        elif block.language == "":
+            known = [line for line in block.lines if line.startswith("drakegrasp ")]
+            if is_code(block):
+                rest = [line for line in block.lines if line not in known]
+                assert not [line for line in rest if why_not(line) is None], where
+        else:
+            assert block.language in ("python", "yaml", "xml"), where
+
+
+def test_lists_name_nothing_that_is_gone() -> None:
+    texts = "\n".join(line for block in BLOCKS for line in ["", *block.lines])
+    for start in (*NOT_RUN, *NO_CODE):
+        assert f"\n{start}" in texts, start
+    for part in PY_NOT_RUN:
+        assert any(part in block.text for block in BLOCKS if block.language == "py"), part
+
+
+def test_yaml_blocks_are_read(tmp_path: Path) -> None:
+    """As a configuration or as an objects.yaml; the hand file is the tutorial's."""
+    kinds = []
+    for block in BLOCKS:
+        if block.language != "yaml":
+            continue
+        content = yaml.safe_load(block.text)
+        if "objects" in content:
+            kinds.append("objects")
+            for name in content["objects"]:
+                trimesh.creation.box([0.05, 0.05, 0.1]).export(tmp_path / f"{name}.stl")
+            (tmp_path / "objects.yaml").write_text(block.text, encoding="utf-8")
+            said = next(iter(content["objects"].values()))
+            (source,) = find_meshes(tmp_path)
+            assert (source.name, source.class_name, source.up, source.licence) == tuple(
+                said[key] for key in ("name", "class", "up", "licence")
+            )
+        elif "fingers" in content:
+            kinds.append("hand")
+        else:
+            kinds.append("config")
+            path = tmp_path / "mine.yaml"
+            path.write_text(block.text, encoding="utf-8")
+            assert load_config(str(path)).to_dict() != load_config().to_dict()
+    assert sorted(kinds) == ["config", "hand", "objects"]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset that nobody simulated."""
+    folder = tmp_path_factory.mktemp("docs")
+    (folder / "meshes").mkdir()
+    return make_dataset(folder / "out", folder / "meshes")
+
+
+def meshes(folder: Path) -> Path:
+    """Write two meshes in centimetres."""
+    folder.mkdir()
+    for name in ("1_box_a", "2_box_b"):
+        trimesh.creation.box(100.0 * np.array(BOXES[name][0])).export(folder / f"{name}.stl")
+    return folder
+
+
+@pytest.mark.parametrize(
+    "line",
+    [line for line in LINES if line.split()[1] not in SIMULATED],
+    ids=lambda line: f"{LINES[line]} {line[:40]}",
+)
+def test_commands_of_the_docs_run(
+    line: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    out = Path(shutil.copytree(made, tmp_path / "OUT"))
+    if "MESHES" in line:
+        meshes(tmp_path / "MESHES")
+    with h5py.File(out / "trials.hdf5") as file:
+        first = int(file["successes/trial_id"][0])
+    (tmp_path / "rejected.txt").write_text(f"{first}  # an edge\n")
+    write_decisions(out / "reject.json", Decisions())
+
+    # `a|b|c` stands for each of them.
+    words = shlex.split(line)[1:]
+    choices = next((word.split("|") for word in words if "|" in word), [""])
+    for choice in choices:
+        done = CliRunner().invoke(main, [choice if "|" in word else word for word in words])
+        assert done.exit_code == 0, f"{LINES[line]}: {done.output}"
+        if "FOLDER" in words:
+            assert any((tmp_path / "FOLDER").iterdir())
+            shutil.rmtree(tmp_path / "FOLDER")
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "line",
+    [line for line in LINES if line.split()[1] in SIMULATED],
+    ids=lambda line: f"{LINES[line]} {line[:40]}",
+)
+def test_commands_that_simulate_run(
+    line: str, small_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "demo").mkdir()
+    for name in ("OUT", "demo/dataset"):
+        os.symlink(small_dataset, tmp_path / name, target_is_directory=True)
+    data = GraspDataset(small_dataset / "grasping_oto.hdf5", split="test")
+    words = shlex.split(line)[1:]
+
+    # The numbers of trials in the docs are of other datasets.
+    if "--trial" in words:
+        words[words.index("--trial") + 1] = str(data[0].trial_id)
+
+    # Predictions: of the dataset a stored grasp, of a mesh one of its sides.
+    if "--object" in words:
+        write_fixed(tmp_path, "10_box_tall")
+        box = trimesh.load_mesh(tmp_path / "10_box_tall.obj")
+        box.apply_scale(100.0).export(tmp_path / "mug.obj")
+        x = box.extents[0] / 200.0
+        grasp = [x, 0.01, 0.0, x, -0.01, 0.0, -x, 0.0, 0.0, 1, 0, 0, 1, 0, 0, -1, 0, 0]
+        np.save(tmp_path / "predictions.npy", np.array([grasp]))
+    elif "predictions.npy" in words:
+        np.save(tmp_path / "predictions.npy", data.column("grasps")[:1])
+    with h5py.File(tmp_path / "predictions.h5", "w") as file:
+        file["test/grasps"], file["test/rows"] = data.column("grasps")[:1], np.array([0])
+
+    done = CliRunner().invoke(main, words)
+    assert done.exit_code == 0, f"{LINES[line]}: {done.output}"
+    for option in ("--html", "--out"):
+        if option in words:
+            assert list(tmp_path.glob(f"{words[words.index(option) + 1]}*"))
