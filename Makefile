@@ -88,7 +88,7 @@ format: $(STAMP) ## let ruff lay out the code
 	$(BIN)/ruff format .
 
 docs: docs-pages ## the site of the docs in site/; every link must lead somewhere
-	PATH="$(abspath $(BIN)):$$PATH" NO_MKDOCS_2_WARNING=1 mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 docs-pages: $(STAMP)  ## write the pages of the docs that are made from code
 	$(BIN)/python pipelines/docs/dataset_format.py docs/reference/dataset-format.md

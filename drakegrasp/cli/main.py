@@ -18,10 +18,9 @@ from drakegrasp.cli.bench import bench
 from drakegrasp.cli.build import assemble, build, stats
 from drakegrasp.cli.errors import say
 from drakegrasp.cli.export import export
-from drakegrasp.cli.figures import figures
 from drakegrasp.cli.group import main
 from drakegrasp.cli.hand import hand
-from drakegrasp.cli.inspect import inspect_
+from drakegrasp.cli.inspect import figures, inspect_
 from drakegrasp.cli.morph import morph
 from drakegrasp.cli.options import (
     builtin_overrides,
