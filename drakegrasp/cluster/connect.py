@@ -7,6 +7,7 @@ import logging
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
@@ -115,7 +116,7 @@ def _start_local(
     workers: int | None, security: Security | None, memory: str | None
 ) -> Iterator[Client]:
     with _undisturbed_loop() as loop:
-        cluster = LocalCluster(
+        cluster = _LocalCluster(
             loop=loop,
             n_workers=workers or available_cores(),
             threads_per_worker=1,
@@ -128,6 +129,22 @@ def _start_local(
             yield client
 
 
+class _LocalCluster(LocalCluster):
+    """A cluster on this machine whose start may be interrupted.
+
+    Dask cannot close a cluster that has not started, and at the end of the program a traceback
+    would say so (distributed 2026.8). Its processes end with this one all the same.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        """Start the cluster, with the options of a `LocalCluster`."""
+        try:
+            super().__init__(**options)
+        except BaseException:
+            self._instances.discard(self)
+            raise
+
+
 @contextmanager
 def _undisturbed_loop() -> Iterator[IOLoop]:
     """Run an event loop in a thread that no Ctrl-C reaches, nor the processes that it starts.
@@ -135,6 +152,8 @@ def _undisturbed_loop() -> Iterator[IOLoop]:
     At a terminal Ctrl-C goes to every process. The client stops then, and its workers with it; one
     that has just begun to start would print a traceback instead.
     """
+    # The first process that a thread starts also starts this one, and clears the thread's mask.
+    resource_tracker.ensure_running()
     runner = LoopRunner()
     runner.start()
     try:
