@@ -14,6 +14,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import h5py
@@ -37,8 +38,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     # What the simulation reads of each patch, noted on the way.
     read, patches = contacts._read_faces, []
 
-    def note(*patch: object) -> object:
-        patches.append(faces := read(*patch))
+    def note(surface: Any, object_is_M: bool) -> Any:
+        patches.append(faces := read(surface, object_is_M))
         return faces
 
     with mock.patch.object(contacts, "_read_faces", note):
