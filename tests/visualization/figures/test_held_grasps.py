@@ -48,9 +48,11 @@ def test_approaches_are_of_one_object(boxes: Path, tmp_path: Path) -> None:
     found = read_approaches(boxes, 1, "2_box_b", config)
     assert found.attempts == 12
     assert found.groups.tolist() == [2, 2, 2]  # stable
-    # All palms are tilted by 0.25 rad; the one attempt whose ray misses approached nothing.
+    # All palms are tilted by 0.25 rad; the one attempt whose ray misses, row 7, approached nothing.
     np.testing.assert_allclose(found.successes[:, 2], np.cos(0.25), atol=1e-9)
-    assert len(found.directions) == 8
+    with h5py.File(boxes / TRIALS, "r") as file:
+        palms = file["trials/X_OG"][12:24][[1, 2, 4, 5, 6, 8, 9, 10]].reshape(-1, 3, 4)
+    np.testing.assert_allclose(found.directions, -palms[:, :, 2], atol=1e-9)
     with h5py.File(boxes / TRIALS, "r") as file:
         standoffs = np.array(config.candidates.drawn_standoffs)
         rows = file["trials/standoff_index"][12:24][[0, 3, 11]]

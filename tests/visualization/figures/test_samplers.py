@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
-from helpers.datasets import make_dataset
+from helpers.datasets import TRIALS, edit_file, make_dataset
 
 from drakegrasp.errors import DataError
+from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Candidates
 from drakegrasp.visualization.figures.samplers import compare_samplers, palm_rays
 
@@ -62,3 +65,17 @@ def test_rays_end_on_the_surface(boxes: Path) -> None:
     np.testing.assert_allclose(rays[:, 1], [[0.0, 0.0, 0.05], [0.0, 0.0, 0.05]], atol=1e-12)
     np.testing.assert_allclose(rays[:, 0], [[0.0, 0.0, 0.17], [0.0, 0.0, 0.17]], atol=1e-12)
     assert len(palm_rays(candidates, 0.12, 1)) == 1
+
+
+def test_attempts_that_the_simulator_did_not_decide_do_not_count(
+    boxes: Path, tmp_path: Path
+) -> None:
+    out = Path(shutil.copytree(boxes, tmp_path / "out"))
+
+    def time_out(file: h5py.File) -> None:
+        file["trials/outcome"][2] = Outcome.TIMEOUT
+
+    edit_file(out / TRIALS, time_out)
+    numbers = compare_samplers(out).numbers
+    assert numbers["of_object"]["rotations"]["attempts"] == 11
+    assert numbers["of_objects"]["rotations"]["attempts"] == 35
