@@ -24,7 +24,7 @@ from drakegrasp.dataset.manifest import REQUIRED_VERSIONS, installed_versions
 from drakegrasp.errors import MachineError, printable
 from drakegrasp.runtime import kernels
 from drakegrasp.runtime.blas import running_kernel
-from drakegrasp.runtime.journal import WALL_FACTOR
+from drakegrasp.runtime.journal import wall_limit
 from drakegrasp.runtime.kernels import KERNELS, agreed_kernel, common_kernel, supported_kernel
 from drakegrasp.vision.probe_image import probe_image
 
@@ -34,7 +34,7 @@ SATURATION = 1.0
 #: Time without a sign of life after which the scheduler gives a worker up [s]: longer than the
 #: limits of every step (see `runtime.journal`). A step that holds the interpreter gives none, and
 #: its journal tells more than the scheduler knows. A lost connection is noticed at once.
-SILENCE_SECONDS = 2.0 * WALL_FACTOR * PREPARE_SECONDS
+SILENCE_SECONDS = 2.0 * wall_limit(PREPARE_SECONDS)
 #: Topic of the messages from workers that join later.
 _TOPIC = "drakegrasp-admission"
 _MAY_DIFFER = "last bits of simulated values may differ"
