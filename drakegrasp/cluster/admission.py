@@ -24,7 +24,7 @@ from drakegrasp.dataset.manifest import REQUIRED_VERSIONS, installed_versions
 from drakegrasp.errors import MachineError, printable
 from drakegrasp.runtime import kernels
 from drakegrasp.runtime.blas import running_kernel
-from drakegrasp.runtime.journal import WALL_FACTOR
+from drakegrasp.runtime.journal import wall_limit
 from drakegrasp.runtime.kernels import KERNELS, agreed_kernel, common_kernel, supported_kernel
 from drakegrasp.vision.probe_image import probe_image
 
@@ -34,7 +34,7 @@ SATURATION = 1.0
 #: Time without a sign of life after which the scheduler gives a worker up [s]: longer than the
 #: limits of every step (see `runtime.journal`). A step that holds the interpreter gives none, and
 #: its journal tells more than the scheduler knows. A lost connection is noticed at once.
-SILENCE_SECONDS = 2.0 * WALL_FACTOR * PREPARE_SECONDS
+SILENCE_SECONDS = 2.0 * wall_limit(PREPARE_SECONDS)
 #: Topic of the messages from workers that join later.
 _TOPIC = "drakegrasp-admission"
 _MAY_DIFFER = "last bits of simulated values may differ"
@@ -120,7 +120,7 @@ class Admission(WorkerPlugin):  # type: ignore[misc]
         """Check and set up the worker; Dask calls this before it gives it any task."""
         os.environ.update(worker_environment())  # for a worker that was started by hand
         fault = unfitness(worker.state.nthreads, installed_versions(self._config), self._versions)
-        if fault is None and socket.gethostname() not in self._hosts:
+        if fault is None and _host() not in self._hosts:
             fault = _image_fault()
         if fault is not None:
             worker.log_event(_TOPIC, f"not used: worker {worker.address}: {fault}")
@@ -197,7 +197,7 @@ def _rendering_hosts(client: Client) -> frozenset[str]:
         MachineError: If there are workers, and none can render.
     """
     addresses: dict[str, list[str]] = {}
-    for address, host in client.run(socket.gethostname).items():
+    for address, host in client.run(_host).items():
         addresses.setdefault(host, []).append(address)
     if not addresses:
         return frozenset()  # those that join are asked then
@@ -212,6 +212,11 @@ def _rendering_hosts(client: Client) -> frozenset[str]:
         sys.stderr.write(f"not used: workers on {host}: {printable(str(faults[host]))}\n")
         client.retire_workers(addresses[host], close_workers=True)
     return frozenset(host for host in faults if host not in bad)
+
+
+def _host() -> str:
+    """Return the name of the machine that calls."""
+    return socket.gethostname()
 
 
 def _image_fault() -> str | None:

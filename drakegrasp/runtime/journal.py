@@ -49,8 +49,9 @@ NATIVE_DEATHS = 2
 #: Passed time limits in a row in one step after which it is not tried again: one may be due to a
 #: process that somebody suspended.
 HUNG_DEATHS = 2
-#: The limit of wall-clock time of a step, as a multiple of its limit of computing time.
-WALL_FACTOR = 3.0
+#: The limit of wall-clock time of a step: this multiple of its limit of computing time, for a
+#: machine that has far more to do than cores, but at most so much more [s].
+WALL_FACTOR, WALL_SECONDS = 10.0, 3600.0
 #: Deaths without a mark in a row in one step after which it is not tried again.
 SILENT_DEATHS = 8
 #: The same for preparing a mesh, which is one step.
@@ -165,7 +166,7 @@ class Journal:
         Args:
             name: Name of the step, up to 14 ASCII characters.
             seconds: Computing time [s] after which this process ends itself, wherever it is, and
-                a `WALL_FACTOR`-th of the wall-clock time; None for a step that cannot hang.
+                after `wall_limit` of it by the wall clock; None for a step that cannot hang.
         """
         if self._file is None:
             yield
@@ -176,7 +177,7 @@ class Journal:
         if seconds is not None:
             # Both alarms are in C: they also end a process that never returns to Python.
             signal.setitimer(signal.ITIMER_PROF, seconds)
-            faulthandler.dump_traceback_later(WALL_FACTOR * seconds, exit=True, file=self._file)
+            faulthandler.dump_traceback_later(wall_limit(seconds), exit=True, file=self._file)
         try:
             yield
         except MemoryError:
@@ -190,6 +191,11 @@ class Journal:
         # The next record clears it.
         if name in self.unresolved:
             self._passed |= 1 << self.unresolved.index(name)
+
+
+def wall_limit(seconds: float) -> float:
+    """Return the limit of wall-clock time [s] of a step with a limit of computing time [s]."""
+    return min(WALL_FACTOR * seconds, seconds + WALL_SECONDS)
 
 
 #: The journal of a process that is not started again when it dies: it records nothing.

@@ -19,10 +19,10 @@ from drakegrasp.runtime.journal import (
     NO_JOURNAL,
     PREPARE_DEATHS,
     SILENT_DEATHS,
-    WALL_FACTOR,
     Verdict,
     _History,
     open_journal,
+    wall_limit,
 )
 
 UNIT = {"name": "mug", "start": 0, "stop": 10}
@@ -106,7 +106,7 @@ def test_suspect_runs_first_and_is_cleared_by_passing(tmp_path: Path) -> None:
 def test_hang_costs_its_limit(tmp_path: Path) -> None:
     start = time.monotonic()
     run(tmp_path / "journal", "freeze:try 4")
-    assert 0.5 < time.monotonic() - start < 10.0
+    assert wall_limit(0.5) < time.monotonic() - start < 60.0
 
 
 def test_limit_is_of_computing_time(tmp_path: Path) -> None:
@@ -120,7 +120,7 @@ def test_limit_is_of_computing_time(tmp_path: Path) -> None:
     assert "try 4 HUNG" in run(path).stdout
 
 
-@pytest.mark.parametrize("seconds", [1.0, 4.0])
+@pytest.mark.parametrize("seconds", [1.0, 7.0])
 def test_suspended_process_is_not_convicted(tmp_path: Path, seconds: float) -> None:
     """Neither a stop beyond the limit of computing time, nor one beyond that of the wall clock."""
     path = tmp_path / "journal"
@@ -139,7 +139,7 @@ def test_suspended_process_is_not_convicted(tmp_path: Path, seconds: float) -> N
     time.sleep(seconds)
     process.send_signal(signal.SIGCONT)
     process.communicate("\n")
-    assert (process.returncode == 0) == (seconds < WALL_FACTOR * 0.5)
+    assert (process.returncode == 0) == (seconds < wall_limit(0.5))
     assert deaths_until_done(path)[0] == 0
 
 
