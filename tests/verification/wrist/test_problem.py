@@ -13,7 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from drakegrasp.frames import Array, invert_pose, make_pose, rotate_vectors, transform_points
 from drakegrasp.hand.description import Hand, load_hand
-from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses
+from drakegrasp.hand.kinematics import (
+    coordinate_limits,
+    fingertip_poses,
+    link_poses,
+    still_links,
+)
 from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.verification.wrist.hand_constants import hand_constants
 from drakegrasp.verification.wrist.pads import signed_distance
@@ -186,10 +191,17 @@ def test_clearance_is_the_lowest_corners_height_within_the_rounding(name: str, s
     at, hand = evaluate(problem, x), hand_of(name)
     shapes = link_shapes(hand)
     X_GF = fingertip_poses(hand, spread=x[POSE], closing=x[POSE + 1 :])
-    parts = [(invert_pose(hand.X_BG), hand.palm_link)]
-    parts += list(zip(X_GF, hand.fingertip_links, strict=True))
+    # The palm is all that no finger and no spread moves.
+    still = [link for link in still_links(hand) if shapes[link]]
+    assert hand.palm_link in still
+    rest = {"spread": 0.0, "closing": np.zeros(hand.num_fingers)}
+    palm = [(link_poses(hand, link, **rest), link) for link in still]
+    groups = [palm, *([part] for part in zip(X_GF, hand.fingertip_links, strict=True))]
     corners = [
-        transform_points(at.X_OG @ X_GB, np.concatenate(shapes[link])) for X_GB, link in parts
+        np.concatenate(
+            [transform_points(at.X_OG @ X, np.concatenate(shapes[link])) for X, link in group]
+        )
+        for group in groups
     ]
     exact = np.array([problem.height + (p @ problem.up_O).min() for p in corners])
     most = np.array([len(corners[0])] + [max(map(len, corners[1:]))] * hand.num_fingers)
