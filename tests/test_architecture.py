@@ -59,7 +59,7 @@ WALLS = {
         "bench",
     ),
     "pyarrow": ("exchange",),
-    "torch": ("dataset.torch_samples",),
+    "torch": ("dataset.loaders.torch_samples",),
 }
 #: Modules that name a type of a library for the type checker alone: what callers give or get.
 NAMES_TYPES = {("api", "distributed"), ("verification.result", "matplotlib")}

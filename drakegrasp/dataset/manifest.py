@@ -97,7 +97,9 @@ class ObjectEntry:
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry as JSON types, in the order of the manifest."""
-        return {"class" if key == "class_name" else key: v for key, v in asdict(self).items()}
+        # What is not stated leaves no trace.
+        said = {key: v for key, v in asdict(self).items() if (key, v) != ("licence", None)}
+        return {"class" if key == "class_name" else key: v for key, v in said.items()}
 
 
 def _refuse_no_name(text: Any) -> None:

@@ -26,7 +26,7 @@ from drakegrasp.dataset.schema import DATA_FIELDS, SPLITS, refuse_other_schema
 from drakegrasp.errors import DataError, MachineError
 
 if TYPE_CHECKING:
-    from drakegrasp.dataset.torch_samples import TorchSamples
+    from drakegrasp.dataset.loaders.torch_samples import TorchSamples
 
 #: The fields of a sample, by name.
 FIELDS = {field.name: field for field in DATA_FIELDS}
@@ -178,7 +178,7 @@ class GraspDataset:
         _refuse_other_fields(fields)
         if find_spec("torch") is None:
             raise MachineError("to_torch needs torch, got none: pip install 'drakegrasp[torch]'")
-        from drakegrasp.dataset.torch_samples import TorchSamples
+        from drakegrasp.dataset.loaders.torch_samples import TorchSamples
 
         return TorchSamples(self, fields)
 

@@ -94,6 +94,7 @@ def test_licences_are_those_of_the_manifest(dataset: Path) -> None:
     write_manifest(
         replace(manifest, objects=(replace(first, licence="CC-BY-4.0"), *others)), dataset
     )
+    assert read_manifest(dataset).objects[0].licence == "CC-BY-4.0"
     assemble(dataset)
     card = json.loads((dataset / CARD_FILES[0]).read_text(encoding="utf-8"))
     assert card["licences"] == {

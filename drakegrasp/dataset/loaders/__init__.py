@@ -1,0 +1,1 @@
+"""Loaders: the samples of a dataset for a library of machine learning."""
