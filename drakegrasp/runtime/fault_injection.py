@@ -36,12 +36,15 @@ def inject_fault(*place: str | int) -> None:
 
 
 def _cause(kind: str) -> None:
+    # The process ends.
     if kind == "crash":
         ctypes.string_at(0)  # a segmentation fault
     elif kind == "abort":
         os.abort()
     elif kind == "exit":
         os._exit(3)
+
+    # It never returns.
     elif kind == "hang":
         while True:  # in C, without the interpreter's lock, like a simulation
             ctypes.CDLL(None).pause()
@@ -50,6 +53,8 @@ def _cause(kind: str) -> None:
     elif kind == "spin":
         while True:  # computes; the others only wait
             pass
+
+    # An error of Python.
     elif kind == "memory":
         raise MemoryError
     elif kind == "blank":
