@@ -139,7 +139,9 @@ def test_suspended_process_is_not_convicted(tmp_path: Path, seconds: float) -> N
     time.sleep(seconds)
     process.send_signal(signal.SIGCONT)
     process.communicate("\n")
-    assert (process.returncode == 0) == (seconds < wall_limit(0.5))
+
+    # Beyond the limit of the wall clock it may end first; it is convicted of nothing.
+    assert process.returncode == 0 or seconds > wall_limit(0.5)
     assert deaths_until_done(path)[0] == 0
 
 
