@@ -80,16 +80,30 @@ def _is_elsewhere(dataset: h5py.h5d.DatasetID) -> bool:
     return made.get_external_count() > 0 or made.get_layout() == h5py.h5d.VIRTUAL
 
 
+def read_texts(dataset: h5py.Dataset) -> tuple[str, ...]:
+    """Return the texts of a dataset, to be shown: none steers a terminal.
+
+    Raises:
+        DataError: If one of them is no text or cannot be printed.
+    """
+    path = dataset.file.filename
+    try:
+        texts = tuple(dataset.asstr()[:].tolist())
+    except (TypeError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: must hold names, got others ({error})") from None
+    for text in texts:
+        if not text.isprintable():
+            raise DataError(f"{path}: a name must be printable, got {text!r}")
+    return texts
+
+
 def read_names(dataset: h5py.Dataset) -> tuple[str, ...]:
-    """Return the names of objects or classes in a dataset of texts.
+    """Return the names of objects in a dataset of texts, which may become names of files.
 
     Raises:
         DataError: If one of them is none.
     """
-    try:
-        names = tuple(dataset.asstr()[:].tolist())
-    except (TypeError, UnicodeDecodeError) as error:
-        raise DataError(f"{dataset.file.filename}: must hold names, got others ({error})") from None
+    names = read_texts(dataset)
     for name in names:
         if not is_name(name):
             raise DataError(f"{dataset.file.filename}: a name must be {NAME_RULE}, got {name!r}")

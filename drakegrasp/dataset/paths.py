@@ -39,6 +39,11 @@ def plan_path(out: Path, name: str) -> Path:
     return out / "objects" / f"{_file_name(name)}.plan.h5"
 
 
+def shards_folder(out: Path, name: str) -> Path:
+    """Return the folder of an object's shards."""
+    return out / "shards" / _file_name(name)
+
+
 def _file_name(name: str) -> str:
     """Return a name that leads to no other folder.
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.filters import Removal
-from drakegrasp.dataset.hdf5 import open_hdf5, read_names
+from drakegrasp.dataset.hdf5 import open_hdf5, read_texts
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.samples import shards_sha256
@@ -151,7 +151,7 @@ def count_funnel(out: Path) -> Funnel:
         with open_hdf5(out / TRIALS_FILE) as file:
             refuse_other_schema(out / TRIALS_FILE, file.attrs["schema_version"])
             objects = {name: values[:] for name, values in file["objects"].items()}
-            names, classes = (read_names(file["objects"][key]) for key in ("name", "class_name"))
+            names, classes = (read_texts(file["objects"][key]) for key in ("name", "class_name"))
             index = file["trials/object"][:]
             outcome = file["trials/outcome"][:]
             words = {word: file[f"trials/{word}"][:] for word in WORDS}

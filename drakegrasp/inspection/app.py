@@ -30,9 +30,8 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from drakegrasp.dataset.paths import model_path
 from drakegrasp.errors import DataError, DrakegraspError
-from drakegrasp.inspection.catalog import Catalog, Snapshot
+from drakegrasp.inspection.catalog import Catalog, Snapshot, find_model
 from drakegrasp.inspection.decisions import DecisionFile
 from drakegrasp.inspection.links import ServerLinks
 from drakegrasp.inspection.pages import gallery_page, grasp_page, render
@@ -250,9 +249,10 @@ def _mesh(inspection: Inspection, request: Request) -> Response:
         if kind == "link":
             return Response(inspection.hand.glb(number), media_type="model/gltf-binary")
         if kind == "object":
-            path = model_path(snapshot.out, snapshot.names[number])
-            content = object_mesh(path, path.stat().st_mtime_ns)
-            return Response(content, media_type="model/gltf-binary")
+            path = find_model(snapshot.out, snapshot.names[number])
+            if path is not None:
+                content = object_mesh(path, path.stat().st_mtime_ns)
+                return Response(content, media_type="model/gltf-binary")
     except (IndexError, FileNotFoundError):
         pass
     raise HTTPException(404, "there is no such mesh")

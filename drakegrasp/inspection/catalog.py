@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import Config, parse_config
-from drakegrasp.dataset.hdf5 import open_hdf5, read_names
+from drakegrasp.dataset.hdf5 import open_hdf5, read_texts
 from drakegrasp.dataset.manifest import Manifest, read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, FILE_NAME, TRIALS_FILE, model_path
 from drakegrasp.dataset.rejections import AttemptKey
@@ -32,6 +32,7 @@ from drakegrasp.inspection.table import (
     read_shard_part,
     read_trials_table,
 )
+from drakegrasp.runtime.names import is_name
 
 #: While a build runs, its new shards are looked for this often [s].
 LISTING_PERIOD = 5.0
@@ -158,6 +159,15 @@ class Catalog:
         )
 
 
+def find_model(out: Path, name: str) -> Path | None:
+    """Return the file of an object's meshes, or None if it is not there.
+
+    A stranger's dataset may hold names that no file can have; they are shown as they are.
+    """
+    path = model_path(out, name) if is_name(name) else None
+    return path if path is not None and path.is_file() else None
+
+
 def _read_assembled(out: Path) -> Snapshot:
     """Return the state of a dataset with a trials.hdf5; nothing else has to be there."""
     # Objects and configuration.
@@ -166,7 +176,7 @@ def _read_assembled(out: Path) -> Snapshot:
         with open_hdf5(path) as file:
             refuse_other_schema(path, file.attrs["schema_version"])
             config = parse_config(json.loads(file.attrs["config"]))
-            names, classes = (read_names(file["objects"][key]) for key in ("name", "class_name"))
+            names, classes = (read_texts(file["objects"][key]) for key in ("name", "class_name"))
     except (OSError, KeyError, ValueError, ConfigError) as error:
         raise DataError(f"{path}: must be the trials of a dataset, got none ({error})") from None
 
@@ -176,7 +186,7 @@ def _read_assembled(out: Path) -> Snapshot:
         for name in DATA_FILES.values()
         if not (out / name).is_file()
     ]
-    gone = [name for name in names if not model_path(out, name).is_file()]
+    gone = [name for name in names if find_model(out, name) is None]
     if gone:
         missing.append(f"{len(gone):,} of {len(names):,} objects have no mesh: no 3D view of them.")
 

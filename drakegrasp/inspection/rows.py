@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.hdf5 import open_hdf5
-from drakegrasp.dataset.paths import DATA_FILES
+from drakegrasp.dataset.paths import DATA_FILES, shards_folder
 from drakegrasp.dataset.schema import SPLITS, TRIAL_FIELDS
 from drakegrasp.dataset.shards import ASSEMBLED_FIELDS
 from drakegrasp.errors import DataError
@@ -125,7 +125,7 @@ def _shard_path(snapshot: Snapshot, i: int) -> Path:
     """Return the path of the shard that holds an attempt; its end is that of the object's poses."""
     key, step = snapshot.key(i), snapshot.config.unit_candidates
     start = key.candidate // step * step
-    (path,) = (snapshot.out / "shards" / key.object).glob(f"{start:07d}-*.h5")
+    (path,) = shards_folder(snapshot.out, key.object).glob(f"{start:07d}-*.h5")
     return path
 
 

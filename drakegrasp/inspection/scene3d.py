@@ -17,10 +17,9 @@ import numpy as np
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
-from drakegrasp.dataset.paths import model_path
 from drakegrasp.errors import DrakegraspError
 from drakegrasp.frames import Array, rotate_vectors, transform_points, unpack_pose
-from drakegrasp.inspection.catalog import Snapshot
+from drakegrasp.inspection.catalog import Snapshot, find_model
 from drakegrasp.outcomes import Outcome
 
 #: Object meshes that are kept in memory.
@@ -116,10 +115,11 @@ def scene_of(snapshot: Snapshot, i: int, row: Mapping[str, Any], hand: HandView)
         links = hand.poses(X_TG_held, row["lifted_q"], spread)
         states["lifted"] = {"links": links, "contacts": _contacts(row, "lifted", X_TO)}
 
+    name = snapshot.names[snapshot.table.object[i]]
     return {
         "object": _columns(X_TO),
         "objectNumber": int(snapshot.table.object[i]),
-        "hasObject": model_path(snapshot.out, snapshot.names[snapshot.table.object[i]]).is_file(),
+        "hasObject": find_model(snapshot.out, name) is not None,
         "links": len(hand.links),
         "states": states,
         "success": bool(snapshot.table.outcome[i] == Outcome.SUCCESS),

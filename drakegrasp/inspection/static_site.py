@@ -13,12 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from drakegrasp.dataset.paths import model_path
 from drakegrasp.dataset.rejections import FILE_NAME, read_decisions
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import DataError
 from drakegrasp.inspection.app import ASSETS
-from drakegrasp.inspection.catalog import Catalog, Snapshot
+from drakegrasp.inspection.catalog import Catalog, Snapshot, find_model
 from drakegrasp.inspection.links import FileLinks
 from drakegrasp.inspection.pages import gallery_page, grasp_page, render
 from drakegrasp.inspection.plots import PLOTS, plot_svg, plots_values
@@ -89,8 +88,8 @@ def _write_meshes(snapshot: Snapshot, folder: Path, hand: HandView, places: np.n
     for number in range(len(hand.links)):
         _write_mesh(folder, f"link-{number}", hand.glb(number))
     for number in np.unique(snapshot.table.object[places]).tolist():
-        path = model_path(snapshot.out, snapshot.names[number])
-        if path.is_file():
+        path = find_model(snapshot.out, snapshot.names[number])
+        if path is not None:
             _write_mesh(folder, f"object-{number}", object_mesh(path, path.stat().st_mtime_ns))
 
 
