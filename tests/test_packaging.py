@@ -82,12 +82,12 @@ def test_environment_runs_the_wheel_and_not_the_checkout(installed: Path, tmp_pa
 
 
 def test_every_module_of_the_wheel_can_be_imported(installed: Path, tmp_path: Path) -> None:
-    """All but what needs the extra `peer`; the public names, the hand and the presets, too."""
+    """All but what needs the extras `peer` and `slurm`; public names, hand and presets, too."""
     code = """
 import importlib, pkgutil, drakegrasp
 names = [m.name for m in pkgutil.walk_packages(drakegrasp.__path__, "drakegrasp.")]
 for name in names:
-    if not name.startswith("drakegrasp.bench.mujoco_"):
+    if not name.startswith(("drakegrasp.bench.mujoco_", "drakegrasp.cluster.slurm_job")):
         importlib.import_module(name)
 for name in drakegrasp.__all__:
     getattr(drakegrasp, name)

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-if TYPE_CHECKING:
-    from drakegrasp.cli.errors import say
-from drakegrasp.commissioning.finding import Finding
+from drakegrasp.cli.errors import say
 from drakegrasp.errors import printable
+
+if TYPE_CHECKING:
+    from drakegrasp.commissioning.finding import Finding
 
 
 @click.group()

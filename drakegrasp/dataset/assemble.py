@@ -17,7 +17,8 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.card.files import write_card
+from drakegrasp.dataset.card.content import content_of
+from drakegrasp.dataset.card.files import card_files
 from drakegrasp.dataset.filters import Removal, Successes, judge_successes, split_samples
 from drakegrasp.dataset.hdf5 import AnyArray, create_field, open_hdf5, write_field
 from drakegrasp.dataset.lock import build_lock
@@ -120,7 +121,8 @@ def assemble_locked(
     sweep_temporary(out)
     with disk_full_named(out), replaced_together(out) as new:
         # First pass: copy the trials, and learn of each success what the filters need.
-        with new_hdf5(new(TRIALS_FILE)) as trials:
+        trials_path = new(TRIALS_FILE)
+        with new_hdf5(trials_path) as trials:
             slices, successes = _write_trials(trials, out, manifest, progress)
 
             # Decide which successes are samples, and in which split.
@@ -136,8 +138,9 @@ def assemble_locked(
 
         # Second pass: copy the samples. It reads the shards again, because the split of a sample
         # depends on the successes of all shards, and their images do not fit into memory.
+        data_paths = {camera: new(DATA_FILES[camera]) for camera in CAMERAS}
         with ExitStack() as stack:
-            files = {c: stack.enter_context(new_hdf5(new(DATA_FILES[c]))) for c in CAMERAS}
+            files = {c: stack.enter_context(new_hdf5(path)) for c, path in data_paths.items()}
             for camera, file in files.items():
                 _write_attributes(file, manifest, {**origin, "camera": camera})
                 create_splits(file, ids, slices[0].shapes)
@@ -145,12 +148,12 @@ def assemble_locked(
                 write_samples(files, out, shard_slice, ids)
                 progress(done, 2 * len(slices))
 
-        # Filters, split and rejections change with the files that they made.
+        # What the files hold, in words and numbers. Filters, split and rejections change with the
+        # files that they made.
+        content = content_of(manifest, trials_path, data_paths["oto"])
+        for name, text in card_files(content).items():
+            new(name).write_bytes(text)
         new(FILE_NAME).write_bytes(manifest_text(manifest))
-
-    # What the files hold, in words and numbers.
-    with disk_full_named(out):
-        write_card(out)
     return summarise(out)
 
 

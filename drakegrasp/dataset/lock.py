@@ -102,7 +102,9 @@ def _claim(out: Path) -> str:
     key = os.path.realpath(out)
     with _claiming:
         if key in _held:
-            raise _refusal(out / FILE_NAME, None, certain=True, who="another thread of this one")
+            raise _refusal(
+                out / FILE_NAME, None, certain=True, who="this process, which has it already"
+            )
         _held.add(key)
     return key
 

@@ -146,10 +146,15 @@ def count_funnel(out: Path) -> Funnel:
     Raises:
         DataError: If trials.hdf5 is missing or damaged.
     """
+    return funnel_of(out / TRIALS_FILE)
+
+
+def funnel_of(path: Path) -> Funnel:
+    """Return the funnel that a file of trials tells, as `count_funnel`."""
     # The columns that are counted, whole: a few bytes per trial.
     try:
-        with open_hdf5(out / TRIALS_FILE) as file:
-            refuse_other_schema(out / TRIALS_FILE, file.attrs["schema_version"])
+        with open_hdf5(path) as file:
+            refuse_other_schema(path, file.attrs["schema_version"])
             objects = {name: values[:] for name, values in file["objects"].items()}
             names, classes = (read_texts(file["objects"][key]) for key in ("name", "class_name"))
             index = file["trials/object"][:]
@@ -158,7 +163,7 @@ def count_funnel(out: Path) -> Funnel:
             success = file["successes/trial_id"][:]
             removal = file["successes/removal"][:]
     except (OSError, KeyError) as error:
-        raise DataError(f"{out}: must hold {TRIALS_FILE}, got none ({error})") from None
+        raise DataError(f"{path.parent}: must hold {path.name}, got none ({error})") from None
 
     count = len(objects["name"])
     return Funnel(
@@ -180,7 +185,11 @@ def count_splits(out: Path) -> list[SplitCount]:
     Raises:
         DataError: If the data files are missing or damaged.
     """
-    path = out / DATA_FILES["oto"]
+    return splits_of(out / DATA_FILES["oto"])
+
+
+def splits_of(path: Path) -> list[SplitCount]:
+    """Return what a data file tells of its splits, as `count_splits`."""
     try:
         with open_hdf5(path) as file:
             refuse_other_schema(path, file.attrs["schema_version"])

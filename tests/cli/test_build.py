@@ -27,6 +27,7 @@ from drakegrasp.cli.main import main
 from drakegrasp.config import Config
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.paths import CARD_FILES
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.objects.sources import find_meshes
@@ -37,6 +38,8 @@ from drakegrasp.runtime.progress import silent
 from drakegrasp.simulation.trial import TrialRecord
 
 FILES = (OTO, OTM, TRIALS)
+#: Assembling renames these, the card, the manifest, and before them the list of them all.
+RENAMES = len(FILES) + len(CARD_FILES) + 2
 #: A filter that would remove every sample.
 SLIPPED = ("--set", f"filters.max_slip={SLIP / 2}")
 
@@ -139,9 +142,9 @@ for left, copy in enumerate(copies):
 
 @pytest.fixture(scope="module")
 def killed(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """A dataset whose assembling was killed at each of its five renames."""
+    """A dataset whose assembling was killed at each of its seven renames."""
     folder = tmp_path_factory.mktemp("killed")
-    copies = [Path(shutil.copytree(whole, folder / str(k))) for k in range(5)]
+    copies = [Path(shutil.copytree(whole, folder / str(k))) for k in range(RENAMES)]
     command = [sys.executable, "-c", DIE, SLIPPED[1], *map(str, copies)]
     subprocess.run(command, check=True, capture_output=True)
     return copies
@@ -159,7 +162,7 @@ def samples(out: Path) -> list[int]:
 
 
 @pytest.mark.parametrize("command", ["stats", "check", "assemble"])
-@pytest.mark.parametrize("rename", range(5))
+@pytest.mark.parametrize("rename", range(RENAMES))
 def test_files_appear_together_whenever_assembling_is_killed(
     killed: list[Path], tmp_path: Path, rename: int, command: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -177,7 +180,8 @@ def test_files_appear_together_whenever_assembling_is_killed(
     # The next command leaves files of one state, and nothing else.
     assert run(command, out).exit_code == 0
     assert samples(out) == ([0] * 4 if rename else [9] * 4)
-    assert sorted(os.listdir(out)) == sorted(["manifest.json", "objects", "shards", *FILES])
+    whole = ["manifest.json", "objects", "shards", *FILES, *CARD_FILES]
+    assert sorted(os.listdir(out)) == sorted(whole)
 
 
 def test_files_of_two_states_are_a_finding(out: Path) -> None:

@@ -17,9 +17,9 @@ from drakegrasp.config import Config
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.manifest import Manifest, read_manifest
-from drakegrasp.dataset.paths import DATA_FILES
+from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, SPLITS
-from drakegrasp.dataset.statistics import Funnel, count_funnel, count_splits
+from drakegrasp.dataset.statistics import Funnel, funnel_of, splits_of
 from drakegrasp.outcomes import Outcome
 
 #: What the licence is called of meshes for which none is stated.
@@ -63,7 +63,20 @@ def card_content(out: Path) -> dict[str, Any]:
     Raises:
         DataError: If the manifest or one of the three files is missing or damaged.
     """
-    manifest, funnel = read_manifest(out), count_funnel(out)
+    return content_of(read_manifest(out), out / TRIALS_FILE, out / DATA_FILES["oto"])
+
+
+def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
+    """Return what the card says of a manifest and of files that may not have their names yet.
+
+    Args:
+        manifest: Of the dataset.
+        trials: Its trials.hdf5.
+        data: One of its data files.
+
+    Raises:
+        DataError: If one of the files is missing or damaged.
+    """
     return {
         "title": _title(manifest),
         "hand": Path(manifest.config.hand).stem,
@@ -73,7 +86,7 @@ def card_content(out: Path) -> dict[str, Any]:
         "settings": _settings(manifest.config),
         "versions": manifest.versions,
         "licences": licences(manifest),
-        "counts": _counts(out, funnel),
+        "counts": _counts(data, funnel_of(trials)),
         "refused": {mesh.name: mesh.reason for mesh in manifest.refused},
         "conventions": CONVENTIONS,
         "limits": [{"limit": text, "docs": f"docs/{page}"} for text, page in LIMITS],
@@ -107,9 +120,9 @@ def _settings(config: Config) -> dict[str, Any]:
     return {f"{room}.{key}": tree[room][key] for room, names in keys.items() for key in names}
 
 
-def _counts(out: Path, funnel: Funnel) -> dict[str, Any]:
+def _counts(data: Path, funnel: Funnel) -> dict[str, Any]:
     """Return the numbers of attempts, grasps and samples: of all, by class, object and split."""
-    samples = _samples_by_object(out)
+    samples = _samples_by_object(data)
     rows = {name: _row(funnel, samples, [i]) for i, name in enumerate(funnel.names)}
     members: dict[str, list[int]] = {}
     for i, name in enumerate(funnel.classes):
@@ -124,7 +137,7 @@ def _counts(out: Path, funnel: Funnel) -> dict[str, Any]:
         },
         "splits": {
             row.split: {"samples": row.samples, "objects": row.objects, "classes": row.classes}
-            for row in count_splits(out)
+            for row in splits_of(data)
         },
         "classes": {
             name: {"objects": len(places), **_row(funnel, samples, places)}
@@ -153,10 +166,10 @@ def _row(
     }
 
 
-def _samples_by_object(out: Path) -> dict[str, dict[str, int]]:
+def _samples_by_object(data: Path) -> dict[str, dict[str, int]]:
     """Return the numbers of samples by split and object; the files were read before."""
     found = {}
-    with open_hdf5(out / DATA_FILES["oto"]) as file:
+    with open_hdf5(data) as file:
         for split in SPLITS:
             names: npt.NDArray[Any] = file[split]["object_props/object_name"][:]
             unique, counts = np.unique(names.astype(bytes), return_counts=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 from drakegrasp.dataset.card.content import card_content
 from drakegrasp.dataset.card.text import card_text
@@ -21,7 +22,15 @@ def write_card(out: Path) -> None:
         DataError: If a file of the dataset is missing or damaged.
         OSError: If the disk is full.
     """
-    content = card_content(out)
+    for name, text in card_files(card_content(out)).items():
+        write_atomic(out / name, text)
+
+
+def card_files(content: dict[str, Any]) -> dict[str, bytes]:
+    """Return the bytes of both files by their names.
+
+    Args:
+        content: Of the card, see `card_content`.
+    """
     text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
-    for name, each in zip(CARD_FILES, (text, card_text(content)), strict=True):
-        write_atomic(out / name, each.encode())
+    return dict(zip(CARD_FILES, (text.encode(), card_text(content).encode()), strict=True))

@@ -106,7 +106,8 @@ def _check_directory(out: Path, stack: ExitStack, findings: Findings, report: Re
             context.add(data, consistency.kept_are_samples(data, trials))
     if len(files) == len(CAMERAS) and all(data.config for data in files.values()):
         check_pair(files[CAMERAS[0]], files[CAMERAS[1]], findings)
-    _check_card(out, findings)
+    if not findings.violations():
+        _check_card(out, findings)  # else it would differ for the same cause
 
 
 def _open_files(out: Path, stack: ExitStack, findings: Findings) -> dict[str, OpenFile]:
