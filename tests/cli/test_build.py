@@ -272,7 +272,7 @@ def test_build_connects_with_the_certificates_that_it_is_given(
 
 @pytest.mark.cluster
 @pytest.mark.slow
-@pytest.mark.parametrize("seconds", [0.0, 1.0, 3.0])
+@pytest.mark.parametrize("seconds", [0.5, 1.0, 3.0])
 def test_ctrl_c_while_workers_start_is_one_line(tmp_path: Path, seconds: float) -> None:
     """It reaches every process of the terminal, also those that have just begun."""
     (tmp_path / "meshes").mkdir()
