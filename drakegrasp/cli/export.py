@@ -10,12 +10,12 @@ from drakegrasp.cli.errors import say
 from drakegrasp.cli.options import out_argument
 
 #: The formats as the help lists them; loading them would take longer than printing the help.
-FORMATS = ("hub", "original", "dexgraspbench", "glb")
+FORMATS = ("hf", "original", "dexgraspbench", "glb")
 
 
 @click.command()
 @out_argument
-@click.argument("directory", type=click.Path(path_type=Path))
+@click.argument("directory", type=click.Path(path_type=Path), required=False)
 @click.option("--to", "form", type=click.Choice(FORMATS), required=True, help="The format.")
 @click.option(
     "--license",
@@ -23,16 +23,16 @@ FORMATS = ("hub", "original", "dexgraspbench", "glb")
     metavar="ID",
     default="unknown",
     show_default=True,
-    help="Licence that the card of format hub names, e.g. cc-by-4.0.",
+    help="Licence that the card of format hf names, e.g. cc-by-4.0.",
 )
 @click.option("--quiet", is_flag=True, help="Show no progress.")
-def export(out: Path, directory: Path, form: str, licence: str, quiet: bool) -> None:
+def export(out: Path, directory: Path | None, form: str, licence: str, quiet: bool) -> None:
     """Write the samples of a dataset in another format.
 
-    DIRECTORY must be new or empty.
+    DIRECTORY must be new or empty.  [default: OUT/export_FORMAT]
 
     \b
-    hub            Parquet, a dataset card and Croissant metadata, as the Hugging
+    hf             Parquet, a dataset card and Croissant metadata, as the Hugging
                    Face Hub has them; needs pip install 'drakegrasp[hub]'
     original       HDF5 as of the paper's released code: depth first, 27 numbers
                    a grasp, axes of its cameras
@@ -42,6 +42,7 @@ def export(out: Path, directory: Path, form: str, licence: str, quiet: bool) -> 
     from drakegrasp.exchange.export import export_dataset
     from drakegrasp.runtime.progress import progress_bar
 
+    directory = out / f"export_{form}" if directory is None else directory
     with progress_bar("export", "sample", show=not quiet) as progress:
         count = export_dataset(out, directory, form, licence=licence, progress=progress)  # type: ignore[arg-type]
     say(f"{count:,} samples in {directory}")

@@ -17,8 +17,8 @@ from drakegrasp.errors import DataError
 from drakegrasp.runtime.files import atomic_folder
 from drakegrasp.runtime.progress import Report, silent
 
-#: `hub` needs the extra `[hub]`.
-Format = Literal["hub", "original", "dexgraspbench", "glb"]
+#: `hf` needs the extra `[hub]`.
+Format = Literal["hf", "original", "dexgraspbench", "glb"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 
 
@@ -36,7 +36,7 @@ def export_dataset(
         out: Directory of the dataset.
         directory: Where to write; it must be new or empty, and appears when it is complete.
         form: One of `FORMATS`.
-        licence: Identifier of the licence in the card of format `hub`.
+        licence: Identifier of the licence in the card of format `hf`.
         progress: Called with the number of samples done and of all.
 
     Raises:
@@ -61,7 +61,7 @@ def export_dataset(
 
 def _writer(form: Format, licence: str) -> Callable[[Path, Path, Report], int]:
     """Return the function that writes a format; its libraries are loaded when it is asked for."""
-    if form == "hub":
+    if form == "hf":
         from drakegrasp.exchange.hub import write_hub
 
         return partial(write_hub, licence=licence)

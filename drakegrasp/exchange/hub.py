@@ -50,7 +50,7 @@ def write_hub(out: Path, folder: Path, progress: Report, *, licence: str) -> int
         import pyarrow  # noqa: F401
     except ModuleNotFoundError:
         raise MachineError(
-            "format hub needs pyarrow, got none: pip install 'drakegrasp[hub]'"
+            "format hf needs pyarrow, got none: pip install 'drakegrasp[hub]'"
         ) from None
 
     # The Parquet files of each camera and split.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -52,6 +53,13 @@ def test_missing_dataset_is_refused_before_anything_is_written(tmp_path: Path) -
     with pytest.raises(DataError, match="must be a data file of drakegrasp"):
         export_dataset(tmp_path / "out", tmp_path / "to", "original")
     assert not list(tmp_path.iterdir())
+
+
+def test_samples_go_into_the_dataset_by_default(dataset: Path, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(dataset, tmp_path / "out"))
+    done = CliRunner().invoke(main, ["export", str(out), "--to", "original"])
+    assert done.exit_code == 0
+    assert (out / "export_original" / "grasping_oto.hdf5").is_file()
 
 
 def test_export_that_fails_leaves_nothing(

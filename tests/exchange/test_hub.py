@@ -52,7 +52,7 @@ print(json.dumps({"rows": found, "croissant": counts}))
 @pytest.fixture(scope="module")
 def folder(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     to = tmp_path_factory.mktemp("hub") / "to"
-    export_dataset(dataset, to, "hub", licence="cc-by-4.0")
+    export_dataset(dataset, to, "hf", licence="cc-by-4.0")
     return to
 
 
@@ -123,7 +123,7 @@ def test_long_splits_are_cut_into_files(
 
     monkeypatch.setattr(hub, "FILE_ROWS", 2)
     monkeypatch.setattr(hub, "GROUP_ROWS", 1)
-    export_dataset(dataset, tmp_path / "to", "hub")
+    export_dataset(dataset, tmp_path / "to", "hf")
     data = GraspDataset(dataset / "grasping_oto.hdf5", split="test")
     files = sorted((tmp_path / "to" / "oto").glob("test-*.parquet"))
     ids = [i for file in files for i in pq.read_table(file)["trial_id"].to_pylist()]
@@ -136,5 +136,5 @@ def test_missing_pyarrow_is_one_line(
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(MachineError, match=r"needs pyarrow, got none: pip install"):
-        export_dataset(dataset, tmp_path / "to", "hub")
+        export_dataset(dataset, tmp_path / "to", "hf")
     assert not list(tmp_path.iterdir())

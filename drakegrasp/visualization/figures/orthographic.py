@@ -81,10 +81,9 @@ def draw_rays(
         (rays[~behind], 3.0, opacity),
     ):
         if len(part) and alpha > 0.0:
-            axes.add_collection(
-                LineCollection(part[..., :2], colors=colour, linewidths=width, alpha=alpha,
-                               zorder=order)
-            )  # fmt: skip
+            lines = LineCollection(list(part[..., :2]), colors=colour, linewidths=width)
+            lines.set(alpha=alpha, zorder=order)
+            axes.add_collection(lines)
 
 
 def finish_view(axes: Axes, low: Array, high: Array) -> None:
