@@ -110,7 +110,7 @@ def assemble_locked(
     rejected: Sequence[int | AttemptKey] | None = None,
     progress: Report = silent,
 ) -> Assembly:
-    """Write the three files and the manifest, in a directory whose lock the caller holds.
+    """Write the three files, their card and the manifest; the caller holds the lock.
 
     Args:
         out: Directory of the dataset.

@@ -97,7 +97,7 @@ def _claim(out: Path) -> str:
     On network file systems the kernel's lock belongs to a process, with all its threads.
 
     Raises:
-        DataError: If another thread has it.
+        DataError: If a thread of this process has it already.
     """
     key = os.path.realpath(out)
     with _claiming:

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, write_field
+from drakegrasp.dataset.paths import shards_folder
 from drakegrasp.dataset.schema import (
     LOOK_FIELDS,
     SCHEMA_VERSION,
@@ -62,7 +63,7 @@ class ShardHeader:
 
     def path(self, out: Path) -> Path:
         """Return the path of the shard in a dataset's directory."""
-        return out / "shards" / self.object_name / self.file_name
+        return shards_folder(out, self.object_name) / self.file_name
 
     def journal_path(self, out: Path) -> Path:
         """Return the path of the work unit's journal, see `drakegrasp.runtime.journal`."""
