@@ -93,16 +93,20 @@ def build(
 def assemble(out: Path, reject: Path | None, overrides: tuple[str, ...]) -> None:
     """Filter and split again, without simulating.
 
-    The command writes trials.hdf5 and both data files again from the shards in OUT.
+    The command writes trials.hdf5 and both data files again from the shards in OUT. What a
+    reject.json names and is no success of the dataset is skipped, and named.
     """
     from drakegrasp.dataset.assemble import assemble as assemble_files
-    from drakegrasp.dataset.rejections import read_rejected
+    from drakegrasp.dataset.manifest import read_manifest
+    from drakegrasp.dataset.rejections import read_rejected, unused_rejections
     from drakegrasp.runtime.progress import progress_bar
 
     rejected = () if reject is None else read_rejected(reject)
     with progress_bar("assemble", "shards") as progress:
         assemble_files(out, overrides=overrides, rejected=rejected, progress=progress)
     print_stats(out)
+    for sentence in unused_rejections(out, rejected, read_manifest(out).rejected):
+        say(sentence)
 
 
 @click.command()

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import trimesh
-from helpers.pages import ATTACK, Tags
+from helpers.pages import ATTACK, Tags, coded, get, numbered, state_of
 from matplotlib.image import imread
 from starlette.testclient import TestClient
 
@@ -30,7 +30,7 @@ def token(client: TestClient) -> str:
 
 
 def decide(client: TestClient, label: str, decision: str) -> int:
-    content = {"label": label, "decision": decision}
+    content = {"label": coded(state_of(client), label), "decision": decision}
     answer = client.post("/decide", json=content, headers={TOKEN_HEADER: token(client)})
     return answer.status_code
 
@@ -53,26 +53,26 @@ def test_gallery_shows_what_is_selected_page_by_page(client: TestClient) -> None
 def test_contacts_are_drawn_in_all_three_images(client: TestClient) -> None:
     card = client.get("/?object=1_box_a&sort=row&order=up").text.partition("</li>")[0]
     assert card.count("<circle") == 9
-    assert "/strip/0-0-0-oto.png" in card
-    strip = imread(BytesIO(client.get("/strip/0-0-0-oto.png").content))
+    assert coded(state_of(client), "/strip/0-0-0-oto.png") in card
+    strip = imread(BytesIO(get(client, "/strip/0-0-0-oto.png").content))
     assert strip.shape[:2] == (32, 96)
     for address in ("0-0-1-oto", "0-0-0-out", "9-9-9-oto", "x-oto"):
-        assert client.get(f"/strip/{address}.png").status_code == 404
+        assert get(client, f"/strip/{address}.png").status_code == 404
 
 
 def test_next_and_previous_go_through_the_selection(client: TestClient) -> None:
     query = "object=2_box_b&sort=row&order=up"
-    page = client.get(f"/grasp/1-1-0?{query}").text
+    page = get(client, f"/grasp/1-1-0?{query}").text
     assert "2 of 3" in page
     links = {a.get("id"): a.get("href") for tag, a in Tags(page).tags if tag == "a"}
-    assert links["previous"] == f"/grasp/1-0-0?{query}"
-    assert links["next"] == f"/grasp/1-3-2?{query}"
+    for name, label in (("previous", "1-0-0"), ("next", "1-3-2")):
+        assert numbered(state_of(client), str(links[name])) == f"/grasp/{label}?{query}"
     assert links["gallery"] == f"/?{query}"
-    assert "not in the selection" in client.get(f"/grasp/0-0-0?{query}").text
+    assert "not in the selection" in get(client, f"/grasp/0-0-0?{query}").text
 
 
 def test_page_of_a_grasp_has_numbers_and_a_scene(client: TestClient) -> None:
-    page = client.get("/grasp/0-0-0").text
+    page = get(client, "/grasp/0-0-0").text
     for text in ("2.0 mm", "10.0", "camera otm", "--trial 0", "stable"):
         assert text in page
     found = re.search(r'<script type="application/json" id="scene">(.*?)</script>', page, re.S)
@@ -90,7 +90,7 @@ def test_page_of_a_grasp_has_numbers_and_a_scene(client: TestClient) -> None:
 
 
 def test_failed_attempt_is_shown_as_far_as_it_got(client: TestClient) -> None:
-    page = client.get("/grasp/0-2-1").text
+    page = get(client, "/grasp/0-2-1").text
     assert "ray miss" in page
     assert 'data-state="start"' in page
     assert 'data-state="closed"' not in page
@@ -99,13 +99,14 @@ def test_failed_attempt_is_shown_as_far_as_it_got(client: TestClient) -> None:
 
 
 def test_meshes_are_glb_files(client: TestClient) -> None:
-    for address in ("object-0", "link-0", "link-8"):
+    box = f"object-{state_of(client).codes[0]}"
+    for address in (box, "link-0", "link-8"):
         answer = client.get(f"/mesh/{address}.glb")
         scene = trimesh.load(BytesIO(answer.content), file_type="glb")
         assert len(scene.geometry) > 0
-    box = trimesh.load(BytesIO(client.get("/mesh/object-0.glb").content), file_type="glb")
-    assert (box.bounds[1] - box.bounds[0]).tolist() == pytest.approx([0.06, 0.05, 0.10])
-    for address in ("object-9", "link-99", "other-0"):
+    mesh = trimesh.load(BytesIO(client.get(f"/mesh/{box}.glb").content), file_type="glb")
+    assert (mesh.bounds[1] - mesh.bounds[0]).tolist() == pytest.approx([0.06, 0.05, 0.10])
+    for address in ("object-0", "link-99", "link-x", "other-0"):
         assert client.get(f"/mesh/{address}.glb").status_code == 404
 
 
@@ -132,13 +133,16 @@ def test_decisions_are_on_disk_at_once_and_undone_in_turn(client: TestClient, ou
     a, b = AttemptKey("1_box_a", 0, 0), AttemptKey("2_box_b", 1, 0)
     assert (read_decisions(path).rejected, read_decisions(path).kept) == ({a}, {b})
     assert "card rejected" in client.get("/").text
-    assert 'data-decision="kept"' in client.get("/grasp/1-1-0").text
+    assert 'data-decision="kept"' in get(client, "/grasp/1-1-0").text
 
     headers = {TOKEN_HEADER: token(client)}
-    expected = [("1-1-0", "rejected"), ("1-1-0", ""), ("0-0-0", ""), (None, None)]
-    for label, decision in expected:
+    for label, decision in (("1-1-0", "rejected"), ("1-1-0", ""), ("0-0-0", "")):
         result = client.post("/undo", headers=headers).json()
-        assert (result["label"], result.get("decision")) == (label, decision)
+        assert (numbered(state_of(client), result["label"]), result["decision"]) == (
+            label,
+            decision,
+        )
+    assert client.post("/undo", headers=headers).json() == {"name": None}
     assert not read_decisions(path).rejected
 
 
@@ -158,7 +162,8 @@ def test_an_edited_file_is_not_overwritten(client: TestClient, out: Path) -> Non
     decide(client, "1-1-0", "rejected")
     assert read_decisions(out / "reject.json").rejected == {AttemptKey("2_box_b", 1, 0)}
     (out / "reject.json").write_text("mine")
-    assert decide_raw(client, {"label": "0-0-0", "decision": "kept"}, token_of(client)) == 400
+    content = {"label": coded(state_of(client), "0-0-0"), "decision": "kept"}
+    assert decide_raw(client, content, token_of(client)) == 400
     assert (out / "reject.json").read_text() == "mine"
 
 
@@ -188,7 +193,8 @@ def decide_raw(client: TestClient, content: object, with_token: str | None) -> i
 def test_what_cannot_be_decided_is_refused(
     client: TestClient, out: Path, content: object, status: int
 ) -> None:
-    assert decide_raw(client, content, token(client)) == status
+    text = coded(state_of(client), json.dumps(content))
+    assert decide_raw(client, json.loads(text), token(client)) == status
     assert not (out / "reject.json").exists()
 
 
@@ -196,7 +202,7 @@ def test_what_cannot_be_decided_is_refused(
 
 
 def test_changes_need_the_token_of_the_page(client: TestClient, out: Path) -> None:
-    content = {"label": "0-0-0", "decision": "rejected"}
+    content = {"label": coded(state_of(client), "0-0-0"), "decision": "rejected"}
     for wrong in (None, "", "x", "ü"):
         headers = {} if wrong is None else {TOKEN_HEADER: wrong.encode()}
         assert client.post("/decide", json=content, headers=headers).status_code == 403
@@ -219,7 +225,7 @@ def test_a_foreign_host_gets_nothing(client: TestClient) -> None:
 
 @pytest.mark.parametrize("path", [*PAGES, "/static/inspect.js", "/strip/0-0-0-oto.png", "/nothing"])
 def test_every_answer_has_the_strictest_policy(client: TestClient, path: str) -> None:
-    answer = client.get(path)
+    answer = get(client, path)
     for name, value in HEADERS.items():
         assert answer.headers[name] == value
     policy = answer.headers["content-security-policy"]
@@ -231,7 +237,7 @@ def test_every_answer_has_the_strictest_policy(client: TestClient, path: str) ->
 def test_pages_ask_nothing_of_other_hosts_and_run_no_script_of_their_own(
     client: TestClient, path: str
 ) -> None:
-    for tag, attributes in Tags(client.get(path).text).tags:
+    for tag, attributes in Tags(get(client, path).text).tags:
         for name in ("src", "href", "action"):
             address = attributes.get(name) or "/"
             assert address.startswith(("/", "?")) and not address.startswith("//"), (tag, address)
@@ -244,7 +250,7 @@ def test_pages_ask_nothing_of_other_hosts_and_run_no_script_of_their_own(
 @pytest.mark.parametrize("path", ["/", "/grasp/0-0-0", f"/?object={ATTACK}", "/plots"])
 def test_names_stay_text(hostile: Path, path: str) -> None:
     with TestClient(make_app(Inspection(hostile)), base_url="http://localhost") as client:
-        page = client.get(path).text
+        page = get(client, path).text
         assert "<script>alert" not in page
         if path != "/plots":
             assert ATTACK in Tags(page).text
@@ -263,7 +269,7 @@ def test_names_stay_text(hostile: Path, path: str) -> None:
     ],
 )
 def test_errors_are_pages_without_foreign_tags(client: TestClient, path: str, status: int) -> None:
-    answer = client.get(path)
+    answer = get(client, path)
     assert answer.status_code == status
     assert "<b>x</b>" not in answer.text
 

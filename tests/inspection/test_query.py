@@ -8,6 +8,7 @@ from urllib.parse import parse_qsl
 
 import numpy as np
 import pytest
+from helpers.pages import numbered
 
 from drakegrasp.dataset.rejections import AttemptKey, Decisions
 from drakegrasp.errors import DataError
@@ -25,7 +26,7 @@ def snapshot(boxes: Path) -> Snapshot:
 
 def chosen(snapshot: Snapshot, text: str, decisions: Decisions = NOTHING) -> list[str]:
     query = parse_query(dict(parse_qsl(text)))
-    return [snapshot.label(i) for i in select(snapshot, query, decisions)]
+    return [numbered(snapshot, snapshot.label(i)) for i in select(snapshot, query, decisions)]
 
 
 def test_successes_are_shown_unless_others_are_asked_for(snapshot: Snapshot) -> None:
