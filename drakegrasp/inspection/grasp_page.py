@@ -89,7 +89,7 @@ def grasp_page(
         score=QUANTITIES["suspicion"].text(table.value("suspicion", i)),
         parts=_parts(snapshot, i, row),
         facts=_facts(snapshot, i, row),
-        pose=_pose_text(key.object, row),
+        pose=_pose_lines(key.object, row),
         fingers=_fingers(row),
         scene=scene,
         meshes={
@@ -164,15 +164,15 @@ def _certificate(snapshot: Snapshot, i: int) -> list[tuple[str, str]]:
     return lines
 
 
-def _pose_text(name: str, row: dict[str, Any]) -> str:
-    """Return palm poses and joints of an attempt as JSON to copy, as far as it got."""
+def _pose_lines(name: str, row: dict[str, Any]) -> list[str]:
+    """Return palm poses and joints of an attempt as lines of JSON to copy, as far as it got."""
     values: dict[str, Any] = {"object": name}
     for key in ("X_TO", "X_OG", "closed_q", "X_OG_lifted", "lifted_q"):
         value = unpack_pose(row[key]) if key.startswith("X_") else row[key]
         if np.isfinite(value).all():
             values[key] = value.tolist()
-    lines = (f"{json.dumps(key)}: {json.dumps(value)}" for key, value in values.items())
-    return "{" + ",\n ".join(lines) + "}"
+    lines = [f" {json.dumps(key)}: {json.dumps(value)}" for key, value in values.items()]
+    return ["{", *(f"{line}," for line in lines[:-1]), lines[-1], "}"]
 
 
 def _fingers(row: dict[str, Any]) -> list[dict[str, Any]]:

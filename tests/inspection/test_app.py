@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
+import gc
+import html
 import json
 import re
+import shutil
+import weakref
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
+import h5py
+import numpy as np
 import pytest
 import trimesh
+from helpers.datasets import TRIALS, change, set_at
 from helpers.pages import ATTACK, Tags, coded, get, numbered, state_of
 from matplotlib.image import imread
 from starlette.testclient import TestClient
 
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.filters import Removal
+from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.rejections import AttemptKey, read_decisions, read_rejected
+from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import DataError
+from drakegrasp.frames import unpack_pose
+from drakegrasp.inspection import plots
 from drakegrasp.inspection.app import HEADERS, TOKEN_HEADER, Inspection, make_app
 from drakegrasp.inspection.query import PAGE
 
@@ -280,6 +292,151 @@ def test_page_works_while_the_files_are_replaced(client: TestClient, out: Path) 
     after = client.get("/?sort=row&order=up").text
     assert "no sample: rejected" in after
     assert "no sample: rejected" not in before
+
+
+def test_an_open_page_rejects_the_grasp_that_it_shows(client: TestClient, out: Path) -> None:
+    """Though another object came before its own meanwhile."""
+    whole = read_manifest(out)
+    write_manifest(replace(whole, objects=whole.objects[1:]), out)
+    assemble(out)
+    label = coded(state_of(client), "0-0-0")
+    assert "2_box_b" in client.get(f"/grasp/{label}").text
+    write_manifest(whole, out)
+    assemble(out)
+    content = {"label": label, "decision": "rejected"}
+    assert decide_raw(client, content, token(client)) == 200
+    assert read_decisions(out / "reject.json").rejected == {AttemptKey("2_box_b", 0, 0)}
+    # A mesh of the page is that of its object, too.
+    code = label.partition("-")[0]
+    mesh = trimesh.load(BytesIO(client.get(f"/mesh/object-{code}.glb").content), file_type="glb")
+    assert (mesh.bounds[1] - mesh.bounds[0]).tolist() == pytest.approx([0.08, 0.04, 0.06])
+
+
+def test_answers_say_what_is_decided_in_all(client: TestClient, out: Path) -> None:
+    headers = {TOKEN_HEADER: token(client)}
+
+    def counts(label: str) -> object:
+        content = {"label": coded(state_of(client), label), "decision": "rejected"}
+        return client.post("/decide", json=content, headers=headers).json()["counts"]
+
+    assert counts("0-0-0") == {"rejected": 1, "kept": 0, "samples": 1}
+    assert counts("1-1-0") == {"rejected": 2, "kept": 0, "samples": 2}
+    # After assembling they are samples no more.
+    assemble(out, rejected=read_rejected(out / "reject.json"))
+    assert counts("2-0-0") == {"rejected": 3, "kept": 0, "samples": 1}
+    undone = client.post("/undo", headers=headers).json()
+    assert undone["name"] == "3_brick, palm pose 0, stand-off 0"
+    assert undone["counts"] == {"rejected": 2, "kept": 0, "samples": 0}
+    assert undone["done"] is True
+
+
+def test_undo_of_a_page_is_its_own(client: TestClient, out: Path) -> None:
+    headers = {TOKEN_HEADER: token(client)}
+    for label, page in (("0-0-0", "a"), ("1-1-0", "b")):
+        content = {"label": coded(state_of(client), label), "decision": "rejected", "page": page}
+        client.post("/decide", json=content, headers=headers)
+    undone = client.post("/undo", json={"page": "a"}, headers=headers).json()
+    assert numbered(state_of(client), undone["label"]) == "0-0-0"
+    assert read_decisions(out / "reject.json").rejected == {AttemptKey("2_box_b", 1, 0)}
+
+
+@pytest.mark.parametrize("path", ["/", "/grasp/0-0-0"])
+def test_pages_say_how_to_take_rejected_grasps_out(boxes: Path, tmp_path: Path, path: str) -> None:
+    """The command can be pasted into a shell, whatever the directory is called."""
+    out = Path(shutil.copytree(boxes, tmp_path / "my data;x"))
+    with TestClient(make_app(Inspection(out)), base_url="http://localhost") as client:
+        hidden = [a for _, a in Tags(get(client, path).text).tags if a.get("id") == "nextstep"]
+        assert "hidden" in hidden[0]
+        decide(client, "0-0-0", "rejected")
+        page = get(client, path).text
+        shown = [a for _, a in Tags(page).tags if a.get("id") == "nextstep"]
+        assert "hidden" not in shown[0]
+        command = f"drakegrasp assemble '{out}' --reject '{out / 'reject.json'}'"
+        text = " ".join(Tags(page).text.split())
+        assert (
+            f"1 rejected, 1 of them samples now. To take them out of the files: {command}" in text
+        )
+        assert f"drakegrasp replay '{out}' --trial 0" in Tags(get(client, "/grasp/0-0-0").text).text
+
+
+def test_samples_can_be_chosen_in_one_step(client: TestClient, out: Path) -> None:
+    assemble(out, rejected=[0])
+    page = client.get("/").text
+    links = {a.get("href") for tag, a in Tags(page).tags if tag == "a"}
+    assert "/?split=samples" in links
+    options = re.findall(r'<select name="split">(.*?)</select>', page, re.S)[0]
+    assert re.findall(r'value="(\w*)"', options)[:2] == ["", "samples"]
+    # What filters keep is called samples, and nothing but a decision is called kept.
+    removals = re.findall(r'<select name="removal">(.*?)</select>', page, re.S)[0]
+    assert re.findall(r'value="(\w*)"', removals) == ["", "rejected"]
+    assert "8 of 36 attempts" in " ".join(Tags(client.get("/?split=samples").text).text.split())
+
+
+def test_page_of_a_grasp_has_friction_certificate_and_text_to_copy(
+    client: TestClient, out: Path
+) -> None:
+    assert "repeats with noise" not in get(client, "/grasp/0-0-0").text
+    for name, value in (("certified_share", 0.75), ("certified_friction", 0.4)):
+        change(out, TRIALS, f"successes/{name}", 0, lambda _, value=value: value)
+    page = get(client, "/grasp/0-0-0").text
+    with h5py.File(out / TRIALS) as file:
+        friction = float(file["trials/friction_hand"][0])
+        q = file["trials/closed_q"][0].tolist()
+        X_OG = unpack_pose(file["trials/X_OG"][0])
+    for name, value in (
+        ("friction of the object with hand, table", f"{friction:.3g}, {friction:.3g}"),
+        ("repeats with noise that hold", "75 %"),
+        ("least friction with the hand that holds", "0.4"),
+    ):
+        assert f"<th>{name}</th><td>{value}</td>" in page
+    content = json.loads(re.findall(r"<pre>(.*?)</pre>", html.unescape(page), re.S)[0])
+    assert content["closed_q"] == q
+    assert content["X_OG"] == X_OG.tolist()
+    # An attempt that never closed has a start only, and dashes.
+    page = get(client, "/grasp/0-2-1").text
+    content = json.loads(re.findall(r"<pre>(.*?)</pre>", html.unescape(page), re.S)[0])
+    assert set(content) == {"object", "X_TO", "X_OG"}
+    assert "<th>other links after closing</th><td>–</td>" in page
+
+
+def test_a_contact_without_a_normal_is_a_reason(client: TestClient, out: Path) -> None:
+    change(out, TRIALS, "trials/normal_angle", 0, set_at(0, to=np.nan))
+    card = client.get("/").text.partition("</li>")[0]
+    assert "normal angle: none" in card
+    parts = get(client, "/grasp/0-0-0").text
+    assert re.search(r"<th>normal angle</th><td>none</td>", parts)
+
+
+def test_contacts_that_the_object_hides_are_hollow(client: TestClient, out: Path) -> None:
+    """As on contact sheets: a depth image with nothing near hides no contact."""
+    before = get(client, "/grasp/0-0-0").text.count('class="hidden"')
+    assert before > 0
+    # Without depth nothing is before a contact.
+    for camera in CAMERAS:
+        with h5py.File(out / f"grasping_{camera}.hdf5", "r+") as file:
+            for split in file.values():
+                images = split["images"][:]
+                images[:, 3] = 9.0
+                split["images"][:] = images
+    assert get(client, "/grasp/0-0-0").text.count('class="hidden"') == 0
+    assert client.get("/").text.count('class="hidden"') == 0
+
+
+def test_plots_are_drawn_once_for_each_state_and_then_forgotten(
+    client: TestClient, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = []
+    monkeypatch.setattr(plots, "svg_bytes", lambda figure: drawn.append(figure) or b"<svg/>")
+    for _ in range(2):
+        assert client.get("/plot/outcomes.svg").status_code == 200
+    assert len(drawn) == 1
+    state = weakref.ref(state_of(client))
+    assemble(out, rejected=[0])
+    client.get("/")
+    gc.collect()
+    assert state() is None
+    assert client.get("/plot/outcomes.svg").status_code == 200
+    assert len(drawn) == 2
 
 
 def test_broken_rejections_are_refused_at_the_start(out: Path) -> None:

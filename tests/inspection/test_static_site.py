@@ -7,10 +7,14 @@ import re
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 from helpers.pages import ATTACK, Tags, coded
 
+from drakegrasp.cli.main import main
+from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
 from drakegrasp.errors import DataError
+from drakegrasp.inspection import static_site
 from drakegrasp.inspection.catalog import Catalog
 from drakegrasp.inspection.static_site import Site, write_site
 
@@ -70,6 +74,39 @@ def test_files_cannot_decide_but_show_decisions(out: Path, tmp_path: Path) -> No
     assert index.count("card rejected") == 1
     for page in (tmp_path / "site").rglob("*.html"):
         assert "<button data-" not in page.read_text(encoding="utf-8").replace("data-state", "")
+
+
+def test_what_is_left_out_is_told(
+    boxes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(static_site, "MAX_GRASPS", 4)
+    result = CliRunner().invoke(main, ["inspect", str(boxes), "--static", str(tmp_path / "site")])
+    assert result.exit_code == 0, result.stderr
+    assert "4 grasps in " in result.stdout
+    assert "the most suspicious of 9" in result.stdout
+    index = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
+    assert "Only the 4 most suspicious of 9 successes are here." in index
+    assert index.count("<li ") == 4
+    # Failures are not there, so none can be asked for.
+    assert 'name="outcome"' not in index
+
+
+@pytest.mark.parametrize("how", [KeyboardInterrupt, DataError])
+def test_a_run_that_ends_early_leaves_nothing(
+    out: Path, tmp_path: Path, how: type[BaseException]
+) -> None:
+    """After Ctrl-C, and where the dataset was assembled anew: the next run can begin."""
+
+    def end(done: int, total: int) -> None:
+        if how is KeyboardInterrupt:
+            raise KeyboardInterrupt
+        if done == 1:
+            assemble(out, rejected=[0])
+
+    with pytest.raises(how):
+        write_site(out, tmp_path / "site", progress=end)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]
+    assert write_site(out, tmp_path / "site").grasps == 9
 
 
 def test_names_stay_text(hostile: Path, tmp_path: Path) -> None:
