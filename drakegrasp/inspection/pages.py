@@ -32,12 +32,7 @@ from drakegrasp.inspection.query import (
     Query,
     count_decisions,
 )
-from drakegrasp.inspection.rows import (
-    THUMBNAIL,
-    contact_dots,
-    read_look,
-    read_rows,
-)
+from drakegrasp.inspection.rows import THUMBNAIL, contact_dots, read_rows
 from drakegrasp.inspection.table import NONE
 from drakegrasp.outcomes import Outcome
 from drakegrasp.visualization.style import FINGER_COLOURS
@@ -129,7 +124,7 @@ def make_cards(
     snapshot: Snapshot, decisions: Decisions, query: Query, places: Places, links: Links
 ) -> list[dict[str, Any]]:
     """Return the values of the cards of attempts."""
-    # Only the columns of the dots are read: a page must be quick.
+    # Only the columns of the dots are read, and no images: a page must be quick.
     table, cards = snapshot.table, []
     rows = read_rows(snapshot, places.tolist(), THUMBNAIL)
 
@@ -138,7 +133,6 @@ def make_cards(
         label, key = snapshot.label(i), snapshot.key(i)
         outcome = Outcome(int(table.outcome[i]))
         success = outcome is Outcome.SUCCESS
-        look = read_look(snapshot, i, "oto") if success else None
         cards.append(
             {
                 "label": label,
@@ -150,7 +144,7 @@ def make_cards(
                 "number": number_text(snapshot, i),
                 "size": snapshot.config.camera.size,
                 "strip": links.strip(label, "oto") if success else "",
-                "dots": contact_dots(snapshot, row, "oto", look) if success else [],
+                "dots": contact_dots(snapshot, row, "oto") if success else [],
                 "words": words_of(snapshot, i),
                 "suspicion": QUANTITIES["suspicion"].text(table.value("suspicion", i)),
                 "reasons": _reasons(snapshot, i),

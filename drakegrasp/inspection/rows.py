@@ -159,7 +159,7 @@ def _shard_path(snapshot: Snapshot, i: int) -> Path:
 
 
 def contact_dots(
-    snapshot: Snapshot, row: dict[str, Any], camera: str, look: Look | None
+    snapshot: Snapshot, row: dict[str, Any], camera: str, look: Look | None = None
 ) -> list[Dot]:
     """Return where a camera sees the contacts after closing; those behind it are left out.
 

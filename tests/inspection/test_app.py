@@ -419,7 +419,6 @@ def test_contacts_that_the_object_hides_are_hollow(client: TestClient, out: Path
                 images[:, 3] = 9.0
                 split["images"][:] = images
     assert get(client, "/grasp/0-0-0").text.count('class="hidden"') == 0
-    assert client.get("/").text.count('class="hidden"') == 0
 
 
 def test_plots_are_drawn_once_for_each_state_and_then_forgotten(

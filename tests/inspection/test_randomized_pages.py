@@ -68,6 +68,6 @@ def test_dots_are_where_the_moved_camera_sees_the_contacts(drawn: Path, camera: 
     expected = project(
         intrinsics(snapshot.config.camera), transform_points(X_CO, row["closed_p_OQ"])
     )
-    dots = contact_dots(snapshot, row, camera, None)
+    dots = contact_dots(snapshot, row, camera)
     assert len(dots) == 3
     np.testing.assert_allclose([[dot.u, dot.v] for dot in dots], expected, atol=0.01)
