@@ -221,15 +221,22 @@ def test_keyboard_moves_rejects_keeps_and_undoes(
     page.wait_for_selector("#cards")
 
 
-def test_keys_work_after_a_click_on_a_checkbox_and_with_caps_lock(
+def test_keys_work_after_a_click_on_a_checkbox(
     page: Page, address: str, state: Snapshot, out: Path
 ) -> None:
     page.goto(coded(state, f"{address}/grasp/0-0-0?sort=row&order=up"))
     wait_for_view(page)
     page.click("#showforces")
-    page.keyboard.press("R")
+    page.keyboard.press("r")
     page.wait_for_url(coded(state, "**/grasp/0-1-0?sort=row&order=up"))
     assert read_decisions(out / "reject.json").rejected == {AttemptKey("1_box_a", 0, 0)}
+
+
+def test_keys_work_with_caps_lock(page: Page, address: str, state: Snapshot, out: Path) -> None:
+    page.goto(coded(state, f"{address}/grasp/0-0-0?sort=row&order=up"))
+    page.keyboard.press("K")
+    page.wait_for_url(coded(state, "**/grasp/0-1-0?sort=row&order=up"))
+    assert read_decisions(out / "reject.json").kept == {AttemptKey("1_box_a", 0, 0)}
 
 
 def test_keys_work_while_a_recording_is_made(
