@@ -61,7 +61,7 @@ def read_closed_grasps(out: Path) -> Iterator[ClosedGrasp]:
             trials = file["trials"]
             names = read_names(file["objects/name"])
             objects, X_TO, X_OG, q, spread = (
-                trials[key][:][rows] for key in ("object", "X_TO", "X_OG", "closed_q", "spread")
+                trials[key][rows] for key in ("object", "X_TO", "X_OG", "closed_q", "spread")
             )
     except (OSError, KeyError, IndexError) as error:
         raise DataError(f"{path}: must be the trials of a dataset, got none ({error})") from None
