@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, write_field
+from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, write_fixed
 from drakegrasp.dataset.paths import shards_folder
 from drakegrasp.dataset.schema import (
     LOOK_FIELDS,
@@ -100,7 +100,7 @@ def write_shard(out: Path, shard: Shard) -> Path:
         for name, fields, columns in tables:
             group = file.create_group(name)
             for field in fields:
-                write_field(group, field, np.asarray(columns[field.name]))
+                write_fixed(group, field, np.asarray(columns[field.name]))
     return path
 
 

@@ -117,6 +117,23 @@ def test_units_cover_the_candidates_of_each_object(manifest: Manifest) -> None:
     assert manifest.units == len(ranges)
 
 
+def test_units_of_many_candidates_grow(manifest: Manifest) -> None:
+    """So large datasets have few files and tasks; what one machine makes does not change."""
+
+    def stops(candidates: int, *, most: int) -> list[int]:
+        config = load_config(overrides=[f"candidates.max={most}"])
+        objects = (replace(MUG, candidates=candidates),)
+        grown = replace(manifest, config=config, objects=objects)
+        headers = list(grown.headers())
+        assert [h.start for h in headers] == [0, *(h.stop for h in headers[:-1])]
+        assert grown.units == len(headers)
+        return [h.stop for h in headers]
+
+    assert stops(1000, most=1000) == list(range(50, 1001, 50))
+    assert stops(1001, most=10_000) == [50, 100, 200, 400, 800, 1001]
+    assert len(stops(10_000, most=10_000)) == 28
+
+
 def _drop(key: str) -> Any:
     return lambda content: content["objects"][0].pop(key)
 
