@@ -166,7 +166,7 @@ def test_point_and_normal_are_weighted_by_pressure(
 
 
 def test_contact_point_is_where_drakes_force_acts(closed: Scene) -> None:
-    """On a plane the force and its moment about the patch's centroid tell the centre of pressure."""
+    """On a plane, force and moment about the patch's centroid tell the centre of pressure."""
     results = closed.plant.get_contact_results_output_port().Eval(closed.context)
     tips, found = [body.index() for body in closed.handles.fingertips], read_contacts(closed)
     X_OW = invert_pose(closed.pose(closed.object))

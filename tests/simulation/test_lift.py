@@ -202,7 +202,7 @@ def test_monitor_judges_what_moved_since_the_last_look(
     monitor = lifting._Monitor(scene)
     turn = make_pose(rotation_about([0.0, 1.0, 0.0], np.deg2rad(angle_deg)), [0.0, shift, 0.0])
     monkeypatch.setattr(lifting, "_object_in_hand", lambda _: X_GO @ turn)
-    monkeypatch.setattr(lifting, "closing_angles", lambda _: angles + [0.0, closed, 0.0])
+    monkeypatch.setattr(lifting, "closing_angles", lambda _: angles + np.eye(3)[1] * closed)
     tips = {body.index() for body in scene.handles.fingertips}
     palm = scene.plant.GetBodyByName(scene.handles.hand.palm_link).index()
     table = scene.table.index()
