@@ -18,15 +18,15 @@ from pathlib import Path
 import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
-_SIM, _DATA, _CHECKS = "tests/simulation/test_", "tests/dataset/test_", "tests/dataset/checks/test_"
+_SIM, _DATA, _CHECKS = (
+    "tests/simulation/test_",
+    "tests/dataset/test_",
+    "tests/dataset/checks/test_check_",
+)
 #: A search for the simplest example of a failure takes minutes.
 _QUICK = (
     "--deselect=tests/simulation/test_settle.py::test_convex_solid_stays_on_a_face_that_carries_it"
 )
-_EVERY_CHECK = [
-    f"{_CHECKS}check_{name}.py"
-    for name in ("trials", "samples", "images", "consistency", "layout", "run", "conditions")
-]
 #: The modules, and the tests that must notice.
 MODULES = {
     **{
@@ -36,15 +36,15 @@ MODULES = {
         ]
         for name, tests in {
             "verdict": "verdict trial",
-            "contacts": "contacts trial settle",
-            "lift": "lift trial drive",
-            "trial": "trial screen drive",
-            "stepping": "trial lift",
-            "drive": "drive lift",
-            "screen": "screen trial",
-            "scene": "trial lift drive construction",
-            "construction": "construction trial drive",
-            "settle": "settle trial",
+            "contacts": "contacts trial",
+            "lift": "lift trial",
+            "trial": "trial",
+            "stepping": "trial",
+            "drive": "drive",
+            "screen": "screen",
+            "scene": "lift trial construction",
+            "construction": "construction trial",
+            "settle": "settle",
             "trajectory": "trajectory lift",
             "robustness": "robustness",
             "candidates": "candidates",
@@ -53,15 +53,27 @@ MODULES = {
     "drakegrasp/hand/finger_sweep.py": ["tests/hand/test_finger_sweep.py", f"{_SIM}screen.py"],
     "drakegrasp/dataset/filters.py": [f"{_DATA}filters.py", f"{_DATA}assemble.py"],
     "drakegrasp/dataset/suspicion.py": [f"{_DATA}suspicion.py", f"{_DATA}assemble.py"],
-    "drakegrasp/dataset/samples.py": [f"{_DATA}assemble.py", *_EVERY_CHECK],
+    "drakegrasp/dataset/samples.py": [f"{_DATA}assemble.py", f"{_CHECKS}samples.py"],
     **{
-        f"drakegrasp/dataset/checks/{path.name}": _EVERY_CHECK
-        for path in sorted((ROOT / "drakegrasp/dataset/checks").glob("*.py"))
+        f"drakegrasp/dataset/checks/{name}.py": [f"{_CHECKS}{test}.py" for test in tests.split()]
+        for name, tests in {
+            "trials": "trials",
+            "trials_file": "trials consistency",
+            "samples": "samples images",
+            "images": "images samples",
+            "hold": "samples trials",
+            "data_file": "samples images consistency",
+            "consistency": "consistency trials",
+            "conditions": "conditions",
+            "layout": "layout run",
+            "open_file": "layout run",
+            "findings": "run trials samples",
+            "context": "run consistency",
+            "run": "run layout",
+        }.items()
     },
     "drakegrasp/verification/verify.py": ["tests/verification/test_verify.py"],
-    "drakegrasp/verification/forces/lift.py": [
-        "tests/verification/forces/test_force_lift.py",
-    ],
+    "drakegrasp/verification/forces/lift.py": ["tests/verification/forces/test_force_lift.py"],
 }
 _OPERATORS: dict[type[ast.AST], str] = {
     ast.Lt: ">=",
