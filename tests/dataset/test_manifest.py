@@ -156,14 +156,14 @@ def test_broken_entry_is_refused(tmp_path: Path, manifest: Manifest, harm: Any) 
     content = json.loads((tmp_path / FILE_NAME).read_text(encoding="utf-8"))
     harm(content)
     (tmp_path / FILE_NAME).write_text(json.dumps(content), encoding="utf-8")
-    with pytest.raises(DataError, match=r"manifest\.json: must be a readable manifest"):
+    with pytest.raises(DataError, match=r"manifest\.json: .*must be"):
         read_manifest(tmp_path)
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff", b"[]"])
 def test_file_that_is_no_manifest_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / FILE_NAME).write_bytes(content)
-    with pytest.raises(DataError, match=r"manifest\.json: must be a readable manifest"):
+    with pytest.raises(DataError, match=r"manifest\.json: .*must be"):
         read_manifest(tmp_path)
 
 

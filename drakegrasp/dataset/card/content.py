@@ -6,16 +6,15 @@ has no time and no machine in it: the same files give the same card.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
 from drakegrasp.config import Config
 from drakegrasp.dataset.filters import Removal
-from drakegrasp.dataset.hdf5 import open_hdf5
+from drakegrasp.dataset.hdf5 import read_names
+from drakegrasp.dataset.layout.opening import open_samples
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry, read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, SPLITS
@@ -189,9 +188,7 @@ def _row(
 def _samples_by_object(data: Path) -> dict[str, dict[str, int]]:
     """Return the numbers of samples by split and object; the files were read before."""
     found = {}
-    with open_hdf5(data) as file:
+    with open_samples(data) as file:
         for split in SPLITS:
-            names: npt.NDArray[Any] = file[split]["object_props/object_name"][:]
-            unique, counts = np.unique(names.astype(bytes), return_counts=True)
-            found[split] = {n.decode(): int(c) for n, c in zip(unique, counts, strict=True)}
+            found[split] = dict(Counter(read_names(file[split]["object_props/object_name"])))
     return found
