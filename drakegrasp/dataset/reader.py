@@ -22,7 +22,8 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.hdf5 import ImageRows, open_hdf5
-from drakegrasp.dataset.schema import DATA_FIELDS, SPLITS, refuse_other_schema
+from drakegrasp.dataset.layout.opening import open_samples
+from drakegrasp.dataset.schema import DATA_FIELDS, SPLITS
 from drakegrasp.errors import DataError, MachineError
 
 if TYPE_CHECKING:
@@ -77,7 +78,8 @@ class GraspDataset:
         image_size: Edge of the square images [px].
 
     Raises:
-        DataError: If the file is missing, of another kind or schema, or the split is unknown.
+        DataError: If the file is missing, damaged or differs from the schema, or the split is
+            unknown.
     """
 
     def __init__(self, path: str | Path, *, split: str = "train") -> None:
@@ -87,19 +89,12 @@ class GraspDataset:
         self._file: h5py.File | None = None
         self._fields: dict[str, h5py.Dataset | ImageRows] = {}
         self._process = -1
-        try:
-            with open_hdf5(self.path) as file:
-                # The version first: another schema may have other fields.
-                refuse_other_schema(self.path, file.attrs["schema_version"])
-                self._length = len(file[split]["grasps"])
-                self.image_size = int(file[split]["images"].shape[-1])
-                self.K = np.array(file.attrs["K"])
-                self.camera = str(file.attrs["camera"])
-                self._content = _content(file, split)
-        except (OSError, KeyError) as error:
-            raise DataError(
-                f"{self.path}: must be a data file of drakegrasp, got none ({error})"
-            ) from None
+        with open_samples(self.path) as file:
+            self._length = len(file[split]["grasps"])
+            self.image_size = int(file[split]["images"].shape[-1])
+            self.K = np.array(file.attrs["K"])
+            self.camera = str(file.attrs["camera"])
+            self._content = _content(file, split)
 
     def __len__(self) -> int:
         return self._length

@@ -20,7 +20,8 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import Config, parse_config
-from drakegrasp.dataset.hdf5 import open_hdf5, read_texts
+from drakegrasp.dataset.hdf5 import read_texts
+from drakegrasp.dataset.layout.opening import open_trials
 from drakegrasp.dataset.manifest import Manifest, read_manifest
 from drakegrasp.dataset.paths import (
     ASSEMBLED_FILES,
@@ -30,9 +31,8 @@ from drakegrasp.dataset.paths import (
     model_path,
 )
 from drakegrasp.dataset.rejections import AttemptKey
-from drakegrasp.dataset.schema import refuse_other_schema
 from drakegrasp.dataset.shards import ShardHeader
-from drakegrasp.errors import ConfigError, DataError
+from drakegrasp.errors import DataError
 from drakegrasp.inspection.table import (
     AttemptTable,
     empty_table,
@@ -43,6 +43,7 @@ from drakegrasp.inspection.table import (
     rows_within,
 )
 from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.json_text import parse_json
 from drakegrasp.runtime.names import is_name
 
 #: While a build runs, its new shards are looked for this often [s].
@@ -273,19 +274,16 @@ def _read_assembled(out: Path, stamps: Mapping[Path, Stamp]) -> tuple[Snapshot, 
     """
     # Objects and configuration.
     path = out / TRIALS_FILE
-    try:
-        with open_hdf5(path) as file:
-            refuse_other_schema(path, file.attrs["schema_version"])
-            config = parse_config(json.loads(file.attrs["config"]))
-            names, classes, meshes = (
-                read_texts(file["objects"][key]) for key in ("name", "class_name", "mesh_sha256")
-            )
-            config_hash = str(file.attrs["config_hash"])
-            signature = str(file.attrs.get("signature", ""))
-    except DataError:
-        raise
-    except (OSError, KeyError, ValueError, ConfigError) as error:
-        raise DataError(f"{path}: must be the trials of a dataset, got none ({error})") from None
+    with open_trials(path) as file:
+        try:
+            config = parse_config(parse_json(file.attrs["config"]))
+        except ValueError as error:
+            raise DataError(f"{path}: attribute config must be one, got {error}") from None
+        names, classes, meshes = (
+            read_texts(file["objects"][key]) for key in ("name", "class_name", "mesh_sha256")
+        )
+        config_hash = str(file.attrs.get("config_hash", ""))
+        signature = str(file.attrs.get("signature", ""))
 
     # What else there is.
     missing = [

@@ -152,9 +152,9 @@ def _is_shard_of(snapshot: Snapshot, i: int, file: h5py.File) -> bool:
 
 def _shard_path(snapshot: Snapshot, i: int) -> Path:
     """Return the path of the shard that holds an attempt; its end is that of the object's poses."""
-    key, step = snapshot.key(i), snapshot.config.unit_candidates
-    start = key.candidate // step * step
-    (path,) = shards_folder(snapshot.out, key.object).glob(f"{start:07d}-*.h5")
+    key = snapshot.key(i)
+    *_, unit = snapshot.config.unit_ranges(key.candidate + 1)
+    (path,) = shards_folder(snapshot.out, key.object).glob(f"{unit.start:07d}-*.h5")
     return path
 
 
