@@ -439,6 +439,6 @@ def test_plots_are_drawn_once_for_each_state_and_then_forgotten(
 
 
 def test_broken_rejections_are_refused_at_the_start(out: Path) -> None:
-    (out / "reject.json").write_text("{}")
+    (out / "reject.json").write_text("3")
     with pytest.raises(DataError, match="must be a list of rejections"):
         Inspection(out)

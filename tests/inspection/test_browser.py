@@ -213,7 +213,7 @@ def test_keyboard_moves_rejects_keeps_and_undoes(
     page.keyboard.press("u")
     wait_for_decision(out, keys[1], "")
     # The page takes one request at a time: a key before the answer would be lost.
-    page.wait_for_function("document.querySelector('#decision').textContent === ''")
+    page.wait_for_selector("#decision", state="hidden")
     page.keyboard.press("u")
     page.wait_for_url(coded(state, "**/grasp/0-0-0?sort=row&order=up"))
     wait_for_decision(out, keys[0], "")
@@ -288,7 +288,7 @@ def test_the_gallery_counts_undoes_and_says_what_to_do_next(
     assert page.inner_text("#message") == "Undone: 2_box_b, palm pose 1, stand-off 0"
     wait_for_decision(out, AttemptKey("2_box_b", 1, 0), "")
     page.click("[data-undo]")
-    page.wait_for_function("document.querySelector('#message').textContent === 'Nothing to undo.'")
+    page.wait_for_selector("#message:has-text('Nothing to undo.')")
 
 
 def test_each_tab_undoes_its_own_decisions(
