@@ -207,8 +207,8 @@ def _build(
     # Assemble the shards, unless the files are of these very shards already.
     stale = not is_assembled(out, verify_shards=True)
     if stale:
-        with progress_bar("assemble", "shards", show=job.show) as report:
-            assemble_locked(out, manifest, progress=report)
+        with progress_bar("assemble", "tasks", show=job.show) as report:
+            assemble_locked(out, manifest, execute=job.execute, progress=report)
     else:
         write_card(out)  # the licence of a mesh may be stated otherwise now
 

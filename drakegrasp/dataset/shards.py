@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, write_fixed
+from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, read_column, write_fixed
 from drakegrasp.dataset.paths import shards_folder
 from drakegrasp.dataset.schema import (
     LOOK_FIELDS,
@@ -116,11 +116,11 @@ def read_shard(path: Path, header: ShardHeader | None = None, *, verify_seal: bo
         DataError: If the file is missing, truncated or changed by a single bit, or of another
             schema, configuration, mesh or range; the message names the file and the reason.
     """
-    with _open_shard(path, header, verify_seal=verify_seal) as (file, own_header):
+    with open_shard(path, header, verify_seal=verify_seal) as (file, own_header):
         return Shard(
             header=own_header,
-            trials={f.name: file["trials"][f.name][:] for f in trial_columns()},
-            looks={f.name: file["looks"][f.name][:] for f in LOOK_FIELDS},
+            trials={f.name: read_column(file["trials"], f.name) for f in trial_columns()},
+            looks={f.name: read_column(file["looks"], f.name) for f in LOOK_FIELDS},
         )
 
 
@@ -149,19 +149,29 @@ def read_trials(
     Raises:
         DataError: See `read_shard`.
     """
-    with _open_shard(path, header, verify_seal=verify_seal) as (file, _):
-        return {name: np.asarray(file["trials"][name][:]) for name in names}
+    with open_shard(path, header, verify_seal=verify_seal) as (file, _):
+        return {name: read_column(file["trials"], name) for name in names}
 
 
 @contextmanager
-def _open_shard(
-    path: Path, header: ShardHeader | None, *, verify_seal: bool
+def open_shard(
+    path: Path, header: ShardHeader | None, *, verify_seal: bool = True, again: bool = False
 ) -> Iterator[tuple[h5py.File, ShardHeader]]:
-    """Open a shard for reading, with its header; errors of the block mean a damaged shard."""
+    """Open a shard for reading, with its header; errors of the block mean a damaged shard.
+
+    Args:
+        path: Of the file.
+        header: Identity that the shard must have; any if None.
+        verify_seal: Whether to verify the seal first, which reads the whole file.
+        again: Whether the same work has opened the shard before, see `open_hdf5`.
+
+    Raises:
+        DataError: See `read_shard`.
+    """
     if verify_seal:
         refuse_broken_seal(path)
     try:
-        with open_hdf5(path) as file:
+        with open_hdf5(path, again=again) as file:
             # The version first: another schema may have other attributes.
             refuse_other_schema(path, file.attrs["schema_version"])
 

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from drakegrasp.dataset.assembly.survey import shards_sha256
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.hdf5 import open_hdf5, read_texts
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRIALS_FILE
-from drakegrasp.dataset.samples import shards_sha256
 from drakegrasp.dataset.schema import SPLITS, refuse_other_schema
 from drakegrasp.dataset.shards import read_trials
 from drakegrasp.errors import DataError

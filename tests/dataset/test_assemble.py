@@ -5,15 +5,19 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
 
-from drakegrasp.dataset import shards
+from drakegrasp.dataset import assemble as assembling
+from drakegrasp.dataset import hdf5, shards
 from drakegrasp.dataset.assemble import assemble, assemble_locked, summarise
+from drakegrasp.dataset.assembly import pack, samples
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.lock import FILE_NAME, build_lock
 from drakegrasp.dataset.manifest import read_manifest
@@ -21,6 +25,7 @@ from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import DataError
 from drakegrasp.frames import invert_pose, transform_points, unpack_pose
 from drakegrasp.grasp import unpack_grasp
+from drakegrasp.runtime.executor import processes
 from drakegrasp.runtime.files import refuse_broken_seal
 
 FILES = (OTO, OTM, TRIALS)
@@ -204,3 +209,78 @@ def test_whenever_assembling_is_killed_the_files_are_of_one_state(out: Path) -> 
     (out / "manifest.json").write_bytes(manifest)
     assemble(out)
     assert [(out / name).read_bytes() for name in FILES] == before
+
+
+def backwards(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
+    """Run the last task first."""
+    return iter([function(item) for item in reversed(list(items))])
+
+
+def arrays(out: Path) -> dict[str, Any]:
+    """Return every value of the three files."""
+    found = {}
+    for name in FILES:
+        with h5py.File(out / name) as file:
+            places: list[str] = []
+            file.visit(places.append)
+            found |= {
+                f"{name}/{place}": file[place][:].tolist()
+                for place in places
+                if isinstance(file[place], h5py.Dataset)
+            }
+    return found
+
+
+@pytest.fixture
+def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Chunks of five rows, in tasks of ten: a task begins and ends within a shard."""
+    for module in (hdf5, pack, samples):
+        monkeypatch.setattr(module, "COLUMN_CHUNK", 5)
+    for module in (pack, assembling):
+        monkeypatch.setattr(module, "TASK_ROWS", 10)
+
+
+@pytest.mark.usefixtures("small_chunks")
+def test_files_do_not_depend_on_the_order_of_the_tasks(out: Path) -> None:
+    before = arrays(out)
+    assemble(out)
+    in_order = [(out / name).read_bytes() for name in FILES]
+    with h5py.File(out / TRIALS) as file:
+        assert file["trials/X_TO"].chunks == (5, 12)
+        assert len(file["trials/X_TO"]) == 36
+    assemble(out, execute=backwards)
+    assert [(out / name).read_bytes() for name in FILES] == in_order
+    assert repr(arrays(out)) == repr(before)
+
+
+def test_files_do_not_depend_on_the_number_of_processes(out: Path) -> None:
+    before = [(out / name).read_bytes() for name in FILES]
+    with processes(2) as execute:
+        assemble(out, execute=execute)
+    assert [(out / name).read_bytes() for name in FILES] == before
+
+
+@pytest.mark.usefixtures("small_chunks")
+def test_what_a_task_left_is_removed_when_another_fails(out: Path) -> None:
+    def last_fails(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
+        done = [function(item) for item in items]
+        yield from reversed(done[1:])
+        if len(done) > 3:
+            assert list(out.glob(".rows-*"))
+            raise DataError("lost")
+        yield done[0]
+
+    before = [(out / name).read_bytes() for name in FILES]
+    with pytest.raises(DataError, match="lost"):
+        assemble(out, execute=last_fails)
+    assert [(out / name).read_bytes() for name in FILES] == before
+    assert not list(out.glob(".*"))
+
+
+def test_a_pool_of_processes_says_what_a_task_raised(out: Path) -> None:
+    sorted(out.glob("shards/*/*.h5"))[0].unlink()
+    with (
+        processes(2) as execute,
+        pytest.raises(DataError, match="must be a complete shard, got none"),
+    ):
+        assemble(out, execute=execute)
