@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import h5py
 import numpy as np
 import numpy.typing as npt
 
@@ -20,7 +21,10 @@ from drakegrasp.dataset.schema import SPLITS, refuse_other_schema
 from drakegrasp.dataset.shards import read_trials
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.executor import Executor, run_here
 
+#: Rows that are read at a time.
+BLOCK = 1 << 20
 #: The columns that say how well a success holds.
 WORDS = ("precision", "stable")
 
@@ -74,12 +78,13 @@ class Unfinished:
     total: int
 
 
-def is_assembled(out: Path, *, verify_shards: bool = False) -> bool:
+def is_assembled(out: Path, *, verify_shards: bool = False, execute: Executor = run_here) -> bool:
     """Return whether the three files exist and are what assembling would write now.
 
     Args:
         out: Directory of the dataset.
         verify_shards: Whether to compare the shards, too, which looks into each of them.
+        execute: Looks into them.
 
     Raises:
         DataError: If a file has values that lie elsewhere, or a shard is missing.
@@ -87,7 +92,7 @@ def is_assembled(out: Path, *, verify_shards: bool = False) -> bool:
     manifest = read_manifest(out)
     expected = {"signature": manifest.signature()}
     if verify_shards:
-        expected["shards"] = shards_sha256(out, manifest)
+        expected["shards"] = shards_sha256(out, manifest, execute)
     try:
         for name in ASSEMBLED_FILES:
             with open_hdf5(out / name) as file:
@@ -151,32 +156,50 @@ def count_funnel(out: Path) -> Funnel:
 
 def funnel_of(path: Path) -> Funnel:
     """Return the funnel that a file of trials tells, as `count_funnel`."""
-    # The columns that are counted, whole: a few bytes per trial.
+    # The columns that are counted, a block after the other.
     try:
         with open_hdf5(path) as file:
             refuse_other_schema(path, file.attrs["schema_version"])
             objects = {name: values[:] for name, values in file["objects"].items()}
             names, classes = (read_texts(file["objects"][key]) for key in ("name", "class_name"))
-            index = file["trials/object"][:]
-            outcome = file["trials/outcome"][:]
-            words = {word: file[f"trials/{word}"][:] for word in WORDS}
+            count = len(objects["name"])
+            outcomes = np.zeros((count, 1 + max(Outcome)), dtype=np.int64)
+            held = {word: np.zeros(count, dtype=np.int64) for word in WORDS}
+            for start in range(0, len(file["trials/outcome"]), BLOCK):
+                rows = slice(start, start + BLOCK)
+                index, outcome = (file[f"trials/{name}"][rows] for name in ("object", "outcome"))
+                outcomes += _count_pairs(index, outcome, count, 1 + max(Outcome))
+                for word, numbers in held.items():
+                    numbers += np.bincount(index[file[f"trials/{word}"][rows]], minlength=count)
+
+            # Of the successes, all.
             success = file["successes/trial_id"][:]
             removal = file["successes/removal"][:]
+            owner = _objects_of(file["trials/object"], success)
     except (OSError, KeyError) as error:
         raise DataError(f"{path.parent}: must hold {path.name}, got none ({error})") from None
 
-    count = len(objects["name"])
     return Funnel(
         names=names,
         classes=classes,
         candidates=objects["candidates"],
         distinct=objects["distinct"],
         valid=objects["valid"],
-        outcomes=_count_pairs(index, outcome, count, 1 + max(Outcome)),
-        precision=np.bincount(index[words["precision"]], minlength=count),
-        stable=np.bincount(index[words["stable"]], minlength=count),
-        removals=_count_pairs(index[success], removal, count, 1 + max(Removal)),
+        outcomes=outcomes,
+        precision=held["precision"],
+        stable=held["stable"],
+        removals=_count_pairs(owner, removal, count, 1 + max(Removal)),
     )
+
+
+def _objects_of(column: h5py.Dataset, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
+    """Return some rows of a column, given in rising order, without reading all at once."""
+    found = [np.zeros(0, dtype=np.int32)]
+    for start in range(0, len(column), BLOCK):
+        bounds = np.searchsorted(rows, (start, start + BLOCK))
+        own = rows[slice(*bounds)] - start
+        found.append(column[start : start + BLOCK][own])
+    return np.concatenate(found)
 
 
 def count_splits(out: Path) -> list[SplitCount]:
