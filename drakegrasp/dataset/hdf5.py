@@ -123,9 +123,12 @@ def read_column(group: h5py.Group, name: str) -> AnyArray:
     """Return a column of numbers, whole: a third of the time that `group[name][:]` takes.
 
     Raises:
-        OSError, KeyError: If it is missing or cannot be read.
+        OSError: If it is missing or cannot be read.
     """
-    column = h5py.h5d.open(group.id, name.encode())
+    try:
+        column = h5py.h5d.open(group.id, name.encode())
+    except KeyError as error:
+        raise OSError(f"no column {name} ({error})") from None
     values = np.empty(column.shape, dtype=column.dtype)
     try:
         if values.size:
@@ -233,8 +236,25 @@ class ImageRows:
         Raises:
             OSError: If the chunk is damaged.
         """
+        image = np.empty(self._shape, dtype=self._dataset.dtype)
+        self.read_into(row, image)
+        return image
+
+    def read_into(self, row: int, image: AnyArray) -> None:
+        """Read the image of a row.
+
+        Args:
+            row: Of the field.
+            image: Contiguous array of an image's shape and type; it is overwritten.
+
+        Raises:
+            OSError: If the chunk is damaged.
+        """
         chunk = self._chunk(row) if self._inflated_here else None
-        return np.asarray(self._dataset[row]) if chunk is None else self._inflate(chunk, row)
+        if chunk is None:
+            image[...] = self._dataset[row]
+        else:
+            _unshuffle(self._inflate(chunk, row), image)
 
     def _chunk(self, row: int) -> bytes | None:
         """Return what is stored of a row; None if no filter was applied, or nothing is."""
@@ -244,23 +264,24 @@ class ImageRows:
             return None
         return None if skipped else chunk
 
-    def _inflate(self, chunk: bytes, row: int) -> AnyArray:
+    def _inflate(self, chunk: bytes, row: int) -> bytearray:
         try:
-            content = deflate.zlib_decompress(chunk, self._bytes)
+            content: bytearray = deflate.zlib_decompress(chunk, self._bytes)
         except deflate.DeflateError as error:
             raise OSError(f"the chunk of row {row} cannot be inflated ({error})") from None
         if len(content) != self._bytes:
             raise OSError(f"the chunk of row {row} must have {self._bytes} B, got {len(content)}")
-        return _unshuffle(content, self._dataset.dtype).reshape(self._shape)
+        return content
 
 
-def _unshuffle(content: bytearray, dtype: np.dtype[Any]) -> AnyArray:
-    """Return the numbers whose first bytes come first in a buffer, then the second ones."""
-    planes = np.frombuffer(content, dtype=np.uint8).reshape(dtype.itemsize, -1)
-    if dtype.itemsize == 1:
-        return planes[0]
-    numbers = planes[3].astype(np.uint32)
+def _unshuffle(content: bytearray, image: AnyArray) -> None:
+    """Write the numbers whose first bytes come first in a buffer, then the second ones."""
+    planes = np.frombuffer(content, dtype=np.uint8).reshape(image.itemsize, -1)
+    if image.itemsize == 1:
+        image.reshape(-1)[:] = planes[0]
+        return
+    numbers = image.view(np.uint32).reshape(-1)
+    numbers[:] = planes[3]
     for k in (2, 1, 0):
         numbers <<= 8
         numbers |= planes[k]
-    return numbers.view(np.float32)

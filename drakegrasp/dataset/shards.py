@@ -15,20 +15,32 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, read_column, write_fixed
+from drakegrasp.dataset.hdf5 import AnyArray, read_column, write_fixed
+from drakegrasp.dataset.layout.attributes import COUNT, TEXT
+from drakegrasp.dataset.layout.opening import (
+    opened,
+    refuse_other_attributes,
+    refuse_other_codes,
+    refuse_other_structure,
+)
+from drakegrasp.dataset.layout.structure import Tables
 from drakegrasp.dataset.paths import shards_folder
 from drakegrasp.dataset.schema import (
     LOOK_FIELDS,
     SCHEMA_VERSION,
     TRIAL_FIELDS,
     Field,
-    refuse_other_schema,
 )
 from drakegrasp.errors import DataError
+from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.files import atomic_hdf5, refuse_broken_seal
 
 #: Fields of `/trials` that only the whole dataset knows; no shard has them.
 ASSEMBLED_FIELDS = ("trial_id", "object")
+_ATTRIBUTES = {
+    **dict.fromkeys(("config_hash", "mesh_sha256", "object_name"), TEXT),
+    **dict.fromkeys(("start", "stop"), COUNT),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,45 +161,59 @@ def read_trials(
     Raises:
         DataError: See `read_shard`.
     """
-    with open_shard(path, header, verify_seal=verify_seal) as (file, _):
+    tables = {"trials": tuple(f for f in trial_columns() if f.name in (*names, "outcome"))}
+    with open_shard(path, header, tables, verify_seal=verify_seal) as (file, _):
+        refuse_other_codes(path, "/trials/outcome", file["trials/outcome"][:], list(Outcome))
         return {name: read_column(file["trials"], name) for name in names}
 
 
 @contextmanager
 def open_shard(
-    path: Path, header: ShardHeader | None, *, verify_seal: bool = True, again: bool = False
+    path: Path,
+    header: ShardHeader | None,
+    tables: Tables | None = None,
+    *,
+    verify_seal: bool = True,
+    again: bool = False,
 ) -> Iterator[tuple[h5py.File, ShardHeader]]:
-    """Open a shard for reading, with its header; errors of the block mean a damaged shard.
+    """Open a shard for reading, with its header, while the block runs.
 
     Args:
         path: Of the file.
         header: Identity that the shard must have; any if None.
+        tables: Fields that must be there; if None all, with outcomes and rows that exist.
         verify_seal: Whether to verify the seal first, which reads the whole file.
-        again: Whether the same work has opened the shard before, see `open_hdf5`.
+        again: Whether the same work has opened the shard before: then only its identity is looked
+            at.
 
     Raises:
         DataError: See `read_shard`.
     """
     if verify_seal:
         refuse_broken_seal(path)
-    try:
-        with open_hdf5(path, again=again) as file:
-            # The version first: another schema may have other attributes.
-            refuse_other_schema(path, file.attrs["schema_version"])
+    with opened(path, "a complete shard", again=again) as file:
+        refuse_other_attributes(path, file, _ATTRIBUTES)
 
-            # Then its identity: a file may have been copied to the path of another unit.
-            own_header = ShardHeader(
-                config_hash=str(file.attrs["config_hash"]),
-                mesh_sha256=str(file.attrs["mesh_sha256"]),
-                object_name=str(file.attrs["object_name"]),
-                start=int(file.attrs["start"]),
-                stop=int(file.attrs["stop"]),
+        # Its identity: a file may have been copied to the path of another unit.
+        own_header = ShardHeader(
+            config_hash=file.attrs["config_hash"],
+            mesh_sha256=file.attrs["mesh_sha256"],
+            object_name=file.attrs["object_name"],
+            start=int(file.attrs["start"]),
+            stop=int(file.attrs["stop"]),
+        )
+        if header is not None and own_header != header:
+            raise DataError(
+                f"{path}: must be a shard of {header.label}, got one of {own_header.label}"
             )
-            if header is not None and own_header != header:
-                raise DataError(
-                    f"{path}: must be a shard of {header.label}, got one of {own_header.label}"
-                )
 
-            yield file, own_header
-    except (OSError, KeyError) as error:
-        raise DataError(f"{path}: must be a complete shard, got another file ({error})") from None
+        # Its columns.
+        if not again:
+            every = {"trials": trial_columns(), "looks": LOOK_FIELDS}
+            refuse_other_structure(path, file, every if tables is None else tables)
+        if not again and tables is None:
+            outcomes = read_column(file["trials"], "outcome")
+            refuse_other_codes(path, "/trials/outcome", outcomes, list(Outcome))
+            looked = read_column(file["looks"], "row")
+            refuse_other_codes(path, "/looks/row", looked, len(outcomes))
+        yield file, own_header

@@ -8,16 +8,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import h5py
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.assembly.survey import shards_sha256
 from drakegrasp.dataset.filters import Removal
-from drakegrasp.dataset.hdf5 import open_hdf5, read_texts
+from drakegrasp.dataset.hdf5 import open_hdf5, read_names, read_texts
+from drakegrasp.dataset.layout.opening import open_samples, open_trials, read_codes
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRIALS_FILE
-from drakegrasp.dataset.schema import SPLITS, refuse_other_schema
+from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.dataset.shards import read_trials
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome
@@ -156,50 +156,36 @@ def count_funnel(out: Path) -> Funnel:
 
 def funnel_of(path: Path) -> Funnel:
     """Return the funnel that a file of trials tells, as `count_funnel`."""
-    # The columns that are counted, a block after the other.
-    try:
-        with open_hdf5(path) as file:
-            refuse_other_schema(path, file.attrs["schema_version"])
-            objects = {name: values[:] for name, values in file["objects"].items()}
-            names, classes = (read_texts(file["objects"][key]) for key in ("name", "class_name"))
-            count = len(objects["name"])
-            outcomes = np.zeros((count, 1 + max(Outcome)), dtype=np.int64)
-            held = {word: np.zeros(count, dtype=np.int64) for word in WORDS}
-            for start in range(0, len(file["trials/outcome"]), BLOCK):
-                rows = slice(start, start + BLOCK)
-                index, outcome = (file[f"trials/{name}"][rows] for name in ("object", "outcome"))
-                outcomes += _count_pairs(index, outcome, count, 1 + max(Outcome))
-                for word, numbers in held.items():
-                    numbers += np.bincount(index[file[f"trials/{word}"][rows]], minlength=count)
-
-            # Of the successes, all.
-            success = file["successes/trial_id"][:]
-            removal = file["successes/removal"][:]
-            owner = _objects_of(file["trials/object"], success)
-    except (OSError, KeyError) as error:
-        raise DataError(f"{path.parent}: must hold {path.name}, got none ({error})") from None
+    # The columns that are counted, a block of rows after the other.
+    with open_trials(path) as file:
+        objects, trials, successes = (file[name] for name in ("objects", "trials", "successes"))
+        names, classes = (read_texts(objects[key]) for key in ("name", "class_name"))
+        counts = {key: objects[key][:] for key in ("candidates", "distinct", "valid")}
+        count, rows = len(names), len(trials["outcome"])
+        success = read_codes(successes["trial_id"], rows)
+        removal = read_codes(successes["removal"], list(Removal))
+        outcomes = np.zeros((count, 1 + max(Outcome)), dtype=np.int64)
+        held = {word: np.zeros(count, dtype=np.int64) for word in WORDS}
+        owner = np.zeros(len(success), dtype=np.int32)
+        for start in range(0, rows, BLOCK):
+            block = slice(start, start + BLOCK)
+            index = read_codes(trials["object"], count, block)
+            outcome = read_codes(trials["outcome"], list(Outcome), block)
+            outcomes += _count_pairs(index, outcome, count, 1 + max(Outcome))
+            for word, numbers in held.items():
+                numbers += np.bincount(index[trials[word][block]], minlength=count)
+            here = (success >= start) & (success < start + BLOCK)
+            owner[here] = index[success[here] - start]
 
     return Funnel(
         names=names,
         classes=classes,
-        candidates=objects["candidates"],
-        distinct=objects["distinct"],
-        valid=objects["valid"],
+        **counts,
         outcomes=outcomes,
         precision=held["precision"],
         stable=held["stable"],
         removals=_count_pairs(owner, removal, count, 1 + max(Removal)),
     )
-
-
-def _objects_of(column: h5py.Dataset, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
-    """Return some rows of a column, given in rising order, without reading all at once."""
-    found = [np.zeros(0, dtype=np.int32)]
-    for start in range(0, len(column), BLOCK):
-        bounds = np.searchsorted(rows, (start, start + BLOCK))
-        own = rows[slice(*bounds)] - start
-        found.append(column[start : start + BLOCK][own])
-    return np.concatenate(found)
 
 
 def count_splits(out: Path) -> list[SplitCount]:
@@ -213,20 +199,16 @@ def count_splits(out: Path) -> list[SplitCount]:
 
 def splits_of(path: Path) -> list[SplitCount]:
     """Return what a data file tells of its splits, as `count_splits`."""
-    try:
-        with open_hdf5(path) as file:
-            refuse_other_schema(path, file.attrs["schema_version"])
-            return [
-                SplitCount(
-                    split=split,
-                    samples=len(file[split]["grasps"]),
-                    objects=len(set(file[split]["object_props/object_name"][:])),
-                    classes=len(set(file[split]["object_props/class_name"][:])),
-                )
-                for split in SPLITS
-            ]
-    except (OSError, KeyError) as error:
-        raise DataError(f"{path}: must be a data file, got none ({error})") from None
+    with open_samples(path) as file:
+        return [
+            SplitCount(
+                split=split,
+                samples=len(file[split]["grasps"]),
+                objects=len(set(read_names(file[split]["object_props/object_name"]))),
+                classes=len(set(read_names(file[split]["object_props/class_name"]))),
+            )
+            for split in SPLITS
+        ]
 
 
 def _count_pairs(

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -43,7 +43,7 @@ class Clock:
     def __init__(self) -> None:
         self.prepare: list[float] = []
         self.units: list[UnitSummary] = []
-        self.assembling: Counter[str] = Counter()
+        self.assembling: defaultdict[str, float] = defaultdict(float)
         self.last = 0.0
 
     def __call__(self, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
@@ -123,7 +123,7 @@ def stage_times(clock: Clock, core: float, *, assembled: float, out: Path) -> St
         look=seconds["look"] / max(1, successes),
         survey=core * clock.assembling[survey_object.__name__] / attempts,
         pack=core * clock.assembling[pack_rows.__name__] / attempts,
-        put=core * (assembled - clock.assembling.total()) / attempts,
+        put=core * (assembled - sum(clock.assembling.values())) / attempts,
         successes=successes / attempts,
         samples=samples / max(1, successes),
         **measure_storage(out),
