@@ -95,10 +95,12 @@ def build(
 def assemble(out: Path, reject: Path | None, overrides: tuple[str, ...], workers: int) -> None:
     """Filter and split again, without simulating.
 
-    The command writes trials.hdf5 and both data files again from the shards in OUT.
+    The command writes trials.hdf5 and both data files again from the shards in OUT. What a
+    reject.json names and is no success of the dataset is skipped, and named.
     """
     from drakegrasp.dataset.assemble import assemble as assemble_files
-    from drakegrasp.dataset.rejections import read_rejected
+    from drakegrasp.dataset.manifest import read_manifest
+    from drakegrasp.dataset.rejections import read_rejected, unused_rejections
     from drakegrasp.runtime.executor import processes
     from drakegrasp.runtime.progress import progress_bar
 
@@ -108,6 +110,8 @@ def assemble(out: Path, reject: Path | None, overrides: tuple[str, ...], workers
             out, overrides=overrides, rejected=rejected, execute=execute, progress=progress
         )
     print_stats(out)
+    for sentence in unused_rejections(out, rejected, read_manifest(out).rejected):
+        say(sentence)
 
 
 @click.command()
