@@ -146,3 +146,18 @@ def test_images_that_are_off_by_one_pixel_are_found(out: Path, shift: tuple[int,
     for place, axes in (("images", (1, 2)), ("masks", (0, 1))):
         change(out, OTO, f"test/{place}", 1, lambda a, axes=axes: np.roll(a, shift, axes))
     assert {h[:3] for h in found(out)} == {(OTO, "/test", 1)}
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_mesh_is_measured_inside_the_border_of_the_mask(out: Path, inside: bool) -> None:
+    """Pixels that are 0.6 mm behind the mesh, in its box: all inside, or all at the border.
+
+    At the border a pixel may show a face nearly from its edge.
+    """
+    with h5py.File(out / OTO, "r+") as file:
+        mask, image = file["train/masks"][0], file["train/images"][0]
+        border = (mask == 1) & ~ndimage.binary_erosion(mask, np.ones((3, 3)))
+        image[3, (mask == 1) & (border != inside)] += 6e-4
+        file["train/images"][0] = image
+    what = "points in the mask must be on the object's mesh within"
+    must_find(out, *([(OTO, "/train", 0, what)] if inside else []))
