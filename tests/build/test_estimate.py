@@ -16,7 +16,9 @@ from drakegrasp.build.estimate import CERTIFY_SECONDS, START_SECONDS, plan_build
 from drakegrasp.build.stage_times import MEASURED, logged_times, read_times
 from drakegrasp.cli.main import main
 from drakegrasp.config import load_config, override_config
+from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.log import BuildLog
+from drakegrasp.dataset.statistics import count_funnel
 from drakegrasp.errors import ConfigError, DataError
 
 EVEN = replace(
@@ -155,6 +157,9 @@ def test_storage_adds_up_to_the_directory(small_dataset: Path) -> None:
     sizes = load_script("measurements/measure_stages").measure_storage(small_dataset)
     assert all(size > 0.0 for size in sizes.values())
     config = load_config(overrides=["candidates.max=40", "unit_candidates=10"])
-    plan = plan_build(3, config, 1, replace(MEASURED, successes=0.0, **sizes))
+    funnel = count_funnel(small_dataset)
+    held, kept = funnel.removals.sum(), funnel.removals[:, Removal.KEPT].sum()
+    shares = {"successes": held / funnel.outcomes.sum(), "samples": kept / held}
+    plan = plan_build(3, config, 1, replace(MEASURED, **shares, **sizes))
     whole = sum(p.stat().st_size for p in small_dataset.rglob("*") if p.is_file())
-    assert 0.1 * whole < plan.bytes < whole
+    assert plan.bytes == pytest.approx(whole, rel=0.1)
