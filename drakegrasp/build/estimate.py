@@ -67,6 +67,10 @@ class Plan:
         return self.workers * self.hours
 
 
+#: More workers, or objects, than any build has.
+MOST_WORKERS = 1_000_000
+
+
 def plan_build(objects: int, config: Config, workers: int, times: StageTimes) -> Plan:
     """Return what building some objects from nothing is expected to take.
 
@@ -78,8 +82,8 @@ def plan_build(objects: int, config: Config, workers: int, times: StageTimes) ->
         HandError: If the hand's file cannot be read.
     """
     for name, count in (("objects", objects), ("workers", workers)):
-        if count < 1:
-            raise ConfigError(f"{name} must be at least 1, got {count}")
+        if not 1 <= count <= MOST_WORKERS:
+            raise ConfigError(f"{name} must be 1 to {MOST_WORKERS:,}, got {count}")
 
     # How much there is to do.
     per_object = math.ceil(config.candidates.max / config.unit_candidates)

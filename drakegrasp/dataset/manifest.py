@@ -31,7 +31,7 @@ from drakegrasp.config import (
     parse_config,
 )
 from drakegrasp.dataset import log as build_log
-from drakegrasp.dataset.layout.json_files import read_mapping, validated
+from drakegrasp.dataset.layout.json_files import Name, read_mapping, validated
 from drakegrasp.dataset.paths import FILE_NAME, OWN_FILES, OWN_FOLDERS
 from drakegrasp.dataset.rejections import AttemptKey, key_to_json
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, refuse_other_schema
@@ -42,19 +42,11 @@ from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_digest, hand_file
 from drakegrasp.runtime.file_set import refuse_half_replaced
 from drakegrasp.runtime.files import probe_folder, write_atomic
-from drakegrasp.runtime.names import NAME_RULE, is_name
 
 #: Packages whose versions may change a result.
 VERSIONED = ("drakegrasp", "drake", "numpy", "scipy", "trimesh", "manifold3d", "h5py")
 #: Versions that must not change within a dataset, nor between a client and its workers.
 REQUIRED_VERSIONS = ("drakegrasp", "drake", "hand")
-
-
-def _refuse_no_name(text: str) -> str:
-    """Refuse what would lead out of the directory as a file's name, or steer a terminal."""
-    if not is_name(text):
-        raise ValueError(f"a name must be {NAME_RULE}, got {text!r}")
-    return text
 
 
 def _refuse_no_pose(packed: tuple[float, ...]) -> tuple[float, ...]:
@@ -67,7 +59,6 @@ def _refuse_no_pose(packed: tuple[float, ...]) -> tuple[float, ...]:
 
 
 #: Types of what a manifest holds; they are checked when one is read.
-Name = Annotated[str, AfterValidator(_refuse_no_name)]
 Axis = Annotated[str, Field(pattern=r"^[+-][xyz]$")]
 Hex = Annotated[str, Field(pattern="^[0-9a-f]+$")]
 Licence = Annotated[str, Field(pattern=r"^[ -~]*[!-~][ -~]*$", max_length=200)]

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, with_config
 
-from drakegrasp.dataset.layout.json_files import read_mapping, validated
+from drakegrasp.dataset.layout.json_files import Name, read_mapping, validated
 from drakegrasp.errors import DataError, printable
 from drakegrasp.runtime.files import write_atomic
 
@@ -38,7 +38,7 @@ class AttemptKey:
         standoff_index: Index into the configuration's stand-offs.
     """
 
-    object: str
+    object: Name
     candidate: Annotated[int, Field(ge=0, le=2**31 - 1)]
     standoff_index: Annotated[int, Field(ge=0, le=255)]
 

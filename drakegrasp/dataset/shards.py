@@ -102,6 +102,10 @@ def trial_columns() -> tuple[Field, ...]:
     return tuple(f for f in TRIAL_FIELDS if f.name not in ASSEMBLED_FIELDS)
 
 
+def _tables() -> dict[str, tuple[Field, ...]]:
+    return {"trials": trial_columns(), "looks": LOOK_FIELDS}
+
+
 def write_shard(out: Path, shard: Shard) -> Path:
     """Write a shard into a dataset's directory and return its path."""
     path = shard.header.path(out)
@@ -128,8 +132,7 @@ def read_shard(path: Path, header: ShardHeader | None = None, *, verify_seal: bo
         DataError: If the file is missing, truncated or changed by a single bit, or of another
             schema, configuration, mesh or range; the message names the file and the reason.
     """
-    tables = {"trials": trial_columns(), "looks": LOOK_FIELDS}
-    with _open_shard(path, header, tables, verify_seal=verify_seal) as (file, own_header):
+    with _open_shard(path, header, _tables(), verify_seal=verify_seal) as (file, own_header):
         rows = len(file["trials/outcome"])
         refuse_other_codes(path, "/trials/outcome", file["trials/outcome"][:], list(Outcome))
         refuse_other_codes(path, "/looks/row", file["looks/row"][:], rows)
@@ -152,7 +155,12 @@ def read_outcomes(
 
 
 def read_trials(
-    path: Path, header: ShardHeader, names: Sequence[str], *, verify_seal: bool = True
+    path: Path,
+    header: ShardHeader,
+    names: Sequence[str],
+    *,
+    verify_seal: bool = True,
+    complete: bool = False,
 ) -> dict[str, AnyArray]:
     """Return some columns of a shard's `/trials`, by their names.
 
@@ -161,11 +169,14 @@ def read_trials(
         header: Identity that the shard must have.
         names: Of the columns.
         verify_seal: Whether to verify the seal, which reads the whole file.
+        complete: Whether all other fields must be there, too.
 
     Raises:
         DataError: See `read_shard`.
     """
-    tables = {"trials": tuple(f for f in trial_columns() if f.name in (*names, "outcome"))}
+    tables = _tables()
+    if not complete:
+        tables = {"trials": tuple(f for f in tables["trials"] if f.name in (*names, "outcome"))}
     with _open_shard(path, header, tables, verify_seal=verify_seal) as (file, _):
         refuse_other_codes(path, "/trials/outcome", file["trials/outcome"][:], list(Outcome))
         return {name: np.asarray(file["trials"][name][:]) for name in names}

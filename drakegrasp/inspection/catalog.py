@@ -6,6 +6,7 @@ end, whatever a build writes meanwhile.
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from dataclasses import dataclass
@@ -123,7 +124,7 @@ class Catalog:
             return self._snapshot
 
     def _read(self) -> Snapshot:
-        if (self.out / TRIALS_FILE).is_file():
+        if os.path.lexists(self.out / TRIALS_FILE):
             self._parts.clear()
             return _read_assembled(self.out)
         return self._read_shards(read_manifest(self.out))
@@ -132,7 +133,7 @@ class Catalog:
         """Return the state of a build that runs or was stopped."""
         # Shards never change: only new ones are read.
         numbers = {entry.name: i for i, entry in enumerate(manifest.objects)}
-        done = [header for header in manifest.headers() if header.path(self.out).is_file()]
+        done = [header for header in manifest.headers() if os.path.lexists(header.path(self.out))]
         for header in done:
             if header not in self._parts:
                 number = numbers[header.object_name]
@@ -183,7 +184,7 @@ def _read_assembled(out: Path) -> Snapshot:
     missing = [
         f"{name} is not there: images come from the shards, if they are."
         for name in DATA_FILES.values()
-        if not (out / name).is_file()
+        if not os.path.lexists(out / name)
     ]
     gone = [name for name in names if find_model(out, name) is None]
     if gone:

@@ -44,9 +44,9 @@ def write_site(out: Path, folder: Path, *, progress: Report = silent) -> int:
         DataError: If there is no dataset, it has no success, or the folder holds other files.
     """
     # Refuse what cannot be done before anything is written.
+    decisions = read_decisions(out / FILE_NAME)
     catalog = Catalog(out)
     snapshot, query = catalog.current(), Query()
-    decisions = read_decisions(out / FILE_NAME)
     places = select(snapshot, query, decisions)[:MAX_GRASPS]
     if not len(places):
         raise DataError(f"{out}: must hold at least one success to show, got none")

@@ -146,7 +146,8 @@ def attribute_kinds(allowed: Mapping[str, Sequence[str]]) -> Iterator[Kind]:
         allowed: Names of values in ATTRIBUTES that are none, by attribute.
     """
     for key, fine in allowed.items():
-        yield Kind(f"attribute {key} missing", _sealed(lambda file, k=key: file.attrs.pop(k)))
+        if "missing" not in fine:
+            yield Kind(f"attribute {key} missing", _sealed(lambda file, k=key: file.attrs.pop(k)))
         for name, value in ATTRIBUTES.items():
             if name not in fine:
 
@@ -166,12 +167,12 @@ def attribute_kind(key: str, name: str, value: Any) -> Kind:
 _ORIGIN: dict[str, Sequence[str]] = {
     "schema_version": (),
     "config": (),
-    "config_hash": (),
+    "config_hash": ("a text",),
     "seed": ("a number",),
     "versions": (),
-    "fingers": (),
-    "signature": (),
-    "shards": (),
+    "fingers": ("missing",),
+    "signature": ("a text",),
+    "shards": ("a text",),
     "K": (),
     "near": ("a number",),
     "far": ("a number",),
@@ -189,7 +190,6 @@ TRIALS: tuple[Kind, ...] = (
     attribute_kind("schema_version", "before", 1),
     attribute_kind("seed", "negative", -1),
     attribute_kind("near", "negative", -1.0),
-    attribute_kind("config", "no configuration", '{"physics": 5}'),
     attribute_kind("config", "NaN", '{"physics": {"time_step": NaN}}'),
     attribute_kind("fingers", "of numbers", '{"a": 5}'),
 )
@@ -221,12 +221,14 @@ DATA: tuple[Kind, ...] = (
     attribute_kind("K", "NaN inside", np.full((3, 3), np.nan)),
     attribute_kind("K", "of 9 numbers", np.ones(9)),
 )
-DATA_VALUES: tuple[Kind, ...] = (
-    value_kind("test/object_props/object_name", "no UTF-8", 0, b"\xff\xfe"),
-    value_kind("test/object_props/object_name", "leads outside", 0, "../../outside"),
-    value_kind("test/object_props/class_name", "no UTF-8", 0, b"\xff\xfe"),
-    value_kind("test/trial_id", "negative", 0, -1),
-    value_kind("test/trial_id", "after the last", 0, 99),
+#: What only a comparison with the configuration shows.
+CONTRADICTIONS: tuple[Kind, ...] = (
+    attribute_kind("config", "no configuration", '{"physics": 5}'),
+    attribute_kind("config_hash", "another", "0123456789abcdef"),
+    attribute_kind("seed", "another", 12),
+    attribute_kind("near", "another", 0.02),
+    attribute_kind("far", "another", 0.8),
+    attribute_kind("K", "another", np.eye(3)),
 )
 SHARD: tuple[Kind, ...] = (
     *ANY_FILE,
