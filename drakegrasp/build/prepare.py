@@ -137,6 +137,12 @@ def prepare(source: MeshSource, config: Config) -> PreparedObject:
     """
     model = prepare_object(source, config.objects)
     resting = settle(model, config)
+
+    # What else a mesh alone decides: one whose distances hang or take too much memory costs the
+    # mesh here, and would stop the build later.
+    if config.screen.mode == "on":
+        inject_fault(source.name, "distances")
+        _ = model.field
     return PreparedObject(
         model=replace(model, notes=(*model.notes, *resting.notes)),
         X_TO=resting.X_TO,

@@ -249,6 +249,7 @@ def _predict_all(
     """
     _refuse_failing(journal, "predict", setup.prepared.model.name)
     with journal.step("predict", STAGE_SECONDS):
+        inject_fault(setup.prepared.model.name, "predict")
         return list(predict_attempts(setup, attempts))
 
 

@@ -168,22 +168,21 @@ class Manifest:
 
     def headers(self) -> Iterator[ShardHeader]:
         """Yield the work units of the dataset in the order of its rows."""
-        step, config_hash = self.config.unit_candidates, self.config.simulation_hash()
+        config_hash = self.config.simulation_hash()
         for entry in self.objects:
-            for start in range(0, entry.candidates, step):
+            for unit in self.config.unit_ranges(entry.candidates):
                 yield ShardHeader(
                     config_hash=config_hash,
                     mesh_sha256=entry.mesh_sha256,
                     object_name=entry.name,
-                    start=start,
-                    stop=min(start + step, entry.candidates),
+                    start=unit.start,
+                    stop=unit.stop,
                 )
 
     @property
     def units(self) -> int:
         """Number of work units."""
-        step = self.config.unit_candidates
-        return sum(-(-entry.candidates // step) for entry in self.objects)
+        return sum(len(tuple(self.config.unit_ranges(e.candidates))) for e in self.objects)
 
     def signature(self) -> str:
         """Return a hash of all in it that decides a row of the dataset, hexadecimal."""

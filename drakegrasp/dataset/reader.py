@@ -133,12 +133,25 @@ class GraspDataset:
         Raises:
             KeyError: If there is no such field.
         """
-        file = self._open()
-        if name not in self._fields:
-            field = file[self.split][name]
-            self._fields[name] = ImageRows(field) if FIELDS[name].sample else field
-        value: Any = self._fields[name][row]
+        value: Any = self._field(name)[row]
         return value.decode() if FIELDS[name].dtype == "str" else value
+
+    def read_images(self, name: str, rows: Sequence[int], images: npt.NDArray[Any]) -> None:
+        """Read images of some rows into an array, without a copy on the way.
+
+        Args:
+            name: Of the field, `images` or `masks`.
+            rows: n of them, in any order.
+            images: Contiguous array (n, ...) of the field's type; it is overwritten.
+
+        Raises:
+            DataError: If the field has no images.
+        """
+        field = self._field(name)
+        if not isinstance(field, ImageRows):
+            raise DataError(f"field must be one of images, masks, got {name!r}")
+        for image, row in zip(images, rows, strict=True):
+            field.read_into(row, image)
 
     def column(self, name: str) -> npt.NDArray[Any]:
         """Return all rows (n, ...) of a field, e.g. `grasps` or `grasp_props/stable`.
@@ -182,6 +195,14 @@ class GraspDataset:
 
     def __repr__(self) -> str:
         return f"GraspDataset({str(self.path)!r}, split={self.split!r}): {len(self)} grasps"
+
+    def _field(self, name: str) -> h5py.Dataset | ImageRows:
+        """Return a field in the file of this process, which is kept open with it."""
+        file = self._open()
+        if name not in self._fields:
+            field = file[self.split][name]
+            self._fields[name] = ImageRows(field) if FIELDS[name].sample else field
+        return self._fields[name]
 
     def _open(self) -> h5py.File:
         """Return the file, as this process opened it."""

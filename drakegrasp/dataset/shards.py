@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.hdf5 import AnyArray, write_field
+from drakegrasp.dataset.hdf5 import AnyArray, write_fixed
 from drakegrasp.dataset.layout.attributes import COUNT, TEXT
 from drakegrasp.dataset.layout.opening import (
     opened,
@@ -116,7 +116,7 @@ def write_shard(out: Path, shard: Shard) -> Path:
         for name, fields, columns in tables:
             group = file.create_group(name)
             for field in fields:
-                write_field(group, field, np.asarray(columns[field.name]))
+                write_fixed(group, field, np.asarray(columns[field.name]))
     return path
 
 

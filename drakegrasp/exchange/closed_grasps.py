@@ -62,7 +62,7 @@ def read_closed_grasps(out: Path) -> Iterator[ClosedGrasp]:
         refuse_other_codes(out / DATA_FILES["oto"], "trial_id", rows, len(trials["object"]))
         objects = read_codes(trials["object"], len(names))[rows]
         X_TO, X_OG, q, spread = (
-            trials[key][:][rows] for key in ("X_TO", "X_OG", "closed_q", "spread")
+            trials[key][rows] for key in ("X_TO", "X_OG", "closed_q", "spread")
         )
 
     for i, row in enumerate(rows.tolist()):

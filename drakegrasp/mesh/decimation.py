@@ -128,7 +128,7 @@ def _decimate_parted(solid: Solid, max_faces: int) -> Solid | None:
     """Return the least aggressive decimation, parted where its surface touches itself."""
     target = int(PARTED * max_faces)
     for aggressiveness in DECIMATION_STEPS:
-        reduced = _parted(solid, target, aggressiveness)
+        reduced = reduce_and_part(solid, target, aggressiveness)
         if 0 < len(reduced.faces) <= max_faces:
             return reduced
     return None
@@ -139,11 +139,17 @@ def _decimate_twice(solid: Solid, max_faces: int) -> Solid | None:
     between = int(FIRST * max_faces)
     if len(solid.faces) <= between:
         return None  # fast_simplification refuses to aim at more faces than there are
-    return _decimate_parted(_parted(solid, between, DECIMATION_STEPS[0]), max_faces)
+    return _decimate_parted(reduce_and_part(solid, between, DECIMATION_STEPS[0]), max_faces)
 
 
-def _parted(solid: Solid, target: int, aggressiveness: float) -> Solid:
-    """Return a quadric decimation without duplicate faces and touching edges."""
+def reduce_and_part(solid: Solid, target: int, aggressiveness: float) -> Solid:
+    """Return a quadric decimation without duplicate faces and touching edges.
+
+    Args:
+        solid: The surface, which has more faces than `target`.
+        target: Number of faces to aim at.
+        aggressiveness: How fast the error may grow from round to round, see `DECIMATION_STEPS`.
+    """
     vertices, faces = fast_simplification.simplify(
         np.ascontiguousarray(solid.vertices),
         np.ascontiguousarray(solid.faces),

@@ -15,6 +15,9 @@ from drakegrasp.mesh.surfaces import Faces
 
 #: Mesh files that can be read; other files are ignored.
 SUFFIXES = (".obj", ".stl", ".ply", ".glb")
+#: Faces from which what reading a file leaves behind is worth freeing at once: a scene of trimesh
+#: refers to itself, so it would wait for Python's collector.
+MANY_FACES = 100_000
 
 
 def load_mesh(path: str | Path) -> trimesh.Trimesh:
@@ -24,7 +27,8 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
         MeshError: If the file cannot be read or holds no finite triangles.
     """
     path = Path(path)
-    return parse_mesh(path.name, read_bytes(path))
+    vertices, faces = parse_mesh(path.name, read_bytes(path))
+    return clean_triangles(vertices, faces, path.name)
 
 
 def read_bytes(path: Path) -> bytes:
@@ -41,18 +45,18 @@ def read_bytes(path: Path) -> bytes:
         ) from error
 
 
-def parse_mesh(name: str, content: bytes) -> trimesh.Trimesh:
-    """Return the triangles of a mesh file's content, in the file's units and axes.
+def parse_mesh(name: str, content: bytes) -> tuple[Array, Faces]:
+    """Return the vertices (n, 3) and faces (m, 3) of a mesh file, in the file's units and axes.
 
-    All geometries of a scene are joined, with their transforms applied. Equal vertices are
-    merged, duplicate and degenerate faces dropped; materials are not read.
+    All geometries of a scene are joined, with their transforms applied; materials are not read.
+    The triangles are as they stand in the file: see `clean_triangles`.
 
     Args:
         name: Name of the file; its suffix gives the format.
         content: The file's bytes.
 
     Raises:
-        MeshError: If it holds no finite triangles.
+        MeshError: If it is no mesh file.
     """
     suffix = Path(name).suffix.lower()
     if suffix not in SUFFIXES:
@@ -73,10 +77,9 @@ def parse_mesh(name: str, content: bytes) -> trimesh.Trimesh:
                 if isinstance(part, trimesh.Trimesh) and len(part.faces):
                     part = trimesh.Trimesh(part.vertices, part.faces, process=False)
                     parts.append(part.apply_transform(X_SN))
-            vertices, faces = _concatenate(parts)
+            return _concatenate(parts)
     except Exception as error:
         raise MeshError(f"{name}: must be a valid {suffix} mesh, got: {one_line(error)}") from error
-    return clean_triangles(vertices, faces, name)
 
 
 def clean_triangles(vertices: Array, faces: Faces, name: str) -> trimesh.Trimesh:
@@ -98,9 +101,9 @@ def clean_triangles(vertices: Array, faces: Faces, name: str) -> trimesh.Trimesh
             f"{name}: faces must use vertices 0..{len(vertices) - 1}, "
             f"got {faces.min()}..{faces.max()}"
         )
-    used = vertices[faces.ravel()]
-    if not np.isfinite(used).all():
-        bad = int((~np.isfinite(used)).any(axis=1).sum())
+    infinite = np.asarray(~np.isfinite(vertices).all(axis=1))
+    if infinite.any() and infinite[faces].any():
+        bad = int(infinite[faces].sum())
         raise MeshError(f"{name}: vertices must be finite, got NaN or inf at {bad} corners")
 
     # Merge equal vertices.
@@ -114,7 +117,10 @@ def _concatenate(parts: list[trimesh.Trimesh]) -> tuple[Array, Faces]:
     """Return the vertices and faces of several meshes as one; of none, empty arrays."""
     if not parts:
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+    if len(parts) == 1:  # no copies of what may be large
+        vertices, faces = parts[0].vertices.view(np.ndarray), parts[0].faces.view(np.ndarray)
+        return vertices.astype(np.float64, copy=False), faces.astype(np.int64, copy=False)
     offsets = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
-    faces = [part.faces + offset for part, offset in zip(parts, offsets, strict=True)]
+    every = [part.faces + offset for part, offset in zip(parts, offsets, strict=True)]
     vertices = np.vstack([part.vertices for part in parts])
-    return np.array(vertices, dtype=np.float64), np.vstack(faces).astype(np.int64)
+    return np.array(vertices, dtype=np.float64), np.vstack(every).astype(np.int64)

@@ -19,6 +19,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from drakegrasp.arithmetic import norm
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
 from drakegrasp.mesh.components import (
@@ -45,6 +46,10 @@ from drakegrasp.mesh.union import separate, unite
 #: Vertices closer than this fraction of the diagonal are merged: above the rounding of files
 #: with eight digits, far below the detail of any scan.
 WELD = 1e-8
+#: Vertices that are sorted at a time while equal ones are merged.
+WELD_PART = 300_000
+#: Number of vertices below which three indices of them go into one 64-bit integer.
+MOST_PACKED = 2**21
 #: Rims closer than this fraction of the diagonal are the two sides of one seam.
 STITCH = 1e-4
 #: A component whose mean thickness is below this fraction of its diagonal encloses nothing.
@@ -69,21 +74,58 @@ def weld(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
         faces: (m, 3).
     """
     # Merge vertices that round to the same grid point; drop faces that then use one twice.
-    grid = np.round(vertices / (WELD * max(diagonal(vertices[faces.ravel()]), 1e-300)))
-    _, first, inverse = np.unique(grid, axis=0, return_index=True, return_inverse=True)
-    faces = first[inverse.reshape(-1)][faces].astype(np.int64)
+    used = np.zeros(len(vertices), dtype=bool)
+    used[faces] = True
+    low = vertices.min(axis=0, initial=np.inf, where=used[:, None])
+    high = vertices.max(axis=0, initial=-np.inf, where=used[:, None])
+    spacing = WELD * max(float(norm(high - low)), 1e-300)
+    faces = _first_equal(vertices, spacing)[faces]
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
 
     # A face that occurs twice is a copy, or the wall between two touching solids. The
     # interpretation that leaves fewer edges with an odd number of faces is the right one.
-    _, index, inverse, counts = np.unique(
-        np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True, return_counts=True
-    )
+    index, inverse, counts = _unique_faces(faces)
     if (counts > 1).any():
         once = faces[np.sort(index)]
-        without = faces[counts[inverse.reshape(-1)] != 2]
+        without = faces[counts[inverse] != 2]
         faces = min((once, without), key=_odd_edges) if len(without) else once
     return compact(vertices, faces)
+
+
+def _first_equal(vertices: Array, spacing: float) -> Faces:
+    """Return the first vertex (n,) that rounds to the same point of a grid, for each vertex.
+
+    Sorting all vertices at once would take several times their memory: an STL file has each of
+    them six times. So each part of them is sorted first, and then what is left of the parts.
+    """
+    firsts, places, total = [], [], 0
+    for start in range(0, len(vertices), WELD_PART):
+        part = np.round(vertices[start : start + WELD_PART] / spacing)
+        _, first, inverse = np.unique(part, axis=0, return_index=True, return_inverse=True)
+        firsts.append(start + first)
+        places.append((total + inverse.reshape(-1)).astype(np.int32))
+        total += len(first)
+    kept, place = np.concatenate(firsts), np.concatenate(places)
+    if len(firsts) == 1:
+        return kept[place].astype(np.int64)
+
+    # Equal ones of two parts: the earlier part is the first.
+    grid = np.round(vertices[kept] / spacing)
+    _, first, inverse = np.unique(grid, axis=0, return_index=True, return_inverse=True)
+    return kept[first[inverse.reshape(-1)]][place].astype(np.int64)
+
+
+def _unique_faces(faces: Faces) -> tuple[Faces, Faces, Faces]:
+    """Return the first face of each set of three vertices, the set of each face, and its size."""
+    corners = np.sort(faces, axis=1)
+    base = int(corners.max(initial=0)) + 1
+    if base < MOST_PACKED:
+        # One number for each face sorts like its three, and takes a third of the memory.
+        corners = (corners[:, 0] * base + corners[:, 1]) * base + corners[:, 2]
+    _, index, inverse, counts = np.unique(
+        corners, axis=0, return_index=True, return_inverse=True, return_counts=True
+    )
+    return index, inverse.reshape(-1), counts
 
 
 def repair_solid(vertices: Array, faces: Faces) -> Solid:

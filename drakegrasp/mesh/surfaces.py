@@ -197,8 +197,14 @@ def cover_triangles(triangles: Array, spacing: float) -> tuple[Array, Faces]:
 
 def compact(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
     """Return a surface without its unused vertices; the others keep their order."""
-    used, inverse = np.unique(faces, return_inverse=True)
-    return vertices[used], inverse.reshape(-1, 3).astype(np.int64)
+    if faces.size < len(vertices):
+        few, inverse = np.unique(faces, return_inverse=True)
+        return vertices[few], inverse.reshape(-1, 3).astype(np.int64)
+
+    # The same without sorting, which takes four times the memory of the faces.
+    used = np.zeros(len(vertices), dtype=bool)
+    used[faces] = True
+    return vertices[used], (np.cumsum(used) - 1)[faces].astype(np.int64)
 
 
 def split_faces(vertices: Array, faces: Faces, midpoints: Faces) -> Faces:

@@ -23,6 +23,7 @@ import trimesh
 from drakegrasp.config import ObjectConfig, PhysicsConfig
 from drakegrasp.errors import MeshError, one_line
 from drakegrasp.frames import Array
+from drakegrasp.mesh.coarsening import coarsen
 from drakegrasp.mesh.components import count_parts
 from drakegrasp.mesh.decimation import decimate
 from drakegrasp.mesh.distance_field import DistanceField, make_distance_field
@@ -154,13 +155,15 @@ def prepare_object(source: MeshSource, config: ObjectConfig | None = None) -> Ob
             solid; the message gives the reason.
     """
     mesh, digest = load_source(source)
+    vertices, faces = upright_vertices(mesh, source), np.asarray(mesh.faces)
+    del mesh  # it may be large
     config = config or ObjectConfig()
     if source.mass is not None:
         config = config.model_copy(update={"mass": source.mass})
     try:
         model = make_object(
-            upright_vertices(mesh, source),
-            np.asarray(mesh.faces),
+            vertices,
+            faces,
             config,
             name=source.name,
             class_name=source.class_name,
@@ -212,7 +215,8 @@ def make_object(
             f"file's unit with --units ({', '.join(UNITS)}) or for this mesh in {MANIFEST_NAME}"
         )
 
-    # One watertight solid.
+    # One watertight solid, with no more faces than mending has memory for.
+    vertices, faces, reduced = coarsen(vertices, faces)
     solid = repair_solid(vertices, faces)
     _refuse_slight(solid)
 
@@ -223,7 +227,7 @@ def make_object(
     collision, error = decimate(visual, config.max_collision_faces)
     collision = subdivide(collision, MAX_EDGE, MAX_SUBDIVIDED_FACES)
 
-    notes = solid.notes
+    notes = (*reduced, *solid.notes)
     parts = count_parts(solid.vertices, solid.faces)
     if parts > 1:
         notes = (*notes, f"{parts} parts do not touch and will move as one")

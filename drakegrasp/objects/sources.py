@@ -35,7 +35,8 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Positive, describe_mistake
 from drakegrasp.errors import MeshError, one_line
 from drakegrasp.frames import Array
-from drakegrasp.mesh.loading import SUFFIXES, parse_mesh, read_bytes
+from drakegrasp.mesh.loading import MANY_FACES, SUFFIXES, clean_triangles, parse_mesh, read_bytes
+from drakegrasp.runtime.environment import release_memory
 from drakegrasp.runtime.names import NAME_RULE, is_name
 from drakegrasp.yaml_text import parse_yaml
 
@@ -290,7 +291,12 @@ def load_source(source: MeshSource) -> tuple[trimesh.Trimesh, str]:
         MeshError: If the file cannot be read or holds no finite triangles.
     """
     content = read_bytes(source.path)
-    return parse_mesh(source.path.name, content), _sha256(content, source)
+    digest = _sha256(content, source)
+    vertices, faces = parse_mesh(source.path.name, content)
+    del content
+    if len(faces) > MANY_FACES:
+        release_memory()
+    return clean_triangles(vertices, faces, source.path.name), digest
 
 
 def upright_vertices(mesh: trimesh.Trimesh, source: MeshSource) -> Array:
@@ -306,4 +312,6 @@ def _sha256(content: bytes, source: MeshSource) -> str:
     for what in ("mass", "density", "friction"):
         value = getattr(source, what)
         said += [] if value is None else [f"{what} {value!r}"]
-    return hashlib.sha256(content + "\n".join(said).encode()).hexdigest()
+    digest = hashlib.sha256(content)
+    digest.update("\n".join(said).encode())
+    return digest.hexdigest()

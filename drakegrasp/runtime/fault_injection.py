@@ -1,7 +1,8 @@
 """Fault injection: crashes and hangs at a chosen place, to test that they are contained.
 
 In: the environment variable DRAKEGRASP_TEST_FAULT, which only tests set:
-`KIND:OBJECT:CANDIDATE:STANDOFF` for an attempt, `KIND:OBJECT` for preparing an object, several
+`KIND:OBJECT:CANDIDATE:STANDOFF` for an attempt, `KIND:OBJECT` for preparing an object,
+`KIND:OBJECT:distances` for its distance field, `KIND:OBJECT:predict` for the screen; several
 separated by blanks. Without it nothing happens.
 """
 
@@ -19,7 +20,8 @@ def inject_fault(*place: str | int) -> None:
     """Cause the fault that the environment asks for at a place, if any.
 
     Args:
-        place: An object's name; for an attempt also its candidate and its standoff.
+        place: An object's name; for an attempt also its candidate and its standoff, for other
+            steps what they do.
 
     Raises:
         MemoryError: For the kind `memory`.

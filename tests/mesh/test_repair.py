@@ -19,6 +19,7 @@ from helpers.meshes import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import drakegrasp.mesh.repair
 import drakegrasp.mesh.union
 from drakegrasp.errors import MeshError
 from drakegrasp.mesh.components import part_touching_edges
@@ -222,3 +223,21 @@ def test_touching_edge_gets_a_vertex_for_each_side():
     assert len(parted) == len(vertices) + 2 and len(new_faces) == len(faces) + 4
     assert is_solid_surface(new_faces)
     assert signed_volume(parted, new_faces) == pytest.approx(2 * 0.02**3)
+
+
+@pytest.mark.parametrize("limit", ["WELD_PART", "MOST_PACKED"])
+def test_welding_in_parts_changes_no_bit(monkeypatch, limit):
+    """A soup as in an STL file: each corner has a vertex of its own, some faces come twice."""
+    ball = trimesh.creation.icosphere(2, radius=0.05)
+    rng = np.random.default_rng(0)
+    order = np.append(rng.permutation(len(ball.faces)), [3, 3, 7])
+    soup = ball.vertices[ball.faces[order]].reshape(-1, 3)
+    soup += rng.uniform(-1e-11, 1e-11, soup.shape)
+    faces = np.arange(len(soup)).reshape(-1, 3)
+    whole = weld(soup, faces)
+    assert (len(whole[0]), len(whole[1])) == (len(ball.vertices), len(ball.faces))
+    monkeypatch.setattr(drakegrasp.mesh.repair, limit, 50)
+    parts = weld(soup, faces)
+    for one, other in zip(whole, parts, strict=True):
+        np.testing.assert_array_equal(one, other)
+        assert one.dtype == other.dtype
