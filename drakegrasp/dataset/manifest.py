@@ -110,13 +110,6 @@ class ObjectEntry:
     notes: tuple[str, ...]
     licence: Licence | None = None
 
-    def __post_init__(self) -> None:
-        if not self.candidates <= self.distinct <= self.valid <= self.combinations:
-            raise ValueError(
-                "candidates must be at most distinct, valid and combinations, in this order, got "
-                f"{self.candidates}, {self.distinct}, {self.valid} and {self.combinations}"
-            )
-
     def to_json(self) -> dict[str, Any]:
         """Return the entry as JSON types, in the order of the manifest."""
         # What is not stated leaves no trace.
@@ -268,16 +261,8 @@ def read_manifest(out: Path) -> Manifest:
     except ConfigError as error:
         raise DataError(f"{path}: {error}") from None
 
-    # It must not contradict itself.
-    for key, said, must in (
-        ("config_hash", stored.config_hash, config.simulation_hash()),
-        ("seed", stored.seed, config.seed),
-    ):
-        if said != must:
-            raise DataError(f"{path}: {key} must be {must}, that of its config, got {said}")
-    twins = [name for name, n in Counter(entry.name for entry in stored.objects).items() if n > 1]
-    if twins:
-        raise DataError(f"{path}: objects must have a name each, got {twins[0]!r} twice")
+    if (mistake := next(_contradictions(stored, config), None)) is not None:
+        raise DataError(f"{path}: {mistake}")
     return Manifest(
         config=config,
         objects=stored.objects,
@@ -300,6 +285,30 @@ class _Stored(BaseModel):
     objects: tuple[ObjectEntry, ...]
     refused: tuple[RefusedMesh, ...]
     rejected: tuple[AttemptKey, ...] = ()
+
+
+def _contradictions(stored: _Stored, config: Config) -> Iterator[str]:
+    """Yield where a manifest contradicts itself, in words."""
+    for key, said, must in (
+        ("config_hash", stored.config_hash, config.simulation_hash()),
+        ("seed", stored.seed, config.seed),
+    ):
+        if said != must:
+            yield f"{key} must be {must}, that of its config, got {said}"
+
+    for name, count in Counter(entry.name for entry in stored.objects).items():
+        if count > 1:
+            yield f"objects must have a name each, got {name!r} twice"
+    for i, entry in enumerate(stored.objects):
+        numbers = (entry.candidates, entry.distinct, entry.valid, entry.combinations)
+        if list(numbers) != sorted(numbers):
+            yield (
+                f"objects.{i}: candidates, distinct, valid and combinations must rise, "
+                f"got {', '.join(map(str, numbers))}"
+            )
+        if entry.candidates > config.candidates.max:
+            most = config.candidates.max
+            yield f"objects.{i}.candidates must be at most {most}, got {entry.candidates}"
 
 
 def claim_directory(out: Path, config: Config) -> Manifest | None:

@@ -76,6 +76,7 @@ MANIFEST: tuple[Kind, ...] = (
     value_kind(("objects", 0, "candidates"), "more than distinct", "5"),
     value_kind(("objects", 0, "distinct"), "more than valid", "5"),
     value_kind(("objects", 0, "valid"), "more than combinations", "5"),
+    value_kind(("config", "candidates", "max"), "less than candidates", "3"),
     value_kind(("fingers", "thumb"), "is a number", "5"),
     value_kind(("schema_version",), "of the future", "999"),
     value_kind(("seed",), "of another configuration", "12"),
