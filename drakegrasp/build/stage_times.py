@@ -116,6 +116,7 @@ def logged_times(out: Path, config: Config) -> StageTimes | None:
         out: Directory of the dataset.
         config: Only units of this configuration count.
     """
+    # Add up the units of builds with this configuration.
     seconds: Counter[str] = Counter()
     outcomes: Counter[str] = Counter()
     objects = set()
@@ -127,6 +128,8 @@ def logged_times(out: Path, config: Config) -> StageTimes | None:
             seconds.update(unit.seconds)
             outcomes.update(unit.outcomes)
             objects.add(unit.object)
+
+    # Their means; the log may have none.
     attempts, successes = outcomes.total(), outcomes[Outcome.SUCCESS.label]
     if not attempts:
         return None
