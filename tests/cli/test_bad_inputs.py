@@ -182,6 +182,19 @@ def some(kinds: Sequence[Kind], command: str, commands: Sequence[str]) -> Sequen
     return kinds[k - 1 :: len(commands) - 1]
 
 
+def test_every_kind_has_a_name() -> None:
+    modules = (array_kinds, hdf5_kinds, manifests, text_kinds)
+    tables = {
+        f"{module.__name__}.{name}": [kind.name for kind in table]
+        for module in modules
+        for name, table in vars(module).items()
+        if name.isupper() and isinstance(table, tuple) and isinstance(table[0], Kind)
+    }
+    for name, names in tables.items():
+        assert len(set(names)) == len(names), name
+    assert sum(map(len, tables.values())) > 1500
+
+
 READ_MANIFEST = (
     *("stats", "assemble", "check", "replay", "figures", "export glb", "export dexgraspbench"),
     *("verify", "bench", "build"),

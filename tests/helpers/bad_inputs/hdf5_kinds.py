@@ -184,13 +184,13 @@ TRIALS: tuple[Kind, ...] = (
     *field_kinds("objects", OBJECT_FIELDS, _TURNS),
     *field_kinds("trials", TRIAL_FIELDS, _TURNS),
     *field_kinds("successes", SUCCESS_FIELDS, _TURNS[1:]),
-    *(dataset_kind("trials/outcome", way) for way in _TURNS if way != "a group"),
+    *(dataset_kind("trials/outcome", way) for way in _TURNS if way != "without rows"),
     *attribute_kinds(_ORIGIN),
     attribute_kind("schema_version", "of the future", 999),
     attribute_kind("schema_version", "before", 1),
     attribute_kind("seed", "negative", -1),
     attribute_kind("near", "negative", -1.0),
-    attribute_kind("config", "NaN", '{"physics": {"time_step": NaN}}'),
+    attribute_kind("config", "NaN inside", '{"physics": {"time_step": NaN}}'),
     attribute_kind("fingers", "of numbers", '{"a": 5}'),
 )
 #: Values that no header shows.
@@ -213,8 +213,8 @@ DATA: tuple[Kind, ...] = (
         for k, split in enumerate(("train", "valid", "test"))
         for kind in field_kinds(split, DATA_FIELDS, _TURNS[k:])
     ),
-    *(dataset_kind("train/grasps", way) for way in _TURNS if way != "one row more"),
-    *(dataset_kind("test/images", way) for way in _TURNS if way != "of another type"),
+    *(dataset_kind("train/grasps", way) for way in _TURNS if way != "one row less"),
+    *(dataset_kind("test/images", way) for way in _TURNS if way != "one row less"),
     *attribute_kinds({**_ORIGIN, "camera": ()}),
     attribute_kind("camera", "unknown", "stereo"),
     attribute_kind("schema_version", "of the future", 999),
