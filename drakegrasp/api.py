@@ -360,5 +360,7 @@ def _refuse_workers(
         raise ConfigError(f"scheduler must be an address like tcp://host:8786, got {scheduler!r}")
     if workers is not None and (scheduler or scheduler_file):
         raise ConfigError("workers must not be given with a scheduler, which has its own")
-    if workers is not None and not 1 <= workers <= MOST_PROCESSES:
-        raise ConfigError(f"workers must be 1 to {MOST_PROCESSES:,}, got {workers}")
+    if workers is not None and workers < 1:
+        raise ConfigError(f"workers must be at least 1, got {workers}")
+    if workers is not None and workers > MOST_PROCESSES:
+        raise ConfigError(f"workers must be at most {MOST_PROCESSES:,}, got {workers}")

@@ -82,8 +82,10 @@ def plan_build(objects: int, config: Config, workers: int, times: StageTimes) ->
         HandError: If the hand's file cannot be read.
     """
     for name, count in (("objects", objects), ("workers", workers)):
-        if not 1 <= count <= MOST_WORKERS:
-            raise ConfigError(f"{name} must be 1 to {MOST_WORKERS:,}, got {count}")
+        if count < 1:
+            raise ConfigError(f"{name} must be at least 1, got {count}")
+        if count > MOST_WORKERS:
+            raise ConfigError(f"{name} must be at most {MOST_WORKERS:,}, got {count}")
 
     # How much there is to do.
     per_object = len(tuple(config.unit_ranges(config.candidates.max)))

@@ -91,7 +91,10 @@ def read_decisions(path: Path) -> Decisions:
     version = tree.get("version")
     if type(version) is not int or version != VERSION:
         got = printable(repr(version)[:40])
-        raise DataError(f"{path}: version must be {VERSION}, got {got}")
+        raise DataError(
+            f"{path}: must be a list of rejections of drakegrasp inspect of version {VERSION}, "
+            f"got version {got}"
+        )
     stored = validated(path, content, _Stored)
     return Decisions(rejected=frozenset(stored.rejected), kept=frozenset(stored.kept))
 

@@ -21,6 +21,7 @@ from click.testing import CliRunner, Result
 from helpers.bad_inputs import array_kinds, hdf5_kinds, manifests, text_kinds
 from helpers.bad_inputs.kinds import Kind, Workplace
 from helpers.datasets import OTM, OTO, TRIALS, make_dataset
+from helpers.scripts import PIPELINES, load_script
 
 from drakegrasp.cli.main import main
 from drakegrasp.dataset.manifest import read_manifest
@@ -491,3 +492,28 @@ NAMES_OF_OPTIONS = ("candidates.max", "max_grasps", "hand", "config", "certify",
 
 def _keys(value: str) -> Iterator[str]:
     yield from (value.partition("=")[0], repr(value)[1:-1], *NAMES_OF_OPTIONS)
+
+
+@pytest.mark.parametrize("option", text_kinds.CLUSTER_OPTIONS)
+def test_options_of_a_cluster(base: Path, tmp_path: Path, option: str) -> None:
+    script, wrong = load_script(PIPELINES / "submit_build.py").main, {}
+    values = text_kinds.CLUSTER_OPTIONS[option]
+    for value in values:
+        words = ["--objects", str(base / "meshes"), "--out", str(tmp_path / "out"), "--dry-run"]
+        words += ["--cluster", "slurm", "--host", "10.0.0.1"]
+        words += [] if option == "--workers" else ["--workers", "2"]
+        result = CliRunner().invoke(script, [*words, option, value])
+        answer = wrong_answer(result, (option, option[2:]))
+        if answer is not None:
+            wrong[value] = answer
+    assert not list(tmp_path.iterdir())
+    report(f"submit_build.py {option}", values, wrong)
+
+
+def test_ports(base: Path) -> None:
+    wrong = {}
+    for value in text_kinds.PORTS:
+        answer = wrong_answer(run(["inspect", str(base / "out"), "--port", value]), ("--port",))
+        if answer is not None:
+            wrong[value] = answer
+    report("option --port", text_kinds.PORTS, wrong)

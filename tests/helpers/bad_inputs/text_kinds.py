@@ -192,3 +192,15 @@ OPTIONS: dict[str, tuple[str, ...]] = {
         *("randomize.camera_shift=1e300", "lift.height=1e300", "close.speed=1e300"),
     ),
 }
+#: Options of the submission script under SLURM.
+CLUSTER_OPTIONS: dict[str, tuple[str, ...]] = {
+    "--workers": (*_EXTREME, "0"),
+    "--cores": (*_EXTREME, "0"),
+    "--memory": ("", " ", "x", "-1GB", "nan", "inf", "0", "0GB", "1e400GB", "1e30GB", "٣GB"),
+    "--walltime": (
+        *("", " ", "x", "-1:00:00", "00:00:00", "1:2:3:4", "1.5", "nan", "٣:00:00", "²"),
+        *("9" * 5000 + ":00:00", "1-", "-", "1:"),
+    ),
+}
+#: Ports that `inspect` cannot have.
+PORTS = ("", " ", "x", "-1", "65536", "1.5", "nan", "9" * 5000)
