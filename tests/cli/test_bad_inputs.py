@@ -21,7 +21,7 @@ from click.testing import CliRunner, Result
 from helpers.bad_inputs import array_kinds, hdf5_kinds, manifests, text_kinds
 from helpers.bad_inputs.kinds import Kind, Workplace
 from helpers.datasets import OTM, OTO, TRIALS, make_dataset
-from helpers.scripts import PIPELINES, load_script
+from helpers.scripts import load_script
 
 from drakegrasp.cli.main import main
 from drakegrasp.dataset.manifest import read_manifest
@@ -496,14 +496,14 @@ def _keys(value: str) -> Iterator[str]:
 
 @pytest.mark.parametrize("option", text_kinds.CLUSTER_OPTIONS)
 def test_options_of_a_cluster(base: Path, tmp_path: Path, option: str) -> None:
-    script, wrong = load_script(PIPELINES / "submit_build.py").main, {}
+    script, wrong = load_script("submit_build").main, {}
     values = text_kinds.CLUSTER_OPTIONS[option]
     for value in values:
         words = ["--objects", str(base / "meshes"), "--out", str(tmp_path / "out"), "--dry-run"]
         words += ["--cluster", "slurm", "--host", "10.0.0.1"]
         words += [] if option == "--workers" else ["--workers", "2"]
         result = CliRunner().invoke(script, [*words, option, value])
-        answer = wrong_answer(result, (option, option[2:]))
+        answer = wrong_answer(result, (option, option[2:], "workers"))
         if answer is not None:
             wrong[value] = answer
     assert not list(tmp_path.iterdir())
