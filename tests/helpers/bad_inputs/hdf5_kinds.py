@@ -260,8 +260,8 @@ PLAN: tuple[Kind, ...] = (
     *attribute_kinds(
         {
             "model_sha256": (),
-            "config_hash": (),
-            "mesh_sha256": (),
+            "config_hash": ("a text",),  # `replay` compares them
+            "mesh_sha256": ("a text",),
             "table_force": ("a number",),
             "stopped": (),
             "combinations": ("a number",),
