@@ -68,6 +68,10 @@ class Plan:
         return self.workers * self.hours
 
 
+#: More workers, or objects, than any build has.
+MOST_WORKERS = 1_000_000
+
+
 def plan_build(objects: int, config: Config, workers: int, times: StageTimes) -> Plan:
     """Return what building some objects from nothing is expected to take.
 
@@ -81,6 +85,8 @@ def plan_build(objects: int, config: Config, workers: int, times: StageTimes) ->
     for name, count in (("objects", objects), ("workers", workers)):
         if count < 1:
             raise ConfigError(f"{name} must be at least 1, got {count}")
+        if count > MOST_WORKERS:
+            raise ConfigError(f"{name} must be at most {MOST_WORKERS:,}, got {count}")
 
     # How much there is to do.
     ranges = tuple(config.unit_ranges(config.candidates.max))

@@ -9,23 +9,23 @@ from pathlib import Path
 import click
 
 from drakegrasp.cli.errors import say
-from drakegrasp.cli.options import manifest_option, units_option
+from drakegrasp.cli.options import PathType, manifest_option, units_option
 
 
 @click.command()
-@click.argument("mesh_dir", type=click.Path(path_type=Path))
+@click.argument("mesh_dir", type=PathType(path_type=Path))
 @units_option
 @manifest_option
 @click.option(
     "--json",
     "json_file",
-    type=click.Path(path_type=Path),
+    type=PathType(path_type=Path),
     metavar="FILE",
     help="Write all findings as JSON too.",
 )
 @click.option(
     "--sheet",
-    type=click.Path(path_type=Path),
+    type=PathType(path_type=Path),
     metavar="FILE",
     help="Write a picture of every object with its status (.png).",
 )

@@ -9,6 +9,7 @@ import click
 
 from drakegrasp.cli.errors import say
 from drakegrasp.cli.options import (
+    PathType,
     build_options,
     out_argument,
     parse_request,
@@ -78,7 +79,7 @@ def build(
 @out_argument
 @click.option(
     "--reject",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    type=PathType(path_type=Path, exists=True, dir_okay=False),
     metavar="FILE",
     help="Trials that must not become samples: the reject.json of an inspection, or a text file "
     "with an id per line; # starts a comment.",

@@ -148,7 +148,12 @@ def read_outcomes(
 
 
 def read_trials(
-    path: Path, header: ShardHeader, names: Sequence[str], *, verify_seal: bool = True
+    path: Path,
+    header: ShardHeader,
+    names: Sequence[str],
+    *,
+    verify_seal: bool = True,
+    complete: bool = False,
 ) -> dict[str, AnyArray]:
     """Return some columns of a shard's `/trials`, by their names.
 
@@ -157,11 +162,14 @@ def read_trials(
         header: Identity that the shard must have.
         names: Of the columns.
         verify_seal: Whether to verify the seal, which reads the whole file.
+        complete: Whether all other fields must be there, too.
 
     Raises:
         DataError: See `read_shard`.
     """
-    tables = {"trials": tuple(f for f in trial_columns() if f.name in (*names, "outcome"))}
+    tables = None
+    if not complete:
+        tables = {"trials": tuple(f for f in trial_columns() if f.name in (*names, "outcome"))}
     with open_shard(path, header, tables, verify_seal=verify_seal) as (file, _):
         refuse_other_codes(path, "/trials/outcome", file["trials/outcome"][:], list(Outcome))
         return {name: read_column(file["trials"], name) for name in names}

@@ -5,6 +5,7 @@ While a build runs, or after it was stopped, the funnel is counted from the shar
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -96,11 +97,28 @@ def is_assembled(out: Path, *, verify_shards: bool = False, execute: Executor = 
     try:
         for name in ASSEMBLED_FILES:
             with open_hdf5(out / name) as file:
-                if any(file.attrs[key] != value for key, value in expected.items()):
+                attrs = {key: file.attrs[key] for key in expected}
+                if any(not _same(attrs[key], value) for key, value in expected.items()):
                     return False
     except (OSError, KeyError):
         return False
     return True
+
+
+def _same(found: object, text: str) -> bool:
+    return isinstance(found, str) and found == text
+
+
+def _refuse_broken_files(out: Path) -> None:
+    """Refuse files that are there and cannot be read; a build would write them anew.
+
+    Raises:
+        DataError: If there is one.
+    """
+    for name in ASSEMBLED_FILES:
+        if os.path.lexists(out / name):
+            with open_trials(out / name) if name == TRIALS_FILE else open_samples(out / name):
+                pass
 
 
 def count_unfinished(out: Path) -> Unfinished | None:
@@ -111,7 +129,10 @@ def count_unfinished(out: Path) -> Unfinished | None:
     Raises:
         DataError: If the directory holds no dataset.
     """
-    if not (out / FILE_NAME).exists() or is_assembled(out):
+    if not os.path.lexists(out / FILE_NAME):
+        return None
+    _refuse_broken_files(out)
+    if is_assembled(out):
         return None
 
     # Add up the outcomes and words of the shards that exist.
