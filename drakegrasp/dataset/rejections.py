@@ -17,7 +17,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, with_config
 
-from drakegrasp.dataset.layout.json_files import read_mapping, validated
+from drakegrasp.dataset.layout.json_files import Name, read_mapping, validated
 from drakegrasp.errors import DataError, printable
 from drakegrasp.runtime.files import write_atomic
 
@@ -41,7 +41,7 @@ class AttemptKey:
         standoff_index: Index into the configuration's stand-offs.
     """
 
-    object: str
+    object: Name
     candidate: Annotated[int, Field(ge=0, le=2**31 - 1)]
     standoff_index: Annotated[int, Field(ge=0, le=255)]
 
@@ -94,7 +94,10 @@ def read_decisions(path: Path) -> Decisions:
     version = tree.get("version")
     if type(version) is not int or version != VERSION:
         got = printable(repr(version)[:40])
-        raise DataError(f"{path}: version must be {VERSION}, got {got}")
+        raise DataError(
+            f"{path}: must be a list of rejections of drakegrasp inspect of version {VERSION}, "
+            f"got version {got}"
+        )
     stored = validated(path, content, _Stored)
     return Decisions(rejected=frozenset(stored.rejected), kept=frozenset(stored.kept))
 

@@ -289,7 +289,7 @@ def _read_assembled(out: Path, stamps: Mapping[Path, Stamp]) -> tuple[Snapshot, 
     missing = [
         f"{name} is not there: images come from the shards, if they are."
         for name in DATA_FILES.values()
-        if not (out / name).is_file()
+        if not os.path.lexists(out / name)
     ]
     gone = [name for name in names if find_model(out, name) is None]
     if gone:

@@ -60,9 +60,9 @@ def write_site(out: Path, folder: Path, *, progress: Report = silent) -> Site:
             dataset is assembled anew meanwhile.
     """
     # Refuse what cannot be done before anything is written.
+    decisions = read_decisions(out / FILE_NAME)
     catalog = Catalog(out)
     snapshot, query = catalog.current(), Query()
-    decisions = read_decisions(out / FILE_NAME)
     successes = select(snapshot, query, decisions)
     places = successes[:MAX_GRASPS]
     if not len(places):

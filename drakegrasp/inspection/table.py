@@ -7,6 +7,7 @@ poses stay in the files.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -160,7 +161,7 @@ def read_shard_part(out: Path, header: ShardHeader, number: int, object_: int) -
     Raises:
         DataError: If it is missing or damaged.
     """
-    columns = read_trials(header.path(out), header, READ, verify_seal=False)
+    columns = read_trials(header.path(out), header, READ, verify_seal=False, complete=True)
     count = len(columns["outcome"])
     objects = np.full(count, object_, dtype=np.int32)
     return _part(columns, objects, number, np.arange(count, dtype=np.int32))
@@ -169,7 +170,7 @@ def read_shard_part(out: Path, header: ShardHeader, number: int, object_: int) -
 def read_sample_ids(out: Path) -> dict[str, npt.NDArray[np.int64]]:
     """Return the trial ids of the samples by split, in rising order; none without data files."""
     for camera in CAMERAS:
-        if (out / DATA_FILES[camera]).exists():
+        if os.path.lexists(out / DATA_FILES[camera]):
             with open_samples(out / DATA_FILES[camera]) as file:
                 return {split: file[split]["trial_id"][:] for split in SPLITS}
     return {split: np.zeros(0, dtype=np.int64) for split in SPLITS}
