@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -303,6 +303,12 @@ class VerifyConfig(_Section):
     max_angle_error_deg: Positive = 5.0  # of an object lifted by forces alone
 
 
+#: Palm poses in a work unit, and the most in one of an object that has many.
+UNIT_CANDIDATES, LARGEST_UNIT = 50, 400
+#: With more candidates than this an object has many: its later units are larger.
+FEW_CANDIDATES = 1000
+
+
 #: Keys that change no shard: they act on assembled shards, or only say where to stop.
 POSTPROCESSING_KEYS = ("filters", "split", "max_grasps", "attempt_seconds", "verify")
 
@@ -312,7 +318,8 @@ class Config(_Section):
 
     hand: str = "barrett"  # a hand in drakegrasp/models, or a path to a hand's YAML
     seed: Annotated[int, Field(ge=0)] = 0
-    unit_candidates: Count = 50  # candidates in a work unit
+    # Candidates in a work unit; None: 50, and of objects with more than 1,000 up to 400.
+    unit_candidates: Count | None = None
     attempt_seconds: Positive = 60.0  # [s] of computing (CPU time) before an attempt is a `timeout`
     objects: ObjectConfig = ObjectConfig()
     builtin: BuiltinConfig = BuiltinConfig()
@@ -334,6 +341,27 @@ class Config(_Section):
         """Return the resolved values as plain JSON types."""
         return self.model_dump(mode="json")
 
+    def unit_ranges(self, candidates: int) -> Iterator[range]:
+        """Yield the work units of an object, as ranges of its candidates.
+
+        The units of an object with many candidates grow from 50 to 400: fewer files and tasks, and
+        with `max_grasps` an object that has enough at once is not tried longer than before.
+
+        Args:
+            candidates: Number of candidates of the object.
+        """
+        start = 0
+        while start < candidates:
+            size = self.unit_candidates or UNIT_CANDIDATES
+            if self._units_grow:
+                size = min(max(size, start), LARGEST_UNIT)
+            yield range(start, min(start + size, candidates))
+            start += size
+
+    @property
+    def _units_grow(self) -> bool:
+        return self.unit_candidates is None and self.candidates.max > FEW_CANDIDATES
+
     def simulation_hash(self) -> str:
         """Return the hash (16 hex digits) of every value that decides what a shard holds.
 
@@ -347,6 +375,8 @@ class Config(_Section):
             del values["certify"]  # without repeats the noise is not used
         if self.randomize == RandomizeConfig():
             del values["randomize"]  # nothing is drawn
+        if self.unit_candidates is None and not self._units_grow:
+            values["unit_candidates"] = UNIT_CANDIDATES  # the same units
         canonical = json.dumps(values, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 

@@ -428,6 +428,19 @@ def test_simulation_hash_changes_with_what_is_simulated_and_nothing_else(key: st
     assert same is (key.split(".")[0] in NOT_SIMULATED)
 
 
+def test_hash_of_the_units_is_that_of_their_ranges() -> None:
+    few, many = ["candidates.max=1000"], ["candidates.max=1001"]
+    hashes = [
+        [
+            load_config(overrides=[*size, *units]).simulation_hash()
+            for units in ([], ["unit_candidates=50"])
+        ]
+        for size in (few, many)
+    ]
+    assert hashes[0][0] == hashes[0][1]
+    assert hashes[1][0] != hashes[1][1]
+
+
 def test_noise_of_no_repeats_is_not_simulated() -> None:
     noisy = load_config(overrides=["certify.palm_noise=0.01"])
     assert noisy.simulation_hash() == Config().simulation_hash()

@@ -21,7 +21,8 @@ import numpy as np
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.filters import Removal
-from drakegrasp.dataset.hdf5 import open_hdf5, read_names
+from drakegrasp.dataset.hdf5 import read_names
+from drakegrasp.dataset.layout.opening import open_trials, read_codes
 from drakegrasp.dataset.manifest import installed_versions, read_manifest
 from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.prepared_objects import load_prepared
@@ -180,18 +181,16 @@ def wilson_interval(hits: int, count: int, confidence: float = CONFIDENCE) -> tu
 def _read_lifts(out: Path) -> list[StoredLift]:
     """Return all lifts of a dataset, in the order of its rows: objects are together."""
     path = out / TRIALS_FILE
-    try:
-        with open_hdf5(path) as file:
-            trials, successes = file["trials"], file["successes"]
-            names = read_names(file["objects/name"])
-            objects, outcomes = trials["object"][:], trials["outcome"][:]
-            X_OG, spreads = trials["X_OG"][:], trials["spread"][:]
-            materials = {f.name: trials[f.name][:] for f in fields(Materials)}
-            # Only what was lifted has the time of a lift.
-            lifted = np.isfinite(trials["time_lift"][:])
-            kept = successes["trial_id"][:][successes["removal"][:] == Removal.KEPT]
-    except (OSError, KeyError) as error:
-        raise DataError(f"{path}: must be the trials of a dataset, got none ({error})") from None
+    with open_trials(path) as file:
+        trials, successes = file["trials"], file["successes"]
+        names = read_names(file["objects/name"])
+        objects = read_codes(trials["object"], len(names))
+        outcomes = read_codes(trials["outcome"], list(Outcome))
+        X_OG, spreads = trials["X_OG"][:], trials["spread"][:]
+        materials = {f.name: trials[f.name][:] for f in fields(Materials)}
+        # Only what was lifted has the time of a lift.
+        lifted = np.isfinite(trials["time_lift"][:])
+        kept = successes["trial_id"][:][successes["removal"][:] == Removal.KEPT]
 
     samples = set(kept.tolist())
     lifts = []

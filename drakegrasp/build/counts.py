@@ -62,10 +62,9 @@ class Counts:
 
         # For `max_grasps`, by object: grasps before the first gap, where it is, and those beyond.
         self._max_grasps = manifest.config.max_grasps
-        self._unit_candidates = manifest.config.unit_candidates
         self._grasps: Counter[str] = Counter()
         self._gap: Counter[str] = Counter()
-        self._beyond: dict[str, dict[int, int]] = {}
+        self._beyond: dict[str, dict[int, tuple[int, int]]] = {}
 
     def add_damaged(self, name: str) -> None:
         """Count a damaged shard."""
@@ -115,7 +114,7 @@ class Counts:
     def _close_gap(self, header: ShardHeader, grasps: int) -> None:
         name = header.object_name
         beyond = self._beyond.setdefault(name, {})
-        beyond[header.start] = grasps
-        while (more := beyond.pop(self._gap[name], None)) is not None:
+        beyond[header.start] = (header.stop, grasps)
+        while (unit := beyond.pop(self._gap[name], None)) is not None:
+            self._gap[name], more = unit
             self._grasps[name] += more
-            self._gap[name] += self._unit_candidates

@@ -82,7 +82,7 @@ def plan_build(objects: int, config: Config, workers: int, times: StageTimes) ->
             raise ConfigError(f"{name} must be at least 1, got {count}")
 
     # How much there is to do.
-    per_object = math.ceil(config.candidates.max / config.unit_candidates)
+    per_object = len(tuple(config.unit_ranges(config.candidates.max)))
     units = objects * per_object
     standoffs = len(with_hand_defaults(config).candidates.drawn_standoffs)
     attempts = objects * config.candidates.max * standoffs

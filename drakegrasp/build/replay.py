@@ -10,12 +10,11 @@ import numpy as np
 from drakegrasp.build.attempts import TrialSetup, measure_contacts, try_attempt
 from drakegrasp.build.columns import trial_rows
 from drakegrasp.build.work_unit import unit_attempts
-from drakegrasp.dataset.hdf5 import open_hdf5
+from drakegrasp.dataset.layout.opening import object_name, open_trials, read_trial
 from drakegrasp.dataset.manifest import Manifest, installed_versions, read_manifest
 from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
 from drakegrasp.dataset.shards import ShardHeader, trial_columns
-from drakegrasp.errors import DataError
 from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.blas import one_thread
@@ -134,16 +133,9 @@ def _stored_trial(out: Path, trial_id: int) -> _StoredTrial:
 
 def _stored_row(out: Path, trial_id: int) -> tuple[dict[str, np.ndarray], str]:
     path = out / TRIALS_FILE
-    try:
-        with open_hdf5(path) as file:
-            count = len(file["trials/outcome"])
-            if not 0 <= trial_id < count:
-                raise DataError(f"{path}: trial must be 0 to {count - 1}, got {trial_id}")
-            row = {f.name: np.asarray(file["trials"][f.name][trial_id]) for f in trial_columns()}
-            name = file["objects/name"][int(file["trials/object"][trial_id])].decode()
-    except (OSError, KeyError) as error:
-        raise DataError(f"{path}: must be the trials of a dataset, got none ({error})") from None
-    return row, name
+    with open_trials(path) as file:
+        row = read_trial(file, trial_id)
+        return {f.name: row[f.name] for f in trial_columns()}, object_name(file, row)
 
 
 def _difference(a: np.ndarray, b: np.ndarray) -> float:

@@ -140,7 +140,14 @@ def print_stats(out: Path) -> None:
     console.print(hold_table(funnel))
     console.print()
     if unfinished is None:
-        console.print(split_table(count_splits(out)))
+        splits = count_splits(out)
+        console.print(split_table(splits))
+        samples = {row.split: row.samples for row in splits}
+        if any(samples.values()) and not samples["train"]:
+            say(
+                "no sample is for training: a class trains if two of its objects have samples, or "
+                "if split.train_classes names it"
+            )
     else:
         say(f"{out}: {unfinished_line(unfinished)}")
 

@@ -130,6 +130,11 @@ def unfinished_line(unfinished: Unfinished) -> str:
     """Return a line on the progress of a build that is running or was stopped."""
     if not unfinished.total:
         return "not finished: its objects are not prepared yet"
+    if unfinished.done == unfinished.total:
+        return (
+            "all work units are done, but the files are missing or of another state: "
+            "`drakegrasp assemble` writes them"
+        )
     return (
         f"not finished: {unfinished.done:,} of {unfinished.total:,} work units are done; "
         "samples are chosen at the end"

@@ -20,7 +20,8 @@ import numpy.typing as npt
 from drakegrasp.dataset.card.content import content_of
 from drakegrasp.dataset.card.files import card_files
 from drakegrasp.dataset.filters import Removal, Successes, judge_successes, split_samples
-from drakegrasp.dataset.hdf5 import AnyArray, create_field, open_hdf5, write_field
+from drakegrasp.dataset.hdf5 import AnyArray, create_field, write_field
+from drakegrasp.dataset.layout.opening import open_samples, open_trials, read_codes
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import (
     Manifest,
@@ -191,21 +192,15 @@ def summarise(out: Path) -> Assembly:
     Raises:
         DataError: If they are missing or damaged.
     """
-    try:
-        with (
-            open_hdf5(out / TRIALS_FILE) as trials,
-            open_hdf5(out / DATA_FILES["oto"]) as data,
-        ):
-            removal = trials["successes/removal"][:]
-            reasons, counts = np.unique(removal, return_counts=True)
-            return Assembly(
-                trials=len(trials["trials/outcome"]),
-                grasps=len(removal),
-                removed={Removal(int(r)): int(n) for r, n in zip(reasons, counts, strict=True)},
-                samples={split: len(data[split]["trial_id"]) for split in SPLITS},
-            )
-    except (OSError, KeyError) as error:
-        raise DataError(f"{out}: must hold the files of a dataset, got none ({error})") from None
+    with open_trials(out / TRIALS_FILE) as trials, open_samples(out / DATA_FILES["oto"]) as data:
+        removal = read_codes(trials["successes/removal"], list(Removal))
+        reasons, counts = np.unique(removal, return_counts=True)
+        return Assembly(
+            trials=len(trials["trials/outcome"]),
+            grasps=len(removal),
+            removed={Removal(int(r)): int(n) for r, n in zip(reasons, counts, strict=True)},
+            samples={split: len(data[split]["trial_id"]) for split in SPLITS},
+        )
 
 
 def _write_attributes(file: h5py.File, manifest: Manifest, origin: Mapping[str, str]) -> None:

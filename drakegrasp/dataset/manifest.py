@@ -9,22 +9,35 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import h5py
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, with_config
 
-from drakegrasp.config import POSTPROCESSING_KEYS, Config, override_config, parse_config
+from drakegrasp.config import (
+    POSTPROCESSING_KEYS,
+    Config,
+    NonNegative,
+    Number,
+    Positive,
+    override_config,
+    parse_config,
+)
 from drakegrasp.dataset import log as build_log
+from drakegrasp.dataset.layout.json_files import read_mapping, validated
 from drakegrasp.dataset.paths import FILE_NAME, OWN_FILES, OWN_FOLDERS
-from drakegrasp.dataset.rejections import AttemptKey, key_from_json, key_to_json
+from drakegrasp.dataset.rejections import AttemptKey, key_to_json
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, refuse_other_schema
 from drakegrasp.dataset.shards import ShardHeader
-from drakegrasp.errors import ConfigError, DataError
+from drakegrasp.errors import ConfigError, DataError, GraspError
+from drakegrasp.frames import read_pose, unpack_pose
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_digest, hand_file
 from drakegrasp.runtime.file_set import refuse_half_replaced
@@ -37,6 +50,34 @@ VERSIONED = ("drakegrasp", "drake", "numpy", "scipy", "trimesh", "manifold3d", "
 REQUIRED_VERSIONS = ("drakegrasp", "drake", "hand")
 
 
+def _refuse_no_name(text: str) -> str:
+    """Refuse what would lead out of the directory as a file's name, or steer a terminal."""
+    if not is_name(text):
+        raise ValueError(f"a name must be {NAME_RULE}, got {text!r}")
+    return text
+
+
+def _refuse_no_pose(packed: tuple[float, ...]) -> tuple[float, ...]:
+    """Refuse numbers that are no rigid motion."""
+    try:
+        read_pose(unpack_pose(np.array(packed)), "it")
+    except GraspError as error:
+        raise ValueError(str(error)) from None
+    return packed
+
+
+#: Types of what a manifest holds; they are checked when one is read.
+Name = Annotated[str, AfterValidator(_refuse_no_name)]
+Axis = Annotated[str, Field(pattern=r"^[+-][xyz]$")]
+Hex = Annotated[str, Field(pattern="^[0-9a-f]+$")]
+Licence = Annotated[str, Field(pattern=r"^[ -~]*[!-~][ -~]*$", max_length=200)]
+Whole = Annotated[int, Field(ge=0, le=2**63 - 1)]
+Pose = Annotated[
+    tuple[Number, ...], Field(min_length=12, max_length=12), AfterValidator(_refuse_no_pose)
+]
+
+
+@with_config(ConfigDict(extra="forbid"))
 @dataclass(frozen=True, kw_only=True)
 class ObjectEntry:
     """An object that was prepared, in the manifest.
@@ -60,40 +101,30 @@ class ObjectEntry:
         licence: Identifier of the mesh's licence; None: not stated.
     """
 
-    name: str
-    class_name: str
-    mesh_sha256: str
-    scale: float
-    up: str
-    mass: float
-    density: float
-    friction: float | None
-    collision_error: float
-    X_TO: tuple[float, ...]
+    name: Name
+    class_name: Annotated[Name, Field(validation_alias="class")]
+    mesh_sha256: Hex
+    scale: Positive
+    up: Axis
+    mass: Positive
+    density: Positive
+    friction: Positive | None
+    collision_error: NonNegative
+    X_TO: Pose
     rolled: bool
-    candidates: int
-    combinations: int
-    valid: int
-    distinct: int
+    candidates: Whole
+    combinations: Whole
+    valid: Whole
+    distinct: Whole
     notes: tuple[str, ...]
-    licence: str | None = None
+    licence: Licence | None = None
 
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> ObjectEntry:
-        """Return the entry that `to_json` gave.
-
-        Raises:
-            KeyError, TypeError: If the content is not an entry.
-        """
-        converted = {
-            "class_name": content["class"],
-            "X_TO": tuple(content["X_TO"]),
-            "notes": tuple(content["notes"]),
-        }
-        plain = {key: value for key, value in content.items() if key not in ("class", *converted)}
-        for name in (content["name"], content["class"]):
-            _refuse_no_name(name)
-        return cls(**converted, **plain)
+    def __post_init__(self) -> None:
+        if not self.candidates <= self.distinct <= self.valid <= self.combinations:
+            raise ValueError(
+                "candidates must be at most distinct, valid and combinations, in this order, got "
+                f"{self.candidates}, {self.distinct}, {self.valid} and {self.combinations}"
+            )
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry as JSON types, in the order of the manifest."""
@@ -102,16 +133,7 @@ class ObjectEntry:
         return {"class" if key == "class_name" else key: v for key, v in said.items()}
 
 
-def _refuse_no_name(text: Any) -> None:
-    """Refuse what would lead out of the directory as a file's name, or steer a terminal.
-
-    Raises:
-        TypeError: If it is no name.
-    """
-    if not isinstance(text, str) or not is_name(text):
-        raise TypeError(f"a name must be {NAME_RULE}, got {text!r}")
-
-
+@with_config(ConfigDict(extra="forbid"))
 @dataclass(frozen=True, kw_only=True)
 class RefusedMesh:
     """A mesh that cannot be simulated, in the manifest.
@@ -123,20 +145,10 @@ class RefusedMesh:
         again: Whether the machine may be at fault, so that the next build tries it again.
     """
 
-    name: str
-    mesh_sha256: str
+    name: Name
+    mesh_sha256: Hex
     reason: str
     again: bool = False
-
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> RefusedMesh:
-        """Return the entry that `to_json` gave.
-
-        Raises:
-            KeyError, TypeError: If the content is not an entry.
-        """
-        _refuse_no_name(content["name"])
-        return cls(**content)
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry as JSON types, in the order of the manifest."""
@@ -165,22 +177,21 @@ class Manifest:
 
     def headers(self) -> Iterator[ShardHeader]:
         """Yield the work units of the dataset in the order of its rows."""
-        step, config_hash = self.config.unit_candidates, self.config.simulation_hash()
+        config_hash = self.config.simulation_hash()
         for entry in self.objects:
-            for start in range(0, entry.candidates, step):
+            for unit in self.config.unit_ranges(entry.candidates):
                 yield ShardHeader(
                     config_hash=config_hash,
                     mesh_sha256=entry.mesh_sha256,
                     object_name=entry.name,
-                    start=start,
-                    stop=min(start + step, entry.candidates),
+                    start=unit.start,
+                    stop=unit.stop,
                 )
 
     @property
     def units(self) -> int:
         """Number of work units."""
-        step = self.config.unit_candidates
-        return sum(-(-entry.candidates // step) for entry in self.objects)
+        return sum(len(tuple(self.config.unit_ranges(e.candidates))) for e in self.objects)
 
     def signature(self) -> str:
         """Return a hash of all in it that decides a row of the dataset, hexadecimal."""
@@ -250,29 +261,54 @@ def read_manifest(out: Path) -> Manifest:
     """
     path = out / FILE_NAME
     refuse_half_replaced(out)
-    try:
-        # The version first: another schema may have other keys.
-        content = json.loads(path.read_text(encoding="utf-8"))
-        refuse_other_schema(path, content["schema_version"])
-
-        return Manifest(
-            config=parse_config(content["config"]),
-            objects=tuple(ObjectEntry.from_json(entry) for entry in content["objects"]),
-            refused=tuple(RefusedMesh.from_json(entry) for entry in content["refused"]),
-            rejected=tuple(key_from_json(entry) for entry in content.get("rejected", ())),
-            versions=content["versions"],
-            fingers=content.get("fingers", {}),
-        )
-
     # A missing file is another mistake than a broken one.
+    try:
+        tree, content = read_mapping(path, "a readable manifest")
     except FileNotFoundError:
         raise DataError(
             f"{out}: must be the directory of a dataset, got one without {FILE_NAME}"
         ) from None
-    except (OSError, KeyError, TypeError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise DataError(
-            f"{path}: must be a readable manifest, got a broken one ({error})"
-        ) from None
+
+    # The version first: another schema may have other keys.
+    refuse_other_schema(path, tree.get("schema_version"))
+    stored = validated(path, content, _Stored)
+    try:
+        config = parse_config(stored.config)
+    except ConfigError as error:
+        raise DataError(f"{path}: {error}") from None
+
+    # It must not contradict itself.
+    for key, said, must in (
+        ("config_hash", stored.config_hash, config.simulation_hash()),
+        ("seed", stored.seed, config.seed),
+    ):
+        if said != must:
+            raise DataError(f"{path}: {key} must be {must}, that of its config, got {said}")
+    twins = [name for name, n in Counter(entry.name for entry in stored.objects).items() if n > 1]
+    if twins:
+        raise DataError(f"{path}: objects must have a name each, got {twins[0]!r} twice")
+    return Manifest(
+        config=config,
+        objects=stored.objects,
+        refused=stored.refused,
+        rejected=stored.rejected,
+        versions=stored.versions,
+        fingers=stored.fingers,
+    )
+
+
+class _Stored(BaseModel):
+    """The keys of the file."""
+
+    schema_version: int
+    config_hash: Hex
+    seed: int
+    config: dict[str, Any]
+    versions: dict[str, str]
+    fingers: dict[str, bool] = {}
+    objects: tuple[ObjectEntry, ...]
+    refused: tuple[RefusedMesh, ...]
+    rejected: tuple[AttemptKey, ...] = ()
 
 
 def claim_directory(out: Path, config: Config) -> Manifest | None:

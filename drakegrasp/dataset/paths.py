@@ -7,7 +7,8 @@ from pathlib import Path
 
 from drakegrasp.dataset import lock as build_lock
 from drakegrasp.dataset import log as build_log
-from drakegrasp.dataset.hdf5 import open_hdf5
+from drakegrasp.dataset.layout.attributes import TEXT, attribute_mistakes
+from drakegrasp.dataset.layout.opening import opened, refuse_first
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import DataError
 from drakegrasp.runtime.files import refuse_broken_seal
@@ -70,8 +71,9 @@ def refuse_changed_object(out: Path, name: str) -> None:
     """
     path, model = plan_path(out, name), model_path(out, name)
     refuse_broken_seal(path, "plan of an object")
-    with open_hdf5(path) as file:
-        expected = str(file.attrs["model_sha256"])
+    with opened(path, "the plan of an object") as file:
+        refuse_first(path, attribute_mistakes(file, {"model_sha256": TEXT}))
+        expected = file.attrs["model_sha256"]
     if not model.is_file() or model_file_sha256(out, name) != expected:
         got = "other content" if model.is_file() else "none"
         raise DataError(f"{model}: must be the file that was written with its plan, got {got}")

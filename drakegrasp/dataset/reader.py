@@ -22,7 +22,8 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.hdf5 import ImageRows, open_hdf5
-from drakegrasp.dataset.schema import DATA_FIELDS, SPLITS, refuse_other_schema
+from drakegrasp.dataset.layout.opening import open_samples
+from drakegrasp.dataset.schema import DATA_FIELDS, SPLITS
 from drakegrasp.errors import DataError, MachineError
 
 if TYPE_CHECKING:
@@ -77,7 +78,8 @@ class GraspDataset:
         image_size: Edge of the square images [px].
 
     Raises:
-        DataError: If the file is missing, of another kind or schema, or the split is unknown.
+        DataError: If the file is missing, damaged or differs from the schema, or the split is
+            unknown.
     """
 
     def __init__(self, path: str | Path, *, split: str = "train") -> None:
@@ -87,19 +89,12 @@ class GraspDataset:
         self._file: h5py.File | None = None
         self._fields: dict[str, h5py.Dataset | ImageRows] = {}
         self._process = -1
-        try:
-            with open_hdf5(self.path) as file:
-                # The version first: another schema may have other fields.
-                refuse_other_schema(self.path, file.attrs["schema_version"])
-                self._length = len(file[split]["grasps"])
-                self.image_size = int(file[split]["images"].shape[-1])
-                self.K = np.array(file.attrs["K"])
-                self.camera = str(file.attrs["camera"])
-                self._content = _content(file, split)
-        except (OSError, KeyError) as error:
-            raise DataError(
-                f"{self.path}: must be a data file of drakegrasp, got none ({error})"
-            ) from None
+        with open_samples(self.path) as file:
+            self._length = len(file[split]["grasps"])
+            self.image_size = int(file[split]["images"].shape[-1])
+            self.K = np.array(file.attrs["K"])
+            self.camera = str(file.attrs["camera"])
+            self._content = _content(file, split)
 
     def __len__(self) -> int:
         return self._length
@@ -138,12 +133,25 @@ class GraspDataset:
         Raises:
             KeyError: If there is no such field.
         """
-        file = self._open()
-        if name not in self._fields:
-            field = file[self.split][name]
-            self._fields[name] = ImageRows(field) if FIELDS[name].sample else field
-        value: Any = self._fields[name][row]
+        value: Any = self._field(name)[row]
         return value.decode() if FIELDS[name].dtype == "str" else value
+
+    def read_images(self, name: str, rows: Sequence[int], images: npt.NDArray[Any]) -> None:
+        """Read images of some rows into an array, without a copy on the way.
+
+        Args:
+            name: Of the field, `images` or `masks`.
+            rows: n of them, in any order.
+            images: Contiguous array (n, ...) of the field's type; it is overwritten.
+
+        Raises:
+            DataError: If the field has no images.
+        """
+        field = self._field(name)
+        if not isinstance(field, ImageRows):
+            raise DataError(f"field must be one of images, masks, got {name!r}")
+        for image, row in zip(images, rows, strict=True):
+            field.read_into(row, image)
 
     def column(self, name: str) -> npt.NDArray[Any]:
         """Return all rows (n, ...) of a field, e.g. `grasps` or `grasp_props/stable`.
@@ -187,6 +195,14 @@ class GraspDataset:
 
     def __repr__(self) -> str:
         return f"GraspDataset({str(self.path)!r}, split={self.split!r}): {len(self)} grasps"
+
+    def _field(self, name: str) -> h5py.Dataset | ImageRows:
+        """Return a field in the file of this process, which is kept open with it."""
+        file = self._open()
+        if name not in self._fields:
+            field = file[self.split][name]
+            self._fields[name] = ImageRows(field) if FIELDS[name].sample else field
+        return self._fields[name]
 
     def _open(self) -> h5py.File:
         """Return the file, as this process opened it."""

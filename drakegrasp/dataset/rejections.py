@@ -12,16 +12,22 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from drakegrasp.errors import DataError
+from pydantic import BaseModel, ConfigDict, Field, with_config
+
+from drakegrasp.dataset.layout.json_files import read_mapping, validated
+from drakegrasp.errors import DataError, printable
 from drakegrasp.runtime.files import write_atomic
 
 FILE_NAME = "reject.json"
 #: Version of the file's layout.
 VERSION = 1
+#: An id of a trial is shorter.
+_MOST_DIGITS = 19
 
 
+@with_config(ConfigDict(extra="forbid"))
 @dataclass(frozen=True, order=True)
 class AttemptKey:
     """The identity of an attempt in a dataset.
@@ -33,8 +39,8 @@ class AttemptKey:
     """
 
     object: str
-    candidate: int
-    standoff_index: int
+    candidate: Annotated[int, Field(ge=0, le=2**31 - 1)]
+    standoff_index: Annotated[int, Field(ge=0, le=255)]
 
     def __str__(self) -> str:
         return f"{self.object}, palm pose {self.candidate}, stand-off {self.standoff_index}"
@@ -79,19 +85,23 @@ def read_decisions(path: Path) -> Decisions:
         DataError: If the file is something else.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        if content["version"] != VERSION:
-            raise DataError(f"{path}: version must be {VERSION}, got {content['version']!r}")
-        return Decisions(
-            rejected=frozenset(key_from_json(entry) for entry in content["rejected"]),
-            kept=frozenset(key_from_json(entry) for entry in content["kept"]),
-        )
+        tree, content = read_mapping(path, "a list of rejections of drakegrasp inspect")
     except FileNotFoundError:
         return Decisions()
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataError(
-            f"{path}: must be a list of rejections of drakegrasp inspect, got none ({error})"
-        ) from None
+    version = tree.get("version")
+    if type(version) is not int or version != VERSION:
+        got = printable(repr(version)[:40])
+        raise DataError(f"{path}: version must be {VERSION}, got {got}")
+    stored = validated(path, content, _Stored)
+    return Decisions(rejected=frozenset(stored.rejected), kept=frozenset(stored.kept))
+
+
+class _Stored(BaseModel):
+    """The keys of the file."""
+
+    version: int
+    rejected: tuple[AttemptKey, ...]
+    kept: tuple[AttemptKey, ...]
 
 
 def write_decisions(path: Path, decisions: Decisions) -> None:
@@ -117,13 +127,14 @@ def read_rejected(path: Path) -> list[int] | list[AttemptKey]:
         return sorted(read_decisions(path).rejected)
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError:
-        raise DataError(f"{path}: must be a text file of trial ids, got a binary file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        got = "a binary file" if isinstance(error, UnicodeDecodeError) else error.strerror
+        raise DataError(f"{path}: must be a text file of trial ids, got {got}") from None
     ids = []
     for number, line in enumerate(lines, start=1):
         text = line.partition("#")[0].strip()
-        if text and not text.isdecimal():
-            raise DataError(f"{path}, line {number}: must be the id of a trial, got {text!r}")
+        if text and not (text.isascii() and text.isdecimal() and len(text) < _MOST_DIGITS):
+            raise DataError(f"{path}, line {number}: must be the id of a trial, got {text[:40]!r}")
         if text:
             ids.append(int(text))
     return ids
@@ -151,18 +162,6 @@ def find_keys(
             raise DataError(f"{out}: rejected trials must be successes, got {name}")
         found.add(key)
     return tuple(sorted(found))
-
-
-def key_from_json(entry: Any) -> AttemptKey:
-    """Return the attempt that `key_to_json` gave.
-
-    Raises:
-        KeyError, TypeError: If the content is none.
-    """
-    name, candidate, standoff = (entry[key] for key in ("object", "candidate", "standoff_index"))
-    if not isinstance(name, str) or type(candidate) is not int or type(standoff) is not int:
-        raise TypeError(f"an attempt must be a name and two numbers, got {entry!r}")
-    return AttemptKey(name, candidate, standoff)
 
 
 def key_to_json(key: AttemptKey) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.errors import DataError
+from drakegrasp.errors import DataError, printable
 from drakegrasp.outcomes import Outcome, Stage
 
 #: Goes up with every change of the table that an older reader cannot read.
@@ -97,6 +97,12 @@ class Field:
         return np.full((count, *self.row_shape(sizes)), fill, dtype=self.dtype)
 
 
+def is_this_schema(version: object) -> bool:
+    """Return whether an attribute or key `schema_version` is that of this schema."""
+    whole = isinstance(version, int | np.integer) and not isinstance(version, bool)
+    return whole and version == SCHEMA_VERSION
+
+
 def refuse_other_schema(path: Path, version: object) -> None:
     """Refuse a file of another version of the schema.
 
@@ -107,8 +113,8 @@ def refuse_other_schema(path: Path, version: object) -> None:
     Raises:
         DataError: If the version is another.
     """
-    if version != SCHEMA_VERSION:
-        got = "none" if version is None else str(version)
+    if not is_this_schema(version):
+        got = "none" if version is None else printable(str(version)[:40])
         raise DataError(f"{path}: schema must be {SCHEMA_VERSION}, got {got}; {OTHER_SCHEMA}")
 
 

@@ -15,20 +15,32 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, write_field
+from drakegrasp.dataset.hdf5 import AnyArray, write_fixed
+from drakegrasp.dataset.layout.attributes import COUNT, TEXT
+from drakegrasp.dataset.layout.opening import (
+    opened,
+    refuse_other_attributes,
+    refuse_other_codes,
+    refuse_other_structure,
+)
+from drakegrasp.dataset.layout.structure import Tables
 from drakegrasp.dataset.paths import shards_folder
 from drakegrasp.dataset.schema import (
     LOOK_FIELDS,
     SCHEMA_VERSION,
     TRIAL_FIELDS,
     Field,
-    refuse_other_schema,
 )
 from drakegrasp.errors import DataError
+from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.files import atomic_hdf5, refuse_broken_seal
 
 #: Fields of `/trials` that only the whole dataset knows; no shard has them.
 ASSEMBLED_FIELDS = ("trial_id", "object")
+_ATTRIBUTES = {
+    **dict.fromkeys(("config_hash", "mesh_sha256", "object_name"), TEXT),
+    **dict.fromkeys(("start", "stop"), COUNT),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +112,7 @@ def write_shard(out: Path, shard: Shard) -> Path:
         for name, fields, columns in tables:
             group = file.create_group(name)
             for field in fields:
-                write_field(group, field, np.asarray(columns[field.name]))
+                write_fixed(group, field, np.asarray(columns[field.name]))
     return path
 
 
@@ -116,7 +128,11 @@ def read_shard(path: Path, header: ShardHeader | None = None, *, verify_seal: bo
         DataError: If the file is missing, truncated or changed by a single bit, or of another
             schema, configuration, mesh or range; the message names the file and the reason.
     """
-    with _open_shard(path, header, verify_seal=verify_seal) as (file, own_header):
+    tables = {"trials": trial_columns(), "looks": LOOK_FIELDS}
+    with _open_shard(path, header, tables, verify_seal=verify_seal) as (file, own_header):
+        rows = len(file["trials/outcome"])
+        refuse_other_codes(path, "/trials/outcome", file["trials/outcome"][:], list(Outcome))
+        refuse_other_codes(path, "/looks/row", file["looks/row"][:], rows)
         return Shard(
             header=own_header,
             trials={f.name: file["trials"][f.name][:] for f in trial_columns()},
@@ -149,35 +165,34 @@ def read_trials(
     Raises:
         DataError: See `read_shard`.
     """
-    with _open_shard(path, header, verify_seal=verify_seal) as (file, _):
+    tables = {"trials": tuple(f for f in trial_columns() if f.name in (*names, "outcome"))}
+    with _open_shard(path, header, tables, verify_seal=verify_seal) as (file, _):
+        refuse_other_codes(path, "/trials/outcome", file["trials/outcome"][:], list(Outcome))
         return {name: np.asarray(file["trials"][name][:]) for name in names}
 
 
 @contextmanager
 def _open_shard(
-    path: Path, header: ShardHeader | None, *, verify_seal: bool
+    path: Path, header: ShardHeader | None, tables: Tables, *, verify_seal: bool
 ) -> Iterator[tuple[h5py.File, ShardHeader]]:
-    """Open a shard for reading, with its header; errors of the block mean a damaged shard."""
+    """Open a shard for reading, with its header; the fields of `tables` are there."""
     if verify_seal:
         refuse_broken_seal(path)
-    try:
-        with open_hdf5(path) as file:
-            # The version first: another schema may have other attributes.
-            refuse_other_schema(path, file.attrs["schema_version"])
+    with opened(path, "a complete shard") as file:
+        refuse_other_attributes(path, file, _ATTRIBUTES)
 
-            # Then its identity: a file may have been copied to the path of another unit.
-            own_header = ShardHeader(
-                config_hash=str(file.attrs["config_hash"]),
-                mesh_sha256=str(file.attrs["mesh_sha256"]),
-                object_name=str(file.attrs["object_name"]),
-                start=int(file.attrs["start"]),
-                stop=int(file.attrs["stop"]),
+        # Its identity: a file may have been copied to the path of another unit.
+        own_header = ShardHeader(
+            config_hash=file.attrs["config_hash"],
+            mesh_sha256=file.attrs["mesh_sha256"],
+            object_name=file.attrs["object_name"],
+            start=int(file.attrs["start"]),
+            stop=int(file.attrs["stop"]),
+        )
+        if header is not None and own_header != header:
+            raise DataError(
+                f"{path}: must be a shard of {header.label}, got one of {own_header.label}"
             )
-            if header is not None and own_header != header:
-                raise DataError(
-                    f"{path}: must be a shard of {header.label}, got one of {own_header.label}"
-                )
 
-            yield file, own_header
-    except (OSError, KeyError) as error:
-        raise DataError(f"{path}: must be a complete shard, got another file ({error})") from None
+        refuse_other_structure(path, file, tables)
+        yield file, own_header

@@ -12,11 +12,12 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.filters import Removal
-from drakegrasp.dataset.hdf5 import open_hdf5, read_texts
+from drakegrasp.dataset.hdf5 import open_hdf5, read_names, read_texts
+from drakegrasp.dataset.layout.opening import open_samples, open_trials, read_codes
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.samples import shards_sha256
-from drakegrasp.dataset.schema import SPLITS, refuse_other_schema
+from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.dataset.shards import read_trials
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome
@@ -152,26 +153,21 @@ def count_funnel(out: Path) -> Funnel:
 def funnel_of(path: Path) -> Funnel:
     """Return the funnel that a file of trials tells, as `count_funnel`."""
     # The columns that are counted, whole: a few bytes per trial.
-    try:
-        with open_hdf5(path) as file:
-            refuse_other_schema(path, file.attrs["schema_version"])
-            objects = {name: values[:] for name, values in file["objects"].items()}
-            names, classes = (read_texts(file["objects"][key]) for key in ("name", "class_name"))
-            index = file["trials/object"][:]
-            outcome = file["trials/outcome"][:]
-            words = {word: file[f"trials/{word}"][:] for word in WORDS}
-            success = file["successes/trial_id"][:]
-            removal = file["successes/removal"][:]
-    except (OSError, KeyError) as error:
-        raise DataError(f"{path.parent}: must hold {path.name}, got none ({error})") from None
+    with open_trials(path) as file:
+        objects, trials, successes = (file[name] for name in ("objects", "trials", "successes"))
+        names, classes = (read_texts(objects[key]) for key in ("name", "class_name"))
+        counts = {key: objects[key][:] for key in ("candidates", "distinct", "valid")}
+        count = len(names)
+        index = read_codes(trials["object"], count)
+        outcome = read_codes(trials["outcome"], list(Outcome))
+        words = {word: trials[word][:] for word in WORDS}
+        success = read_codes(successes["trial_id"], len(outcome))
+        removal = read_codes(successes["removal"], list(Removal))
 
-    count = len(objects["name"])
     return Funnel(
         names=names,
         classes=classes,
-        candidates=objects["candidates"],
-        distinct=objects["distinct"],
-        valid=objects["valid"],
+        **counts,
         outcomes=_count_pairs(index, outcome, count, 1 + max(Outcome)),
         precision=np.bincount(index[words["precision"]], minlength=count),
         stable=np.bincount(index[words["stable"]], minlength=count),
@@ -190,20 +186,16 @@ def count_splits(out: Path) -> list[SplitCount]:
 
 def splits_of(path: Path) -> list[SplitCount]:
     """Return what a data file tells of its splits, as `count_splits`."""
-    try:
-        with open_hdf5(path) as file:
-            refuse_other_schema(path, file.attrs["schema_version"])
-            return [
-                SplitCount(
-                    split=split,
-                    samples=len(file[split]["grasps"]),
-                    objects=len(set(file[split]["object_props/object_name"][:])),
-                    classes=len(set(file[split]["object_props/class_name"][:])),
-                )
-                for split in SPLITS
-            ]
-    except (OSError, KeyError) as error:
-        raise DataError(f"{path}: must be a data file, got none ({error})") from None
+    with open_samples(path) as file:
+        return [
+            SplitCount(
+                split=split,
+                samples=len(file[split]["grasps"]),
+                objects=len(set(read_names(file[split]["object_props/object_name"]))),
+                classes=len(set(read_names(file[split]["object_props/class_name"]))),
+            )
+            for split in SPLITS
+        ]
 
 
 def _count_pairs(

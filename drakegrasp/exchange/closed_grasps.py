@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from drakegrasp.dataset.hdf5 import open_hdf5, read_names
+from drakegrasp.dataset.hdf5 import read_names
+from drakegrasp.dataset.layout.opening import open_trials, read_codes, refuse_other_codes
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import SPLITS
-from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, unpack_pose
 
 
@@ -56,15 +56,14 @@ def read_closed_grasps(out: Path) -> Iterator[ClosedGrasp]:
 
     # Their postures, from the file of all trials.
     path = out / TRIALS_FILE
-    try:
-        with open_hdf5(path) as file:
-            trials = file["trials"]
-            names = read_names(file["objects/name"])
-            objects, X_TO, X_OG, q, spread = (
-                trials[key][:][rows] for key in ("object", "X_TO", "X_OG", "closed_q", "spread")
-            )
-    except (OSError, KeyError, IndexError) as error:
-        raise DataError(f"{path}: must be the trials of a dataset, got none ({error})") from None
+    with open_trials(path) as file:
+        trials = file["trials"]
+        names = read_names(file["objects/name"])
+        refuse_other_codes(out / DATA_FILES["oto"], "trial_id", rows, len(trials["object"]))
+        objects = read_codes(trials["object"], len(names))[rows]
+        X_TO, X_OG, q, spread = (
+            trials[key][rows] for key in ("X_TO", "X_OG", "closed_q", "spread")
+        )
 
     for i, row in enumerate(rows.tolist()):
         pose = unpack_pose(X_TO[i])

@@ -13,6 +13,7 @@ from typing import Literal, get_args
 
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.errors import DataError
 from drakegrasp.runtime.files import atomic_folder
 from drakegrasp.runtime.progress import Report, silent
@@ -50,7 +51,8 @@ def export_dataset(
     if form not in FORMATS:
         raise DataError(f"format must be one of {', '.join(FORMATS)}, got {form!r}")
     for path in DATA_FILES.values():
-        GraspDataset(out / path)
+        if not any(len(GraspDataset(out / path, split=split)) for split in SPLITS):
+            raise DataError(f"{out / path}: must have samples to export, got none")
     if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
         raise DataError(f"{directory}: must be a new or empty directory, got one that holds files")
 

@@ -22,18 +22,14 @@ from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS, SPLITS, Field
 from drakegrasp.errors import MachineError
-from drakegrasp.exchange.hub_card import ParquetFile, card, croissant
+from drakegrasp.exchange.hub_card import DEPTH_UNIT, IMAGES, ParquetFile, card, croissant
 from drakegrasp.runtime.progress import Report
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-#: Depth of one unit of a depth image [m]: a tenth of a millimetre, up to 6.5 m.
-DEPTH_UNIT = 1e-4
 #: Samples in a file, which takes about 150 MB, and in a group of rows, which is read as a whole.
 FILE_ROWS, GROUP_ROWS = 4000, 100
-#: Columns that are images, made of the fields `images` and `masks`.
-IMAGES = ("image", "depth", "mask")
 #: What the other fields are called here, where it is not their last name.
 NAMES = {"grasps": "grasp", "grasps_held": "grasp_held"}
 
@@ -72,7 +68,7 @@ def write_hub(out: Path, folder: Path, progress: Report, *, licence: str) -> int
             progress(done, total)
 
     # What they are, for people and for programs.
-    text = card(out, written, licence=licence)
+    text = card(out, written, columns(), licence=licence)
     (folder / "README.md").write_text(text, encoding="utf-8")
     description = croissant(folder, written, columns(), licence=licence)
     (folder / "croissant.json").write_text(json.dumps(description, indent=1), encoding="utf-8")

@@ -18,8 +18,28 @@ import yaml
 
 from drakegrasp.dataset.card.content import card_content
 from drakegrasp.dataset.card.text import card_text
+from drakegrasp.dataset.hdf5 import open_hdf5
+from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.schema import CAMERAS, SPLITS, Field
 
+#: Depth of one unit of a depth image [m]: a tenth of a millimetre, up to 6.5 m.
+DEPTH_UNIT = 1e-4
+#: Columns that are images, made of the fields `images` and `masks`, and what they hold.
+IMAGES = {
+    "image": "colour, 8-bit PNG",
+    "depth": "16-bit PNG in units of 0.1 mm",
+    "mask": "8-bit PNG, 255 where the object is seen, else 0",
+}
+#: The files of a folder, in words.
+FILES = {
+    "oto/, otm/": "the samples, as each camera sees them, in Parquet files",
+    "croissant.json": "the same for programs, with a hash of each file",
+}
+#: What is not as in the files of a dataset.
+CONVENTIONS = {
+    "depth": "z of the camera frame in units of 0.1 mm; see Camera for pixels that show nothing",
+    "images": "PNG files; row 0 is the top",
+}
 #: Types of Croissant by NumPy's letter of a kind.
 _TYPES = {"f": "sc:Float", "i": "sc:Integer", "u": "sc:Integer", "b": "sc:Boolean"}
 
@@ -41,15 +61,23 @@ class ParquetFile:
     rows: int
 
 
-def card(out: Path, files: Sequence[ParquetFile], *, licence: str) -> str:
+def card(
+    out: Path,
+    files: Sequence[ParquetFile],
+    columns: Mapping[str, Field | None],
+    *,
+    licence: str,
+) -> str:
     """Return the text of the dataset card.
 
     Args:
         out: Directory of the dataset.
         files: The files that were written.
+        columns: Fields by the columns' names; None for an image.
         licence: Identifier of the licence.
     """
-    content = card_content(out)
+    content = card_content(out) | {"files": FILES}
+    content["conventions"] = {**content["conventions"], **CONVENTIONS}
     rows = {
         (c, s): sum(f.rows for f in files if (f.camera, f.split) == (c, s))
         for c in CAMERAS
@@ -75,7 +103,7 @@ def card(out: Path, files: Sequence[ParquetFile], *, licence: str) -> str:
         ],
     }
 
-    # The text: how much is in each file, and the card of the dataset.
+    # The text: the card of the dataset, how much is in each file, and what its columns are.
     counts = "\n".join(
         f"| {split} | {rows['oto', split]:,} | {rows['otm', split]:,} |" for split in SPLITS
     )
@@ -84,14 +112,46 @@ def card(out: Path, files: Sequence[ParquetFile], *, licence: str) -> str:
 ---
 
 {card_text(content)}
-## These files
+## Samples by camera
 
 | split | camera `oto` | camera `otm` |
 |---|---|---|
 {counts}
 
-Depth images are 16-bit PNG files in units of 0.1 mm; masks are 255 where the object is seen.
+{_camera_text(out)}
+## Columns
+
+| column | shape | unit | frame | what it is |
+|---|---|---|---|---|
+{_column_rows(columns)}
 """
+
+
+def _camera_text(out: Path) -> str:
+    """Return how a pixel of a depth image is a point before the camera."""
+    with open_hdf5(out / DATA_FILES["oto"]) as file:
+        K, near, far = (np.asarray(file.attrs[name]).tolist() for name in ("K", "near", "far"))
+    (fx, _, cx), (_, fy, cy) = K[:2]
+    return f"""## Camera
+
+Both cameras have focal lengths {fx:.6f} and {fy:.6f} and their centre at ({cx:g}, {cy:g}) [px].
+A pixel (u, v) of depth z [m], {1.0 / DEPTH_UNIT:g} units of the image to a metre, is the point
+((u - {cx:g}) z / {fx:.6f}, (v - {cy:g}) z / {fy:.6f}, z) in the camera's frame. The camera sees
+from {near:g} m on; where nothing is before {far:g} m, the depth is {far:g} m.
+"""
+
+
+def _column_rows(columns: Mapping[str, Field | None]) -> str:
+    """Return a row of a Markdown table per column."""
+    rows = []
+    for name, field in columns.items():
+        if field is None:
+            rows.append(f"| `{name}` | | | | {IMAGES[name]} |")
+        else:
+            shape = " x ".join(map(str, field.axes))
+            meaning = field.meaning.replace("|", "\\|")
+            rows.append(f"| `{name}` | {shape} | {field.unit} | {field.frame} | {meaning} |")
+    return "\n".join(rows)
 
 
 def croissant(

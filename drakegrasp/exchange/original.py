@@ -46,6 +46,7 @@ def write_original(out: Path, folder: Path, progress: Report) -> int:
     for camera in CAMERAS:
         with atomic_hdf5(folder / DATA_FILES[camera]) as file:
             file.attrs["camera_axes"] = "+X left, +Y up, +Z forward"
+            file.attrs["K"] = _split(out, camera, SPLITS[0]).K
             file.attrs["grasps"] = "points [m], outward unit normals, forces on the object [N]"
             for split in SPLITS:
                 done = _write_split(file.create_group(split), _split(out, camera, split), done)

@@ -2,7 +2,8 @@
 
 In: a dataset. Out: `<object>/<trial_id>.glb`, which any viewer opens without a simulator. glTF has
 +Y up, so our table frame {T} is turned by -90 degrees about X. Links are drawn as their collision
-shapes, which are convex.
+shapes, which are convex. Nodes are called `object/NAME` and `hand/LINK`: an object may be named as
+a link is.
 """
 
 from __future__ import annotations
@@ -62,10 +63,10 @@ def posed_scene(
     scene = trimesh.Scene(base_frame="scene")
     body = model.visual.copy()
     body.visual = _paint(body, (*object_colour(model.name), 1.0))
-    _add(scene, model.name, body, grasp.X_TO)
+    _add(scene, f"object/{model.name}", body, grasp.X_TO)
     for link, X_TL in posed.link_poses(grasp.X_TG, grasp.q).items():
         if link in links:
-            _add(scene, link, links[link], X_TL)
+            _add(scene, f"hand/{link}", links[link], X_TL)
     return scene
 
 

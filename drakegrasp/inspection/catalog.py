@@ -6,7 +6,6 @@ end, whatever a build writes meanwhile.
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from dataclasses import dataclass
@@ -17,13 +16,13 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import Config, parse_config
-from drakegrasp.dataset.hdf5 import open_hdf5, read_texts
+from drakegrasp.dataset.hdf5 import read_texts
+from drakegrasp.dataset.layout.opening import open_trials
 from drakegrasp.dataset.manifest import Manifest, read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, FILE_NAME, TRIALS_FILE, model_path
 from drakegrasp.dataset.rejections import AttemptKey
-from drakegrasp.dataset.schema import refuse_other_schema
 from drakegrasp.dataset.shards import ShardHeader
-from drakegrasp.errors import ConfigError, DataError
+from drakegrasp.errors import DataError
 from drakegrasp.inspection.table import (
     AttemptTable,
     empty_table,
@@ -32,6 +31,7 @@ from drakegrasp.inspection.table import (
     read_shard_part,
     read_trials_table,
 )
+from drakegrasp.runtime.json_text import parse_json
 from drakegrasp.runtime.names import is_name
 
 #: While a build runs, its new shards are looked for this often [s].
@@ -172,13 +172,12 @@ def _read_assembled(out: Path) -> Snapshot:
     """Return the state of a dataset with a trials.hdf5; nothing else has to be there."""
     # Objects and configuration.
     path = out / TRIALS_FILE
-    try:
-        with open_hdf5(path) as file:
-            refuse_other_schema(path, file.attrs["schema_version"])
-            config = parse_config(json.loads(file.attrs["config"]))
-            names, classes = (read_texts(file["objects"][key]) for key in ("name", "class_name"))
-    except (OSError, KeyError, ValueError, ConfigError) as error:
-        raise DataError(f"{path}: must be the trials of a dataset, got none ({error})") from None
+    with open_trials(path) as file:
+        try:
+            config = parse_config(parse_json(file.attrs["config"]))
+        except ValueError as error:
+            raise DataError(f"{path}: attribute config must be one, got {error}") from None
+        names, classes = (read_texts(file["objects"][key]) for key in ("name", "class_name"))
 
     # What else there is.
     missing = [

@@ -123,9 +123,9 @@ def _shard_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
 
 def _shard_path(snapshot: Snapshot, i: int) -> Path:
     """Return the path of the shard that holds an attempt; its end is that of the object's poses."""
-    key, step = snapshot.key(i), snapshot.config.unit_candidates
-    start = key.candidate // step * step
-    (path,) = shards_folder(snapshot.out, key.object).glob(f"{start:07d}-*.h5")
+    key = snapshot.key(i)
+    *_, unit = snapshot.config.unit_ranges(key.candidate + 1)
+    (path,) = shards_folder(snapshot.out, key.object).glob(f"{unit.start:07d}-*.h5")
     return path
 
 

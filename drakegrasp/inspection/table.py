@@ -16,12 +16,18 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import norm
-from drakegrasp.dataset.hdf5 import open_hdf5
+from drakegrasp.dataset.filters import Removal
+from drakegrasp.dataset.layout.opening import (
+    open_samples,
+    open_trials,
+    read_codes,
+    refuse_other_codes,
+)
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.schema import CAMERAS, SPLITS
 from drakegrasp.dataset.shards import ShardHeader, read_trials
 from drakegrasp.dataset.suspicion import COLUMNS, PARTS, suspicion
-from drakegrasp.errors import DataError
+from drakegrasp.outcomes import Outcome
 
 AnyArray = npt.NDArray[Any]
 #: Number of a removal or a split that an attempt does not have.
@@ -115,24 +121,25 @@ def read_trials_table(path: Path) -> AttemptTable:
         DataError: If the file cannot be read.
     """
     # Block by block into arrays for all: the float64 columns of a large file fill the memory.
-    try:
-        with open_hdf5(path) as file:
-            trials = file["trials"]
-            count = len(trials["outcome"])
-            whole = _zeros(count)
-            ends = []
-            for start in range(0, count, BLOCK):
-                rows = slice(start, min(start + BLOCK, count))
-                columns = {name: trials[name][rows] for name in READ}
-                place = np.arange(rows.start, rows.stop, dtype=np.int32)
-                part = _part(columns, trials["object"][rows], 0, place)
-                # The only source is 0: memory that is never written costs nothing.
-                for name in _DTYPES.keys() - {"source"}:
-                    whole[name][rows] = getattr(part, name)
-                ends.append((part.closed + np.int32(start), part.features))
-            whole["removal"][file["successes/trial_id"][:]] = file["successes/removal"][:]
-    except (OSError, KeyError, IndexError) as error:
-        raise DataError(f"{path}: must be the trials of a dataset, got none ({error})") from None
+    with open_trials(path) as file:
+        trials, successes = file["trials"], file["successes"]
+        count, objects = len(trials["outcome"]), len(file["objects/name"])
+        whole = _zeros(count)
+        ends = []
+        for start in range(0, count, BLOCK):
+            rows = slice(start, min(start + BLOCK, count))
+            columns = {name: trials[name][rows] for name in READ}
+            number = trials["object"][rows]
+            refuse_other_codes(path, "/trials/object", number, objects)
+            refuse_other_codes(path, "/trials/outcome", columns["outcome"], list(Outcome))
+            place = np.arange(rows.start, rows.stop, dtype=np.int32)
+            part = _part(columns, number, 0, place)
+            # The only source is 0: memory that is never written costs nothing.
+            for name in _DTYPES.keys() - {"source"}:
+                whole[name][rows] = getattr(part, name)
+            ends.append((part.closed + np.int32(start), part.features))
+        removal = read_codes(successes["removal"], list(Removal))
+        whole["removal"][read_codes(successes["trial_id"], count)] = removal
 
     table = _with_features(whole, ends)
     for number, ids in enumerate(read_sample_ids(path.parent).values()):
@@ -161,11 +168,9 @@ def read_shard_part(out: Path, header: ShardHeader, number: int, object_: int) -
 def read_sample_ids(out: Path) -> dict[str, npt.NDArray[np.int64]]:
     """Return the trial ids of the samples by split, in rising order; none without data files."""
     for camera in CAMERAS:
-        try:
-            with open_hdf5(out / DATA_FILES[camera]) as file:
+        if (out / DATA_FILES[camera]).exists():
+            with open_samples(out / DATA_FILES[camera]) as file:
                 return {split: file[split]["trial_id"][:] for split in SPLITS}
-        except (OSError, KeyError):
-            continue
     return {split: np.zeros(0, dtype=np.int64) for split in SPLITS}
 
 

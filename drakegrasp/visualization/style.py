@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
-from drakegrasp.dataset.hdf5 import open_hdf5
+from drakegrasp.dataset.layout.opening import open_samples
 from drakegrasp.dataset.reader import Sample
 from drakegrasp.frames import Array
 from drakegrasp.grasp import unpack_grasp
@@ -103,7 +103,7 @@ def draw_contacts(axes: Axes, sample: Sample, K: Array, *, scale: float = 1.0) -
 
 def read_far(path: Path) -> float:
     """Return the far plane [m] of a data file."""
-    with open_hdf5(path) as file:
+    with open_samples(path) as file:
         return float(file.attrs["far"])
 
 

@@ -5,10 +5,10 @@ Usage: python pipelines/docs/builtin_objects.py [--check] FILE
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
+
+import generated_page
 
 from drakegrasp.config import BuiltinConfig
 from drakegrasp.objects.builtin.classes import CLASSES, ObjectClass
@@ -68,20 +68,8 @@ def _row(item: ObjectClass) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Write the page, or with --check return 1 if the file differs from it."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("target", type=Path, help="the page")
-    parser.add_argument("--check", action="store_true", help="compare, and write nothing")
-    arguments = parser.parse_args(argv)
-
-    target, page = arguments.target, format_page()
-    if not arguments.check:
-        target.write_text(page, encoding="utf-8")
-        return 0
-    if target.exists() and target.read_text(encoding="utf-8") == page:
-        return 0
-    sys.stderr.write(f"{target}: must be what `make docs-pages` writes, got another text\n")
-    return 1
+    """Run the script, see `generated_page`."""
+    return generated_page.main(format_page(), __doc__.splitlines()[0], argv)
 
 
 if __name__ == "__main__":

@@ -38,7 +38,7 @@ def run_nothing(unit: WorkUnit) -> UnitSummary:
 def units(count: int) -> Iterator[WorkUnit]:
     """Yield the work units of a dataset of objects with 10,000 palm poses each."""
     config = Config()
-    per_object = config.candidates.max // config.unit_candidates
+    per_object = len(tuple(config.unit_ranges(config.candidates.max)))
     objects = tuple(
         ObjectEntry(
             name=f"{i}_object",

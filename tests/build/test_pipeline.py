@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import h5py
@@ -23,7 +24,7 @@ from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.log import read_log
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.shards import read_shard, write_shard
+from drakegrasp.dataset.shards import read_shard, trial_columns, write_shard
 from drakegrasp.dataset.statistics import count_funnel, count_splits
 from drakegrasp.errors import ConfigError, DataError, MachineError, MeshError
 from drakegrasp.objects.sources import MeshSource, find_meshes
@@ -36,12 +37,16 @@ pytestmark = [pytest.mark.sim, pytest.mark.slow]
 def test_every_attempt_has_a_row_and_every_success_a_look(small_dataset: Path) -> None:
     funnel = count_funnel(small_dataset)
     assert np.all(funnel.candidates == 40)
-    assert np.all(funnel.outcomes.sum(axis=1) == 3 * 40)
-    assert funnel.outcomes[:, Outcome.SUCCESS].sum() == funnel.removals.sum() > 0
-    assert (
-        sum(c.samples for c in count_splits(small_dataset))
-        == funnel.removals[:, Removal.KEPT].sum()
-    )
+    with h5py.File(small_dataset / "trials.hdf5") as file:
+        keys = ("object", "candidate", "standoff_index")
+        rows = list(zip(*(file[f"trials/{key}"][:].tolist() for key in keys), strict=True))
+        outcomes, ids = file["trials/outcome"][:], file["successes/trial_id"][:]
+        kept = ids[file["successes/removal"][:] == Removal.KEPT]
+    assert rows == list(product(range(3), range(40), range(3)))
+    assert ids.tolist() == np.flatnonzero(outcomes == Outcome.SUCCESS).tolist()
+    with h5py.File(small_dataset / "grasping_otm.hdf5") as file:
+        sampled = np.concatenate([file[split]["trial_id"][:] for split in file])
+    assert sorted(sampled.tolist()) == kept.tolist() != []
 
 
 def test_dataset_keeps_every_invariant(small_dataset: Path) -> None:
@@ -395,12 +400,19 @@ def test_replay_gives_the_same_bits(small_dataset: Path, stage: str) -> None:
 
 
 def test_replay_says_what_differs(small_dataset: Path, tmp_path: Path) -> None:
+    """In every column, but for those that say which attempt it is."""
     out = _copy(small_dataset, tmp_path)
+    names = {f.name for f in trial_columns()} - {"candidate", "standoff_index"}
     with h5py.File(out / "trials.hdf5", "r+") as file:
-        file["trials/spread"][0] += 0.25
-    again = replay_trial(out, 0)
+        number = int(np.flatnonzero(file["trials/outcome"][:] == Outcome.SUCCESS)[0])
+        for name in names:
+            values = file["trials"][name]
+            row = values[number]
+            values[number] = ~row if row.dtype.kind == "b" else row + row.dtype.type(1)
+    again = replay_trial(out, number)
     assert not again.same
-    assert again.differences == {"spread": pytest.approx(0.25)}
+    assert set(again.differences) == names
+    assert again.differences["spread"] == again.differences["outcome"] == pytest.approx(1.0)
     with pytest.raises(DataError, match="trial must be 0 to 359, got 360"):
         replay_trial(out, 360)
 

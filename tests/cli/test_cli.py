@@ -17,10 +17,12 @@ import pytest
 import trimesh
 from click.testing import CliRunner, Result
 from helpers.assertions import arrays_of
+from helpers.datasets import make_dataset
 from matplotlib.image import imread
 
 from drakegrasp.cli.main import main
 from drakegrasp.cli.options import parse_request
+from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.frames import make_pose
@@ -299,6 +301,22 @@ def test_stats_of_a_build_that_runs_count_what_is_done(small_dataset: Path, tmp_
     assert hold[1] == "300"
     shutil.rmtree(out / "shards")
     assert "not finished: 0 of 12 work units are done" in run("stats", out).stdout
+
+
+@pytest.mark.slow
+def test_stats_say_that_the_files_are_of_another_state(small_dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(small_dataset, out)
+    (out / "trials.hdf5").unlink()
+    assert f"{out}: all work units are done, but the files are missing" in run("stats", out).stdout
+
+
+def test_stats_say_that_nothing_trains(tmp_path: Path) -> None:
+    (tmp_path / "meshes").mkdir()
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes")
+    assert "no sample is for training" not in run("stats", out).stdout
+    assemble(out, overrides=["split.train_classes=[]"])
+    assert "no sample is for training" in run("stats", out).stdout
 
 
 @pytest.mark.sim

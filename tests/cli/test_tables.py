@@ -5,9 +5,10 @@ from __future__ import annotations
 from io import StringIO
 
 import numpy as np
+import pytest
 from rich.console import Console
 
-from drakegrasp.cli.tables import hold_table
+from drakegrasp.cli.tables import funnel_table, hold_table
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.statistics import Funnel
 from drakegrasp.outcomes import Outcome
@@ -37,3 +38,36 @@ def test_hold_table_tells_what_share_of_the_held_ones_is_stable() -> None:
     assert ["1_mug", "1,200", "20", "12", "9", "45%", "12"] in lines
     assert ["2_[box]", "7", "0", "0", "0", "-", "0"] in lines
     assert ["all", "1,207", "20", "12", "9", "45%", "12"] in lines
+
+
+@pytest.mark.parametrize("compact", [False, True])
+def test_columns_of_the_funnel_add_up_to_the_attempts(compact: bool) -> None:
+    """Each outcome of a build is in one column: here each has another power of two attempts."""
+    outcomes = np.zeros((1, 1 + max(Outcome)), dtype=np.int64)
+    built = [outcome for outcome in Outcome if not outcome.verification_only]
+    outcomes[0, built] = 2 ** np.arange(len(built))
+    count = outcomes.sum(axis=1)
+    removals = np.zeros((1, 1 + max(Removal)), dtype=np.int64)
+    removals[0, Removal.KEPT] = outcomes[0, Outcome.SUCCESS]
+    funnel = Funnel(
+        names=("1_mug",),
+        classes=("mug",),
+        candidates=count,
+        distinct=count,
+        valid=count,
+        outcomes=outcomes,
+        precision=removals[:, 0],
+        stable=removals[:, 0],
+        removals=removals,
+    )
+    text = StringIO()
+    Console(width=400, file=text).print(funnel_table(funnel, compact=compact))
+    (row,) = (line.split() for line in text.getvalue().splitlines() if "1_mug" in line)
+    numbers = [int(cell.replace(",", "")) for cell in row if cell.replace(",", "").isdigit()]
+    # The number of grasps is also that of the samples.
+    assert sum(set(numbers) - {count[0]}) == count[0]
+    if compact:
+        lost = 2 ** built.index(Outcome.DROPPED) + 2 ** built.index(Outcome.SLIPPED)
+        assert lost in numbers
+    else:
+        assert {2**k for k in range(len(built))} <= set(numbers)

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
 
+from drakegrasp.dataset import assemble as assemble_module
 from drakegrasp.dataset import shards
 from drakegrasp.dataset.assemble import assemble, assemble_locked, summarise
 from drakegrasp.dataset.filters import Removal
@@ -19,17 +23,18 @@ from drakegrasp.dataset.lock import FILE_NAME, build_lock
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import DataError
-from drakegrasp.frames import invert_pose, transform_points, unpack_pose
-from drakegrasp.grasp import unpack_grasp
+from drakegrasp.frames import (
+    invert_pose,
+    make_pose,
+    pack_pose,
+    rotation_about,
+    transform_points,
+    unpack_pose,
+)
+from drakegrasp.grasp import pack_grasp, unpack_grasp
 from drakegrasp.runtime.files import refuse_broken_seal
 
 FILES = (OTO, OTM, TRIALS)
-
-
-@pytest.fixture
-def out(tmp_path: Path) -> Path:
-    (tmp_path / "meshes").mkdir()
-    return make_dataset(tmp_path / "out", tmp_path / "meshes")
 
 
 def test_each_seal_is_verified_once(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -85,6 +90,140 @@ def test_palm_and_contacts_of_a_sample_are_as_far_apart_as_in_its_trial(
             expected = transform_points(X_GO, trial[f"{when}_p_OQ"][number])
             np.testing.assert_allclose(p_GQ[when], expected, atol=1e-6)
     assert np.abs(p_GQ["closed"] - p_GQ["lifted"]).max() > SLIP / 4
+
+
+def spoil(out: Path, edit: Callable[[dict[str, np.ndarray], dict[str, np.ndarray]], None]) -> None:
+    """Change the first success of the first shard, given its row of /trials and of /looks."""
+    header = next(read_manifest(out).headers())
+    shard = shards.read_shard(header.path(out), header)
+    row = int(shard.looks["row"][0])
+    trial = {name: values[row : row + 1] for name, values in shard.trials.items()}
+    edit(trial, {name: values[:1] for name, values in shard.looks.items()})
+    shards.write_shard(out, shard)
+
+
+def empty_mask(camera: str) -> Any:
+    return lambda _, look: look[f"mask_{camera}"].fill(0)
+
+
+def turned_camera(camera: str) -> Any:
+    """Turn a camera about its own y axis, so that it looks past the object, or at its back."""
+
+    def turn(_: Any, look: dict[str, np.ndarray]) -> None:
+        X = make_pose(rotation_about([0.0, 1.0, 0.0], 1.2), np.zeros(3))
+        look[f"X_TC_{camera}"][0] = pack_pose(unpack_pose(look[f"X_TC_{camera}"][0]) @ X)
+
+    return turn
+
+
+def flat(camera: str) -> Any:
+    """Give a depth image one value; its colours still vary."""
+
+    def fill(_: Any, look: dict[str, np.ndarray]) -> None:
+        image = look[f"image_{camera}"][0]
+        image[:3] = np.linspace(0.0, 1.0, image[:3].size).reshape(image[:3].shape)
+        image[3] = 0.3
+
+    return fill
+
+
+def one_finger(name: str, value: float) -> Any:
+    return lambda trial, _: trial[name][0].__setitem__(1, value)
+
+
+def lost_finger(when: str) -> Any:
+    return lambda trial, _: trial[f"{when}_touching"][0].__setitem__(2, False)
+
+
+@pytest.mark.parametrize(
+    ("edit", "reason"),
+    [
+        (empty_mask("oto"), Removal.NOT_SEEN),
+        (empty_mask("otm"), Removal.NOT_SEEN),
+        (turned_camera("oto"), Removal.OUT_OF_VIEW),
+        (turned_camera("otm"), Removal.OUT_OF_VIEW),
+        (flat("otm"), Removal.FLAT_DEPTH),
+        (flat("oto"), None),
+        (one_finger("surface_distance", 2.1e-3), Removal.OFF_SURFACE),
+        (one_finger("normal_angle", 0.6), Removal.NORMAL_OFF),
+        (one_finger("closed_nhat_Q_O", np.nan), Removal.OFF_SURFACE),
+        (one_finger("lifted_nhat_Q_O", np.nan), Removal.OFF_SURFACE),
+        (lambda trial, _: trial["lifted_other_links"].fill(1), Removal.OTHER_LINKS),
+        (lambda trial, _: trial["slip"].fill(0.011), Removal.SLID),
+        (lambda trial, _: trial["turn"].fill(0.2), Removal.TURNED),
+        (lost_finger("closed"), Removal.MISSING_FINGER),
+        (lost_finger("lifted"), Removal.MISSING_FINGER),
+    ],
+)
+def test_a_success_that_is_spoiled_is_removed_for_that_reason(
+    sound: Path, tmp_path: Path, edit: Any, reason: Removal | None
+) -> None:
+    """By one number of one finger or camera; the other grasps of the dataset stay."""
+    out = Path(shutil.copytree(sound, tmp_path / "out"))
+    spoil(out, edit)
+    found = assemble(out, overrides=["filters.min_depth_variance=1e-6"]).removed
+    assert found == ({Removal.KEPT: 9} if reason is None else {Removal.KEPT: 8, reason: 1})
+    with h5py.File(out / TRIALS) as file:
+        assert file["successes/removal"][0] == (reason or Removal.KEPT)
+
+
+@pytest.mark.parametrize(
+    ("limit", "reason"),
+    [
+        ("max_suspicion", Removal.SUSPICIOUS),
+        ("max_penetration", Removal.SUSPICIOUS),
+        ("max_imbalance", Removal.SUSPICIOUS),
+        ("max_normal_sum", Removal.SUSPICIOUS),
+    ],
+)
+def test_each_part_of_the_suspicion_reaches_its_filter(
+    sound: Path, tmp_path: Path, limit: str, reason: Removal
+) -> None:
+    """The score of a made-up grasp is 1.2, its depth 0.1 mm, its forces do not carry the weight."""
+    out = Path(shutil.copytree(sound, tmp_path / "out"))
+    assert assemble(out, overrides=[f"filters.{limit}=1e9"]).removed == {Removal.KEPT: 9}
+    assert assemble(out, overrides=[f"filters.{limit}=1e-5"]).removed == {reason: 9}
+
+
+def test_camera_height_is_above_the_table(sound: Path, tmp_path: Path) -> None:
+    """A limit a millimetre above the lowest camera removes its grasps, one below keeps all."""
+    out = Path(shutil.copytree(sound, tmp_path / "out"))
+    with h5py.File(out / OTM) as file:
+        heights = [
+            X[11] for split in file for X in file[f"{split}/object_props/frame_work2cam_otm"]
+        ]
+    for by, removed in ((1e-3, True), (-1e-3, False)):
+        limit = min(heights) + by
+        counts = assemble(out, overrides=[f"filters.min_camera_height={limit}"]).removed
+        lower = sum(height < limit for height in heights)
+        assert counts.get(Removal.BISECTS_TABLE, 0) == lower
+        assert (lower > 0) == removed
+
+
+@pytest.mark.parametrize(
+    ("p_CQ", "seen"),
+    [
+        ([0.0, 0.0, 0.3], True),
+        ([0.1, 0.0, 0.3], True),
+        # Half the image is 0.5 m wide at a distance of 0.5 m.
+        ([0.49, 0.0, 0.5], True),
+        ([0.51, 0.0, 0.5], False),
+        ([-0.51, 0.0, 0.5], False),
+        ([0.0, 0.51, 0.5], False),
+        ([0.0, -0.51, 0.5], False),
+        ([0.0, 0.0, -0.3], False),
+    ],
+)
+def test_contact_is_in_view_within_the_image_and_before_the_camera(
+    p_CQ: list[float], seen: bool
+) -> None:
+    """A camera of 33 pixels that sees 45 degrees to each side."""
+    K = np.array([[16.0, 0.0, 16.0], [0.0, 16.0, 16.0], [0.0, 0.0, 1.0]])
+    X_TC = make_pose(rotation_about([1.0, 0.0, 0.0], 2.0), [0.1, 0.2, 0.7])
+    p_TQ = transform_points(X_TC, np.array([[0.0, 0.0, 0.4], p_CQ]))
+    grasp_T = pack_grasp(p_TQ, np.tile([0.0, 0.0, 1.0], (2, 1)))
+    mask = np.zeros((33, 33))
+    assert assemble_module._in_view(K, mask, pack_pose(X_TC), grasp_T) is seen
 
 
 def test_limits_of_the_hold_change_without_a_simulation(out: Path) -> None:

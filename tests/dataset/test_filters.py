@@ -106,6 +106,57 @@ def test_null_switches_a_limit_off(field: str, value: float, limit: str) -> None
 
 
 @pytest.mark.parametrize(
+    ("limit", "value", "field", "kept", "removed", "reason"),
+    [
+        ("min_camera_height", 0.2, "camera_height", 0.201, 0.199, Removal.BISECTS_TABLE),
+        ("min_depth_variance", 0.005, "depth_variance", 0.0051, 0.0049, Removal.FLAT_DEPTH),
+        ("max_surface_distance", 5e-3, "surface_distance", 4.9e-3, 5.1e-3, Removal.OFF_SURFACE),
+        ("max_surface_distance", 5e-4, "surface_distance", 4e-4, 6e-4, Removal.OFF_SURFACE),
+        ("max_normal_angle_deg", 50.0, "normal_angle", 0.87, 0.88, Removal.NORMAL_OFF),
+        ("max_slip", 0.02, "slip", 0.0199, 0.0201, Removal.SLID),
+        ("max_turn_deg", 50.0, "turn", 0.87, 0.88, Removal.TURNED),
+        ("other_links", 3, "other_links", 3, 4, Removal.OTHER_LINKS),
+    ],
+)
+def test_each_limit_is_the_configured_one(
+    limit: str, value: float, field: str, kept: float, removed: float, reason: Removal
+) -> None:
+    """Values of which the usual limit would judge at least one otherwise."""
+    values = np.array([kept, removed], dtype=getattr(good(2), field).dtype)
+    found = judge_successes(replace(good(2), **{field: values}), FilterConfig(**{limit: value}))
+    assert found.tolist() == [Removal.KEPT, reason]
+
+
+@pytest.mark.parametrize(("sigma", "outlier"), [(0.0, False), (3.0, True), (5.0, False)])
+def test_outliers_are_beyond_the_configured_number_of_deviations(
+    sigma: float, outlier: bool
+) -> None:
+    """One of twenty is sqrt(19), some 4.4 deviations from the mean."""
+    grasps = np.zeros((20, 18))
+    grasps[7, 3] = 1.0
+    removal = judge_successes(replace(good(20), grasp_T=grasps), FilterConfig(outlier_sigma=sigma))
+    assert np.flatnonzero(removal == Removal.OUTLIER).tolist() == ([7] if outlier else [])
+
+
+def test_outliers_are_judged_among_the_grasps_that_are_left() -> None:
+    """Far ones that another filter removes do not widen the deviation."""
+    grasps, slip = np.zeros((40, 18)), np.zeros(40)
+    grasps[7, 3] = 1.0
+    grasps[20:, 3], slip[20:] = np.linspace(-50.0, 50.0, 20), 1.0
+    removal = judge_successes(replace(good(40), grasp_T=grasps, slip=slip), FilterConfig())
+    assert removal[7] == Removal.OUTLIER
+    assert np.all(removal[20:] == Removal.SLID)
+    assert np.count_nonzero(removal == Removal.KEPT) == 19
+
+
+def test_numbers_of_removals_are_those_in_files() -> None:
+    """Files of earlier builds have them: a new one comes at the end."""
+    names = "kept other_links slid turned not_seen out_of_view bisects_table flat_depth "
+    names += "off_surface normal_off outlier rejected suspicious missing_finger"
+    assert [(r.value, r.label) for r in Removal] == list(enumerate(names.split()))
+
+
+@pytest.mark.parametrize(
     ("field", "limit"),
     [
         ("suspicion", "max_suspicion"),

@@ -10,10 +10,12 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import FileIO
 from pathlib import Path
 
 import pytest
 
+from drakegrasp.dataset import lock
 from drakegrasp.dataset.lock import FILE_NAME, build_lock
 from drakegrasp.errors import DataError
 from drakegrasp.runtime.processes import this_process
@@ -35,7 +37,7 @@ def holder(out: Path) -> Iterator[subprocess.Popen[bytes]]:
         [sys.executable, "-c", HOLD, out], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
     assert process.stdout is not None
-    assert process.stdout.readline() == b"held\n"
+    assert process.stdout.readline() == b"held\n", "the process must not die"
     try:
         yield process
     finally:
@@ -157,3 +159,22 @@ def test_two_threads_do_not_hold_a_directory_both(
                 raise AssertionError
     with build_lock(tmp_path / "out"):
         pass
+
+
+def test_lock_on_a_file_that_its_holder_removed_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between opening the file and locking it; somebody may have made another one since."""
+    path, lock_file, tries = tmp_path / FILE_NAME, lock.lock_file, []
+
+    def late(file: FileIO) -> bool | None:
+        if not tries:
+            path.unlink()
+            path.write_text("")
+        tries.append(file)
+        return lock_file(file)
+
+    monkeypatch.setattr(lock, "lock_file", late)
+    with build_lock(tmp_path):
+        assert len(tries) == 2
+        assert json.loads(path.read_text())["process"]["pid"] == os.getpid()

@@ -14,6 +14,8 @@ from drakegrasp.dataset.manifest import (
     Manifest,
     ObjectEntry,
     RefusedMesh,
+    claim_directory,
+    installed_versions,
     read_manifest,
     with_postprocessing,
     write_manifest,
@@ -117,6 +119,23 @@ def test_units_cover_the_candidates_of_each_object(manifest: Manifest) -> None:
     assert manifest.units == len(ranges)
 
 
+def test_units_of_many_candidates_grow(manifest: Manifest) -> None:
+    """So large datasets have few files and tasks; what one machine makes does not change."""
+
+    def stops(candidates: int, *, most: int) -> list[int]:
+        config = load_config(overrides=[f"candidates.max={most}"])
+        objects = (replace(MUG, candidates=candidates),)
+        grown = replace(manifest, config=config, objects=objects)
+        headers = list(grown.headers())
+        assert [h.start for h in headers] == [0, *(h.stop for h in headers[:-1])]
+        assert grown.units == len(headers)
+        return [h.stop for h in headers]
+
+    assert stops(1000, most=1000) == list(range(50, 1001, 50))
+    assert stops(1001, most=10_000) == [50, 100, 200, 400, 800, 1001]
+    assert len(stops(10_000, most=10_000)) == 28
+
+
 def _drop(key: str) -> Any:
     return lambda content: content["objects"][0].pop(key)
 
@@ -137,14 +156,14 @@ def test_broken_entry_is_refused(tmp_path: Path, manifest: Manifest, harm: Any) 
     content = json.loads((tmp_path / FILE_NAME).read_text(encoding="utf-8"))
     harm(content)
     (tmp_path / FILE_NAME).write_text(json.dumps(content), encoding="utf-8")
-    with pytest.raises(DataError, match=r"manifest\.json: must be a readable manifest"):
+    with pytest.raises(DataError, match=r"manifest\.json: .*must be"):
         read_manifest(tmp_path)
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff", b"[]"])
 def test_file_that_is_no_manifest_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / FILE_NAME).write_bytes(content)
-    with pytest.raises(DataError, match=r"manifest\.json: must be a readable manifest"):
+    with pytest.raises(DataError, match=r"manifest\.json: .*must be"):
         read_manifest(tmp_path)
 
 
@@ -154,3 +173,22 @@ def test_filters_may_change_but_not_the_physics(manifest: Manifest) -> None:
     assert changed.objects == (MUG,)
     with pytest.raises(ValueError, match=r"physics\.time_step \(0\.008 there, 0\.004 here\)"):
         with_postprocessing(manifest, ["physics.time_step=0.004"])
+
+
+@pytest.mark.parametrize("name", ["drakegrasp", "drake", "hand"])
+def test_dataset_of_other_versions_is_not_continued(tmp_path: Path, name: str) -> None:
+    """The package, the simulator and the hand's files decide what comes out."""
+    config = load_config()
+    versions = installed_versions(config)
+    write_manifest(Manifest(config=config, versions=versions), tmp_path)
+    assert claim_directory(tmp_path, config) is not None
+    write_manifest(Manifest(config=config, versions={**versions, name: "other"}), tmp_path)
+    with pytest.raises(DataError, match=rf"must be continued with {name} other, which made it"):
+        claim_directory(tmp_path, config)
+
+
+def test_dataset_of_another_version_of_a_reader_is_continued(tmp_path: Path) -> None:
+    config = load_config()
+    versions = {**installed_versions(config), "h5py": "other"}
+    write_manifest(Manifest(config=config, versions=versions), tmp_path)
+    assert claim_directory(tmp_path, config) is not None

@@ -26,8 +26,11 @@ def write_data_file(path: Path, trial_ids: range) -> Path:
     with h5py.File(path, "w") as file:
         file.attrs["schema_version"] = SCHEMA_VERSION
         file.attrs["K"] = np.eye(3)
+        file.attrs["near"], file.attrs["far"], file.attrs["seed"] = 0.01, 0.75, 0
         file.attrs["camera"] = "oto"
-        file.attrs["signature"] = "of a test"
+        file.attrs["config"] = file.attrs["versions"] = "{}"
+        for key in ("signature", "shards", "config_hash"):
+            file.attrs[key] = "of a test"
         for split in SPLITS:
             group = file.create_group(split)
             ids = trial_ids if split == "train" else range(0)

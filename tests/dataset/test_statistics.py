@@ -4,18 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-from helpers.datasets import SLIPPED, SUCCESS, TRIALS, change, make_dataset
+import h5py
+from helpers.datasets import SLIPPED, SUCCESS, TRIALS, change
 
+from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.filters import Removal
-from drakegrasp.dataset.statistics import count_funnel, count_unfinished
+from drakegrasp.dataset.statistics import count_funnel, count_splits, count_unfinished
 from drakegrasp.outcomes import Outcome
-
-
-@pytest.fixture
-def out(tmp_path: Path) -> Path:
-    (tmp_path / "meshes").mkdir()
-    return make_dataset(tmp_path / "out", tmp_path / "meshes")
 
 
 def test_words_are_counted_by_object(out: Path) -> None:
@@ -39,3 +34,35 @@ def test_words_of_a_build_that_runs_are_those_of_its_shards(out: Path) -> None:
     assert unfinished.funnel.precision.tolist() == [3, 2, 3]
     assert unfinished.funnel.stable.tolist() == [3, 2, 3]
     assert not unfinished.funnel.removals[:, Removal.KEPT].any()
+
+
+def test_removals_are_counted_by_object(out: Path) -> None:
+    """Two grasps of the second object are rejected, and one of the third slides."""
+    with h5py.File(out / TRIALS) as file:
+        rows = file["successes/trial_id"][:]
+        objects = file["trials/object"][:][rows]
+    assemble(out, rejected=rows[objects == 1][:2].tolist())
+    removals = count_funnel(out).removals
+    assert removals[:, Removal.KEPT].tolist() == [3, 1, 3]
+    assert removals[:, Removal.REJECTED].tolist() == [0, 2, 0]
+    assert removals.sum() == len(rows)
+
+
+def test_outcomes_are_counted_by_object(out: Path) -> None:
+    """One attempt of the third object has another outcome than its row in the others."""
+    with h5py.File(out / TRIALS) as file:
+        last = len(file["trials/outcome"]) - 1
+        before = Outcome(int(file["trials/outcome"][last]))
+    change(out, TRIALS, "trials/outcome", last, lambda _: Outcome.CRASHED)
+    outcomes = count_funnel(out).outcomes
+    assert outcomes.sum(axis=1).tolist() == [12, 12, 12]
+    assert outcomes[:, Outcome.CRASHED].tolist() == [0, 0, 1]
+    assert outcomes[2, before] == outcomes[1, before] - 1
+
+
+def test_splits_are_counted(out: Path) -> None:
+    """A class with one object is tested whole; of the other class one object is."""
+    counts = {c.split: (c.samples, c.objects, c.classes) for c in count_splits(out)}
+    assert counts["test"] == (6, 2, 2)
+    assert counts["train"][0] + counts["valid"][0] == 3
+    assert counts["train"][1:] == counts["valid"][1:] == (1, 1)

@@ -10,11 +10,12 @@ from click.testing import CliRunner
 
 from drakegrasp.cli import export as command
 from drakegrasp.cli.main import main
+from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError
 from drakegrasp.exchange import dexgraspbench
 from drakegrasp.exchange.closed_grasps import ClosedGrasp
-from drakegrasp.exchange.export import FORMATS, export_dataset
+from drakegrasp.exchange.export import FORMATS, Format, export_dataset
 
 
 def test_closed_grasps_are_the_samples_of_all_splits(
@@ -53,6 +54,15 @@ def test_missing_dataset_is_refused_before_anything_is_written(tmp_path: Path) -
     with pytest.raises(DataError, match="must be a data file of drakegrasp"):
         export_dataset(tmp_path / "out", tmp_path / "to", "original")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_dataset_without_samples_is_refused(dataset: Path, tmp_path: Path, form: Format) -> None:
+    out = Path(shutil.copytree(dataset, tmp_path / "out"))
+    assemble(out, overrides=["filters.max_slip=1e-9"])
+    with pytest.raises(DataError, match="must have samples to export, got none"):
+        export_dataset(out, tmp_path / "to", form)
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
 def test_samples_go_into_the_dataset_by_default(dataset: Path, tmp_path: Path) -> None:

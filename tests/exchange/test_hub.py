@@ -110,10 +110,27 @@ def test_card_names_licence_files_and_counts(dataset: Path, folder: Path) -> Non
     for config in described["configs"]:
         for entry in config["data_files"]:
             assert list(folder.glob(entry["path"]))
-    assert (dataset / "DATACARD.md").read_text(encoding="utf-8") in text
+    # What the dataset's own card says of how it was made, word for word.
+    own = (dataset / "DATACARD.md").read_text(encoding="utf-8")
+    assert own[own.index("## How it was made") :] in text
     for split in SPLITS:
         count = len(GraspDataset(dataset / "grasping_oto.hdf5", split=split))
         assert f"| {split} | {count} | {count} |" in text
+
+
+def test_card_says_what_the_folder_holds_and_nothing_else(dataset: Path, folder: Path) -> None:
+    text = (folder / "README.md").read_text(encoding="utf-8")
+    for absent in ("trials.hdf5", "manifest.json", "grasping_o", "in 0..1", "objects/"):
+        assert absent not in text.partition("## Columns")[0]
+    assert "| `oto/, otm/` |" in text
+    data = GraspDataset(dataset / "grasping_oto.hdf5")
+    assert f"focal lengths {data.K[0, 0]:.6f} and {data.K[1, 1]:.6f}" in text
+    assert f"centre at ({data.K[0, 2]:g}, {data.K[1, 2]:g}) [px]" in text
+    assert "the depth is 0.75 m" in text
+    for name, field in hub.columns().items():
+        rows = [line for line in text.splitlines() if line.startswith(f"| `{name}` |")]
+        assert len(rows) == 1
+        assert field is None or f"| {field.unit} | {field.frame} |" in rows[0]
 
 
 def test_long_splits_are_cut_into_files(

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
+from drakegrasp.dataset.paths import model_path
 from drakegrasp.exchange.closed_grasps import ClosedGrasp
 from drakegrasp.exchange.export import export_dataset
-from drakegrasp.exchange.posed_scenes import X_UT
+from drakegrasp.exchange.posed_scenes import X_UT, link_meshes, posed_scene
 from drakegrasp.frames import invert_pose
 from drakegrasp.hand.description import load_hand
+from drakegrasp.objects.model import load_object
 from drakegrasp.visualization.posed_hand import PosedHand
 
 
@@ -33,19 +36,32 @@ def test_bodies_are_where_they_are(folder: Path, grasps: list[ClosedGrasp]) -> N
             name: invert_pose(X_UT) @ scene.graph.get(name)[0]
             for name in scene.graph.nodes_geometry
         }
-        assert poses.pop(grasp.object_name) == pytest.approx(grasp.X_TO, abs=1e-6)
+        assert poses.pop(f"object/{grasp.object_name}") == pytest.approx(grasp.X_TO, abs=1e-6)
         links = posed.link_poses(grasp.X_TG, grasp.q)
-        assert set(hand.fingertip_links) <= set(poses) <= set(links)
+        nodes = {f"hand/{name}": X_TL for name, X_TL in links.items()}
+        assert {f"hand/{name}" for name in hand.fingertip_links} <= set(poses) <= set(nodes)
         for name, X_TL in poses.items():
-            assert pytest.approx(links[name], abs=1e-6) == X_TL
+            assert pytest.approx(nodes[name], abs=1e-6) == X_TL
 
 
 def test_up_is_y(folder: Path, grasps: list[ClosedGrasp]) -> None:
     """The object of the dataset is a box that stands on the table, and the palm is above it."""
     grasp = grasps[0]
     scene = trimesh.load_scene(folder / grasp.object_name / f"{grasp.trial_id}.glb")
-    X, name = scene.graph.get(grasp.object_name)
+    X, name = scene.graph.get(f"object/{grasp.object_name}")
     corners = trimesh.transform_points(scene.geometry[name].vertices, X)
     assert corners[:, 1].min() == pytest.approx(0.0, abs=1e-6)
-    palm = np.array(scene.graph.get(load_hand().palm_link)[0])
+    palm = np.array(scene.graph.get(f"hand/{load_hand().palm_link}")[0])
     assert palm[1, 3] > corners[:, 1].max()
+
+
+@pytest.mark.parametrize("name", ["scene", "palm"])
+def test_an_object_may_have_any_name(dataset: Path, grasps: list[ClosedGrasp], name: str) -> None:
+    hand = load_hand()
+    links = link_meshes(hand)
+    model = load_object(model_path(dataset, grasps[0].object_name))
+    named = replace(model, name=hand.palm_link if name == "palm" else name)
+    scene = posed_scene(named, PosedHand(hand), links, grasps[0])
+    assert len(scene.graph.nodes_geometry) == len(links) + 1
+    X, _ = scene.graph.get(f"object/{named.name}")
+    assert invert_pose(X_UT) @ X == pytest.approx(grasps[0].X_TO, abs=1e-6)

@@ -35,10 +35,13 @@ def test_sphere_and_cylinder_approach_the_closed_form(tmp_path):
     np.testing.assert_allclose(tin.I_OOcm_O, expected, rtol=1e-3, atol=1e-9)
 
 
-def test_centre_of_mass_of_a_cone_is_a_quarter_up(tmp_path):
+def test_cone_has_the_closed_form_about_its_centre_of_mass(tmp_path):
     cone = trimesh.creation.cone(radius=0.03, height=0.1, sections=128)
     model = prepare(write(tmp_path / "cone.obj", cone))
     np.testing.assert_allclose(model.p_OOcm, [0.0, 0.0, -0.025], atol=1e-6)
+    # About that centre, and not about the middle of its height.
+    side, axis = 3.0 / 80.0 * (4.0 * 0.03**2 + 0.1**2), 0.3 * 0.03**2
+    np.testing.assert_allclose(model.I_OOcm_O, np.diag([side, side, axis]), rtol=2e-3, atol=1e-9)
 
 
 @settings(max_examples=15, deadline=None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from helpers.shards import some_shard
 
 from drakegrasp.dataset.shards import write_shard
 from drakegrasp.runtime import files
+from drakegrasp.runtime.file_set import LIST_NAME, replaced_together
 from drakegrasp.runtime.files import atomic_hdf5, atomic_path, probe_folder, write_atomic
 
 
@@ -81,3 +83,45 @@ def test_failed_rename_leaves_nothing(tmp_path: Path, monkeypatch: pytest.Monkey
     with pytest.raises(OSError, match="No space left"):
         write_shard(tmp_path, some_shard())
     assert everything_in(tmp_path) == []
+
+
+def test_file_is_on_the_disk_before_it_has_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And its folder afterwards: after a power cut the name never stands for an empty file."""
+    path, synced = tmp_path / "file.txt", watch_sync(monkeypatch)
+    write_atomic(path, b"content")
+    ((first, there), (second, named)) = [(name, path in seen) for name, seen in synced]
+    assert first.parent == tmp_path and first.name.startswith(".file.txt.") and not there
+    assert second == tmp_path and named
+
+
+def test_files_that_are_replaced_together_are_on_the_disk_before_their_list(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced, listed = watch_sync(monkeypatch), tmp_path / LIST_NAME
+    with replaced_together(tmp_path) as new:
+        for name in ("a", "b"):
+            new(name).write_text(name)
+    before = [path.name for path, seen in synced if listed not in seen]
+    assert [name[:3] for name in before[:2]] == [".a.", ".b."]
+    # The names are on the disk before the list goes, and then that it went.
+    *_, (last, seen), (end, left) = synced
+    assert last == end == tmp_path
+    assert listed in seen and {tmp_path / "a", tmp_path / "b"} <= seen
+    assert listed not in left
+    assert [(tmp_path / name).read_text() for name in ("a", "b")] == ["a", "b"]
+
+
+def watch_sync(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Path, set[Path]]]:
+    """Return a list that gets what is synced, and what its folder holds at that time."""
+    synced: list[tuple[Path, set[Path]]] = []
+    sync = os.fsync
+
+    def watch(descriptor: int) -> None:
+        path = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
+        synced.append((path, set((path if path.is_dir() else path.parent).iterdir())))
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", watch)
+    return synced

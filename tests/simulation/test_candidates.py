@@ -497,6 +497,13 @@ def test_spreads_come_from_the_list_and_all_come() -> None:
     assert spreads == {0.0, 11.25, 22.5}
 
 
+def test_each_standoff_draws_its_own_spread() -> None:
+    """Of three spreads two stand-offs share one in a third of the cases."""
+    drawn = np.array([a.spread for a in attempts(range(30))]).reshape(30, 3)
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        assert 2 <= np.count_nonzero(drawn[:, i] == drawn[:, j]) <= 20
+
+
 @pytest.mark.parametrize("cut", [1, 7, 29])
 def test_attempts_do_not_depend_on_how_the_work_is_cut(cut: int) -> None:
     whole = attempts(range(30))

@@ -6,13 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.objects import STANDOFF, from_above, standing
+from helpers.objects import CUBE, STANDOFF, from_above, standing
 
-from drakegrasp.frames import X_WT, invert_pose, transform_points
+from drakegrasp.frames import X_WT, invert_pose, make_pose, transform_points
 from drakegrasp.hand.file_format import HalfSpace
+from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.simulation.contacts import Contacts, read_contacts
-from drakegrasp.simulation.scene import Scene, advance, reset_attempt
+from drakegrasp.simulation import contacts as contacts_module
+from drakegrasp.simulation.contacts import Contacts, bodies_on_object, read_contacts
+from drakegrasp.simulation.scene import Scene, advance, release, reset_attempt
 from drakegrasp.simulation.verdict import judge_closed
 
 pytestmark = pytest.mark.sim
@@ -107,3 +109,109 @@ def test_barretts_pad_is_the_front_of_its_fingertip(closed):
     off = np.array([[0.0179, 0.01, 0.0], [0.03, -0.002, 0.011], [0.059, -0.004, 0.0]])
     assert finger.on_pad(on).all()
     assert not finger.on_pad(off).any()
+
+
+def test_weak_contacts_do_not_count(closed: Scene) -> None:
+    """Fingertips press with some 10 N: a limit above that leaves nothing that touches."""
+    forces = np.linalg.norm(read_contacts(closed).f_Q_O, axis=1)
+    tips = {body.index() for body in closed.handles.fingertips}
+    for limit in (0.9 * forces.min(), 1.1 * forces.max()):
+        strict = replace(closed, physics=closed.physics.model_copy(update={"contact_force": limit}))
+        expected = [limit < forces.min()] * 3
+        assert read_contacts(strict).touching.tolist() == expected
+        assert bodies_on_object(strict) == (tips if expected[0] else set())
+
+
+def test_weak_contact_of_another_link_does_not_count(closed: Scene) -> None:
+    """All pads moved away: what the fingertips press with is then other links'."""
+    forces = np.linalg.norm(read_contacts(closed).f_Q_O, axis=1)
+    limit = float(forces[:2].mean() + forces[2]) / 2.0
+    strict = replace(closed, physics=closed.physics.model_copy(update={"contact_force": limit}))
+    assert with_pads(closed, NOWHERE, NOWHERE, NOWHERE).other_links == 3
+    assert (
+        with_pads(strict, NOWHERE, NOWHERE, NOWHERE).other_links
+        == (forces > limit).sum()
+        in (
+            1,
+            2,
+        )
+    )
+
+
+#: Two faces of a patch over an edge of the cube: the smaller one carries more.
+AREAS, PRESSURES = np.array([1e-6, 3e-6]), np.array([5e6, 1e6])
+POINTS = np.array([[0.03, 0.0, 0.0], [0.035, 0.01, 0.002]])
+NORMALS = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+
+
+def test_point_and_normal_are_weighted_by_pressure(
+    closed: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The faces carry 5 and 3 N, whatever their areas are."""
+    X_WO = closed.pose(closed.object)
+    faces = contacts_module._Faces(
+        areas=AREAS,
+        centres_W=transform_points(X_WO, POINTS),
+        normals_W=NORMALS @ X_WO[:3, :3].T,
+        pressures=PRESSURES,
+        depths=np.array([1e-4, 3e-4]),
+    )
+    monkeypatch.setattr(contacts_module, "_read_faces", lambda *_: faces)
+    found = with_pads(closed, EVERYWHERE, EVERYWHERE, EVERYWHERE)
+    assert found.touching.all()
+    np.testing.assert_allclose(found.p_OQ[0], (5.0 * POINTS[0] + 3.0 * POINTS[1]) / 8.0, atol=1e-12)
+    np.testing.assert_allclose(found.nhat_Q_O[0], np.array([3.0, 5.0, 0.0]) / np.sqrt(34.0))
+    assert found.area[0] == pytest.approx(4e-6)
+    assert found.penetration[0] == pytest.approx(3e-4)
+
+
+def test_contact_point_is_where_drakes_force_acts(closed: Scene) -> None:
+    """On a plane, force and moment about the patch's centroid tell the centre of pressure."""
+    results = closed.plant.get_contact_results_output_port().Eval(closed.context)
+    tips, found = [body.index() for body in closed.handles.fingertips], read_contacts(closed)
+    X_OW = invert_pose(closed.pose(closed.object))
+    seen = set()
+    for i in range(results.num_hydroelastic_contacts()):
+        info = results.hydroelastic_contact_info(i)
+        surface = info.contact_surface()
+        body = {contacts_module._body_of(closed, g) for g in (surface.id_M(), surface.id_N())}
+        (tip,) = body & set(tips)
+        k = tips.index(tip)
+        n_O = np.array([0.0, np.sign(found.p_OQ[k, 1]), 0.0])
+        f_O, tau_O = (
+            X_OW[:3, :3] @ part
+            for part in (info.F_Ac_W().translational(), info.F_Ac_W().rotational())
+        )
+        centroid_O = transform_points(X_OW, surface.centroid()[None])[0]
+        point = centroid_O + np.cross(n_O, tau_O) / (n_O @ f_O)
+        np.testing.assert_allclose(found.p_OQ[k], point, atol=2e-5)
+        seen.add(k)
+    assert seen == {0, 1, 2}
+
+
+def test_depth_of_a_fingertip_is_how_far_it_is_in_the_cube(closed: Scene) -> None:
+    """A convex shape is deepest at a corner. Drake's field of pressure is not quite a distance."""
+    found, hand = read_contacts(closed), closed.handles.hand
+    for k, tip in enumerate(closed.handles.fingertips):
+        corners = np.concatenate(link_shapes(hand)[hand.fingers[k].fingertip])
+        X_OF = invert_pose(closed.pose(closed.object)) @ closed.pose(tip)
+        y = np.abs(transform_points(X_OF, corners)[:, 1])
+        assert found.penetration[k] == pytest.approx(CUBE / 2.0 - y.min(), rel=0.3)
+
+
+def test_hand_and_object_on_the_table_are_told_apart(scene: Scene, cube: ObjectModel) -> None:
+    """A cube that stands there, then a hand that presses on the table beside it."""
+    X_WO = X_WT @ standing(cube)
+    reset_attempt(scene, X_WO, X_WO @ from_above(cube, 0.3).X_OG, spread=0.0)
+    release(scene)
+    advance(scene, 0.3)
+    stands = read_contacts(scene)
+    assert (stands.object_on_table, stands.hand_on_table) == (True, False)
+    np.testing.assert_allclose(stands.table_force, [0.0, 0.0, 9.81 * cube.mass], atol=0.1)
+    assert stands.other_links == 0 and not stands.touching.any()
+
+    # Open fingers point down: with the palm this low their ends are in the table.
+    X_TG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.3, 0.0, 0.05])
+    reset_attempt(scene, X_WO, X_WT @ X_TG, spread=0.0, closing=np.full(3, 1.3))
+    presses = read_contacts(scene)
+    assert (presses.object_on_table, presses.hand_on_table) == (False, True)

@@ -7,9 +7,10 @@ from collections import Counter
 import numpy as np
 import pytest
 from helpers.objects import CUBE, STANDOFF, from_above, standing
+from pydrake.math import RigidTransform
 
 from drakegrasp.config import override_config
-from drakegrasp.frames import X_WT
+from drakegrasp.frames import X_WT, make_pose, rotation_about
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation import lift as lifting
@@ -148,3 +149,125 @@ def test_slip_before_the_wrist_moves_is_told_apart(scene, cube, config):
     assert 1e-6 < moved.slip_released < 0.5 * moved.slip
     assert moved.slip_released == pytest.approx(waited.slip_released, rel=1e-6)
     assert 1e-6 < moved.turn_released < moved.turn
+
+
+def test_long_steps_are_for_what_stands_still_in_the_hand(cube, config, hand, monkeypatch):
+    """Where fingers can be pushed open the cube creeps at each look, and all steps are fine."""
+    simulated = Counter()
+    simulate = stepping.advance
+
+    def count(stage: Scene, duration: float) -> None:
+        simulated[stage.physics.time_step] += duration
+        simulate(stage, duration)
+
+    monkeypatch.setattr(stepping, "advance", count)
+    long = config.physics.coarse_steps * config.physics.time_step
+    shares = {}
+    scene = build_scene(cube, config.physics, hand)
+    for drive in ("worm", "torque"):
+        simulated.clear()
+        drawn = override_config(config, [f"lift.drive={drive}"])
+        record = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), drawn)
+        shares[drive] = simulated[long] / record.time_lift
+    assert shares["worm"] > 0.7
+    assert shares["torque"] < 0.3
+
+
+@pytest.mark.parametrize(
+    ("shift", "angle_deg", "closed", "touching", "at_rest", "certain"),
+    [
+        # What stands still may take long steps; a fingertip that is on it is not lost.
+        (0.0, 0.0, 0.0, "all", True, False),
+        (0.9e-4, 0.09, 0.9e-3, "all", True, False),
+        # A little motion of any kind needs fine steps.
+        (1.1e-4, 0.0, 0.0, "all", False, False),
+        (0.0, 0.11, 0.0, "all", False, False),
+        (0.0, 0.0, 1.1e-3, "all", False, False),
+        # Much motion with nothing that touches: lost for good, but not on a slow finger's account.
+        (6e-4, 0.0, 0.0, "none", False, True),
+        (0.0, 0.6, 0.0, "none", False, True),
+        (6e-4, 0.0, 0.0, "palm", False, False),
+        (0.0, 0.0, 1.1e-3, "none", False, False),
+        # What stands still has slipped where a fingertip is off it, unless the table holds it.
+        (0.0, 0.0, 0.0, "off", True, True),
+        (0.0, 0.0, 0.0, "off on table", True, False),
+    ],
+)
+def test_monitor_judges_what_moved_since_the_last_look(
+    scene, cube, monkeypatch, shift, angle_deg, closed, touching, at_rest, certain
+):
+    """A look takes 0.1 s; fingers stand below 0.01 rad/s. Nothing is simulated."""
+    close(scene, cube)
+    X_GO, angles = lifting._object_in_hand(scene), lifting.closing_angles(scene)
+    monitor = lifting._Monitor(scene)
+    turn = make_pose(rotation_about([0.0, 1.0, 0.0], np.deg2rad(angle_deg)), [0.0, shift, 0.0])
+    monkeypatch.setattr(lifting, "_object_in_hand", lambda _: X_GO @ turn)
+    monkeypatch.setattr(lifting, "closing_angles", lambda _: angles + np.eye(3)[1] * closed)
+    tips = {body.index() for body in scene.handles.fingertips}
+    palm = scene.plant.GetBodyByName(scene.handles.hand.palm_link).index()
+    table = scene.table.index()
+    on_object = {
+        "all": tips,
+        "none": {table},
+        "palm": {palm},
+        "off": {palm},
+        "off on table": {table},
+    }[touching]
+    monkeypatch.setattr(lifting, "bodies_on_object", lambda _: on_object)
+    monkeypatch.setattr(lifting, "_has_lost_tip", lambda _: "off" in touching)
+    assert monitor.update(scene, 0.1, 0.01) is certain
+    assert monitor.at_rest is at_rest
+
+
+def test_monitor_looks_again_after_a_motion(scene, cube, monkeypatch):
+    """While nothing moves, contacts are looked for once; after a motion they are again."""
+    close(scene, cube)
+    tips, looks = {body.index() for body in scene.handles.fingertips}, []
+
+    def look(_):
+        looks.append(True)
+        return tips
+
+    monkeypatch.setattr(lifting, "bodies_on_object", look)
+    monitor = lifting._Monitor(scene)
+    X_GO = lifting._object_in_hand(scene)
+    counts = []
+    for shift in (0.0, 0.0, 1e-3, 1e-3, 1e-3):
+        moved = X_GO @ make_pose(np.eye(3), [0.0, shift, 0.0])
+        monkeypatch.setattr(lifting, "_object_in_hand", lambda _, X=moved: X)
+        assert not monitor.update(scene, 0.1, 0.01)
+        counts.append(len(looks))
+    assert counts == [1, 1, 2, 3, 3]
+
+
+@pytest.mark.parametrize(("away", "lost"), [(0.0, False), (2.5e-3, False), (4e-3, True)])
+def test_fingertip_is_lost_beyond_a_few_millimetres(scene, cube, monkeypatch, away, lost):
+    """The object is moved away from the two fingers on one side, by that and how deep it was."""
+    close(scene, cube)
+    depth = float(read_contacts(scene).penetration.max())
+    X_WO = X_WT @ standing(cube) @ make_pose(np.eye(3), [0.0, 0.0, 0.0])
+    sides = read_contacts(scene).p_OQ[:, 1]
+    alone = int(np.argmax(np.sign(sides) != np.sign(sides.sum())))
+    X_WO[1, 3] -= np.sign(sides[alone]) * ((away + depth) if away else 0.0)
+    release(scene)
+    scene.plant.SetFreeBodyPose(scene.context, scene.object, RigidTransform(X_WO))
+    assert lifting._has_lost_tip(scene) is lost
+
+
+def test_wrist_begins_and_looks_fall_where_a_long_step_does(config):
+    """On multiples of 24 ms, never before what was asked for."""
+    rules = override_config(config, ["physics.time_step=0.008", "physics.coarse_steps=3"])
+    for time, expected in ((0.0, 0.0), (0.001, 0.024), (0.024, 0.024), (0.0241, 0.048)):
+        assert lifting._on_grid(time, rules) == pytest.approx(expected, abs=1e-12)
+    assert lifting._next_check(0.048, rules) == pytest.approx(0.168, abs=1e-12)
+
+
+def test_wrist_starts_after_the_release_time_and_keeps_its_limits(scene, cube, config):
+    close(scene, cube)
+    motion = lifting._plan_motion(scene, config)
+    long = config.physics.coarse_steps * config.physics.time_step
+    waited = motion.begin - scene.time
+    assert config.lift.release_time - 1e-9 <= waited < config.lift.release_time + long
+    distance = np.linalg.norm(motion.p_end - motion.p_start)
+    assert motion.duration == pytest.approx(lift_duration(float(distance), config))
+    assert motion.p_end - X_WT[:3, 3] == pytest.approx(config.lift.p_TG)

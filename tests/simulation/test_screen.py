@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import islice
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from helpers.objects import (
 from drakegrasp.config import ScreenConfig, load_config
 from drakegrasp.frames import make_pose
 from drakegrasp.hand.description import Hand, load_hand
-from drakegrasp.hand.finger_sweep import hand_paths
+from drakegrasp.hand.finger_sweep import GAP_STRIDE, hand_paths
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation import screen
@@ -80,7 +81,7 @@ def test_object_under_one_finger_only_is_screened(cube, hand):
     """The palm beside the cube: one fingertip may meet it, the others close on nothing."""
     attempt = from_above(cube, STANDOFF)
     aside = replace(attempt, X_OG=make_pose(np.eye(3), [0.0, 0.12, 0.0]) @ attempt.X_OG)
-    assert ask(cube, hand, aside).outcome in (Outcome.SCREENED, Outcome.START_COLLISION)
+    assert ask(cube, hand, aside).outcome is Outcome.SCREENED
 
 
 def test_fingertip_that_meets_the_object_beside_its_pad_is_screened(cube, hand):
@@ -224,3 +225,171 @@ def test_no_field_is_made_where_nobody_asks(cube, hand):
     off = ScreenConfig(mode="off")
     assert predict(model, hand, standing(model), [from_above(cube, STANDOFF)], off) == [None]
     assert "field" not in vars(model)
+
+
+# The sweep and the margins, against brute force
+
+
+def lookup_of(model: ObjectModel, attempts: list[Attempt]) -> screen._PointLookup:
+    X_OG = np.stack([attempt.X_OG for attempt in attempts])
+    return screen._PointLookup(model.field, standing(model), X_OG)
+
+
+def brute_sweep(lookup, path, row: int, config: ScreenConfig) -> tuple[int, bool, int]:
+    """Return start, whether the pad arrives, and the last angle, looking at every angle."""
+    rows, end = np.array([row]), len(path.angles) - 1
+    start, starting, arrives, last = 0, True, False, end
+    for k in range(end + 1):
+        points = path.points[k][None]
+        to_object = lookup.distances(rows, points, config.clearance)
+        least = min(to_object.min(), lookup.heights(rows, points).min())
+        starting &= bool(least > np.float32(config.clearance))
+        start = k if starting else start
+        if to_object[0, : path.pad].min() <= np.float32(config.reach_margin):
+            arrives, last = True, k
+        if least < -np.float32(config.block_margin):
+            break
+    return start, arrives, last
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        ScreenConfig(),
+        ScreenConfig(clearance=0.0055, reach_margin=0.004, block_margin=0.002),
+    ],
+    ids=["usual", "other"],
+)
+def test_sweep_finds_what_a_look_at_every_angle_finds(cube, hand, config):
+    """For each finger of attempts around the cube, some of which close on the table."""
+    attempts = [from_above(cube, standoff) for standoff in (0.035, 0.045, 0.06, 0.09, 0.13)]
+    aside = make_pose(np.eye(3), [0.03, 0.05, 0.0])
+    attempts += [replace(attempt, X_OG=aside @ attempt.X_OG) for attempt in attempts]
+    lookup, rows = lookup_of(cube, attempts), np.arange(len(attempts))
+    kinds = set()
+    for path in hand_paths(hand, 0.0).fingers:
+        sweep = screen._sweep_finger(lookup, path, rows, config)
+        for row in rows:
+            start, arrives, last = brute_sweep(lookup, path, row, config)
+            assert sweep.start[row] == start
+            assert sweep.arrives[row] == arrives
+            assert not arrives or sweep.last[row] == last
+            kinds.add((start > 0, arrives))
+    assert {(True, True), (True, False)} <= kinds
+
+
+def test_fingers_start_before_they_may_cross(hand):
+    """All close alike: at no moment on the way do two fingertips come near each other."""
+    paths = hand_paths(hand, float(np.deg2rad(22.5)))
+    ends = np.array([[len(path.angles) - 1 for path in paths.fingers], [20, 30, 40]])
+    starts = screen._clear_starts(paths, ends)
+    assert np.array_equal(starts[1], ends[1])
+    assert np.all(starts[0] < ends[0])
+
+    def gap(k: int) -> float:
+        return min(gap[k // GAP_STRIDE, k // GAP_STRIDE] for gap in paths.gaps.values())
+
+    (start,) = set(starts[0].tolist())
+    assert all(gap(k) > screen.FINGER_GAP for k in range(0, start + 1, GAP_STRIDE))
+    assert gap(start + GAP_STRIDE) <= screen.FINGER_GAP
+
+
+def test_fingers_start_before_they_may_cross_in_an_attempt(cube, hand):
+    """In the air, with margins so wide that it is simulated: they start well before their ends."""
+    attempt = from_above(cube, 0.25)
+    found = ask(cube, hand, attempt, reach_margin=1.0, block_margin=1.0, clearance=1e-4)
+    assert found.outcome is None
+    paths = hand_paths(hand, 0.0)
+    places = np.array([[np.searchsorted(path.angles, 9.0) - 1 for path in paths.fingers]])
+    starts = screen._clear_starts(paths, places)[0]
+    expected = [path.angles[k] for path, k in zip(paths.fingers, starts, strict=True)]
+    assert found.closing == pytest.approx(expected)
+    assert max(found.closing) < 0.9 * min(path.angles[-1] for path in paths.fingers)
+
+
+def lowest(hand: Hand) -> float:
+    """Return how far the open hand reaches below its palm, which looks down [m]."""
+    paths = hand_paths(hand, 0.0)
+    opened = [paths.still, *(path.points[0] for path in paths.fingers)]
+    return float(np.concatenate(opened)[:, 2].max())
+
+
+@pytest.mark.parametrize(
+    ("margins", "outcome", "clear"),
+    [
+        (-1.5, Outcome.START_COLLISION, False),
+        (-0.5, Outcome.SCREENED, False),
+        (0.5, Outcome.SCREENED, False),
+        (1.5, Outcome.SCREENED, True),
+    ],
+)
+def test_open_hand_is_certain_beyond_the_margin_only(
+    cube, hand, config, scene, margins, outcome, clear
+):
+    """Open fingers over the table beside the cube, so many margins above it: Drake agrees."""
+    margin = ScreenConfig().start_margin
+    height = lowest(hand) + margins * margin
+    X_TG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.4, 0.0, height])
+    attempt = replace(from_above(cube, STANDOFF), X_OG=np.linalg.inv(standing(cube)) @ X_TG)
+    found = ask(cube, hand, attempt)
+    assert (found.outcome, found.clear) == (outcome, clear)
+    hits = margins < 0.0
+    drakes = run_attempt(scene, standing(cube), attempt, config).outcome
+    assert drakes is (Outcome.START_COLLISION if hits else Outcome.SCREENED)
+
+
+@pytest.mark.parametrize(("margins", "clear"), [(0.5, False), (1.5, True)])
+def test_open_hand_near_the_object_is_not_clear(cube, hand, margins, clear):
+    """Over the cube's top, so many margins from its faces in closed form."""
+    paths = hand_paths(hand, 0.0)
+    opened = np.concatenate([paths.still, *(path.points[0] for path in paths.fingers)])
+
+    def distance(standoff: float) -> float:
+        X_OG = from_above(cube, standoff).X_OG
+        outside = np.abs(opened @ X_OG[:3, :3].T + X_OG[:3, 3]) - cube.half_extents
+        return float(np.linalg.norm(np.maximum(outside, 0.0), axis=1).min())
+
+    wanted = margins * ScreenConfig().start_margin
+    standoff = min(np.linspace(0.0, 0.1, 1001), key=lambda s: abs(distance(s) - wanted))
+    assert distance(standoff) == pytest.approx(wanted, abs=2e-4)
+    found = ask(cube, hand, from_above(cube, standoff), reach_margin=0.2, block_margin=1.0)
+    assert (found.outcome, found.clear) == (None, clear)
+
+
+@pytest.mark.parametrize("name", ["start_margin", "reach_margin", "block_margin", "clearance"])
+def test_coarse_grid_widens_each_margin(cube, name):
+    margins, blur = ScreenConfig(), screen.COVERED + 0.004
+    coarse = SimpleNamespace(blur=blur)
+    assert screen.extra_margin(coarse) == pytest.approx(0.004)
+    wide = screen._widened(margins, coarse)
+    assert getattr(wide, name) == pytest.approx(getattr(margins, name) + 0.004)
+    assert screen.extra_margin(SimpleNamespace(blur=0.5 * screen.COVERED)) == 0.0
+
+
+def test_one_finger_that_is_not_required_screens_nothing(cube, hand):
+    """The last finger closes on nothing: the attempt is lost only where it must touch."""
+    attempt = from_above(cube, STANDOFF)
+    nowhere = {"pad_region": ((-1.0, 0.0, 0.0, -0.005),), "pad_point": (0.0, 0.009, 0.0)}
+    *others, last = hand.fingers
+    for required, outcome in ((True, Outcome.SCREENED), (False, None)):
+        finger = replace(last, required=required, **nowhere)
+        found = ask(cube, replace(hand, fingers=(*others, finger)), attempt)
+        assert found.outcome is outcome
+
+
+def test_heights_and_distances_are_those_of_the_points(cube, hand):
+    """Lower bounds of the distances from the cube's faces; the least is exact where it matters."""
+    X_OG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.01, -0.02, 0.2])
+    lookup = screen._PointLookup(cube.field, standing(cube), X_OG[None])
+    p_GQ = np.array([[0.0, 0.0, 0.16], [0.028, 0.0, 0.2], [0.0, 0.016, 0.163]], dtype=np.float32)
+    p_OQ = p_GQ @ X_OG[:3, :3].T + X_OG[:3, 3]
+    rows = np.array([0])
+    np.testing.assert_allclose(
+        lookup.heights(rows, p_GQ)[0], p_OQ[:, 2] + standing(cube)[2, 3], atol=1e-6
+    )
+    outside = np.maximum(np.abs(p_OQ) - cube.half_extents, 0.0)
+    truth = np.linalg.norm(outside, axis=1)
+    found = lookup.distances(rows, p_GQ, 1.0)[0]
+    error = 2.0 * cube.field.error
+    assert np.all(found <= truth + 1e-4) and np.all(found >= truth - error - 1e-4)
+    assert found.min() == pytest.approx(truth.min(), abs=1e-4)

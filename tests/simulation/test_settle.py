@@ -15,10 +15,13 @@ from scipy.spatial import ConvexHull
 
 from drakegrasp.config import Config, load_config, override_config
 from drakegrasp.errors import MeshError
+from drakegrasp.frames import X_WT, make_pose
 from drakegrasp.objects.model import ObjectModel, make_object, prepare_object
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.simulation import settle as settle_module
-from drakegrasp.simulation.scene import Scene
+from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.contacts import Contacts
+from drakegrasp.simulation.scene import Scene, reset_object
 from drakegrasp.simulation.settle import Resting, settle
 
 pytestmark = pytest.mark.sim
@@ -99,6 +102,90 @@ def test_object_falls_from_its_own_origin_and_a_tall_one_from_the_table(
     monkeypatch.setattr(settle_module, "_wait_for_rest", watch)
     settle(as_dropped(trimesh.creation.box([side] * 3)), config)
     assert landing[0] == pytest.approx(-np.sqrt(2.0 * 9.81 * fall), abs=1e-6)
+
+
+@pytest.mark.parametrize(("share", "refused"), [(0.98, True), (0.995, False), (1.02, True)])
+def test_table_must_carry_the_weight(
+    config: Config, monkeypatch: pytest.MonkeyPatch, share: float, refused: bool
+):
+    """To one per cent: more or less is an error of the contact."""
+    read = settle_module.read_contacts
+
+    def wrong(scene: Scene) -> Contacts:
+        contacts = read(scene)
+        return replace(contacts, table_force=share * contacts.table_force)
+
+    monkeypatch.setattr(settle_module, "read_contacts", wrong)
+    box = as_dropped(trimesh.creation.box([0.05] * 3))
+    if refused:
+        with pytest.raises(MeshError, match=r"must carry its 9\.81 N at rest, got"):
+            settle(box, config)
+    else:
+        assert settle(box, config).table_force == pytest.approx(share * 9.81, rel=0.002)
+
+
+def test_what_lands_deep_is_raised_and_set_down_again(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+):
+    """By as much as it is deep, at rest, four times at most."""
+    box, raised, deep = as_dropped(trimesh.creation.box([0.05] * 3)), [], 2e-3
+    measured, lift = settle_module._sink, settle_module._raise
+    monkeypatch.setattr(settle_module, "_sink", lambda scene: measured(scene) + deep)
+
+    def watch(scene: Scene, height: float) -> None:
+        before = scene.pose(scene.object)[2, 3]
+        lift(scene, height)
+        raised.append(scene.pose(scene.object)[2, 3] - before - height)
+        assert not scene.plant.GetVelocities(scene.context).any()
+
+    monkeypatch.setattr(settle_module, "_raise", watch)
+    resting = settle(box, config)
+    assert resting.sink == pytest.approx(deep, abs=1e-4)
+    assert raised == pytest.approx([0.0] * 4, abs=1e-12)
+
+
+def test_object_that_left_the_table_is_refused(config: Config, monkeypatch: pytest.MonkeyPatch):
+    def fall(scene: Scene, config: Config) -> bool:
+        settle_module._raise(scene, -1.0)
+        return False
+
+    monkeypatch.setattr(settle_module, "_wait_for_rest", fall)
+    monkeypatch.setattr(settle_module, "_sink", lambda _: 0.0)
+    with pytest.raises(MeshError, match="must come to rest on the table, got an object that left"):
+        settle(as_dropped(trimesh.creation.box([0.05] * 3)), config)
+
+
+@pytest.mark.parametrize("speed", [10.1, np.nan])
+def test_what_is_too_fast_while_it_settles_is_refused(
+    config: Config, monkeypatch: pytest.MonkeyPatch, speed: float
+):
+    monkeypatch.setattr(settle_module, "_speeds", lambda _: (speed, 0.0))
+    with pytest.raises(MeshError, match=r"its speed must stay below 10 m/s while it settles"):
+        settle(as_dropped(trimesh.creation.box([0.05] * 3)), config)
+
+
+@pytest.mark.parametrize(
+    ("linear", "angular", "rests"), [(9e-4, 9e-3, True), (1.1e-3, 0.0, False), (0.0, 0.011, False)]
+)
+def test_what_turns_or_moves_does_not_rest(
+    config: Config, monkeypatch: pytest.MonkeyPatch, linear: float, angular: float, rests: bool
+):
+    """It rests after 0.2 s below both limits."""
+    monkeypatch.setattr(settle_module, "_speeds", lambda _: (linear, angular))
+    box, short = as_dropped(trimesh.creation.box([0.05] * 3)), ["settle.max_time=0.5"]
+    if rests:
+        assert settle(box, override_config(config, short)).seconds == pytest.approx(0.2)
+    else:
+        with pytest.raises(MeshError, match="must come to rest on the table within"):
+            settle(box, override_config(config, short))
+
+
+def test_depth_in_the_table_is_that_of_the_lowest_point(config: Config):
+    box = as_dropped(trimesh.creation.box([0.04, 0.05, 0.06]))
+    scene = build_scene(box, config.physics)
+    for height in (0.03, 0.025, 0.04):
+        reset_object(scene, X_WT @ make_pose(np.eye(3), [0.0, 0.0, height]))
+        assert settle_module._sink(scene) == pytest.approx(0.03 - height, abs=1e-12)
 
 
 def test_what_sinks_in_is_noted(config: Config):

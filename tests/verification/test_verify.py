@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
 import drakegrasp as dg
-from drakegrasp.config import load_config, override_config
+from drakegrasp.config import Config, load_config, override_config
 from drakegrasp.errors import GraspError, OffSurfaceError
 from drakegrasp.frames import X_WT, invert_pose, make_pose
 from drakegrasp.hand.description import load_hand
@@ -295,3 +295,94 @@ def test_results_know_what_they_were_asked(held: dg.Verification, cube: PlacedOb
     # The fingers were opened before they closed.
     assert np.all(held.pregrasp.closing < held.closing)
     assert (X_WT @ cube.X_TO @ held.pregrasp.X_OG)[2, 3] > 0.65
+
+
+# Each limit, lowered below what was found
+
+
+def limited(name: str, found: float, factor: float) -> Config:
+    return override_config(CONFIG, [f"verify.{name}={factor * found}"])
+
+
+@pytest.mark.parametrize(
+    ("name", "found", "said"),
+    [
+        ("max_residual", "residual", "to their points: fingertip"),
+        ("max_normal_error_deg", "normal_error_deg", "to their points and normals: pad"),
+    ],
+)
+def test_a_fit_beyond_a_limit_is_no_way_to_make_the_grasp(
+    held: dg.Verification, name: str, found: str, said: str
+) -> None:
+    values = np.asarray(getattr(held, found))
+    finger = 1 + int(values.argmax())
+    assert held.fit is not None
+    assert verifying._misfit(held.fit, limited(name, values.max(), 1.01)) == ""
+    assert f"{said} {finger} stays" in verifying._misfit(
+        held.fit, limited(name, values.max(), 0.99)
+    )
+
+
+def test_contacts_beyond_the_limit_are_another_grasp(held: dg.Verification) -> None:
+    assert held.contact_error is not None
+    largest, finger = held.contact_error.max(), 1 + int(held.contact_error.argmax())
+    near = verifying._judge(held, limited("max_contact_error", largest, 1.01))
+    far = verifying._judge(held, limited("max_contact_error", largest, 0.99))
+    assert near.held and near.outcome is Outcome.SUCCESS
+    assert far.outcome is Outcome.UNREACHABLE
+    assert far.reason.startswith(f"fingertip {finger} closes on the object")
+
+
+def test_distance_from_the_surface_has_a_limit(
+    cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
+) -> None:
+    """Points that are moved outwards by 1 mm."""
+    p, n = grasp
+    for limit, off in ((0.9e-3, True), (1.2e-3, False)):
+        config = override_config(CONFIG, [f"verify.max_surface_distance={limit}"])
+        found = verify_contacts(cube, p + 1e-3 * n, n, method="forces", config=config)
+        assert (found.outcome is Outcome.OFF_SURFACE) == off
+
+
+def test_as_many_palm_poses_are_tried_as_may_be(
+    held: dg.Verification,
+    cube: PlacedObject,
+    grasp: tuple[np.ndarray, np.ndarray],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """And of different failures the one that got furthest is told."""
+    assert held.trial is not None
+    ends = [Outcome.SLIPPED, Outcome.MISSING_FINGERTIP, Outcome.DROPPED, Outcome.SUCCESS]
+    trials = [replace(held.trial, outcome=end, closed=None, lifted=None) for end in ends]
+    monkeypatch.setattr(verifying, "fit_wrist", lambda *_, **__: [held.fit] * len(trials))
+    for most, outcome in ((3, Outcome.SLIPPED), (4, Outcome.SUCCESS)):
+        remaining = iter(trials)
+        monkeypatch.setattr(verifying, "_try", lambda *_, r=remaining: (held.pregrasp, next(r)))
+        config = override_config(CONFIG, [f"verify.max_tries={most}"])
+        found = verify_contacts(cube, *grasp, method="hand", config=config)
+        assert (found.outcome, found.tries) == (outcome, most)
+
+
+@pytest.mark.parametrize(("collisions", "shares"), [(0, [1.0]), (1, [1.0, 0.5]), (2, [1.0, 0.5])])
+def test_fingers_are_opened_until_the_hand_is_clear(
+    held: dg.Verification,
+    cube: PlacedObject,
+    monkeypatch: pytest.MonkeyPatch,
+    collisions: int,
+    shares: list[float],
+) -> None:
+    """By the whole margin, then by half of it."""
+    opened, ends = [], iter([Outcome.START_COLLISION] * collisions + [Outcome.SUCCESS])
+
+    def run(scene: object, X_TO: np.ndarray, attempt: Pregrasp, config: Config) -> TrialRecord:
+        opened.append(attempt.closing)
+        return TrialRecord(outcome=next(ends), X_TO=X_TO, X_OG=attempt.X_OG)
+
+    monkeypatch.setattr(verifying, "run_attempt", run)
+    assert held.fit is not None
+    config = override_config(CONFIG, ["verify.open_margin_deg=10"])
+    pregrasp, trial = verifying._try(cube, cube.X_TO, held.fit, config)
+    expected = [held.fit.closing - share * np.deg2rad(10.0) for share in shares]
+    np.testing.assert_allclose(opened, np.maximum(expected, 0.0), atol=1e-12)
+    assert trial.outcome is (Outcome.START_COLLISION if collisions == 2 else Outcome.SUCCESS)
+    np.testing.assert_array_equal(pregrasp.X_OG, held.fit.X_OG)

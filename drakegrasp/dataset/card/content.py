@@ -6,20 +6,21 @@ has no time and no machine in it: the same files give the same card.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
 from drakegrasp.config import Config
 from drakegrasp.dataset.filters import Removal
-from drakegrasp.dataset.hdf5 import open_hdf5
-from drakegrasp.dataset.manifest import Manifest, read_manifest
+from drakegrasp.dataset.hdf5 import read_names
+from drakegrasp.dataset.layout.opening import open_samples
+from drakegrasp.dataset.manifest import Manifest, ObjectEntry, read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, SPLITS
 from drakegrasp.dataset.statistics import Funnel, funnel_of, splits_of
+from drakegrasp.hand.file_format import read_hand_file
+from drakegrasp.hand.files import hand_file, hand_names
 from drakegrasp.outcomes import Outcome
 
 #: What the licence is called of meshes for which none is stated.
@@ -33,13 +34,15 @@ LIMITS = (
         "explanation/physics.md",
     ),
     (
-        "Labels depend on the drive of the fingers, on friction and mass, and up to three per cent "
-        "of what is simulated hangs on a hair.",
+        "Labels depend on the drive of the fingers, on friction and mass, and some hang on a hair: "
+        "of the attempts that were simulated with the Barrett Hand, three in a hundred end "
+        "otherwise with half the step.",
         "benchmarks.md",
     ),
     (
-        "Samples are successes that passed the filters; what failed is in trials.hdf5, where "
-        "solver_error, timeout and crashed say nothing about a grasp.",
+        "Samples are successes that passed the filters, so they say nothing of how often a grasp "
+        "fails. Among the attempts the outcomes solver_error, timeout and crashed say nothing "
+        "about a grasp.",
         "reference/outcomes.md",
     ),
     (
@@ -52,6 +55,15 @@ LIMITS = (
         "explanation/determinism.md",
     ),
 )
+
+
+#: The files of a dataset that a reader needs, in words.
+FILES = {
+    "grasping_oto.hdf5, grasping_otm.hdf5": "the samples, as each camera sees them",
+    "trials.hdf5": "every attempt with its outcome, also those that failed",
+    "manifest.json": "all settings, versions, objects and refused meshes",
+    "objects/": "what was simulated of each mesh",
+}
 
 
 def card_content(out: Path) -> dict[str, Any]:
@@ -77,33 +89,33 @@ def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
     Raises:
         DataError: If one of the files is missing or damaged.
     """
+    # The manifest has more objects than the files while a build goes on that adds some.
+    funnel = funnel_of(trials)
+    entries = [entry for entry in manifest.objects if entry.name in funnel.names]
     return {
-        "title": _title(manifest),
+        "title": f"Simulated grasps of {len(entries)} object{'s' * (len(entries) != 1)}",
         "hand": Path(manifest.config.hand).stem,
+        "fingers": list(manifest.fingers),
         "schema_version": SCHEMA_VERSION,
         "seed": manifest.config.seed,
         "config_hash": manifest.config.simulation_hash(),
         "settings": _settings(manifest.config),
         "versions": manifest.versions,
-        "licences": licences(manifest),
-        "counts": _counts(data, funnel_of(trials)),
+        "licences": licences(entries),
+        "counts": _counts(data, funnel),
         "refused": {mesh.name: mesh.reason for mesh in manifest.refused},
+        "files": FILES,
         "conventions": CONVENTIONS,
         "limits": [{"limit": text, "docs": f"docs/{page}"} for text, page in LIMITS],
     }
 
 
-def licences(manifest: Manifest) -> dict[str, list[str]]:
+def licences(entries: Iterable[ObjectEntry]) -> dict[str, list[str]]:
     """Return the objects' names by the licence of their meshes, in the order of the names."""
     found: dict[str, list[str]] = {}
-    for entry in manifest.objects:
+    for entry in entries:
         found.setdefault(entry.licence or NOT_STATED, []).append(entry.name)
     return dict(sorted(found.items()))
-
-
-def _title(manifest: Manifest) -> str:
-    count = len(manifest.objects)
-    return f"Simulated grasps of {count} object{'s' * (count != 1)}"
 
 
 def _settings(config: Config) -> dict[str, Any]:
@@ -117,7 +129,14 @@ def _settings(config: Config) -> dict[str, Any]:
         "camera": ("size",),
     }
     tree = config.to_dict()
-    return {f"{room}.{key}": tree[room][key] for room, names in keys.items() for key in names}
+    settings = {f"{room}.{key}": tree[room][key] for room, names in keys.items() for key in names}
+
+    # Labels depend on the drive. The file of somebody's own hand may be elsewhere now.
+    if config.lift.drive is None:
+        built_in = config.hand in hand_names()
+        own = read_hand_file(hand_file(config.hand)).drive if built_in else "that of the hand file"
+        settings["lift.drive"] = own
+    return settings
 
 
 def _counts(data: Path, funnel: Funnel) -> dict[str, Any]:
@@ -169,9 +188,7 @@ def _row(
 def _samples_by_object(data: Path) -> dict[str, dict[str, int]]:
     """Return the numbers of samples by split and object; the files were read before."""
     found = {}
-    with open_hdf5(data) as file:
+    with open_samples(data) as file:
         for split in SPLITS:
-            names: npt.NDArray[Any] = file[split]["object_props/object_name"][:]
-            unique, counts = np.unique(names.astype(bytes), return_counts=True)
-            found[split] = {n.decode(): int(c) for n, c in zip(unique, counts, strict=True)}
+            found[split] = dict(Counter(read_names(file[split]["object_props/object_name"])))
     return found

@@ -16,19 +16,34 @@ def card_text(content: Mapping[str, Any]) -> str:
         content: As `card_content` gives it.
     """
     return f"# {_plain(content['title'])}\n\n" + "\n\n".join(
-        [_what(content), _how(content), _licences(content), _how_many(content), _limits(content)]
+        [
+            _what(content),
+            _files(content),
+            _how(content),
+            _licences(content),
+            _how_many(content),
+            _limits(content),
+        ]
     )
 
 
 def _what(content: Mapping[str, Any]) -> str:
+    fingers = f"The fingers in the order of a grasp: {', '.join(content['fingers'])}."
     conventions = "\n".join(f"* **{k}**: {text}" for k, text in content["conventions"].items())
     return f"""## What it is
 
 Every sample is a grasp that a simulated hand (`{content["hand"]}`) closed, lifted and held, with
-colour, depth and mask as a camera behind the palm sees the object before. Attempts that failed are
-kept with their outcome. Made by drakegrasp; its docs explain every field.
+colour, depth and mask as a camera behind the palm sees the object before. Made by drakegrasp; its
+docs explain every field. {fingers if content["fingers"] else ""}
 
 {conventions}"""
+
+
+def _files(content: Mapping[str, Any]) -> str:
+    rows = [(f"`{name}`", what) for name, what in content["files"].items()]
+    return f"""## Files
+
+{_table(("file", "what is in it"), rows)}"""
 
 
 def _how(content: Mapping[str, Any]) -> str:
@@ -37,7 +52,7 @@ def _how(content: Mapping[str, Any]) -> str:
     return f"""## How it was made
 
 Schema {content["schema_version"]}, seed {content["seed"]}, configuration
-`{content["config_hash"]}`; `manifest.json` has all settings.
+`{content["config_hash"]}`.
 
 {settings}
 
@@ -71,7 +86,12 @@ def _how_many(content: Mapping[str, Any]) -> str:
         ("Meshes that were refused", ("mesh", "reason"), refused),
     ]
     parts = [f"### {head}\n\n{_table(heads, rows)}" for head, heads, rows in tables if rows]
-    return "## How many\n\n" + "\n\n".join(parts)
+    head = """## How many
+
+*Held* are the attempts that lifted the object and kept it in the hand; *precision* grasps are those
+of them that the fingertips held alone; *stable* those of these in which the object moved by less
+than 5 mm and 5 degrees in the hand; *samples* the held grasps that passed all filters."""
+    return "\n\n".join([head, *parts])
 
 
 def _limits(content: Mapping[str, Any]) -> str:
@@ -99,6 +119,7 @@ def _cell(value: object) -> str:
 
 def _plain(text: str) -> str:
     """Return a text whose signs mean nothing to Markdown tables and HTML."""
-    for sign, written in (("&", "&amp;"), ("<", "&lt;"), (">", "&gt;"), ("|", "\\|")):
+    signs = {"&": "&amp;", "<": "&lt;", ">": "&gt;", "\\": "\\\\", "|": "\\|"}
+    for sign, written in signs.items():
         text = text.replace(sign, written)
     return " ".join(text.split())

@@ -16,14 +16,8 @@ import numpy as np
 from drakegrasp.config import Config
 from drakegrasp.dataset.checks import layout as layout_rules
 from drakegrasp.dataset.checks.findings import AnyArray, Batch, Findings, Violation, of_file
-from drakegrasp.dataset.schema import (
-    DATA_FIELDS,
-    OBJECT_FIELDS,
-    SPLITS,
-    SUCCESS_FIELDS,
-    TRIAL_FIELDS,
-    Field,
-)
+from drakegrasp.dataset.layout.structure import DATA_TABLES, TRIAL_TABLES
+from drakegrasp.dataset.schema import Field
 from drakegrasp.errors import first_line
 
 Rule = Callable[[Batch], Iterator[Violation]]
@@ -107,11 +101,7 @@ def open_file(name: str, file: h5py.File, camera: str, findings: Findings) -> Op
         findings: Where violations go.
     """
     # Another version has another layout: its version is all that is told.
-    fields = (
-        {split: DATA_FIELDS for split in SPLITS}
-        if camera
-        else {"objects": OBJECT_FIELDS, "trials": TRIAL_FIELDS, "successes": SUCCESS_FIELDS}
-    )
+    fields = DATA_TABLES if camera else TRIAL_TABLES
     other = list(layout_rules.version(name, file))
     if other:
         findings.add(other)
@@ -124,9 +114,9 @@ def open_file(name: str, file: h5py.File, camera: str, findings: Findings) -> Op
     # Its layout: a group with a broken dataset is not read.
     opened = OpenFile(name, file, config, fields)
     broken_groups = set()
-    for violation in layout_rules.structure(name, file, fields, config):
+    for violation, difference in layout_rules.structure(name, file, fields, config):
         findings.add([violation])
-        if not violation.what.startswith("attribute"):
+        if not difference.text_only:
             broken_groups.add(violation.group[1:].split("/")[0])
     opened.groups = {g: file[g] for g in fields if g in file and g not in broken_groups}
     return opened

@@ -3,6 +3,10 @@
 In: a `GraspDataset` and the names of fields. Out: a `torch.utils.data.Dataset`, whose items torch
 collates and moves between processes by itself. The module loads without torch, too, so that every
 module of the package does; `GraspDataset.to_torch` says if torch is missing.
+
+A loader asks for the samples of a batch at once. Their images are read where the batch will be:
+into one block, in a worker in memory that it shares with the training process. Read one by one,
+each image would be written three times, always into new pages, which costs as much as inflating it.
 """
 
 from __future__ import annotations
@@ -13,19 +17,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.schema import DATA_FIELDS
+from drakegrasp.dataset.reader import FIELDS
 
 if TYPE_CHECKING:
     from drakegrasp.dataset.reader import GraspDataset
 
 try:
     import torch
-    from torch.utils.data import Dataset
+    from torch.utils.data import Dataset, get_worker_info
+    from torch.utils.data._utils.collate import collate, default_collate_fn_map
 except ModuleNotFoundError:
     Dataset = object
+    default_collate_fn_map = {}
 
 #: Fields that are read when a sample is asked for; the others fit into memory.
-_IMAGES = frozenset(field.name for field in DATA_FIELDS if field.sample)
+_IMAGES = frozenset(name for name, field in FIELDS.items() if field.sample)
 
 
 class TorchSamples(Dataset):
@@ -53,6 +59,17 @@ class TorchSamples(Dataset):
         row = self.data.row_of(index)
         return {name: self._tensor(name, row) for name in self.fields}
 
+    def __getitems__(self, indices: Sequence[int]) -> list[dict[str, Any]]:
+        """Return the samples of a batch, as torch's loaders ask for them.
+
+        Each is a dictionary as `self[i]`. Their tensors are rows of one block, which the default
+        collation of torch takes as it is.
+        """
+        rows = [self.data.row_of(index) for index in indices]
+        block = {name: self._tensors(name, rows) for name in self.fields}
+        views = [{name: values[k] for name, values in block.items()} for k in range(len(rows))]
+        return [_Row(view, block, views) for view in views]
+
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_columns": {}}
 
@@ -60,7 +77,65 @@ class TorchSamples(Dataset):
         """Return a field of a sample; a tensor of its own, which the caller may change."""
         if name in _IMAGES:
             return torch.from_numpy(self.data.value(name, row))
+        value = self._column(name)[row]
+        return str(value) if isinstance(value, str) else torch.from_numpy(np.array(value))
+
+    def _tensors(self, name: str, rows: Sequence[int]) -> torch.Tensor | list[str]:
+        """Return a field of some samples; tensors are new, and shared if a worker makes them."""
+        # Text is a list, as torch collates it.
+        if FIELDS[name].dtype == "str":
+            return [str(text) for text in self._column(name)[rows]]
+
+        # Only a worker hands its tensors to another process.
+        field, size = FIELDS[name], {"S": self.data.image_size}
+        shape = field.row_shape(size) if name in _IMAGES else self._column(name).shape[1:]
+        values = torch.from_numpy(np.empty((len(rows), *shape), dtype=field.dtype))
+        if get_worker_info() is not None:
+            values.share_memory_()
+
+        if name in _IMAGES:
+            self.data.read_images(name, rows, values.numpy())
+        else:
+            values.numpy()[...] = self._column(name)[rows]
+        return values
+
+    def _column(self, name: str) -> npt.NDArray[Any]:
+        """Return all rows of a field that is no image."""
         if name not in self._columns:
             self._columns[name] = self.data.column(name)
-        value = self._columns[name][row]
-        return str(value) if isinstance(value, str) else torch.from_numpy(np.array(value))
+        return self._columns[name]
+
+
+class _Row(dict[str, Any]):
+    """A sample whose tensors are rows of the block of its batch.
+
+    Attributes:
+        block: Fields of the whole batch.
+        views: What each sample of the batch held when it was read, in their order.
+    """
+
+    def __init__(
+        self, values: dict[str, Any], block: dict[str, Any], views: list[dict[str, Any]]
+    ) -> None:
+        super().__init__(values)
+        self.block, self.views = block, views
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Become a plain dictionary in a copy and in another process."""
+        return dict, (dict(self),)
+
+
+def _collate_rows(batch: list[_Row], *, collate_fn_map: dict[Any, Any] | None = None) -> Any:
+    """Return the block of a batch; collate its samples one by one if somebody changed them."""
+    views = batch[0].views
+    whole = len(batch) == len(views) and all(
+        row.keys() == view.keys() and all(row[name] is value for name, value in view.items())
+        for row, view in zip(batch, views, strict=True)
+    )
+    if whole:
+        return batch[0].block
+    return collate([dict(row) for row in batch], collate_fn_map=collate_fn_map)
+
+
+# The documented way to tell torch's default collation of a type.
+default_collate_fn_map[_Row] = _collate_rows

@@ -15,11 +15,9 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import norm
 from drakegrasp.config import Config
-from drakegrasp.dataset.hdf5 import open_hdf5
+from drakegrasp.dataset.layout.opening import open_trials
 from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.prepared_objects import load_prepared
-from drakegrasp.dataset.schema import refuse_other_schema
-from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.outcomes import Outcome
 from drakegrasp.visualization.figures.approach_map import ObjectApproaches
@@ -59,19 +57,15 @@ def read_held(out: Path) -> HeldGrasps:
     ids: list[npt.NDArray[np.int64]] = []
     parts: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in COLUMNS}
     path = out / TRIALS_FILE
-    try:
-        with open_hdf5(path) as file:
-            refuse_other_schema(path, file.attrs["schema_version"])
-            trials = file["trials"]
-            (rows,) = np.nonzero(trials["outcome"][:] == Outcome.SUCCESS)
-            for start in range(0, len(trials["outcome"]), BLOCK):
-                picked = rows[(rows >= start) & (rows < start + BLOCK)] - start
-                ids.append(picked + start)
-                for name in COLUMNS:
-                    if len(picked) or not start:
-                        parts[name].append(trials[name][start : start + BLOCK][picked])
-    except (OSError, KeyError) as error:
-        raise DataError(f"{path}: must be the trials of a dataset, got none ({error})") from None
+    with open_trials(path) as file:
+        trials = file["trials"]
+        (rows,) = np.nonzero(trials["outcome"][:] == Outcome.SUCCESS)
+        for start in range(0, len(trials["outcome"]), BLOCK):
+            picked = rows[(rows >= start) & (rows < start + BLOCK)] - start
+            ids.append(picked + start)
+            for name in COLUMNS:
+                if len(picked) or not start:
+                    parts[name].append(trials[name][start : start + BLOCK][picked])
     columns = {name: np.concatenate(values) for name, values in parts.items()}
 
     degrees = np.rad2deg(1.0)
@@ -115,7 +109,7 @@ def read_approaches(out: Path, number: int, name: str, config: Config) -> Object
     """
     # The attempts of the object, which are beside each other.
     prepared = load_prepared(out, name, config)
-    with open_hdf5(out / TRIALS_FILE) as file:
+    with open_trials(out / TRIALS_FILE) as file:
         trials = file["trials"]
         (rows,) = np.nonzero(trials["object"][:] == number)
         part = slice(int(rows[0]), int(rows[-1]) + 1) if len(rows) else slice(0, 0)

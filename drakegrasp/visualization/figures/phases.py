@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
 
 from drakegrasp.arithmetic import multiply, norm
@@ -31,7 +32,7 @@ from drakegrasp.visualization.figures.trial_stages import (
     frustum,
     load_trial,
 )
-from drakegrasp.visualization.style import ARROW, INK, add_axes, shortened
+from drakegrasp.visualization.style import ARROW, FINGER_COLOURS, INK, add_axes, shortened
 from drakegrasp.visualization.third_person import (
     RenderScene,
     Snapshot,
@@ -165,15 +166,21 @@ def _draw(panels: list[Panel], name: str, field_deg: float, distance: float) -> 
                       weight=weight)  # fmt: skip
 
     # What the colours are, and of which trial.
-    marks = [
-        Line2D([], [], color=SIGHT, linewidth=1.6, label="line of sight of the camera C"),
-        Line2D([], [], color=FIELD, linewidth=1.6,
-               label=f"field of view, {field_deg:g}°; C stands {distance:g} m behind the palm"),
-        Line2D([], [], color=INK, marker="o", linestyle="none", markeredgecolor="white",
-               markersize=8, label="contacts, with their outward normals"),
+    dots = [
+        Line2D([], [], color=colour, marker="o", linestyle="none", markeredgecolor="white",
+               markersize=8) for colour in FINGER_COLOURS[:3]
     ]  # fmt: skip
+    marks: dict[str, Any] = {
+        "line of sight of the camera C": Line2D([], [], color=SIGHT, linewidth=1.6),
+        f"field of view, {field_deg:g}°; C stands {distance:g} m behind the palm": Line2D(
+            [], [], color=FIELD, linewidth=1.6
+        ),
+        "contacts, with their outward normals": tuple(dots),
+    }
     figure.legend(
-        handles=marks, loc="lower left", bbox_to_anchor=(GAP / width, 0.02), ncols=len(marks),
+        handles=list(marks.values()), labels=list(marks),
+        handler_map={tuple: HandlerTuple(ndivide=None, pad=0.2)},
+        loc="lower left", bbox_to_anchor=(GAP / width, 0.02), ncols=len(marks),
         fontsize=9, frameon=False, borderaxespad=0.0, borderpad=0.0, labelcolor=INK,
         columnspacing=1.6,
     )  # fmt: skip

@@ -69,7 +69,7 @@ def compare_samplers(out: Path, other: Path | None = None) -> SamplerComparison:
 
     # The objects that all have, and the one with the most successes.
     funnels = {method: count_funnel(path) for method, path in datasets.items()}
-    names = _common_objects(datasets)
+    names = _common_objects(datasets, funnels)
     own = funnels[config.candidates.method]
     wins = {name: int(own.outcomes[own.names.index(name), Outcome.SUCCESS]) for name in names}
     name = max(names, key=lambda name: wins[name])
@@ -195,15 +195,21 @@ def _settings(config: Config) -> dict[str, Any]:
     return settings
 
 
-def _common_objects(datasets: dict[str, Path]) -> list[str]:
+def _common_objects(datasets: dict[str, Path], funnels: dict[str, Funnel]) -> list[str]:
     """Return the names of the objects that all datasets have, of the same mesh, in order.
+
+    A manifest has more objects than the files while a build goes on that adds some.
 
     Raises:
         DataError: If there is none.
     """
     first, *others = (
-        {entry.name: entry.mesh_sha256 for entry in read_manifest(path).objects}
-        for path in datasets.values()
+        {
+            entry.name: entry.mesh_sha256
+            for entry in read_manifest(path).objects
+            if entry.name in funnels[method].names
+        }
+        for method, path in datasets.items()
     )
     names = [name for name, mesh in first.items() if all(o.get(name) == mesh for o in others)]
     if not names:

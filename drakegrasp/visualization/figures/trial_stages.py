@@ -15,7 +15,7 @@ import numpy as np
 from pydrake.geometry import LightParameter
 
 from drakegrasp.config import Config
-from drakegrasp.dataset.hdf5 import open_hdf5
+from drakegrasp.dataset.layout.opening import object_name, open_trials, read_trial
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.prepared_objects import load_prepared
@@ -80,17 +80,9 @@ def load_trial(out: Path, trial_id: int, *, table_size: float = TABLE_SIZE) -> T
     # Read the trial.
     config = read_manifest(out).config
     path = out / TRIALS_FILE
-    try:
-        with open_hdf5(path) as file:
-            trials = file["trials"]
-            if not 0 <= trial_id < len(trials["outcome"]):
-                raise DataError(
-                    f"{path}: trial must be 0 to {len(trials['outcome']) - 1}, got {trial_id}"
-                )
-            row = {name: np.asarray(values[trial_id]) for name, values in trials.items()}
-            name = file["objects/name"][int(row["object"])].decode()
-    except (OSError, KeyError) as error:
-        raise DataError(f"{path}: must be the trials of a dataset, got none ({error})") from None
+    with open_trials(path) as file:
+        row = read_trial(file, trial_id)
+        name = object_name(file, row)
     outcome = Outcome(int(row["outcome"]))
     if outcome.stage is not Stage.LIFTED:
         raise DataError(f"{path}: trial {trial_id} must have been lifted, got {outcome.label}")

@@ -24,7 +24,7 @@ from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.statistics import Funnel, count_funnel
-from drakegrasp.errors import DataError
+from drakegrasp.errors import DataError, MachineError
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.files import write_atomic
 from drakegrasp.runtime.progress import Report, silent
@@ -104,7 +104,7 @@ def write_figures(
 
     Raises:
         DataError: If the directory holds no dataset, or `compare` or `trial_id` do not fit.
-        MachineError: If OpenGL failed.
+        MachineError: If OpenGL failed and `trial_id` was given.
         OSError: If a file cannot be written.
     """
     held = read_held(out)
@@ -130,14 +130,15 @@ def write_figures(
                 for part, figure in figures.items():
                     _write(figure, folder / part)
                     written.names.append(part)
-        except DataError as error:
+        except (DataError, MachineError) as error:
             if asked.get(name):
                 raise
             written.left_out[name] = str(error)
         progress(i + 1, len(drawings))
 
-    # Older files of what is not there now would be of another state.
-    for name in written.left_out:
+    # Older files of what is not there now would be of another state; a sheet of classes has pages.
+    names = {*drawings, *(path.stem for path in folder.glob("classes_[0-9]*.*"))}
+    for name in names.difference(written.names):
         for suffix in (".png", ".svg"):
             (folder / f"{name}{suffix}").unlink(missing_ok=True)
     text = json.dumps(numbers, indent=1, ensure_ascii=False, allow_nan=False)

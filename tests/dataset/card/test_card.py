@@ -13,7 +13,7 @@ import pytest
 from helpers.datasets import make_dataset
 
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.dataset.card.content import card_content
+from drakegrasp.dataset.card.content import card_content, content_of
 from drakegrasp.dataset.card.text import card_text
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
@@ -69,9 +69,9 @@ def test_text_has_the_counts_and_nothing_that_is_markup(dataset: Path) -> None:
     content = card_content(dataset)
     assert (dataset / CARD_FILES[1]).read_text(encoding="utf-8") == card_text(content)
     row = content["counts"]["objects"].pop("3_brick")
-    content["counts"]["objects"]["<b>a|b"] = {**row, "attempts": 1234567}
+    content["counts"]["objects"]["<b>a|b\\|c"] = {**row, "attempts": 1234567}
     text = card_text(content)
-    assert "| &lt;b&gt;a\\|b | brick | 1,234,567 |" in text
+    assert "| &lt;b&gt;a\\|b\\\\\\|c | brick | 1,234,567 |" in text
     for each in content["limits"]:
         assert each["limit"] in text
 
@@ -101,6 +101,31 @@ def test_licences_are_those_of_the_manifest(dataset: Path) -> None:
         "CC-BY-4.0": [first.name],
         "not stated": [entry.name for entry in others],
     }
+
+
+def test_objects_are_those_of_the_files_while_a_build_adds_some(dataset: Path) -> None:
+    before = card_content(dataset)
+    manifest = read_manifest(dataset)
+    more = replace(manifest.objects[0], name="9_new", licence="MIT")
+    write_manifest(replace(manifest, objects=(*manifest.objects, more)), dataset)
+    assert card_content(dataset) == before
+    assert before["title"] == "Simulated grasps of 3 objects"
+
+
+def test_drive_and_fingers_are_named(dataset: Path) -> None:
+    content = card_content(dataset)
+    assert content["settings"]["lift.drive"] == "worm"
+    manifest = replace(read_manifest(dataset), fingers={"thumb": True, "ring": False})
+    for drive, hand, expected in (
+        ("locked", "barrett", "locked"),
+        (None, "/gone/my.yaml", "that of the hand file"),
+    ):
+        lift = manifest.config.lift.model_copy(update={"drive": drive})
+        config = manifest.config.model_copy(update={"hand": hand, "lift": lift})
+        files = (dataset / "trials.hdf5", dataset / "grasping_oto.hdf5")
+        content = content_of(replace(manifest, config=config), *files)
+        assert content["settings"]["lift.drive"] == expected
+        assert "in the order of a grasp: thumb, ring." in card_text(content)
 
 
 def test_check_finds_the_card_of_other_files(dataset: Path) -> None:

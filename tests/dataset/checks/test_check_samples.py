@@ -35,7 +35,9 @@ SAMPLE_CASES: Mapping[str, tuple[str, str, Edit, str]] = {
         PROPS + "frame_cam2img_otm must be finite",
     ),
     "colour": (OTO, "images", set_at(1, 3, 3, to=1.5), "colours must be within 0..1"),
+    "low colour": (OTO, "images", set_at(0, 3, 3, to=-0.1), "colours must be within 0..1"),
     "depth": (OTM, "images", set_at(3, 3, 3, to=0.9), "depths must be within 0.01..0.75 m"),
+    "low depth": (OTM, "images", set_at(3, 3, 3, to=0.009), "depths must be within 0.01..0.75 m"),
     "mask value": (OTO, "masks", set_at(3, 3, to=2), "mask must hold 0 and 1 only"),
     "empty mask": (OTM, "masks", lambda m: 0 * m, "mask must have an object pixel"),
     "normal": (
@@ -49,6 +51,14 @@ SAMPLE_CASES: Mapping[str, tuple[str, str, Edit, str]] = {
     "work": (OTO, PROPS + "frame_world2work", moved(0, 0, 0.01), "frame_world2work must be the"),
     "mass": (OTO, PROPS + "work2mass", lambda m: -m, "work2mass must be positive"),
     "inertia": (OTO, PROPS + "work2inertia", set_at(1, to=0.1), "work2inertia must be symmetric"),
+    "triangle": (
+        OTO,
+        PROPS + "work2inertia",
+        lambda _: np.diag([1e-3, 1e-3, 2.1e-3]).ravel(),
+        "work2inertia must be symmetric with moments of a real body",
+    ),
+    "negative inertia": (OTO, PROPS + "work2inertia", lambda i: -i, "work2inertia must be symm"),
+    "massless": (OTO, PROPS + "work2mass", lambda m: 0 * m, "work2mass must be positive"),
     "inverse": (
         OTM,
         PROPS + "frame_work2cam_otm",

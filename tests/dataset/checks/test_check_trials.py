@@ -32,7 +32,9 @@ TRIAL_CASES: Mapping[str, tuple[str, int, Edit, str]] = {
     "trial_id": ("trial_id", MISSING, lambda i: i + 1, "trial_id must be the row's number"),
     "outcome": ("outcome", BELOW, lambda _: 99, "outcome must be 0..12"),
     "object": ("object", BELOW, lambda _: 3, "object must be a row of /objects, 0..2"),
+    "negative object": ("object", BELOW, lambda _: -1, "object must be a row of /objects, 0..2"),
     "candidate": ("candidate", BELOW, lambda _: 4, "candidate must be one of"),
+    "negative candidate": ("candidate", BELOW, lambda _: -1, "candidate must be one of"),
     "standoff": ("standoff_index", BELOW, lambda _: 3, "standoff_index must be below 3"),
     "lost value": ("closed_q", SUCCESS, set_at(1, to=np.nan), "closed_q must be finite from"),
     "infinite": ("spread", BELOW, lambda _: np.inf, "spread must be finite"),
@@ -77,6 +79,8 @@ TRIAL_CASES: Mapping[str, tuple[str, int, Edit, str]] = {
     "early word": ("stable", MISSING, lambda _: True, "stable must be 0 before the stage lifted"),
     "lifted pose": ("X_TO_lifted", SUCCESS, mirrored, "X_TO_lifted must have an orthonormal"),
     "resting": ("X_TO", SUCCESS, moved(0.001, 0, 0), "X_TO must be the object's resting pose"),
+    "other link": ("closed_other_links", SUCCESS, lambda _: 1, "outcome must follow from the con"),
+    "hand on table": ("closed_hand_on_table", SUCCESS, lambda _: True, "outcome must follow from"),
     "on table": ("lifted_object_on_table", SUCCESS, lambda _: True, "outcome must follow"),
     "verdict": ("outcome", SLIPPED, lambda _: Outcome.DROPPED, "outcome must follow from the"),
 }

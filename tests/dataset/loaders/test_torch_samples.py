@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from drakegrasp.dataset.reader import FIELDS, GraspDataset
 
 torch = pytest.importorskip("torch")
 
-from torch.utils.data import DataLoader, Dataset  # noqa: E402  (torch may be missing)
+from torch.utils.data import DataLoader, Dataset, Subset, default_collate  # noqa: E402  (torch may be missing)
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +53,69 @@ def test_a_tensor_is_its_callers_own(data: GraspDataset) -> None:
     for name in ("images", "grasps"):
         samples[0][name].fill_(7.0)
         assert (samples[0][name].numpy() == data.column(name)[0]).all()
+
+
+@pytest.mark.parametrize("fields", [("images", "grasps"), tuple(FIELDS)])
+def test_a_batch_is_the_block_into_which_it_was_read(
+    data: GraspDataset, fields: tuple[str, ...]
+) -> None:
+    samples = data.to_torch(fields)
+    order = [1, 0, -1]
+    rows = samples.__getitems__(order)
+    batch = default_collate(rows)
+    assert list(batch) == list(fields)
+    for name in fields:
+        expected = default_collate([samples[i][name] for i in order])
+        if isinstance(expected, list):
+            assert batch[name] == expected
+        else:
+            assert batch[name].dtype == expected.dtype
+            assert torch.equal(batch[name], expected)
+            # Nothing was copied.
+            assert batch[name].data_ptr() == rows[0][name].data_ptr()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda rows: rows[1].update(images=rows[1]["images"] / 2),
+        lambda rows: [row.pop("images") for row in rows],
+        lambda rows: [row.update(weight=torch.ones(())) for row in rows],
+        lambda rows: rows.pop(),
+        lambda rows: rows.reverse(),
+        lambda rows: rows.append(rows[0]),
+    ],
+    ids=["value", "less", "more", "fewer rows", "order", "twice"],
+)
+def test_a_batch_that_somebody_changed_is_collated_as_it_is(
+    data: GraspDataset, change: Callable[[list[dict[str, Any]]], Any]
+) -> None:
+    rows = data.to_torch(("images", "grasps")).__getitems__([0, 1])
+    change(rows)
+    batch, plain = default_collate(rows), default_collate([dict(row) for row in rows])
+    assert list(batch) == list(plain)
+    assert all(torch.equal(batch[name], plain[name]) for name in plain)
+
+
+def test_a_sample_of_a_batch_is_copied_as_a_plain_dictionary(data: GraspDataset) -> None:
+    row = data.to_torch(("grasps",)).__getitems__([0, 1])[1]
+    copied = pickle.loads(pickle.dumps(row))
+    assert type(copied) is dict
+    assert torch.equal(copied["grasps"], row["grasps"])
+
+
+def shared_and_first(rows: list[dict[str, Any]]) -> tuple[bool, torch.Tensor]:
+    """Return whether the samples lie in shared memory already, and the first image."""
+    return rows[0]["images"].is_shared(), rows[0]["images"]
+
+
+@pytest.mark.slow
+def test_a_worker_reads_into_shared_memory_behind_a_subset(data: GraspDataset) -> None:
+    subset = Subset(data.to_torch(), [1, 0])
+    loader = DataLoader(subset, batch_size=2, num_workers=1, collate_fn=shared_and_first)
+    shared, image = next(iter(loader))
+    assert shared
+    assert (image.numpy() == data.column("images")[1]).all()
 
 
 class Witness(Dataset):

@@ -9,14 +9,14 @@ import pytest
 from helpers.objects import CUBE, box_model, standing
 from scipy.spatial.transform import Rotation
 
-from drakegrasp.config import Config, load_config
-from drakegrasp.frames import X_WT, make_pose
+from drakegrasp.config import Config, load_config, override_config
+from drakegrasp.frames import X_WT, make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.scene import Scene, advance, reset_object
-from drakegrasp.simulation.trajectory import PEAK_ACCELERATION, lift_duration
+from drakegrasp.simulation.trajectory import PEAK_ACCELERATION, lift_duration, lift_path
 from drakegrasp.verification.forces import lift as force_lift_module
 from drakegrasp.verification.forces.contact_forces import patch_torsion_radius
 from drakegrasp.verification.forces.lift import ForceLift, LiftEnd, lift_by_forces
@@ -256,3 +256,27 @@ def test_scene_with_a_hand_is_refused(cube, config):
     with_hand = build_scene(cube, config.physics, load_hand())
     with pytest.raises(ValueError, match="must have no hand"):
         lift_by_forces(with_hand, standing(cube), P, N, force_limit=LIMIT, config=config)
+
+
+@pytest.mark.parametrize(
+    ("limit", "found"),
+    [("max_position_error", "position_error"), ("max_angle_error_deg", "angle_error")],
+)
+def test_lift_that_ends_beyond_a_limit_has_strayed(scene, cube, config, monkeypatch, limit, found):
+    """At each look it is off by 1 mm and 1 degree; the other limit is far above."""
+    off = (1e-3, np.deg2rad(1.0))
+    monkeypatch.setattr(force_lift_module, "_deviation", lambda *_: off)
+    amount = {"max_position_error": 1e-3, "max_angle_error_deg": 1.0}[limit]
+    for factor, end in ((1.01, LiftEnd.HELD), (0.99, LiftEnd.STRAYED), (0.2, LiftEnd.STRAYED)):
+        rules = ["verify.max_position_error=1", "verify.max_angle_error_deg=90"]
+        limited = override_config(config, [*rules, f"verify.{limit}={factor * amount}"])
+        ended = lift_by_forces(scene, standing(cube), P, N, force_limit=LIMIT, config=limited)
+        assert ended.end is end
+        assert getattr(ended, found) == off[found == "angle_error"]
+
+
+def test_deviation_is_distance_and_angle_from_the_path(scene, cube, config):
+    path = lift_path(standing(cube), config)
+    X_WO = path.X_WO @ make_pose(rotation_about([0.0, 1.0, 0.0], 0.2), [0.003, 0.0, 0.004])
+    reset_object(scene, X_WO)
+    assert force_lift_module._deviation(scene, path) == pytest.approx((0.005, 0.2))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from helpers.datasets import TRIALS, edit_file, make_dataset
 
+from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Candidates
@@ -31,6 +33,15 @@ def test_what_was_not_tried_has_no_successes(boxes: Path) -> None:
     assert list(found.numbers["of_objects"]) == ["rotations"]
     assert found.numbers["of_objects"]["rotations"]["attempts"] == 36
     assert found.standoff == 0.12
+
+
+def test_objects_without_trials_are_left_out(boxes: Path, tmp_path: Path) -> None:
+    """A build that adds meshes writes the manifest first."""
+    out = Path(shutil.copytree(boxes, tmp_path / "out"))
+    manifest = read_manifest(out)
+    more = replace(manifest.objects[0], name="0_new")
+    write_manifest(replace(manifest, objects=(more, *manifest.objects)), out)
+    assert compare_samplers(out).numbers == compare_samplers(boxes).numbers
 
 
 def test_both_samplers_have_numbers_of_their_own_datasets(boxes: Path, tmp_path: Path) -> None:

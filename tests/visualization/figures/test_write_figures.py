@@ -14,7 +14,7 @@ from helpers import datasets
 from helpers.datasets import OTO, TRIALS, edit_file, make_dataset
 from helpers.machine import needs_egl
 
-from drakegrasp.errors import DataError
+from drakegrasp.errors import DataError, MachineError
 from drakegrasp.visualization.figures import write
 from drakegrasp.visualization.figures.write import NUMBERS_FILE, write_figures
 
@@ -72,7 +72,7 @@ def test_what_the_dataset_lacks_is_left_out(boxes: Path, tmp_path: Path) -> None
     edit_file(out / TRIALS, lambda f: f["trials/outcome"].write_direct(np.full(36, 9, "u1")))
     folder = tmp_path / "figures"
     folder.mkdir()
-    for name in ("approaches.png", "mine.png"):
+    for name in ("approaches.png", "classes_1.png", "classes_12.svg", "mine.png"):
         (folder / name).touch()
     written = write_figures(out, folder)
     assert set(written.names) == {"outcomes", "hold", "objects"}
@@ -85,6 +85,7 @@ def test_what_the_dataset_lacks_is_left_out(boxes: Path, tmp_path: Path) -> None
         *(f"{name}.png" for name in written.names),
         "mine.png",
     }
+    assert not list(folder.glob("classes_*.svg"))
     assert json.loads((folder / NUMBERS_FILE).read_text())["hold"]["held"] == 0
 
 
@@ -99,6 +100,20 @@ def test_names_are_drawn_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyP
     for svg in (tmp_path / "figures").glob("*.svg"):
         assert b"<script" not in svg.read_bytes()
     assert name in json.loads((tmp_path / "figures" / NUMBERS_FILE).read_text())["objects"]
+
+
+def test_without_opengl_the_other_figures_are_drawn(
+    boxes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise MachineError("no EGL")
+
+    monkeypatch.setattr(write, "phases_figure", fail)
+    written = write_figures(boxes, tmp_path / "figures")
+    assert set(written.names) == ALL - {"phases"}
+    assert written.left_out == {"phases": "no EGL"}
+    with pytest.raises(MachineError, match="no EGL"):
+        write_figures(boxes, tmp_path / "asked", trial_id=0)
 
 
 def test_what_was_asked_for_must_be_drawn(boxes: Path, tmp_path: Path) -> None:

@@ -1,0 +1,117 @@
+"""Rules of the attributes of a file: which there are, and of what kind.
+
+In: an open HDF5 file. Out: every `Mistake`. Whether they agree with the configuration
+is for `checks.layout`: that needs more than NumPy and h5py.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import h5py
+import numpy as np
+
+from drakegrasp.dataset.schema import CAMERAS
+from drakegrasp.errors import printable
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and bool(value.strip()) and value.isprintable()
+
+
+def _is_mapping(value: Any) -> bool:
+    try:
+        return isinstance(value, str) and isinstance(json.loads(value), dict)
+    except (ValueError, RecursionError):
+        return False
+
+
+def _is_truths(value: Any) -> bool:
+    return _is_mapping(value) and all(isinstance(v, bool) for v in json.loads(value).values())
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= 0)
+
+
+def _is_positive(value: Any) -> bool:
+    return _is_number(value) and bool(value > 0.0)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, float | np.floating) and bool(np.isfinite(value))
+
+
+def _is_matrix(value: Any) -> bool:
+    return (
+        isinstance(value, np.ndarray)
+        and value.shape == (3, 3)
+        and value.dtype.kind == "f"
+        and bool(np.isfinite(value).all())
+    )
+
+
+#: A rule: what the value must be, in words, and whether it is.
+Rule = tuple[str, Callable[[Any], bool]]
+TEXT: Rule = ("a text", _is_text)
+COUNT: Rule = ("a whole number that is not negative", _is_whole)
+NUMBER: Rule = ("a finite number", _is_number)
+TRUTH: Rule = ("true or false", lambda value: isinstance(value, bool | np.bool_))
+_POSITIVE: Rule = ("a positive number", _is_positive)
+_MAPPING: Rule = ("a mapping in JSON", _is_mapping)
+
+#: Attributes of all three files.
+ORIGIN: Mapping[str, Rule] = {
+    "config": _MAPPING,
+    "config_hash": TEXT,
+    "seed": COUNT,
+    "versions": _MAPPING,
+    "fingers": ("whether a grasp needs each finger, in JSON", _is_truths),
+    "signature": TEXT,
+    "shards": TEXT,
+    "K": ("a matrix of 3 x 3 finite numbers", _is_matrix),
+    "near": _POSITIVE,
+    "far": _POSITIVE,
+}
+#: Those that files of before they were written may lack.
+_YOUNG = ("fingers",)
+#: And of the data files.
+OF_CAMERA: Mapping[str, Rule] = {
+    **ORIGIN,
+    "camera": (f"one of {', '.join(CAMERAS)}", lambda v: isinstance(v, str) and v in CAMERAS),
+}
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """An attribute that breaks its rule: what it must be, and what it is."""
+
+    key: str
+    must: str
+    got: str
+
+    def __str__(self) -> str:
+        return f"attribute {self.key} must be {self.must}, got {self.got}"
+
+
+def attribute_mistakes(file: h5py.File, rules: Mapping[str, Rule]) -> Iterator[Mistake]:
+    """Yield the attributes that are missing or break their rules.
+
+    Args:
+        file: The file.
+        rules: By the attributes' names.
+    """
+    for key, (must, obeys) in rules.items():
+        if key in file.attrs:
+            value = file.attrs[key]
+            if not obeys(value):
+                yield Mistake(key, must, _shown(value))
+        elif key not in _YOUNG:
+            yield Mistake(key, must, "none")
+
+
+def _shown(value: Any) -> str:
+    return printable(" ".join(repr(value).split())[:60])

@@ -1,0 +1,60 @@
+"""Reads the JSON files of a dataset as typed data: what is of another type is refused.
+
+In: a file and a pydantic model. Out: the model, or a `DataError` that names the file and the key.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from drakegrasp.config import describe_mistake
+from drakegrasp.errors import DataError, one_line, printable
+from drakegrasp.runtime.json_text import parse_json
+
+M = TypeVar("M", bound=BaseModel)
+
+
+def read_mapping(path: Path, what: str) -> tuple[dict[str, Any], bytes]:
+    """Return the content of a JSON file that must be a mapping, and its bytes.
+
+    Args:
+        path: Of the file.
+        what: What it must be, in words.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        DataError: If it cannot be read, or is something else.
+    """
+    try:
+        content = path.read_bytes()
+        tree = parse_json(content)
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError) as error:
+        got = f"a broken one ({printable(one_line(error))})"
+        raise DataError(f"{path}: must be {what}, got {got}") from None
+    if not isinstance(tree, dict):
+        raise DataError(f"{path}: must be {what}, got a {type(tree).__name__}")
+    return tree, content
+
+
+def validated(path: Path, content: bytes, model: type[M]) -> M:
+    """Return JSON text as a model; every value has exactly its type.
+
+    Args:
+        path: Of its file, for the message.
+        content: The text, which `read_mapping` has read.
+        model: The model.
+
+    Raises:
+        DataError: If a key is missing, unknown or of another type.
+    """
+    try:
+        return model.model_validate_json(content, strict=True)
+    except ValidationError as error:
+        mistake = error.errors()[0]
+        line = describe_mistake(mistake, whole="the file", legal="a known key")
+        raise DataError(f"{path}: {printable(line[:300])}") from None

@@ -1,0 +1,175 @@
+"""Opens the three files of a dataset to read them: one that differs from the schema is refused.
+
+In: a path. Out: an open file in which every group, dataset and attribute of the schema is there,
+of its type and shape. What the rows hold is not read; `read_codes` refuses numbers of things that
+do not exist. `drakegrasp check` lists all that is wrong with a file, and does not go through here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.dataset.hdf5 import open_hdf5, read_names
+from drakegrasp.dataset.layout.attributes import (
+    OF_CAMERA,
+    ORIGIN,
+    Rule,
+    attribute_mistakes,
+)
+from drakegrasp.dataset.layout.structure import DATA_TABLES, TRIAL_TABLES, Tables, differences
+from drakegrasp.dataset.schema import TRIAL_FIELDS, refuse_other_schema
+from drakegrasp.errors import DataError, first_line, printable
+from drakegrasp.outcomes import Outcome
+
+
+@contextmanager
+def open_samples(path: Path) -> Iterator[h5py.File]:
+    """Open grasping_oto.hdf5 or grasping_otm.hdf5 while the block runs.
+
+    Raises:
+        DataError: If it is missing, damaged, or differs from the schema.
+    """
+    with opened(path, "a data file of drakegrasp") as file:
+        refuse_other_attributes(path, file, OF_CAMERA)
+        refuse_other_structure(path, file, DATA_TABLES)
+        yield file
+
+
+@contextmanager
+def open_trials(path: Path) -> Iterator[h5py.File]:
+    """Open trials.hdf5 while the block runs.
+
+    Raises:
+        DataError: If it is missing, damaged, or differs from the schema.
+    """
+    with opened(path, "the trials of a dataset") as file:
+        refuse_other_attributes(path, file, ORIGIN)
+        refuse_other_structure(path, file, TRIAL_TABLES)
+        yield file
+
+
+@contextmanager
+def opened(path: Path, what: str) -> Iterator[h5py.File]:
+    """Open an HDF5 file while the block runs; what HDF5 cannot read in the block is told.
+
+    Args:
+        path: Of the file.
+        what: What it must be, in words.
+
+    Raises:
+        DataError: If it is missing or damaged.
+    """
+    try:
+        with open_hdf5(path) as file:
+            yield file
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: must be {what}, got none ({first_line(error)})") from None
+
+
+def refuse_other_attributes(path: Path, file: h5py.File, rules: Mapping[str, Rule]) -> None:
+    """Refuse a file of another version of the schema, or with an attribute that breaks its rule.
+
+    Args:
+        path: Of the file, for the message.
+        file: The file.
+        rules: By the attributes' names.
+
+    Raises:
+        DataError: If there is one; the first is told.
+    """
+    # The version first: another schema may have other attributes.
+    refuse_other_schema(path, file.attrs.get("schema_version"))
+    refuse_first(path, attribute_mistakes(file, rules))
+
+
+def refuse_other_structure(path: Path, file: h5py.File, tables: Tables) -> None:
+    """Refuse a file whose groups and datasets differ from the schema.
+
+    Args:
+        path: Of the file, for the message.
+        file: The file.
+        tables: Fields of each group.
+
+    Raises:
+        DataError: If they do; the first difference is told.
+    """
+    refuse_first(path, differences(file, tables))
+
+
+def refuse_first(path: Path, mistakes: Iterator[object]) -> None:
+    """Refuse a file with any mistake; the first is told.
+
+    Raises:
+        DataError: If there is one.
+    """
+    if (first := next(mistakes, None)) is not None:
+        raise DataError(f"{path}: {printable(str(first))}")
+
+
+def read_codes(dataset: h5py.Dataset, codes: int | Sequence[int]) -> npt.NDArray[Any]:
+    """Return a column (n,) of numbers that stand for something.
+
+    Args:
+        dataset: The column.
+        codes: How many things there are, counted from 0, or the numbers of those that there are.
+
+    Raises:
+        DataError: If a number stands for nothing.
+    """
+    values: npt.NDArray[Any] = dataset[:]
+    refuse_other_codes(Path(dataset.file.filename), dataset.name, values, codes)
+    return values
+
+
+def refuse_other_codes(
+    path: Path, place: str, values: npt.NDArray[Any], codes: int | Sequence[int]
+) -> None:
+    """Refuse numbers that stand for nothing, see `read_codes`.
+
+    Raises:
+        DataError: If there is one.
+    """
+    if isinstance(codes, int):
+        bad, must = (values < 0) | (values >= codes), f"0 to {codes - 1}"
+    else:
+        bad, must = ~np.isin(values, codes), f"{min(codes)} to {max(codes)}"
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise DataError(f"{path}: {place} must be {must}, got {values[row]} in row {row}")
+
+
+def read_trial(file: h5py.File, trial_id: int) -> dict[str, npt.NDArray[Any]]:
+    """Return a row of /trials by the fields' names.
+
+    Args:
+        file: What `open_trials` opened.
+        trial_id: Number of the row.
+
+    Raises:
+        DataError: If there is no such row.
+    """
+    trials = file["trials"]
+    count = len(trials["outcome"])
+    if not 0 <= trial_id < count:
+        raise DataError(f"{file.filename}: trial must be 0 to {count - 1}, got {trial_id}")
+    row = {f.name: np.asarray(trials[f.name][trial_id]) for f in TRIAL_FIELDS}
+    refuse_other_codes(Path(file.filename), "/trials/outcome", row["outcome"][None], list(Outcome))
+    return row
+
+
+def object_name(file: h5py.File, row: Mapping[str, npt.NDArray[Any]]) -> str:
+    """Return the name of the object of a row of /trials.
+
+    Raises:
+        DataError: If there is no such object, or its name is none.
+    """
+    names = read_names(file["objects/name"])
+    refuse_other_codes(Path(file.filename), "/trials/object", row["object"][None], len(names))
+    return names[int(row["object"])]

@@ -1,0 +1,192 @@
+"""Rules of the groups and datasets of a file: they are those of the schema, and agree in length.
+
+In: an open HDF5 file and the fields of its groups. Out: every `Difference` from them. Only headers
+are read. `opening` refuses the first one for all commands, `checks.layout` lists all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+import h5py
+import numpy as np
+
+from drakegrasp.dataset.schema import (
+    DATA_FIELDS,
+    OBJECT_FIELDS,
+    SPLITS,
+    SUCCESS_FIELDS,
+    TRIAL_FIELDS,
+    Field,
+)
+
+#: Fields of each group of a file, by the group's name.
+Tables = Mapping[str, tuple[Field, ...]]
+DATA_TABLES: Tables = {split: DATA_FIELDS for split in SPLITS}
+TRIAL_TABLES: Tables = {
+    "objects": OBJECT_FIELDS,
+    "trials": TRIAL_FIELDS,
+    "successes": SUCCESS_FIELDS,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Difference:
+    """What a file has otherwise than the schema.
+
+    Attributes:
+        place: Path of the group or the dataset; empty for the whole file.
+        what: What must be there, in words.
+        got: What is there instead.
+        text_only: Whether it is in the words beside the values: the rows can be read.
+    """
+
+    place: str = ""
+    what: str
+    got: str
+    text_only: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.place + ': ' if self.place else ''}{self.what}, got {self.got}"
+
+
+def differences(
+    file: h5py.File, tables: Tables, *, image: int | None = None, thorough: bool = False
+) -> Iterator[Difference]:
+    """Yield what the groups and datasets of a file have otherwise than the schema.
+
+    Args:
+        file: The file.
+        tables: Fields of each group.
+        image: Size of the images [px]; what most datasets say if None.
+        thorough: Whether what hinders nobody from reading is a difference, too: more than the
+            fields, and other attributes of them.
+    """
+    # The headers of all datasets, each looked at once.
+    found = {name: _datasets(file, name, fields) for name, fields in tables.items()}
+    lengths = _lengths(tables, found)
+    if image is not None:
+        lengths["S"] = image
+
+    if thorough:
+        yield from _extras(file, tables)
+    for name, fields in tables.items():
+        datasets = found[name]
+        if datasets is None:
+            yield Difference(place=f"/{name}", what="the group must be there", got="none")
+            continue
+
+        # Each field by itself; the number of rows is that of most datasets.
+        rows = _most_frequent([dataset.shape[0] for dataset in datasets.values() if dataset.shape])
+        for f in fields:
+            place, dataset = f"/{name}/{f.name}", datasets.get(f.name)
+            yield from _of_field(place, dataset, f, rows, lengths)
+            if thorough and dataset is not None:
+                yield from _of_attributes(place, h5py.Dataset(dataset), f)
+
+
+def _datasets(
+    file: h5py.File, name: str, fields: Iterable[Field]
+) -> dict[str, h5py.h5d.DatasetID] | None:
+    """Return the datasets of a group that are fields; None if there is no such group."""
+    group = file.get(name)
+    if not isinstance(group, h5py.Group):
+        return None
+    found = {}
+    for f in fields:
+        try:
+            item = h5py.h5o.open(group.id, f.name.encode())
+        except KeyError:
+            continue
+        if isinstance(item, h5py.h5d.DatasetID):
+            found[f.name] = item
+    return found
+
+
+def _extras(file: h5py.File, tables: Tables) -> Iterator[Difference]:
+    """Yield the groups and datasets that are no fields."""
+    for extra in sorted(set(file) - set(tables)):
+        yield Difference(what="groups must be those of the schema", got=f"/{extra} too")
+    for name, fields in tables.items():
+        group, paths = file.get(name), set()
+
+        def visit(path: str, node: h5py.Dataset | h5py.Group, paths: set[str] = paths) -> None:
+            if isinstance(node, h5py.Dataset):
+                paths.add(path)
+
+        if isinstance(group, h5py.Group):
+            group.visititems(visit)
+        for key in sorted(paths - {f.name for f in fields}):
+            got = f"{key} too"
+            yield Difference(place=f"/{name}", what="datasets must be those of the schema", got=got)
+
+
+def _lengths(
+    tables: Tables, found: Mapping[str, dict[str, h5py.h5d.DatasetID] | None]
+) -> dict[str, int]:
+    """Return the lengths of the letters in the shapes that most datasets of a file agree on."""
+    votes: dict[str, list[int]] = {"k": [], "j": [], "S": []}
+    for name, fields in tables.items():
+        datasets = found[name] or {}
+        for f in fields:
+            shape = datasets[f.name].shape if f.name in datasets else None
+            if not shape or len(shape) != 1 + len(f.axes):
+                continue
+            for axis, length in zip(f.axes, shape[1:], strict=True):
+                if axis == "6k":
+                    votes["k"].append(length // 6)
+                elif isinstance(axis, str):
+                    votes[axis].append(length)
+    known = {letter: _most_frequent(lengths) for letter, lengths in votes.items()}
+    return {letter: length for letter, length in (known | {"6k": 6 * known["k"]}).items() if length}
+
+
+def _most_frequent(numbers: list[int]) -> int:
+    return max(numbers, key=numbers.count, default=0)
+
+
+def _of_field(
+    place: str,
+    dataset: h5py.h5d.DatasetID | None,
+    field: Field,
+    rows: int,
+    lengths: Mapping[str, int],
+) -> Iterator[Difference]:
+    """Yield what type and shape a dataset has otherwise than its field.
+
+    Args:
+        place: Path of the dataset.
+        dataset: The dataset; None if it is missing.
+        field: The field.
+        rows: Number of rows that it must have.
+        lengths: Of the letters in the shapes, where they are known.
+    """
+    if dataset is None:
+        yield Difference(place=place, what="the dataset must be there", got="none")
+        return
+
+    dtype, found = dataset.dtype, dataset.shape
+    text = h5py.check_string_dtype(dtype) is not None
+    if text != (field.dtype == "str") or not (text or dtype == np.dtype(field.dtype)):
+        yield Difference(place=place, what=f"type must be {field.dtype}", got=str(dtype))
+    try:
+        shape = (rows, *field.row_shape(lengths))
+    except KeyError:
+        # No sound dataset tells the length of a letter; one without a space has no shape.
+        shape = (rows, *(found or ())[1:])
+    if found != shape:
+        yield Difference(place=place, what=f"shape must be {shape}", got=str(found))
+
+
+def _of_attributes(place: str, dataset: h5py.Dataset, field: Field) -> Iterator[Difference]:
+    """Yield what attributes a dataset has otherwise than its field."""
+    attrs = dict(dataset.attrs)
+    for key, value in (("unit", field.unit), ("frame", field.frame)):
+        if not (isinstance(attrs.get(key), str) and attrs[key] == value):
+            what, got = f"attribute {key} must be {value!r}", repr(attrs.get(key))
+            yield Difference(place=place, what=what, got=got, text_only=True)
+    # Wording may improve without a new version of the schema.
+    if not str(attrs.get("meaning", "")):
+        what = "attribute meaning must be there"
+        yield Difference(place=place, what=what, got="none", text_only=True)

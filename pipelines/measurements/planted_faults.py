@@ -1,0 +1,184 @@
+"""Plant faults in a copy of the source, one at a time, and say which of them the tests find.
+
+The table `planted_faults.yaml` has faults that were once planted by hand and that no test saw;
+`draw_faults.py` draws others. A fault is a text that is replaced in one file, and the tests that
+must notice. Prints JSON: for each fault whether a test failed, and the seconds that took. Exits
+with 1 if a fault was not found that is not called equivalent.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from itertools import count
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+#: Times of change, a second apart [s].
+_TIMES = count(1_000_000_000)
+ROOT = Path(__file__).resolve().parents[2]
+TABLE = Path(__file__).with_suffix(".yaml")
+#: Exit codes: of pytest if all tests passed, and of a run that was killed.
+PASSED, KILLED = 0, -1
+#: A run may take as many times as long as one test may.
+HANG = 4.0
+#: What the tests load; a fork of this process need not load it again.
+LIBRARIES = (
+    *("h5py", "networkx", "numpy", "pydantic", "rich.table", "trimesh", "yaml"),
+    *("scipy.ndimage", "scipy.optimize", "scipy.spatial", "pydrake.multibody.plant"),
+    *("pydrake.systems.analysis", "pydrake.systems.primitives", "pydrake.solvers"),
+)
+
+
+def copy_source(folder: Path) -> None:
+    """Copy the files that Git knows of, with what has changed in them, into a folder."""
+    listed = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    for name in filter(None, listed.stdout.split("\0")):
+        if (ROOT / name).is_file():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, folder / name)
+
+
+def with_fault(text: str, fault: dict[str, Any]) -> str:
+    """Return a file's text with a fault in it.
+
+    Args:
+        text: Of the file.
+        fault: Has `old` and `new`; `line` says where `old` begins if it occurs several times.
+
+    Raises:
+        ValueError: If the text is not there, or not only once.
+    """
+    lines = text.splitlines(keepends=True)
+    start = sum(map(len, lines[: fault.get("line", 1) - 1]))
+    times = text.count(fault["old"], start)
+    if not times or ("line" not in fault and times > 1):
+        raise ValueError(f"{fault['file']}: must have {fault['old']!r} once, got {times} times")
+    return text[:start] + text[start:].replace(fault["old"], fault["new"], 1)
+
+
+def try_fault(folder: Path, fault: dict[str, Any], timeout: float) -> dict[str, Any]:
+    """Plant a fault in a copy, run its tests, and take it out again.
+
+    Args:
+        folder: The copy.
+        fault: Of a table.
+        timeout: For one test [s]; a test that hangs has found the fault.
+
+    Returns:
+        What was found: `found`, the first test that failed, and `seconds`.
+    """
+    path, began = folder / fault["file"], time.monotonic()
+    original = path.read_text(encoding="utf-8")
+    try:
+        _write(path, with_fault(original, fault))
+        code, said = run_tests(folder, fault["tests"], timeout)
+    finally:
+        _write(path, original)
+    failed = [line for line in said.splitlines() if line.startswith(("FAILED", "ERROR"))]
+    if code not in (PASSED, KILLED) and not failed:
+        raise RuntimeError(f"pytest must run the tests of {fault['fault']!r}, got:\n{said}")
+    return {
+        "fault": fault["fault"],
+        "file": fault["file"],
+        "found": code != PASSED,
+        "by": failed[0] if failed else "",
+        "seconds": round(time.monotonic() - began, 1),
+    }
+
+
+def _write(path: Path, text: str) -> None:
+    """Write a module, with another time of change than ever: compiled code is told by it."""
+    path.write_text(text, encoding="utf-8")
+    changed = next(_TIMES)
+    os.utime(path, (changed, changed))
+
+
+def run_tests(folder: Path, tests: Sequence[str], timeout: float) -> tuple[int, str]:
+    """Run tests in a copy until one fails; return pytest's exit code and what it said.
+
+    In a fork of this process, which has the libraries loaded.
+    """
+    with tempfile.TemporaryFile() as output:
+        child = get_context("fork").Process(
+            target=_run, args=(folder, list(tests), timeout, output.fileno())
+        )
+        child.start()
+        child.join(HANG * timeout)
+        if child.is_alive():
+            child.kill()
+            child.join()
+        output.seek(0)
+        code = child.exitcode
+        return KILLED if code is None or code < 0 else code, output.read().decode(errors="replace")
+
+
+def _run(folder: Path, tests: list[str], timeout: float, output: int) -> None:
+    for stream in (1, 2):
+        os.dup2(output, stream)
+    os.chdir(folder)
+    sys.path[:0] = [str(folder), str(folder / "tests")]
+    os.environ["PYTHONPATH"] = f"{folder}:{folder / 'tests'}"
+    options = ["-x", "-q", "--no-header", "--tb=no", "-p", "no:cacheprovider"]
+    options += [f"--timeout={timeout:g}", "-m", "not server and not slow"]
+    sys.exit(pytest.main([*options, *tests]))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the script; return its exit code."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("table", type=Path, nargs="?", default=TABLE, help="YAML with faults")
+    parser.add_argument("--only", default="", help="faults with this text in their name or file")
+    parser.add_argument(
+        "--timeout", type=float, default=60.0, help="seconds that a test may take (default: 60)"
+    )
+    parser.add_argument("--trust", action="store_true", help="do not try the tests without a fault")
+    arguments = parser.parse_args(argv)
+    faults = yaml.safe_load(arguments.table.read_text(encoding="utf-8"))
+    chosen = [f for f in faults if arguments.only in f["fault"] or arguments.only in f["file"]]
+
+    for library in LIBRARIES:
+        importlib.import_module(library)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        copy_source(folder)
+
+        # Without a fault all tests must pass, or nothing is learnt.
+        tests = sorted({test for fault in chosen for test in fault["tests"]})
+        code, said = (PASSED, "") if arguments.trust else run_tests(folder, tests, 600.0)
+        if code != PASSED:
+            sys.stderr.write(f"the tests must pass without a fault, got:\n{said}")
+            return 2
+
+        missed = 0
+        for fault in chosen:
+            result = try_fault(folder, fault, arguments.timeout)
+            if "equivalent" in fault:
+                result["equivalent"] = fault["equivalent"]
+            missed += not result["found"] and "equivalent" not in fault
+            sys.stdout.write(json.dumps(result) + "\n")
+            sys.stdout.flush()
+    sys.stdout.write(json.dumps({"faults": len(chosen), "not found": missed}) + "\n")
+    return int(missed > 0)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

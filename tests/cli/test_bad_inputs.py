@@ -1,0 +1,423 @@
+"""Every kind of bad input gets one line and exit code 1 or 2, from every command that reads it.
+
+A kind spoils one thing of one file. A table lists the kinds of a file; a test walks a table
+through a command that reads the file, and names all kinds that had another answer.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import traceback
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner, Result
+from helpers.bad_inputs import array_kinds, hdf5_kinds, manifests, text_kinds
+from helpers.bad_inputs.kinds import Kind, Workplace
+from helpers.datasets import OTM, OTO, TRIALS, make_dataset
+
+from drakegrasp.cli.main import main
+from drakegrasp.hand.files import MODELS
+
+MANIFEST, REJECT, LOG = "manifest.json", "reject.json", "log.jsonl"
+SHARD = "shards/1_box_a/0000000-0000002.h5"
+MODEL, PLAN = "objects/1_box_a.npz", "objects/1_box_a.plan.h5"
+#: What the dataset of the tests was made with.
+SETTINGS = (
+    *("camera.size=32", "unit_candidates=2", "filters.min_depth_variance=0"),
+    "split.valid_fraction=0.34",
+)
+_BUILD = (
+    *("build", "--objects", "{meshes}", "--out", "{out}", "--quiet", "--workers", "1"),
+    *(part for text in SETTINGS for part in ("--set", text)),
+)
+#: Commands by their names in the table.
+COMMANDS: dict[str, tuple[str, ...]] = {
+    "stats": ("stats", "{out}"),
+    "assemble": ("assemble", "{out}"),
+    "check": ("check", "{out}"),
+    "check FILE": ("check", "{out}/{file}"),
+    "replay": ("replay", "{out}", "--trial", "0"),
+    "figures": ("figures", "{out}", "--out", "{to}/figures", "--quiet"),
+    "inspect": ("inspect", "{out}", "--static", "{to}/site"),
+    "export original": ("export", "{out}", "{to}/original", "--to", "original", "--quiet"),
+    "export hf": ("export", "{out}", "{to}/hf", "--to", "hf", "--quiet"),
+    "export dexgraspbench": ("export", "{out}", "{to}/dex", "--to", "dexgraspbench", "--quiet"),
+    "export glb": ("export", "{out}", "{to}/glb", "--to", "glb", "--quiet"),
+    "verify": ("verify", f"{{out}}/{OTO}", "--out", "{to}/verdicts", "--workers", "1", "--quiet"),
+    "bench": ("bench", "--cross-check", "{out}", "1", "--out", "{to}/report.json", "--quiet"),
+    "build": _BUILD,
+    "build --plan": (*_BUILD, "--plan"),
+}
+assert OTM
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sound dataset with meshes, a hand file, decisions and predictions."""
+    base = tmp_path_factory.mktemp("sound")
+    (base / "meshes").mkdir()
+    out = make_dataset(base / "out", base / "meshes")
+    manifest = json.loads((out / MANIFEST).read_text())
+    key = {"object": "1_box_a", "candidate": 0, "standoff_index": 0}
+    manifest["refused"] = [{"name": "4_cup", "mesh_sha256": "0" * 64, "reason": "open"}]
+    manifest["fingers"] = {"finger_1": True, "finger_2": True, "finger_3": True}
+    (base / "manifest.json").write_text(json.dumps({**manifest, "rejected": [key]}))
+    (base / "reject.json").write_text(json.dumps({"version": 1, "rejected": [key], "kept": [key]}))
+    return base
+
+
+#: A bad input is refused within this time [s].
+PATIENCE = 5
+
+
+class TookTooLongError(BaseException):
+    """A command did not end."""
+
+
+def _give_up(number: int, frame: object) -> None:
+    raise TookTooLongError
+
+
+def run(command: Sequence[str], **places: object) -> Result:
+    words = [word.format(**places) for word in command]
+    before = signal.signal(signal.SIGALRM, _give_up)
+    signal.alarm(PATIENCE)
+    try:
+        return CliRunner().invoke(main, words)
+    except TookTooLongError as error:
+        return Result(CliRunner(), b"", b"", b"", None, 99, error, (type(error), error, None))
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def wrong_answer(result: Result, names: Sequence[str]) -> str | None:
+    """Return what is wrong with the answer to a bad input, or None.
+
+    Args:
+        result: Of the command.
+        names: What the line must name one of.
+    """
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        frames = traceback.extract_tb(result.exception.__traceback__)
+        own = [f for f in frames if "/drakegrasp/" in f.filename and "/tests/" not in f.filename]
+        at = f"{Path(own[-1].filename).name}:{own[-1].lineno}" if own else ""
+        text = " ".join(str(result.exception).split())[:100]
+        return f"TRACEBACK {type(result.exception).__name__} at {at} ({text})"
+    if result.exit_code not in (1, 2):
+        return f"exit code {result.exit_code}"
+    lines = [line for line in result.stderr.splitlines() if "━" not in line]
+    errors = [line for line in lines if line.startswith("error: ")]
+    # `check` lists what it finds.
+    found = [line for line in result.stdout.splitlines() if ": " in line]
+    if not errors and not lines and any(name in line for name in names for line in found):
+        return None
+    if len(errors) != 1 or len(lines) != 1:
+        return f"{len(lines)} lines on standard error: {lines[:3]}; {result.stdout[-200:]!r}"
+    if not any(name in errors[0] for name in names):
+        return f"no name in: {errors[0][:150]}"
+    if not errors[0].isprintable():
+        return f"control characters in: {errors[0][:150]!r}"
+    return None
+
+
+def walk(
+    base: Path, tmp_path: Path, file: str, kinds: Sequence[Kind], command: str, *left_out: str
+) -> None:
+    """Give each kind of a file to a command; fail with all answers that are wrong."""
+    place, to = tmp_path / "place", tmp_path / "to"
+    to.mkdir()
+    work = Workplace(base / "out", place)
+    for name in left_out:
+        (place / name).unlink()
+    if file == MANIFEST:
+        shutil.copy(base / MANIFEST, place / MANIFEST)
+    work.sound = work.content()
+    shutil.copytree(place, tmp_path / "pristine", symlinks=True)
+    work.pristine = tmp_path / "pristine"
+
+    wrong = {}
+    for kind in kinds:
+        kind.spoil(place / file)
+        before = work.content()
+        result = run(COMMANDS[command], out=place, to=to, meshes=base / "meshes", file=file)
+        answer = wrong_answer(result, (Path(file).name, Path(file).stem.partition(".")[0]))
+        after = work.content()
+        after.pop(LOG, None)
+        if answer is None and after != before:
+            changed = {n for n in after.keys() | before.keys() if after.get(n) != before.get(n)}
+            answer = f"changed {sorted(changed)}"
+        if answer is None and any(to.iterdir()):
+            answer = f"left {[path.name for path in to.iterdir()]}"
+        if answer is not None:
+            wrong[kind.name] = answer
+        shutil.rmtree(to)
+        to.mkdir()
+        work.restore()
+    report(f"{file} / {command}", kinds, wrong)
+
+
+def report(title: str, kinds: Sequence[object], wrong: dict[str, str]) -> None:
+    if place := os.environ.get("BAD_INPUTS_LOG"):
+        with open(place, "a") as file:
+            file.write(f"== {title}: {len(kinds)} tried, {len(kinds) - len(wrong)} answered\n")
+            file.writelines(f"   {name[:80]!r}: {answer}\n" for name, answer in wrong.items())
+    lines = [f"{name!r}: {answer}" for name, answer in wrong.items()]
+    assert not wrong, f"{title}: {len(wrong)} of {len(kinds)} kinds:\n" + "\n".join(lines)
+
+
+READ_MANIFEST = (
+    *("stats", "assemble", "check", "replay", "figures", "export glb", "export dexgraspbench"),
+    *("verify", "bench", "build", "build --plan"),
+)
+
+
+@pytest.mark.parametrize("command", READ_MANIFEST)
+def test_manifest(base: Path, tmp_path: Path, command: str) -> None:
+    walk(base, tmp_path, MANIFEST, manifests.MANIFEST, command)
+
+
+def test_manifest_of_unfinished(base: Path, tmp_path: Path) -> None:
+    walk(base, tmp_path, MANIFEST, manifests.MANIFEST, "inspect", OTO, OTM, TRIALS)
+
+
+READ_TRIALS = (
+    *("stats", "check", "check FILE", "replay", "figures", "inspect", "export glb"),
+    *("export dexgraspbench", "bench"),
+)
+
+
+@pytest.mark.parametrize("command", READ_TRIALS)
+def test_trials(base: Path, tmp_path: Path, command: str) -> None:
+    values = hdf5_kinds.TRIAL_VALUES if command in ("stats", "check", "inspect") else ()
+    walk(base, tmp_path, TRIALS, (*hdf5_kinds.TRIALS, *values), command)
+
+
+READ_DATA = (
+    *("stats", "check", "check FILE", "figures", "inspect", "export glb", "export dexgraspbench"),
+    *("export original", "export hf", "verify"),
+)
+
+
+@pytest.mark.parametrize("command", READ_DATA)
+def test_data(base: Path, tmp_path: Path, command: str) -> None:
+    walk(base, tmp_path, OTO, hdf5_kinds.DATA, command)
+
+
+@pytest.mark.parametrize("command", ["assemble", "check"])
+def test_shards(base: Path, tmp_path: Path, command: str) -> None:
+    walk(base, tmp_path, SHARD, hdf5_kinds.SHARD, command)
+
+
+def test_shards_of_unfinished(base: Path, tmp_path: Path) -> None:
+    walk(base, tmp_path, SHARD, hdf5_kinds.SHARD, "inspect", OTO, OTM, TRIALS)
+
+
+@pytest.mark.parametrize("command", ["replay", "check", "figures", "export glb", "verify"])
+def test_plans(base: Path, tmp_path: Path, command: str) -> None:
+    walk(base, tmp_path, PLAN, hdf5_kinds.PLAN, command)
+
+
+@pytest.mark.parametrize("command", ["replay", "check", "assemble", "verify"])
+def test_models(base: Path, tmp_path: Path, command: str) -> None:
+    walk(base, tmp_path, MODEL, array_kinds.MODEL, command)
+
+
+def walk_file(
+    tmp_path: Path, sound: bytes, suffix: str, kinds: Sequence[Kind], command: Sequence[str]
+) -> None:
+    """Give each kind of a single file to a command; fail with all answers that are wrong."""
+    file, to, wrong = tmp_path / f"spoiled{suffix}", tmp_path / "to", {}
+    for kind in kinds:
+        to.mkdir()
+        file.write_bytes(sound)
+        kind.spoil(file)
+        result = run(command, file=file, to=to)
+        answer = wrong_answer(result, ("spoiled", "grasp", "X_TC", "pose", "rows", "objects"))
+        if answer is None and any(to.iterdir()):
+            answer = f"left {[path.name for path in to.iterdir()]}"
+        if answer is not None:
+            wrong[kind.name] = answer
+        shutil.rmtree(to)
+        shutil.rmtree(file) if file.is_dir() else file.unlink()
+    report(" ".join(command[:1]) + f" {suffix}", kinds, wrong)
+
+
+def _npy(path: Path, array: np.ndarray) -> bytes:
+    np.save(path / "sound.npy", array)
+    return (path / "sound.npy").read_bytes()
+
+
+PREDICTIONS = {
+    ".npy": array_kinds.PREDICTIONS_NPY,
+    ".csv": array_kinds.PREDICTIONS_CSV,
+    ".h5": array_kinds.PREDICTIONS_HDF5,
+}
+
+
+@pytest.mark.parametrize("suffix", PREDICTIONS)
+def test_predictions(base: Path, tmp_path: Path, suffix: str) -> None:
+    import h5py
+
+    sound = _npy(tmp_path, array_kinds.GRASP)
+    if suffix == ".csv":
+        sound = array_kinds._LINE.encode()
+    elif suffix == ".h5":
+        with h5py.File(tmp_path / "sound.h5", "w") as file:
+            file["grasps"] = np.tile(array_kinds.GRASP, (2, 1))
+            file["rows"] = np.arange(2)
+        sound = (tmp_path / "sound.h5").read_bytes()
+    command = ("verify", "{file}", "--out", "{to}/verdicts", "--workers", "1", "--quiet")
+    target = (
+        ("--dataset", str(base / "out" / OTO))
+        if suffix == ".h5"
+        else ("--object", str(base / "meshes" / "1_box_a.stl"))
+    )
+    walk_file(tmp_path, sound, suffix, PREDICTIONS[suffix], (*command, *target))
+
+
+def test_cameras(base: Path, tmp_path: Path) -> None:
+    np.save(tmp_path / "grasp.npy", array_kinds.GRASP)
+    command = (
+        "verify",
+        str(tmp_path / "grasp.npy"),
+        "--object",
+        str(base / "meshes" / "1_box_a.stl"),
+        "--frame",
+        "camera",
+        "--camera",
+        "{file}",
+        "--out",
+        "{to}/verdicts",
+        "--workers",
+        "1",
+        "--quiet",
+    )
+    walk_file(tmp_path, _npy(tmp_path, np.eye(4)), ".npy", array_kinds.CAMERA_NPY, command)
+
+
+def test_decisions(base: Path, tmp_path: Path) -> None:
+    sound = (base / REJECT).read_bytes()
+    out = Path(shutil.copytree(base / "out", tmp_path / "out"))
+    before = (out / MANIFEST).read_bytes()
+    walk_file(
+        tmp_path, sound, ".json", manifests.DECISIONS, ("assemble", str(out), "--reject", "{file}")
+    )
+    walk_file(
+        tmp_path,
+        b"0\n",
+        ".txt",
+        manifests.REJECTED_IDS,
+        ("assemble", str(out), "--reject", "{file}"),
+    )
+    assert (out / MANIFEST).read_bytes() == before
+
+
+def test_decisions_in_the_dataset(base: Path, tmp_path: Path) -> None:
+    shutil.copy(base / REJECT, base / "out" / REJECT)
+    try:
+        kinds = [k for k in manifests.DECISIONS if "not there" not in k.name]
+        walk(base, tmp_path, REJECT, kinds, "inspect")
+    finally:
+        (base / "out" / REJECT).unlink()
+
+
+def test_configurations(base: Path, tmp_path: Path) -> None:
+    sound = yaml.safe_dump(
+        {
+            "seed": 1,
+            "builtin": {"seed": 0},
+            "candidates": {"max": 4},
+            "physics": {},
+            "lift": {},
+            "camera": {},
+            "split": {},
+        }
+    )
+    walk_file(
+        tmp_path,
+        sound.encode(),
+        ".yaml",
+        text_kinds.CONFIG,
+        (
+            "build",
+            "--objects",
+            str(base / "meshes"),
+            "--out",
+            "{to}/out",
+            "--config",
+            "{file}",
+            "--plan",
+        ),
+    )
+
+
+@pytest.mark.parametrize("command", ["build", "audit", "morph"])
+def test_objects_yaml(base: Path, tmp_path: Path, command: str) -> None:
+    sound = b"units: m\nlicence: x\nobjects:\n  1_box_a: {friction: 0.5}\n"
+    meshes = str(base / "meshes")
+    words = {
+        "build": ("build", "--objects", meshes, "--out", "{to}/out", "--plan"),
+        "audit": ("audit", meshes, "--json", "{to}/a.json"),
+        "morph": ("objects", "morph", meshes, "--per-mesh", "1", "--out", "{to}/morphs"),
+    }[command]
+    walk_file(tmp_path, sound, ".yaml", text_kinds.OBJECTS, (*words, "--manifest", "{file}"))
+
+
+def test_hands(base: Path, tmp_path: Path) -> None:
+    sound = (MODELS / "barrett_hand.yaml").read_bytes()
+    walk_file(
+        tmp_path,
+        sound,
+        ".yaml",
+        text_kinds.HAND,
+        (
+            "build",
+            "--objects",
+            str(base / "meshes"),
+            "--out",
+            "{to}/out",
+            "--set",
+            "hand={file}",
+            "--workers",
+            "1",
+            "--quiet",
+        ),
+    )
+
+
+@pytest.mark.parametrize("option", text_kinds.OPTIONS)
+def test_options(base: Path, tmp_path: Path, option: str) -> None:
+    wrong = {}
+    values = text_kinds.OPTIONS[option]
+    for value in values:
+        to = tmp_path / "to"
+        to.mkdir()
+        objects = "builtin" if option in ("--per-class", "--objects-seed") else base / "meshes"
+        words = ["build", "--objects", str(objects), "--out", str(to / "out"), "--quiet", "--plan"]
+        if option == "--workers" or option.startswith("--scheduler"):
+            words.remove("--plan")
+        if option in words:
+            k = words.index(option)
+            del words[k : k + 2]
+        os.chdir(to)
+        result = run([w.replace("{", "{{").replace("}", "}}") for w in (*words, option, value)])
+        answer = wrong_answer(result, (option, option[2:], "config", *_keys(value)))
+        if answer is None and any(to.iterdir()):
+            answer = f"left {[path.name for path in to.iterdir()]}"
+        if answer is not None:
+            wrong[value] = answer
+        os.chdir(tmp_path)
+        shutil.rmtree(to)
+    report(f"option {option}", values, wrong)
+
+
+def _keys(value: str) -> Iterator[str]:
+    yield from (value.partition("=")[0], value, "hand", "max", "seed", "unit")

@@ -1,0 +1,294 @@
+"""Bad files of predicted grasps, of cameras' poses, and of prepared objects."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from helpers.bad_inputs.hdf5_kinds import WAYS, dataset_kind
+from helpers.bad_inputs.kinds import ANY_FILE, Kind, one_of
+
+from drakegrasp.runtime.files import seal
+
+#: Three contacts on the sides of a box, then their normals: a sound grasp.
+GRASP = np.array([0.03, 0, 0, -0.03, 0, 0, 0, 0.025, 0, 1, 0, 0, -1, 0, 0, 0, 1, 0.0])
+
+
+def _npy(name: str, array: Any) -> Kind:
+    """Return a kind whose file holds an array, pickled if it must be."""
+    return Kind(name, lambda path: np.save(path, np.asarray(array), allow_pickle=True))
+
+
+def _header(name: str, text: str, content: bytes = bytes(144)) -> Kind:
+    """Return a kind whose header is a text, of the length that it has."""
+
+    def spoil(path: Path) -> None:
+        line = text.encode().ljust(117) + b"\n"
+        path.write_bytes(b"\x93NUMPY\x01\x00" + len(line).to_bytes(2, "little") + line + content)
+
+    return Kind(name, spoil)
+
+
+def _described(name: str, descr: str, shape: str, order: str = "False") -> Kind:
+    return _header(name, f"{{'descr': {descr}, 'fortran_order': {order}, 'shape': {shape}}}")
+
+
+def _with(index: int, value: float) -> Any:
+    grasp = GRASP.copy()
+    grasp[index] = value
+    return grasp
+
+
+def _bytes(name: str, content: bytes) -> Kind:
+    return Kind(name, lambda path: path.write_bytes(content))
+
+
+def _version(major: int) -> Callable[[Path], None]:
+    def spoil(path: Path) -> None:
+        content = path.read_bytes()
+        path.write_bytes(content[:6] + bytes([major]) + content[7:])
+
+    return spoil
+
+
+_HEADERS: tuple[Kind, ...] = (
+    _header("no header", "x"),
+    _header("a header that calls", "__import__('os').getcwd()"),
+    _header("a header without shape", "{'descr': '<f8', 'fortran_order': False}"),
+    _header("a header of other keys", "{'a': 1}"),
+    _described("a shape beyond memory", "'<f8'", f"({2**60},)"),
+    _described("a shape that overflows", "'<f8'", f"({2**32}, {2**32})"),
+    _described("a shape beyond 64 bits", "'<f8'", f"({2**70},)"),
+    _described("a negative shape", "'<f8'", "(-1,)"),
+    _described("a shape of texts", "'<f8'", "('x',)"),
+    _described("a shape of truth values", "'<f8'", "(True, 18)"),
+    _described("a shape that is longer", "'<f8'", "(2, 18)"),
+    _described("no type", "'<x9'", "(18,)"),
+    _described("a type of Python", "'|O'", "(18,)"),
+    _described("a type without size", "'|V0'", "(18,)"),
+    _described("an order of text", "'<f8'", "(18,)", "'x'"),
+    Kind("cut in the header", lambda path: path.write_bytes(path.read_bytes()[:40])),
+    Kind("cut after the header", lambda path: path.write_bytes(path.read_bytes()[:128])),
+    Kind("cut in the magic text", lambda path: path.write_bytes(path.read_bytes()[:4])),
+    Kind("version 9", _version(9)),
+    Kind("version 2", _version(2)),
+    _bytes("a header of 4 GB", b"\x93NUMPY\x02\x00\xff\xff\xff\xff{'descr'"),
+    _bytes("a zip", b"PK\x05\x06" + bytes(18)),
+    _bytes("a pickle", b"\x80\x04K\x05."),
+)
+PREDICTIONS_NPY: tuple[Kind, ...] = (
+    *ANY_FILE,
+    *_HEADERS,
+    _npy("a single number", 1.0),
+    _npy("without rows", np.zeros((0, 18))),
+    _npy("without columns", np.zeros((3, 0))),
+    _npy("17 numbers", GRASP[:17]),
+    _npy("three axes", np.tile(GRASP, (2, 2, 1))),
+    _npy("a column per grasp", np.asfortranarray(np.tile(GRASP, (3, 1)).T)),
+    _npy("texts", np.array(["1.0"] * 18)),
+    _npy("bytes", np.array([b"1.0"] * 18)),
+    _npy("truth values", np.ones(18, dtype=bool)),
+    _npy("complex numbers", GRASP.astype(complex)),
+    _npy("dates", np.zeros(18, dtype="M8[s]")),
+    _npy("pairs", np.zeros(18, dtype=[("a", "f8")])),
+    _npy("objects", np.array([None] * 18, dtype=object)),
+    _npy("NaN", _with(0, np.nan)),
+    _npy("infinite", _with(4, np.inf)),
+    _npy("huge", _with(0, 1e300)),
+    _npy("of another unit", np.concatenate([1e3 * GRASP[:9], GRASP[9:]])),
+    _npy("a normal of length zero", np.concatenate([GRASP[:9], np.zeros(9)])),
+    _npy("a normal that is too long", np.concatenate([GRASP[:9], 2 * GRASP[9:]])),
+    _npy("zeros in 18 numbers", np.zeros(18)),
+    _npy("whole numbers beyond floats", np.full(18, 2**63, dtype=np.uint64)),
+)
+CAMERA_NPY: tuple[Kind, ...] = (
+    *ANY_FILE,
+    *_HEADERS,
+    _npy("a single number", 1.0),
+    _npy("eleven numbers", np.zeros(11)),
+    _npy("3 x 3", np.eye(3)),
+    _npy("for other grasps", np.tile(np.eye(4), (7, 1, 1))),
+    _npy("texts", np.full((4, 4), "1")),
+    _npy("objects", np.full((4, 4), None)),
+    _npy("NaN", np.full((4, 4), np.nan)),
+    _npy("zeros in a pose", np.zeros((4, 4))),
+    _npy("mirrored", np.diag([1.0, 1.0, -1.0, 1.0])),
+    _npy("scaled", np.diag([2.0, 2.0, 2.0, 1.0])),
+    _npy("another last row", np.ones((4, 4))),
+)
+
+
+def _csv(name: str, text: str | bytes) -> Kind:
+    content = text if isinstance(text, bytes) else text.encode()
+    return Kind(name, lambda path: path.write_bytes(content))
+
+
+_LINE = ",".join(map(str, GRASP))
+PREDICTIONS_CSV: tuple[Kind, ...] = (
+    *ANY_FILE,
+    _csv("only a header", ",".join("abc") + "\n"),
+    _csv("17 numbers", ",".join(map(str, GRASP[:17]))),
+    _csv("lines of unequal length", f"{_LINE}\n{_LINE},1\n"),
+    _csv("semicolons", _LINE.replace(",", ";")),
+    _csv("blanks", _LINE.replace(",", " ")),
+    _csv("a text in between", _LINE.replace("0.03", "x", 1)),
+    _csv("an empty cell", _LINE.replace("0.03", "", 1)),
+    _csv("quotes", _LINE.replace("0.03", '"0.03"', 1)),
+    _csv("NaN", _LINE.replace("0.03", "nan", 1)),
+    _csv("infinite", _LINE.replace("0.03", "1e999", 1)),
+    _csv("digits of 10,000", _LINE.replace("0.03", "9" * 10_000, 1)),
+    _csv("UTF-16", _LINE.encode("utf-16")),
+    _csv("a null byte", _LINE.replace("0.03", "\x00", 1)),
+    _csv("two headers", f"{','.join('a' * 18)}\n{','.join('b' * 18)}\n{_LINE}"),
+    _csv("commas", "," * 17),
+    _csv("steering", _LINE.replace("0.03", "\x1b]0;x\x07", 1)),
+)
+
+
+def _predictions_hdf5(name: str, edit: Callable[[h5py.File], object]) -> Kind:
+    def spoil(path: Path) -> None:
+        with h5py.File(path, "w") as file:
+            file["grasps"] = np.tile(GRASP, (2, 1))
+            file["rows"] = np.arange(2)
+            edit(file)
+
+    return Kind(name, spoil)
+
+
+def _instead(key: str, value: Any) -> Callable[[h5py.File], None]:
+    def edit(file: h5py.File) -> None:
+        del file[key]
+        file[key] = value
+
+    return edit
+
+
+def _grouped(file: h5py.File) -> None:
+    for name in ("a", "b"):
+        file[f"{name}/grasps"] = file["grasps"][:]
+    del file["grasps"]
+
+
+def _beyond(file: h5py.File) -> None:
+    del file["grasps"]
+    file.create_dataset("grasps", shape=(2**40, 18), dtype="f8", chunks=(1, 18))
+
+
+PREDICTIONS_HDF5: tuple[Kind, ...] = (
+    *ANY_FILE,
+    Kind("no array", lambda path: h5py.File(path, "w").close()),
+    *(
+        Kind(f"grasps {way}", one_spoil)
+        for way in WAYS
+        if way not in ("of another type", "one row less", "one row more")
+        for one_spoil in [dataset_kind("grasps", way).spoil]
+    ),
+    *(
+        Kind(f"rows {way}", one_spoil)
+        for way in WAYS
+        if way != "missing"
+        for one_spoil in [dataset_kind("rows", way).spoil]
+    ),
+    _predictions_hdf5("rows that do not exist", _instead("rows", np.array([0, 99]))),
+    _predictions_hdf5("rows below zero", _instead("rows", np.array([0, -1]))),
+    _predictions_hdf5("rows beyond 64 bits", _instead("rows", np.full(2, 2**64 - 1, np.uint64))),
+    _predictions_hdf5("rows that are a group", lambda file: _instead("rows", 1)(file)),
+    _predictions_hdf5("grasps in two groups", _grouped),
+    _predictions_hdf5("grasps beyond memory", _beyond),
+    _predictions_hdf5("NaN", _instead("grasps", np.full((2, 18), np.nan))),
+    _predictions_hdf5("17 numbers", _instead("grasps", np.zeros((2, 17)))),
+    _predictions_hdf5("a null space", _instead("grasps", h5py.Empty("f8"))),
+)
+
+
+def _npz(name: str, edit: Callable[[dict[str, Any]], object]) -> Kind:
+    """Return a kind of a prepared object, vouched for by its plan as whoever spoils it can."""
+
+    def spoil(path: Path) -> None:
+        with np.load(path, allow_pickle=False) as content:
+            values = dict(content)
+        edit(values)
+        buffer = io.BytesIO()
+        np.savez(buffer, **values)
+        path.write_bytes(buffer.getvalue())
+        _vouch(path)
+
+    return Kind(name, spoil)
+
+
+def _vouch(path: Path) -> None:
+    plan = path.with_suffix(".plan.h5")
+    with h5py.File(plan, "r+") as file:
+        file.attrs["model_sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
+    seal(plan)
+
+
+def _vouched(kind: Kind) -> Kind:
+    def spoil(path: Path) -> None:
+        kind.spoil(path)
+        _vouch(path)
+
+    return Kind(f"{kind.name}, vouched for", spoil)
+
+
+def _zip(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("name.npy", b"x")
+
+
+def _put(key: str, value: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda values: values.__setitem__(key, np.asarray(value))
+
+
+_NOT_OBJECTS = ("a directory", "a link to itself")
+MODEL: tuple[Kind, ...] = (
+    *ANY_FILE,
+    *(_vouched(kind) for kind in ANY_FILE if kind.name not in _NOT_OBJECTS),
+    _vouched(Kind("a zip of another", _zip)),
+    *(
+        _npz(f"{key} missing", lambda values, k=key: values.pop(k))
+        for key in ("name", "mass", "visual_vertices", "visual_faces", "notes", "friction", "up")
+    ),
+    *(
+        _npz(f"{key} {name}", _put(key, value))
+        for key, name, value in (
+            ("name", "is a number", 5),
+            ("name", "are two", ["a", "b"]),
+            ("name", "leads outside", "../../outside"),
+            ("class_name", "is a number", 5),
+            ("mass", "is a text", "x"),
+            ("mass", "is negative", -1.0),
+            ("mass", "is zero", 0.0),
+            ("mass", "is NaN", np.nan),
+            ("mass", "are two", [1.0, 2.0]),
+            ("scale", "is negative", -1.0),
+            ("scale", "is a text", "x"),
+            ("up", "is no axis", "north"),
+            ("friction", "is a text", "x"),
+            ("friction", "is negative", -1.0),
+            ("friction", "are two", [1.0, 2.0]),
+            ("collision_error", "is a text", "x"),
+            ("notes", "is a number", 5),
+            ("visual_vertices", "is empty", np.zeros((0, 3))),
+            ("visual_vertices", "is NaN", np.full((8, 3), np.nan)),
+            ("visual_vertices", "of two axes", np.zeros((8, 2))),
+            ("visual_vertices", "of texts", np.full((8, 3), "x")),
+            ("visual_faces", "after the last vertex", np.full((12, 3), 99, np.int32)),
+            ("visual_faces", "is negative", np.full((12, 3), -1, np.int32)),
+            ("visual_faces", "of fractions", np.full((12, 3), 0.5)),
+            ("collision_faces", "after the last vertex", np.full((12, 3), 99_999, np.int32)),
+            ("p_OOcm", "is NaN", np.full(3, np.nan)),
+            ("p_OOcm", "of four", np.zeros(4)),
+            ("I_OOcm_O", "is NaN", np.full((3, 3), np.nan)),
+            ("I_OOcm_O", "of zeros", np.zeros((3, 3))),
+        )
+    ),
+)
+#: Used where a table needs one of them.
+EMPTY = one_of(ANY_FILE, "empty")

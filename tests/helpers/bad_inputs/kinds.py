@@ -1,0 +1,104 @@
+"""A kind of bad input, and the kinds that every text file can have."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+#: Spoils a file.
+Spoil = Callable[[Path], object]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A way to spoil a file, and its name in the table."""
+
+    name: str
+    spoil: Spoil
+
+
+def _folder(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+def _loop(path: Path) -> None:
+    path.unlink()
+    path.symlink_to(path.name)
+
+
+def _cut(share: float) -> Spoil:
+    def cut(path: Path) -> None:
+        content = path.read_bytes()
+        path.write_bytes(content[: int(share * len(content))])
+
+    return cut
+
+
+def _write(content: bytes) -> Spoil:
+    return lambda path: path.write_bytes(content)
+
+
+#: Any file may be one of these.
+ANY_FILE = (
+    Kind("empty", _write(b"")),
+    Kind("a directory", _folder),
+    Kind("a link to itself", _loop),
+    Kind("cut to a tenth", _cut(0.1)),
+    Kind("cut in half", _cut(0.5)),
+    Kind("random bytes", _write(bytes(range(128, 256)) * 8)),
+    Kind("zeros", _write(bytes(4096))),
+)
+
+#: And a text file that must be JSON or YAML of mappings.
+ANY_TEXT = (
+    *ANY_FILE,
+    Kind("Latin-1", lambda path: path.write_bytes(path.read_bytes() + '\n"ü'.encode("latin-1"))),
+    Kind("UTF-16", lambda path: path.write_bytes(path.read_text().encode("utf-16"))),
+    Kind("nested too deeply", _write(b"[" * 100_000)),
+    Kind("a list", _write(b"[1, 2]")),
+    Kind("a text", _write(b'"manifest"')),
+    Kind("a number of 10,000 digits", _write(b"9" * 10_000)),
+)
+
+
+def one_of(kinds: Sequence[Kind], name: str) -> Kind:
+    (found,) = [kind for kind in kinds if kind.name == name]
+    return found
+
+
+class Workplace:
+    """A directory that is spoiled again and again, and put back.
+
+    Args:
+        pristine: What it holds when it is sound; it is not changed.
+        place: Where the copy goes.
+    """
+
+    def __init__(self, pristine: Path, place: Path) -> None:
+        self.pristine, self.place = pristine, place
+        shutil.copytree(pristine, place)
+        self.sound = self.content()
+
+    def content(self) -> dict[str, bytes | str]:
+        """Return what each path below the place holds."""
+        found: dict[str, bytes | str] = {}
+        for path in sorted(self.place.rglob("*")):
+            name = str(path.relative_to(self.place))
+            if path.is_symlink():
+                found[name] = f"-> {path.readlink()}"
+            elif path.is_dir():
+                found[name] = "folder"
+            else:
+                found[name] = path.read_bytes()
+        return found
+
+    def restore(self) -> None:
+        """Put back what differs."""
+        now = self.content()
+        if now == self.sound:
+            return
+        shutil.rmtree(self.place)
+        shutil.copytree(self.pristine, self.place)

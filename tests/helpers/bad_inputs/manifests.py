@@ -1,0 +1,153 @@
+"""Bad manifests, decisions of an inspection, lists of rejected trials, and logs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from helpers.bad_inputs.json_kinds import table, twice, value_kind
+from helpers.bad_inputs.kinds import ANY_TEXT, Kind
+
+_OBJECT = {
+    "name": "name",
+    "class": "name",
+    "mesh_sha256": "hash",
+    "scale": "positive",
+    "up": "axis",
+    "mass": "positive",
+    "density": "positive",
+    "collision_error": "not negative",
+    "X_TO": "pose",
+    "rolled": "truth",
+    "candidates": "count",
+    "combinations": "count",
+    "valid": "count",
+    "distinct": "count",
+    "notes": "list of texts",
+}
+MANIFEST: tuple[Kind, ...] = (
+    *ANY_TEXT,
+    *table(
+        {
+            ("schema_version",): "count",
+            ("config_hash",): "hash",
+            ("seed",): "count",
+            ("config",): "mapping",
+            ("versions",): "mapping",
+            ("versions", "drake"): "text",
+            ("fingers",): "mapping",
+            ("objects",): "list",
+            ("objects", 0): "mapping",
+            ("refused",): "list",
+            **{("objects", 0, key): of for key, of in _OBJECT.items()},
+            ("refused", 0): "mapping",
+            ("refused", 0, "name"): "name",
+            ("refused", 0, "mesh_sha256"): "hash",
+            ("refused", 0, "reason"): "text",
+            ("rejected",): "list",
+            ("rejected", 0): "mapping",
+            ("rejected", 0, "object"): "name",
+            ("rejected", 0, "candidate"): "count",
+            ("rejected", 0, "standoff_index"): "count",
+            ("config", "physics"): "mapping",
+            ("config", "seed"): "count",
+            ("config", "physics", "time_step"): "positive",
+        },
+        optional=(
+            ("fingers",),
+            ("rejected",),
+            ("rejected", 0),
+            ("refused", 0),
+            ("objects", 0),
+            ("versions", "drake"),
+            ("config", "physics"),
+            ("config", "seed"),
+            ("config", "physics", "time_step"),
+        ),
+    ),
+    *(value_kind(("objects", 0, "friction"), f"is {v}", v) for v in ("-1", "0", "NaN", '"x"')),
+    value_kind(("objects", 0, "licence"), "is a number", "5"),
+    value_kind(("objects", 0, "licence"), "steers", '"a\\u001bb"'),
+    value_kind(("objects", 0, "colour"), "is no key", "5"),
+    value_kind(("objects", 0, "X_TO"), "of 11 numbers", str([0.5] * 11)),
+    value_kind(("objects", 0, "X_TO"), "of texts", str(["x"] * 12).replace("'", '"')),
+    value_kind(("objects", 0, "X_TO"), "no rotation", str([0.5] * 12)),
+    value_kind(("objects", 0, "name"), "leads outside", '"../../outside"'),
+    value_kind(("objects", 0, "name"), "of another object", '"2_box_b"'),
+    value_kind(("objects", 0, "candidates"), "more than distinct", "5"),
+    value_kind(("objects", 0, "distinct"), "more than valid", "5"),
+    value_kind(("objects", 0, "valid"), "more than combinations", "5"),
+    value_kind(("fingers", "thumb"), "is a number", "5"),
+    value_kind(("schema_version",), "of the future", "999"),
+    value_kind(("seed",), "of another configuration", "12"),
+    value_kind(("config_hash",), "of another configuration", '"0123456789abcdef"'),
+    value_kind(("config", "colour"), "is no key", "5"),
+    value_kind(("config", "seed"), "beyond 64 bits", str(2**64)),
+    value_kind(("rejected", 0, "colour"), "is no key", "5"),
+    twice(("objects",)),
+    twice(("seed",)),
+)
+
+DECISIONS: tuple[Kind, ...] = (
+    *(kind for kind in ANY_TEXT),
+    *table(
+        {
+            ("version",): "count",
+            ("rejected",): "list",
+            ("kept",): "list",
+            ("rejected", 0): "mapping",
+            ("rejected", 0, "object"): "name",
+            ("rejected", 0, "candidate"): "count",
+            ("rejected", 0, "standoff_index"): "count",
+            ("kept", 0): "mapping",
+            ("kept", 0, "candidate"): "count",
+        },
+        optional=(("rejected", 0), ("kept", 0)),
+    ),
+    value_kind(("version",), "of the future", "2"),
+    value_kind(("rejected", 0, "object"), "that is not there", '"4_cup"'),
+    twice(("rejected",)),
+)
+
+
+def _line(text: bytes) -> Kind:
+    return Kind(f"the line {text[:20]!r}", lambda path: path.write_bytes(b"3\n" + text + b"\n"))
+
+
+#: A text of trial ids; 0 is a success, 1 is none.
+REJECTED_IDS: tuple[Kind, ...] = tuple(
+    _line(text)
+    for text in (
+        *(b"-1", b"1", b"1.5", b"nan", b"x", b"0 3", b"0,3", b"99999999", b"9" * 5000),
+        *(b"\xff\xfe", b"\x00", "²".encode(), "٣".encode()),
+    )
+)
+
+
+def _log(text: bytes) -> Kind:
+    name = f"the line {text[:30]!r}"
+
+    def spoil(path: Path) -> None:
+        path.write_bytes(path.read_bytes() + text + b"\n")
+
+    return Kind(name, spoil)
+
+
+#: Lines that no build writes, after sound ones.
+_DONE = b'{"time": "x", "event": "unit done", "object": "1_box_a", "outcomes": %b, "seconds": %b}'
+LOG: tuple[Kind, ...] = tuple(
+    _log(text)
+    for text in (
+        *(b"[]", b"5", b"null", b'"x"', b"{}", b"{", b"\xff", b"[" * 100_000, b"9" * 10_000),
+        *(b'{"event": 5}', b'{"event": null}', b'{"event": []}', b'{"event": "started"}'),
+        *(b'{"event": "started", "config_hash": 5}', b'{"event": "started", "config_hash": []}'),
+        *(b'{"event": "unit done"}', b'{"event": "unit done", "seconds": 5}'),
+        *(_DONE % (outcomes, b'{"try": 1}') for outcomes in (b"null", b"5", b"[]", b'"x"')),
+        *(_DONE % (b'{"success": %b}' % n, b'{"try": 1}') for n in (b"-3", b"NaN", b'"x"', b"0.5")),
+        *(_DONE % (b'{"success": 3}', seconds) for seconds in (b"5", b"[]", b'"x"', b"true")),
+        *(
+            _DONE % (b'{"success": 3}', b'{"try": %b}' % n)
+            for n in (b"-3", b"NaN", b'"x"', b"null", b"[]", b"1e999", b"1e308")
+        ),
+        *(_DONE % (b'{"other": 3}', b'{"try": 1}'), _DONE % (b'{"success": 3}', b'{"other": 1}')),
+    )
+)

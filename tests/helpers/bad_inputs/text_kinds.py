@@ -1,0 +1,195 @@
+"""Bad YAML files and bad options."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+from helpers.bad_inputs.kinds import ANY_TEXT, Kind
+
+#: Values of a key of YAML by the name of the way.
+VALUES: dict[str, Any] = {
+    "null": None,
+    "text": "x",
+    "list": [],
+    "list of lists": [[[]]],
+    "mapping": {"a": 1},
+    "truth value": True,
+    "negative": -1,
+    "zero": 0,
+    "NaN": float("nan"),
+    "infinite": float("inf"),
+    "huge": 10**30,
+    "date": "2026-01-01T00:00:00Z",
+}
+
+
+def _file(name: str, text: str | bytes) -> Kind:
+    content = text if isinstance(text, bytes) else text.encode()
+    return Kind(name, lambda path: path.write_bytes(content))
+
+
+#: Texts that are no YAML, or none that anybody reads.
+ANY_YAML: tuple[Kind, ...] = (
+    *(k for k in ANY_TEXT if k.name not in ("empty", "cut to a tenth", "cut in half", "UTF-16")),
+    _file("a tab", "a:\n\tb: 1\n"),
+    _file("an open bracket", "a: [1\n"),
+    _file("a tag of Python", "!!python/object/apply:os.getcwd []\n"),
+    _file("two documents", "a: 1\n---\nb: 2\n"),
+    _file("an alias of nothing", "a: *b\n"),
+    _file("an alias of itself", "a: &a [*a]\n"),
+    _file(
+        "aliases of aliases",
+        _bomb := "\n".join(
+            ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
+            + [f"a{k + 1}: &a{k + 1} [{', '.join([f'*a{k}'] * 10)}]" for k in range(9)]
+        ),
+    ),
+    _file("a key twice", "seed: 1\nseed: 2\n"),
+    _file("a key that is a list", "? [a]\n: 1\n"),
+    _file("a key that is a number", "5: 1\n"),
+    _file("a key that is nothing", "~: 1\n"),
+    _file("a number in base 60", "seed: 1:30\n"),
+    _file("a control character", "seed: \x07\n"),
+    _file("a text with a null byte", "seed: \x00\n"),
+)
+
+
+def keys(wrong: dict[str, tuple[str, ...]]) -> list[Kind]:
+    """Return kinds in which a key, dotted, has one of some wrong values."""
+    return [
+        Kind(f"{key} {way}", lambda path, k=key, w=way: _put(path, k, VALUES[w]))
+        for key, ways in wrong.items()
+        for way in ways
+    ]
+
+
+def without(*names: str) -> list[Kind]:
+    """Return kinds in which a key, dotted, is missing."""
+    return [Kind(f"{key} missing", lambda path, k=key: _put(path, k, ...)) for key in names]
+
+
+def _put(path: Path, key: str, value: Any) -> None:
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    *parents, last = (int(part) if part.isdecimal() else part for part in key.split("."))
+    node = content
+    for part in parents:
+        node = node[part]
+    if value is ...:
+        del node[last]
+    else:
+        node[last] = value
+    path.write_text(yaml.safe_dump(content))
+
+
+_NO_NUMBER = ("text", "list", "mapping", "truth value", "NaN", "infinite", "date")
+CONFIG: tuple[Kind, ...] = (
+    *ANY_YAML,
+    *keys(
+        {
+            "seed": (*_NO_NUMBER, "null", "negative", "huge"),
+            "builtin.seed": (*_NO_NUMBER, "negative", "huge"),
+            "candidates.max": (*_NO_NUMBER, "null", "negative", "zero", "huge"),
+            "unit_candidates": (*_NO_NUMBER, "negative", "zero", "huge"),
+            "max_grasps": (*_NO_NUMBER, "negative", "zero", "huge"),
+            "physics.time_step": (*_NO_NUMBER, "null", "negative", "zero", "huge"),
+            "lift.hold_time": (*_NO_NUMBER, "null", "negative", "huge"),
+            "camera.size": (*_NO_NUMBER, "null", "negative", "zero", "huge"),
+            "candidates.standoffs": (*_NO_NUMBER, "negative", "list of lists"),
+            "hand": ("list", "mapping", "truth value", "zero", "null"),
+            "split.train_classes": ("text", "mapping", "zero"),
+            "physics": ("text", "list", "truth value", "negative"),
+        }
+    ),
+)
+OBJECTS: tuple[Kind, ...] = (
+    *ANY_YAML,
+    *keys(
+        {
+            "units": ("text", "list", "mapping", "truth value", "zero"),
+            "licence": ("list", "mapping", "truth value"),
+            "objects": ("text", "list", "mapping", "truth value", "zero"),
+            "objects.1_box_a": ("text", "list", "mapping", "truth value", "zero"),
+            "objects.1_box_a.mass": (*_NO_NUMBER, "negative", "zero"),
+            "objects.1_box_a.density": (*_NO_NUMBER, "negative", "zero"),
+            "objects.1_box_a.friction": (*_NO_NUMBER, "negative", "zero"),
+            "objects.1_box_a.scale": (*_NO_NUMBER, "null", "negative", "zero"),
+            "objects.1_box_a.up": ("text", "list", "mapping", "truth value", "null", "zero"),
+            "objects.1_box_a.class": ("list", "mapping", "truth value"),
+            "objects.1_box_a.name": ("list", "mapping", "truth value"),
+        }
+    ),
+)
+HAND: tuple[Kind, ...] = (
+    *ANY_YAML,
+    *without(
+        "version",
+        "model",
+        "palm",
+        "fingers",
+        "standoffs",
+        "palm.link",
+        "palm.p_BG",
+        "fingers.0.name",
+        "fingers.0.fingertip",
+        "fingers.0.closing_joint",
+        "fingers.0.pad_point",
+    ),
+    *keys(
+        {
+            "version": (*_NO_NUMBER, "null", "negative", "zero"),
+            "model": ("text", "list", "mapping", "truth value", "null", "zero"),
+            "palm": ("text", "list", "mapping", "null"),
+            "palm.link": ("text", "list", "mapping", "null", "zero"),
+            "palm.p_BG": (*_NO_NUMBER, "null", "list of lists"),
+            "fingers": ("text", "list", "mapping", "null"),
+            "fingers.0": ("text", "list", "mapping", "null"),
+            "fingers.0.name": ("list", "mapping", "null", "zero"),
+            "fingers.0.fingertip": ("text", "list", "null"),
+            "fingers.0.closing_joint": ("text", "list", "null"),
+            "fingers.0.pad_point": (*_NO_NUMBER, "null"),
+            "fingers.0.required": ("text", "list", "null"),
+            "standoffs": (*_NO_NUMBER, "null", "negative", "list of lists"),
+            "closing_speed_deg": ("text", "list", "null", "negative", "zero", "NaN", "infinite"),
+            "drive": ("text", "list", "null", "zero"),
+        }
+    ),
+)
+
+_EXTREME = ("", " ", "x", "1.5", "nan", "inf", "1e3", "-1", str(10**30), "9" * 5000, "٣x")
+#: Options of `build` with the values that must be refused.
+OPTIONS: dict[str, tuple[str, ...]] = {
+    "--workers": (*_EXTREME, "0", str(2**31), "1000001"),
+    "--candidates": (*_EXTREME, "0"),
+    "--max-grasps": (*_EXTREME, "0"),
+    "--certify": _EXTREME,
+    "--seed": (*_EXTREME, str(2**64)),
+    "--per-class": (*_EXTREME, "0", "10001"),
+    "--objects-seed": (*_EXTREME, str(2**64)),
+    "--units": ("", " ", "x", "M", "inch"),
+    "--config": ("", " ", "x", ".", "nowhere.yaml", "\x00", "a" * 5000),
+    "--manifest": ("", " ", ".", "nowhere.yaml", "a" * 5000),
+    "--scheduler": ("", " "),
+    "--scheduler-file": ("", " ", ".", "nowhere.json"),
+    "--times": ("", " ", ".", "nowhere.json"),
+    "--out": ("", " ", "a" * 5000, "\x00"),
+    "--objects": ("", " ", "nowhere", "\x00", "a" * 5000),
+    "--set": (
+        *("", " ", "=", "x", "=1", "seed", "seed=", ".=1", "a..b=1", "physics=5", "physics.=5"),
+        *("seed.a=5", "seed=1.5", "seed=-1", f"seed={2**64}", f"seed={'9' * 5000}", "seed=nan"),
+        *("seed=[", "seed=!!python/object/apply:os.getcwd []", "seed=&a [*a]", "unit_candidates=0"),
+        *("unit_candidates=1e30", "candidates.max=1e300", "candidates.max=" + str(10**30)),
+        *("physics.time_step=0", "physics.time_step=nan", "physics.time_step=1e-320"),
+        *("physics.friction_hand=1e300", "physics.friction_table=1e300", "objects.mass=1e300"),
+        *("objects.mass=1e-320", "objects.max_collision_faces=1e30", "lift.hold_time=1e300"),
+        *("settle.max_time=1e300", "settle.drop_height=1e300", "camera.size=1e30"),
+        *("camera.distance=1e300", "attempt_seconds=1e300", "attempt_seconds=1e-320"),
+        *("certify.repeats=1e30", "max_grasps=1e30", "builtin.per_class=1e30"),
+        *("candidates.jitter_deg=1e300", "candidates.standoffs=[1e300]"),
+        *("candidates.global_x_deg=[1e300]", "hand=", "hand=.", "hand=nowhere", "hand=[1]"),
+        *("split.valid_fraction=1", "split.train_classes=[5]", "filters.max_slip=-1"),
+        *("certify.palm_noise=1e300", "randomize.mass=[2, 1]", "randomize.mass=[1e300, 1e300]"),
+        *("randomize.camera_shift=1e300", "lift.height=1e300", "close.speed=1e300"),
+    ),
+}

@@ -1,0 +1,176 @@
+"""What Drake is given: the object's mass properties, the materials, the solver, the motors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from helpers.objects import from_above, model_of, standing
+from pydrake.multibody.plant import DiscreteContactApproximation
+from pydrake.multibody.tree import RigidBody
+
+from drakegrasp.config import Config, override_config
+from drakegrasp.frames import X_WT
+from drakegrasp.hand.description import Hand
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.simulation.construction import (
+    build_scene,
+    object_friction,
+    object_inertia,
+    partner_friction,
+)
+from drakegrasp.simulation.scene import (
+    Scene,
+    advance,
+    closing_angles,
+    closing_rates,
+    finger_speed,
+    reset_attempt,
+)
+
+pytestmark = pytest.mark.sim
+
+#: A cone on its side: neither its centre of mass nor its principal axes are those of {O}.
+RADIUS, HEIGHT = 0.03, 0.1
+
+
+@pytest.fixture(scope="module")
+def cone(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
+    mesh = trimesh.creation.cone(radius=RADIUS, height=HEIGHT, sections=64)
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1, 0, 0]))
+    return model_of(mesh, tmp_path_factory.mktemp("cone"))
+
+
+def test_plant_has_the_mass_properties_of_the_model(cone: ObjectModel, config: Config) -> None:
+    assert np.linalg.norm(cone.p_OOcm) > 0.005
+    scene = build_scene(cone, config.physics)
+    M = scene.object.CalcSpatialInertiaInBodyFrame(scene.context)
+    assert M.get_mass() == pytest.approx(cone.mass)
+    np.testing.assert_allclose(M.get_com(), cone.p_OOcm, atol=1e-12)
+    about_com = M.Shift(M.get_com()).CalcRotationalInertia().CopyToFullMatrix3()
+    np.testing.assert_allclose(about_com, cone.I_OOcm_O, rtol=1e-9, atol=1e-12)
+    assert np.abs(np.triu(cone.I_OOcm_O, 1)).max() > 1e-5
+
+
+def test_another_mass_scales_the_inertia_and_not_the_centre(cone: ObjectModel) -> None:
+    M = object_inertia(cone, 3.0 * cone.mass)
+    assert M.get_mass() == pytest.approx(3.0 * cone.mass)
+    np.testing.assert_allclose(M.get_com(), cone.p_OOcm, atol=1e-12)
+    about_com = M.Shift(M.get_com()).CalcRotationalInertia().CopyToFullMatrix3()
+    np.testing.assert_allclose(about_com, 3.0 * cone.I_OOcm_O, rtol=1e-9, atol=1e-12)
+
+
+def properties(scene: Scene, body: RigidBody, group: str, name: str) -> list[object]:
+    """Return a proximity property of each shape of a body."""
+    inspector = scene.scene_graph.model_inspector()
+    return [
+        inspector.GetProximityProperties(geometry).GetProperty(group, name)
+        for geometry in scene.plant.GetCollisionGeometriesForBody(body)
+    ]
+
+
+def test_materials_are_the_configured_ones(cone: ObjectModel, config: Config, hand: Hand) -> None:
+    """None of them has its usual value: stiffness, dissipation and friction of each body."""
+    other = override_config(
+        config,
+        [
+            "physics.dissipation=3.5",
+            "physics.relaxation_time=0.07",
+            "physics.fingertip_modulus=2.5e5",
+            "physics.link_modulus=3.5e6",
+            "physics.table_modulus=4.5e6",
+            "physics.friction_hand=0.35",
+            "physics.friction_table=0.85",
+        ],
+    )
+    physics = other.physics
+    scene = build_scene(cone, physics, hand)
+    handles = scene.handles
+    assert handles is not None
+    palm = scene.plant.GetBodyByName(hand.palm_link, handles.instance)
+    own, held = object_friction(physics), partner_friction(0.35, physics)
+    assert (own, 2.0 * own * held / (own + held)) == (0.85, pytest.approx(0.35))
+    for body, modulus, friction in (
+        (scene.object, None, own),
+        (scene.table, 4.5e6, partner_friction(0.85, physics)),
+        (palm, 3.5e6, held),
+        *((tip, 2.5e5, held) for tip in handles.fingertips),
+    ):
+        assert set(properties(scene, body, "material", "hunt_crossley_dissipation")) == {3.5}
+        assert set(properties(scene, body, "material", "relaxation_time")) == {0.07}
+        for found in properties(scene, body, "material", "coulomb_friction"):
+            assert found.static_friction() == found.dynamic_friction() == pytest.approx(friction)
+        if modulus is not None:
+            assert set(properties(scene, body, "hydroelastic", "hydroelastic_modulus")) == {modulus}
+
+
+@pytest.mark.parametrize("solver", ["sap", "similar", "lagged"])
+def test_solver_and_step_are_the_configured_ones(
+    cone: ObjectModel, config: Config, hand: Hand, solver: str
+) -> None:
+    physics = override_config(
+        config, [f"physics.solver={solver}", "physics.time_step=0.003", "physics.coarse_steps=4"]
+    ).physics
+    scene = build_scene(cone, physics, hand)
+    assert scene.coarse_scene is not None
+    for plant, step in ((scene.plant, 0.003), (scene.coarse_scene().plant, 0.012)):
+        expected = DiscreteContactApproximation.__members__[f"k{solver.capitalize()}"]
+        assert plant.get_discrete_contact_approximation() == expected
+        assert plant.time_step() == pytest.approx(step)
+
+
+def test_open_hand_closes_at_its_speed(
+    scene: Scene, cube: ObjectModel, config: Config, hand: Hand
+) -> None:
+    """In the air, where nothing stops a finger."""
+    X_WO = X_WT @ standing(cube)
+    reset_attempt(scene, X_WO, X_WO @ from_above(cube, 0.3).X_OG, spread=0.0)
+    advance(scene, 0.3)
+    expected = 0.3 * np.asarray(hand.closing_speed)
+    np.testing.assert_allclose(closing_angles(scene), expected, rtol=0.05)
+    unit = hand.closing_unit
+    np.testing.assert_allclose(closing_rates(scene), hand.closing_speed / unit, rtol=0.05)
+    assert finger_speed(scene) == pytest.approx(np.abs(closing_rates(scene)).max())
+
+
+def test_the_arm_carries_the_hand(scene: Scene, cube: ObjectModel, config: Config) -> None:
+    """Only the object has a weight: the hand hangs still where nothing touches it."""
+    plant, handles = scene.plant, scene.handles
+    assert handles is not None
+    weightless = (handles.instance, handles.wrist_instance)
+    assert [plant.is_gravity_enabled(i) for i in weightless] == [False, False]
+    assert plant.is_gravity_enabled(scene.object.model_instance())
+
+
+def test_motors_are_those_of_the_hand_file(scene: Scene, hand: Hand) -> None:
+    handles = scene.handles
+    assert handles is not None
+    for motor, joint, finger in zip(
+        handles.motors, handles.closing_joints, hand.fingers, strict=True
+    ):
+        assert motor.joint().name() == joint.name() == finger.closing_joint
+        assert motor.effort_limit() == finger.effort_limit
+        assert motor.default_rotor_inertia() == finger.rotor_inertia
+        assert motor.default_gear_ratio() == finger.gear_ratio
+    for driven, finger in zip(handles.driven, hand.fingers, strict=True):
+        ratios = {joint.name(): ratio for joint, ratio in driven.items()}
+        coupled = {coupling.joint: coupling.ratio for coupling in finger.coupled}
+        assert ratios == {finger.closing_joint: 1.0, **coupled}
+
+
+def test_only_fingertips_of_different_fingers_meet(scene: Scene) -> None:
+    handles, plant = scene.handles, scene.plant
+    assert handles is not None
+    inspector = scene.scene_graph.model_inspector()
+    bodies = [plant.get_body(i) for i in plant.GetBodyIndices(handles.instance)]
+    tips = {body.name() for body in handles.fingertips}
+    for a in bodies:
+        for b in bodies:
+            meet = {
+                not inspector.CollisionFiltered(g, h)
+                for g in plant.GetCollisionGeometriesForBody(a)
+                for h in plant.GetCollisionGeometriesForBody(b)
+                if g != h
+            }
+            different = a.name() != b.name() and {a.name(), b.name()} <= tips
+            assert meet <= {different}, (a.name(), b.name())
