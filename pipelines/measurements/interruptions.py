@@ -22,7 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -191,13 +191,14 @@ def kill_in(
         The phase in which it died, how long its workers lived on [s], and whether the files were of
         one state.
     """
-    begun: dict[str, Callable[[], bool]] = {
-        "prepare": lambda: any(out.glob("objects/*.journal")),
-        "simulate": lambda: any(out.glob("shards/*/*.journal")),
-        "assemble": lambda: any(out.glob(".trials.hdf5.*.tmp")),
+    since = time.time()
+    signs = {
+        "prepare": "objects/*.journal",
+        "simulate": "shards/*/*.journal",
+        "assemble": ".trials.hdf5.*.tmp",
     }
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    while not begun[phase]() and process.poll() is None:
+    while not has_newer(out, signs[phase], since) and process.poll() is None:
         time.sleep(0.002)
     time.sleep(delay)
     workers = children(process.pid)
@@ -219,6 +220,17 @@ def kill_in(
         "orphans": orphans,
         "one state": has_one_state(out),
     }
+
+
+def has_newer(out: Path, pattern: str, since: float) -> bool:
+    """Return whether there is a file of a pattern that was changed since a time [s]."""
+    for path in out.glob(pattern):
+        try:
+            if path.stat().st_mtime >= since:
+                return True
+        except FileNotFoundError:
+            continue
+    return False
 
 
 def has_one_state(out: Path) -> bool:
