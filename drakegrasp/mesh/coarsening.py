@@ -115,6 +115,6 @@ def _deviation(vertices: Array, solid: Solid) -> float:
     """Return how far some vertices of the full surface are at most from the reduced one [m]."""
     count = min(DEVIATION_POINTS, len(vertices))
     points = vertices[np.linspace(0, len(vertices) - 1, count).astype(int)]
-    # In millimetres: trimesh (4) takes triangles with edges below a millimetre for degenerate.
+    # In millimetres: trimesh (5) takes triangles with edges below a millimetre for degenerate.
     surface = trimesh.Trimesh(1e3 * solid.vertices, solid.faces, process=False)
     return float(trimesh.proximity.closest_point(surface, 1e3 * points)[1].max()) / 1e3
