@@ -6,7 +6,8 @@
 Each object is one of SMALL under a new name, with 10,000 palm poses: those of SMALL again and
 again, in another order each time. Shards are written as a build writes them; the first copies of an
 object are made from rows, the others from its shards. The files are not
-assembled: the next command is `drakegrasp assemble OUT`. `drakegrasp check OUT` finds nothing.
+assembled: the next command is `drakegrasp assemble OUT`. `drakegrasp check OUT` finds that colours
+are not those of the new names, and nothing else.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
