@@ -1,4 +1,4 @@
-"""A step that hangs ends at its limit, whether it holds the interpreter's lock, computes or waits."""
+"""A step that hangs ends at its limit, with and without the lock of the interpreter."""
 
 from __future__ import annotations
 
