@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -147,14 +147,14 @@ def build_on(
         MachineError: If a worker would give other results than this machine.
     """
     config = with_hand_defaults(config)
-    with (
-        build_lock(out) as dead,
-        cluster as client,
-        admitted_workers(client, config) as kernel,
-    ):
+    with build_lock(out) as dead, ExitStack() as stack:
+        # A directory that cannot be used is refused before workers start.
+        claim_directory(out, config)
+        client = stack.enter_context(cluster)
+        kernel = stack.enter_context(admitted_workers(client, config))
+
         # The built-in objects become mesh files of the dataset.
         if sources is None:
-            claim_directory(out, config)
             with progress_bar("objects", "meshes", show=show) as report:
                 sources = builtin_sources(out / BUILTIN_FOLDER, config.builtin, report)
 
@@ -344,6 +344,10 @@ def _verify_on(
             return verify_batch(grasps, DaskExecutor(client), report, on_result)
 
 
+#: Processes on one machine; more are a mistyped number.
+MOST_PROCESSES = 10_000
+
+
 def _refuse_workers(
     workers: int | None, scheduler: str | None, scheduler_file: str | Path | None
 ) -> None:
@@ -358,3 +362,5 @@ def _refuse_workers(
         raise ConfigError("workers must not be given with a scheduler, which has its own")
     if workers is not None and workers < 1:
         raise ConfigError(f"workers must be at least 1, got {workers}")
+    if workers is not None and workers > MOST_PROCESSES:
+        raise ConfigError(f"workers must be at most {MOST_PROCESSES:,}, got {workers}")

@@ -7,6 +7,7 @@ everywhere else they are in radians. Use `load_config` to get a configuration.
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
@@ -29,13 +30,32 @@ from pydantic_core import PydanticCustomError
 from drakegrasp.errors import ConfigError, one_line
 from drakegrasp.yaml_text import parse_yaml
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=1)]
-NonNegativeCount = Annotated[int, Field(ge=0)]
+#: No quantity of ours is larger, or nearer to zero; sums of such numbers stay finite.
+LARGEST, SMALLEST = 1e12, 1e-12
+#: Counts are stored in 32 bits, seeds in 64.
+MOST, MOST_SEED = 2**31 - 1, 2**64 - 1
+
+
+def _refuse_tiny(value: float) -> float:
+    if value < SMALLEST:
+        raise ValueError(f"must be at least {SMALLEST:g}, got {value}")
+    return value
+
+
+Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
+Positive = Annotated[
+    float, Field(gt=0.0, le=LARGEST, allow_inf_nan=False), AfterValidator(_refuse_tiny)
+]
+NonNegative = Annotated[float, Field(ge=0.0, le=LARGEST, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1, le=MOST)]
+NonNegativeCount = Annotated[int, Field(ge=0, le=MOST)]
+Seed = Annotated[int, Field(ge=0, le=MOST_SEED)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
-Angles = Annotated[tuple[Annotated[float, Field(allow_inf_nan=False)], ...], Field(min_length=1)]
+Angles = Annotated[tuple[Number, ...], Field(min_length=1)]
+
+
+#: Characters that are shown of a wrong value.
+LONGEST_SHOWN = 200
 
 
 class _Section(BaseModel):
@@ -75,7 +95,7 @@ class BuiltinConfig(_Section):
     """
 
     per_class: Annotated[int, Field(ge=1, le=10_000)] = 2  # objects of each of the 64 classes
-    seed: Annotated[int, Field(ge=0)] = 0  # of the draw of their sizes, apart from the others
+    seed: Seed = 0  # of the draw of their sizes, apart from the others
 
 
 #: Longest coarse step that is allowed [s]; own choice, 24 ms are what was measured.
@@ -85,7 +105,7 @@ MAX_COARSE_STEP = 0.06
 class PhysicsConfig(_Section):
     """Contact and time stepping; reasons and sources in docs/explanation/physics.md."""
 
-    time_step: Annotated[float, Field(gt=0.0, le=0.02)] = 0.008  # [s]
+    time_step: Annotated[float, Field(ge=1e-6, le=0.02)] = 0.008  # [s]
     coarse_steps: Annotated[int, Field(ge=1, le=8)] = 3  # time steps in one coarse step of a lift
     friction_hand: Positive = 0.71  # effective coefficient between hand and object
     friction_table: Positive = 0.71  # effective coefficient between table and object
@@ -116,7 +136,7 @@ class SettleConfig(_Section):
     max_linear_speed: Positive = 1e-3  # [m/s], slower than this is at rest
     max_angular_speed: Positive = 1e-2  # [rad/s], slower than this is at rest
     rest_time: Positive = 0.2  # [s], at rest for this long
-    time_step: Annotated[float, Field(gt=0.0, le=0.02)] = (
+    time_step: Annotated[float, Field(ge=1e-6, le=0.02)] = (
         0.002  # [s]; longer ones tilt it in landing
     )
 
@@ -317,7 +337,7 @@ class Config(_Section):
     """Everything that decides what is in a dataset, except the meshes."""
 
     hand: str = "barrett"  # a hand in drakegrasp/models, or a path to a hand's YAML
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Seed = 0
     # Candidates in a work unit; None: 50, and of objects with more than 1,000 up to 400.
     unit_candidates: Count | None = None
     attempt_seconds: Positive = 60.0  # [s] of computing (CPU time) before an attempt is a `timeout`
@@ -406,10 +426,29 @@ def load_config(
             one line with the key's path, what it must be, and what it was.
     """
     tree = _read_source("paper" if source is None else source)
+    own = copy.deepcopy(tree)
     for text in overrides:
         _apply_override(tree, text)
     tree.update({key: value for key, value in values.items() if value is not None})
-    return parse_config(_with_absolute_hand(tree))
+    try:
+        return parse_config(_with_absolute_hand(tree))
+    except ConfigError:
+        # A mistake of the file by itself is told with its name.
+        if source is not None:
+            _refuse_mistakes(own, str(source))
+        raise
+
+
+def _refuse_mistakes(tree: dict[str, Any], name: str) -> None:
+    """Refuse what a preset or a file says by itself.
+
+    Raises:
+        ConfigError: If it cannot be used, with its name.
+    """
+    try:
+        parse_config(tree)
+    except ConfigError as error:
+        raise ConfigError(f"{name}: {error}") from None
 
 
 def override_config(config: Config, overrides: Sequence[str]) -> Config:
@@ -534,6 +573,8 @@ def describe_mistake(mistake: Any, *, whole: str, legal: str) -> str:
         return f"{path}: {message}"
     if kind in ("extra_forbidden", "unexpected_keyword_argument"):
         return f"{path}: must be {legal}, got an unknown one"
+    if kind == "invalid_key":
+        return f"{path}: must be a text to be a key, got {mistake['loc'][-1]!r}"
     if kind == "missing":
         return f"{path}: must be given, got nothing"
 
@@ -547,7 +588,15 @@ def describe_mistake(mistake: Any, *, whole: str, legal: str) -> str:
         "too_short": f"a list of at least {context.get('min_length')}",
         "too_long": f"a list of at most {context.get('max_length')}",
     }.get(kind, message.removeprefix("Input should be ").removeprefix("Input should "))
-    return f"{path}: must be {must}, got {mistake['input']!r}"
+    return f"{path}: must be {must}, got {_shown(mistake['input'])}"
+
+
+def _shown(value: Any) -> str:
+    """Return a value as it is shown, not all of a long one; Python prints no number of any size."""
+    try:
+        return repr(value)[:LONGEST_SHOWN]
+    except ValueError:
+        return "a number of too many digits"
 
 
 def _siblings(place: tuple[Any, ...]) -> list[str]:

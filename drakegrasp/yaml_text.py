@@ -14,22 +14,37 @@ import yaml
 MOST_VALUES = 1_000_000
 
 
+#: Brackets within each other; settings have three. PyYAML takes seconds for a thousand.
+DEEPEST = 100
+
+
+class _Loader(yaml.SafeLoader):
+    def fetch_flow_collection_start(self, TokenClass: type[yaml.Token]) -> None:
+        if self.flow_level >= DEEPEST:
+            raise yaml.YAMLError("values nested too deeply")
+        super().fetch_flow_collection_start(TokenClass)
+
+
 def parse_yaml(text: str | bytes) -> Any:
     """Return the content of a YAML text.
 
     Raises:
-        yaml.YAMLError: If it is no YAML, is nested too deeply, contains itself, or stands for more
-            than `MOST_VALUES` values.
+        yaml.YAMLError: If it is no YAML, is nested too deeply, contains itself, has a key twice, or
+            stands for more than `MOST_VALUES` values.
     """
-    loader = yaml.SafeLoader(text)
+    loader = _Loader(text)
     try:
         node = loader.get_single_node()
         if node is None:
             return None
         _refuse_large(node)
+        _refuse_twins(node)
         return loader.construct_document(node)
     except RecursionError:
         raise yaml.YAMLError("values nested too deeply") from None
+    except ValueError as error:
+        # A number of thousands of digits, or a date that no calendar has.
+        raise yaml.YAMLError(str(error)) from None
     finally:
         loader.dispose()
 
@@ -48,6 +63,25 @@ def _refuse_large(root: yaml.Node) -> None:
 
     if size(root) > MOST_VALUES:
         raise yaml.YAMLError(f"aliases that stand for more than {MOST_VALUES:,} values")
+
+
+def _refuse_twins(root: yaml.Node) -> None:
+    """Refuse a mapping with a key twice, of which PyYAML would take the last."""
+    nodes, seen = [root], set()
+    while nodes:
+        node = nodes.pop()
+        if id(node) in seen or isinstance(node, yaml.ScalarNode):
+            continue
+        seen.add(id(node))
+        nodes += _children(node)
+        keys = [
+            key.value
+            for key, _ in (node.value if isinstance(node, yaml.MappingNode) else ())
+            if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge"
+        ]
+        if len(set(keys)) < len(keys):
+            twice = next(key for key in keys if keys.count(key) > 1)
+            raise yaml.YAMLError(f"the key {twice!r} twice{str(node.start_mark).rstrip()}")
 
 
 def _children(node: yaml.Node) -> list[yaml.Node]:

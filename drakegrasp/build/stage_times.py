@@ -5,15 +5,18 @@ Out: `StageTimes`, from which `drakegrasp.build.estimate` makes a plan.
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated, Any
 
-from drakegrasp.config import Config
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from drakegrasp.config import Config, NonNegative, NonNegativeCount
 from drakegrasp.dataset.log import FILE_NAME, read_log
-from drakegrasp.errors import DataError
+from drakegrasp.errors import DataError, one_line
 from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.json_text import read_json
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,7 +28,9 @@ class StageTimes:
         scene: Building an object's scene and distance field, on each worker that needs it [s].
         attempt: An attempt, over all outcomes [s].
         look: Both images of a success [s].
-        assemble: Filters and files, per attempt, on one core [s].
+        survey: Reading shards before the files are assembled, per attempt [s].
+        pack: Packing rows and samples, per attempt [s].
+        put: What one process does of assembling, however many workers there are, per attempt [s].
         successes: Share of the attempts that succeed.
         samples: Share of the successes that the filters keep.
         unit_bytes: Of a shard without rows [B].
@@ -36,33 +41,38 @@ class StageTimes:
         source: Where the figures are from, for the reader.
     """
 
-    prepare: float
-    scene: float
-    attempt: float
-    look: float
-    assemble: float
-    successes: float
-    samples: float
-    unit_bytes: float
-    attempt_bytes: float
-    success_bytes: float
-    sample_bytes: float
-    object_bytes: float
+    prepare: NonNegative
+    scene: NonNegative
+    attempt: NonNegative
+    look: NonNegative
+    survey: NonNegative
+    pack: NonNegative
+    put: NonNegative
+    successes: NonNegative
+    samples: NonNegative
+    unit_bytes: NonNegative
+    attempt_bytes: NonNegative
+    success_bytes: NonNegative
+    sample_bytes: NonNegative
+    object_bytes: NonNegative
     source: str
 
 
 #: By the log and the files of thirty G3DB meshes with 400 palm poses each (34,800 attempts, preset
 #: `paper`, Drake 1.51.1, 2026-11-22) on two workers; files by `measure_storage` of
-#: `pipelines/measurements/measure_stages.py`.
+#: `pipelines/measurements/measure_stages.py`. Assembling, and the bytes of a unit, by 1.5 million
+#: attempts of `pipelines/measurements/synthetic_dataset.py`.
 MEASURED = StageTimes(
     prepare=3.2,
     scene=0.4,
     attempt=0.018,
     look=0.039,
-    assemble=0.0006,
+    survey=14e-6,
+    pack=21e-6,
+    put=2.0e-6,
     successes=0.0101,
     samples=0.43,
-    unit_bytes=151e3,
+    unit_bytes=27e3,
     attempt_bytes=278.0,
     success_bytes=66e3,
     sample_bytes=71e3,
@@ -78,12 +88,29 @@ def read_times(path: Path) -> StageTimes:
         DataError: If it holds anything else.
     """
     try:
-        return StageTimes(**json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, TypeError, ValueError) as error:
+        return TypeAdapter(StageTimes).validate_python(read_json(path), strict=False)
+    except (OSError, ValueError) as error:
         raise DataError(
             f"{path}: must be the output of pipelines/measurements/measure_stages.py, "
-            f"got other ({error})"
+            f"got other ({one_line(error)})"
         ) from None
+
+
+class _Unit(BaseModel):
+    """What the log says of a unit that was simulated."""
+
+    model_config = ConfigDict(strict=True)
+    object: str
+    outcomes: dict[str, NonNegativeCount]
+    seconds: Annotated[dict[str, NonNegative], Field(min_length=1)]
+
+
+def _unit_of(event: dict[str, Any]) -> _Unit | None:
+    """Return a unit of the log; None for one that was done before, and what no build writes."""
+    try:
+        return _Unit.model_validate(event)
+    except ValidationError:
+        return None
 
 
 def logged_times(out: Path, config: Config) -> StageTimes | None:
@@ -96,18 +123,20 @@ def logged_times(out: Path, config: Config) -> StageTimes | None:
         out: Directory of the dataset.
         config: Only units of this configuration count.
     """
+    # Add up the units of builds with this configuration.
     seconds: Counter[str] = Counter()
     outcomes: Counter[str] = Counter()
     objects = set()
     ours = False
     for event in read_log(out):
         if event["event"] == "started":
-            ours = event["config_hash"] == config.simulation_hash()
-        # A unit that was done before has no seconds.
-        elif ours and event["event"] == "unit done" and event["seconds"]:
-            seconds.update(event["seconds"])
-            outcomes.update(event["outcomes"])
-            objects.add(event["object"])
+            ours = event.get("config_hash") == config.simulation_hash()
+        elif ours and event["event"] == "unit done" and (unit := _unit_of(event)) is not None:
+            seconds.update(unit.seconds)
+            outcomes.update(unit.outcomes)
+            objects.add(unit.object)
+
+    # Their means; the log may have none.
     attempts, successes = outcomes.total(), outcomes[Outcome.SUCCESS.label]
     if not attempts:
         return None

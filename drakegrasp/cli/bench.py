@@ -11,6 +11,7 @@ import click
 from drakegrasp.build.request import BUILTIN
 from drakegrasp.cli.errors import say
 from drakegrasp.cli.options import (
+    PathType,
     builtin_overrides,
     manifest_option,
     objects_seed_option,
@@ -53,19 +54,19 @@ from drakegrasp.cli.options import (
 @click.option("--peer", "mujoco", is_flag=True, help="Run the same attempts in MuJoCo as well.")
 @click.option(
     "--cross-check",
-    type=(click.Path(path_type=Path), click.IntRange(min=1)),
+    type=(PathType(path_type=Path), click.IntRange(min=1)),
     metavar="OUT N",
     help="Instead, try N stored lifts of the dataset OUT again in MuJoCo.",
 )
 @click.option(
     "--compare",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    type=PathType(path_type=Path, exists=True, dir_okay=False),
     metavar="FILE",
     help="Print the ratios to this earlier report.",
 )
 @click.option(
     "--out",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=PathType(path_type=Path, dir_okay=False),
     default=Path("bench.json"),
     show_default=True,
     metavar="FILE",

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from drakegrasp.cli.errors import say
-from drakegrasp.cli.options import out_argument
+from drakegrasp.cli.options import PathType, out_argument
 
 #: The formats as the help lists them; loading them would take longer than printing the help.
 FORMATS = ("hf", "original", "dexgraspbench", "glb")
@@ -15,7 +15,7 @@ FORMATS = ("hf", "original", "dexgraspbench", "glb")
 
 @click.command()
 @out_argument
-@click.argument("directory", type=click.Path(path_type=Path), required=False)
+@click.argument("directory", type=PathType(path_type=Path), required=False)
 @click.option("--to", "form", type=click.Choice(FORMATS), required=True, help="The format.")
 @click.option(
     "--license",

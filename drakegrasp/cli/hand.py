@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from drakegrasp.cli.errors import say
+from drakegrasp.cli.options import PathType
 from drakegrasp.errors import printable
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ def list_hands() -> None:
 @click.argument("hand_file", metavar="NAME|YAML")
 @click.option(
     "--picture",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=PathType(path_type=Path, dir_okay=False),
     metavar="PNG",
     help="Write a picture of the hand, open and closed, with pads and palm frame.",
 )

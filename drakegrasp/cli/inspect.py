@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from drakegrasp.cli.errors import say
-from drakegrasp.cli.options import out_argument
+from drakegrasp.cli.options import PathType, out_argument
 
 #: Port without --port; the same every time, so that a tunnel to another machine can stay.
 PORT = 8321
@@ -26,7 +26,7 @@ PORT = 8321
 @click.option(
     "--static",
     "folder",
-    type=click.Path(path_type=Path),
+    type=PathType(path_type=Path),
     metavar="DIR",
     help="Write the pages to DIR as files that open without a server, and end.",
 )
@@ -58,8 +58,9 @@ def inspect_(out: Path, port: int, folder: Path | None, no_browser: bool) -> Non
     from drakegrasp.runtime.progress import progress_bar
 
     with progress_bar("inspect", "grasps") as progress:
-        count = write_site(out, folder, progress=progress)
-    say(f"{count:,} grasps in {folder / 'index.html'}")
+        site = write_site(out, folder, progress=progress)
+    rest = "" if site.grasps == site.successes else f", the most suspicious of {site.successes:,}"
+    say(f"{site.grasps:,} grasps in {folder / 'index.html'}{rest}")
 
 
 @click.command()
@@ -67,7 +68,7 @@ def inspect_(out: Path, port: int, folder: Path | None, no_browser: bool) -> Non
 @click.option(
     "--out",
     "folder",
-    type=click.Path(path_type=Path),
+    type=PathType(path_type=Path),
     metavar="DIR",
     help="Where to write.  [default: OUT/figures]",
 )
@@ -76,7 +77,7 @@ def inspect_(out: Path, port: int, folder: Path | None, no_browser: bool) -> Non
 )
 @click.option(
     "--compare",
-    type=click.Path(path_type=Path),
+    type=PathType(path_type=Path),
     metavar="OTHER",
     help="A dataset of the same objects by the other method of palm poses (candidates.method).",
 )

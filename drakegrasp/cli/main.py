@@ -23,6 +23,7 @@ from drakegrasp.cli.hand import hand
 from drakegrasp.cli.inspect import figures, inspect_
 from drakegrasp.cli.morph import morph
 from drakegrasp.cli.options import (
+    PathType,
     builtin_overrides,
     objects_seed_option,
     out_argument,
@@ -34,7 +35,7 @@ from drakegrasp.runtime.allocator import restart_with_jemalloc
 
 
 @click.command()
-@click.argument("directory", type=click.Path(path_type=Path), default=Path("."))
+@click.argument("directory", type=PathType(path_type=Path), default=Path("."))
 def doctor(directory: Path) -> None:
     """Check that this machine can run drakegrasp.
 
@@ -72,7 +73,7 @@ def list_objects() -> None:
 
 
 @objects.command("export")
-@click.argument("directory", type=click.Path(path_type=Path))
+@click.argument("directory", type=PathType(path_type=Path))
 @per_class_option
 @objects_seed_option
 def export_objects(directory: Path, per_class: int | None, objects_seed: int | None) -> None:
@@ -92,7 +93,7 @@ def export_objects(directory: Path, per_class: int | None, objects_seed: int | N
 
 
 @click.command()
-@click.argument("path", type=click.Path(path_type=Path), metavar="OUT|FILE", callback=tidied)
+@click.argument("path", type=PathType(path_type=Path), metavar="OUT|FILE", callback=tidied)
 def check(path: Path) -> None:
     """Check every invariant of a dataset.
 
@@ -116,7 +117,7 @@ def check(path: Path) -> None:
 @click.option("--trial", required=True, type=int, metavar="ID", help="Row of trials.hdf5.")
 @click.option(
     "--html",
-    type=click.Path(path_type=Path),
+    type=PathType(path_type=Path),
     metavar="FILE",
     help="Write a recording of the trial that plays in a browser.",
 )

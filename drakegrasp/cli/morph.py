@@ -7,11 +7,11 @@ from pathlib import Path
 import click
 
 from drakegrasp.cli.errors import say
-from drakegrasp.cli.options import manifest_option, units_option
+from drakegrasp.cli.options import PathType, manifest_option, units_option
 
 
 @click.command()
-@click.argument("mesh_dir", type=click.Path(path_type=Path))
+@click.argument("mesh_dir", type=PathType(path_type=Path))
 @click.option(
     "--per-mesh",
     required=True,
@@ -30,7 +30,7 @@ from drakegrasp.cli.options import manifest_option, units_option
 @click.option(
     "--out",
     required=True,
-    type=click.Path(path_type=Path),
+    type=PathType(path_type=Path),
     metavar="DIR",
     help="Directory of the morphs; new or empty.",
 )

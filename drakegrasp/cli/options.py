@@ -5,6 +5,7 @@ In: what click parsed. Out: a `BuildRequest`, with the configuration resolved.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,8 +13,26 @@ from typing import Any, TypeVar
 import click
 
 from drakegrasp.build.request import BUILTIN, BuildRequest
+from drakegrasp.errors import first_line
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+
+class PathType(click.Path):
+    """A path that a file can have."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Refuse what no file is called, as the text of a variable that is not set."""
+        text = os.fspath(value)
+        if not text.strip():
+            self.fail(f"must be a path, got {text!r}", param, ctx)
+        try:
+            os.lstat(text)
+        except (FileNotFoundError, NotADirectoryError, PermissionError):
+            pass
+        except (OSError, ValueError) as error:
+            self.fail(f"must be a path, got one that no file has ({first_line(error)})", param, ctx)
+        return super().convert(value, param, ctx)
 
 
 #: Which built-in objects there are, for every command that takes them.
@@ -38,7 +57,7 @@ units_option = click.option(
 )
 manifest_option = click.option(
     "--manifest",
-    type=click.Path(path_type=Path),
+    type=PathType(path_type=Path),
     metavar="FILE",
     help="YAML file with units and classes by mesh.  [default: objects.yaml beside the meshes]",
 )
@@ -51,7 +70,7 @@ set_option = click.option(
 )
 times_option = click.option(
     "--times",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    type=PathType(path_type=Path, exists=True, dir_okay=False),
     metavar="FILE",
     help="Estimate from these times, which measure_stages.py of pipelines/measurements printed.  "
     "[default: OUT/log.jsonl, else times measured on other meshes]",
@@ -69,7 +88,7 @@ _OPTIONS = (
     click.option(
         "--out",
         required=True,
-        type=click.Path(path_type=Path),
+        type=PathType(path_type=Path),
         metavar="DIR",
         help="Directory of the dataset. The same command continues an interrupted build.",
     ),
@@ -112,14 +131,22 @@ def tidied(context: click.Context, parameter: click.Parameter, out: Path) -> Pat
     return out
 
 
-out_argument = click.argument(
-    "out", type=click.Path(path_type=Path), metavar="OUT", callback=tidied
-)
+out_argument = click.argument("out", type=PathType(path_type=Path), metavar="OUT", callback=tidied)
 workers_option = click.option(
     "--workers",
     type=int,
     metavar="N",
     help="Processes on this machine.  [default: one per core]",
+)
+
+
+processes_option = click.option(
+    "--workers",
+    type=click.IntRange(1, 1024),
+    default=1,
+    show_default=True,
+    metavar="N",
+    help="Processes on this machine; the result is the same.",
 )
 
 
@@ -138,26 +165,26 @@ scheduler_option = click.option(
 )
 scheduler_file_option = click.option(
     "--scheduler-file",
-    type=click.Path(path_type=Path),
+    type=PathType(path_type=Path),
     metavar="FILE",
     help="Use the running Dask scheduler that wrote this file.",
 )
 _TLS_OPTIONS = (
     click.option(
         "--tls-ca-file",
-        type=click.Path(path_type=Path, exists=True, dir_okay=False),
+        type=PathType(path_type=Path, exists=True, dir_okay=False),
         metavar="FILE",
         help="Encrypt, with your own certificate authority (PEM); needs the next two options.",
     ),
     click.option(
         "--tls-cert",
-        type=click.Path(path_type=Path, exists=True, dir_okay=False),
+        type=PathType(path_type=Path, exists=True, dir_okay=False),
         metavar="FILE",
         help="Certificate of client, scheduler and workers, signed by that authority.",
     ),
     click.option(
         "--tls-key",
-        type=click.Path(path_type=Path, exists=True, dir_okay=False),
+        type=PathType(path_type=Path, exists=True, dir_okay=False),
         metavar="FILE",
         help="The certificate's private key.",
     ),

@@ -11,6 +11,7 @@ import click
 
 from drakegrasp.cli.errors import say
 from drakegrasp.cli.options import (
+    PathType,
     scheduler_file_option,
     scheduler_option,
     set_option,
@@ -22,18 +23,18 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("grasps", type=click.Path(path_type=Path), metavar="GRASPS")
+@click.argument("grasps", type=PathType(path_type=Path), metavar="GRASPS")
 @click.option(
     "--object",
     "mesh",
-    type=click.Path(path_type=Path),
+    type=PathType(path_type=Path),
     metavar="MESH",
     help="The object: a .obj, .stl, .ply or .glb file.",
 )
 @click.option("--units", metavar="m|cm|mm", help="Unit of length of the mesh.  [default: m]")
 @click.option(
     "--dataset",
-    type=click.Path(path_type=Path),
+    type=PathType(path_type=Path),
     metavar="FILE",
     help="Instead of --object: the data file OUT/grasping_oto.hdf5 or _otm. Each row gives the "
     "object, its pose and the camera's pose.",
@@ -50,7 +51,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--camera",
-    type=click.Path(path_type=Path),
+    type=PathType(path_type=Path),
     metavar="FILE",
     help="With --object and --frame camera: .npy file with the camera's pose in the table-top "
     "frame X_TC, as (4, 4), or per grasp as (n, 4, 4) or (n, 12).",
@@ -73,7 +74,7 @@ if TYPE_CHECKING:
 @set_option
 @click.option(
     "--out",
-    type=click.Path(path_type=Path),
+    type=PathType(path_type=Path),
     metavar="NAME",
     help="Write NAME.jsonl and NAME.h5 instead of printing lines of JSON.",
 )

@@ -12,13 +12,21 @@ from pathlib import Path
 from drakegrasp.config import Config, load_config
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError, GraspError
+from drakegrasp.frames import Array
+from drakegrasp.hand.file_format import read_hand_file
+from drakegrasp.hand.files import hand_file
 from drakegrasp.verification.placed_grasp import (
     PlacedGrasp,
     VerifyArguments,
     chosen_config,
     place_grasps,
 )
-from drakegrasp.verification.prediction import HDF5_SUFFIXES, read_numbers, read_predictions
+from drakegrasp.verification.prediction import (
+    HDF5_SUFFIXES,
+    read_grasps,
+    read_numbers,
+    read_predictions,
+)
 from drakegrasp.verification.result_files import refuse_unwritable
 
 #: The split of a dataset if none is named.
@@ -87,7 +95,17 @@ def _place(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
         dataset=data,
         rows=None if predicted.rows is None else predicted.rows.tolist(),
     )
-    return place_grasps(predicted.grasps, arguments), chosen_config(arguments)
+    chosen = chosen_config(arguments)
+    _refuse_no_grasps(request.grasps, predicted.grasps, chosen)
+    return place_grasps(predicted.grasps, arguments), chosen
+
+
+def _refuse_no_grasps(path: Path, grasps: Array, config: Config) -> None:
+    """Refuse numbers that are no grasps of the hand, with the name of their file."""
+    try:
+        read_grasps(grasps, len(read_hand_file(hand_file(config.hand)).fingers))
+    except GraspError as error:
+        raise GraspError(f"{path}: {error}") from None
 
 
 def _dataset_path(request: VerifyRequest) -> Path | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ipaddress
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -105,6 +106,12 @@ def describe(request: ClusterRequest) -> list[str]:
     return lines
 
 
+#: More memory than a worker has [B].
+MOST_MEMORY = 10**15
+#: A number of days, hours, minutes or seconds.
+_NUMBER = re.compile("[0-9]{1,6}")
+
+
 def walltime_seconds(text: str) -> float:
     """Return a time limit of SLURM in seconds.
 
@@ -115,8 +122,8 @@ def walltime_seconds(text: str) -> float:
     """
     days, dash, rest = text.partition("-") if "-" in text else ("0", "", text)
     parts = rest.split(":")
-    if not (days.isdigit() and all(p.isdigit() for p in parts) and len(parts) <= 3):
-        raise ConfigError(f"walltime must be a time of SLURM such as 02:00:00, got {text!r}")
+    if len(parts) > 3 or not all(_NUMBER.fullmatch(part) for part in (days, *parts)):
+        raise ConfigError(f"walltime must be a time of SLURM such as 02:00:00, got {text[:40]!r}")
     numbers = [int(p) for p in parts]
     if dash or len(numbers) == 3:
         hours, minutes, seconds = [*numbers, 0, 0][:3]
@@ -278,6 +285,9 @@ def memory_bytes(text: str) -> int:
         ConfigError: If the text is no such size.
     """
     try:
-        return int(parse_bytes(text))
-    except ValueError:
-        raise ConfigError(f"memory must be a size such as 2GB, got {text!r}") from None
+        size = int(parse_bytes(text)) if text.strip() and text.isascii() else 0
+    except (ValueError, OverflowError):
+        size = 0
+    if not 0 < size <= MOST_MEMORY:
+        raise ConfigError(f"memory must be a size such as 2GB, got {text[:40]!r}")
+    return size

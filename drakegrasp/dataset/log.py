@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from drakegrasp.runtime.files import open_own
+from drakegrasp.runtime.json_text import parse_json
 
 FILE_NAME = "log.jsonl"
 
@@ -54,17 +55,17 @@ class BuildLog:
 def read_log(out: Path) -> Iterator[dict[str, Any]]:
     """Yield the events of a directory's builds, oldest first; none if there is no log.
 
-    A line that a full disk has cut off is skipped.
+    A line that is no event is skipped, such as one that a full disk has cut off.
     """
     try:
-        file = (out / FILE_NAME).open(encoding="utf-8")
+        file = (out / FILE_NAME).open("rb")
     except OSError:
         return
     with file:
         for line in file:
             try:
-                event = json.loads(line)
+                event = parse_json(line)
             except ValueError:
                 continue
-            if isinstance(event, dict):
+            if isinstance(event, dict) and isinstance(event.get("event"), str):
                 yield event

@@ -31,7 +31,7 @@ from drakegrasp.config import (
     parse_config,
 )
 from drakegrasp.dataset import log as build_log
-from drakegrasp.dataset.layout.json_files import read_mapping, validated
+from drakegrasp.dataset.layout.json_files import Name, read_mapping, validated
 from drakegrasp.dataset.paths import FILE_NAME, OWN_FILES, OWN_FOLDERS
 from drakegrasp.dataset.rejections import AttemptKey, key_to_json
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, refuse_other_schema
@@ -42,19 +42,11 @@ from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_digest, hand_file
 from drakegrasp.runtime.file_set import refuse_half_replaced
 from drakegrasp.runtime.files import probe_folder, write_atomic
-from drakegrasp.runtime.names import NAME_RULE, is_name
 
 #: Packages whose versions may change a result.
 VERSIONED = ("drakegrasp", "drake", "numpy", "scipy", "trimesh", "manifold3d", "h5py")
 #: Versions that must not change within a dataset, nor between a client and its workers.
 REQUIRED_VERSIONS = ("drakegrasp", "drake", "hand")
-
-
-def _refuse_no_name(text: str) -> str:
-    """Refuse what would lead out of the directory as a file's name, or steer a terminal."""
-    if not is_name(text):
-        raise ValueError(f"a name must be {NAME_RULE}, got {text!r}")
-    return text
 
 
 def _refuse_no_pose(packed: tuple[float, ...]) -> tuple[float, ...]:
@@ -67,7 +59,6 @@ def _refuse_no_pose(packed: tuple[float, ...]) -> tuple[float, ...]:
 
 
 #: Types of what a manifest holds; they are checked when one is read.
-Name = Annotated[str, AfterValidator(_refuse_no_name)]
 Axis = Annotated[str, Field(pattern=r"^[+-][xyz]$")]
 Hex = Annotated[str, Field(pattern="^[0-9a-f]+$")]
 Licence = Annotated[str, Field(pattern=r"^[ -~]*[!-~][ -~]*$", max_length=200)]
@@ -118,13 +109,6 @@ class ObjectEntry:
     distinct: Whole
     notes: tuple[str, ...]
     licence: Licence | None = None
-
-    def __post_init__(self) -> None:
-        if not self.candidates <= self.distinct <= self.valid <= self.combinations:
-            raise ValueError(
-                "candidates must be at most distinct, valid and combinations, in this order, got "
-                f"{self.candidates}, {self.distinct}, {self.valid} and {self.combinations}"
-            )
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry as JSON types, in the order of the manifest."""
@@ -277,16 +261,8 @@ def read_manifest(out: Path) -> Manifest:
     except ConfigError as error:
         raise DataError(f"{path}: {error}") from None
 
-    # It must not contradict itself.
-    for key, said, must in (
-        ("config_hash", stored.config_hash, config.simulation_hash()),
-        ("seed", stored.seed, config.seed),
-    ):
-        if said != must:
-            raise DataError(f"{path}: {key} must be {must}, that of its config, got {said}")
-    twins = [name for name, n in Counter(entry.name for entry in stored.objects).items() if n > 1]
-    if twins:
-        raise DataError(f"{path}: objects must have a name each, got {twins[0]!r} twice")
+    if (mistake := next(_contradictions(stored, config), None)) is not None:
+        raise DataError(f"{path}: {mistake}")
     return Manifest(
         config=config,
         objects=stored.objects,
@@ -309,6 +285,30 @@ class _Stored(BaseModel):
     objects: tuple[ObjectEntry, ...]
     refused: tuple[RefusedMesh, ...]
     rejected: tuple[AttemptKey, ...] = ()
+
+
+def _contradictions(stored: _Stored, config: Config) -> Iterator[str]:
+    """Yield where a manifest contradicts itself, in words."""
+    for key, said, must in (
+        ("config_hash", stored.config_hash, config.simulation_hash()),
+        ("seed", stored.seed, config.seed),
+    ):
+        if said != must:
+            yield f"{key} must be {must}, that of its config, got {said}"
+
+    for name, count in Counter(entry.name for entry in stored.objects).items():
+        if count > 1:
+            yield f"objects must have a name each, got {name!r} twice"
+    for i, entry in enumerate(stored.objects):
+        numbers = (entry.candidates, entry.distinct, entry.valid, entry.combinations)
+        if list(numbers) != sorted(numbers):
+            yield (
+                f"objects.{i}: candidates, distinct, valid and combinations must rise, "
+                f"got {', '.join(map(str, numbers))}"
+            )
+        if entry.candidates > config.candidates.max:
+            most = config.candidates.max
+            yield f"objects.{i}.candidates must be at most {most}, got {entry.candidates}"
 
 
 def claim_directory(out: Path, config: Config) -> Manifest | None:

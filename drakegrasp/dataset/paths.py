@@ -7,8 +7,8 @@ from pathlib import Path
 
 from drakegrasp.dataset import lock as build_lock
 from drakegrasp.dataset import log as build_log
-from drakegrasp.dataset.layout.attributes import TEXT, attribute_mistakes
-from drakegrasp.dataset.layout.opening import opened, refuse_first
+from drakegrasp.dataset.layout.opening import opened
+from drakegrasp.dataset.layout.plans import refuse_other_plan
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import DataError
 from drakegrasp.runtime.files import refuse_broken_seal
@@ -67,12 +67,12 @@ def refuse_changed_object(out: Path, name: str) -> None:
     The plan is sealed, and holds the hash of the other file.
 
     Raises:
-        DataError: If a file is missing or has changed.
+        DataError: If a file is missing or has changed, or the plan is none.
     """
     path, model = plan_path(out, name), model_path(out, name)
     refuse_broken_seal(path, "plan of an object")
     with opened(path, "the plan of an object") as file:
-        refuse_first(path, attribute_mistakes(file, {"model_sha256": TEXT}))
+        refuse_other_plan(path, file)
         expected = file.attrs["model_sha256"]
     if not model.is_file() or model_file_sha256(out, name) != expected:
         got = "other content" if model.is_file() else "none"

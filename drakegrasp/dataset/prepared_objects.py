@@ -7,16 +7,14 @@ units, `check` and `replay` read these two files and do not need the mesh file.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from drakegrasp.config import Config
-from drakegrasp.dataset.layout.attributes import COUNT, NUMBER, TEXT, TRUTH, attribute_mistakes
-from drakegrasp.dataset.layout.opening import opened, refuse_first
+from drakegrasp.dataset.layout.opening import opened
+from drakegrasp.dataset.layout.plans import ARRAYS
 from drakegrasp.dataset.manifest import ObjectEntry
 from drakegrasp.dataset.paths import model_file_sha256, model_path, plan_path, refuse_changed_object
 from drakegrasp.errors import DataError
@@ -24,19 +22,6 @@ from drakegrasp.frames import Array
 from drakegrasp.objects.model import ObjectModel, load_object, save_object
 from drakegrasp.runtime.files import atomic_hdf5
 from drakegrasp.simulation.candidates import Candidates
-
-#: Shapes of the arrays of a plan; n palm poses.
-_ARRAYS: dict[str, tuple[int | None, ...]] = {
-    "X_TO": (4, 4),
-    "X_OG": (None, 4, 4),
-    "distance": (None,),
-}
-_ATTRIBUTES = {
-    **dict.fromkeys(("model_sha256", "config_hash", "mesh_sha256"), TEXT),
-    **dict.fromkeys(("combinations", "valid", "distinct"), COUNT),
-    "table_force": NUMBER,
-    "stopped": TRUTH,
-}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -117,10 +102,8 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
     # Both files must be as they were written, and of this configuration.
     refuse_changed_object(out, name)
     with opened(path, "the plan of an object") as file:
-        refuse_first(path, attribute_mistakes(file, _ATTRIBUTES))
-        refuse_first(path, _other_arrays(file))
         attributes = dict(file.attrs)
-        arrays = {key: file[key][:] for key in _ARRAYS}
+        arrays = {key: file[key][:] for key in ARRAYS}
     if attributes["config_hash"] != config.simulation_hash():
         raise DataError(
             f"{path}: must be of configuration {config.simulation_hash()}, "
@@ -144,20 +127,3 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
         table_force=float(attributes["table_force"]),
         stopped=bool(attributes["stopped"]),
     )
-
-
-def _other_arrays(file: h5py.File) -> Iterator[str]:
-    """Yield what the arrays of a plan have otherwise than `_ARRAYS`, in words."""
-    count: int | None = None
-    for name, expected in _ARRAYS.items():
-        dataset = file.get(name)
-        if not isinstance(dataset, h5py.Dataset):
-            yield f"/{name}: the dataset must be there, got none"
-            continue
-        if dataset.dtype != np.float64:
-            yield f"/{name}: type must be float64, got {dataset.dtype}"
-        found = dataset.shape or ()
-        count = found[0] if count is None and expected[0] is None and found else count
-        shape = tuple(count if length is None else length for length in expected)
-        if found != shape:
-            yield f"/{name}: shape must be {shape}, got {dataset.shape}"

@@ -18,7 +18,7 @@ import yaml
 
 from drakegrasp.dataset.card.content import card_content
 from drakegrasp.dataset.card.text import card_text
-from drakegrasp.dataset.hdf5 import open_hdf5
+from drakegrasp.dataset.layout.opening import open_samples
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.schema import CAMERAS, SPLITS, Field
 
@@ -129,7 +129,7 @@ def card(
 
 def _camera_text(out: Path) -> str:
     """Return how a pixel of a depth image is a point before the camera."""
-    with open_hdf5(out / DATA_FILES["oto"]) as file:
+    with open_samples(out / DATA_FILES["oto"]) as file:
         K, near, far = (np.asarray(file.attrs[name]).tolist() for name in ("K", "near", "far"))
     (fx, _, cx), (_, fy, cy) = K[:2]
     return f"""## Camera

@@ -240,12 +240,12 @@ def read_hand_file(path: Path) -> HandFile:
     """
     try:
         tree: Any = parse_yaml(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
         raise HandError(f"{path}: must be YAML, got text that is not ({one_line(error)})") from None
 
     # Another version may have other keys: its mistake is the version alone.
     version = tree.get("version", VERSION) if isinstance(tree, dict) else VERSION
-    if version != VERSION:
+    if type(version) is not int or version != VERSION:
         raise HandError(
             f"{path}: version: must be {VERSION}, the hand files that are read, got {version!r}"
         )

@@ -7,6 +7,7 @@ poses stay in the files.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,7 +71,8 @@ class AttemptTable:
         precision, stable: (n,) bool, see the schema.
         source, row: (n,) int32, number of the file that holds the attempt, and row in it.
         closed: (m,) int32, places of the attempts whose hand closed, in rising order.
-        features: By the names of FEATURES, (m,) float32, of these; the others have no values.
+        features: By the names of FEATURES, (m,) float32, of these; the others have no values. NaN
+            where an attempt did not get so far, infinite where a contact has no normal.
     """
 
     object: npt.NDArray[np.int32]
@@ -159,7 +161,7 @@ def read_shard_part(out: Path, header: ShardHeader, number: int, object_: int) -
     Raises:
         DataError: If it is missing or damaged.
     """
-    columns = read_trials(header.path(out), header, READ, verify_seal=False)
+    columns = read_trials(header.path(out), header, READ, verify_seal=False, complete=True)
     count = len(columns["outcome"])
     objects = np.full(count, object_, dtype=np.int32)
     return _part(columns, objects, number, np.arange(count, dtype=np.int32))
@@ -168,7 +170,7 @@ def read_shard_part(out: Path, header: ShardHeader, number: int, object_: int) -
 def read_sample_ids(out: Path) -> dict[str, npt.NDArray[np.int64]]:
     """Return the trial ids of the samples by split, in rising order; none without data files."""
     for camera in CAMERAS:
-        if (out / DATA_FILES[camera]).exists():
+        if os.path.lexists(out / DATA_FILES[camera]):
             with open_samples(out / DATA_FILES[camera]) as file:
                 return {split: file[split]["trial_id"][:] for split in SPLITS}
     return {split: np.zeros(0, dtype=np.int64) for split in SPLITS}
@@ -184,6 +186,27 @@ def join(parts: Sequence[AttemptTable]) -> AttemptTable:
         for name in _DTYPES
     }
     return _with_features(whole, ends)
+
+
+def rows_within(part: AttemptTable, wanted: int | None) -> tuple[AttemptTable, int | None]:
+    """Return the attempts of a shard that an object needs, and how many grasps it wants after it.
+
+    Assembly takes the same rows: with `max_grasps` they end with the last wanted grasp.
+
+    Args:
+        part: Attempts of the shard.
+        wanted: Number of grasps that the object still wants; None for all.
+    """
+    if wanted is None:
+        return part, None
+    (hits,) = np.nonzero(part.outcome == Outcome.SUCCESS)
+    if len(hits) < wanted:
+        return part, wanted - len(hits)
+    count = int(hits[wanted - 1]) + 1 if wanted else 0
+    few = int(np.searchsorted(part.closed, count))
+    plain = {name: getattr(part, name)[:count] for name in _DTYPES}
+    features = {name: values[:few] for name, values in part.features.items()}
+    return AttemptTable(**plain, closed=part.closed[:few], features=features), 0
 
 
 def empty_table() -> AttemptTable:
@@ -230,7 +253,12 @@ def _part(
     forces = np.where(lifted, few["lifted_f_Q_O"], few["closed_f_Q_O"])
     extra = {"suspicion": doubts.score, "force": norm(forces).max(axis=1, initial=-np.inf)}
 
-    features = {name: v.astype(np.float32) for name, v in (extra | dict(doubts.values)).items()}
+    # What a contact without a normal has no value of counts as the largest share: as infinite.
+    values = {
+        name: np.where(np.isnan(v) & np.isfinite(doubts.shares[name]), np.inf, v)
+        for name, v in doubts.values.items()
+    }
+    features = {name: v.astype(np.float32) for name, v in (extra | values).items()}
     return AttemptTable(
         object=objects.astype(np.int32),
         candidate=columns["candidate"].astype(np.int32),

@@ -32,7 +32,7 @@ import trimesh
 import yaml
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.config import describe_mistake
+from drakegrasp.config import Positive, describe_mistake
 from drakegrasp.errors import MeshError, one_line
 from drakegrasp.frames import Array
 from drakegrasp.mesh.loading import MANY_FACES, SUFFIXES, clean_triangles, parse_mesh, read_bytes
@@ -104,7 +104,7 @@ class MeshSource:
 # Finding meshes
 
 
-_Factor = Annotated[float, pydantic.Field(gt=0.0, allow_inf_nan=False)]
+_Factor = Positive
 
 
 _Line = Annotated[str, pydantic.Field(pattern=r"^[ -~]*[!-~][ -~]*$", max_length=200)]
@@ -117,7 +117,7 @@ class _Entry(pydantic.BaseModel):
     class_name: str | None = pydantic.Field(default=None, alias="class")
     name: str | None = None
     scale: _Factor = 1.0
-    up: str = "+z"
+    up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] = "+z"
     mass: _Factor | None = None
     density: _Factor | None = None
     friction: _Factor | None = None
@@ -191,10 +191,9 @@ def find_meshes(
             for path in directory.iterdir()
             if path.suffix.lower() in SUFFIXES and path.name[0] != "." and path.is_file()
         ]
-    except OSError as error:
-        raise MeshError(
-            f"{directory}: must be a directory of meshes, got: {error.strerror or error}"
-        ) from error
+    except (OSError, ValueError) as error:
+        got = getattr(error, "strerror", None) or error
+        raise MeshError(f"{directory}: must be a directory of meshes, got: {got}") from error
     if not paths:
         raise MeshError(
             f"{directory}: must hold at least one mesh ({', '.join(SUFFIXES)}), got none"

@@ -15,6 +15,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from drakegrasp.config import LARGEST
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.errors import GraspError, first_line
 from drakegrasp.frames import Array, as_numbers, invert_pose, rotate_vectors, transform_points
@@ -53,11 +54,12 @@ def read_grasps(grasps: npt.ArrayLike, fingers: int) -> tuple[Array, Array]:
             f"got an array of shape {array.shape}"
         )
     array = np.atleast_2d(array)
-    finite = np.isfinite(array)
-    if not finite.all():
-        row, number = np.argwhere(~finite)[0]
+    usable = np.abs(array) <= LARGEST  # false for NaN
+    if not usable.all():
+        row, number = np.argwhere(~usable)[0]
         raise GraspError(
-            f"{_of(array, row)}number {number + 1} must be finite, got {array[row, number]}"
+            f"{_of(array, row)}number {number + 1} must be finite, at most {LARGEST:g}, "
+            f"got {array[row, number]}"
         )
 
     # Points and normals, of which the latter are unit vectors.
@@ -205,7 +207,7 @@ def read_numbers(path: Path) -> Array:
         with path.open("rb") as file:
             array = np.lib.format.read_array(file, allow_pickle=False)
     # A damaged header may claim any size, hence the MemoryError.
-    except (OSError, EOFError, ValueError, MemoryError) as error:
+    except (OSError, EOFError, ValueError, TypeError, ArithmeticError, MemoryError) as error:
         raise GraspError(
             f"{path}: must be a .npy file of numbers, got none ({first_line(error)})"
         ) from None
@@ -257,7 +259,7 @@ def _read_hdf5(path: Path, split: str | None) -> Predictions:
                 return Predictions(grasps=grasps)
             rows = np.asarray(group[ROWS][()])
             place = _place(group, ROWS)
-    except (OSError, KeyError, RuntimeError) as error:
+    except (OSError, KeyError, RuntimeError, MemoryError) as error:
         raise GraspError(
             f"{path}: must be an HDF5 file with grasps, got none ({first_line(error)})"
         ) from None

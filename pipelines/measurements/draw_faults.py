@@ -48,7 +48,7 @@ MODULES = {
     "drakegrasp/hand/finger_sweep.py": ["tests/hand/test_finger_sweep.py", f"{_SIM}screen.py"],
     "drakegrasp/dataset/filters.py": [f"{_DATA}filters.py", f"{_DATA}assemble.py"],
     "drakegrasp/dataset/suspicion.py": [f"{_DATA}suspicion.py", f"{_DATA}assemble.py"],
-    "drakegrasp/dataset/samples.py": [f"{_DATA}assemble.py", f"{_CHECKS}samples.py"],
+    "drakegrasp/dataset/assembly/samples.py": [f"{_DATA}assemble.py", f"{_CHECKS}samples.py"],
     **{
         f"drakegrasp/dataset/checks/{name}.py": [f"{_CHECKS}{test}.py" for test in tests.split()]
         for name, tests in {

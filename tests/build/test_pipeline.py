@@ -16,7 +16,9 @@ from helpers.assertions import assert_same_dataset
 
 from drakegrasp.api import build_dataset
 from drakegrasp.build.pipeline import build, nothing_trains
+from drakegrasp.build.prepare import prepare_one
 from drakegrasp.build.replay import replay_trial
+from drakegrasp.build.work_unit import run_unit
 from drakegrasp.config import Config, SplitConfig, load_config, override_config
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
@@ -91,9 +93,10 @@ def _copy(dataset: Path, folder: Path) -> Path:
 
 
 def _nothing_runs(function: Callable, items: Iterable) -> Iterator:
+    """Run tasks that only read."""
     pending = list(items)
-    assert not pending, "nothing may be done again"
-    return iter(())
+    assert not pending or function not in (run_unit, prepare_one), "nothing may be done again"
+    return (function(item) for item in pending)
 
 
 def test_second_build_simulates_nothing(

@@ -33,7 +33,7 @@ def assert_same_bits(one: Mapping[str, Any], two: Mapping[str, Any]) -> None:
 )
 @given(st.integers(0, 40), st.integers(0, 3), st.integers(0, 2**32))
 def test_shard_comes_back_bit_by_bit(tmp_path: Path, trials: int, looks: int, seed: int) -> None:
-    shard = some_shard(trials=trials, looks=looks, seed=seed)
+    shard = some_shard(trials=trials, looks=min(looks, trials), seed=seed)
     back = read_shard(write_shard(tmp_path, shard), HEADER)
     assert back.header == HEADER
     assert_same_bits(back.trials, shard.trials)
@@ -113,7 +113,7 @@ def test_missing_column_is_refused(tmp_path: Path) -> None:
     with h5py.File(path, "r+") as file:
         del file["trials"]["outcome"]
     seal(path)
-    with pytest.raises(DataError, match=r"\.h5: must be a complete shard.*outcome"):
+    with pytest.raises(DataError, match=r"\.h5: /trials/outcome: the dataset must be there"):
         read_shard(path)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy.typing as npt
 
 from drakegrasp.dataset.schema import LOOK_FIELDS, Field, sizes
 from drakegrasp.dataset.shards import Shard, ShardHeader, trial_columns
+from drakegrasp.outcomes import Outcome
 
 SIZES = sizes(fingers=3, joints=8, image=8)
 
@@ -32,8 +34,15 @@ def column(field: Field, count: int, rng: np.random.Generator) -> npt.NDArray[An
 
 def some_shard(*, trials: int = 12, looks: int = 3, seed: int = 0) -> Shard:
     rng = np.random.default_rng(seed)
-    return Shard(
+    shard = Shard(
         header=HEADER,
         trials={f.name: column(f, trials, rng) for f in trial_columns()},
         looks={f.name: column(f, looks, rng) for f in LOOK_FIELDS},
+    )
+    # Two columns stand for something that there is.
+    outcome = (shard.trials["outcome"] % len(Outcome)).astype(np.uint8)
+    return replace(
+        shard,
+        trials={**shard.trials, "outcome": outcome},
+        looks={**shard.looks, "row": np.arange(looks, dtype=np.int32)},
     )

@@ -88,7 +88,7 @@ def test_what_triangles_do_not_say_is_in_the_manifest_and_in_the_digest(tmp_path
         ("objects: {a: {mass: heavy}}", r"objects\.a\.mass: .*number.*got 'heavy'"),
         ("objects: {a: {friction: yes}}", r"objects\.a\.friction: .*number"),
         ("objects: {a: {scale: .inf}}", r"objects\.a\.scale: .*finite"),
-        ("objects: {a: {up: y}}", r"up must be one of \+x, -x, \+y, -y, \+z, -z, got 'y'"),
+        ("objects: {a: {up: y}}", r"objects\.a\.up: must be .* or '-z', got 'y'"),
         ("objects: {a: {mass: 1, density: 2}}", "mass must not be given with density, got 1 kg"),
         ("units: inch", r"units: .*'m', 'cm' or 'mm'.*got 'inch'"),
         ("unit: cm", r"unit: must be a known key \(units, licence, objects\), got an unknown one"),

@@ -16,6 +16,7 @@ from drakegrasp.dataset.checks import consistency
 from drakegrasp.dataset.checks import trials as trial_rules
 from drakegrasp.dataset.checks.context import Context
 from drakegrasp.dataset.checks.open_file import OpenFile, Rule
+from drakegrasp.dataset.layout.attributes import ORIGIN, attribute_mistakes
 from drakegrasp.outcomes import Outcome
 
 #: Trials in a batch: some 10 MB.
@@ -45,7 +46,9 @@ def check_trials_file(trials: OpenFile, context: Context) -> None:
         candidates=None if objects is None else [entry.candidates for entry in objects],
         standoffs=None if standoffs is None else len(standoffs),
     )
-    fingers = json.loads(str(trials.file.attrs.get("fingers", "{}")))
+    wrong = {mistake.key for mistake in attribute_mistakes(trials.file, ORIGIN)}
+    named = "fingers" not in wrong and "fingers" in trials.file.attrs
+    fingers = json.loads(trials.file.attrs["fingers"]) if named else {}
     last: list[Rule] = [
         partial(trial_rules.verdicts, required=list(fingers.values()) or [True]),
         trial_rules.words,

@@ -6,7 +6,6 @@ is for `checks.layout`: that needs more than NumPy and h5py.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +15,7 @@ import numpy as np
 
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import printable
+from drakegrasp.runtime.json_text import parse_json
 
 
 def _is_text(value: Any) -> bool:
@@ -24,13 +24,13 @@ def _is_text(value: Any) -> bool:
 
 def _is_mapping(value: Any) -> bool:
     try:
-        return isinstance(value, str) and isinstance(json.loads(value), dict)
-    except (ValueError, RecursionError):
+        return isinstance(value, str) and isinstance(parse_json(value), dict)
+    except ValueError:
         return False
 
 
 def _is_truths(value: Any) -> bool:
-    return _is_mapping(value) and all(isinstance(v, bool) for v in json.loads(value).values())
+    return _is_mapping(value) and all(isinstance(v, bool) for v in parse_json(value).values())
 
 
 def _is_whole(value: Any) -> bool:

@@ -6,15 +6,27 @@ In: a file and a pydantic model. Out: the model, or a `DataError` that names the
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import AfterValidator, BaseModel, ValidationError
 
 from drakegrasp.config import describe_mistake
 from drakegrasp.errors import DataError, one_line, printable
 from drakegrasp.runtime.json_text import parse_json
+from drakegrasp.runtime.names import NAME_RULE, is_name
 
 M = TypeVar("M", bound=BaseModel)
+
+
+def _refuse_no_name(text: str) -> str:
+    """Refuse what would lead out of the directory as a file's name, or steer a terminal."""
+    if not is_name(text):
+        raise ValueError(f"a name must be {NAME_RULE}, got {text!r}")
+    return text
+
+
+#: The name of an object or a class.
+Name = Annotated[str, AfterValidator(_refuse_no_name)]
 
 
 def read_mapping(path: Path, what: str) -> tuple[dict[str, Any], bytes]:

@@ -109,7 +109,8 @@ def _extras(file: h5py.File, tables: Tables) -> Iterator[Difference]:
     for extra in sorted(set(file) - set(tables)):
         yield Difference(what="groups must be those of the schema", got=f"/{extra} too")
     for name, fields in tables.items():
-        group, paths = file.get(name), set()
+        group = file.get(name)
+        paths: set[str] = set()
 
         def visit(path: str, node: h5py.Dataset | h5py.Group, paths: set[str] = paths) -> None:
             if isinstance(node, h5py.Dataset):

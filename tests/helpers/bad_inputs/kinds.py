@@ -79,26 +79,31 @@ class Workplace:
 
     def __init__(self, pristine: Path, place: Path) -> None:
         self.pristine, self.place = pristine, place
-        shutil.copytree(pristine, place)
-        self.sound = self.content()
+        shutil.copytree(pristine, place, symlinks=True)
+        self.sound = self.state()
 
-    def content(self) -> dict[str, bytes | str]:
-        """Return what each path below the place holds."""
-        found: dict[str, bytes | str] = {}
-        for path in sorted(self.place.rglob("*")):
-            name = str(path.relative_to(self.place))
-            if path.is_symlink():
-                found[name] = f"-> {path.readlink()}"
-            elif path.is_dir():
-                found[name] = "folder"
-            else:
-                found[name] = path.read_bytes()
+    def state(self) -> dict[str, tuple[int, ...]]:
+        """Return what changes when something below the place is written or replaced."""
+        found = {}
+        for path in self.place.rglob("*"):
+            status = path.lstat()
+            times = () if path.is_dir() else (status.st_mtime_ns, status.st_size, status.st_ino)
+            found[str(path.relative_to(self.place))] = (status.st_mode, *times)
         return found
 
     def restore(self) -> None:
         """Put back what differs."""
-        now = self.content()
-        if now == self.sound:
-            return
-        shutil.rmtree(self.place)
-        shutil.copytree(self.pristine, self.place)
+        now = self.state()
+        for name in sorted(now.keys() | self.sound.keys()):
+            if now.get(name) == self.sound.get(name):
+                continue
+            path, source = self.place / name, self.pristine / name
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+            if source.is_dir():
+                shutil.copytree(source, path)
+            elif source.exists():
+                shutil.copyfile(source, path)
+        self.sound = self.state()

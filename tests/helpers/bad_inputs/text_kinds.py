@@ -50,7 +50,6 @@ ANY_YAML: tuple[Kind, ...] = (
     _file("a key that is a list", "? [a]\n: 1\n"),
     _file("a key that is a number", "5: 1\n"),
     _file("a key that is nothing", "~: 1\n"),
-    _file("a number in base 60", "seed: 1:30\n"),
     _file("a control character", "seed: \x07\n"),
     _file("a text with a null byte", "seed: \x00\n"),
 )
@@ -193,3 +192,15 @@ OPTIONS: dict[str, tuple[str, ...]] = {
         *("randomize.camera_shift=1e300", "lift.height=1e300", "close.speed=1e300"),
     ),
 }
+#: Options of the submission script under SLURM.
+CLUSTER_OPTIONS: dict[str, tuple[str, ...]] = {
+    "--workers": (*_EXTREME, "0"),
+    "--cores": (*_EXTREME, "0"),
+    "--memory": ("", " ", "x", "-1GB", "nan", "inf", "0", "0GB", "1e400GB", "1e30GB", "٣GB"),
+    "--walltime": (
+        *("", " ", "x", "-1:00:00", "00:00:00", "1:2:3:4", "1.5", "nan", "٣:00:00", "²"),
+        *("9" * 5000 + ":00:00", "1-", "-", "1:"),
+    ),
+}
+#: Ports that `inspect` cannot have.
+PORTS = ("", " ", "x", "-1", "65536", "1.5", "nan", "9" * 5000)
