@@ -1,8 +1,4 @@
-<<<<<<< HEAD
-"""A step that hangs ends at its limit, with and without the lock of the interpreter."""
-=======
 """A step that hangs ends at its limit, whatever it does, and what it was at is refused."""
->>>>>>> main
 
 from __future__ import annotations
 
