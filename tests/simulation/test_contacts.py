@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 from helpers.objects import CUBE, STANDOFF, from_above, standing
 
+from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, invert_pose, make_pose, transform_points
+from drakegrasp.hand.description import Hand
 from drakegrasp.hand.file_format import HalfSpace
 from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation import contacts as contacts_module
+from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.contacts import Contacts, bodies_on_object, read_contacts
 from drakegrasp.simulation.scene import Scene, advance, release, reset_attempt
 from drakegrasp.simulation.verdict import judge_closed
@@ -25,8 +28,9 @@ EVERYWHERE: tuple[HalfSpace, ...] = ()
 
 
 @pytest.fixture(scope="module")
-def closed(scene: Scene, cube: ObjectModel) -> Scene:
-    X_WO = X_WT @ standing(cube)
+def closed(cube: ObjectModel, config: Config, hand: Hand) -> Scene:
+    """A scene of its own, which no test changes: the hand closed on the cube."""
+    scene, X_WO = build_scene(cube, config.physics, hand), X_WT @ standing(cube)
     reset_attempt(scene, X_WO, X_WO @ from_above(cube, STANDOFF).X_OG, spread=0.0)
     advance(scene, 2.4)
     return scene
@@ -242,3 +246,14 @@ def test_rest_of_a_split_patch_counts_by_its_own_force(closed: Scene) -> None:
         physics = closed.physics.model_copy(update={"contact_force": factor * rest})
         strict = replace(closed, physics=physics)
         assert with_pads(strict, (beyond,), EVERYWHERE, EVERYWHERE).other_links == count
+
+
+def test_palm_on_the_object_is_another_link(scene: Scene, cube: ObjectModel) -> None:
+    """Open fingers, and the palm a millimetre deep in the top of the cube."""
+    X_WO = X_WT @ standing(cube)
+    reset_attempt(scene, X_WO, X_WO @ from_above(cube, -0.001).X_OG, spread=0.0)
+    found = read_contacts(scene)
+    assert not found.touching.any()
+    assert found.other_links == 1
+    palm = scene.plant.GetBodyByName(scene.handles.hand.palm_link)
+    assert bodies_on_object(scene) == {palm.index()}
