@@ -15,7 +15,7 @@ STAMP  := $(VENV)/.installed
 export LP_NUM_THREADS := 0
 export DRAKE_ALLOW_NETWORK := none
 
-.PHONY: FORCE help install demo test test-fast test-browser test-cluster lint format docs docs-pages clean
+.PHONY: FORCE help install demo test test-fast test-browser chromium test-cluster lint format docs docs-pages clean
 
 help:            ## what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -57,8 +57,11 @@ test: $(STAMP)   ## the whole test suite
 test-fast: $(STAMP)  ## without simulations and clusters
 	$(BIN)/python -m pytest -n 2 -m 'not sim and not cluster and not slow'
 
+test-browser: $(STAMP) chromium  ## the pages in Chromium, which it installs as root on Debian
+	$(BIN)/python -m pytest -m browser tests/inspection
+
 # Without root or apt-get the tests of pages run where Chromium is there, and else skip.
-test-browser: $(STAMP)  ## the pages in Chromium, which it installs as root on Debian
+chromium:        ## Chromium for the tests of pages, as root on Debian
 	@command -v chromium >/dev/null || command -v chromium-browser >/dev/null || \
 	if test "$$(id -u)" = 0 && command -v apt-get >/dev/null; then \
 	  apt-get update -qq && DEBIAN_FRONTEND=noninteractive \
@@ -67,7 +70,6 @@ test-browser: $(STAMP)  ## the pages in Chromium, which it installs as root on D
 	else \
 	  echo "Chromium is not here, and only root can install it: its tests skip"; \
 	fi
-	$(BIN)/python -m pytest -m browser tests/inspection
 
 test-cluster: $(STAMP)  ## with a real SLURM and a real sshd, which it installs; as root, on Debian
 	apt-get update -qq

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from drakegrasp.build.request import BUILTIN, BuildRequest
 from drakegrasp.build.stage_times import MEASURED, StageTimes
 from drakegrasp.config import Config
+from drakegrasp.dataset.assembly.pack import TASK_ROWS
 from drakegrasp.errors import ConfigError
 from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.builtin.classes import CLASSES
@@ -88,17 +89,22 @@ def plan_build(objects: int, config: Config, workers: int, times: StageTimes) ->
             raise ConfigError(f"{name} must be at most {MOST_WORKERS:,}, got {count}")
 
     # How much there is to do.
-    per_object = len(tuple(config.unit_ranges(config.candidates.max)))
-    units = objects * per_object
+    ranges = tuple(config.unit_ranges(config.candidates.max))
+    units = objects * len(ranges)
     standoffs = len(with_hand_defaults(config).candidates.drawn_standoffs)
     attempts = objects * config.candidates.max * standoffs
     successes = attempts * times.successes
     samples = successes * times.samples
 
-    # The mean work unit, and the scenes: all workers that share an object's units build its scene.
-    look = times.successes * (times.look + _certify_seconds(config))
-    unit = attempts / units * (times.attempt + look)
-    scenes = objects * min(workers, per_object)
+    # The mean attempt, and the scenes: all workers that share an object's units build its scene.
+    attempt = times.attempt + times.successes * (times.look + _certify_seconds(config))
+    scenes = objects * min(workers, len(ranges))
+    longest = standoffs * max(map(len, ranges)) * attempt
+
+    # Assembling: a task for each object, then one for some rows each. Meanwhile one process puts
+    # what is packed into the files.
+    survey = _shared(objects, workers, attempts / objects * times.survey)
+    pack = _shared(math.ceil(attempts / TASK_ROWS), workers, TASK_ROWS * times.pack)
 
     return Plan(
         objects=objects,
@@ -108,8 +114,9 @@ def plan_build(objects: int, config: Config, workers: int, times: StageTimes) ->
         stages={
             "start": START_SECONDS,
             "prepare": _shared(objects, workers, times.prepare),
-            "simulate": _shared(units, workers, unit) + math.ceil(scenes / workers) * times.scene,
-            "assemble": attempts * times.assemble,
+            "simulate": max(_shared(units, workers, attempts / units * attempt), longest)
+            + math.ceil(scenes / workers) * times.scene,
+            "assemble": survey + max(pack, attempts * times.put),
         },
         samples=round(samples),
         bytes=(

@@ -111,9 +111,9 @@ class BuildEvents:
             errors=summary.errors,
         )
 
-    def damaged_shard(self, error: Exception) -> None:
+    def damaged_shard(self, reason: str) -> None:
         """Log why a shard is run again."""
-        self._log("damaged shard", reason=str(error))
+        self._log("damaged shard", reason=reason)
 
     def finished(self, *, simulated: int, reused: int, seconds: float) -> None:
         """Log the end of the build: numbers of work units, and its duration [s]."""

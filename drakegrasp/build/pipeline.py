@@ -14,10 +14,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from drakegrasp.build.counts import NAMED, Counts
+from drakegrasp.build.done_units import find_tasks, find_units
 from drakegrasp.build.events import BuildEvents
 from drakegrasp.build.payload import too_heavy
 from drakegrasp.build.prepare import PrepareTask, prepare_one
-from drakegrasp.build.work_unit import WorkUnit, find_outcomes, run_unit
+from drakegrasp.build.work_unit import WorkUnit, run_unit
 from drakegrasp.config import Config, SplitConfig
 from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
 from drakegrasp.dataset.card.files import write_card
@@ -34,7 +35,6 @@ from drakegrasp.dataset.manifest import (
     write_manifest,
 )
 from drakegrasp.dataset.prepared_objects import load_prepared
-from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import is_assembled
 from drakegrasp.errors import DataError, DrakegraspError
 from drakegrasp.hand.description import load_hand
@@ -205,10 +205,10 @@ def _build(
         sweep_temporary(out)
 
     # Assemble the shards, unless the files are of these very shards already.
-    stale = not is_assembled(out, verify_shards=True)
+    stale = not is_assembled(out, verify_shards=True, execute=job.execute)
     if stale:
-        with progress_bar("assemble", "shards", show=job.show) as report:
-            assemble_locked(out, manifest, progress=report)
+        with progress_bar("assemble", "tasks", show=job.show) as report:
+            assemble_locked(out, manifest, execute=job.execute, progress=report)
     else:
         write_card(out)  # the licence of a mesh may be stated otherwise now
 
@@ -353,10 +353,13 @@ def _run_all(manifest: Manifest, job: _Job, report: Report) -> Counts:
 
         job.pool.on_change = change
 
-    # Units are looked up only as there is room for them: by then an object may have enough grasps.
+    # What an earlier build has done is not done again.
+    done = _count_done(manifest, job, counts)
+
+    # An object may have enough grasps by the time that there is room for its next unit.
     def units() -> Iterator[WorkUnit]:
         for header in manifest.headers():
-            if counts.needs(header) and not _is_done(header, counts, job):
+            if counts.needs(header) and header.start not in done[header.object_name]:
                 yield WorkUnit(
                     out=str(job.out), header=header, config=config, restartable=restartable
                 )
@@ -369,21 +372,18 @@ def _run_all(manifest: Manifest, job: _Job, report: Report) -> Counts:
     return counts
 
 
-def _is_done(header: ShardHeader, counts: Counts, job: _Job) -> bool:
-    """Return whether a unit's shard is complete; count it, or count its damage."""
-    try:
-        outcomes = find_outcomes(job.out, header)
-    except DataError as error:
-        counts.add_damaged(str(header.path(job.out).relative_to(job.out)))
-        job.events.damaged_shard(error)
-        return False
-    if outcomes is None:
-        return False
-    # A process may have died after it wrote the shard and before it removed the journal.
-    header.journal_path(job.out).unlink(missing_ok=True)
-    counts.reused += 1
-    counts.add(header, outcomes, reused=True)
-    return True
+def _count_done(manifest: Manifest, job: _Job, counts: Counts) -> dict[str, set[int]]:
+    """Return where the work units begin that are done, by object; count them, and the damage."""
+    done: dict[str, set[int]] = {entry.name: set() for entry in manifest.objects}
+    for found in job.execute(find_units, find_tasks(job.out, manifest)):
+        for header, outcomes in found.done:
+            done[header.object_name].add(header.start)
+            counts.reused += 1
+            counts.add(header, outcomes, reused=True)
+        for path, reason in found.damaged:
+            counts.add_damaged(path)
+            job.events.damaged_shard(reason)
+    return done
 
 
 def _count(names: Sequence[str], what: str, total: int | None = None) -> str:

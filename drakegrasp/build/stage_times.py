@@ -28,7 +28,9 @@ class StageTimes:
         scene: Building an object's scene and distance field, on each worker that needs it [s].
         attempt: An attempt, over all outcomes [s].
         look: Both images of a success [s].
-        assemble: Filters and files, per attempt, on one core [s].
+        survey: Reading shards before the files are assembled, per attempt [s].
+        pack: Packing rows and samples, per attempt [s].
+        put: What one process does of assembling, however many workers there are, per attempt [s].
         successes: Share of the attempts that succeed.
         samples: Share of the successes that the filters keep.
         unit_bytes: Of a shard without rows [B].
@@ -43,7 +45,9 @@ class StageTimes:
     scene: NonNegative
     attempt: NonNegative
     look: NonNegative
-    assemble: NonNegative
+    survey: NonNegative
+    pack: NonNegative
+    put: NonNegative
     successes: NonNegative
     samples: NonNegative
     unit_bytes: NonNegative
@@ -56,16 +60,19 @@ class StageTimes:
 
 #: By the log and the files of thirty G3DB meshes with 400 palm poses each (34,800 attempts, preset
 #: `paper`, Drake 1.51.1, 2026-11-22) on two workers; files by `measure_storage` of
-#: `pipelines/measurements/measure_stages.py`.
+#: `pipelines/measurements/measure_stages.py`. Assembling, and the bytes of a unit, by 1.5 million
+#: attempts of `pipelines/measurements/synthetic_dataset.py`.
 MEASURED = StageTimes(
     prepare=3.2,
     scene=0.4,
     attempt=0.018,
     look=0.039,
-    assemble=0.0006,
+    survey=14e-6,
+    pack=21e-6,
+    put=2.0e-6,
     successes=0.0101,
     samples=0.43,
-    unit_bytes=151e3,
+    unit_bytes=27e3,
     attempt_bytes=278.0,
     success_bytes=66e3,
     sample_bytes=71e3,

@@ -38,7 +38,7 @@ def audit(
     object on the table, and refuses one that does not come to rest.
     Exit code 1 if every mesh is refused.
     """
-    from drakegrasp.cli.tables import ROOMY, audit_line, audit_table, make_console
+    from drakegrasp.cli.tables import ROOMY, audit_line, audit_table, make_console, memory_line
     from drakegrasp.objects.audit import audit as audit_meshes
     from drakegrasp.runtime.files import atomic_path, write_atomic
     from drakegrasp.runtime.progress import progress_bar
@@ -48,6 +48,8 @@ def audit(
     console = make_console()
     console.print(audit_table(rows, compact=console.width < ROOMY))
     say(audit_line(rows))
+    if line := memory_line(rows):
+        say(line)
 
     if json_file is not None:
         text = json.dumps([row.to_json() for row in rows], indent=1, ensure_ascii=False)

@@ -13,6 +13,7 @@ from drakegrasp.cli.options import (
     build_options,
     out_argument,
     parse_request,
+    processes_option,
     scheduler_file_option,
     scheduler_option,
     times_option,
@@ -91,19 +92,27 @@ def build(
     help="Change a setting of the filters or the split, e.g. filters.outlier_sigma=3; may be given "
     "several times.",
 )
-def assemble(out: Path, reject: Path | None, overrides: tuple[str, ...]) -> None:
+@processes_option
+def assemble(out: Path, reject: Path | None, overrides: tuple[str, ...], workers: int) -> None:
     """Filter and split again, without simulating.
 
-    The command writes trials.hdf5 and both data files again from the shards in OUT.
+    The command writes trials.hdf5 and both data files again from the shards in OUT. What a
+    reject.json names and is no success of the dataset is skipped, and named.
     """
     from drakegrasp.dataset.assemble import assemble as assemble_files
-    from drakegrasp.dataset.rejections import read_rejected
+    from drakegrasp.dataset.manifest import read_manifest
+    from drakegrasp.dataset.rejections import read_rejected, unused_rejections
+    from drakegrasp.runtime.executor import processes
     from drakegrasp.runtime.progress import progress_bar
 
     rejected = () if reject is None else read_rejected(reject)
-    with progress_bar("assemble", "shards") as progress:
-        assemble_files(out, overrides=overrides, rejected=rejected, progress=progress)
+    with processes(workers) as execute, progress_bar("assemble", "tasks") as progress:
+        assemble_files(
+            out, overrides=overrides, rejected=rejected, execute=execute, progress=progress
+        )
     print_stats(out)
+    for sentence in unused_rejections(out, rejected, read_manifest(out).rejected):
+        say(sentence)
 
 
 @click.command()

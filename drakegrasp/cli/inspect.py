@@ -58,8 +58,9 @@ def inspect_(out: Path, port: int, folder: Path | None, no_browser: bool) -> Non
     from drakegrasp.runtime.progress import progress_bar
 
     with progress_bar("inspect", "grasps") as progress:
-        count = write_site(out, folder, progress=progress)
-    say(f"{count:,} grasps in {folder / 'index.html'}")
+        site = write_site(out, folder, progress=progress)
+    rest = "" if site.grasps == site.successes else f", the most suspicious of {site.successes:,}"
+    say(f"{site.grasps:,} grasps in {folder / 'index.html'}{rest}")
 
 
 @click.command()

@@ -140,6 +140,16 @@ workers_option = click.option(
 )
 
 
+processes_option = click.option(
+    "--workers",
+    type=click.IntRange(1, 1024),
+    default=1,
+    show_default=True,
+    metavar="N",
+    help="Processes on this machine; the result is the same.",
+)
+
+
 def _address(context: click.Context, parameter: click.Parameter, text: str | None) -> str | None:
     """Refuse an empty address, as of a variable that is not set."""
     if text is not None and not text.strip():

@@ -15,6 +15,7 @@ from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.statistics import Funnel, SplitCount, Unfinished
 from drakegrasp.errors import printable
 from drakegrasp.objects.audit import AuditRow
+from drakegrasp.objects.memory import needed_limit
 from drakegrasp.outcomes import Outcome
 
 #: Short heads of the outcomes, in the order of the funnel.
@@ -160,6 +161,7 @@ def audit_table(rows: Sequence[AuditRow], *, compact: bool = False) -> Table:
         table.add_column(escape("wall\n[mm]"), justify="right", no_wrap=True)
         table.add_column(escape("contact\n[mm]"), justify="right", no_wrap=True)
         table.add_column(escape("memory\n[MB]"), justify="right", no_wrap=True)
+        table.add_column(escape("prepare\n[MB]"), justify="right", no_wrap=True)
     table.add_column("notes, and what may be wrong (!)", overflow="fold")
 
     # A row each.
@@ -179,6 +181,7 @@ def audit_table(rows: Sequence[AuditRow], *, compact: bool = False) -> Table:
                 "-" if row.wall is None else f"{1e3 * row.wall:.1f}",
                 "-" if row.collision_error is None else f"{1e3 * row.collision_error:.1f}",
                 "-" if row.memory is None else f"{row.memory / 1e6:.0f}",
+                "-" if row.preparing is None else f"{row.preparing / 1e6:.0f}",
             ]
         words = [*row.notes, *(f"! {text}" for text in row.warnings)]
         table.add_row(*cells, "\n".join(map(_safe, words)))
@@ -196,6 +199,19 @@ def audit_line(rows: Sequence[AuditRow]) -> str:
     told = ", ".join(f"{counts[status]} {status}" for status in ("fit", "repaired", "refused"))
     warned = sum(bool(row.warnings) for row in rows)
     return f"{len(rows)} meshes: {told}; {warned} with a warning (!)"
+
+
+def memory_line(rows: Sequence[AuditRow]) -> str:
+    """Return what a worker must have to prepare the largest mesh; empty if none can be read."""
+    known = {row.name: row.preparing for row in rows if row.preparing is not None}
+    if not known:
+        return ""
+    largest = max(known, key=lambda name: known[name])
+    limit = needed_limit(known[largest])
+    return (
+        f"preparing takes up to {known[largest] / 1e6:.0f} MB of a worker ({printable(largest)}): "
+        f"--memory must be {limit / 1e6:.0f}MB or more"
+    )
 
 
 def verdict_table(outcomes: Sequence[Outcome]) -> Table:

@@ -1,22 +1,42 @@
 """From shards to trials.hdf5, grasping_oto.hdf5 and grasping_otm.hdf5, and their data card.
 
 In: a directory whose work units are all done. Out: the three files, all or none, and their card.
-Two passes over the shards keep memory at the images of one shard and a few numbers per success,
-whatever the size of the dataset. Imports no Drake.
+The work is done in tasks, by an `Executor`: `assembly.survey` reads the shards of an object,
+`assembly.pack` makes the compressed chunks of some rows. This process decides which successes are
+samples, and puts the chunks into the files. It keeps a few numbers per success, whatever the
+number of attempts. Imports no Drake.
 """
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import islice, takewhile
 from pathlib import Path
 
 import h5py
 import numpy as np
 import numpy.typing as npt
 
+from drakegrasp.dataset.assembly.pack import (
+    TASK_ROWS,
+    PackTask,
+    Part,
+    ShardSlice,
+    pack_rows,
+    unpack_rows,
+)
+from drakegrasp.dataset.assembly.samples import TEXTS, SampleRows
+from drakegrasp.dataset.assembly.survey import (
+    Survey,
+    headers_by_object,
+    join_seals,
+    join_successes,
+    survey_object,
+    survey_tasks,
+)
 from drakegrasp.dataset.card.content import content_of
 from drakegrasp.dataset.card.files import card_files
 from drakegrasp.dataset.filters import Removal, Successes, judge_successes, split_samples
@@ -32,30 +52,13 @@ from drakegrasp.dataset.manifest import (
 )
 from drakegrasp.dataset.paths import DATA_FILES, FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.rejections import AttemptKey, find_keys
-from drakegrasp.dataset.samples import (
-    ShardSlice,
-    create_splits,
-    shards_sha256,
-    walk_shards,
-    write_samples,
-)
-from drakegrasp.dataset.schema import (
-    CAMERAS,
-    CERTIFICATE_FIELDS,
-    OBJECT_FIELDS,
-    SPLITS,
-    SUCCESS_FIELDS,
-    TRIAL_FIELDS,
-)
-from drakegrasp.dataset.shards import Shard, trial_columns
-from drakegrasp.dataset.suspicion import suspicion
+from drakegrasp.dataset.schema import OBJECT_FIELDS, SPLITS, SUCCESS_FIELDS, TRIAL_FIELDS
 from drakegrasp.errors import DataError
-from drakegrasp.frames import Array, invert_pose, transform_points, unpack_pose
-from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp
+from drakegrasp.runtime.executor import Executor, run_here
 from drakegrasp.runtime.file_set import replaced_together
-from drakegrasp.runtime.files import disk_full_named, new_hdf5, sweep_temporary
+from drakegrasp.runtime.files import disk_full_named, new_hdf5, sweep_temporary, temporary_name
 from drakegrasp.runtime.progress import Report, silent
-from drakegrasp.vision.camera import intrinsics, project
+from drakegrasp.vision.camera import intrinsics
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +83,7 @@ def assemble(
     *,
     overrides: Sequence[str] = (),
     rejected: Sequence[int | AttemptKey] = (),
+    execute: Executor = run_here,
     progress: Report = silent,
 ) -> Assembly:
     """Write the three files of a dataset whose work units are all done.
@@ -88,7 +92,8 @@ def assemble(
         out: Directory of the dataset.
         overrides: `key=value` texts that change the filters or the split of the dataset.
         rejected: Trials that an inspection rejects, by id or identity; they become no samples.
-        progress: Called with the number of shards read and to read.
+        execute: Does the work; the files do not depend on it.
+        progress: Called with the number of tasks that are done and to do.
 
     Raises:
         ConfigError: If an override cannot be used; nothing is changed.
@@ -101,7 +106,7 @@ def assemble(
         read_manifest(out)
     with build_lock(out):
         manifest = with_postprocessing(read_manifest(out), overrides)
-        return assemble_locked(out, manifest, rejected=rejected, progress=progress)
+        return assemble_locked(out, manifest, rejected=rejected, execute=execute, progress=progress)
 
 
 def assemble_locked(
@@ -109,6 +114,7 @@ def assemble_locked(
     manifest: Manifest,
     *,
     rejected: Sequence[int | AttemptKey] | None = None,
+    execute: Executor = run_here,
     progress: Report = silent,
 ) -> Assembly:
     """Write the three files, their card and the manifest; the caller holds the lock.
@@ -117,66 +123,152 @@ def assemble_locked(
         out: Directory of the dataset.
         manifest: Of the dataset; it may have other filters or another split than the one there.
         rejected: As for `assemble`; those of the manifest if None, as far as they are successes.
+        execute: As for `assemble`.
         progress: As for `assemble`.
     """
     sweep_temporary(out)
     with disk_full_named(out), replaced_together(out) as new:
-        # First pass: copy the trials, and learn of each success what the filters need.
-        trials_path = new(TRIALS_FILE)
-        with new_hdf5(trials_path) as trials:
-            slices, successes = _write_trials(trials, out, manifest, progress)
+        # Survey the shards: how many rows, and of each success what the filters need.
+        surveys = _survey_all(out, manifest, execute, progress)
+        slices, successes = _placed_rows(surveys, manifest)
 
-            # Decide which successes are samples, and in which split.
-            known = _keys(manifest, successes)
-            if rejected is not None:
-                manifest = replace(manifest, rejected=find_keys(rejected, known, out))
-            ids_rejected = [known[key] for key in manifest.rejected if key in known]
-            removal = judge_successes(successes, manifest.config.filters, ids_rejected)
-            _write_removal(trials, successes, removal)
-            ids = _split_ids(manifest, successes, removal)
-            origin = {"signature": manifest.signature(), "shards": shards_sha256(out, manifest)}
-            _write_attributes(trials, manifest, origin)
+        # Decide which successes are samples, and in which split.
+        known = _keys(manifest, successes)
+        if rejected is not None:
+            manifest = replace(manifest, rejected=find_keys(rejected, known, out))
+        ids_rejected = [known[key] for key in manifest.rejected if key in known]
+        removal = judge_successes(successes, manifest.config.filters, ids_rejected)
+        ids = _split_ids(manifest, successes, removal)
 
-        # Second pass: copy the samples. It reads the shards again, because the split of a sample
-        # depends on the successes of all shards, and their images do not fit into memory.
-        data_paths = {camera: new(DATA_FILES[camera]) for camera in CAMERAS}
+        # Write what is small, and room for all rows.
+        seals = join_seals({survey.object: survey.seals for survey in surveys})
+        origin = {"signature": manifest.signature(), "shards": seals}
+        sizes = surveys[0].sizes
+        paths = {name: new(name) for name in (TRIALS_FILE, *DATA_FILES.values())}
         with ExitStack() as stack:
-            files = {c: stack.enter_context(new_hdf5(path)) for c, path in data_paths.items()}
-            for camera, file in files.items():
+            trials = stack.enter_context(new_hdf5(paths[TRIALS_FILE]))
+            _write_objects(trials, manifest)
+            columns = _create_trials(trials, slices[-1].first + slices[-1].rows, sizes)
+            _write_removal(trials, successes, removal)
+            _write_attributes(trials, manifest, origin)
+            rows = {}
+            for camera, name in DATA_FILES.items():
+                file = stack.enter_context(new_hdf5(paths[name]))
                 _write_attributes(file, manifest, {**origin, "camera": camera})
-                create_splits(file, ids, slices[0].shapes)
-            for done, shard_slice in enumerate(slices, start=len(slices) + 1):
-                write_samples(files, out, shard_slice, ids)
-                progress(done, 2 * len(slices))
+                for split in SPLITS:
+                    rows[split, camera] = SampleRows(
+                        file, split, len(ids[split]), sizes, _texts(manifest)
+                    )
+
+            # Rows are packed in any order, and put into the files in theirs.
+            tasks = list(_pack_tasks(out, slices, ids, sizes))
+            for done, part in enumerate(_in_order(execute(pack_rows, tasks), tasks), start=1):
+                unpack_rows(part, columns, rows)
+                progress(len(surveys) + done, len(surveys) + len(tasks))
+            for split_rows in rows.values():
+                split_rows.flush()
 
         # What the files hold, in words and numbers. Filters, split and rejections change with the
         # files that they made.
-        content = content_of(manifest, trials_path, data_paths["oto"])
+        content = content_of(manifest, paths[TRIALS_FILE], paths[DATA_FILES["oto"]])
         for name, text in card_files(content).items():
             new(name).write_bytes(text)
         new(FILE_NAME).write_bytes(manifest_text(manifest))
     return summarise(out)
 
 
-def _write_trials(
-    file: h5py.File, out: Path, manifest: Manifest, progress: Report
-) -> tuple[list[ShardSlice], Successes]:
-    """Write /objects and /trials; return the place of each shard, and all successes.
+def _survey_all(out: Path, manifest: Manifest, execute: Executor, progress: Report) -> list[Survey]:
+    """Return the surveys of all objects with a palm pose, by their rows of /objects.
 
     Raises:
         DataError: If a shard is missing or damaged, or there is none.
     """
-    K = intrinsics(manifest.config.camera)
-    _write_objects(file, manifest)
-    slices, successes = [], []
-    for shard_slice, shard in walk_shards(out, manifest):
-        _append_trials(file, shard_slice, shard)
-        slices.append(shard_slice)
-        successes.append(_successes(shard_slice, shard, K))
-        progress(len(slices), 2 * manifest.units)
-    if not slices:
+    surveys = []
+    for survey in execute(survey_object, survey_tasks(out, manifest)):
+        surveys.append(survey)
+        progress(len(surveys), 2 * len(manifest.objects))
+    if not surveys:
         raise DataError(f"{out}: no object has a palm pose to try")
-    return slices, _concatenate(successes)
+    return sorted(surveys, key=lambda survey: survey.object)
+
+
+def _placed_rows(
+    surveys: Sequence[Survey], manifest: Manifest
+) -> tuple[list[ShardSlice], Successes]:
+    """Return the place of each shard, and all successes with their trials' ids."""
+    headers = headers_by_object(manifest)
+    first, slices, parts = 0, list[ShardSlice](), []
+    for survey in surveys:
+        parts.append(replace(survey.successes, trial_id=survey.successes.trial_id + first))
+        # Shards behind the last wanted grasp give no rows.
+        for header, rows in zip(headers[survey.object], survey.rows, strict=False):
+            slices.append(ShardSlice(header=header, object=survey.object, first=first, rows=rows))
+            first += rows
+    return slices, join_successes(parts)
+
+
+def _pack_tasks(
+    out: Path,
+    slices: Sequence[ShardSlice],
+    ids: Mapping[str, npt.NDArray[np.int64]],
+    sizes: Mapping[str, int],
+) -> Iterator[PackTask]:
+    """Yield the tasks that pack the rows, from the first to the last."""
+    count, place = slices[-1].first + slices[-1].rows, 0
+    for start in range(0, count, TASK_ROWS):
+        stop = min(start + TASK_ROWS, count)
+        # The shard in which the last range ended may have more rows.
+        while slices[place].first + slices[place].rows <= start:
+            place += 1
+        within = islice(slices, place, None)
+        bounds = {split: np.searchsorted(rows, (start, stop)) for split, rows in ids.items()}
+        yield PackTask(
+            out=str(out),
+            part=str(temporary_name(out / f"rows-{start}")),
+            start=start,
+            stop=stop,
+            slices=tuple(takewhile(partial(_begins_before, stop=stop), within)),
+            ids={split: ids[split][a:b] for split, (a, b) in bounds.items()},
+            sizes=sizes,
+        )
+
+
+def _begins_before(piece: ShardSlice, stop: int) -> bool:
+    return piece.first < stop
+
+
+def _in_order(parts: Iterable[Part], tasks: Sequence[PackTask]) -> Iterator[Part]:
+    """Yield parts, which come in any order, in that of the tasks; remove those that are left."""
+    try:
+        waiting: dict[int, Part] = {}
+        turn = iter(tasks)
+        due = next(turn).start
+        for part in parts:
+            waiting[part.start] = part
+            while (ready := waiting.pop(due, None)) is not None:
+                yield ready
+                due = next((task.start for task in turn), -1)
+    finally:
+        for task in tasks:
+            Path(task.part).unlink(missing_ok=True)
+
+
+def _create_trials(file: h5py.File, count: int, sizes: Mapping[str, int]) -> list[h5py.Dataset]:
+    """Create the columns of /trials, with room for a number of rows, and return them."""
+    group, columns = file.create_group("trials"), []
+    for field in TRIAL_FIELDS:
+        column = create_field(group, field, field.row_shape(sizes))
+        column.resize(count, axis=0)
+        columns.append(column)
+    return columns
+
+
+def _texts(manifest: Manifest) -> dict[str, list[str]]:
+    """Return the texts of samples by object, see `SampleRows`."""
+    return {
+        name: [getattr(entry, attribute) for entry in manifest.objects]
+        for name, attribute in TEXTS.items()
+    }
 
 
 def _keys(manifest: Manifest, successes: Successes) -> dict[AttemptKey, int]:
@@ -218,88 +310,6 @@ def _write_objects(file: h5py.File, manifest: Manifest) -> None:
         values = [np.nan if value is None else value for value in own]
         dtype = object if field.dtype == "str" else field.dtype
         write_field(group, field, np.array(values, dtype=dtype))
-
-
-def _append_trials(file: h5py.File, shard_slice: ShardSlice, shard: Shard) -> None:
-    """Append the rows of a shard to /trials."""
-    group = file.require_group("trials")
-    first, rows = shard_slice.first, shard_slice.rows
-
-    # Only the whole dataset knows the number of a row and of its object.
-    columns = {f.name: shard.trials[f.name][:rows] for f in trial_columns()}
-    columns["trial_id"] = np.arange(first, first + rows, dtype=np.int64)
-    columns["object"] = np.full(rows, shard_slice.object, dtype=np.int32)
-
-    for field in TRIAL_FIELDS:
-        values = columns[field.name]
-        if field.name not in group:
-            create_field(group, field, values.shape[1:])
-        dataset = group[field.name]
-        dataset.resize(first + rows, axis=0)
-        dataset[first:] = values
-
-
-def _successes(shard_slice: ShardSlice, shard: Shard, K: Array) -> Successes:
-    """Return what the filters need of a shard's successes."""
-    taken = shard.looks["row"] < shard_slice.rows
-    rows = shard.looks["row"][taken]
-    trials = {name: values[rows] for name, values in shard.trials.items()}
-    looks = {name: values[taken] for name, values in shard.looks.items()}
-
-    # The grasps in {T}, and whether both cameras see all their contacts.
-    X_TO = unpack_pose(trials["X_TO"])
-    grasps = [
-        transform_grasp(X, pack_grasp(p, n))
-        for X, p, n in zip(X_TO, trials["closed_p_OQ"], trials["closed_nhat_Q_O"], strict=True)
-    ]
-    length = 6 * trials["closed_touching"].shape[1]
-    in_view = [
-        all(_in_view(K, looks[f"mask_{c}"][i], looks[f"X_TC_{c}"][i], grasp) for c in CAMERAS)
-        for i, grasp in enumerate(grasps)
-    ]
-
-    doubts = suspicion(trials)
-    return Successes(
-        candidate=trials["candidate"],
-        standoff_index=trials["standoff_index"],
-        trial_id=shard_slice.first + rows.astype(np.int64),
-        object=np.full(len(rows), shard_slice.object, dtype=np.int32),
-        grasp_T=np.array(grasps).reshape(-1, length),
-        held_O=np.concatenate(
-            [
-                trials[f"lifted_{name}"].reshape(len(rows), length // 2)
-                for name in ("p_OQ", "nhat_Q_O")
-            ],
-            axis=1,
-        ),
-        complete=np.all(trials["closed_touching"] & trials["lifted_touching"], axis=1),
-        other_links=trials["lifted_other_links"],
-        slip=trials["slip"],
-        turn=trials["turn"],
-        seen=np.all([looks[f"mask_{c}"].any(axis=(1, 2)) for c in CAMERAS], axis=0),
-        in_view=np.array(in_view, dtype=bool),
-        # Both cameras are at the same point.
-        camera_height=unpack_pose(looks["X_TC_otm"])[:, 2, 3],
-        depth_variance=looks["image_otm"][:, 3].astype(float).var(axis=(1, 2)),
-        surface_distance=trials["surface_distance"].max(axis=1, initial=0.0),
-        normal_angle=trials["normal_angle"].max(axis=1, initial=0.0),
-        suspicion=doubts.score,
-        **{name: doubts.values[name] for name in ("penetration", "imbalance", "normal_sum")},
-        **{field.name: looks[field.name] for field in CERTIFICATE_FIELDS},
-    )
-
-
-def _in_view(K: Array, mask: AnyArray, X_TC: Array, grasp_T: Array) -> bool:
-    """Return whether all contacts of a grasp are before a camera and within its image."""
-    p_TQ, _ = unpack_grasp(grasp_T)
-    p_CQ = transform_points(invert_pose(unpack_pose(X_TC)), p_TQ)
-    uv = project(K, p_CQ)
-    return bool(np.all(p_CQ[:, 2] > 0.0) and np.all(uv >= 0.0) and np.all(uv <= len(mask) - 1))
-
-
-def _concatenate(successes: Sequence[Successes]) -> Successes:
-    names = [f.name for f in dataclasses.fields(Successes)]
-    return Successes(**{n: np.concatenate([getattr(s, n) for s in successes]) for n in names})
 
 
 def _write_removal(file: h5py.File, successes: Successes, removal: AnyArray) -> None:

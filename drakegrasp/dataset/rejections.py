@@ -9,6 +9,7 @@ their id, which is known once the dataset is assembled.
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,6 +24,8 @@ from drakegrasp.runtime.files import write_atomic
 FILE_NAME = "reject.json"
 #: Version of the file's layout.
 VERSION = 1
+#: Rejections without effect that are named.
+NAMED = 5
 #: An id of a trial is shorter.
 _MOST_DIGITS = 19
 
@@ -148,23 +151,60 @@ def find_keys(
 ) -> tuple[AttemptKey, ...]:
     """Return the identities of what is rejected, in order and each once.
 
+    A key that is no success of the dataset is left out: its object may be gone, or `max_grasps` may
+    end before it. An id must be one, since it is of these files.
+
     Args:
         rejected: Ids of trials, or keys of attempts.
         ids: Of all successes.
         out: Directory of the dataset, for the message.
 
     Raises:
-        DataError: If one of them is no success of the dataset.
+        DataError: If an id is that of no success.
     """
     keys = {number: key for key, number in ids.items()}
-    found = set()
+    found = {entry for entry in rejected if isinstance(entry, AttemptKey) and entry in ids}
     for entry in rejected:
-        key = entry if isinstance(entry, AttemptKey) else keys.get(entry)
-        if key is None or key not in ids:
-            name = f"trial {entry}" if isinstance(entry, int) else str(entry)
-            raise DataError(f"{out}: rejected trials must be successes, got {name}")
-        found.add(key)
+        if not isinstance(entry, AttemptKey):
+            if entry not in keys:
+                raise DataError(f"{out}: rejected trials must be successes, got trial {entry}")
+            found.add(keys[entry])
     return tuple(sorted(found))
+
+
+def unused_rejections(
+    out: Path, given: Sequence[int | AttemptKey], used: Sequence[AttemptKey]
+) -> list[str]:
+    """Return what a person must know of rejections that had no effect, a sentence for each case.
+
+    Args:
+        out: Directory of the dataset.
+        given: What was to be rejected.
+        used: Attempts that are rejected now.
+    """
+    # What was asked for and is no success here.
+    keys = {key for key in given if isinstance(key, AttemptKey)}
+    skipped = sorted(keys - set(used))
+    if skipped:
+        named = "; ".join(map(str, skipped[:NAMED]))
+        more = f"; and {len(skipped) - NAMED:,} more" if len(skipped) > NAMED else ""
+        return [
+            f"skipped {len(skipped):,} of {len(keys):,} rejections, which name no success of the "
+            f"dataset: {named}{more}"
+        ]
+
+    # What an inspection rejected and nobody asked for.
+    path = out / FILE_NAME
+    try:
+        forgotten = read_decisions(path).rejected - set(used)
+    except (DataError, OSError):
+        forgotten = frozenset()
+    if forgotten and not keys:
+        return [
+            f"{path}: rejections that were not used: {len(forgotten):,}; "
+            f"--reject {shlex.quote(str(path))} uses them"
+        ]
+    return []
 
 
 def key_to_json(key: AttemptKey) -> dict[str, Any]:

@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.hdf5 import AnyArray, write_fixed
+from drakegrasp.dataset.hdf5 import AnyArray, read_column, write_fixed
 from drakegrasp.dataset.layout.attributes import COUNT, TEXT
 from drakegrasp.dataset.layout.opening import (
     opened,
@@ -102,10 +102,6 @@ def trial_columns() -> tuple[Field, ...]:
     return tuple(f for f in TRIAL_FIELDS if f.name not in ASSEMBLED_FIELDS)
 
 
-def _tables() -> dict[str, tuple[Field, ...]]:
-    return {"trials": trial_columns(), "looks": LOOK_FIELDS}
-
-
 def write_shard(out: Path, shard: Shard) -> Path:
     """Write a shard into a dataset's directory and return its path."""
     path = shard.header.path(out)
@@ -132,14 +128,11 @@ def read_shard(path: Path, header: ShardHeader | None = None, *, verify_seal: bo
         DataError: If the file is missing, truncated or changed by a single bit, or of another
             schema, configuration, mesh or range; the message names the file and the reason.
     """
-    with _open_shard(path, header, _tables(), verify_seal=verify_seal) as (file, own_header):
-        rows = len(file["trials/outcome"])
-        refuse_other_codes(path, "/trials/outcome", file["trials/outcome"][:], list(Outcome))
-        refuse_other_codes(path, "/looks/row", file["looks/row"][:], rows)
+    with open_shard(path, header, verify_seal=verify_seal) as (file, own_header):
         return Shard(
             header=own_header,
-            trials={f.name: file["trials"][f.name][:] for f in trial_columns()},
-            looks={f.name: file["looks"][f.name][:] for f in LOOK_FIELDS},
+            trials={f.name: read_column(file["trials"], f.name) for f in trial_columns()},
+            looks={f.name: read_column(file["looks"], f.name) for f in LOOK_FIELDS},
         )
 
 
@@ -174,22 +167,38 @@ def read_trials(
     Raises:
         DataError: See `read_shard`.
     """
-    tables = _tables()
-    if not complete:
-        tables = {"trials": tuple(f for f in tables["trials"] if f.name in (*names, "outcome"))}
-    with _open_shard(path, header, tables, verify_seal=verify_seal) as (file, _):
+    columns = tuple(f for f in trial_columns() if f.name in (*names, "outcome"))
+    tables = None if complete else {"trials": columns}
+    with open_shard(path, header, tables, verify_seal=verify_seal) as (file, _):
         refuse_other_codes(path, "/trials/outcome", file["trials/outcome"][:], list(Outcome))
-        return {name: np.asarray(file["trials"][name][:]) for name in names}
+        return {name: read_column(file["trials"], name) for name in names}
 
 
 @contextmanager
-def _open_shard(
-    path: Path, header: ShardHeader | None, tables: Tables, *, verify_seal: bool
+def open_shard(
+    path: Path,
+    header: ShardHeader | None,
+    tables: Tables | None = None,
+    *,
+    verify_seal: bool = True,
+    again: bool = False,
 ) -> Iterator[tuple[h5py.File, ShardHeader]]:
-    """Open a shard for reading, with its header; the fields of `tables` are there."""
+    """Open a shard for reading, with its header, while the block runs.
+
+    Args:
+        path: Of the file.
+        header: Identity that the shard must have; any if None.
+        tables: Fields that must be there; if None all, with outcomes and rows that exist.
+        verify_seal: Whether to verify the seal first, which reads the whole file.
+        again: Whether the same work has opened the shard before: then only its identity is looked
+            at.
+
+    Raises:
+        DataError: See `read_shard`.
+    """
     if verify_seal:
         refuse_broken_seal(path)
-    with opened(path, "a complete shard") as file:
+    with opened(path, "a complete shard", again=again) as file:
         refuse_other_attributes(path, file, _ATTRIBUTES)
 
         # Its identity: a file may have been copied to the path of another unit.
@@ -205,5 +214,13 @@ def _open_shard(
                 f"{path}: must be a shard of {header.label}, got one of {own_header.label}"
             )
 
-        refuse_other_structure(path, file, tables)
+        # Its columns.
+        if not again:
+            every = {"trials": trial_columns(), "looks": LOOK_FIELDS}
+            refuse_other_structure(path, file, every if tables is None else tables)
+        if not again and tables is None:
+            outcomes = read_column(file["trials"], "outcome")
+            refuse_other_codes(path, "/trials/outcome", outcomes, list(Outcome))
+            looked = read_column(file["looks"], "row")
+            refuse_other_codes(path, "/looks/row", looked, len(outcomes))
         yield file, own_header

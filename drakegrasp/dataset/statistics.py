@@ -12,17 +12,20 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from drakegrasp.dataset.assembly.survey import shards_sha256
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.hdf5 import open_hdf5, read_names, read_texts
 from drakegrasp.dataset.layout.opening import open_samples, open_trials, read_codes
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRIALS_FILE
-from drakegrasp.dataset.samples import shards_sha256
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.dataset.shards import read_trials
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.executor import Executor, run_here
 
+#: Rows that are read at a time.
+BLOCK = 1 << 20
 #: The columns that say how well a success holds.
 WORDS = ("precision", "stable")
 
@@ -76,12 +79,13 @@ class Unfinished:
     total: int
 
 
-def is_assembled(out: Path, *, verify_shards: bool = False) -> bool:
+def is_assembled(out: Path, *, verify_shards: bool = False, execute: Executor = run_here) -> bool:
     """Return whether the three files exist and are what assembling would write now.
 
     Args:
         out: Directory of the dataset.
         verify_shards: Whether to compare the shards, too, which looks into each of them.
+        execute: Looks into them.
 
     Raises:
         DataError: If a file has values that lie elsewhere, or a shard is missing.
@@ -89,7 +93,7 @@ def is_assembled(out: Path, *, verify_shards: bool = False) -> bool:
     manifest = read_manifest(out)
     expected = {"signature": manifest.signature()}
     if verify_shards:
-        expected["shards"] = shards_sha256(out, manifest)
+        expected["shards"] = shards_sha256(out, manifest, execute)
     try:
         for name in ASSEMBLED_FILES:
             with open_hdf5(out / name) as file:
@@ -173,26 +177,35 @@ def count_funnel(out: Path) -> Funnel:
 
 def funnel_of(path: Path) -> Funnel:
     """Return the funnel that a file of trials tells, as `count_funnel`."""
-    # The columns that are counted, whole: a few bytes per trial.
+    # The columns that are counted, a block of rows after the other.
     with open_trials(path) as file:
         objects, trials, successes = (file[name] for name in ("objects", "trials", "successes"))
         names, classes = (read_texts(objects[key]) for key in ("name", "class_name"))
         counts = {key: objects[key][:] for key in ("candidates", "distinct", "valid")}
-        count = len(names)
-        index = read_codes(trials["object"], count)
-        outcome = read_codes(trials["outcome"], list(Outcome))
-        words = {word: trials[word][:] for word in WORDS}
-        success = read_codes(successes["trial_id"], len(outcome))
+        count, rows = len(names), len(trials["outcome"])
+        success = read_codes(successes["trial_id"], rows)
         removal = read_codes(successes["removal"], list(Removal))
+        outcomes = np.zeros((count, 1 + max(Outcome)), dtype=np.int64)
+        held = {word: np.zeros(count, dtype=np.int64) for word in WORDS}
+        owner = np.zeros(len(success), dtype=np.int32)
+        for start in range(0, rows, BLOCK):
+            block = slice(start, start + BLOCK)
+            index = read_codes(trials["object"], count, block)
+            outcome = read_codes(trials["outcome"], list(Outcome), block)
+            outcomes += _count_pairs(index, outcome, count, 1 + max(Outcome))
+            for word, numbers in held.items():
+                numbers += np.bincount(index[trials[word][block]], minlength=count)
+            here = (success >= start) & (success < start + BLOCK)
+            owner[here] = index[success[here] - start]
 
     return Funnel(
         names=names,
         classes=classes,
         **counts,
-        outcomes=_count_pairs(index, outcome, count, 1 + max(Outcome)),
-        precision=np.bincount(index[words["precision"]], minlength=count),
-        stable=np.bincount(index[words["stable"]], minlength=count),
-        removals=_count_pairs(index[success], removal, count, 1 + max(Removal)),
+        outcomes=outcomes,
+        precision=held["precision"],
+        stable=held["stable"],
+        removals=_count_pairs(owner, removal, count, 1 + max(Removal)),
     )
 
 

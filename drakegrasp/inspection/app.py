@@ -30,13 +30,14 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from drakegrasp.errors import DataError, DrakegraspError
+from drakegrasp.errors import DataError, DrakegraspError, printable
 from drakegrasp.inspection.catalog import Catalog, Snapshot, find_model
 from drakegrasp.inspection.decisions import DecisionFile
+from drakegrasp.inspection.grasp_page import grasp_page
 from drakegrasp.inspection.links import ServerLinks
-from drakegrasp.inspection.pages import gallery_page, grasp_page, render
+from drakegrasp.inspection.pages import gallery_page, render
 from drakegrasp.inspection.plots import plot_svg, plots_values
-from drakegrasp.inspection.query import Query, parse_query, select
+from drakegrasp.inspection.query import Query, count_decisions, parse_query, select
 from drakegrasp.inspection.recording import Recordings
 from drakegrasp.inspection.rows import read_look, read_rows
 from drakegrasp.inspection.scene3d import HandView, object_mesh, scene_of
@@ -145,7 +146,7 @@ def make_app(inspection: Inspection) -> Starlette:
             route("/", _gallery),
             route("/grasp/{label}", _grasp),
             route("/strip/{label}-{camera:str}.png", _strip),
-            route("/mesh/{kind}-{number:int}.glb", _mesh),
+            route("/mesh/{kind}-{name}.glb", _mesh),
             route("/plots", _plots),
             route("/plot/{name}.svg", _plot),
             route("/recording/{label}.html", _recording),
@@ -243,17 +244,17 @@ def _strip(inspection: Inspection, request: Request) -> Response:
 
 
 def _mesh(inspection: Inspection, request: Request) -> Response:
-    snapshot, number = inspection.catalog.current(), request.path_params["number"]
-    kind = request.path_params["kind"]
+    snapshot = inspection.catalog.current()
+    kind, name = request.path_params["kind"], request.path_params["name"]
     try:
         if kind == "link":
-            return Response(inspection.hand.glb(number), media_type="model/gltf-binary")
+            return Response(inspection.hand.glb(int(name)), media_type="model/gltf-binary")
         if kind == "object":
-            path = find_model(snapshot.out, snapshot.names[number])
+            path = find_model(snapshot.out, snapshot.names[snapshot.numbers[name]])
             if path is not None:
                 content = object_mesh(path, path.stat().st_mtime_ns)
                 return Response(content, media_type="model/gltf-binary")
-    except (IndexError, FileNotFoundError):
+    except (IndexError, KeyError, ValueError, FileNotFoundError):
         pass
     raise HTTPException(404, "there is no such mesh")
 
@@ -304,23 +305,28 @@ def _decide(inspection: Inspection, content: dict[str, Any]) -> Response:
     snapshot = inspection.catalog.current()
     i, decision = _success(snapshot, content), content.get("decision")
     try:
-        inspection.decisions.decide(snapshot.key(i), str(decision))
+        decisions = inspection.decisions.decide(snapshot.key(i), str(decision), _page(content))
     except ValueError as error:
         raise HTTPException(400, str(error)) from None
-    return JSONResponse({"label": snapshot.label(i), "decision": decision})
+    counts = count_decisions(snapshot, decisions)
+    return JSONResponse({"label": snapshot.label(i), "decision": decision, "counts": counts})
 
 
 def _undo(inspection: Inspection, content: dict[str, Any]) -> Response:
-    key = inspection.decisions.undo()
-    if key is None:
-        return JSONResponse({"label": None})
+    undo = inspection.decisions.undo(_page(content))
+    if undo is None:
+        return JSONResponse({"name": None})
     snapshot = inspection.catalog.current()
-    place = None
-    if key.object in snapshot.names:
-        number = snapshot.names.index(key.object)
-        place = snapshot.table.find(number, key.candidate, key.standoff_index)
-    label = None if place is None else snapshot.label(place)
-    return JSONResponse({"label": label, "decision": inspection.decisions.read().of(key)})
+    place = snapshot.find_key(undo.key)
+    return JSONResponse(
+        {
+            "name": printable(str(undo.key)),
+            "label": None if place is None else snapshot.label(place),
+            "decision": undo.decision,
+            "done": undo.done,
+            "counts": count_decisions(snapshot, inspection.decisions.read()),
+        }
+    )
 
 
 def _record(inspection: Inspection, content: dict[str, Any]) -> Response:
@@ -330,8 +336,13 @@ def _record(inspection: Inspection, content: dict[str, Any]) -> Response:
     if trial is None:
         raise HTTPException(404, "the attempt must be a row of trials.hdf5")
     label = str(content.get("label"))
-    inspection.recordings.make(label, trial)
-    return JSONResponse({"url": f"/recording/{label}.html"})
+    found = inspection.recordings.make(label, trial)
+    return JSONResponse({"url": f"/recording/{label}.html", "same": found.same, "text": found.text})
+
+
+def _page(content: dict[str, Any]) -> str:
+    """Return which page of a browser sends a request: its decisions are undone together."""
+    return str(content.get("page", ""))[:64]
 
 
 def _success(snapshot: Snapshot, content: dict[str, Any]) -> int:

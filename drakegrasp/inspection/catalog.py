@@ -6,12 +6,15 @@ end, whatever a build writes meanwhile.
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import threading
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +23,13 @@ from drakegrasp.config import Config, parse_config
 from drakegrasp.dataset.hdf5 import read_texts
 from drakegrasp.dataset.layout.opening import open_trials
 from drakegrasp.dataset.manifest import Manifest, read_manifest
-from drakegrasp.dataset.paths import DATA_FILES, FILE_NAME, TRIALS_FILE, model_path
+from drakegrasp.dataset.paths import (
+    ASSEMBLED_FILES,
+    DATA_FILES,
+    FILE_NAME,
+    TRIALS_FILE,
+    model_path,
+)
 from drakegrasp.dataset.rejections import AttemptKey
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.errors import DataError
@@ -31,12 +40,18 @@ from drakegrasp.inspection.table import (
     read_sample_ids,
     read_shard_part,
     read_trials_table,
+    rows_within,
 )
+from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.json_text import parse_json
 from drakegrasp.runtime.names import is_name
 
 #: While a build runs, its new shards are looked for this often [s].
 LISTING_PERIOD = 5.0
+#: Damaged shards that are named.
+NAMED = 3
+#: What changes when a file is replaced; None if it is not there.
+Stamp = tuple[int, ...] | None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,23 +61,44 @@ class Snapshot:
     Attributes:
         out: Directory of the dataset.
         config: Its configuration.
+        config_hash: Hash of what decides a shard, as its files have it.
         names, classes: Of the objects, by their number.
+        meshes: Hashes of the objects' meshes, hexadecimal.
         table: The attempts.
         sources: Files that hold the attempts; `AttemptTable.source` counts them.
         sample_ids: Trial ids of the samples by split, in rising order.
         assembled: Whether the attempts are rows of trials.hdf5; else they are of shards.
+        stamps: Of the assembled files; shards never change.
         missing: What is not there, in sentences.
     """
 
     out: Path
     config: Config
+    config_hash: str
     names: tuple[str, ...]
     classes: tuple[str, ...]
+    meshes: tuple[str, ...]
     table: AttemptTable
     sources: tuple[Path, ...]
     sample_ids: dict[str, npt.NDArray[np.int64]]
     assembled: bool
+    stamps: Mapping[Path, Stamp] = field(default_factory=dict)
     missing: tuple[str, ...]
+
+    @cached_property
+    def codes(self) -> tuple[str, ...]:
+        """A code of each object for addresses: of configuration, mesh and name.
+
+        Its number would be that of another object as soon as there are more of them.
+        """
+        identities = zip(self.meshes, self.names, strict=True)
+        texts = (json.dumps([self.config_hash, *identity]) for identity in identities)
+        return tuple(hashlib.sha256(text.encode()).hexdigest()[:12] for text in texts)
+
+    @cached_property
+    def numbers(self) -> Mapping[str, int]:
+        """Numbers of the objects by their codes."""
+        return {code: number for number, code in enumerate(self.codes)}
 
     def key(self, i: int) -> AttemptKey:
         """Return the identity of an attempt by its place in the table."""
@@ -71,21 +107,43 @@ class Snapshot:
         return AttemptKey(name, int(table.candidate[i]), int(table.standoff_index[i]))
 
     def label(self, i: int) -> str:
-        """Return the identity of an attempt as three numbers, for addresses: `12-345-2`."""
+        """Return the identity of an attempt for addresses: `9f86d081884c-345-2`.
+
+        The files of a later state have the same label for it, and for no other attempt.
+        """
         table = self.table
-        return f"{table.object[i]}-{table.candidate[i]}-{table.standoff_index[i]}"
+        code = self.codes[table.object[i]]
+        return f"{code}-{table.candidate[i]}-{table.standoff_index[i]}"
 
     def find(self, label: str) -> int | None:
         """Return the place of the attempt of a label, or None if there is none."""
-        numbers = label.split("-")
-        if len(numbers) != 3 or not all(n.isascii() and n.isdecimal() for n in numbers):
+        code, *numbers = label.split("-")
+        if len(numbers) != 2 or not all(n.isascii() and n.isdecimal() for n in numbers):
             return None
-        object_, candidate, standoff = (int(n) for n in numbers)
-        return self.table.find(object_, candidate, standoff)
+        number = self.numbers.get(code)
+        candidate, standoff = (int(n) for n in numbers)
+        return None if number is None else self.table.find(number, candidate, standoff)
+
+    def find_key(self, key: AttemptKey) -> int | None:
+        """Return the place of an attempt by its identity, or None if it is not there."""
+        if key.object not in self.names:
+            return None
+        number = self.names.index(key.object)
+        return self.table.find(number, key.candidate, key.standoff_index)
 
     def trial_id(self, i: int) -> int | None:
         """Return the row of an attempt in trials.hdf5, or None before there is one."""
         return int(self.table.row[i]) if self.assembled else None
+
+    def refuse_replaced(self) -> None:
+        """Refuse what was just read if a file may have been another than that of this state.
+
+        Raises:
+            DataError: If a file was replaced.
+        """
+        for path, stamp in self.stamps.items():
+            if _stamp(path) != stamp:
+                raise DataError(f"{path}: must stay while it is read, got another; load it again")
 
 
 class Catalog:
@@ -102,8 +160,11 @@ class Catalog:
         self.out = out
         self._lock = threading.Lock()
         self._parts: dict[ShardHeader, AttemptTable] = {}
-        self._stamp: Any = None
+        self._stamps: dict[Path, Stamp] = {}
         self._listed = -LISTING_PERIOD
+        # The assembled files, if there are any, and the manifest of a build that is not in them.
+        self._assembled: Snapshot | None = None
+        self._manifest: Manifest | None = None
         self._snapshot: Snapshot | None = None
         self.current()
 
@@ -114,49 +175,86 @@ class Catalog:
             DataError: If they cannot be read.
         """
         with self._lock:
-            names = (TRIALS_FILE, *DATA_FILES.values(), FILE_NAME)
-            stamp = tuple(_stamp(self.out / name) for name in names)
-            building = self._snapshot is not None and not self._snapshot.assembled
+            stamps = {self.out / n: _stamp(self.out / n) for n in (*ASSEMBLED_FILES, FILE_NAME)}
+            changed = self._snapshot is None or stamps != self._stamps
+            if changed:
+                self._read_files(stamps)
             waited = time.monotonic() - self._listed >= LISTING_PERIOD
-            if self._snapshot is None or stamp != self._stamp or (building and waited):
-                self._snapshot = self._read()
-                self._stamp, self._listed = stamp, time.monotonic()
+            if self._snapshot is None or changed or (self._manifest is not None and waited):
+                self._snapshot = self._list_shards()
+                self._stamps, self._listed = stamps, time.monotonic()
             return self._snapshot
 
-    def _read(self) -> Snapshot:
-        if os.path.lexists(self.out / TRIALS_FILE):
-            self._parts.clear()
-            return _read_assembled(self.out)
-        return self._read_shards(read_manifest(self.out))
+    def _read_files(self, stamps: Mapping[Path, Stamp]) -> None:
+        """Read the assembled files, or the manifest of a build that has not ended."""
+        self._assembled = None
+        if stamps[self.out / TRIALS_FILE] is None:
+            self._manifest = read_manifest(self.out)
+            return
+        self._parts.clear()
+        self._assembled, signature = _read_assembled(self.out, stamps)
+        self._manifest = _other_manifest(self.out, signature)
+
+    def _list_shards(self) -> Snapshot:
+        """Return the state of the files with the shards that are there."""
+        before, manifest, assembled = self._snapshot, self._manifest, self._assembled
+        if assembled is None:
+            assert manifest is not None
+            return self._read_shards(manifest)
+        if manifest is None or not (newer := _count_newer(assembled, manifest)):
+            return assembled
+        notice = (
+            f"{TRIALS_FILE} and the data files are of an earlier state: {newer:,} work units are "
+            "newer. They are shown when the build has ended."
+        )
+        if before is not None and before.table is assembled.table and notice in before.missing:
+            return before
+        return replace(assembled, missing=(notice, *assembled.missing))
 
     def _read_shards(self, manifest: Manifest) -> Snapshot:
         """Return the state of a build that runs or was stopped."""
-        # Shards never change: only new ones are read.
+        # Shards never change: only new ones are read. Those of objects that are gone are dropped.
         numbers = {entry.name: i for i, entry in enumerate(manifest.objects)}
-        done = [header for header in manifest.headers() if os.path.lexists(header.path(self.out))]
-        for header in done:
-            if header not in self._parts:
-                number = numbers[header.object_name]
-                self._parts[header] = read_shard_part(self.out, header, 0, number)
+        parts, damaged = {}, []
+        for header in _done_headers(self.out, manifest):
+            try:
+                if (part := self._parts.get(header)) is None:
+                    part = read_shard_part(self.out, header, 0, numbers[header.object_name])
+                parts[header] = part
+            except DataError:
+                damaged.append(header.path(self.out).relative_to(self.out))
+        self._parts = parts
 
-        # Each shard's number is its place among those that are done.
-        parts = [self._parts[header] for header in done]
-        for number, part in enumerate(parts):
-            part.source[:] = number
-        missing = (
-            f"{TRIALS_FILE} and the data files are not there yet: {len(done):,} of "
-            f"{manifest.units:,} work units are done. Filters and split are decided at the end.",
-        )
+        # The number of a shard is its place among those that are there, and that of its object
+        # the place in this manifest, which may have grown.
+        wanted: dict[str, int | None] = dict.fromkeys(numbers, manifest.config.max_grasps)
+        cut = []
+        for number, (header, part) in enumerate(parts.items()):
+            name = header.object_name
+            part.source[:], part.object[:] = number, numbers[name]
+            rows, wanted[name] = rows_within(part, wanted[name])
+            cut.append(rows)
+
+        missing = [
+            f"{TRIALS_FILE} and the data files are not there yet: {len(parts):,} of "
+            f"{manifest.units:,} work units are done. Filters and split are decided at the end."
+        ]
+        if damaged:
+            named = ", ".join(map(str, damaged[:NAMED]))
+            more = f" and {len(damaged) - NAMED:,} more" if len(damaged) > NAMED else ""
+            missing.append(f"Damaged, and not shown: {named}{more}. The build makes them again.")
         return Snapshot(
             out=self.out,
             config=manifest.config,
+            config_hash=manifest.config.simulation_hash(),
             names=tuple(entry.name for entry in manifest.objects),
             classes=tuple(entry.class_name for entry in manifest.objects),
-            table=join(parts) if parts else empty_table(),
-            sources=tuple(header.path(self.out) for header in done),
+            meshes=tuple(entry.mesh_sha256 for entry in manifest.objects),
+            table=join(cut) if cut else empty_table(),
+            sources=tuple(header.path(self.out) for header in parts),
             sample_ids={},
             assembled=False,
-            missing=missing,
+            missing=tuple(missing),
         )
 
 
@@ -169,8 +267,11 @@ def find_model(out: Path, name: str) -> Path | None:
     return path if path is not None and path.is_file() else None
 
 
-def _read_assembled(out: Path) -> Snapshot:
-    """Return the state of a dataset with a trials.hdf5; nothing else has to be there."""
+def _read_assembled(out: Path, stamps: Mapping[Path, Stamp]) -> tuple[Snapshot, str]:
+    """Return the state of a dataset with a trials.hdf5, and the signature of its manifest then.
+
+    Nothing but that file has to be there.
+    """
     # Objects and configuration.
     path = out / TRIALS_FILE
     with open_trials(path) as file:
@@ -178,7 +279,11 @@ def _read_assembled(out: Path) -> Snapshot:
             config = parse_config(parse_json(file.attrs["config"]))
         except ValueError as error:
             raise DataError(f"{path}: attribute config must be one, got {error}") from None
-        names, classes = (read_texts(file["objects"][key]) for key in ("name", "class_name"))
+        names, classes, meshes = (
+            read_texts(file["objects"][key]) for key in ("name", "class_name", "mesh_sha256")
+        )
+        config_hash = str(file.attrs.get("config_hash", ""))
+        signature = str(file.attrs.get("signature", ""))
 
     # What else there is.
     missing = [
@@ -190,21 +295,70 @@ def _read_assembled(out: Path) -> Snapshot:
     if gone:
         missing.append(f"{len(gone):,} of {len(names):,} objects have no mesh: no 3D view of them.")
 
-    return Snapshot(
+    state = Snapshot(
         out=out,
         config=config,
+        config_hash=config_hash,
         names=names,
         classes=classes,
+        meshes=meshes,
         table=read_trials_table(path),
         sources=(path,),
         sample_ids=read_sample_ids(out),
         assembled=True,
+        stamps={path: stamp for path, stamp in stamps.items() if path.name in ASSEMBLED_FILES},
         missing=tuple(missing),
     )
+    return state, signature
 
 
-def _stamp(path: Path) -> tuple[int, ...] | None:
-    """Return what changes when a file is replaced; None if it is not there."""
+def _other_manifest(out: Path, signature: str) -> Manifest | None:
+    """Return the manifest if a build went on since the files were assembled, else None."""
+    try:
+        manifest = read_manifest(out)
+    except DataError:
+        return None  # the files are all that there is
+    return None if manifest.signature() == signature else manifest
+
+
+def _count_newer(state: Snapshot, manifest: Manifest) -> int:
+    """Return how many work units are done that are not in the assembled files."""
+    # Each object's last palm pose in the files, and whether it has all grasps that it wants.
+    table, count = state.table, len(state.names)
+    last = np.full(count, -1, dtype=np.int32)
+    np.maximum.at(last, table.object, table.candidate)
+    grasps = np.bincount(table.object[table.outcome == Outcome.SUCCESS], minlength=count)
+    wanted = manifest.config.max_grasps
+    full = np.zeros(count, dtype=bool) if wanted is None else grasps >= wanted
+
+    numbers = {key: i for i, key in enumerate(zip(state.names, state.meshes, strict=True))}
+    newer = 0
+    for header in _done_headers(state.out, manifest):
+        number = numbers.get((header.object_name, header.mesh_sha256))
+        newer += number is None or (header.start > last[number] and not full[number])
+    return newer
+
+
+def _done_headers(out: Path, manifest: Manifest) -> Iterator[ShardHeader]:
+    """Yield the work units whose shards are there, in the order of the dataset's rows."""
+    # One listing per object: a look at each file of a large build takes seconds.
+    folder, names = None, frozenset[str]()
+    for header in manifest.headers():
+        path = header.path(out)
+        if path.parent != folder:
+            folder, names = path.parent, _names_in(path.parent)
+        if path.name in names:
+            yield header
+
+
+def _names_in(folder: Path) -> frozenset[str]:
+    try:
+        return frozenset(os.listdir(folder))
+    except OSError:
+        return frozenset()
+
+
+def _stamp(path: Path) -> Stamp:
     try:
         status = path.stat()
     except OSError:

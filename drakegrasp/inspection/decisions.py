@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import threading
+import time
+from collections import OrderedDict, deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import FileIO
 from pathlib import Path
 
 from drakegrasp.dataset.rejections import (
@@ -12,13 +19,45 @@ from drakegrasp.dataset.rejections import (
     read_decisions,
     write_decisions,
 )
+from drakegrasp.errors import DataError
+from drakegrasp.runtime.files import open_own
+from drakegrasp.runtime.processes import lock_file
+
+#: Who writes `reject.json` holds this file; it goes when the decision is written.
+LOCK_NAME = f".{FILE_NAME}.lock"
+#: How long a decision waits for those of other inspections [s]; each takes milliseconds.
+PATIENCE = 10.0
+#: Pages whose decisions can be undone, and the decisions of each.
+KEPT_PAGES, KEPT_DECISIONS = 100, 1000
+
+
+@dataclass(frozen=True)
+class Undo:
+    """What came of withdrawing a decision.
+
+    Attributes:
+        key: The attempt.
+        decision: What is decided now.
+        done: Whether it was withdrawn; not if somebody has decided otherwise since.
+    """
+
+    key: AttemptKey
+    decision: str
+    done: bool
+
+
+@dataclass(frozen=True)
+class _Step:
+    key: AttemptKey
+    before: str
+    after: str
 
 
 class DecisionFile:
     """`reject.json` of a dataset, written anew with every decision.
 
-    It is read before each change, so that a file edited by hand or by a second inspection is not
-    overwritten with old content.
+    It is read before each change, and locked until the change is written, so that nothing is lost
+    that another inspection or a person writes.
 
     Args:
         out: Directory of the dataset.
@@ -30,7 +69,7 @@ class DecisionFile:
     def __init__(self, out: Path) -> None:
         self._path = out / FILE_NAME
         self._lock = threading.Lock()
-        self._before: list[tuple[AttemptKey, str]] = []
+        self._steps: OrderedDict[str, deque[_Step]] = OrderedDict()
         self.read()
 
     def read(self) -> Decisions:
@@ -41,31 +80,90 @@ class DecisionFile:
         """
         return read_decisions(self._path)
 
-    def decide(self, key: AttemptKey, decision: str) -> None:
-        """Write a decision: `rejected`, `kept`, or empty text to withdraw it.
+    def decide(self, key: AttemptKey, decision: str, page: str = "") -> Decisions:
+        """Write a decision and return all that there are then.
+
+        Args:
+            key: The attempt.
+            decision: `rejected`, `kept`, or empty text to withdraw what was decided.
+            page: Which page decides, for `undo`.
 
         Raises:
             ValueError: If the decision is none.
             DataError: If the file is something else by now.
             OSError: If it cannot be written.
         """
-        with self._lock:
+        with self._lock, _held(self._path.with_name(LOCK_NAME)):
             decisions = self.read()
-            changed = decisions.with_decision(key, decision)
+            before, changed = decisions.of(key), decisions.with_decision(key, decision)
+            if decision == before:
+                return decisions
             write_decisions(self._path, changed)
-            self._before.append((key, decisions.of(key)))
+            self._steps_of(page).append(_Step(key, before, decision))
+            return changed
 
-    def undo(self) -> AttemptKey | None:
-        """Withdraw the last decision of this inspection; return its attempt, None if none is left.
+    def undo(self, page: str = "") -> Undo | None:
+        """Withdraw the last decision of a page; None if none is left.
+
+        What was decided otherwise since, by another page or inspection, stays.
 
         Raises:
             DataError: If the file is something else by now.
             OSError: If it cannot be written.
         """
-        with self._lock:
-            if not self._before:
+        with self._lock, _held(self._path.with_name(LOCK_NAME)):
+            steps = self._steps_of(page)
+            if not steps:
                 return None
-            key, before = self._before[-1]
-            write_decisions(self._path, self.read().with_decision(key, before))
-            self._before.pop()
-            return key
+            step, decisions = steps[-1], self.read()
+            now = decisions.of(step.key)
+            done = now == step.after
+            if done:
+                write_decisions(self._path, decisions.with_decision(step.key, step.before))
+            steps.pop()
+            return Undo(step.key, step.before if done else now, done)
+
+    def _steps_of(self, page: str) -> deque[_Step]:
+        steps = self._steps.setdefault(page, deque(maxlen=KEPT_DECISIONS))
+        self._steps.move_to_end(page)
+        if len(self._steps) > KEPT_PAGES:
+            self._steps.popitem(last=False)
+        return steps
+
+
+@contextmanager
+def _held(path: Path) -> Iterator[None]:
+    """Hold the kernel's lock on a file while the block runs, and remove it at the end.
+
+    On a file system without locks the block runs without.
+
+    Raises:
+        DataError: If another process holds it for long.
+        OSError: If it cannot be made.
+    """
+    file = _take(path)
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        file.close()
+
+
+def _take(path: Path) -> FileIO:
+    """Return the lock file, which is ours now."""
+    end = time.monotonic() + PATIENCE
+    while time.monotonic() < end:
+        file = FileIO(open_own(path, os.O_RDWR | os.O_CREAT), "r+")
+        try:
+            # Who held it before may have removed it after we opened it.
+            if lock_file(file) is not False and os.path.samestat(
+                path.stat(), os.fstat(file.fileno())
+            ):
+                return file
+        except FileNotFoundError:
+            pass
+        file.close()
+        time.sleep(0.002)
+    raise DataError(
+        f"{path}: must be held for a moment only, got a process that holds it for {PATIENCE:.0f} s"
+    )

@@ -25,8 +25,8 @@ class Links(Protocol):
     def strip(self, label: str, camera: str) -> str:
         """Return that of an attempt's images."""
 
-    def mesh(self, kind: str, number: int) -> str:
-        """Return that of a mesh: kind `object` or `link`."""
+    def mesh(self, kind: str, name: str) -> str:
+        """Return that of a mesh: an `object` by its code, or a `link` by its number."""
 
     def plots(self) -> str:
         """Return that of the page of plots."""
@@ -57,9 +57,9 @@ class ServerLinks:
         """See `Links`."""
         return f"/strip/{label}-{camera}.png"
 
-    def mesh(self, kind: str, number: int) -> str:
+    def mesh(self, kind: str, name: str) -> str:
         """See `Links`."""
-        return f"/mesh/{kind}-{number}.glb"
+        return f"/mesh/{kind}-{name}.glb"
 
     def plots(self) -> str:
         """See `Links`."""
@@ -97,9 +97,9 @@ class FileLinks:
         """See `Links`."""
         return f"{self.up}strip/{label}-{camera}.png"
 
-    def mesh(self, kind: str, number: int) -> str:
+    def mesh(self, kind: str, name: str) -> str:
         """See `Links`: a script that holds the mesh, since a page of a file may read no file."""
-        return f"{self.up}mesh/{kind}-{number}.js"
+        return f"{self.up}mesh/{kind}-{name}.js"
 
     def plots(self) -> str:
         """See `Links`."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import threading
-from functools import lru_cache
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -25,13 +25,15 @@ from drakegrasp.visualization.distributions import (
 #: Plots by name, with what they show.
 PLOTS = {
     "outcomes": "How the attempts ended.",
-    "removals": "What became of the successes: samples (kept), or the filter that removed them.",
+    "removals": "What became of the successes: samples, or the filter that removed them.",
     "objects": "Grasps by object: held at the end of the lift; of these with the fingertips alone "
     "(precision); of these moved by less than 5 mm and 5° in the hand (stable).",
     "distributions": "Held grasps by quantity. Each last bin holds all larger values. What each "
     "quantity is stands on the page of a grasp.",
 }
 _LOCK = threading.Lock()
+#: What was drawn of states of the files that are still in use.
+_DRAWN: WeakKeyDictionary[Snapshot, dict[str, bytes]] = WeakKeyDictionary()
 
 
 def plots_values(snapshot: Snapshot) -> dict[str, Any]:
@@ -52,7 +54,6 @@ def plots_values(snapshot: Snapshot) -> dict[str, Any]:
     }
 
 
-@lru_cache(maxsize=len(PLOTS))
 def plot_svg(snapshot: Snapshot, name: str) -> bytes | None:
     """Return a plot as SVG, or None if there is none of that name."""
     drawings = {
@@ -66,7 +67,10 @@ def plot_svg(snapshot: Snapshot, name: str) -> bytes | None:
     draw = drawings[name]
     # Matplotlib's settings belong to the process: one plot at a time.
     with _LOCK:
-        return svg_bytes(draw(snapshot))
+        drawn = _DRAWN.setdefault(snapshot, {})
+        if name not in drawn:
+            drawn[name] = svg_bytes(draw(snapshot))
+        return drawn[name]
 
 
 def _outcomes(snapshot: Snapshot) -> Any:
@@ -81,7 +85,8 @@ def _removals(snapshot: Snapshot) -> Any:
     counts = np.bincount(decided, minlength=1 + max(Removal))
     shown = [r for r in Removal if counts[r] or r is Removal.KEPT]
     shown.sort(key=lambda r: (r is not Removal.KEPT, -counts[r]))
-    return draw_counts({r.label: int(counts[r]) for r in shown}, "successes")
+    names = {r: "samples" if r is Removal.KEPT else r.label for r in shown}
+    return draw_counts({names[r]: int(counts[r]) for r in shown}, "successes")
 
 
 def _objects(snapshot: Snapshot) -> Any:

@@ -40,7 +40,12 @@ class Quantity:
     digits: int
 
     def text(self, value: float) -> str:
-        """Return a value in SI as text with its unit; a dash if there is none."""
+        """Return a value in SI as text with its unit; a dash if there is none.
+
+        Infinite stands for what a contact without a normal has no value of.
+        """
+        if np.isposinf(value):
+            return "none"
         if not np.isfinite(value):
             return "–"
         space = "" if self.unit in ("", "°") else " "
@@ -69,6 +74,8 @@ RANGES = ("suspicion", "penetration", "slip", "turn", "force", "normal_angle")
 SORTS = (*QUANTITIES, "row")
 HOLDS = ("held", "precision", "stable")
 DECISIONS = ("rejected", "kept", "open")
+#: Choices of the split: all samples, those of one split, what is no sample.
+SPLIT_CHOICES = ("samples", *SPLITS, "none")
 #: Cards on a page of the gallery.
 PAGE = 24
 #: Makes one number of object, palm pose and stand-off, whose type has eight bits.
@@ -139,7 +146,7 @@ def parse_query(params: Mapping[str, str]) -> Query:
     # Texts that must be one of a few; names of objects may be any.
     choices = {
         "outcome": ("any", *(o.label for o in Outcome)),
-        "split": (*SPLITS, "none"),
+        "split": SPLIT_CHOICES,
         "hold": HOLDS,
         "removal": tuple(r.label for r in Removal),
         "decision": DECISIONS,
@@ -222,7 +229,9 @@ def _matches(snapshot: Snapshot, query: Query) -> npt.NDArray[np.bool_]:
     # Verdicts.
     if query.outcome:
         chosen &= table.outcome == Outcome[query.outcome.upper()]
-    if query.split:
+    if query.split == "samples":
+        chosen &= table.split != NONE
+    elif query.split:
         number = NONE if query.split == "none" else SPLITS.index(query.split)
         chosen &= table.split == number
     if query.hold:
@@ -239,6 +248,19 @@ def _matches(snapshot: Snapshot, query: Query) -> npt.NDArray[np.bool_]:
         if largest is not None:
             chosen &= values <= largest
     return chosen
+
+
+def count_decisions(snapshot: Snapshot, decisions: Decisions) -> dict[str, int]:
+    """Return how many attempts are rejected, and kept, and how many rejected are samples now."""
+    samples = 0
+    if decisions.rejected:
+        rejected = _decided(snapshot, "rejected", decisions)
+        samples = int(np.count_nonzero(rejected & (snapshot.table.split != NONE)))
+    return {
+        "rejected": len(decisions.rejected),
+        "kept": len(decisions.kept),
+        "samples": samples,
+    }
 
 
 def _decided(snapshot: Snapshot, decision: str, decisions: Decisions) -> npt.NDArray[np.bool_]:

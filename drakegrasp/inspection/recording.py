@@ -7,12 +7,26 @@ import subprocess
 import sys
 import tempfile
 import threading
+from dataclasses import dataclass
 from pathlib import Path
 
 from drakegrasp.errors import DataError
 
 #: Longest time that a replay may take [s].
 TIMEOUT = 300.0
+
+
+@dataclass(frozen=True)
+class Rerun:
+    """What running an attempt again gave.
+
+    Attributes:
+        same: Whether each value is the stored one, bit for bit.
+        text: What `replay` says of it, a line per value that differs.
+    """
+
+    same: bool
+    text: str
 
 
 class Recordings:
@@ -28,9 +42,10 @@ class Recordings:
         self._out = out
         self._folder: Path | None = None
         self._lock = threading.Lock()
+        self._found: dict[str, Rerun] = {}
 
-    def make(self, label: str, trial: int) -> None:
-        """Run a trial again and keep its recording.
+    def make(self, label: str, trial: int) -> Rerun:
+        """Run a trial again, keep its recording, and return how it compares.
 
         Args:
             label: Of the attempt.
@@ -40,17 +55,19 @@ class Recordings:
             DataError: If it cannot be run again; the reason is the last line of `replay`.
         """
         code = "from drakegrasp.cli.main import run; run()"
-        command = [sys.executable, "-c", code, "replay", str(self._out), "--trial", str(trial)]
+        # -P: a module in the current folder must not stand for one of Python's.
+        arguments = ["replay", "--trial", str(trial)]
+        command = [sys.executable, "-P", "-c", code, *arguments]
         # One at a time: each takes a core for some seconds.
         with self._lock:
             if self._folder is None:
                 self._folder = Path(tempfile.mkdtemp(prefix="drakegrasp-inspect-"))
             path = self._path(label)
-            if path.is_file():
-                return
+            if label in self._found:
+                return self._found[label]
             try:
                 done = subprocess.run(
-                    [*command, "--html", str(path)],
+                    [*command, "--html", str(path), "--", str(self._out)],
                     capture_output=True,
                     text=True,
                     timeout=TIMEOUT,
@@ -58,10 +75,15 @@ class Recordings:
                 )
             except subprocess.TimeoutExpired:
                 raise DataError(f"trial {trial} must replay within {TIMEOUT:.0f} s") from None
-        # Exit code 1 with a recording: values differ, and the recording shows what it is now.
-        if not path.is_file():
-            reason = (done.stderr.strip().splitlines() or ["no recording was written"])[-1]
-            raise DataError(f"trial {trial} cannot be run again: {reason}")
+            if not path.is_file():
+                reason = (done.stderr.strip().splitlines() or ["no recording was written"])[-1]
+                raise DataError(f"trial {trial} cannot be run again: {reason}")
+
+            # Exit code 1 with a recording: values differ, and the recording shows what is now. The
+            # last line is the recording's path.
+            lines = done.stdout.strip().splitlines()[:-1]
+            self._found[label] = Rerun(same=done.returncode == 0, text="\n".join(lines))
+            return self._found[label]
 
     def read(self, label: str) -> bytes | None:
         """Return the recording of an attempt, or None if none was made."""
@@ -76,7 +98,7 @@ class Recordings:
             shutil.rmtree(self._folder, ignore_errors=True)
 
     def _path(self, label: str) -> Path:
-        """Return the path of a recording; a label is three numbers, and nothing else is a name."""
+        """Return the path of a recording; only labels are names."""
         assert self._folder is not None
-        safe = "".join(c for c in label if c in "0123456789-")
+        safe = "".join(c for c in label if c in "0123456789abcdef-")
         return self._folder / f"{safe}.html"

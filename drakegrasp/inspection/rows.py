@@ -14,13 +14,14 @@ import numpy.typing as npt
 from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.paths import DATA_FILES, shards_folder
-from drakegrasp.dataset.schema import SPLITS, TRIAL_FIELDS
+from drakegrasp.dataset.schema import CERTIFICATE_FIELDS, SPLITS, TRIAL_FIELDS
 from drakegrasp.dataset.shards import ASSEMBLED_FIELDS
 from drakegrasp.errors import DataError
 from drakegrasp.frames import invert_pose, rotate_vectors, transform_points, unpack_pose
 from drakegrasp.inspection.catalog import Snapshot
 from drakegrasp.inspection.table import NONE
 from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, intrinsics, project
+from drakegrasp.visualization.style import HIDDEN
 
 #: Columns that the dots on a thumbnail need.
 THUMBNAIL = ("X_TO", "X_OG", "X_C0C", "closed_p_OQ", "closed_nhat_Q_O")
@@ -44,13 +45,21 @@ class Look:
 
 @dataclass(frozen=True)
 class Dot:
-    """A contact on an image: its pixel, and that of the tip of its normal."""
+    """A contact on an image: its pixel, and that of the tip of its normal.
+
+    Attributes:
+        finger: In grasp order.
+        u, v: Pixel of the contact.
+        tip_u, tip_v: Pixel of the tip of its normal.
+        hidden: Whether the object hides it.
+    """
 
     finger: int
     u: float
     v: float
     tip_u: float
     tip_v: float
+    hidden: bool
 
 
 def read_rows(
@@ -74,6 +83,8 @@ def read_rows(
             number = int(table.source[i])
             if number not in files:
                 files[number] = open_hdf5(snapshot.sources[number])
+                if not snapshot.assembled and not _is_shard_of(snapshot, i, files[number]):
+                    raise ValueError(f"{snapshot.sources[number]} is of another mesh")
             trials = files[number]["trials"]
             rows.append({name: np.asarray(trials[name][table.row[i]]) for name in columns})
     except (OSError, KeyError, ValueError, IndexError) as error:
@@ -81,6 +92,8 @@ def read_rows(
     finally:
         for file in files.values():
             file.close()
+    # A file is opened by its name: it may have been another one.
+    snapshot.refuse_replaced()
     return rows
 
 
@@ -88,13 +101,19 @@ def read_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
     """Return the images of an attempt, or None if there are none.
 
     A sample's are in the data file. Those of other successes are in their shard.
+
+    Raises:
+        DataError: If a file was replaced meanwhile.
     """
     try:
         if snapshot.table.split[i] != NONE:
-            return _sample_look(snapshot, i, camera)
-        return _shard_look(snapshot, i, camera)
+            look = _sample_look(snapshot, i, camera)
+        else:
+            look = _shard_look(snapshot, i, camera)
     except (OSError, KeyError, ValueError, IndexError):
-        return None
+        look = None
+    snapshot.refuse_replaced()
+    return look
 
 
 def _sample_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
@@ -110,6 +129,9 @@ def _sample_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
 def _shard_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
     key = snapshot.key(i)
     with open_hdf5(_shard_path(snapshot, i)) as file:
+        if not _is_shard_of(snapshot, i, file):
+            return None
+
         # The row of the attempt in its shard, then that of its images.
         trials, looks = file["trials"], file["looks"]
         here = trials["candidate"][:] == key.candidate
@@ -121,6 +143,13 @@ def _shard_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
         return Look(image=looks[f"image_{camera}"][k], mask=looks[f"mask_{camera}"][k])
 
 
+def _is_shard_of(snapshot: Snapshot, i: int, file: h5py.File) -> bool:
+    """Return whether a shard is of the configuration and the mesh of an attempt."""
+    mesh = snapshot.meshes[snapshot.table.object[i]]
+    identity = (file.attrs["config_hash"], file.attrs["mesh_sha256"])
+    return identity == (snapshot.config_hash, mesh)
+
+
 def _shard_path(snapshot: Snapshot, i: int) -> Path:
     """Return the path of the shard that holds an attempt; its end is that of the object's poses."""
     key = snapshot.key(i)
@@ -129,13 +158,16 @@ def _shard_path(snapshot: Snapshot, i: int) -> Path:
     return path
 
 
-def contact_dots(snapshot: Snapshot, row: dict[str, Any], camera: str) -> list[Dot]:
+def contact_dots(
+    snapshot: Snapshot, row: dict[str, Any], camera: str, look: Look | None = None
+) -> list[Dot]:
     """Return where a camera sees the contacts after closing; those behind it are left out.
 
     Args:
         snapshot: With the configuration of the cameras.
         row: With the columns THUMBNAIL.
         camera: `oto` or `otm`.
+        look: Its images, which tell what the object hides; without them nothing is hidden.
     """
     # The contacts and the tips of their normals in {C}.
     config = snapshot.config.camera
@@ -149,5 +181,31 @@ def contact_dots(snapshot: Snapshot, row: dict[str, Any], camera: str) -> list[D
     for finger, (point, tip) in enumerate(zip(p_CQ, p_CE, strict=True)):
         if np.isfinite(point).all() and min(point[2], tip[2]) > config.near:
             (u, v), (tip_u, tip_v) = project(K, np.array([point, tip])).tolist()
-            dots.append(Dot(finger, u, v, tip_u, tip_v))
+            hidden = look is not None and _is_hidden(look, u, v, float(point[2]))
+            dots.append(Dot(finger, u, v, tip_u, tip_v, hidden))
     return dots
+
+
+def _is_hidden(look: Look, u: float, v: float, depth: float) -> bool:
+    """Return whether something nearer is seen at the pixel of a contact, as on contact sheets."""
+    last = look.image.shape[-1] - 1
+    column, row = (min(max(round(x), 0), last) for x in (u, v))
+    return depth > float(look.image[3, row, column]) + HIDDEN
+
+
+def read_certificate(snapshot: Snapshot, i: int) -> dict[str, float]:
+    """Return how robust a success is, by the names of CERTIFICATE_FIELDS; NaN if not certified.
+
+    Raises:
+        DataError: If a file was replaced meanwhile.
+    """
+    table = snapshot.table
+    group, key = ("successes", "trial_id") if snapshot.assembled else ("looks", "row")
+    try:
+        with open_hdf5(snapshot.sources[table.source[i]]) as file:
+            (found,) = np.nonzero(file[group][key][:] == table.row[i])
+            certificate = {f.name: float(file[group][f.name][found[0]]) for f in CERTIFICATE_FIELDS}
+    except (OSError, KeyError, ValueError, IndexError):
+        certificate = {f.name: float("nan") for f in CERTIFICATE_FIELDS}
+    snapshot.refuse_replaced()
+    return certificate

@@ -118,7 +118,7 @@ def scene_of(snapshot: Snapshot, i: int, row: Mapping[str, Any], hand: HandView)
     name = snapshot.names[snapshot.table.object[i]]
     return {
         "object": _columns(X_TO),
-        "objectNumber": int(snapshot.table.object[i]),
+        "objectCode": snapshot.codes[snapshot.table.object[i]],
         "hasObject": find_model(snapshot.out, name) is not None,
         "links": len(hand.links),
         "states": states,

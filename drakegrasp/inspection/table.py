@@ -71,7 +71,8 @@ class AttemptTable:
         precision, stable: (n,) bool, see the schema.
         source, row: (n,) int32, number of the file that holds the attempt, and row in it.
         closed: (m,) int32, places of the attempts whose hand closed, in rising order.
-        features: By the names of FEATURES, (m,) float32, of these; the others have no values.
+        features: By the names of FEATURES, (m,) float32, of these; the others have no values. NaN
+            where an attempt did not get so far, infinite where a contact has no normal.
     """
 
     object: npt.NDArray[np.int32]
@@ -187,6 +188,27 @@ def join(parts: Sequence[AttemptTable]) -> AttemptTable:
     return _with_features(whole, ends)
 
 
+def rows_within(part: AttemptTable, wanted: int | None) -> tuple[AttemptTable, int | None]:
+    """Return the attempts of a shard that an object needs, and how many grasps it wants after it.
+
+    Assembly takes the same rows: with `max_grasps` they end with the last wanted grasp.
+
+    Args:
+        part: Attempts of the shard.
+        wanted: Number of grasps that the object still wants; None for all.
+    """
+    if wanted is None:
+        return part, None
+    (hits,) = np.nonzero(part.outcome == Outcome.SUCCESS)
+    if len(hits) < wanted:
+        return part, wanted - len(hits)
+    count = int(hits[wanted - 1]) + 1 if wanted else 0
+    few = int(np.searchsorted(part.closed, count))
+    plain = {name: getattr(part, name)[:count] for name in _DTYPES}
+    features = {name: values[:few] for name, values in part.features.items()}
+    return AttemptTable(**plain, closed=part.closed[:few], features=features), 0
+
+
 def empty_table() -> AttemptTable:
     """Return a table without attempts."""
     return _with_features(_zeros(0), [])
@@ -231,7 +253,12 @@ def _part(
     forces = np.where(lifted, few["lifted_f_Q_O"], few["closed_f_Q_O"])
     extra = {"suspicion": doubts.score, "force": norm(forces).max(axis=1, initial=-np.inf)}
 
-    features = {name: v.astype(np.float32) for name, v in (extra | dict(doubts.values)).items()}
+    # What a contact without a normal has no value of counts as the largest share: as infinite.
+    values = {
+        name: np.where(np.isnan(v) & np.isfinite(doubts.shares[name]), np.inf, v)
+        for name, v in doubts.values.items()
+    }
+    features = {name: v.astype(np.float32) for name, v in (extra | values).items()}
     return AttemptTable(
         object=objects.astype(np.int32),
         candidate=columns["candidate"].astype(np.int32),

@@ -24,6 +24,7 @@ from drakegrasp.mesh.surfaces import (
     signed_volume,
 )
 from drakegrasp.objects.contact_fit import AHEAD
+from drakegrasp.objects.memory import forecast_memory
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import (
     UNITS,
@@ -83,6 +84,7 @@ class AuditRow:
         collision_faces: Number of faces for contact.
         collision_error: Largest distance of these from the solid [m].
         memory: Of a worker for this object, beside what it needs anyway [B].
+        preparing: Most memory of a worker while it prepares the mesh, in all [B].
         model: The object.
     """
 
@@ -106,6 +108,7 @@ class AuditRow:
     collision_faces: int | None = None
     collision_error: float | None = None
     memory: float | None = None
+    preparing: float | None = None
     model: ObjectModel | None = field(default=None, repr=False, compare=False)
 
     def to_json(self) -> dict[str, Any]:
@@ -156,6 +159,7 @@ def _audit_one(source: MeshSource) -> AuditRow:
     pieces, _ = face_components(pair_half_edges(vertices, faces, radial=False), len(faces))
     known |= {
         "faces": len(faces),
+        "preparing": forecast_memory(len(faces)),
         "bodies": pieces,
         "watertight": is_solid_surface(faces),
         "extents": (x, y, z),

@@ -1,13 +1,25 @@
-"""How tasks are run: the protocol of executors, and the plain loop.
+"""How tasks are run: the protocol of executors, the plain loop, and processes of this machine.
 
-`run_here` is the plain loop; `drakegrasp.cluster.executor` has the executor on Dask.
+`run_here` is the plain loop, `processes` gives an executor for work that no cluster is started for;
+`drakegrasp.cluster.executor` has the executor on Dask.
 """
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import signal
+import threading
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import islice
+from multiprocessing.connection import wait as wait_for
 from typing import Protocol, TypeVar
+
+from drakegrasp.errors import MachineError
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -40,3 +52,71 @@ class WorkerPool:
 def run_here(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
     """Run in this process, one item after the other: for tests and debuggers."""
     return (function(item) for item in items)
+
+
+@contextmanager
+def processes(workers: int) -> Iterator[Executor]:
+    """Run tasks in processes of this machine while the block runs; one worker is this process.
+
+    Args:
+        workers: Number of processes.
+    """
+    if workers == 1:
+        yield run_here
+        return
+
+    # A forked process could hang: this one may have threads.
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin_worker)
+    try:
+        yield _PoolExecutor(pool, 2 * workers)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+@dataclass(frozen=True)
+class _PoolExecutor:
+    """An `Executor` on a pool of processes.
+
+    Attributes:
+        pool: The pool.
+        in_flight: Number of tasks that run or wait for a process.
+    """
+
+    pool: ProcessPoolExecutor
+    in_flight: int
+
+    def __call__(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+        """Yield function(item) of every item as they are done.
+
+        Raises:
+            MachineError: If a process died.
+            Exception: What the function raised.
+        """
+        remaining, pending = iter(items), set[Future[R]]()
+        try:
+            while True:
+                room = self.in_flight - len(pending)
+                pending |= {self.pool.submit(function, x) for x in islice(remaining, room)}
+                if not pending:
+                    return
+                done, pending = wait(pending, return_when=FIRST_COMPLETED)
+                for future in done:
+                    yield future.result()
+        except BrokenProcessPool:
+            raise MachineError(
+                "a worker process died; is there enough memory? Fewer --workers need less"
+            ) from None
+
+
+def _begin_worker() -> None:
+    """Leave Ctrl-C to the parent process, and end with it, however it ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def end() -> None:
+        wait_for([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=end, daemon=True).start()

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -22,10 +22,13 @@ import click
 import h5py
 
 from drakegrasp.build.pipeline import build
+from drakegrasp.build.prepare import prepare_one
 from drakegrasp.build.stage_times import StageTimes
 from drakegrasp.build.work_unit import UnitSummary
 from drakegrasp.cli.options import manifest_option, set_option, units_option
 from drakegrasp.config import load_config
+from drakegrasp.dataset.assembly.pack import pack_rows
+from drakegrasp.dataset.assembly.survey import survey_object
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.statistics import count_splits
@@ -40,6 +43,7 @@ class Clock:
     def __init__(self) -> None:
         self.prepare: list[float] = []
         self.units: list[UnitSummary] = []
+        self.assembling: defaultdict[str, float] = defaultdict(float)
         self.last = 0.0
 
     def __call__(self, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
@@ -47,11 +51,14 @@ class Clock:
         for item in items:
             start = time.perf_counter()
             result = function(item)
-            self.last = time.perf_counter()
-            if isinstance(result, UnitSummary):
+            end = time.perf_counter()
+            if function is prepare_one:
+                self.prepare.append(end - start)
+            elif isinstance(result, UnitSummary):
                 self.units.append(result)
+                self.last = end
             else:
-                self.prepare.append(self.last - start)
+                self.assembling[function.__name__] += end - start
             yield result
 
 
@@ -95,7 +102,7 @@ def stage_times(clock: Clock, core: float, *, assembled: float, out: Path) -> St
     Args:
         clock: What the tasks took by the wall clock.
         core: CPU time of this process per wall-clock time.
-        assembled: Time of the assembly [s].
+        assembled: Time from the last unit to the end [s].
         out: The dataset.
     """
     # Sum over all units, and over those of each object.
@@ -114,7 +121,9 @@ def stage_times(clock: Clock, core: float, *, assembled: float, out: Path) -> St
         scene=seconds["build"] / objects,
         attempt=(seconds["try"] + seconds["measure"] + seconds["write"]) / attempts,
         look=seconds["look"] / max(1, successes),
-        assemble=core * assembled / attempts,
+        survey=core * clock.assembling[survey_object.__name__] / attempts,
+        pack=core * clock.assembling[pack_rows.__name__] / attempts,
+        put=core * (assembled - sum(clock.assembling.values())) / attempts,
         successes=successes / attempts,
         samples=samples / max(1, successes),
         **measure_storage(out),

@@ -1,6 +1,4 @@
-"""A step that hangs ends at its limit, and what it was at is refused: with and without the
-interpreter's lock, computing or waiting.
-"""
+"""A step that hangs ends at its limit, whatever it does, and what it was at is refused."""
 
 from __future__ import annotations
 

@@ -249,11 +249,6 @@ def test_shards(base: Path, tmp_path: Path, command: str) -> None:
     walk(base, tmp_path, SHARD, some(hdf5_kinds.SHARD, command, READ_SHARDS), command)
 
 
-def test_shards_of_unfinished(base: Path, tmp_path: Path) -> None:
-    kinds = [kind for kind in hdf5_kinds.SHARD if "/looks/row" not in kind.name]
-    walk(base, tmp_path, SHARD, kinds[::3], "inspect", OTO, OTM, TRIALS)
-
-
 @pytest.mark.parametrize("command", READ_PLANS)
 def test_plans(base: Path, tmp_path: Path, command: str) -> None:
     walk(base, tmp_path, PLAN, some(hdf5_kinds.PLAN, command, READ_PLANS), command)

@@ -29,6 +29,7 @@ from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import CARD_FILES
 from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.rejections import AttemptKey, Decisions, write_decisions
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
@@ -101,6 +102,17 @@ def test_refused_assemble_changes_nothing(
     assert result.exit_code in (1, 2)
     assert words in result.stderr
     assert state(out) == before
+
+
+def test_assemble_says_which_rejections_had_no_effect(out: Path) -> None:
+    keys = [AttemptKey("1_box_a", 0, 0), AttemptKey("0_gone", 0, 0)]
+    write_decisions(out / "reject.json", Decisions(rejected=frozenset(keys)))
+    result = run("assemble", out, "--reject", out / "reject.json")
+    assert result.exit_code == 0
+    assert "skipped 1 of 2 rejections, which name no success" in result.stdout
+    result = run("assemble", out)
+    assert result.exit_code == 0
+    assert f"{out / 'reject.json'}: rejections that were not used: 2" in result.stdout
 
 
 def test_assemble_beside_a_build_does_not_change_its_filters(out: Path) -> None:

@@ -346,6 +346,8 @@ def test_audit_lists_what_would_be_refused(tmp_path: Path) -> None:
     assert "fit" in result.stdout
     assert "refused" in result.stdout
     assert "2 meshes: 1 fit, 0 repaired, 1 refused; 0 with a warning (!)" in result.stdout
+    line = "preparing takes up to 425 MB of a worker (1_box_a): --memory must be 450MB or more"
+    assert line in result.stdout
 
 
 def test_audit_writes_findings_and_a_sheet(tmp_path: Path) -> None:

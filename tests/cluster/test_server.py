@@ -38,9 +38,17 @@ PATIENCE = 600.0
 
 @pytest.fixture(scope="module")
 def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("meshes")
+    folder = tmp_path_factory.mktemp("meshes") / "m s$d"
     write_fixed(folder, "10_box_tall")
     return folder
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    """A directory whose path a shell splits, and whose `$` it replaces, where it has no quotes."""
+    folder = tmp_path / "a b$c"
+    folder.mkdir()
+    return folder / "out $(touch ran)"
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +90,7 @@ def submit(env: dict[str, str], meshes: Path, out: Path, *arguments: str) -> Non
     assert result.returncode == 0, result.stderr
     assert f"{CANDIDATES // UNIT} work units simulated" in result.stdout
     assert not list(out.glob(".tls-*"))
+    assert not list(out.parent.parent.rglob("ran"))
 
 
 def settings(client: Client) -> dict[str, dict[str, Any]]:
@@ -133,9 +142,8 @@ def remote_processes() -> list[psutil.Process]:
 
 
 def test_slurm_builds_what_a_plain_loop_builds(
-    slurm: dict[str, str], meshes: Path, built_here: Path, tmp_path: Path
+    slurm: dict[str, str], meshes: Path, built_here: Path, out: Path
 ) -> None:
-    out = tmp_path / "out"
     options = ["--workers", "2", "--walltime", "00:30:00", "--tls"]
     submit(slurm, meshes, out, "--cluster", "slurm", *options)
     assert_same_dataset(built_here, out)
@@ -172,10 +180,10 @@ def workers(client: Client) -> int:
 
 
 def test_sbatch_file_builds_what_a_plain_loop_builds(
-    slurm: dict[str, str], meshes: Path, built_here: Path, tmp_path: Path
+    slurm: dict[str, str], meshes: Path, built_here: Path, out: Path, tmp_path: Path
 ) -> None:
     """The recipe, with scheduler, workers and client in one allocation."""
-    out, log = tmp_path / "out", tmp_path / "log"
+    log = tmp_path / "log"
     recipe = (PIPELINES / "recipes" / "build.sbatch").read_text()
     asked = f"--quiet --candidates {CANDIDATES} --set unit_candidates={UNIT}"
     script = tmp_path / "build.sbatch"
@@ -209,9 +217,8 @@ def test_slurm_refuses_a_job_in_one_line(
 
 
 def test_ssh_builds_what_a_plain_loop_builds(
-    ssh: dict[str, str], meshes: Path, built_here: Path, tmp_path: Path
+    ssh: dict[str, str], meshes: Path, built_here: Path, out: Path
 ) -> None:
-    out = tmp_path / "out"
     submit(ssh, meshes, out, "--cluster", "ssh", "127.0.0.1", "--workers", "2", "--tls")
     assert_same_dataset(built_here, out)
     wait_until(lambda: not remote_processes(), "the end of the workers", out / "none")

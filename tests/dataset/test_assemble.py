@@ -6,7 +6,7 @@ import shutil
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,9 @@ import pytest
 from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
 
 from drakegrasp.dataset import assemble as assemble_module
-from drakegrasp.dataset import shards
+from drakegrasp.dataset import hdf5, shards
 from drakegrasp.dataset.assemble import assemble, assemble_locked, summarise
+from drakegrasp.dataset.assembly import pack, samples, survey
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.lock import FILE_NAME, build_lock
 from drakegrasp.dataset.manifest import read_manifest
@@ -32,6 +33,7 @@ from drakegrasp.frames import (
     unpack_pose,
 )
 from drakegrasp.grasp import pack_grasp, unpack_grasp
+from drakegrasp.runtime.executor import processes
 from drakegrasp.runtime.files import refuse_broken_seal
 
 FILES = (OTO, OTM, TRIALS)
@@ -223,7 +225,7 @@ def test_contact_is_in_view_within_the_image_and_before_the_camera(
     p_TQ = transform_points(X_TC, np.array([[0.0, 0.0, 0.4], p_CQ]))
     grasp_T = pack_grasp(p_TQ, np.tile([0.0, 0.0, 1.0], (2, 1)))
     mask = np.zeros((33, 33))
-    assert assemble_module._in_view(K, mask, pack_pose(X_TC), grasp_T) is seen
+    assert survey._in_view(K, mask, pack_pose(X_TC), grasp_T) is seen
 
 
 def test_limits_of_the_hold_change_without_a_simulation(out: Path) -> None:
@@ -343,3 +345,78 @@ def test_whenever_assembling_is_killed_the_files_are_of_one_state(out: Path) -> 
     (out / "manifest.json").write_bytes(manifest)
     assemble(out)
     assert [(out / name).read_bytes() for name in FILES] == before
+
+
+def backwards(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
+    """Run the last task first."""
+    return iter([function(item) for item in reversed(list(items))])
+
+
+def arrays(out: Path) -> dict[str, Any]:
+    """Return every value of the three files."""
+    found = {}
+    for name in FILES:
+        with h5py.File(out / name) as file:
+            places: list[str] = []
+            file.visit(places.append)
+            found |= {
+                f"{name}/{place}": file[place][:].tolist()
+                for place in places
+                if isinstance(file[place], h5py.Dataset)
+            }
+    return found
+
+
+@pytest.fixture
+def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Chunks of five rows, in tasks of ten: a task begins and ends within a shard."""
+    for module in (hdf5, pack, samples):
+        monkeypatch.setattr(module, "COLUMN_CHUNK", 5)
+    for module in (pack, assemble_module):
+        monkeypatch.setattr(module, "TASK_ROWS", 10)
+
+
+@pytest.mark.usefixtures("small_chunks")
+def test_files_do_not_depend_on_the_order_of_the_tasks(out: Path) -> None:
+    before = arrays(out)
+    assemble(out)
+    in_order = [(out / name).read_bytes() for name in FILES]
+    with h5py.File(out / TRIALS) as file:
+        assert file["trials/X_TO"].chunks == (5, 12)
+        assert len(file["trials/X_TO"]) == 36
+    assemble(out, execute=backwards)
+    assert [(out / name).read_bytes() for name in FILES] == in_order
+    assert repr(arrays(out)) == repr(before)
+
+
+def test_files_do_not_depend_on_the_number_of_processes(out: Path) -> None:
+    before = [(out / name).read_bytes() for name in FILES]
+    with processes(2) as execute:
+        assemble(out, execute=execute)
+    assert [(out / name).read_bytes() for name in FILES] == before
+
+
+@pytest.mark.usefixtures("small_chunks")
+def test_what_a_task_left_is_removed_when_another_fails(out: Path) -> None:
+    def last_fails(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
+        done = [function(item) for item in items]
+        yield from reversed(done[1:])
+        if len(done) > 3:
+            assert list(out.glob(".rows-*"))
+            raise DataError("lost")
+        yield done[0]
+
+    before = [(out / name).read_bytes() for name in FILES]
+    with pytest.raises(DataError, match="lost"):
+        assemble(out, execute=last_fails)
+    assert [(out / name).read_bytes() for name in FILES] == before
+    assert not list(out.glob(".*"))
+
+
+def test_a_pool_of_processes_says_what_a_task_raised(out: Path) -> None:
+    sorted(out.glob("shards/*/*.h5"))[0].unlink()
+    with (
+        processes(2) as execute,
+        pytest.raises(DataError, match="must be a complete shard, got none"),
+    ):
+        assemble(out, execute=execute)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -10,11 +9,13 @@ from helpers.datasets import make_dataset
 
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.filters import Removal
+from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.rejections import (
     AttemptKey,
     Decisions,
     read_decisions,
     read_rejected,
+    unused_rejections,
     write_decisions,
 )
 from drakegrasp.errors import DataError
@@ -81,12 +82,37 @@ def test_assembly_drops_exactly_what_is_rejected(tmp_path: Path) -> None:
     assert assembly.removed == {Removal.KEPT: 7, Removal.REJECTED: 2}
 
 
-def test_rejecting_what_is_no_success_changes_nothing(tmp_path: Path) -> None:
+def test_an_id_that_is_no_success_changes_nothing(tmp_path: Path) -> None:
     out = make_dataset(tmp_path / "out", tmp_path)
     before = (out / "trials.hdf5").read_bytes()
-    stranger = AttemptKey("1_box_a", 0, 1)
-    write_decisions(out / "reject.json", Decisions(rejected=frozenset([stranger])))
-    assert json.loads((out / "reject.json").read_text())["rejected"][0]["standoff_index"] == 1
-    with pytest.raises(DataError, match="got 1_box_a, palm pose 0, stand-off 1"):
-        assemble(out, rejected=read_rejected(out / "reject.json"))
+    with pytest.raises(DataError, match="must be successes, got trial 1"):
+        assemble(out, rejected=[0, 1])
     assert (out / "trials.hdf5").read_bytes() == before
+
+
+def test_keys_that_are_no_success_are_left_out(tmp_path: Path) -> None:
+    """Of a failure, and of an object that is gone: the others count."""
+    out = make_dataset(tmp_path / "out", tmp_path)
+    failure, gone = AttemptKey("1_box_a", 0, 1), AttemptKey("0_gone", 0, 0)
+    path = out / "reject.json"
+    write_decisions(path, Decisions(rejected=frozenset([A, failure, gone])))
+    given = read_rejected(path)
+    assert assemble(out, rejected=given).removed == {Removal.KEPT: 8, Removal.REJECTED: 1}
+    used = read_manifest(out).rejected
+    assert used == (A,)
+    (sentence,) = unused_rejections(out, given, used)
+    assert sentence.startswith("skipped 2 of 3 rejections")
+    assert "0_gone, palm pose 0, stand-off 0; 1_box_a, palm pose 0, stand-off 1" in sentence
+
+
+def test_rejections_that_nobody_asked_for_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "reject.json"
+    write_decisions(path, Decisions(rejected=frozenset([A, B])))
+    for given in ([], [0]):
+        (sentence,) = unused_rejections(tmp_path, given, [A])
+        assert "not used: 1; --reject" in sentence
+    assert unused_rejections(tmp_path, [A, B], [A, B]) == []
+    assert unused_rejections(tmp_path, [], [A, B]) == []
+    # A file that cannot be read is no matter of an assembly that does not use it.
+    path.write_text("broken")
+    assert unused_rejections(tmp_path, [], []) == []

@@ -2,10 +2,47 @@
 
 from __future__ import annotations
 
+import re
 from html.parser import HTMLParser
+from typing import Any
+
+from starlette.testclient import TestClient
+
+from drakegrasp.inspection.catalog import Snapshot
 
 #: A name that must stay text.
 ATTACK = "<script>alert(1)</script>"
+
+
+def state_of(client: TestClient) -> Snapshot:
+    """The state of the files that an application shows."""
+    found: Snapshot = client.app.state.inspection.catalog.current()  # type: ignore[attr-defined]
+    return found
+
+
+def coded(snapshot: Snapshot, text: str) -> str:
+    """Return an address or a label with the codes of objects where it has their numbers.
+
+    `/grasp/0-3-2` is the page of object 0, palm pose 3, stand-off 2.
+    """
+
+    def code(found: re.Match[str]) -> str:
+        number = int(found[1])
+        return snapshot.codes[number] if number < len(snapshot.codes) else found[0]
+
+    return re.sub(r"\b(\d+)(?=-\d+-\d)", code, text)
+
+
+def get(client: TestClient, address: str) -> Any:
+    """Return the answer to an address with numbers for the codes of objects, see `coded`."""
+    return client.get(coded(state_of(client), address))
+
+
+def numbered(snapshot: Snapshot, text: str) -> str:
+    """Return a text with the numbers of objects for their codes: what `coded` was given."""
+    for number, code in enumerate(snapshot.codes):
+        text = text.replace(code, str(number))
+    return text
 
 
 class Tags(HTMLParser):

@@ -11,19 +11,23 @@ import shutil
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
 import uvicorn
-from helpers.pages import ATTACK
+from helpers.pages import ATTACK, coded, numbered
 from matplotlib.image import imread
 
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.filters import Removal
+from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.rejections import AttemptKey, read_decisions, read_rejected
 from drakegrasp.inspection.app import Inspection, make_app
+from drakegrasp.inspection.catalog import Catalog, Snapshot
 from drakegrasp.inspection.serve import listen
 from drakegrasp.inspection.static_site import write_site
 
@@ -76,6 +80,12 @@ def _is_ours(url: str) -> bool:
 
 
 @pytest.fixture
+def state(boxes: Path) -> Snapshot:
+    """Of the dataset that is shown: objects have codes in addresses."""
+    return Catalog(boxes).current()
+
+
+@pytest.fixture
 def address(out: Path) -> Iterator[str]:
     yield from serve(out)
 
@@ -111,9 +121,9 @@ def keep_screenshot(page: Page, name: str) -> None:
         page.screenshot(path=str(Path(folder) / f"{name}.png"), full_page="narrow" in name)
 
 
-def labels(page: Page) -> list[str]:
+def labels(page: Page, state: Snapshot) -> list[str]:
     found = page.locator("#cards li").evaluate_all("cards => cards.map(c => c.dataset.label)")
-    return list(found)
+    return [numbered(state, label) for label in found]
 
 
 def wait_for_decision(out: Path, key: AttemptKey, decision: str) -> None:
@@ -124,15 +134,15 @@ def wait_for_decision(out: Path, key: AttemptKey, decision: str) -> None:
         time.sleep(0.05)
 
 
-def test_gallery_filters_and_sorts(page: Page, address: str) -> None:
+def test_gallery_filters_and_sorts(page: Page, address: str, state: Snapshot) -> None:
     page.goto(address)
-    assert len(labels(page)) == 9
+    assert len(labels(page, state)) == 9
     page.select_option("select[name=object]", "2_box_b")
     page.select_option("select[name=sort]", "row")
     page.select_option("select[name=order]", "up")
     page.click("form button")
     page.wait_for_url("**object=2_box_b**")
-    assert labels(page) == ["1-0-0", "1-1-0", "1-3-2"]
+    assert labels(page, state) == ["1-0-0", "1-1-0", "1-3-2"]
     # What was chosen stays chosen, and empty fields are not in the address.
     assert page.input_value("select[name=object]") == "2_box_b"
     assert "min_slip" not in page.url
@@ -141,17 +151,19 @@ def test_gallery_filters_and_sorts(page: Page, address: str) -> None:
     page.wait_for_selector(".empty")
     page.click("text=Reset")
     page.wait_for_selector("#cards")
-    assert len(labels(page)) == 9
+    assert len(labels(page, state)) == 9
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_pages_fit_and_their_pictures_load(page: Page, address: str, size: str) -> None:
+def test_pages_fit_and_their_pictures_load(
+    page: Page, address: str, state: Snapshot, size: str
+) -> None:
     width, height = SIZES[size]
     page.set_viewport_size({"width": width, "height": height})
     for name, path in (
         ("gallery", "/"),
         ("failures", "/?outcome=any&sort=row&order=up"),
-        ("grasp", "/grasp/0-0-0"),
+        ("grasp", coded(state, "/grasp/0-0-0")),
         ("plots", "/plots"),
     ):
         page.goto(address + path)
@@ -162,8 +174,8 @@ def test_pages_fit_and_their_pictures_load(page: Page, address: str, size: str) 
         keep_screenshot(page, f"{name}_{size}")
 
 
-def test_3d_view_draws_each_state(page: Page, address: str) -> None:
-    page.goto(f"{address}/grasp/0-0-0")
+def test_3d_view_draws_each_state(page: Page, address: str, state: Snapshot) -> None:
+    page.goto(coded(state, f"{address}/grasp/0-0-0"))
     wait_for_view(page)
     assert page.get_attribute("#view3d", "data-ready") == "yes"
     # A blank canvas has one colour; hand, object, table and contacts in light have many.
@@ -177,23 +189,25 @@ def test_3d_view_draws_each_state(page: Page, address: str) -> None:
     assert page.locator("#view3d").screenshot() not in shots
 
 
-def test_keyboard_moves_rejects_keeps_and_undoes(page: Page, address: str, out: Path) -> None:
+def test_keyboard_moves_rejects_keeps_and_undoes(
+    page: Page, address: str, state: Snapshot, out: Path
+) -> None:
     keys = [AttemptKey("1_box_a", *numbers) for numbers in ((0, 0), (1, 0), (3, 2))]
-    page.goto(f"{address}/grasp/0-0-0?sort=row&order=up")
+    page.goto(coded(state, f"{address}/grasp/0-0-0?sort=row&order=up"))
     page.keyboard.press("r")  # rejects, and goes on to the next
-    page.wait_for_url("**/grasp/0-1-0?sort=row&order=up")
+    page.wait_for_url(coded(state, "**/grasp/0-1-0?sort=row&order=up"))
     wait_for_decision(out, keys[0], "rejected")
     page.keyboard.press("k")
-    page.wait_for_url("**/grasp/0-3-2?sort=row&order=up")
+    page.wait_for_url(coded(state, "**/grasp/0-3-2?sort=row&order=up"))
     wait_for_decision(out, keys[1], "kept")
     page.keyboard.press("ArrowLeft")
-    page.wait_for_url("**/grasp/0-1-0?sort=row&order=up")
+    page.wait_for_url(coded(state, "**/grasp/0-1-0?sort=row&order=up"))
     assert page.inner_text("#decision") == "kept"
     page.keyboard.press("p")
-    page.wait_for_url("**/grasp/0-0-0?sort=row&order=up")
+    page.wait_for_url(coded(state, "**/grasp/0-0-0?sort=row&order=up"))
     assert page.inner_text("#decision") == "rejected"
     page.keyboard.press("ArrowRight")
-    page.wait_for_url("**/grasp/0-1-0?sort=row&order=up")
+    page.wait_for_url(coded(state, "**/grasp/0-1-0?sort=row&order=up"))
 
     # Undo shows what was undone.
     page.keyboard.press("u")
@@ -201,44 +215,141 @@ def test_keyboard_moves_rejects_keeps_and_undoes(page: Page, address: str, out: 
     # The page takes one request at a time: a key before the answer would be lost.
     page.wait_for_function("document.querySelector('#decision').textContent === ''")
     page.keyboard.press("u")
-    page.wait_for_url("**/grasp/0-0-0?sort=row&order=up")
+    page.wait_for_url(coded(state, "**/grasp/0-0-0?sort=row&order=up"))
     wait_for_decision(out, keys[0], "")
     page.keyboard.press("g")
     page.wait_for_selector("#cards")
 
 
-def test_buttons_reject_and_assembly_drops_exactly_these(
-    page: Page, address: str, out: Path
+def test_keys_work_after_a_click_on_a_checkbox(
+    page: Page, address: str, state: Snapshot, out: Path
+) -> None:
+    page.goto(coded(state, f"{address}/grasp/0-0-0?sort=row&order=up"))
+    wait_for_view(page)
+    page.click("#showforces")
+    page.keyboard.press("r")
+    page.wait_for_url(coded(state, "**/grasp/0-1-0?sort=row&order=up"))
+    assert read_decisions(out / "reject.json").rejected == {AttemptKey("1_box_a", 0, 0)}
+
+
+def test_keys_work_with_caps_lock(page: Page, address: str, state: Snapshot, out: Path) -> None:
+    page.goto(coded(state, f"{address}/grasp/0-0-0?sort=row&order=up"))
+    page.keyboard.press("K")
+    page.wait_for_url(coded(state, "**/grasp/0-1-0?sort=row&order=up"))
+    assert read_decisions(out / "reject.json").kept == {AttemptKey("1_box_a", 0, 0)}
+
+
+def test_keys_work_while_a_recording_is_made(
+    page: Page, address: str, state: Snapshot, out: Path
+) -> None:
+    page.route("**/record", lambda route: None)  # an answer that never comes
+    page.goto(coded(state, f"{address}/grasp/0-0-0?sort=row&order=up"))
+    page.click("[data-record]")
+    page.wait_for_selector("[data-record]:disabled")
+    page.keyboard.press("k")
+    wait_for_decision(out, AttemptKey("1_box_a", 0, 0), "kept")
+    page.unroute("**/record")
+
+
+def _fulfil(body: str, route: playwright.Route) -> None:
+    route.fulfill(body=body)
+
+
+def test_a_recording_says_how_it_compares(page: Page, address: str, state: Snapshot) -> None:
+    answers = [
+        '{"url": "/", "same": true, "text": "trial 0 of <b>: was success, is success"}',
+        '{"url": "/", "same": false, "text": "slip differs: by up to 0.001"}',
+    ]
+    for answer, words in zip(answers, ("Equal to what is stored.", "Differs from"), strict=True):
+        page.route("**/record", partial(_fulfil, answer))
+        page.goto(coded(state, f"{address}/grasp/0-0-0"))
+        page.click("[data-record]")
+        page.wait_for_selector("#verdict:not([hidden])")
+        assert words in page.inner_text("#verdict")
+        keep_screenshot(page, "verdict_wide")
+        page.unroute("**/record")
+
+
+def test_the_gallery_counts_undoes_and_says_what_to_do_next(
+    page: Page, address: str, state: Snapshot, out: Path
 ) -> None:
     page.goto(address)
-    page.click("[data-label='1-1-0'] [data-decide=rejected]")
-    page.wait_for_selector("[data-label='1-1-0'].rejected")
+    assert not page.is_visible("#nextstep")
+    page.click(coded(state, "[data-label='1-1-0'] [data-decide=rejected]"))
+    page.wait_for_selector("#nextstep:not([hidden])")
+    assert "1 rejected, 1 of them samples now" in page.inner_text("#nextstep")
+    assert "drakegrasp assemble" in page.inner_text("#nextstep")
+    keep_screenshot(page, "next_wide")
+    page.set_viewport_size({"width": 390, "height": 844})
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    keep_screenshot(page, "next_narrow")
+    page.click("[data-undo]")
+    page.wait_for_selector("#nextstep", state="hidden")
+    assert page.inner_text("#message") == "Undone: 2_box_b, palm pose 1, stand-off 0"
+    wait_for_decision(out, AttemptKey("2_box_b", 1, 0), "")
+    page.click("[data-undo]")
+    page.wait_for_function("document.querySelector('#message').textContent === 'Nothing to undo.'")
+
+
+def test_each_tab_undoes_its_own_decisions(
+    page: Page, address: str, state: Snapshot, out: Path
+) -> None:
+    other = page.context.new_page()
+    for tab, label in ((page, "0-0-0"), (other, "1-1-0")):
+        tab.goto(address)
+        tab.click(coded(state, f"[data-label='{label}'] [data-decide=rejected]"))
+        tab.wait_for_selector(coded(state, f"[data-label='{label}'].rejected"))
+    page.keyboard.press("u")
+    wait_for_decision(out, AttemptKey("1_box_a", 0, 0), "")
+    assert read_decisions(out / "reject.json").rejected == {AttemptKey("2_box_b", 1, 0)}
+
+
+def test_files_of_an_earlier_state_are_told(page: Page, out: Path) -> None:
+    whole = read_manifest(out)
+    write_manifest(replace(whole, objects=whole.objects[1:]), out)
+    assemble(out)
+    write_manifest(whole, out)
+    for address in serve(out):
+        for size, (width, height) in SIZES.items():
+            page.set_viewport_size({"width": width, "height": height})
+            page.goto(address)
+            assert "2 work units are newer" in page.inner_text(".notice")
+            keep_screenshot(page, f"newer_{size}")
+
+
+def test_buttons_reject_and_assembly_drops_exactly_these(
+    page: Page, address: str, state: Snapshot, out: Path
+) -> None:
+    page.goto(address)
+    page.click(coded(state, "[data-label='1-1-0'] [data-decide=rejected]"))
+    page.wait_for_selector(coded(state, "[data-label='1-1-0'].rejected"))
     assert read_decisions(out / "reject.json").of(AttemptKey("2_box_b", 1, 0)) == "rejected"
-    page.click("[data-label='2-0-0'] [data-decide=rejected]")
-    page.wait_for_selector("[data-label='2-0-0'].rejected")
+    page.click(coded(state, "[data-label='2-0-0'] [data-decide=rejected]"))
+    page.wait_for_selector(coded(state, "[data-label='2-0-0'].rejected"))
     # The same button again withdraws the decision.
-    page.click("[data-label='1-1-0'] [data-decide=rejected]")
+    page.click(coded(state, "[data-label='1-1-0'] [data-decide=rejected]"))
     wait_for_decision(out, AttemptKey("2_box_b", 1, 0), "")
     assembly = assemble(out, rejected=read_rejected(out / "reject.json"))
     assert assembly.removed == {Removal.KEPT: 8, Removal.REJECTED: 1}
 
 
-def test_a_server_that_has_ended_is_named(browser: Browser, out: Path) -> None:
+def test_a_server_that_has_ended_is_named(browser: Browser, out: Path, state: Snapshot) -> None:
     page = browser.new_page()
     served = serve(out)
     page.goto(next(served))
     next(served, None)
-    page.click("[data-label='0-0-0'] [data-decide=rejected]")
+    page.click(coded(state, "[data-label='0-0-0'] [data-decide=rejected]"))
     page.wait_for_selector("#message:not([hidden])", timeout=PATIENCE)
     assert "does not answer" in page.inner_text("#message")
     page.close()
 
 
 def test_a_name_that_is_a_script_stays_text(page: Page, hostile: Path) -> None:
+    state = Catalog(hostile).current()
     for address in serve(hostile):
         page.goto(address)
         assert page.locator("#cards h2", has_text=ATTACK).count() == 3
-        page.goto(f"{address}/grasp/0-0-0")
+        page.goto(coded(state, f"{address}/grasp/0-0-0"))
         wait_for_view(page)
         assert ATTACK in page.inner_text("h1")
         assert page.locator("h1 script").count() == 0
@@ -246,27 +357,29 @@ def test_a_name_that_is_a_script_stays_text(page: Page, hostile: Path) -> None:
         page.wait_for_load_state("networkidle")
 
 
-def test_files_open_without_a_server(page: Page, boxes: Path, tmp_path: Path) -> None:
+def test_files_open_without_a_server(
+    page: Page, boxes: Path, tmp_path: Path, state: Snapshot
+) -> None:
     write_site(boxes, tmp_path / "site")
     page.goto((tmp_path / "site" / "index.html").as_uri())
     page.wait_for_selector("#pages button")
-    assert len(labels(page)) == 9
+    assert len(labels(page, state)) == 9
     page.select_option("select[name=object]", "2_box_b")
     page.select_option("select[name=sort]", "row")
     page.select_option("select[name=order]", "up")
     page.click("form button")
-    assert labels(page) == ["1-0-0", "1-1-0", "1-3-2"]
+    assert labels(page, state) == ["1-0-0", "1-1-0", "1-3-2"]
     assert page.inner_text("#count") == "3"
     page.fill("input[name=max_slip]", "1")
     page.click("form button")
-    assert labels(page) == []
+    assert labels(page, state) == []
     page.click("text=Reset")
     page.wait_for_selector("#cards li")
-    page.locator("[data-label='0-0-0'] a").click()
+    page.locator(coded(state, "[data-label='0-0-0'] a")).click()
     wait_for_view(page)
     assert page.get_attribute("#view3d", "data-ready") == "yes"
     assert colours_of(page) > 30
     page.keyboard.press("ArrowRight")
-    page.wait_for_url("**/grasp/0-1-0.html")
+    page.wait_for_url(coded(state, "**/grasp/0-1-0.html"))
     page.goto((tmp_path / "site" / "plots.html").as_uri())
     page.wait_for_load_state("networkidle")

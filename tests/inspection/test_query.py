@@ -8,12 +8,13 @@ from urllib.parse import parse_qsl
 
 import numpy as np
 import pytest
+from helpers.pages import numbered
 
 from drakegrasp.dataset.rejections import AttemptKey, Decisions
 from drakegrasp.errors import DataError
 from drakegrasp.inspection.catalog import Catalog, Snapshot
 from drakegrasp.inspection.query import QUANTITIES, Query, parse_query, select
-from drakegrasp.inspection.table import FEATURES
+from drakegrasp.inspection.table import FEATURES, NONE
 
 NOTHING = Decisions()
 
@@ -25,7 +26,7 @@ def snapshot(boxes: Path) -> Snapshot:
 
 def chosen(snapshot: Snapshot, text: str, decisions: Decisions = NOTHING) -> list[str]:
     query = parse_query(dict(parse_qsl(text)))
-    return [snapshot.label(i) for i in select(snapshot, query, decisions)]
+    return [numbered(snapshot, snapshot.label(i)) for i in select(snapshot, query, decisions)]
 
 
 def test_successes_are_shown_unless_others_are_asked_for(snapshot: Snapshot) -> None:
@@ -65,6 +66,14 @@ def test_splits_are_a_partition_of_the_samples(snapshot: Snapshot) -> None:
     parts = [chosen(snapshot, f"split={split}") for split in ("train", "valid", "test")]
     assert sorted(label for part in parts for label in part) == sorted(chosen(snapshot, ""))
     assert all(parts)
+
+
+def test_any_sample_is_one_choice(snapshot: Snapshot) -> None:
+    split = snapshot.table.split.copy()
+    split[[0, 3]] = NONE
+    changed = replace(snapshot, table=replace(snapshot.table, split=split))
+    assert len(chosen(changed, "split=samples&outcome=any")) == 7
+    assert set(chosen(changed, "split=none")) == {"0-0-0", "0-1-0"}
 
 
 def test_ranges_are_in_the_units_that_are_shown(snapshot: Snapshot) -> None:

@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 from helpers.datasets import TRIALS, make_dataset
+from helpers.pages import get
 from starlette.testclient import TestClient
 
 from drakegrasp.dataset.reader import GraspDataset
@@ -53,7 +54,7 @@ def test_page_of_an_attempt_tells_its_own_mass(drawn: Path) -> None:
     with h5py.File(drawn / TRIALS) as file:
         mass = float(file["trials/mass"][0])
     with TestClient(make_app(Inspection(drawn)), base_url="http://127.0.0.1:8321") as client:
-        assert f"{mass:.4g} kg" in client.get("/grasp/0-0-0").text
+        assert f"{mass:.4g} kg" in get(client, "/grasp/0-0-0").text
 
 
 @pytest.mark.parametrize("camera", ["oto", "otm"])

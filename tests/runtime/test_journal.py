@@ -133,8 +133,7 @@ def test_suspended_process_is_not_convicted(tmp_path: Path, seconds: float) -> N
         text=True,
     )
     assert process.stdout is not None
-    while "try 4" not in process.stdout.readline():
-        pass
+    assert any("try 4" in line for line in process.stdout), "the process must get there"
     process.send_signal(signal.SIGSTOP)
     time.sleep(seconds)
     process.send_signal(signal.SIGCONT)
@@ -190,8 +189,7 @@ def test_kill_leaves_a_journal_without_a_mark(tmp_path: Path) -> None:
         [sys.executable, "-c", RUN.replace("0.5", "60"), path, "hang:try 4"], stdout=subprocess.PIPE
     )
     assert process.stdout is not None
-    while b"try 4" not in process.stdout.readline():
-        pass
+    assert any(b"try 4" in line for line in process.stdout), "the process must get there"
     process.kill()
     process.communicate()
     with open_journal(path, UNIT) as journal:

@@ -215,3 +215,30 @@ def test_hand_and_object_on_the_table_are_told_apart(scene: Scene, cube: ObjectM
     reset_attempt(scene, X_WO, X_WT @ X_TG, spread=0.0, closing=np.full(3, 1.3))
     presses = read_contacts(scene)
     assert (presses.object_on_table, presses.hand_on_table) == (False, True)
+
+
+def test_point_contacts_are_counted(closed: Scene) -> None:
+    """Those of the object; one of hand and table means that they touch."""
+    reader = contacts_module._Reader(closed)
+    grasped, table = closed.object.index(), closed.table.index()
+    tip, *_ = (body.index() for body in closed.handles.fingertips)
+    for pair, count, on_table in (
+        ({tip, grasped}, 1, False),
+        ({grasped, table}, 2, False),
+        ({tip, table}, 2, True),
+    ):
+        reader.add_point_pair(pair)
+        found = reader.contacts()
+        assert (found.point_contacts, found.hand_on_table) == (count, on_table)
+
+
+def test_rest_of_a_split_patch_counts_by_its_own_force(closed: Scene) -> None:
+    """It carries what the pad does not."""
+    whole = with_pads(closed, EVERYWHERE, EVERYWHERE, EVERYWHERE)
+    beyond = (1.0, 0.0, 0.0, _contact_in_link(closed, whole) + 1e-3)
+    part = with_pads(closed, (beyond,), EVERYWHERE, EVERYWHERE)
+    rest = float(np.linalg.norm(whole.f_Q_O[0] - part.f_Q_O[0]))
+    for factor, count in ((0.99, 1), (1.01, 0)):
+        physics = closed.physics.model_copy(update={"contact_force": factor * rest})
+        strict = replace(closed, physics=physics)
+        assert with_pads(strict, (beyond,), EVERYWHERE, EVERYWHERE).other_links == count

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.meshes import G3DB, needs_g3db
-from hypothesis import assume, given, settings
+from hypothesis import Phase, assume, example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
 
 from drakegrasp.config import Config, load_config, override_config
 from drakegrasp.errors import MeshError
@@ -22,7 +23,7 @@ from drakegrasp.simulation import settle as settle_module
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.scene import Scene, reset_object
-from drakegrasp.simulation.settle import Resting, settle
+from drakegrasp.simulation.settle import Resting, settle, snapped
 
 pytestmark = pytest.mark.sim
 
@@ -69,22 +70,28 @@ def test_shape_with_a_base_of_few_triangles_rests_as_it_was_dropped(name: str, c
     assert resting.seconds < 2.0 and not resting.stopped and resting.notes == ()
 
 
-@settings(max_examples=12, deadline=None, derandomize=True)
+#: The examples depend on what else is loaded; the search for a simpler failure takes minutes.
+@settings(max_examples=8, deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate])
 @given(
     base=st.lists(st.tuples(*[st.floats(-0.1, 0.1)] * 2), min_size=3, max_size=7),
     top=st.lists(
         st.tuples(*[st.floats(-0.1, 0.1)] * 2, st.floats(0.03, 0.2)), min_size=1, max_size=6
     ),
 )
+@example(base=[(0.0, 0.0), (0.0, 0.0625), (0.0625, 0.0625)], top=[(0.0, 0.0, 0.125)])
 def test_convex_solid_stays_on_a_face_that_carries_it(base, top):
-    """Its centre of mass is at least 5 mm within the edges of the face that it is dropped on."""
+    """Its centre of mass is at least 5 mm within the edges of the face that it is set down on.
+
+    One that falls is pushed at the middle of that face, which may turn it over.
+    """
     flat = np.array(base)
     assume(np.linalg.svd(flat - flat.mean(axis=0), compute_uv=False)[1] > 0.01)
     points = np.vstack((np.column_stack((flat, np.zeros(len(flat)))), top))
     mesh = trimesh.convex.convex_hull(points)
     edges = ConvexHull(flat).equations
     assume((edges[:, :2] @ mesh.center_mass[:2] + edges[:, 2]).max() < -0.005)
-    assert tilt_deg(settle(as_dropped(mesh), load_config())) < 0.5
+    set_down = load_config(overrides=["settle.drop_height=0"])
+    assert tilt_deg(settle(as_dropped(mesh), set_down)) < 0.5
 
 
 @pytest.mark.parametrize(("side", "fall"), [(0.1, 0.25), (0.8, 0.0)])
@@ -234,3 +241,16 @@ def test_no_mesh_of_g3db_sinks_into_the_table(config: Config):
         sinks[source.name] = settle(model, config).sink
     assert len(sinks) >= 29
     assert max(sinks.values()) < 3e-4
+
+
+def test_pose_on_the_grid_is_the_pose_to_a_microradian():
+    """Any rotation: each entry of the matrix from the quaternion, and only the height stays."""
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        X_TO = make_pose(Rotation.random(rng=rng).as_matrix(), rng.uniform(-0.2, 0.2, 3))
+        found = snapped(X_TO)
+        np.testing.assert_allclose(found[:3, :3], X_TO[:3, :3], atol=4e-6)
+        np.testing.assert_allclose(found[:3, :3] @ found[:3, :3].T, np.eye(3), atol=1e-12)
+        assert found[:2, 3].tolist() == [0.0, 0.0]
+        assert found[2, 3] == pytest.approx(X_TO[2, 3], abs=2.0**-21)
+        assert (found[2, 3] * 2.0**20) % 1.0 == 0.0

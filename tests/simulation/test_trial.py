@@ -294,7 +294,8 @@ def test_table_friction_stops_a_sliding_block(tmp_path):
         velocity[3] = start
         scene.plant.SetVelocities(scene.context, velocity)
         before = scene.pose(scene.object)[0, 3]
-        advance(scene, 1.0)
+        advance(scene, 0.3)
+        assert np.abs(scene.plant.GetVelocities(scene.context)).max() < 1e-3
         speeds.append((start, scene.pose(scene.object)[0, 3] - before))
     for start, distance in speeds:
         assert distance == pytest.approx(start**2 / (2.0 * 0.5 * GRAVITY), rel=0.05)
@@ -307,30 +308,35 @@ def test_camera_stands_behind_the_palm(cube, config):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("step", [0.004, 0.008])
-def test_smaller_step_gives_the_same_verdicts(tmp_path, config, hand, step):
-    """At the default of 8 ms, or at 4 ms, 95 % of what is simulated ends as at 1 ms."""
+def test_smaller_step_gives_the_same_verdicts(tmp_path, config, hand):
+    """At the default of 8 ms, and at 4 ms, 95 % of what is simulated ends as at 1 ms."""
     model = box_model(tmp_path, [0.05, 0.07, 0.15], name="1_box_tall")
-    X_TO = standing(model)
-    coarse = override_config(config, ["screen.mode=off", f"physics.time_step={step}"])
+    X_TO, steps = standing(model), (0.008, 0.004)
+    rules = [
+        override_config(config, ["screen.mode=off", f"physics.time_step={step}"]) for step in steps
+    ]
     fine = override_config(
         config, ["screen.mode=off", "physics.time_step=0.001", "physics.coarse_steps=1"]
     )
-    coarse_scene = build_scene(model, coarse.physics, hand)
-    fine_scene = build_scene(model, fine.physics, hand)
+    scenes = [build_scene(model, rule.physics, hand) for rule in (*rules, fine)]
+
     # Take attempts from the draw until there are 20 to compare, and three successes among them.
-    verdicts: list[tuple[Outcome, Outcome]] = []
+    same: list[list[bool]] = []
+    successes = 0
     for attempt in drawn_attempts(model, X_TO, config, 0):
-        record = run_attempt(coarse_scene, X_TO, attempt, coarse)
-        if record.closed is not None:
-            again = run_attempt(fine_scene, X_TO, attempt, fine)
-            verdicts.append((record.outcome, again.outcome))
-        successes = sum(outcome is Outcome.SUCCESS for outcome, _ in verdicts)
-        if len(verdicts) >= 20 and successes >= 3:
+        records = [
+            run_attempt(scene, X_TO, attempt, rule)
+            for scene, rule in zip(scenes, rules, strict=False)
+        ]
+        if any(record.closed is not None for record in records):
+            truth = run_attempt(scenes[-1], X_TO, attempt, fine).outcome
+            same.append([record.outcome is truth for record in records])
+            successes += truth is Outcome.SUCCESS
+        if len(same) >= 20 and successes >= 3:
             break
-    assert len(verdicts) >= 20
+    assert len(same) >= 20
     assert successes >= 3
-    assert np.mean([outcome is again for outcome, again in verdicts]) >= 0.95
+    assert np.all(np.mean(same, axis=0) >= 0.95)
 
 
 def test_object_rests_on_the_table_after_an_attempt_that_ended_early(scene, cube, config):

@@ -56,18 +56,19 @@ def open_trials(path: Path) -> Iterator[h5py.File]:
 
 
 @contextmanager
-def opened(path: Path, what: str) -> Iterator[h5py.File]:
+def opened(path: Path, what: str, *, again: bool = False) -> Iterator[h5py.File]:
     """Open an HDF5 file while the block runs; what HDF5 cannot read in the block is told.
 
     Args:
         path: Of the file.
         what: What it must be, in words.
+        again: See `open_hdf5`.
 
     Raises:
         DataError: If it is missing or damaged.
     """
     try:
-        with open_hdf5(path) as file:
+        with open_hdf5(path, again=again) as file:
             yield file
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: must be {what}, got none ({first_line(error)})") from None
@@ -113,25 +114,33 @@ def refuse_first(path: Path, mistakes: Iterator[object]) -> None:
         raise DataError(f"{path}: {printable(str(first))}")
 
 
-def read_codes(dataset: h5py.Dataset, codes: int | Sequence[int]) -> npt.NDArray[Any]:
+def read_codes(
+    dataset: h5py.Dataset, codes: int | Sequence[int], rows: slice = slice(None)
+) -> npt.NDArray[Any]:
     """Return a column (n,) of numbers that stand for something.
 
     Args:
         dataset: The column.
         codes: How many things there are, counted from 0, or the numbers of those that there are.
+        rows: Those that are read.
 
     Raises:
         DataError: If a number stands for nothing.
     """
-    values: npt.NDArray[Any] = dataset[:]
-    refuse_other_codes(Path(dataset.file.filename), dataset.name, values, codes)
+    values: npt.NDArray[Any] = dataset[rows]
+    first = rows.start or 0
+    refuse_other_codes(Path(dataset.file.filename), dataset.name, values, codes, first)
     return values
 
 
 def refuse_other_codes(
-    path: Path, place: str, values: npt.NDArray[Any], codes: int | Sequence[int]
+    path: Path,
+    place: str,
+    values: npt.NDArray[Any],
+    codes: int | Sequence[int],
+    first: int = 0,
 ) -> None:
-    """Refuse numbers that stand for nothing, see `read_codes`.
+    """Refuse numbers that stand for nothing, see `read_codes`; `first` is the row of the first.
 
     Raises:
         DataError: If there is one.
@@ -142,7 +151,7 @@ def refuse_other_codes(
         bad, must = ~np.isin(values, codes), f"{min(codes)} to {max(codes)}"
     if bad.any():
         row = int(np.argmax(bad))
-        raise DataError(f"{path}: {place} must be {must}, got {values[row]} in row {row}")
+        raise DataError(f"{path}: {place} must be {must}, got {values[row]} in row {first + row}")
 
 
 def read_trial(file: h5py.File, trial_id: int) -> dict[str, npt.NDArray[Any]]:

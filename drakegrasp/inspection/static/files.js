@@ -19,11 +19,11 @@
         const x = number(card, range[2]), limit = Number.parseFloat(value);
         if (Number.isNaN(limit)) continue;
         if (!(range[1] === "min" ? x >= limit : x <= limit)) return false;
-      } else if (name === "outcome") {
-        if (value !== "success") return false;
       } else if (name === "decision") {
         const decision = card.querySelector(".word.decision").textContent || "open";
         if (decision !== value) return false;
+      } else if (name === "split" && value === "samples") {
+        if (card.dataset.split === "none") return false;
       } else if (!(name === "hold" ? card.dataset.hold.split(" ") : [card.dataset[key(name)]]).includes(value)) return false;
     }
     return true;

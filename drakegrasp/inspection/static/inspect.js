@@ -6,8 +6,13 @@
   const grasp = document.getElementById("grasp");
   let busy = false;
 
-  function say(text) {
+  // Undo goes through the decisions of this tab, whatever others decide meanwhile.
+  const page = (token && sessionStorage.getItem("page")) || String(Math.random());
+  if (token) sessionStorage.setItem("page", page);
+
+  function say(text, kind = "bad") {
     message.textContent = text;
+    message.className = kind;
     message.hidden = !text;
   }
 
@@ -44,41 +49,60 @@
     element.querySelector(".word.decision").textContent = decision;
   }
 
+  // What is decided in all, and what to do next.
+  function count(counts) {
+    const numbers = { rejected: counts.rejected, samples: counts.samples, kept: counts.kept };
+    for (const [id, number] of Object.entries(numbers)) {
+      const element = document.getElementById(id);
+      if (element) element.textContent = number.toLocaleString("en");
+    }
+    for (const element of document.querySelectorAll(".rejectedcount")) element.textContent = counts.rejected.toLocaleString("en");
+    document.getElementById("nextstep").hidden = !counts.rejected;
+  }
+
   // The same button again withdraws a decision.
   function decide(element, decision, advance) {
     return act(async () => {
       const now = element.dataset.decision || (element.classList.contains(decision) ? decision : "");
       const wanted = now === decision && !advance ? "" : decision;
-      await post("/decide", { label: element.dataset.label, decision: wanted });
+      const result = await post("/decide", { label: element.dataset.label, decision: wanted, page });
       show(element, wanted);
+      count(result.counts);
       if (advance) go("next");
     });
   }
 
   function undo() {
     return act(async () => {
-      const result = await post("/undo", {});
-      if (result.label === null) return say("Nothing to undo.");
+      const result = await post("/undo", { page });
+      if (result.name === null) return say("Nothing to undo.", "good");
+      count(result.counts);
       const card = document.querySelector(`[data-label="${result.label}"]`);
-      if (card) return show(card, result.decision);
+      if (card) show(card, result.decision);
+      if (!result.done) return say(`Not undone, decided otherwise since (${result.decision || "open"}): ${result.name}`);
+      if (card || result.label === null) return say(`Undone: ${result.name}`, "good");
       location.href = `/grasp/${result.label}${location.search}`;
     });
   }
 
-  function record(button) {
+  // A replay takes seconds: keys work meanwhile.
+  async function record(button) {
+    const link = document.getElementById("recording"), verdict = document.getElementById("verdict");
     button.disabled = true;
     button.textContent = "Running…";
-    return act(async () => {
-      const link = document.getElementById("recording");
-      try {
-        link.href = (await post("/record", { label: grasp.dataset.label })).url;
-        link.hidden = false;
-        button.hidden = true;
-      } finally {
-        button.disabled = false;
-        button.textContent = "Run again and record";
-      }
-    });
+    try {
+      const result = await post("/record", { label: grasp.dataset.label });
+      link.href = result.url;
+      link.hidden = verdict.hidden = false;
+      button.hidden = true;
+      verdict.textContent = `${result.same ? "Equal to what is stored" : "Differs from what is stored"}.\n${result.text}`;
+      verdict.classList.toggle("same", result.same);
+    } catch (error) {
+      say(error.message);
+    } finally {
+      button.disabled = false;
+      button.textContent = "Run again and record";
+    }
   }
 
   function go(id) {
@@ -96,7 +120,7 @@
   });
 
   document.addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.altKey || event.metaKey || event.target.closest("input, select, textarea")) return;
+    if (event.ctrlKey || event.altKey || event.metaKey || event.target.closest("input:not([type=checkbox]), select, textarea")) return;
     const decidable = grasp && grasp.querySelector("[data-decide]");
     const keys = {
       ArrowRight: () => go("next"), n: () => go("next"),
@@ -105,7 +129,8 @@
       r: () => decidable && decide(grasp, "rejected", true),
       k: () => decidable && decide(grasp, "kept", true),
     };
-    const action = keys[event.key];
+    // With Caps Lock a letter is a capital one.
+    const action = keys[event.key.length === 1 ? event.key.toLowerCase() : event.key];
     if (!action) return;
     event.preventDefault();
     action();

@@ -1,0 +1,1 @@
+"""Assembling in tasks: surveying shards, packing rows, writing samples."""

@@ -1,0 +1,266 @@
+"""Some rows of the dataset, packed by a task: what the client only has to put into the files.
+
+In: a range of rows that begins and ends with a chunk, and their shards. Out: a part, a file with
+compressed chunks of the columns of /trials, compressed images and masks of the samples among the
+rows, and the samples' other columns. The client reads a part front to back, and removes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.dataset.assembly.samples import IMAGES, SampleRows, record_type, sample_values
+from drakegrasp.dataset.hdf5 import COLUMN_CHUNK, AnyArray, packed_chunk, read_column
+from drakegrasp.dataset.paths import model_path
+from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS, SPLITS, TRIAL_FIELDS
+from drakegrasp.dataset.shards import ShardHeader, open_shard, trial_columns
+from drakegrasp.objects.model import ObjectModel, load_object
+from drakegrasp.runtime.files import disk_full_named, temporary_name
+
+#: Rows of a task: some ten of the largest shards, 30 MB in memory.
+TASK_ROWS = 8 * COLUMN_CHUNK
+#: Place of the chunk of an image, without its row.
+_ORIGIN = {f.name: (0,) * len(f.axes) for f in DATA_FIELDS if f.name in IMAGES}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShardSlice:
+    """The rows of a shard that the dataset takes, and their place.
+
+    Attributes:
+        header: Of the shard.
+        object: Row of its object in /objects.
+        first: Id of the trial in its first row.
+        rows: Number of rows taken, from the first.
+    """
+
+    header: ShardHeader
+    object: int
+    first: int
+    rows: int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PackTask:
+    """A range of rows to pack.
+
+    Attributes:
+        out: Directory of the dataset.
+        part: Path of the file to write.
+        start, stop: The range, ids of trials; the start is that of a chunk.
+        slices: The shards that have rows in it, in order.
+        ids: Ids of the trials in it that are samples, in rising order, by split.
+        sizes: Lengths of the letters in the shapes of the fields.
+    """
+
+    out: str
+    part: str
+    start: int
+    stop: int
+    slices: tuple[ShardSlice, ...]
+    ids: Mapping[str, npt.NDArray[np.int64]]
+    sizes: Mapping[str, int]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Part:
+    """What is in a part.
+
+    Attributes:
+        start: First row of its range.
+        path: Of the file.
+        chunks: Stored bytes of each chunk: of the first field of /trials, of the second, ...
+        images: Stored bytes of each image and the filters that HDF5 skipped for it, by split,
+            camera, field of IMAGES and sample.
+        objects: Row of /objects of each sample, by split.
+    """
+
+    start: int
+    path: str
+    chunks: Sequence[int]
+    images: Sequence[tuple[int, int]]
+    objects: Mapping[str, npt.NDArray[np.int32]]
+
+
+def pack_rows(task: PackTask) -> Part:
+    """Pack a range of rows; a part that is there is replaced.
+
+    Raises:
+        DataError: If a shard is no longer there.
+        DiskFullError: If there is no room for the part.
+    """
+    # Read the shards, whose seals the survey has verified.
+    count = task.stop - task.start
+    columns = {f.name: np.empty((count, *f.row_shape(task.sizes)), f.dtype) for f in TRIAL_FIELDS}
+    columns["trial_id"][:] = np.arange(task.start, task.stop)
+    samples = {split: _Samples(task.sizes) for split in SPLITS}
+    load = lru_cache(1)(load_object)  # the shards of an object come one after the other
+    for piece in task.slices:
+        path = piece.header.path(Path(task.out))
+        with open_shard(path, piece.header, verify_seal=False, again=True) as (file, _):
+            trials = {f.name: read_column(file["trials"], f.name) for f in trial_columns()}
+            _fill_rows(columns, trials, piece, task)
+            _add_samples(samples, trials, file["looks"], piece, task, load)
+
+    # Write the part under a name of this process: another may be at the same one.
+    temporary = temporary_name(Path(task.part))
+    with disk_full_named(Path(task.out)):
+        try:
+            with temporary.open("xb") as stream:
+                chunks = [stream.write(chunk) for chunk in _packed_columns(columns)]
+                images = [
+                    (stream.write(chunk), skipped)
+                    for split in SPLITS
+                    for chunk, skipped in samples[split].in_order()
+                ]
+                for split in SPLITS:
+                    for camera in CAMERAS:
+                        np.save(stream, samples[split].numbers(camera), allow_pickle=False)
+            temporary.replace(task.part)
+        finally:
+            temporary.unlink(missing_ok=True)
+    return Part(
+        start=task.start,
+        path=task.part,
+        chunks=chunks,
+        images=images,
+        objects={s: np.array(samples[s].objects, dtype=np.int32) for s in SPLITS},
+    )
+
+
+def unpack_rows(
+    part: Part,
+    columns: Sequence[h5py.Dataset],
+    rows: Mapping[tuple[str, str], SampleRows],
+) -> None:
+    """Put the chunks of a part into the files, and remove it.
+
+    Args:
+        part: The part.
+        columns: Datasets of TRIAL_FIELDS, with room for all rows.
+        rows: The rows of the data files by split and camera.
+    """
+    path = Path(part.path)
+    with path.open("rb") as stream:
+        # The columns of the trials, each some chunks.
+        each = len(part.chunks) // len(columns)
+        for k, size in enumerate(part.chunks):
+            column = columns[k // each]
+            place = (part.start + k % each * COLUMN_CHUNK, *(0,) * (column.ndim - 1))
+            column.id.write_direct_chunk(place, stream.read(size))
+
+        # The samples: what is stored, then the numbers.
+        images = iter(part.images)
+        for split in SPLITS:
+            for camera in CAMERAS:
+                for name in IMAGES:
+                    for size, skipped in islice(images, len(part.objects[split])):
+                        rows[split, camera].add_image(name, stream.read(size), skipped)
+        for split in SPLITS:
+            for camera in CAMERAS:
+                numbers = np.load(stream, allow_pickle=False)
+                rows[split, camera].add_numbers(numbers, part.objects[split])
+    path.unlink()
+
+
+class _Samples:
+    """The samples of a split among the rows of a task, in order.
+
+    Attributes:
+        objects: Row of /objects of each.
+    """
+
+    def __init__(self, sizes: Mapping[str, int]) -> None:
+        self.objects: list[int] = []
+        self._type = record_type(sizes)
+        self._records: dict[str, list[AnyArray]] = {camera: [] for camera in CAMERAS}
+        self._images: dict[tuple[str, str], list[tuple[bytes, int]]] = {
+            (camera, name): [] for camera in CAMERAS for name in IMAGES
+        }
+
+    def add_record(self, camera: str, values: Mapping[str, Any]) -> None:
+        """Add the numbers of a sample."""
+        record = np.zeros(1, dtype=self._type)
+        for name, value in values.items():
+            record[name][0] = value
+        self._records[camera].append(record)
+
+    def add_image(self, camera: str, name: str, chunk: bytes, skipped: int) -> None:
+        """Add what is stored of an image of a sample."""
+        self._images[camera, name].append((chunk, skipped))
+
+    def in_order(self) -> Iterator[tuple[bytes, int]]:
+        """Yield what is stored of the images, by camera, field and sample."""
+        for images in self._images.values():
+            yield from images
+
+    def numbers(self, camera: str) -> AnyArray:
+        """Return the records (n,) of a data file."""
+        return np.concatenate([np.zeros(0, dtype=self._type), *self._records[camera]])
+
+
+def _fill_rows(
+    columns: Mapping[str, AnyArray],
+    trials: Mapping[str, AnyArray],
+    piece: ShardSlice,
+    task: PackTask,
+) -> None:
+    """Copy the rows of a shard that are in the range of a task."""
+    first, last = max(task.start, piece.first), min(task.stop, piece.first + piece.rows)
+    to = slice(first - task.start, last - task.start)
+    columns["object"][to] = piece.object
+    for name, values in trials.items():
+        columns[name][to] = values[first - piece.first : last - piece.first]
+
+
+def _add_samples(
+    samples: Mapping[str, _Samples],
+    trials: Mapping[str, AnyArray],
+    looks: h5py.Group,
+    piece: ShardSlice,
+    task: PackTask,
+    load: Callable[[Path], ObjectModel],
+) -> None:
+    """Add the samples of a shard that are in the range of a task; `load` gives its object."""
+    # Most shards of a hard object have none.
+    first, last = max(task.start, piece.first), min(task.stop, piece.first + piece.rows)
+    bounds = {split: np.searchsorted(task.ids[split], (first, last)) for split in SPLITS}
+    if all(start == stop for start, stop in bounds.values()):
+        return
+
+    model = load(model_path(Path(task.out), piece.header.object_name))
+    names = ("X_CI_otm", *(f"X_TC_{camera}" for camera in CAMERAS))
+    poses = {name: read_column(looks, name) for name in names}
+    look_of = {row: k for k, row in enumerate(read_column(looks, "row").tolist())}
+    for split, (start, stop) in bounds.items():
+        for trial_id in task.ids[split][start:stop].tolist():
+            row = trial_id - piece.first
+            k = look_of[row]
+            trial = {name: values[row] for name, values in trials.items()}
+            look = {name: values[k] for name, values in poses.items()}
+            samples[split].objects.append(piece.object)
+            for camera in CAMERAS:
+                values = sample_values(model, trial, look, camera)
+                samples[split].add_record(camera, {**values, "trial_id": trial_id})
+                for name, own in IMAGES.items():
+                    skipped, chunk = looks[f"{own}_{camera}"].id.read_direct_chunk(
+                        (k, *_ORIGIN[name])
+                    )
+                    samples[split].add_image(camera, name, chunk, skipped)
+
+
+def _packed_columns(columns: Mapping[str, AnyArray]) -> Iterator[bytes]:
+    """Yield the chunks of the columns, by field and place."""
+    for field in TRIAL_FIELDS:
+        values = columns[field.name]
+        for start in range(0, len(values), COLUMN_CHUNK):
+            yield packed_chunk(values[start : start + COLUMN_CHUNK], COLUMN_CHUNK)

@@ -1,0 +1,86 @@
+"""Measure how much memory preparing a mesh takes, by its faces: each mesh in a process of its own.
+
+\b
+    python pipelines/measurements/prepare_memory.py [--subdivisions N ...] [--kind KIND ...]
+
+Balls of 10 cm are written as STL, OBJ and PLY (`stl`, `obj`, `ply`), and as PLY with noise and six
+holes (`open`). Prints a line of JSON for each: peak memory before and in all, what `drakegrasp
+audit` forecasts, and seconds. Processes have jemalloc where it is installed, as workers do.
+"""  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import click
+import numpy as np
+import trimesh
+
+from drakegrasp.runtime.allocator import jemalloc_environment
+
+KINDS = ("stl", "obj", "ply", "open")
+RADIUS = 0.05
+#: Runs in the process of a mesh; what is imported there is not the mesh's memory.
+_CHILD = """
+import json, re, sys, time
+from pathlib import Path
+from drakegrasp.build.prepare import prepare
+from drakegrasp.config import load_config
+from drakegrasp.objects.memory import forecast_memory
+from drakegrasp.objects.sources import find_mesh
+
+def peak():
+    # Not ru_maxrss, which begins with the parent's.
+    return int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) / 976.6
+
+source, config, start, before = find_mesh(sys.argv[1]), load_config(), time.monotonic(), peak()
+model = prepare(source, config).model
+print(json.dumps({
+    "before [MB]": round(before), "peak [MB]": round(peak()),
+    "forecast [MB]": round(forecast_memory(int(sys.argv[2])) / 1e6),
+    "seconds": round(time.monotonic() - start, 1), "notes": model.notes,
+}))
+"""
+
+
+def ball(subdivisions: int, kind: str) -> trimesh.Trimesh:
+    """Return a ball of 20 * 4^subdivisions faces; of the kind "open" with noise and holes."""
+    mesh = trimesh.creation.icosphere(subdivisions, radius=RADIUS)
+    if kind != "open":
+        return mesh
+    rng = np.random.default_rng(0)
+    keep = np.ones(len(mesh.faces), dtype=bool)
+    for direction in rng.standard_normal((6, 3)):
+        along = mesh.triangles_center @ (direction / np.linalg.norm(direction))
+        keep &= along < 0.985 * RADIUS
+    rough = mesh.vertices * (1.0 + 2e-3 * rng.standard_normal((len(mesh.vertices), 1)))
+    return trimesh.Trimesh(rough, mesh.faces[keep], process=False)
+
+
+@click.command(help=__doc__)
+@click.option("--subdivisions", multiple=True, type=int, default=(5, 6, 7, 8), show_default=True)
+@click.option("--kind", "kinds", multiple=True, type=click.Choice(KINDS), default=KINDS)
+def main(subdivisions: tuple[int, ...], kinds: tuple[str, ...]) -> None:
+    """Run the script."""
+    environment = {**os.environ, **jemalloc_environment()}
+    for number in subdivisions:
+        for kind in kinds:
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / f"1_ball.{'ply' if kind == 'open' else kind}"
+                mesh = ball(number, kind)
+                mesh.export(path)
+                command = [sys.executable, "-c", _CHILD, str(path), str(len(mesh.faces))]
+                child = subprocess.run(
+                    command, env=environment, capture_output=True, text=True, check=True
+                )
+            line = {"kind": kind, "faces": len(mesh.faces), **json.loads(child.stdout)}
+            click.echo(json.dumps(line))
+
+
+if __name__ == "__main__":
+    main()
