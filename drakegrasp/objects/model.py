@@ -307,6 +307,7 @@ def load_object(path: str | Path) -> ObjectModel:
     Raises:
         MeshError: If the file is missing, damaged or something else.
     """
+    # The arrays, as they are in the file.
     path = Path(path)
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as content:
@@ -315,6 +316,8 @@ def load_object(path: str | Path) -> ObjectModel:
         raise MeshError(
             f"{path.name}: must be an object file of drakegrasp, got: {one_line(error)}"
         ) from error
+
+    # Their types in an object, and whether one can be like that.
     try:
         for key in ("name", "class_name", "mesh_sha256", "mass", "collision_error", "scale", "up"):
             values[key] = values[key].item()

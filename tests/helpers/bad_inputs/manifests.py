@@ -104,7 +104,6 @@ DECISIONS: tuple[Kind, ...] = (
         optional=(("rejected", 0), ("kept", 0)),
     ),
     value_kind(("version",), "of the future", "2"),
-    value_kind(("rejected", 0, "object"), "that is not there", '"4_cup"'),
     twice(("rejected",)),
 )
 
