@@ -167,9 +167,8 @@ def read_trials(
     Raises:
         DataError: See `read_shard`.
     """
-    tables = None
-    if not complete:
-        tables = {"trials": tuple(f for f in trial_columns() if f.name in (*names, "outcome"))}
+    columns = tuple(f for f in trial_columns() if f.name in (*names, "outcome"))
+    tables = None if complete else {"trials": columns}
     with open_shard(path, header, tables, verify_seal=verify_seal) as (file, _):
         refuse_other_codes(path, "/trials/outcome", file["trials/outcome"][:], list(Outcome))
         return {name: read_column(file["trials"], name) for name in names}

@@ -33,11 +33,13 @@ from drakegrasp.mesh.surfaces import Solid, diagonal, signed_volume
 from drakegrasp.objects.sources import (
     MANIFEST_NAME,
     UNITS,
+    UPRIGHT,
     MeshSource,
     load_source,
     upright_vertices,
 )
 from drakegrasp.runtime.files import write_atomic
+from drakegrasp.runtime.names import is_name
 from drakegrasp.seeding import object_key
 
 #: Smaller objects are sheets or specks, which hydroelastic contact does not resolve.
@@ -305,6 +307,7 @@ def load_object(path: str | Path) -> ObjectModel:
     Raises:
         MeshError: If the file is missing, damaged or something else.
     """
+    # The arrays, as they are in the file.
     path = Path(path)
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as content:
@@ -313,12 +316,57 @@ def load_object(path: str | Path) -> ObjectModel:
         raise MeshError(
             f"{path.name}: must be an object file of drakegrasp, got: {one_line(error)}"
         ) from error
-    for key in ("name", "class_name", "mesh_sha256", "mass", "collision_error", "scale", "up"):
-        values[key] = values[key].item()
-    friction = values["friction"].item()
-    values["friction"] = None if np.isnan(friction) else friction
-    values["notes"] = tuple(values["notes"].tolist())
+
+    # Their types in an object, and whether one can be like that.
+    try:
+        for key in ("name", "class_name", "mesh_sha256", "mass", "collision_error", "scale", "up"):
+            values[key] = values[key].item()
+        friction = values["friction"].item()
+        values["friction"] = None if np.isnan(friction) else friction
+        values["notes"] = tuple(values["notes"].tolist())
+        mistake = _mistake(values)
+    except (TypeError, ValueError) as error:
+        mistake = one_line(error)
+    if mistake is not None:
+        raise MeshError(f"{path.name}: must be an object file of drakegrasp, got: {mistake}")
     return ObjectModel(**values)
+
+
+def _mistake(values: dict[str, Any]) -> str | None:
+    """Return what no object has of the values in a file, in words; None if all are possible."""
+    # Texts.
+    for key in ("name", "class_name"):
+        if not (isinstance(values[key], str) and is_name(values[key])):
+            return f"{key} {values[key]!r}"
+    if values["up"] not in UPRIGHT:
+        return f"up {values['up']!r}"
+    if not all(isinstance(note, str) for note in values["notes"]):
+        return "notes that are no texts"
+
+    # Numbers.
+    friction = 1.0 if values["friction"] is None else values["friction"]
+    for key, number in (
+        ("mass", values["mass"]),
+        ("scale", values["scale"]),
+        ("friction", friction),
+    ):
+        if not (isinstance(number, float) and np.isfinite(number) and number > 0.0):
+            return f"{key} {number!r}"
+    error = values["collision_error"]
+    if not (isinstance(error, float) and np.isfinite(error) and error >= 0.0):
+        return f"collision_error {error!r}"
+
+    # Arrays; a face names three vertices.
+    for key in ("visual_vertices", "collision_vertices", "p_OOcm", "I_OOcm_O"):
+        if values[key].dtype.kind != "f" or not np.isfinite(values[key]).all():
+            return f"{key} that are not finite numbers"
+    if values["I_OOcm_O"].shape != (3, 3) or np.linalg.eigvalsh(values["I_OOcm_O"]).min() <= 0.0:
+        return "an inertia that no solid has"
+    for kind in ("visual", "collision"):
+        faces, count = values[f"{kind}_faces"], len(values[f"{kind}_vertices"])
+        if faces.dtype.kind != "i" or (faces.size and not 0 <= faces.min() <= faces.max() < count):
+            return f"{kind}_faces of vertices that are not there"
+    return None
 
 
 def object_colour(name: str) -> tuple[float, float, float]:

@@ -174,13 +174,13 @@ def report(title: str, kinds: Sequence[object], wrong: dict[str, str]) -> None:
 def some(kinds: Sequence[Kind], command: str, commands: Sequence[str]) -> Sequence[Kind]:
     """Return all kinds for the first command, and for each other one its share.
 
-    All of them read a file by the same function, so each kind is tried twice. With the variable
-    ALL_BAD_INPUTS in the environment each is tried with every command, which takes half an hour.
+    All of them read a file by the same function, so most kinds are tried twice. With the variable
+    ALL_BAD_INPUTS in the environment each is tried with every command, which takes long.
     """
     k = commands.index(command)
     if k == 0 or "ALL_BAD_INPUTS" in os.environ:
         return kinds
-    return kinds[k - 1 :: len(commands) - 1]
+    return kinds[k - 1 :: max(len(commands) - 1, 6)]
 
 
 def test_every_kind_has_a_name() -> None:
@@ -209,7 +209,7 @@ READ_DATA = (
     *("export original", "export hf", "verify"),
 )
 READ_SHARDS = ("assemble", "check")
-READ_PLANS = ("check", "replay", "figures", "export glb", "verify")
+READ_PLANS = ("export glb", "check", "replay", "figures", "verify")
 READ_MODELS = ("assemble", "check", "replay", "verify")
 
 
@@ -247,11 +247,6 @@ def test_attributes_that_contradict(base: Path, tmp_path: Path, command: str, na
 @pytest.mark.parametrize("command", READ_SHARDS)
 def test_shards(base: Path, tmp_path: Path, command: str) -> None:
     walk(base, tmp_path, SHARD, some(hdf5_kinds.SHARD, command, READ_SHARDS), command)
-
-
-def test_shards_of_unfinished(base: Path, tmp_path: Path) -> None:
-    kinds = [kind for kind in hdf5_kinds.SHARD if "/looks/row" not in kind.name]
-    walk(base, tmp_path, SHARD, kinds[::3], "inspect", OTO, OTM, TRIALS)
 
 
 @pytest.mark.parametrize("command", READ_PLANS)
@@ -392,8 +387,7 @@ def test_decisions(base: Path, tmp_path: Path) -> None:
 
 
 def test_decisions_in_the_dataset(base: Path, tmp_path: Path) -> None:
-    kinds = [kind for kind in manifests.DECISIONS if "not there" not in kind.name]
-    walk(base, tmp_path, REJECT, kinds, "inspect")
+    walk(base, tmp_path, REJECT, manifests.DECISIONS, "inspect")
 
 
 def test_configurations(base: Path, tmp_path: Path) -> None:
