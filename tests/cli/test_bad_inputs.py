@@ -205,12 +205,12 @@ READ_TRIALS = (
     *("export dexgraspbench", "bench"),
 )
 READ_DATA = (
-    *("stats", "check", "check FILE", "figures", "inspect", "export glb", "export dexgraspbench"),
+    *("stats", "check", "check FILE", "inspect", "export glb", "export dexgraspbench"),
     *("export original", "export hf", "verify"),
 )
 READ_SHARDS = ("assemble", "check")
-READ_PLANS = ("export glb", "check", "replay", "figures", "verify")
-READ_MODELS = ("assemble", "check", "replay", "verify")
+READ_PLANS = ("check", "replay")
+READ_MODELS = ("assemble", "check", "replay")
 
 
 @pytest.mark.parametrize("command", READ_MANIFEST)
