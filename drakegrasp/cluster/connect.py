@@ -142,6 +142,8 @@ class _LocalCluster(LocalCluster):
             super().__init__(**options)
         except BaseException:
             self._instances.discard(self)
+            # A nanny whose worker did not start says so to nobody but this log.
+            logging.getLogger("asyncio").disabled = True
             raise
 
 

@@ -57,9 +57,9 @@ def read_grasps(grasps: npt.ArrayLike, fingers: int) -> tuple[Array, Array]:
     usable = np.abs(array) <= LARGEST  # false for NaN
     if not usable.all():
         row, number = np.argwhere(~usable)[0]
+        must = f"at most {LARGEST:g}" if np.isfinite(array[row, number]) else "finite"
         raise GraspError(
-            f"{_of(array, row)}number {number + 1} must be finite, at most {LARGEST:g}, "
-            f"got {array[row, number]}"
+            f"{_of(array, row)}number {number + 1} must be {must}, got {array[row, number]}"
         )
 
     # Points and normals, of which the latter are unit vectors.

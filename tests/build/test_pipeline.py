@@ -228,7 +228,7 @@ def test_build_keeps_what_an_inspection_rejected(
 
     # No mesh is simulated again here: only its entry counts.
     manifest = read_manifest(out)
-    changed = [replace(entry, mesh_sha256="other") for entry in manifest.objects]
+    changed = [replace(entry, mesh_sha256="0" * 64) for entry in manifest.objects]
     write_manifest(replace(manifest, objects=tuple(changed)), out)
     build(find_meshes(meshes), out, small_config, run_here, show=False)
     assert read_manifest(out).rejected == ()

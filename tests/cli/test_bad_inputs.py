@@ -481,7 +481,15 @@ def test_options(base: Path, tmp_path: Path, option: str) -> None:
 
 
 #: How the lines about some options call them.
-NAMES_OF_OPTIONS = ("candidates.max", "max_grasps", "hand", "config", "certify", "builtin.")
+NAMES_OF_OPTIONS = (
+    "candidates.max",
+    "max_grasps",
+    "hand",
+    "config",
+    "certify",
+    "builtin.",
+    "seed: ",
+)
 
 
 def _keys(value: str) -> Iterator[str]:

@@ -104,7 +104,7 @@ def old(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (check_dataset, TRIALS),
         (check_dataset, FILE_NAME),
         (assemble, FILE_NAME),
-        (count_unfinished, FILE_NAME),
+        (count_unfinished, TRIALS),
         (count_funnel, TRIALS),
         (count_splits, OTO),
         (partial(claim_directory, config=Config()), FILE_NAME),

@@ -205,14 +205,14 @@ _KEPT = TemporaryDirectory(prefix="datasets-")
 
 def make_dataset(out: Path, meshes: Path, *overrides: str) -> Path:
     """Write the small dataset, with some values of the configuration, and its meshes."""
-    kept_out, kept_meshes = _made(overrides)
+    kept_out, kept_meshes = _made(overrides, tuple(BOXES))
     shutil.copytree(kept_out, out, dirs_exist_ok=True)
     shutil.copytree(kept_meshes, meshes, dirs_exist_ok=True)
     return out
 
 
 @cache
-def _made(overrides: tuple[str, ...]) -> tuple[Path, Path]:
+def _made(overrides: tuple[str, ...], names: tuple[str, ...]) -> tuple[Path, Path]:
     folder = Path(mkdtemp(dir=_KEPT.name))
     (folder / "meshes").mkdir()
     return _make(folder / "out", folder / "meshes", overrides), folder / "meshes"

@@ -23,6 +23,7 @@ from drakegrasp.dataset.schema import (
     OBJECT_FIELDS,
     SCHEMA_VERSION,
     SPLITS,
+    SUCCESS_FIELDS,
     TRIAL_FIELDS,
     sizes,
 )
@@ -44,6 +45,16 @@ NHAT_Q_C = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 X_TC = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.5])
 
 
+def write_attributes(file: h5py.File) -> None:
+    """Write the attributes that every file has."""
+    file.attrs["schema_version"], file.attrs["K"] = SCHEMA_VERSION, K
+    file.attrs["near"], file.attrs["far"] = CAMERA.near, CAMERA.far
+    file.attrs["seed"] = 0
+    file.attrs["config"] = file.attrs["versions"] = "{}"
+    for key in ("signature", "shards", "config_hash"):
+        file.attrs[key] = "of a test"
+
+
 def write_data_file(
     path: Path, names: list[str], split: str = "train", *, first_id: int = 10
 ) -> None:
@@ -61,13 +72,8 @@ def write_data_file(
         "object_props/frame_work2cam_otm": pack_pose(X_TC),
     }
     with h5py.File(path, "w") as file:
-        file.attrs["schema_version"], file.attrs["K"] = SCHEMA_VERSION, K
+        write_attributes(file)
         file.attrs["camera"] = "oto"
-        file.attrs["near"], file.attrs["far"] = CAMERA.near, CAMERA.far
-        file.attrs["seed"] = 0
-        file.attrs["config"] = file.attrs["versions"] = "{}"
-        for key in ("signature", "shards", "config_hash"):
-            file.attrs[key] = "of a test"
         for name in SPLITS:
             group, rows = file.create_group(name), len(names) if name == split else 0
             for field in DATA_FIELDS:
@@ -198,6 +204,9 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     }
     objects = {"name": BOX, "class_name": "box", "mesh_sha256": ""}
     with h5py.File(out / "trials.hdf5", "w") as file:
+        write_attributes(file)
+        for field in SUCCESS_FIELDS:
+            write_field(file.require_group("successes"), field, field.empty(1, LETTERS))
         for field in TRIAL_FIELDS:
             values = field.empty(2, LETTERS)
             values[0] = row.get(field.name, values[0])

@@ -85,8 +85,10 @@ def refuse_other_attributes(path: Path, file: h5py.File, rules: Mapping[str, Rul
     Raises:
         DataError: If there is one; the first is told.
     """
-    # The version first: another schema may have other attributes.
-    refuse_other_schema(path, file.attrs.get("schema_version"))
+    # The version first: another schema may have other attributes, and a stranger's file has none.
+    if "schema_version" not in file.attrs:
+        raise DataError(f"{path}: must be a data file of drakegrasp, got another HDF5 file")
+    refuse_other_schema(path, file.attrs["schema_version"])
     refuse_first(path, attribute_mistakes(file, rules))
 
 
