@@ -39,8 +39,8 @@ from drakegrasp.runtime.progress import silent
 from drakegrasp.simulation.trial import TrialRecord
 
 FILES = (OTO, OTM, TRIALS)
-#: Assembling renames what a task made and the list of new files, and only then the files themselves,
-#: the card and the manifest.
+#: Assembling renames what a task made and the list of new files, and only then the files, the card
+#: and the manifest.
 LISTED = 2
 RENAMES = LISTED + len(FILES) + len(CARD_FILES) + 1
 #: A filter that would remove every sample.
