@@ -28,6 +28,7 @@ from drakegrasp.cli.options import (
     objects_seed_option,
     out_argument,
     per_class_option,
+    processes_option,
     tidied,
 )
 from drakegrasp.cli.verify import verify
@@ -94,17 +95,19 @@ def export_objects(directory: Path, per_class: int | None, objects_seed: int | N
 
 @click.command()
 @click.argument("path", type=PathType(path_type=Path), metavar="OUT|FILE", callback=tidied)
-def check(path: Path) -> None:
+@processes_option
+def check(path: Path, workers: int) -> None:
     """Check every invariant of a dataset.
 
     OUT is a dataset's directory; FILE is one of its three main files. Exit code 1 if an
     invariant is broken.
     """
     from drakegrasp.dataset.checks.run import check_dataset
+    from drakegrasp.runtime.executor import processes
     from drakegrasp.runtime.progress import progress_bar
 
-    with progress_bar("check", "steps") as progress:
-        violations = check_dataset(path, progress=progress)
+    with processes(workers) as execute, progress_bar("check", "steps") as progress:
+        violations = check_dataset(path, execute=execute, progress=progress)
     for violation in violations:
         say(str(violation))
     say(f"{path}: {len(violations) or 'no'} broken invariants")

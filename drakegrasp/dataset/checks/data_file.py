@@ -7,6 +7,7 @@ findings of the context.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -16,7 +17,7 @@ from drakegrasp.dataset.checks import consistency
 from drakegrasp.dataset.checks import hold as hold_rules
 from drakegrasp.dataset.checks import images as image_rules
 from drakegrasp.dataset.checks import samples as sample_rules
-from drakegrasp.dataset.checks.context import Context, Dataset
+from drakegrasp.dataset.checks.context import Context, Dataset, RowsTask, judge_rows
 from drakegrasp.dataset.checks.findings import AnyArray, Batch, Findings, Violation, of_file
 from drakegrasp.dataset.checks.images import Lens
 from drakegrasp.dataset.checks.open_file import OpenFile
@@ -26,6 +27,8 @@ from drakegrasp.outcomes import Outcome
 
 #: Samples in a batch: some 20 MB of images.
 SAMPLE_ROWS = 64
+#: Samples in a task.
+TASK_ROWS = 16 * SAMPLE_ROWS
 #: Samples in a batch without images.
 PAIR_ROWS = 8192
 #: Fields of a trial with which a sample is compared.
@@ -48,50 +51,9 @@ def check_data_file(data: OpenFile, camera: str, context: Context) -> None:
     """
     if data.config is None:
         return  # a finding already; without a lens no image can be judged
-    findings, dataset, filters = context.findings, context.dataset, data.config.filters
-    lens = Lens.of(camera, data.config)
     context.add(data, consistency.splits(data))
     for split in data.groups:
-        for whole in data.batches(split, SAMPLE_ROWS, findings):
-            # Values that stand for themselves.
-            batch = data.judge(whole, findings, sample_rules.finite)
-            batch = data.judge(
-                batch,
-                findings,
-                sample_rules.normals,
-                partial(image_rules.image_values, lens=lens),
-                image_rules.mask_values,
-                sample_rules.frames,
-                sample_rules.work_frame,
-                sample_rules.mass_properties,
-                hold_rules.poses,
-            )
-            batch = data.judge(
-                batch, findings, hold_rules.words, partial(hold_rules.limits, filters=filters)
-            )
-
-            # The frames of a sample, and its trial.
-            batch = data.judge(batch, findings, sample_rules.inverse_frames)
-            batch = data.judge(
-                batch,
-                findings,
-                sample_rules.camera_pair,
-                partial(image_rules.image_frames, lens=lens),
-            )
-            if dataset is not None:
-                batch = _judge_by_trial(data, batch, camera, dataset, findings)
-
-            # What the images show, which needs right frames.
-            batch = image_rules.without_noise(batch, lens, data.config.camera)
-            batch = data.judge(
-                batch,
-                findings,
-                partial(image_rules.contacts_in_image, lens=lens),
-                partial(image_rules.table_pixels, lens=lens),
-            )
-            if dataset is not None:
-                _judge_by_mesh(data, batch, lens, dataset, findings)
-            context.advance(len(whole))
+        judge_rows(_tasks(data, camera, split, context.dataset), data, split, context)
 
 
 def check_pair(oto: OpenFile, otm: OpenFile, findings: Findings) -> None:
@@ -103,11 +65,85 @@ def check_pair(oto: OpenFile, otm: OpenFile, findings: Findings) -> None:
             what = f"number of rows must be that of {oto.name}, {count}"
             findings.add([of_file(otm.name, what, str(otm.count(split)), f"/{split}")])
             continue
-        good = np.setdiff1d(np.arange(count), oto.bad(split) + otm.bad(split))
+        bad = np.union1d(oto.bad(split), otm.bad(split))
+        good = np.setdiff1d(np.arange(count), bad)
         for start in range(0, len(good), PAIR_ROWS):
             rows = good[start : start + PAIR_ROWS]
             batch, other = (file.read(split, rows, names) for file in (oto, otm))
             findings.add(sample_rules.same_properties(batch, other))
+
+
+def _tasks(data: OpenFile, camera: str, split: str, dataset: Dataset | None) -> Iterator[RowsTask]:
+    count = data.count(split)
+    for start in range(0, count, TASK_ROWS):
+        stop = min(start + TASK_ROWS, count)
+        yield RowsTask(
+            judge=partial(_judge_samples, camera=camera),
+            file=data,
+            group=split,
+            start=start,
+            stop=stop,
+            dataset=None if dataset is None else _of_rows(dataset, data, split, start, stop),
+        )
+
+
+def _of_rows(dataset: Dataset, data: OpenFile, split: str, start: int, stop: int) -> Dataset:
+    """Return the dataset with those bad trials that some samples are of, which are few."""
+    trials = dataset.trials
+    if trials is not None:
+        try:
+            ids = data.groups[split]["trial_id"][start:stop]
+        except OSError:
+            ids = np.zeros(0, dtype=np.int64)  # a finding of the task
+        trials = replace(trials, bad_rows={"trials": np.intersect1d(ids, trials.bad("trials"))})
+    return replace(dataset, findings=Findings(), trials=trials)
+
+
+def _judge_samples(task: RowsTask, findings: Findings, *, camera: str) -> AnyArray:
+    """Apply every rule to rows of a split; no later step needs any of them."""
+    data, dataset = task.file, task.dataset
+    assert data.config is not None
+    filters, lens = data.config.filters, Lens.of(camera, data.config)
+    for whole in data.batches(task.group, task.start, task.stop, SAMPLE_ROWS, findings):
+        # Values that stand for themselves.
+        batch = data.judge(whole, findings, sample_rules.finite)
+        batch = data.judge(
+            batch,
+            findings,
+            sample_rules.normals,
+            partial(image_rules.image_values, lens=lens),
+            image_rules.mask_values,
+            sample_rules.frames,
+            sample_rules.work_frame,
+            sample_rules.mass_properties,
+            hold_rules.poses,
+        )
+        batch = data.judge(
+            batch, findings, hold_rules.words, partial(hold_rules.limits, filters=filters)
+        )
+
+        # The frames of a sample, and its trial.
+        batch = data.judge(batch, findings, sample_rules.inverse_frames)
+        batch = data.judge(
+            batch,
+            findings,
+            sample_rules.camera_pair,
+            partial(image_rules.image_frames, lens=lens),
+        )
+        if dataset is not None:
+            batch = _judge_by_trial(data, batch, camera, dataset, findings)
+
+        # What the images show, which needs right frames.
+        batch = image_rules.without_noise(batch, lens, data.config.camera)
+        batch = data.judge(
+            batch,
+            findings,
+            partial(image_rules.contacts_in_image, lens=lens),
+            partial(image_rules.table_pixels, lens=lens),
+        )
+        if dataset is not None:
+            _judge_by_mesh(data, batch, lens, dataset, findings)
+    return np.zeros(0, dtype=np.int64)
 
 
 def _judge_by_trial(

@@ -141,6 +141,17 @@ class Findings:
                 rows.add(violation.row)
         return rows
 
+    def merge(self, other: Findings) -> None:
+        """Take over what a part of the check found; what two parts say of a file counts once."""
+        for key, found in other._listed.items():
+            listed = self._listed.setdefault(key, [])
+            new = [v for v in found if v.row is not None or v not in listed]
+            room = max(0, MAX_LISTED - len(listed))
+            listed += new[:room]
+            more = len(new[room:]) + other._more.get(key, 0)
+            if more:
+                self._more[key] = self._more.get(key, 0) + more
+
     def violations(self) -> list[Violation]:
         """Return the listed violations, with a line for those that were only counted."""
         result = []

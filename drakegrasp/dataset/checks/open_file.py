@@ -1,21 +1,25 @@
 """An HDF5 file of a dataset while it is checked.
 
 In: a file with any content. Out: batches of the rows of those groups whose layout is sound. Rows
-that break a rule, or cannot be read, are remembered, so that no further rule judges them.
+that break a rule, or cannot be read, are remembered, so that no further rule judges them. Sent to
+another process, the file is opened again there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
+import numpy.typing as npt
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.checks import layout as layout_rules
 from drakegrasp.dataset.checks.findings import AnyArray, Batch, Findings, Violation, of_file
+from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.layout.structure import DATA_TABLES, TRIAL_TABLES
 from drakegrasp.dataset.schema import Field
 from drakegrasp.errors import first_line
@@ -33,7 +37,7 @@ class OpenFile:
         config: Its configuration, if it is sound.
         fields: Fields of each group, by the group's name.
         groups: Groups by name, without those whose layout is broken.
-        bad_rows: Rows of each group that break a rule or cannot be read.
+        bad_rows: (n,) rows of each group that break a rule or cannot be read, in rising order.
     """
 
     name: str
@@ -41,15 +45,28 @@ class OpenFile:
     config: Config | None
     fields: Mapping[str, tuple[Field, ...]]
     groups: dict[str, h5py.Group] = field(default_factory=dict)
-    bad_rows: dict[str, set[int]] = field(default_factory=dict)
+    bad_rows: dict[str, npt.NDArray[np.int64]] = field(default_factory=dict)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "file": self.file.filename, "groups": tuple(self.groups)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self.file = open_hdf5(Path(state["file"]), again=True)
+        self.groups = {name: self.file[name] for name in state["groups"]}
 
     def count(self, group: str) -> int:
         """Return the number of rows of a group; 0 if it is missing or broken."""
         return len(self.groups[group][self.fields[group][0].name]) if group in self.groups else 0
 
-    def bad(self, group: str) -> list[int]:
-        """Return the rows of a group that break a rule or cannot be read."""
-        return sorted(self.bad_rows.get(group, ()))
+    def bad(self, group: str) -> npt.NDArray[np.int64]:
+        """Return the rows (n,) of a group that break a rule or cannot be read."""
+        return self.bad_rows.get(group, np.zeros(0, dtype=np.int64))
+
+    def mark_bad(self, group: str, rows: npt.NDArray[np.int64]) -> None:
+        """Remember rows (n,) of a group that break a rule or cannot be read."""
+        if len(rows):
+            self.bad_rows[group] = np.union1d(self.bad(group), rows)
 
     def read(self, group: str, rows: AnyArray, names: Sequence[str] | None = None) -> Batch:
         """Return some rows of a group.
@@ -69,16 +86,21 @@ class OpenFile:
         columns = {f.name: column(self.groups[group][f.name], f)[choice] for f in fields}
         return Batch(file=self.name, group=f"/{group}", rows=rows, columns=columns)
 
-    def batches(self, group: str, size: int, findings: Findings) -> Iterator[Batch]:
-        """Yield all rows of a group, `size` at a time; rows that cannot be read are a finding."""
-        for start in range(0, self.count(group), size):
-            rows = np.arange(start, min(start + size, self.count(group)))
+    def batches(
+        self, group: str, start: int, stop: int, size: int, findings: Findings
+    ) -> Iterator[Batch]:
+        """Yield the rows of a group from `start` to before `stop`, `size` at a time.
+
+        Rows that cannot be read are a finding.
+        """
+        for first in range(start, stop, size):
+            rows = np.arange(first, min(first + size, stop))
             try:
                 yield self.read(group, rows)
             except (OSError, UnicodeDecodeError) as error:
-                what = f"rows {start} to {rows[-1]} must be readable"
+                what = f"rows {first} to {rows[-1]} must be readable"
                 findings.add([of_file(self.name, what, first_line(error), f"/{group}")])
-                self.bad_rows.setdefault(group, set()).update(rows.tolist())
+                self.mark_bad(group, rows)
 
     def judge(self, batch: Batch, findings: Findings, *rules: Rule) -> Batch:
         """Apply rules that do not build on each other; return the rows that break none."""
@@ -87,7 +109,7 @@ class OpenFile:
         rows: set[int] = set()
         for rule in rules:
             rows |= findings.add(rule(batch))
-        self.bad_rows.setdefault(batch.group[1:], set()).update(rows)
+        self.mark_bad(batch.group[1:], np.array(sorted(rows), dtype=np.int64))
         return batch.without(rows)
 
 

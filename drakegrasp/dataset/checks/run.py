@@ -1,12 +1,13 @@
 """`drakegrasp check`: every rule on every row of a dataset, or of one of its files.
 
 In: a dataset's directory, or grasping_oto.hdf5, grasping_otm.hdf5 or trials.hdf5 alone. Out: a
-list of violations, empty for a sound dataset. Rows are read in batches, so the memory is bounded.
-Imports no Drake.
+list of violations, empty for a sound dataset. Rows are read in batches, so the memory is bounded,
+and judged in tasks, by an `Executor`. Imports no Drake.
 
-The rules are in `layout`, `samples`, `images`, `trials` and `consistency`. `data_file`,
-`trials_file` and this module apply them in an order: a row that breaks a rule is not shown to the
-rules that build on it, so the check reports the cause and not all that follows from it.
+The rules are in `layout`, `object_files`, `samples`, `images`, `trials` and `consistency`.
+`data_file`, `trials_file` and this module apply them in an order: a row that breaks a rule is not
+shown to the rules that build on it, so the check reports the cause and not all that follows from
+it.
 """
 
 from __future__ import annotations
@@ -20,26 +21,29 @@ from drakegrasp.dataset.checks import consistency
 from drakegrasp.dataset.checks.context import Context, Dataset
 from drakegrasp.dataset.checks.data_file import check_data_file, check_pair
 from drakegrasp.dataset.checks.findings import Findings, Violation, of_file
+from drakegrasp.dataset.checks.object_files import check_object, object_tasks
 from drakegrasp.dataset.checks.open_file import OpenFile, open_file
 from drakegrasp.dataset.checks.trials_file import check_trials_file
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.manifest import Manifest, read_manifest
-from drakegrasp.dataset.paths import CARD_FILES, DATA_FILES, TRIALS_FILE, refuse_changed_object
+from drakegrasp.dataset.paths import CARD_FILES, DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.schema import CAMERAS, refuse_other_schema
-from drakegrasp.dataset.shards import read_shard
 from drakegrasp.errors import DataError, first_line
-from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.executor import Executor, run_here
 from drakegrasp.runtime.progress import Report, silent
 
 __all__ = ["Violation", "check_dataset"]
 
 
-def check_dataset(path: str | Path, *, progress: Report | None = None) -> list[Violation]:
+def check_dataset(
+    path: str | Path, *, execute: Executor = run_here, progress: Report | None = None
+) -> list[Violation]:
     """Return every broken invariant of a dataset or of one of its files.
 
     Args:
         path: Directory of a dataset, or one of its three HDF5 files. A file alone is checked for
             all that needs no other file.
+        execute: Runs the tasks; the result is the same whatever runs them.
         progress: Called with the number of rows and shards that are done and to do.
 
     Raises:
@@ -49,13 +53,15 @@ def check_dataset(path: str | Path, *, progress: Report | None = None) -> list[V
     path, findings, report = Path(path), Findings(), progress or silent
     with ExitStack() as stack:
         if path.is_dir():
-            _check_directory(path, stack, findings, report)
+            _check_directory(path, stack, findings, report, execute)
         else:
-            _check_file(path, stack, findings, report)
+            _check_file(path, stack, findings, report, execute)
     return findings.violations()
 
 
-def _check_file(path: Path, stack: ExitStack, findings: Findings, report: Report) -> None:
+def _check_file(
+    path: Path, stack: ExitStack, findings: Findings, report: Report, execute: Executor
+) -> None:
     """Check a file alone."""
     try:
         file = stack.enter_context(open_hdf5(path))
@@ -73,14 +79,16 @@ def _check_file(path: Path, stack: ExitStack, findings: Findings, report: Report
         )
     refuse_other_schema(path, file.attrs.get("schema_version"))
     opened = open_file(path.name, file, camera if camera in CAMERAS else "", findings)
-    context = Context(findings=findings, report=report, total=_rows(opened))
+    context = Context(findings=findings, report=report, total=_rows(opened), execute=execute)
     if camera in CAMERAS:
         check_data_file(opened, camera, context)
     else:
         check_trials_file(opened, context)
 
 
-def _check_directory(out: Path, stack: ExitStack, findings: Findings, report: Report) -> None:
+def _check_directory(
+    out: Path, stack: ExitStack, findings: Findings, report: Report, execute: Executor
+) -> None:
     """Check the files of a dataset, each with its objects, its shards and the other files."""
     # Open the files; the trials come under the camera "".
     manifest = read_manifest(out)
@@ -90,12 +98,15 @@ def _check_directory(out: Path, stack: ExitStack, findings: Findings, report: Re
     trials = files.pop("", None)
     dataset = Dataset(out=out, manifest=manifest, trials=trials, findings=findings)
     context = Context(
-        findings=findings, report=report, total=rows + manifest.units, dataset=dataset
+        findings=findings,
+        report=report,
+        total=rows + manifest.units,
+        execute=execute,
+        dataset=dataset,
     )
 
     # The files that all others follow from.
-    _check_objects(out, dataset.names, findings)
-    _check_shards(out, manifest, context)
+    _check_objects(out, manifest, context)
 
     # The trials come first: a sample of a broken trial is not compared with it.
     if trials is not None:
@@ -124,34 +135,14 @@ def _open_files(out: Path, stack: ExitStack, findings: Findings) -> dict[str, Op
     return files
 
 
-def _check_objects(out: Path, names: list[str], findings: Findings) -> None:
-    """The files of each object are as they were written: the plan vouches for both."""
-    for name in names:
-        try:
-            refuse_changed_object(out, name)
-        except DataError as error:
-            path, _, got = str(error).partition(": ")
-            what = "an object's file must be as it was written"
-            findings.add([of_file(str(Path(path).relative_to(out)), what, got)])
-
-
-def _check_shards(out: Path, manifest: Manifest, context: Context) -> None:
-    """The shards of the manifest are there and whole, each object's up to its last grasp."""
-    wanted = {entry.name: manifest.config.max_grasps for entry in manifest.objects}
-    for header in manifest.headers():
-        context.advance(1)
-        left, path = wanted[header.object_name], header.path(out)
-        if left is not None and left <= 0:
-            continue
-        try:
-            outcome = read_shard(path, header).trials["outcome"]
-        except DataError as error:
-            what = "the shard must be there, whole and of its work unit"
-            got = str(error).rpartition(", got ")[2] if path.exists() else "none"
-            context.findings.add([of_file(str(path.relative_to(out)), what, got)])
-            continue
-        if left is not None:
-            wanted[header.object_name] = left - int((outcome == Outcome.SUCCESS).sum())
+def _check_objects(out: Path, manifest: Manifest, context: Context) -> None:
+    """The files of each object are as they were written."""
+    results = []
+    for found in context.execute(check_object, object_tasks(out, manifest)):
+        results.append(found)
+        context.advance(found.units)
+    for found in sorted(results, key=lambda found: found.object):
+        context.findings.merge(found.findings)
 
 
 def _check_card(out: Path, findings: Findings) -> None:

@@ -7,6 +7,8 @@ findings of the context.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -14,13 +16,16 @@ import numpy as np
 from drakegrasp.dataset.checks import conditions as condition_rules
 from drakegrasp.dataset.checks import consistency
 from drakegrasp.dataset.checks import trials as trial_rules
-from drakegrasp.dataset.checks.context import Context
+from drakegrasp.dataset.checks.context import Context, Dataset, RowsTask, judge_rows
+from drakegrasp.dataset.checks.findings import AnyArray, Findings
 from drakegrasp.dataset.checks.open_file import OpenFile, Rule
 from drakegrasp.dataset.layout.attributes import ORIGIN, attribute_mistakes
 from drakegrasp.outcomes import Outcome
 
 #: Trials in a batch: some 10 MB.
 TRIAL_ROWS = 8192
+#: Trials in a task.
+TASK_ROWS = 8 * TRIAL_ROWS
 
 
 def check_trials_file(trials: OpenFile, context: Context) -> None:
@@ -31,11 +36,36 @@ def check_trials_file(trials: OpenFile, context: Context) -> None:
         context: Takes the violations. Its manifest, if it has one, says which objects and
             candidates there are.
     """
-    findings, dataset = context.findings, context.dataset
+    dataset = context.dataset
     if dataset is not None:
         context.add(trials, consistency.same_objects(trials, dataset.manifest))
     if not {"objects", "trials"} <= set(trials.groups):
         return  # a broken layout, which is a finding already; trials need their objects
+
+    # The rows, and then the columns of the successes.
+    expected = judge_rows(_tasks(trials, dataset), trials, "trials", context)
+    if "successes" in trials.groups:
+        context.add(trials, consistency.successes(trials, expected))
+
+
+def _tasks(trials: OpenFile, dataset: Dataset | None) -> Iterator[RowsTask]:
+    count = trials.count("trials")
+    if dataset is not None:
+        dataset = replace(dataset, findings=Findings(), trials=None)
+    for start in range(0, count, TASK_ROWS):
+        yield RowsTask(
+            judge=_judge_trials,
+            file=trials,
+            group="trials",
+            start=start,
+            stop=min(start + TASK_ROWS, count),
+            dataset=dataset,
+        )
+
+
+def _judge_trials(task: RowsTask, findings: Findings) -> AnyArray:
+    """Apply every rule to rows of /trials; return the ids of the successes among them."""
+    trials, dataset = task.file, task.dataset
 
     # The rules whose limits depend on the dataset.
     objects = dataset.manifest.objects if dataset else None
@@ -69,15 +99,11 @@ def check_trials_file(trials: OpenFile, context: Context) -> None:
 
     # Numbers, then stages, which need a legal outcome, then what needs finite values, then what
     # needs sound poses.
-    successes = []
-    for whole in trials.batches("trials", TRIAL_ROWS, findings):
+    successes = [np.zeros(0, dtype=np.int64)]
+    for whole in trials.batches("trials", task.start, task.stop, TRIAL_ROWS, findings):
         successes.append(whole["trial_id"][whole["outcome"] == Outcome.SUCCESS])
         batch = trials.judge(whole, findings, numbers)
         batch = trials.judge(batch, findings, trial_rules.stages)
         batch = trials.judge(batch, findings, *last)
         trials.judge(batch, findings, trial_rules.motion)
-        context.advance(len(whole))
-
-    if "successes" in trials.groups:
-        expected = np.concatenate([np.zeros(0, dtype=np.int64), *successes])
-        context.add(trials, consistency.successes(trials, expected))
+    return np.concatenate(successes)

@@ -25,6 +25,7 @@ from helpers.datasets import (
 )
 
 from drakegrasp.config import load_config
+from drakegrasp.dataset.checks import data_file, trials_file
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.paths import model_path, plan_path
@@ -32,6 +33,7 @@ from drakegrasp.dataset.shards import read_shard, write_shard
 from drakegrasp.errors import DataError
 from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.model import load_object, save_object
+from drakegrasp.runtime.executor import processes
 
 
 def test_a_sound_dataset_passes(sound: Path) -> None:
@@ -59,6 +61,27 @@ def test_progress_ends_at_the_total(sound: Path) -> None:
     check_dataset(sound, progress=lambda done, total, **_: seen.append((done, total)))
     assert seen[-1][0] == seen[-1][1] == 36 + 2 * 9 + 6
     assert [done for done, _ in seen] == sorted(done for done, _ in seen)
+
+
+def test_two_processes_find_what_one_does(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Small tasks, with faults in the first and the last rows, in an object and in a shard."""
+    (out / "shards/2_box_b/0000002-0000004.h5").unlink()
+    model_path(out, "1_box_a").write_bytes(b"")
+    edit_file(out / TRIALS, lambda f: f["trials/candidate"].__setitem__(slice(None), 99))
+    edit_file(out / TRIALS, lambda f: f["trials/object"].__setitem__(35, 9))
+    for name in (OTO, OTM):
+        edit_file(out / name, lambda f: f["test/grasps"].__setitem__((5, 0), np.nan))
+    expected = check_dataset(out)
+    kinds = [(v.file, v.group) for v in expected]
+    assert kinds.count((TRIALS, "/trials")) == 22  # 20 candidates, the number of more, an object
+    assert {(OTO, "/test"), (OTM, "/test"), ("objects/1_box_a.npz", "")} <= set(kinds)
+
+    monkeypatch.setattr(trials_file, "TASK_ROWS", 7)
+    monkeypatch.setattr(data_file, "TASK_ROWS", 1)
+    small = check_dataset(out)
+    assert sorted(map(str, small)) == sorted(map(str, expected))
+    with processes(2) as execute:
+        assert check_dataset(out, execute=execute) == small
 
 
 def test_a_missing_shard_is_found(out: Path) -> None:
