@@ -4,21 +4,18 @@
     python pipelines/measurements/synthetic_dataset.py SMALL OUT --objects 500
 
 Each object is one of SMALL under a new name, with 10,000 palm poses: those of SMALL again and
-again, in another order each time. Shards are written as a build writes them; the first copies of an
-object are made from rows, the others from its shards. The files are not
-assembled: the next command is `drakegrasp assemble OUT`. `drakegrasp check OUT` finds that colours
-are not those of the new names, and nothing else.
+again, in another order each time, with the colour of the new name. Shards are written as a build
+writes them; the first copies of an object are made from rows, the others from its shards. The files
+are not assembled: the next command is `drakegrasp assemble OUT`.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import click
-import h5py
 import numpy as np
 
 from drakegrasp.config import override_config
@@ -27,8 +24,11 @@ from drakegrasp.dataset.manifest import Manifest, ObjectEntry, read_manifest, wr
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared, save_prepared
 from drakegrasp.dataset.shards import Shard, ShardHeader, read_shard, write_shard
 from drakegrasp.outcomes import Outcome
-from drakegrasp.runtime.files import seal
 from drakegrasp.runtime.progress import progress_bar
+from drakegrasp.simulation.randomization.draws import draw_conditions
+
+#: Columns of attempts, and of looks at successes.
+Rows = tuple[dict[str, AnyArray], dict[str, AnyArray]]
 
 
 @click.command(help=__doc__)
@@ -63,9 +63,14 @@ def main(
             made.append(prepared.entry())
             headers = list(replace(manifest, objects=(made[-1],)).headers())
             if i < len(entries):
-                write_from_rows(out, headers, small, source, entry, i)
+                rows, drawn_rows = load_rows(small, source, entry), drawn(entry.candidates, i)
+                shards = (shard_of_rows(header, rows, drawn_rows) for header in headers)
             else:
-                copy_shards(out, headers, names[i % len(entries)])
+                first = names[i % len(entries)]
+                shards = (copy_of_shard(out, header, first) for header in headers)
+            looks = draw_conditions(prepared.model, config, 0, 0).values()
+            for shard in shards:
+                write_shard(out, with_colour(shard, looks["object_colour"]))
             progress(i + 1, objects)
     write_manifest(replace(manifest, objects=tuple(made)), out)
 
@@ -83,60 +88,59 @@ def repeated(prepared: PreparedObject, name: str, count: int) -> PreparedObject:
     )
 
 
-def write_from_rows(
-    out: Path,
-    headers: list[ShardHeader],
-    small: Path,
-    source: Manifest,
-    entry: ObjectEntry,
-    seed: int,
-) -> None:
-    """Write the shards of an object from rows of another one, drawn without return in turn."""
+def load_rows(small: Path, source: Manifest, entry: ObjectEntry) -> Rows:
+    """Return the columns of all attempts of an object, and of its looks."""
     own = [header for header in source.headers() if header.object_name == entry.name]
     shards = [read_shard(header.path(small), header) for header in own]
-    trials = joined([dict(shard.trials) for shard in shards])
-    looks = joined([dict(shard.looks) for shard in shards])
-    look_of = {
-        int(row): k for k, row in enumerate(np.flatnonzero(trials["outcome"] == Outcome.SUCCESS))
-    }
+    return joined([dict(shard.trials) for shard in shards]), joined(
+        [dict(shard.looks) for shard in shards]
+    )
+
+
+def shard_of_rows(header: ShardHeader, rows: Rows, order: Iterator[int]) -> Shard:
+    """Return a shard of rows of another object, drawn without return in turn."""
+    trials, looks = rows
+    success = np.flatnonzero(trials["outcome"] == Outcome.SUCCESS)
+    look_of = {int(row): k for k, row in enumerate(success)}
 
     # Another order in each round: a column must not compress because it repeats itself.
-    standoffs = len(trials["outcome"]) // entry.candidates
-    order = drawn(entry.candidates, np.random.default_rng(seed))
-    for header in headers:
-        poses = np.array([next(order) for _ in range(header.stop - header.start)])
-        rows = (poses[:, None] * standoffs + np.arange(standoffs)).ravel()
-        columns = {name: values[rows] for name, values in trials.items()}
-        columns["candidate"] = np.repeat(
-            np.arange(header.start, header.stop, dtype=np.int32), standoffs
-        )
-        hits = np.flatnonzero(columns["outcome"] == Outcome.SUCCESS)
-        places = [look_of[int(row)] for row in rows[hits]]
-        seen = {name: values[places] for name, values in looks.items()}
-        seen["row"] = hits.astype(np.int32)
-        write_shard(out, Shard(header=header, trials=columns, looks=seen))
+    standoffs = int(trials["standoff_index"].max()) + 1
+    poses = np.array([next(order) for _ in range(header.stop - header.start)])
+    chosen = (poses[:, None] * standoffs + np.arange(standoffs)).ravel()
+    columns = {name: values[chosen] for name, values in trials.items()}
+    columns["candidate"] = np.repeat(
+        np.arange(header.start, header.stop, dtype=np.int32), standoffs
+    )
+    hits = np.flatnonzero(columns["outcome"] == Outcome.SUCCESS)
+    places = [look_of[int(row)] for row in chosen[hits]]
+    seen = {name: values[places] for name, values in looks.items()}
+    seen["row"] = hits.astype(np.int32)
+    return Shard(header=header, trials=columns, looks=seen)
 
 
-def drawn(count: int, generator: np.random.Generator) -> Iterator[int]:
+def drawn(count: int, seed: int) -> Iterator[int]:
     """Yield the numbers below a count without end, in another order each round."""
+    generator = np.random.default_rng(seed)
     while True:
         yield from generator.permutation(count).tolist()
+
+
+def copy_of_shard(out: Path, header: ShardHeader, first: str) -> Shard:
+    """Return the shard of the first copy of an object, for another one."""
+    own = replace(header, object_name=first)
+    return replace(read_shard(own.path(out)), header=header)
+
+
+def with_colour(shard: Shard, colour: AnyArray) -> Shard:
+    """Return a shard whose object has a colour (3,)."""
+    column = np.array(shard.trials["object_colour"])
+    column[:] = colour
+    return replace(shard, trials={**shard.trials, "object_colour": column})
 
 
 def joined(parts: list[dict[str, AnyArray]]) -> dict[str, AnyArray]:
     """Return the columns of several tables as those of one."""
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-
-
-def copy_shards(out: Path, headers: list[ShardHeader], of: str) -> None:
-    """Copy the shards of an object for another one."""
-    for header in headers:
-        path = header.path(out)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(replace(header, object_name=of).path(out), path)
-        with h5py.File(path, "r+") as file:
-            file.attrs.update(asdict(header))
-        seal(path)
 
 
 if __name__ == "__main__":
