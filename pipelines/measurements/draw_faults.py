@@ -61,6 +61,7 @@ MODULES = {
             "consistency": "consistency trials",
             "conditions": "conditions",
             "layout": "layout run",
+            "object_files": "run",
             "open_file": "layout run",
             "findings": "run trials samples",
             "context": "run consistency",

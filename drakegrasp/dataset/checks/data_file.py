@@ -28,7 +28,7 @@ from drakegrasp.outcomes import Outcome
 #: Samples in a batch: some 20 MB of images.
 SAMPLE_ROWS = 64
 #: Samples in a task.
-TASK_ROWS = 16 * SAMPLE_ROWS
+TASK_ROWS = 4 * SAMPLE_ROWS
 #: Samples in a batch without images.
 PAIR_ROWS = 8192
 #: Fields of a trial with which a sample is compared.
