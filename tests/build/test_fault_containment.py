@@ -44,7 +44,7 @@ from drakegrasp.runtime.journal import Journal, Verdict, wall_limit
 from drakegrasp.runtime.processes import host_label
 from drakegrasp.vision import rendering
 
-UNITS = 36
+UNITS = 28
 KILLS = 20
 
 
@@ -106,24 +106,13 @@ def test_random_kills_change_nothing(meshes: Path, undisturbed: Path, tmp_path: 
         if workers:
             os.kill(rng.choice(workers), signal.SIGKILL)
             killed += 1
-    finish(process)
+    said, _ = finish(process)
     assert killed == KILLS
+    assert f"{UNITS} work units simulated\n" in said
     assert_same_dataset(undisturbed, out)
     assert_clean(out)
     done = [(e["object"], e["start"]) for e in events(out, "unit done")]
     assert len(done) == len(set(done)) == UNITS
-
-
-@pytest.mark.cluster
-@pytest.mark.sim
-@pytest.mark.slow
-def test_four_workers_change_nothing(meshes: Path, undisturbed: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    said, errors = finish(start_build(meshes, out, workers=4))
-    assert f"{UNITS} work units simulated\n" in said
-    assert errors == ""
-    assert_same_dataset(undisturbed, out)
-    assert_clean(out)
 
 
 @pytest.mark.cluster

@@ -209,8 +209,8 @@ READ_DATA = (
     *("export original", "export hf", "verify"),
 )
 READ_SHARDS = ("assemble", "check")
-READ_PLANS = ("check", "replay")
-READ_MODELS = ("assemble", "check", "replay")
+READ_PLANS = ("replay", "check")
+READ_MODELS = ("replay", "assemble", "check")
 
 
 @pytest.mark.parametrize("command", READ_MANIFEST)

@@ -16,7 +16,7 @@ from drakegrasp.runtime.fault_injection import VARIABLE
 #: attempts one succeeds.
 FAST = [
     "screen.mode=off",
-    "candidates.max=18",
+    "candidates.max=14",
     "candidates.global_x_deg=[0]",
     "candidates.global_y_deg=[0]",
     "candidates.global_z_deg=[0,45,90]",

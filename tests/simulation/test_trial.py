@@ -139,12 +139,14 @@ def test_open_hand_that_meets_the_object_collides(scene, cube, config):
     assert record.closed is None
 
 
-def test_hand_wholly_inside_of_an_object_collides(tmp_path, config, hand):
-    """No surfaces cross there, so only the inside test can see it."""
+@pytest.mark.parametrize("mode", ["on", "off"])
+def test_hand_wholly_inside_of_an_object_collides(tmp_path, config, hand, mode):
+    """No surfaces cross there: only the inside test can see it, that of the screen or the scene."""
     block = box_model(tmp_path, [0.6, 0.6, 0.6])
     attempt = replace(from_above(block, 0.0), X_OG=make_pose(np.eye(3), [0.0, 0.0, 0.0]))
+    rules = override_config(config, [f"screen.mode={mode}"])
     scene = build_scene(block, config.physics, hand)
-    assert run_attempt(scene, standing(block), attempt, config).outcome is Outcome.START_COLLISION
+    assert run_attempt(scene, standing(block), attempt, rules).outcome is Outcome.START_COLLISION
 
 
 @pytest.mark.parametrize("name", ["54_candlestick_final", "60_comb_final", "65_coffeemaker_final"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,10 +24,14 @@ from helpers.datasets import (
 )
 from scipy import ndimage
 
+from drakegrasp.config import parse_config
 from drakegrasp.dataset.checks import images as image_rules
+from drakegrasp.dataset.checks.findings import Batch
 from drakegrasp.dataset.checks.images import Lens
-from drakegrasp.dataset.schema import CAMERAS
+from drakegrasp.dataset.paths import model_path
+from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS
 from drakegrasp.frames import invert_pose, make_pose, pack_pose, rotation_about, unpack_pose
+from drakegrasp.objects.model import load_object
 
 
 @pytest.mark.parametrize(
@@ -206,6 +211,27 @@ def test_point_beyond_the_box_is_told_by_how_far(
     points = np.array([[0.0, 0.0, 0.05], p_OQ])
     found = image_rules._beyond_box(points, np.array([0.0, 0.0, 1e3]), HALF, np.array([0.0, slack]))
     assert found == pytest.approx(beyond, abs=1e-9)
+
+
+def test_image_without_a_depth_hides_no_other(sound: Path) -> None:
+    """A sensor may lose all depths of an object; the object of the next image is still found."""
+    with h5py.File(sound / OTO) as file:
+        config = parse_config(json.loads(file.attrs["config"]))
+        group = file["test"]
+        columns = {f.name: np.array(group[f.name]) for f in DATA_FIELDS if f.dtype != "str"}
+        name = group["object_props/object_name"].asstr()[0]
+        rows = np.flatnonzero(group["object_props/object_name"].asstr()[:] == name)
+    batch = Batch(
+        file=OTO, group="/test", rows=rows, columns={k: v[rows] for k, v in columns.items()}
+    )
+    lens = replace(Lens.of("oto", config), loses=True)
+    model = load_object(model_path(sound, name))
+    assert len(rows) > 1
+    batch["images"][0, 3] = lens.far
+    assert list(image_rules.object_pixels(batch, lens, model)) == []
+    batch["images"][1, 3][batch["masks"][1] == 1] -= 0.02
+    (violation,) = image_rules.object_pixels(batch, lens, model)
+    assert violation.row == rows[1]
 
 
 def test_nearest_depth_is_the_least_within_two_pixels() -> None:

@@ -153,9 +153,11 @@ def test_a_truncated_file_is_found_and_the_others_are_still_checked(out: Path) -
         check_dataset(out / OTM)
 
 
-def test_rows_that_cannot_be_read_are_found(out: Path) -> None:
+@pytest.mark.parametrize("column", ["images", "object_props/work2mass"])
+def test_rows_that_cannot_be_read_are_found(out: Path, column: str) -> None:
+    """Also those of a column that both data files have; they are compared with nothing."""
     with h5py.File(out / OTO) as file:
-        offset = file["train/images"].id.get_chunk_info(0).byte_offset
+        offset = file[f"train/{column}"].id.get_chunk_info(0).byte_offset
     with open(out / OTO, "r+b") as raw:
         raw.seek(offset)
         raw.write(b"\xff" * 64)

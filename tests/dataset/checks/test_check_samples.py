@@ -22,6 +22,10 @@ from helpers.datasets import (
     turned,
 )
 
+from drakegrasp.dataset.checks import hold
+from drakegrasp.dataset.checks.findings import Batch
+from drakegrasp.frames import pack_pose
+
 PROPS = "object_props/"
 GRASP = "grasp_props/"
 SAMPLE_CASES: Mapping[str, tuple[str, str, Edit, str]] = {
@@ -160,3 +164,26 @@ def test_a_sample_with_a_contact_off_the_surface_is_found(
     change(out, TRIALS, f"trials/{name}", number, set_at(2, to=value))
     what = f"a sample must pass the filter {reason}"
     must_find(out, *((name, "/train", 1, what) for name in (OTO, OTM)))
+
+
+def test_large_forces_are_as_exact_as_their_copies() -> None:
+    """A copy in float32 is off by a share of the force; more than that is found."""
+    count, k = 2, 3
+    forces = np.random.default_rng(0).uniform(200.0, 900.0, (count, k, 3))
+    X = np.tile(pack_pose(np.eye(4)), (count, 1))
+    zeros = np.zeros((count, k, 3))
+    trials = {"X_TO": X, "X_OG": X, "X_OG_lifted": X}
+    trials |= {f"lifted_{name}": zeros for name in ("p_OQ", "nhat_Q_O")}
+    trials |= {"closed_f_Q_O": forces, "lifted_f_Q_O": forces}
+    trials |= {column: np.zeros((count, k)) for column in hold.COPIES.values()}
+    columns = {"object_props/frame_cam2work_oto": X, "grasps_held": np.zeros((count, 6 * k))}
+    columns |= {f"grasp_props/{name}": X for name in ("X_CG", "X_CG_held")}
+    columns |= {
+        f"grasp_props/{name}": forces.astype(np.float32) for name in ("f_Q_C", "f_Q_C_held")
+    }
+    columns |= {f"grasp_props/{name}": np.zeros((count, k)) for name in hold.COPIES}
+    batch = Batch(file=OTO, group="/test", rows=np.arange(count), columns=columns)
+    assert list(hold.same_as_trial(batch, trials, "oto")) == []
+    batch["grasp_props/f_Q_C"][1, 2, 1] += 0.1
+    (violation,) = hold.same_as_trial(batch, trials, "oto")
+    assert (violation.row, violation.what) == (1, "f_Q_C must follow from its trial")
