@@ -1,0 +1,62 @@
+"""Take the pictures of the inspection page for the docs: the gallery, and the page of a grasp.
+
+In: a dataset's directory. Out: inspect_gallery.png and inspect_grasp.png. Needs Playwright and the
+system's Chromium (`make test-browser` installs it).
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+import uvicorn
+from playwright.sync_api import sync_playwright
+
+from drakegrasp.inspection.app import Inspection, make_app
+from drakegrasp.inspection.serve import listen
+
+#: As root Chromium has no sandbox; WebGL is computed by the CPU.
+OPTIONS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+#: Size of a picture [px].
+WIDTH, HEIGHT = 1280, 900
+#: Longest wait for anything on a page [ms].
+PATIENCE = 60_000.0
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Run the script."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("out", type=Path, help="directory of a dataset")
+    parser.add_argument("pictures", type=Path, help="directory that the pictures go to")
+    arguments = parser.parse_args(argv)
+
+    # Serve the dataset from a thread.
+    listener = listen(0)
+    server = uvicorn.Server(uvicorn.Config(make_app(Inspection(arguments.out)), log_level="error"))
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
+    thread.start()
+    address = f"http://127.0.0.1:{listener.getsockname()[1]}"
+
+    # Look at it: the gallery, the first grasp, and what is closed on it opened.
+    program = shutil.which("chromium") or shutil.which("chromium-browser")
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=program, args=list(OPTIONS))
+        page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+        page.set_default_timeout(PATIENCE)
+        page.goto(f"{address}/?split=samples")
+        page.wait_for_load_state("networkidle")
+        page.screenshot(path=arguments.pictures / "inspect_gallery.png")
+        page.click("#cards a")
+        page.wait_for_selector("#view3d[data-ready]")
+        page.wait_for_load_state("networkidle")
+        page.screenshot(path=arguments.pictures / "inspect_grasp.png")
+        browser.close()
+    server.should_exit = True
+    thread.join()
+
+
+if __name__ == "__main__":
+    main()
