@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from helpers.hands import write_pincer
 
 from drakegrasp.frames import invert_pose, transform_points
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.finger_sweep import hand_paths, pad_points
+from drakegrasp.hand.finger_sweep import _thinned_points, hand_paths, pad_points
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses, link_poses
 from drakegrasp.hand.shapes import link_shapes
 
@@ -38,6 +40,21 @@ def test_points_of_a_fingertip_move_with_it(hand):
         assert distance.max() < 1e-6
         assert np.all(tips > corners.min(axis=0) - 1e-6)
         assert np.all(tips < corners.max(axis=0) + 1e-6)
+
+
+def test_points_leave_no_gap_on_a_surface():
+    """On a box: all corners, one point per cell of the grid, and none farther than a cell."""
+    half, spacing = np.array([0.051, 0.033, 0.021]), 0.004
+    corners = np.array(list(itertools.product(*zip(-half, half, strict=True))))
+    points = _thinned_points(corners, spacing)
+    np.testing.assert_array_equal(points[:8], corners)
+    assert len(np.unique(np.floor(points[8:] / spacing), axis=0)) == len(points) - 8
+    rng = np.random.default_rng(0)
+    surface = rng.uniform(-half, half, (5000, 3))
+    axis = rng.integers(3, size=5000)
+    surface[np.arange(5000), axis] = np.where(rng.random(5000) < 0.5, -1.0, 1.0) * half[axis]
+    gap = np.linalg.norm(surface[:, None] - points, axis=2).min(axis=1)
+    assert gap.max() < 1.2 * spacing
 
 
 def test_points_of_the_pad_come_first(hand):

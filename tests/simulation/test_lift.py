@@ -219,6 +219,25 @@ def test_monitor_judges_what_moved_since_the_last_look(
     assert monitor.at_rest is at_rest
 
 
+def test_lift_is_looked_at_in_even_periods_just_before_a_step(scene, cube, config, monkeypatch):
+    """Rounding moves no step across a look, and a look knows how long ago the last one was."""
+    update, elapsed, times = lifting._Monitor.update, [], []
+
+    def record(monitor, current, seconds, stop_speed):
+        elapsed.append(seconds)
+        times.append(current.time)
+        return update(monitor, current, seconds, stop_speed)
+
+    monkeypatch.setattr(lifting._Monitor, "update", record)
+    record_of = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), config)
+    assert record_of.outcome is Outcome.SUCCESS
+    assert len(times) > 10
+    np.testing.assert_allclose(np.diff(times[:-1]), elapsed[1:-1], atol=1e-6)
+    steps = np.array(times[:-1]) / config.physics.time_step
+    before = np.ceil(steps) - steps
+    assert np.all((before > 1e-7) & (before < 0.01))
+
+
 def test_monitor_looks_again_after_a_motion(scene, cube, monkeypatch):
     """While nothing moves, contacts are looked for once; after a motion they are again."""
     close(scene, cube)
