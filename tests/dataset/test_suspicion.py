@@ -43,6 +43,20 @@ def firm(count: int = 2, mass: float = 1.0) -> dict[str, npt.NDArray[Any]]:
     return {name: np.array([value] * count) for name, value in rows.items()}
 
 
+def test_scales_are_those_of_the_docs() -> None:
+    """See docs/reference/outcomes.md."""
+    assert {name: round(scale, 9) for name, scale in SCALES.items()} == {
+        "penetration": 4e-3,
+        "normal_angle": round(np.pi / 6.0, 9),
+        "surface_distance": 2e-3,
+        "slip": 0.01,
+        "turn": round(np.pi / 18.0, 9),
+        "other_links": 1.0,
+        "imbalance": 0.05,
+        "normal_sum": 0.54,
+    }
+
+
 def test_a_firm_grasp_is_not_suspicious() -> None:
     found = suspicion(firm())
     assert set(COLUMNS) == set(firm())

@@ -273,6 +273,17 @@ def test_fingertip_is_lost_beyond_a_few_millimetres(scene, cube, monkeypatch, aw
     assert lifting._has_lost_tip(scene) is lost
 
 
+def test_coarse_distances_let_a_fingertip_be_farther_off(scene, cube, monkeypatch):
+    """As far as the field may be wrong, no fingertip is taken for lost."""
+    close(scene, cube)
+    X_WO = X_WT @ standing(cube) @ make_pose(np.eye(3), [0.0, 0.0, 0.3])
+    release(scene)
+    scene.plant.SetFreeBodyPose(scene.context, scene.object, RigidTransform(X_WO))
+    assert lifting._has_lost_tip(scene)
+    monkeypatch.setattr(lifting, "extra_margin", lambda _: 1.0)
+    assert not lifting._has_lost_tip(scene)
+
+
 def test_wrist_begins_and_looks_fall_where_a_long_step_does(config):
     """On multiples of 24 ms, never before what was asked for."""
     rules = override_config(config, ["physics.time_step=0.008", "physics.coarse_steps=3"])

@@ -225,6 +225,15 @@ def test_error_within_drake_is_an_outcome(scene, cube, config, monkeypatch, erro
     assert not found.held
 
 
+def test_lift_that_takes_too_long_is_a_timeout(scene, cube, config):
+    """Computing time, as of an attempt; what was planned is there all the same."""
+    hasty = config.model_copy(update={"attempt_seconds": 1e-9})
+    found = lift_by_forces(scene, standing(cube), P, N, force_limit=LIMIT, config=hasty)
+    assert found.end is LiftEnd.TIMEOUT
+    assert found.planned_force > 0.0
+    assert not found.held
+
+
 def test_limit_is_that_of_the_finger(scene, cube, config):
     """Finger 3 opposes two: it needs twice their force, and only its own limit counts for it."""
     mu = config.physics.friction_hand
