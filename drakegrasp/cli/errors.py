@@ -7,9 +7,12 @@ What they print has no control characters, whatever names are in it.
 
 from __future__ import annotations
 
+import os
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import FrameType
 from typing import Any, NoReturn
 
 import click
@@ -23,6 +26,8 @@ from drakegrasp.errors import (
     printable,
 )
 
+#: A signal that comes while a module is imported is sent again after this time [s].
+AGAIN_SECONDS = 0.05
 #: Errors in what the user asked for. All other errors are failures of the work.
 WRONG_USAGE = (ConfigError, GraspError, HandError, MeshError)
 
@@ -76,7 +81,10 @@ def one_line_errors(resumable: Callable[[], bool] = lambda: False) -> Iterator[N
     Args:
         resumable: Says whether the command can be given again after Ctrl-C to go on.
     """
-    before = signal.signal(signal.SIGTERM, _terminate)
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    signal.signal(signal.SIGTERM, _stop)
+    if before[signal.SIGINT] is signal.default_int_handler:  # a shell may have it ignored
+        signal.signal(signal.SIGINT, _stop)
     try:
         yield
     except click.exceptions.NoArgsIsHelpError:
@@ -96,7 +104,8 @@ def one_line_errors(resumable: Callable[[], bool] = lambda: False) -> Iterator[N
         line = "stopped" + "; the same command goes on from here" * resumable()
         _end(line, 143 if isinstance(stop, _Terminated) else 130)
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _end(line: str, code: int) -> NoReturn:
@@ -113,5 +122,23 @@ class _Terminated(KeyboardInterrupt):
     """SIGTERM, which is handled as Ctrl-C is: what was begun is put in order."""
 
 
-def _terminate(number: int, frame: object) -> None:
-    raise _Terminated
+def _stop(number: int, frame: FrameType | None) -> None:
+    """Stop what runs, but no import of a module.
+
+    A library may swallow the exception while it is imported, as trimesh does; the command would go
+    on with half of it. So the signal is sent again a moment later.
+    """
+    if _is_importing(frame):
+        again = threading.Timer(AGAIN_SECONDS, os.kill, (os.getpid(), number))
+        again.daemon = True
+        again.start()
+        return
+    raise _Terminated if number == signal.SIGTERM else KeyboardInterrupt
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import logging
 import signal
 from collections.abc import Iterator
@@ -99,8 +100,11 @@ def _connect_remote(
 ) -> Client:
     file = None if scheduler_file is None else str(scheduler_file)
     # Dask waits for a missing file for ever.
-    if file is not None and not scheduler and not Path(file).is_file():
-        raise MachineError(f"{file}: must be the file of a running Dask scheduler, got none")
+    if file is not None and not scheduler:
+        if not Path(file).is_file():
+            raise MachineError(f"{file}: must be the file of a running Dask scheduler, got none")
+        if not _names_scheduler(Path(file)):
+            raise MachineError(f"{file}: must be the file of a running Dask scheduler, got another")
     try:
         return _RemoteClient(
             scheduler, scheduler_file=file, timeout=CONNECT_SECONDS, security=security
@@ -109,6 +113,15 @@ def _connect_remote(
         raise MachineError(
             f"{scheduler or file}: must be a running Dask scheduler, got none ({error})"
         ) from None
+
+
+def _names_scheduler(file: Path) -> bool:
+    """Return whether a file is JSON with the address of a scheduler; a new one may be empty yet."""
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(content, dict) and isinstance(content.get("address"), str)
 
 
 @contextmanager

@@ -9,7 +9,7 @@ number of attempts. Imports no Drake.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -249,6 +249,9 @@ def _in_order(parts: Iterable[Part], tasks: Sequence[PackTask]) -> Iterator[Part
                 yield ready
                 due = next((task.start for task in turn), -1)
     finally:
+        # First no task writes any more.
+        if isinstance(parts, Generator):
+            parts.close()
         for task in tasks:
             Path(task.part).unlink(missing_ok=True)
 

@@ -69,11 +69,29 @@ def refuse_changed_object(out: Path, name: str) -> None:
     Raises:
         DataError: If a file is missing or has changed, or the plan is none.
     """
-    path, model = plan_path(out, name), model_path(out, name)
+    refuse_changed_model(out, name, recorded_model(out, name))
+
+
+def recorded_model(out: Path, name: str) -> str:
+    """Return the hash of the file of an object's meshes that its plan holds, hexadecimal.
+
+    Raises:
+        DataError: If the plan is missing or has changed.
+    """
+    path = plan_path(out, name)
     refuse_broken_seal(path, "plan of an object")
     with opened(path, "the plan of an object") as file:
         refuse_other_plan(path, file)
-        expected = file.attrs["model_sha256"]
+        return str(file.attrs["model_sha256"])
+
+
+def refuse_changed_model(out: Path, name: str, expected: str) -> None:
+    """Refuse the file of an object's meshes if it is missing, or its hash is not as expected.
+
+    Raises:
+        DataError: If it is.
+    """
+    model = model_path(out, name)
     if not model.is_file() or model_file_sha256(out, name) != expected:
         got = "other content" if model.is_file() else "none"
         raise DataError(f"{model}: must be the file that was written with its plan, got {got}")

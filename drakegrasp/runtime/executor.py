@@ -16,6 +16,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
+from multiprocessing import resource_tracker
 from multiprocessing.connection import wait as wait_for
 from typing import Protocol, TypeVar
 
@@ -67,6 +68,7 @@ def processes(workers: int) -> Iterator[Executor]:
 
     # A forked process could hang: this one may have threads.
     context = multiprocessing.get_context("spawn")
+    resource_tracker.ensure_running()  # it clears the mask of the thread that starts it
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin_worker)
     try:
         yield _PoolExecutor(pool, 2 * workers)
@@ -96,8 +98,10 @@ class _PoolExecutor:
         remaining, pending = iter(items), set[Future[R]]()
         try:
             while True:
-                room = self.in_flight - len(pending)
-                pending |= {self.pool.submit(function, x) for x in islice(remaining, room)}
+                for item in islice(remaining, self.in_flight - len(pending)):
+                    # The first submission starts the processes.
+                    with _interrupts_blocked():
+                        pending.add(self.pool.submit(function, item))
                 if not pending:
                     return
                 done, pending = wait(pending, return_when=FIRST_COMPLETED)
@@ -105,8 +109,27 @@ class _PoolExecutor:
                     yield future.result()
         except BrokenProcessPool:
             raise MachineError(
-                "a worker process died; is there enough memory? Fewer --workers need less"
+                "a worker process died; if memory is short, fewer --workers need less"
             ) from None
+        finally:
+            # What is begun ends, so that nothing is written behind the caller's back.
+            for future in pending:
+                future.cancel()
+            wait(pending)
+
+
+@contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Keep Ctrl-C from processes that start within the block, and from this one until it ends.
+
+    At a terminal Ctrl-C goes to every process; one that has just begun to start would print a
+    traceback.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _begin_worker() -> None:

@@ -23,11 +23,17 @@ _SIM, _DATA, _CHECKS = (
     "tests/dataset/test_",
     "tests/dataset/checks/test_check_",
 )
+#: Tests of some modules that lie elsewhere.
+_BESIDE = {
+    "construction": ("tests/visualization/test_recording.py",),
+    "robustness": ("tests/test_equal_draws.py",),
+}
 #: The modules, and the tests that must notice.
 MODULES = {
     **{
         f"drakegrasp/simulation/{name}.py": [
             *(f"{_SIM}{test}.py" for test in tests.split()),
+            *_BESIDE.get(name, ()),
         ]
         for name, tests in {
             "verdict": "verdict trial",

@@ -150,3 +150,11 @@ def same_configuration(files: Iterable[OpenFile], manifest: Manifest) -> Iterato
     if len(states) > 1:
         what = "the three files must be of one assembly"
         yield of_file(TRIALS_FILE, what, f"{len(states)}; run `drakegrasp assemble` again")
+
+
+def same_shards(files: Iterable[OpenFile], expected: str) -> Iterator[Violation]:
+    """The files were made from the shards that are there, whose seals have a hash in common."""
+    for file in files:
+        if str(file.file.attrs.get("shards")) != expected:
+            what = "the file must be made from the shards that are there"
+            yield of_file(file.name, what, "others; run `drakegrasp assemble` again")

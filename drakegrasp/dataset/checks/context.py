@@ -7,16 +7,16 @@ progress that is reported, and rows that are judged in tasks.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.checks.findings import Findings, Violation, of_file
-from drakegrasp.dataset.checks.open_file import OpenFile
+from drakegrasp.dataset.checks.open_file import FilePlace, OpenFile
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import FILE_NAME, model_path
 from drakegrasp.errors import MeshError, first_line
@@ -24,12 +24,13 @@ from drakegrasp.objects.model import ObjectModel, load_object
 from drakegrasp.runtime.executor import Executor
 from drakegrasp.runtime.progress import Report
 
-#: Objects whose meshes, with their search trees, stay in memory; samples are ordered by object.
+#: Objects whose meshes, with their search trees, stay in memory during a task; samples are ordered
+#: by object.
 KEPT_OBJECTS = 4
 
 
-class _LoadModel(Protocol):
-    def __call__(self, name: str, /) -> ObjectModel | None: ...
+#: Returns an object by its name, or None if its file is broken, which is a finding.
+LoadModel = Callable[[str], ObjectModel | None]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,23 +41,16 @@ class Dataset:
         out: Its directory.
         manifest: Its manifest.
         trials: Its trials.hdf5, if it can be opened.
-        findings: Where violations of its objects' files go.
     """
 
     out: Path
     manifest: Manifest
     trials: OpenFile | None
-    findings: Findings
 
     @property
     def names(self) -> list[str]:
         """Names of the objects, by row of /objects."""
         return [entry.name for entry in self.manifest.objects]
-
-    @cached_property
-    def model(self) -> _LoadModel:
-        """Function that returns an object by name, or None if its file is broken."""
-        return lru_cache(KEPT_OBJECTS)(partial(_load_model, self))
 
 
 @dataclass(kw_only=True, eq=False)
@@ -93,8 +87,28 @@ class Context:
             self.findings.add([of_file(file.name, what, first_line(error))])
 
 
-#: Applies rules to the rows of a task; returns the numbers of rows that the next steps need.
-Judge = Callable[["RowsTask", Findings], npt.NDArray[np.int64]]
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rows:
+    """Rows of a group, in the process that judges them.
+
+    Attributes:
+        file: The file.
+        group: The group.
+        start, stop: The rows, without the last number.
+        dataset: The dataset around the file, if there is one.
+        model: Loads an object of that dataset.
+    """
+
+    file: OpenFile
+    group: str
+    start: int
+    stop: int
+    dataset: Dataset | None
+    model: LoadModel
+
+
+#: Applies rules to rows; returns the numbers of rows that the next steps need.
+Judge = Callable[[Rows, Findings], npt.NDArray[np.int64]]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -102,19 +116,24 @@ class RowsTask:
     """Rows of a group to which rules are to be applied, by any process.
 
     Attributes:
+        number: Of the task, from 0 on.
         judge: Applies the rules.
         file: The file.
         group: The group.
         start, stop: The rows, without the last number.
-        dataset: The dataset around the file, if there is one.
+        out, manifest: Of the dataset around the file, if there is one.
+        trials: The trials of that dataset, with the bad ones among those that count here.
     """
 
+    number: int
     judge: Judge
-    file: OpenFile
+    file: FilePlace
     group: str
     start: int
     stop: int
-    dataset: Dataset | None
+    out: Path | None = None
+    manifest: Manifest | None = None
+    trials: FilePlace | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -122,13 +141,15 @@ class RowsFound:
     """What a task found.
 
     Attributes:
-        task_start, rows: First row of the task, and how many it had.
+        number: Of the task.
+        group, rows: The group, and how many rows of it the task had.
         findings: Its violations.
         bad: (n,), rows that break a rule or cannot be read.
         noted: (m,), what its judge returned.
     """
 
-    task_start: int
+    number: int
+    group: str
     rows: int
     findings: Findings
     bad: npt.NDArray[np.int64]
@@ -136,52 +157,76 @@ class RowsFound:
 
 
 def judge_rows(
-    tasks: Iterable[RowsTask], file: OpenFile, group: str, context: Context
+    tasks: Iterable[RowsTask], file: OpenFile, context: Context
 ) -> npt.NDArray[np.int64]:
-    """Judge the rows of a group in tasks; return what their judges noted, in the order of rows.
+    """Judge rows of a file in tasks; return what their judges noted, in the order of the tasks.
 
     Args:
-        tasks: For rows of the group, together all of them.
+        tasks: The tasks.
         file: The file; it remembers the bad rows.
-        group: The group.
-        context: Takes the violations.
+        context: Takes the violations, in the order of the tasks.
     """
-    results = []
-    for found in context.execute(_judge, tasks):
-        results.append(found)
-        context.advance(found.rows)
-    results.sort(key=lambda found: found.task_start)
-    for found in results:
-        context.findings.merge(found.findings)
-    for rows in (found.bad for found in results if len(found.bad)):
-        file.mark_bad(group, rows)
-    return np.concatenate([np.zeros(0, dtype=np.int64), *(found.noted for found in results)])
+    bad: dict[str, list[npt.NDArray[np.int64]]] = {group: [] for group in file.groups}
+    noted = [np.zeros(0, dtype=np.int64)]
+    waiting: dict[int, RowsFound] = {}
+    due = 0
+    for result in context.execute(_judge, tasks):
+        context.advance(result.rows)
+        waiting[result.number] = result
+        while (found := waiting.pop(due, None)) is not None:
+            context.findings.merge(found.findings)
+            bad[found.group].append(found.bad)
+            noted.append(found.noted)
+            due += 1
+    for group, parts in bad.items():
+        file.mark_bad(group, np.concatenate([np.zeros(0, dtype=np.int64), *parts]))
+    return np.concatenate(noted)
 
 
 def _judge(task: RowsTask) -> RowsFound:
-    findings, file, dataset = Findings(), replace(task.file, bad_rows={}), task.dataset
-    dataset = None if dataset is None else replace(dataset, findings=findings)
-    noted = task.judge(replace(task, file=file, dataset=dataset), findings)
-    return RowsFound(
-        task_start=task.start,
-        rows=task.stop - task.start,
-        findings=findings,
-        bad=file.bad(task.group),
-        noted=noted,
-    )
+    findings = Findings()
+    with ExitStack() as stack:
+        file = stack.enter_context(task.file.opened())
+
+        # The dataset around it. Its objects are loaded for this task alone.
+        dataset, hashes = None, dict[str, str]()
+        if task.out is not None and task.manifest is not None:
+            trials = None if task.trials is None else stack.enter_context(task.trials.opened())
+            dataset = Dataset(out=task.out, manifest=task.manifest, trials=trials)
+            hashes = {entry.name: entry.mesh_sha256 for entry in task.manifest.objects}
+        load = partial(_load_model, task.out or Path(), hashes, findings)
+
+        rows = Rows(
+            file=file,
+            group=task.group,
+            start=task.start,
+            stop=task.stop,
+            dataset=dataset,
+            model=lru_cache(KEPT_OBJECTS)(load),
+        )
+        noted = task.judge(rows, findings)
+        return RowsFound(
+            number=task.number,
+            group=task.group,
+            rows=task.stop - task.start,
+            findings=findings,
+            bad=file.bad(task.group),
+            noted=noted,
+        )
 
 
-def _load_model(dataset: Dataset, name: str) -> ObjectModel | None:
+def _load_model(
+    out: Path, hashes: dict[str, str], findings: Findings, name: str
+) -> ObjectModel | None:
     """Return an object of a dataset; a broken or wrong file is a finding."""
-    path = model_path(dataset.out, name)
-    file = str(path.relative_to(dataset.out))
+    path = model_path(out, name)
+    file = str(path.relative_to(out))
     try:
         model = load_object(path)
     except MeshError as error:
-        dataset.findings.add([of_file(file, "the object must be readable", str(error))])
+        findings.add([of_file(file, "the object must be readable", str(error))])
         return None
-    hashes = {entry.name: entry.mesh_sha256 for entry in dataset.manifest.objects}
     if hashes.get(name) != model.mesh_sha256:
         what = f"mesh_sha256 must be that of {FILE_NAME}"
-        dataset.findings.add([of_file(file, what, model.mesh_sha256)])
+        findings.add([of_file(file, what, model.mesh_sha256)])
     return model

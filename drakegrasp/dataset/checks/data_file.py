@@ -7,7 +7,6 @@ findings of the context.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -17,10 +16,17 @@ from drakegrasp.dataset.checks import consistency
 from drakegrasp.dataset.checks import hold as hold_rules
 from drakegrasp.dataset.checks import images as image_rules
 from drakegrasp.dataset.checks import samples as sample_rules
-from drakegrasp.dataset.checks.context import Context, Dataset, RowsTask, judge_rows
+from drakegrasp.dataset.checks.context import (
+    Context,
+    Dataset,
+    LoadModel,
+    Rows,
+    RowsTask,
+    judge_rows,
+)
 from drakegrasp.dataset.checks.findings import AnyArray, Batch, Findings, Violation, of_file
 from drakegrasp.dataset.checks.images import Lens
-from drakegrasp.dataset.checks.open_file import OpenFile
+from drakegrasp.dataset.checks.open_file import FilePlace, OpenFile
 from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.schema import CONDITION_FIELDS, SHARED_FIELDS, SPLITS
 from drakegrasp.outcomes import Outcome
@@ -52,8 +58,7 @@ def check_data_file(data: OpenFile, camera: str, context: Context) -> None:
     if data.config is None:
         return  # a finding already; without a lens no image can be judged
     context.add(data, consistency.splits(data))
-    for split in data.groups:
-        judge_rows(_tasks(data, camera, split, context.dataset), data, split, context)
+    judge_rows(_tasks(data, camera, context.dataset), data, context)
 
 
 def check_pair(oto: OpenFile, otm: OpenFile, findings: Findings) -> None:
@@ -73,38 +78,47 @@ def check_pair(oto: OpenFile, otm: OpenFile, findings: Findings) -> None:
             findings.add(sample_rules.same_properties(batch, other))
 
 
-def _tasks(data: OpenFile, camera: str, split: str, dataset: Dataset | None) -> Iterator[RowsTask]:
-    count = data.count(split)
-    for start in range(0, count, TASK_ROWS):
-        stop = min(start + TASK_ROWS, count)
-        yield RowsTask(
-            judge=partial(_judge_samples, camera=camera),
-            file=data,
-            group=split,
-            start=start,
-            stop=stop,
-            dataset=None if dataset is None else _of_rows(dataset, data, split, start, stop),
-        )
+def _tasks(data: OpenFile, camera: str, dataset: Dataset | None) -> Iterator[RowsTask]:
+    place, number = data.place({}), 0
+    for split in data.groups:
+        count = data.count(split)
+        for start in range(0, count, TASK_ROWS):
+            stop = min(start + TASK_ROWS, count)
+            trials = None if dataset is None else dataset.trials
+            yield RowsTask(
+                number=number,
+                judge=partial(_judge_samples, camera=camera),
+                file=place,
+                group=split,
+                start=start,
+                stop=stop,
+                out=None if dataset is None else dataset.out,
+                manifest=None if dataset is None else dataset.manifest,
+                trials=None if trials is None else _trials_of(trials, data, split, start, stop),
+            )
+            number += 1
 
 
-def _of_rows(dataset: Dataset, data: OpenFile, split: str, start: int, stop: int) -> Dataset:
-    """Return the dataset with those bad trials that some samples are of, which are few."""
-    trials = dataset.trials
-    if trials is not None:
-        try:
-            ids = data.groups[split]["trial_id"][start:stop]
-        except OSError:
-            ids = np.zeros(0, dtype=np.int64)  # a finding of the task
-        trials = replace(trials, bad_rows={"trials": np.intersect1d(ids, trials.bad("trials"))})
-    return replace(dataset, findings=Findings(), trials=trials)
+def _trials_of(trials: OpenFile, data: OpenFile, split: str, start: int, stop: int) -> FilePlace:
+    """Return the trials for a task, which need not know of all bad ones.
+
+    Where a trial's number cannot be read, nor can its sample: the task finds that, and compares
+    none of them.
+    """
+    bad = trials.bad("trials")
+    try:
+        ids = data.groups[split]["trial_id"][start:stop]
+    except OSError:
+        ids = bad
+    return trials.place({"trials": np.intersect1d(ids, bad)})
 
 
-def _judge_samples(task: RowsTask, findings: Findings, *, camera: str) -> AnyArray:
+def _judge_samples(rows: Rows, findings: Findings, *, camera: str) -> AnyArray:
     """Apply every rule to rows of a split; no later step needs any of them."""
-    data, dataset = task.file, task.dataset
+    data, dataset = rows.file, rows.dataset
     assert data.config is not None
     filters, lens = data.config.filters, Lens.of(camera, data.config)
-    for whole in data.batches(task.group, task.start, task.stop, SAMPLE_ROWS, findings):
+    for whole in data.batches(rows.group, rows.start, rows.stop, SAMPLE_ROWS, findings):
         # Values that stand for themselves.
         batch = data.judge(whole, findings, sample_rules.finite)
         batch = data.judge(
@@ -142,7 +156,7 @@ def _judge_samples(task: RowsTask, findings: Findings, *, camera: str) -> AnyArr
             partial(image_rules.table_pixels, lens=lens),
         )
         if dataset is not None:
-            _judge_by_mesh(data, batch, lens, dataset, findings)
+            _judge_by_mesh(data, batch, lens, rows.model, findings)
     return np.zeros(0, dtype=np.int64)
 
 
@@ -151,8 +165,8 @@ def _judge_by_trial(
 ) -> Batch:
     """Compare samples with their trials; return those that agree, or have no sound trial."""
     trials = dataset.trials
-    if trials is None or "trials" not in trials.groups or data.config is None:
-        return batch
+    if trials is None or data.config is None or not {"objects", "trials"} <= set(trials.groups):
+        return batch  # trials whose objects are broken were not judged
 
     # A sample needs a trial. A trial that is a finding itself says nothing about its sample.
     count = trials.count("trials")
@@ -211,14 +225,14 @@ def _select(columns: Mapping[str, AnyArray], rows: AnyArray) -> dict[str, AnyArr
 
 
 def _judge_by_mesh(
-    data: OpenFile, batch: Batch, lens: Lens, dataset: Dataset, findings: Findings
+    data: OpenFile, batch: Batch, lens: Lens, load: LoadModel, findings: Findings
 ) -> None:
     """Compare samples with the meshes of their objects."""
     assert data.config is not None
     limit = data.config.filters.max_surface_distance
     names = batch["object_props/object_name"]
     for name in dict.fromkeys(names.tolist()):
-        model = dataset.model(name)
+        model = load(name)
         if model is None:
             continue  # a finding already
         data.judge(

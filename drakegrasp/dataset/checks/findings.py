@@ -1,8 +1,8 @@
 """Violations, the batches of rows in which rules look for them, and their collection.
 
 In: rows of a group of a file, as a `Batch`, and for each whether it is bad. Out: `Violation`s,
-one line each with file, row and figure, collected by `Findings`. The rules themselves are in
-`layout`, `samples`, `images`, `trials` and `consistency`; here is what more than one of them uses.
+one line each with file, row and figure, collected by `Findings`. The rules themselves are in the
+modules that `run` lists; here is what more than one of them uses.
 """
 
 from __future__ import annotations

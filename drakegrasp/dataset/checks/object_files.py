@@ -6,17 +6,19 @@ the files of one object.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import hashlib
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from drakegrasp.dataset.assembly.survey import headers_by_object
 from drakegrasp.dataset.checks.findings import Findings, Violation, of_file
 from drakegrasp.dataset.manifest import Manifest
-from drakegrasp.dataset.paths import refuse_changed_object
+from drakegrasp.dataset.paths import model_path, plan_path, recorded_model, refuse_changed_model
 from drakegrasp.dataset.shards import ShardHeader, read_trials
-from drakegrasp.errors import DataError
+from drakegrasp.errors import DataError, first_line
 from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.files import read_seal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,13 +46,15 @@ class ObjectFound:
 
     Attributes:
         object: Row of the object in the manifest.
-        units: Number of its work units.
+        candidates: Number of palm poses in its work units.
         findings: The violations.
+        seals: What `Survey.seals` is; None where a shard is missing or broken.
     """
 
     object: int
-    units: int
+    candidates: int
     findings: Findings
+    seals: bytes | None
 
 
 def object_tasks(out: Path, manifest: Manifest) -> Iterator[ObjectTask]:
@@ -68,25 +72,34 @@ def object_tasks(out: Path, manifest: Manifest) -> Iterator[ObjectTask]:
 
 def check_object(task: ObjectTask) -> ObjectFound:
     """Verify the files of an object."""
-    findings = Findings()
+    findings, digest = Findings(), hashlib.sha256()
     findings.add(_own_files(task))
-    findings.add(_shards(task))
-    return ObjectFound(object=task.object, units=len(task.headers), findings=findings)
+    broken = list(_shards(task, digest.update))
+    findings.add(broken)
+    return ObjectFound(
+        object=task.object,
+        candidates=sum(header.stop - header.start for header in task.headers),
+        findings=findings,
+        seals=None if broken else digest.digest(),
+    )
 
 
 def _own_files(task: ObjectTask) -> Iterator[Violation]:
     """The meshes and the plan are as they were written: the plan vouches for both."""
     out = Path(task.out)
+    path = plan_path(out, task.name)
     try:
-        refuse_changed_object(out, task.name)
-    except DataError as error:
-        path, _, got = str(error).partition(": ")
+        expected = recorded_model(out, task.name)
+        path = model_path(out, task.name)
+        refuse_changed_model(out, task.name, expected)
+    except (DataError, OSError) as error:
         what = "an object's file must be as it was written"
-        yield of_file(str(Path(path).relative_to(out)), what, got)
+        got = first_line(error).removeprefix(f"{path}: ")
+        yield of_file(str(path.relative_to(out)), what, got)
 
 
-def _shards(task: ObjectTask) -> Iterator[Violation]:
-    """The shards are there and whole, up to the last wanted grasp."""
+def _shards(task: ObjectTask, use_seal: Callable[[bytes], None]) -> Iterator[Violation]:
+    """The shards are there and whole, up to the last wanted grasp; the seal of each is used."""
     out, left = Path(task.out), task.wanted
     for header in task.headers:
         if left is not None and left <= 0:
@@ -100,5 +113,6 @@ def _shards(task: ObjectTask) -> Iterator[Violation]:
             got = str(error).rpartition(", got ")[2] if path.exists() else "none"
             yield of_file(str(path.relative_to(out)), what, got)
             continue
+        use_seal(read_seal(path))
         if left is not None:
             left -= int((outcome == Outcome.SUCCESS).sum())

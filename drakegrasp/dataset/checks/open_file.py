@@ -1,13 +1,15 @@
 """An HDF5 file of a dataset while it is checked.
 
 In: a file with any content. Out: batches of the rows of those groups whose layout is sound. Rows
-that break a rule, or cannot be read, are remembered, so that no further rule judges them. Sent to
-another process, the file is opened again there.
+that break a rule, or cannot be read, are remembered, so that no further rule judges them. A
+`FilePlace` is what another process needs to open the file as well.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,7 +24,7 @@ from drakegrasp.dataset.checks.findings import AnyArray, Batch, Findings, Violat
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.layout.structure import DATA_TABLES, TRIAL_TABLES
 from drakegrasp.dataset.schema import Field
-from drakegrasp.errors import first_line
+from drakegrasp.errors import DataError, first_line
 
 Rule = Callable[[Batch], Iterator[Violation]]
 
@@ -47,13 +49,17 @@ class OpenFile:
     groups: dict[str, h5py.Group] = field(default_factory=dict)
     bad_rows: dict[str, npt.NDArray[np.int64]] = field(default_factory=dict)
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "file": self.file.filename, "groups": tuple(self.groups)}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self.file = open_hdf5(Path(state["file"]), again=True)
-        self.groups = {name: self.file[name] for name in state["groups"]}
+    def place(self, bad_rows: Mapping[str, npt.NDArray[np.int64]]) -> FilePlace:
+        """Return what a task needs to open the file, with the bad rows that it must know of."""
+        return FilePlace(
+            path=self.file.filename,
+            identity=_identity(self.file),
+            name=self.name,
+            config=self.config,
+            fields=self.fields,
+            groups=tuple(self.groups),
+            bad_rows=bad_rows,
+        )
 
     def count(self, group: str) -> int:
         """Return the number of rows of a group; 0 if it is missing or broken."""
@@ -111,6 +117,53 @@ class OpenFile:
             rows |= findings.add(rule(batch))
         self.mark_bad(batch.group[1:], np.array(sorted(rows), dtype=np.int64))
         return batch.without(rows)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FilePlace:
+    """A file that a task opens.
+
+    Attributes:
+        path: Of the file.
+        identity: What tells it from another file at the same path.
+        name, config, fields: As of the `OpenFile`.
+        groups: Names of the groups whose layout is sound.
+        bad_rows: As of the `OpenFile`, of those rows that the task deals with.
+    """
+
+    path: str
+    identity: tuple[int, int]
+    name: str
+    config: Config | None
+    fields: Mapping[str, tuple[Field, ...]]
+    groups: tuple[str, ...]
+    bad_rows: Mapping[str, npt.NDArray[np.int64]]
+
+    @contextmanager
+    def opened(self) -> Iterator[OpenFile]:
+        """Open the file while the block runs.
+
+        Raises:
+            DataError: If it is another file by now.
+            OSError: If it cannot be opened.
+        """
+        with open_hdf5(Path(self.path), again=True) as file:
+            if _identity(file) != self.identity:
+                raise DataError(f"{self.path}: must stay while it is checked, got another file")
+            yield OpenFile(
+                name=self.name,
+                file=file,
+                config=self.config,
+                fields=self.fields,
+                groups={name: file[name] for name in self.groups},
+                bad_rows=dict(self.bad_rows),
+            )
+
+
+def _identity(file: h5py.File) -> tuple[int, int]:
+    """Return what tells an open file from others, also from one of the same name."""
+    found = os.fstat(file.id.get_vfd_handle())
+    return found.st_dev, found.st_ino
 
 
 def open_file(name: str, file: h5py.File, camera: str, findings: Findings) -> OpenFile:

@@ -4,10 +4,10 @@ In: a dataset's directory, or grasping_oto.hdf5, grasping_otm.hdf5 or trials.hdf
 list of violations, empty for a sound dataset. Rows are read in batches, so the memory is bounded,
 and judged in tasks, by an `Executor`. Imports no Drake.
 
-The rules are in `layout`, `object_files`, `samples`, `images`, `trials` and `consistency`.
-`data_file`, `trials_file` and this module apply them in an order: a row that breaks a rule is not
-shown to the rules that build on it, so the check reports the cause and not all that follows from
-it.
+The rules are in `layout`, `object_files`, `samples`, `hold`, `images`, `conditions`, `trials` and
+`consistency`. `data_file`, `trials_file` and this module apply them in an order: a row that breaks
+a rule is not shown to the rules that build on it, so the check reports the cause and not all that
+follows from it.
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ import json
 from contextlib import ExitStack
 from pathlib import Path
 
+from drakegrasp.dataset.assembly.survey import join_seals
 from drakegrasp.dataset.card.content import card_content
 from drakegrasp.dataset.checks import consistency
 from drakegrasp.dataset.checks.context import Context, Dataset
 from drakegrasp.dataset.checks.data_file import check_data_file, check_pair
 from drakegrasp.dataset.checks.findings import Findings, Violation, of_file
-from drakegrasp.dataset.checks.object_files import check_object, object_tasks
+from drakegrasp.dataset.checks.object_files import ObjectFound, check_object, object_tasks
 from drakegrasp.dataset.checks.open_file import OpenFile, open_file
 from drakegrasp.dataset.checks.trials_file import check_trials_file
 from drakegrasp.dataset.hdf5 import open_hdf5
@@ -30,6 +31,7 @@ from drakegrasp.dataset.paths import CARD_FILES, DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.schema import CAMERAS, refuse_other_schema
 from drakegrasp.errors import DataError, first_line
 from drakegrasp.runtime.executor import Executor, run_here
+from drakegrasp.runtime.file_set import refuse_half_replaced
 from drakegrasp.runtime.progress import Report, silent
 
 __all__ = ["Violation", "check_dataset"]
@@ -96,17 +98,19 @@ def _check_directory(
     rows = sum(map(_rows, files.values()))
     findings.add(consistency.same_configuration(files.values(), manifest))
     trials = files.pop("", None)
-    dataset = Dataset(out=out, manifest=manifest, trials=trials, findings=findings)
+    dataset = Dataset(out=out, manifest=manifest, trials=trials)
     context = Context(
         findings=findings,
         report=report,
-        total=rows + manifest.units,
+        total=rows + sum(entry.candidates for entry in manifest.objects),
         execute=execute,
         dataset=dataset,
     )
 
     # The files that all others follow from.
-    _check_objects(out, manifest, context)
+    shards = _check_objects(out, manifest, context)
+    if shards is not None:
+        findings.add(consistency.same_shards([*files.values(), *filter(None, [trials])], shards))
 
     # The trials come first: a sample of a broken trial is not compared with it.
     if trials is not None:
@@ -131,18 +135,33 @@ def _open_files(out: Path, stack: ExitStack, findings: Findings) -> dict[str, Op
             got = first_line(error) if (out / name).exists() else "none; `drakegrasp assemble`"
             findings.add([of_file(name, "the file must be there and readable", got)])
             continue
+        except DataError as error:
+            # One with values elsewhere; that some files are half replaced concerns them all.
+            refuse_half_replaced(out)
+            got = first_line(error).rpartition(", got ")[2]
+            findings.add([of_file(name, "the file must hold its own values", got)])
+            continue
         files[camera] = open_file(name, file, camera, findings)
     return files
 
 
-def _check_objects(out: Path, manifest: Manifest, context: Context) -> None:
-    """The files of each object are as they were written."""
-    results = []
+def _check_objects(out: Path, manifest: Manifest, context: Context) -> str | None:
+    """The files of each object are as they were written.
+
+    Returns:
+        What `shards_sha256` is; None where a shard is missing or broken.
+    """
+    results: dict[int, ObjectFound] = {}
     for found in context.execute(check_object, object_tasks(out, manifest)):
-        results.append(found)
-        context.advance(found.units)
-    for found in sorted(results, key=lambda found: found.object):
+        results[found.object] = found
+        context.advance(found.candidates)
+    seals = dict[int, bytes]()
+    for i, found in sorted(results.items()):
         context.findings.merge(found.findings)
+        if found.candidates and found.seals is not None:
+            seals[i] = found.seals
+    whole = all(found.seals is not None for found in results.values())
+    return join_seals(seals) if whole else None
 
 
 def _check_card(out: Path, findings: Findings) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -16,7 +15,7 @@ import numpy as np
 from drakegrasp.dataset.checks import conditions as condition_rules
 from drakegrasp.dataset.checks import consistency
 from drakegrasp.dataset.checks import trials as trial_rules
-from drakegrasp.dataset.checks.context import Context, Dataset, RowsTask, judge_rows
+from drakegrasp.dataset.checks.context import Context, Dataset, Rows, RowsTask, judge_rows
 from drakegrasp.dataset.checks.findings import AnyArray, Findings
 from drakegrasp.dataset.checks.open_file import OpenFile, Rule
 from drakegrasp.dataset.layout.attributes import ORIGIN, attribute_mistakes
@@ -25,7 +24,7 @@ from drakegrasp.outcomes import Outcome
 #: Trials in a batch: some 10 MB.
 TRIAL_ROWS = 8192
 #: Trials in a task.
-TASK_ROWS = 8 * TRIAL_ROWS
+TASK_ROWS = 2 * TRIAL_ROWS
 
 
 def check_trials_file(trials: OpenFile, context: Context) -> None:
@@ -43,29 +42,29 @@ def check_trials_file(trials: OpenFile, context: Context) -> None:
         return  # a broken layout, which is a finding already; trials need their objects
 
     # The rows, and then the columns of the successes.
-    expected = judge_rows(_tasks(trials, dataset), trials, "trials", context)
+    expected = judge_rows(_tasks(trials, dataset), trials, context)
     if "successes" in trials.groups:
         context.add(trials, consistency.successes(trials, expected))
 
 
 def _tasks(trials: OpenFile, dataset: Dataset | None) -> Iterator[RowsTask]:
-    count = trials.count("trials")
-    if dataset is not None:
-        dataset = replace(dataset, findings=Findings(), trials=None)
-    for start in range(0, count, TASK_ROWS):
+    count, place = trials.count("trials"), trials.place({})
+    for number, start in enumerate(range(0, count, TASK_ROWS)):
         yield RowsTask(
+            number=number,
             judge=_judge_trials,
-            file=trials,
+            file=place,
             group="trials",
             start=start,
             stop=min(start + TASK_ROWS, count),
-            dataset=dataset,
+            out=None if dataset is None else dataset.out,
+            manifest=None if dataset is None else dataset.manifest,
         )
 
 
-def _judge_trials(task: RowsTask, findings: Findings) -> AnyArray:
+def _judge_trials(rows: Rows, findings: Findings) -> AnyArray:
     """Apply every rule to rows of /trials; return the ids of the successes among them."""
-    trials, dataset = task.file, task.dataset
+    trials, dataset = rows.file, rows.dataset
 
     # The rules whose limits depend on the dataset.
     objects = dataset.manifest.objects if dataset else None
@@ -92,7 +91,7 @@ def _judge_trials(task: RowsTask, findings: Findings) -> AnyArray:
             partial(
                 condition_rules.as_drawn,
                 names=dataset.names,
-                model=dataset.model,
+                model=rows.model,
                 config=dataset.manifest.config,
             )
         )
@@ -100,7 +99,7 @@ def _judge_trials(task: RowsTask, findings: Findings) -> AnyArray:
     # Numbers, then stages, which need a legal outcome, then what needs finite values, then what
     # needs sound poses.
     successes = [np.zeros(0, dtype=np.int64)]
-    for whole in trials.batches("trials", task.start, task.stop, TRIAL_ROWS, findings):
+    for whole in trials.batches("trials", rows.start, rows.stop, TRIAL_ROWS, findings):
         successes.append(whole["trial_id"][whole["outcome"] == Outcome.SUCCESS])
         batch = trials.judge(whole, findings, numbers)
         batch = trials.judge(batch, findings, trial_rules.stages)

@@ -59,7 +59,7 @@ def test_shards_after_the_last_wanted_grasp_may_be_missing(tmp_path: Path) -> No
 def test_progress_ends_at_the_total(sound: Path) -> None:
     seen: list[tuple[int, int]] = []
     check_dataset(sound, progress=lambda done, total, **_: seen.append((done, total)))
-    assert seen[-1][0] == seen[-1][1] == 36 + 2 * 9 + 6
+    assert seen[-1][0] == seen[-1][1] == 36 + 2 * 9 + 12
     assert [done for done, _ in seen] == sorted(done for done, _ in seen)
 
 
