@@ -460,6 +460,11 @@ def test_scheduler_that_is_not_there_is_named(tmp_path: Path, small_meshes: Path
         build_dataset(small_meshes, tmp_path / "out", scheduler="tcp://127.0.0.1:9")
     with pytest.raises(MachineError, match=r"none\.json: must be the file of a running Dask"):
         build_dataset(small_meshes, tmp_path / "out", scheduler_file=tmp_path / "none.json")
+    for number, text in enumerate(("", "x", "{}", "[]", '{"address": 5}')):
+        file = tmp_path / f"{number}.json"
+        file.write_text(text)
+        with pytest.raises(MachineError, match=r"\d\.json: must be the file of a running Dask"):
+            build_dataset(small_meshes, tmp_path / "out", scheduler_file=file)
 
 
 def test_certificates_come_with_the_grasps_and_change_none(

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import shutil
 import subprocess
 import sys
+import weakref
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 import h5py
 import numpy as np
@@ -25,15 +29,17 @@ from helpers.datasets import (
 )
 
 from drakegrasp.config import load_config
-from drakegrasp.dataset.checks import data_file, trials_file
+from drakegrasp.dataset.checks import context, data_file, object_files, trials_file
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.paths import model_path, plan_path
 from drakegrasp.dataset.shards import read_shard, write_shard
 from drakegrasp.errors import DataError
 from drakegrasp.hand.file_format import with_hand_defaults
-from drakegrasp.objects.model import load_object, save_object
+from drakegrasp.objects.model import ObjectModel, load_object, save_object
 from drakegrasp.runtime.executor import processes
+
+T, R = TypeVar("T"), TypeVar("R")
 
 
 def test_a_sound_dataset_passes(sound: Path) -> None:
@@ -80,8 +86,98 @@ def test_two_processes_find_what_one_does(out: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(data_file, "TASK_ROWS", 1)
     small = check_dataset(out)
     assert sorted(map(str, small)) == sorted(map(str, expected))
+    assert check_dataset(out, execute=backwards) == small
     with processes(2) as execute:
         assert check_dataset(out, execute=execute) == small
+
+
+def backwards(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """Run as workers may: the last item is done first."""
+    return map(function, reversed(list(items)))
+
+
+def test_file_that_is_replaced_meanwhile_is_one_error(out: Path) -> None:
+    def replacing(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+        for item in items:
+            shutil.copy(out / OTO, out / "copy")
+            (out / "copy").replace(out / OTO)
+            yield function(item)
+
+    with pytest.raises(DataError, match=r"_oto.hdf5: must stay while it is checked, got another"):
+        check_dataset(out, execute=replacing)
+
+
+def test_meshes_and_files_are_let_go_with_each_task(
+    sound: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without the collector of cycles."""
+    alive: list[weakref.ref[ObjectModel]] = []
+
+    def load(path: Path) -> ObjectModel:
+        model = load_object(path)
+        alive.append(weakref.ref(model))
+        return model
+
+    monkeypatch.setattr(context, "load_object", load)
+    gc.collect()
+    gc.disable()
+    try:
+        assert check_dataset(sound) == []
+    finally:
+        gc.enable()
+    assert alive
+    assert not any(model() for model in alive)
+
+
+def test_files_of_other_shards_are_found(out: Path) -> None:
+    """A shard that is whole, and not the one that the files were made from."""
+    header = next(read_manifest(out).headers())
+    shard = read_shard(header.path(out), header)
+    slip = np.array(shard.trials["slip"])
+    slip[np.isfinite(slip)] += 1e-3
+    write_shard(out, replace(shard, trials={**shard.trials, "slip": slip}))
+    what = "the file must be made from the shards that are there"
+    must_find(out, *((name, "", None, what) for name in (OTO, OTM, TRIALS)))
+
+
+def test_trials_without_sound_objects_are_not_compared(out: Path) -> None:
+    def spoil(file: h5py.File) -> None:
+        del file["objects/valid"]
+        file["trials/object"][...] = 99
+
+    edit_file(out / TRIALS, spoil)
+    must_find(out, (TRIALS, "/objects/valid", None, "the dataset must be there"))
+
+
+def test_file_with_a_link_hides_no_other_fault(out: Path) -> None:
+    edit_file(out / OTM, lambda f: f.__setitem__("link", h5py.SoftLink("/train")))
+    change(out, OTO, "train/images", 0, set_at(0, 0, 0, to=2.0))
+    must_find(
+        out,
+        (OTM, "", None, "the file must hold its own values"),
+        (OTO, "/train", 0, "colours must be within 0..1"),
+    )
+
+
+def test_object_file_that_cannot_be_read_is_found(
+    out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(out: Path, name: str, expected: str) -> None:
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(object_files, "refuse_changed_model", fail)
+    what = "an object's file must be as it was written"
+    names = [entry.name for entry in read_manifest(out).objects]
+    must_find(out, *((f"objects/{name}.npz", "", None, what) for name in names))
+
+
+def test_any_path_of_a_dataset_may_have_faults(out: Path, tmp_path: Path) -> None:
+    odd = Path(shutil.copytree(out, tmp_path / "a: b, got c" / "out"))
+    model_path(odd, "1_box_a").unlink()
+    plan_path(odd, "2_box_b").write_bytes(b"")
+    places = {v.file: v.got for v in check_dataset(odd)}
+    assert {"objects/1_box_a.npz", "objects/2_box_b.plan.h5"} <= set(places)
+    assert "a: b" not in places["objects/2_box_b.plan.h5"]
 
 
 def test_a_missing_shard_is_found(out: Path) -> None:

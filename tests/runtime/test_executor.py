@@ -1,0 +1,72 @@
+"""The processes of this machine: what is begun ends, and Ctrl-C is one line."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from drakegrasp.errors import MachineError
+from drakegrasp.runtime.executor import processes
+
+
+def touch_late(path: Path) -> Path:
+    time.sleep(0.5)
+    path.touch()
+    return path
+
+
+def test_what_is_begun_ends_before_the_executor_does(tmp_path: Path) -> None:
+    """Nothing is written behind the back of who has stopped; what waits is not begun."""
+    paths = [tmp_path / str(k) for k in range(8)]
+    with processes(2) as execute:
+        results = execute(touch_late, paths)
+        next(results)
+        results.close()  # type: ignore[attr-defined]
+        there = set(tmp_path.iterdir())
+        assert len(there) < len(paths)
+        time.sleep(1.5)
+        assert set(tmp_path.iterdir()) == there
+
+
+def test_process_that_dies_is_one_error() -> None:
+    with processes(2) as execute, pytest.raises(MachineError, match="a worker process died"):
+        list(execute(os._exit, [1, 1, 1]))
+
+
+INTERRUPTED = """
+import sys, time
+from drakegrasp.runtime.executor import processes
+if __name__ == "__main__":
+    print("begins", flush=True)
+    try:
+        with processes(2) as execute:
+            list(execute(time.sleep, [1.0] * 60))
+    except KeyboardInterrupt:
+        print("stopped")
+"""
+
+
+@pytest.mark.parametrize("seconds", [0.05, 0.2, 0.6])
+def test_ctrl_c_while_processes_start_says_nothing(tmp_path: Path, seconds: float) -> None:
+    """It reaches every process of the terminal, also one that has just begun."""
+    script = tmp_path / "script.py"
+    script.write_text(INTERRUPTED)
+    process = subprocess.Popen(
+        [sys.executable, str(script)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "begins\n"
+    time.sleep(seconds)
+    os.killpg(process.pid, signal.SIGINT)
+    said, errors = process.communicate(timeout=60)
+    assert (said, errors, process.returncode) == ("stopped\n", "", 0)
