@@ -58,7 +58,7 @@ LINE = "the disk or the quota is full (No space left on device); make room"
 #: How long the workers of a client that was killed may live on [s]: they end their attempt.
 ORPHANED = 60.0
 #: Phases of a build, and how long after the beginning of one a kill comes at the latest [s].
-PHASES = {"prepare": 1.5, "simulate": 2.0, "assemble": 0.3}
+PHASES = {"prepare": 1.5, "simulate": 2.0, "assemble": 0.8}
 
 
 def write_boxes(folder: Path) -> None:
@@ -195,7 +195,7 @@ def kill_in(
     signs = {
         "prepare": "objects/*.journal",
         "simulate": "shards/*/*.journal",
-        "assemble": ".trials.hdf5.*.tmp",
+        "assemble": "build.lock",
     }
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     while not has_newer(out, signs[phase], since) and process.poll() is None:
