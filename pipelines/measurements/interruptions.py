@@ -59,6 +59,8 @@ LINE = "the disk or the quota is full (No space left on device); make room"
 ORPHANED = 60.0
 #: Phases of a build, and how long after the beginning of one a kill comes at the latest [s].
 PHASES = {"prepare": 1.5, "simulate": 2.0, "assemble": 0.8}
+#: What each phase makes.
+MADE = {"prepare": "objects/*.plan.h5", "simulate": "shards/*/*.h5", "assemble": DATA[0]}
 
 
 def write_boxes(folder: Path) -> None:
@@ -281,8 +283,9 @@ def kill_round(
         killed = 0
         while killed < times:
             found = kill_in(phase, command, out, rng.uniform(0.0, longest), objects, units)
-            if found is None:  # it had finished: without one of its files it assembles again
-                (out / DATA[0]).unlink()
+            if found is None:  # it had finished: it does again what lacks its files
+                for path in out.glob(MADE[phase]):
+                    path.unlink()
                 continue
             killed += 1
             told.append({"meant": phase, **found})
