@@ -60,7 +60,7 @@ ORPHANED = 60.0
 #: Phases of a build, and how long after the beginning of one a kill comes at the latest [s].
 PHASES = {"prepare": 1.5, "simulate": 2.0, "assemble": 0.8}
 #: What each phase makes.
-MADE = {"prepare": "objects/*.plan.h5", "simulate": "shards/*/*.h5", "assemble": DATA[0]}
+MADE = {"prepare": "objects/*.plan.h5", "simulate": "shards/*/*.h5", "assemble": "*.hdf5"}
 
 
 def write_boxes(folder: Path) -> None:
