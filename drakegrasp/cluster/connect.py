@@ -155,8 +155,8 @@ class _LocalCluster(LocalCluster):
             super().__init__(**options)
         except BaseException:
             self._instances.discard(self)
-            # A nanny whose worker did not start says so to nobody but this log.
-            logging.getLogger("asyncio").disabled = True
+            # A nanny whose worker did not start would tell this loop's log, which nobody reads.
+            options["loop"].asyncio_loop.set_exception_handler(lambda loop, context: None)
             raise
 
 
