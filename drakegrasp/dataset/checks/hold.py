@@ -19,6 +19,7 @@ from drakegrasp.dataset.checks.findings import (
     rotation,
     unit_length,
 )
+from drakegrasp.dataset.checks.samples import move_each, rotate_each
 from drakegrasp.dataset.filters import breaks_hold, breaks_surface
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.outcomes import Outcome
@@ -110,10 +111,9 @@ def same_as_trial(batch: Batch, trials: Mapping[str, AnyArray], camera: str) -> 
     """
     # Contacts and palm in the camera's frame.
     X_CO = batch.frame(f"cam2work_{camera}") @ unpack_pose(trials["X_TO"])
-    R_CO = X_CO[:, :3, :3]
     points, normals = batch.contacts("grasps_held")
-    p_CQ = _rotate(R_CO, trials["lifted_p_OQ"]) + X_CO[:, None, :3, 3]
-    n_C = _rotate(R_CO, trials["lifted_nhat_Q_O"])
+    p_CQ = move_each(X_CO, trials["lifted_p_OQ"])
+    n_C = rotate_each(X_CO, trials["lifted_nhat_Q_O"])
     expected = {
         "grasps_held": (np.stack([points, normals]), np.stack([p_CQ, n_C])),
         "X_CG": (batch.pose("grasp_props/X_CG"), X_CO @ unpack_pose(trials["X_OG"])),
@@ -128,7 +128,7 @@ def same_as_trial(batch: Batch, trials: Mapping[str, AnyArray], camera: str) -> 
 
     # Forces.
     for name, column in (("f_Q_C", "closed_f_Q_O"), ("f_Q_C_held", "lifted_f_Q_O")):
-        due = _rotate(R_CO, trials[column])
+        due = rotate_each(X_CO, trials[column])
         off = np.abs(batch[f"grasp_props/{name}"] - due).max(axis=(1, 2))
         scale = np.linalg.norm(due, axis=2).max(axis=1)
         yield from _differs(batch, name, off, RELATIVE_TOLERANCE * (1.0 + scale))
@@ -147,8 +147,3 @@ def _differs(batch: Batch, name: str, off: Array, tolerance: Array | float) -> I
         ~(off <= tolerance),
         lambda i: f"a difference of {off[i]:.4g}",
     )
-
-
-def _rotate(R_AB: Array, v_B: Array) -> Array:
-    """Return vectors v_A (n, k, 3), given the rotation (n, 3, 3) of each row."""
-    return np.asarray(np.einsum("nij,nkj->nki", R_AB, v_B))

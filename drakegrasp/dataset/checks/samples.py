@@ -140,7 +140,7 @@ def contacts_on_mesh(
     # Contacts in {O}, and how they lie there.
     X_OC = invert_pose(batch.object_in_camera(camera))
     p_CQ, n_C = batch.contacts()
-    p_OQ, n_O = _move(X_OC, p_CQ), _rotate(X_OC, n_C)
+    p_OQ, n_O = move_each(X_OC, p_CQ), rotate_each(X_OC, n_C)
     shape = p_OQ.shape[:2]
     fit = fit_contacts(model, p_OQ.reshape(-1, 3), n_O.reshape(-1, 3))
     off, angle = fit.distance.reshape(shape), np.degrees(fit.normal_angle).reshape(shape)
@@ -219,7 +219,7 @@ def same_as_trial(
 
     # The contacts, in the camera frame.
     X_CO = batch.frame(f"cam2work_{camera}") @ X_TO
-    p_CQ, n_C = _move(X_CO, trials["closed_p_OQ"]), _rotate(X_CO, trials["closed_nhat_Q_O"])
+    p_CQ, n_C = move_each(X_CO, trials["closed_p_OQ"]), rotate_each(X_CO, trials["closed_nhat_Q_O"])
     points, normals = batch.contacts()
     off = np.maximum(np.abs(points - p_CQ).max(axis=(1, 2)), np.abs(normals - n_C).max(axis=(1, 2)))
     yield from batch.broken(
@@ -242,11 +242,11 @@ def same_properties(batch: Batch, other: Batch) -> Iterator[Violation]:
         )
 
 
-def _move(X_AB: Array, p_BQ: Array) -> Array:
-    """Return points p_AQ (n, k, 3), given the pose (n, 4, 4) of each row."""
-    return _rotate(X_AB, p_BQ) + X_AB[:, None, :3, 3]
+def move_each(X_AB: Array, p_BQ: Array) -> Array:
+    """Return points p_AQ (n, k, 3) [m] of p_BQ (n, k, 3), each row with its own pose (n, 4, 4)."""
+    return rotate_each(X_AB, p_BQ) + X_AB[:, None, :3, 3]
 
 
-def _rotate(X_AB: Array, v_B: Array) -> Array:
-    """Return vectors v_A (n, k, 3), given the pose (n, 4, 4) of each row."""
+def rotate_each(X_AB: Array, v_B: Array) -> Array:
+    """Return vectors (n, k, 3) of frame B in frame A, each row with its own pose (n, 4, 4)."""
     return np.asarray(np.einsum("nij,nkj->nki", X_AB[:, :3, :3], v_B))
