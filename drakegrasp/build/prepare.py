@@ -97,8 +97,8 @@ def _prepared_or_refused(task: PrepareTask, journal: Journal) -> ObjectEntry | R
     verdict = journal.verdict(PREPARE)
     if verdict is not None:
         # More memory may help, so the next build tries again.
-        reason = f"{name}: preparing it {verdict.value}"
-        return _refused(task, reason, again=verdict is Verdict.VANISHED)
+        again = verdict is Verdict.VANISHED
+        return _refused(task, f"preparing it {verdict.value}", again=again)
     if journal.in_crash_loop:
         raise MachineError(
             f"{name}: the worker died {GIVE_UP_DEATHS} times in a row while preparing it; is "
@@ -114,11 +114,12 @@ def _prepared_entry(task: PrepareTask) -> ObjectEntry | RefusedMesh:
     try:
         prepared = prepare(task.source, config)
     except MeshError as error:
-        return _refused(task, str(error))
+        # The entry has the name already.
+        return _refused(task, str(error).removeprefix(f"{task.source.path.name}: "))
 
     # The digest was taken from another read of the file.
     if prepared.model.mesh_sha256 != task.mesh_sha256:
-        return _refused(task, f"{task.source.name}: the mesh file changed during the build")
+        return _refused(task, "the mesh file changed during the build")
     save_prepared(prepared, Path(task.out), config)
     return prepared.entry()
 

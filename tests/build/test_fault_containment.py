@@ -71,8 +71,18 @@ def undisturbed(meshes: Path, config: Config, tmp_path_factory: pytest.TempPathF
 
 
 def events(out: Path, name: str) -> list[dict[str, Any]]:
-    lines = (out / "log.jsonl").read_text(encoding="utf-8").splitlines()
+    log = out / "log.jsonl"
+    lines = log.read_text(encoding="utf-8").splitlines() if log.exists() else []
     return [line for line in map(json.loads, lines) if line["event"] == name]
+
+
+def begin(out: Path, finished: Path, units: int) -> None:
+    """Copy a dataset as a client that died left it: without the last units of each object."""
+    for name in ("objects", "shards"):
+        shutil.copytree(finished / name, out / name)
+    for folder in (out / "shards").iterdir():
+        for shard in sorted(folder.glob("*.h5"))[UNITS // 2 - units :]:
+            shard.unlink()
 
 
 def assert_clean(out: Path, *patterns: str) -> None:
@@ -118,14 +128,10 @@ def test_random_kills_change_nothing(meshes: Path, undisturbed: Path, tmp_path: 
 @pytest.mark.cluster
 @pytest.mark.sim
 @pytest.mark.slow
-def test_client_that_is_killed_or_stopped_goes_on(
-    meshes: Path, undisturbed: Path, tmp_path: Path
-) -> None:
+def test_client_that_is_stopped_goes_on(meshes: Path, undisturbed: Path, tmp_path: Path) -> None:
+    """One that is killed: test_interruptions.py."""
     out = tmp_path / "out"
-    process = start_build(meshes, out, workers=2)
-    wait_for_shards(out, 2)
-    process.kill()
-    process.communicate()
+    begin(out, undisturbed, units=6)
     for number, code in ((signal.SIGINT, 130), (signal.SIGTERM, 143)):
         # Workers that outlive their client write shards, too: only the log tells of this one.
         before = len(events(out, "unit done"))
@@ -143,7 +149,7 @@ def test_client_that_is_killed_or_stopped_goes_on(
     assert "had been done before" in said
     assert_same_dataset(undisturbed, out)
     assert_clean(out)
-    assert len(events(out, "started")) == 4
+    assert len(events(out, "started")) == 3
     assert len(events(out, "finished")) == 1
 
 
@@ -158,8 +164,7 @@ def test_objects_are_prepared_once_whatever_died(
         raise AssertionError(f"{source.name} is prepared again")
 
     out = tmp_path / "out"
-    for name in ("objects", "shards"):
-        shutil.copytree(undisturbed / name, out / name)
+    begin(out, undisturbed, units=0)
     monkeypatch.setattr("drakegrasp.build.prepare.prepare", prepare)
     build(find_meshes(meshes), out, config, run_here, show=False)
     assert (out / "manifest.json").read_bytes() == (undisturbed / "manifest.json").read_bytes()
@@ -177,10 +182,10 @@ def test_fault_costs_what_is_guilty_and_nothing_else(
     trimesh.creation.box([0.05, 0.05, 0.1]).export(more / "3_box_c.obj")
     faults = "crash:1_box_a:3:1 hang:1_box_a:5:0 freeze:2_box_b:4:2 crash:3_box_c"
     out = tmp_path / "out"
-    # A hang that does not compute takes several times as long.
-    limit = ("--set", "attempt_seconds=2")
+    # A hang that does not compute takes many times as long, and is tried twice.
+    limit = ("--set", "attempt_seconds=1")
     said, errors = finish(start_build(more, out, 2, *limit, fault=faults))
-    assert "refused: 3_box_c: 3_box_c: preparing it crashed its process" in said
+    assert "refused: 3_box_c: preparing it crashed its process" in said
     assert errors == ""
     failing = {
         (0, 3, 1): Outcome.CRASHED,
@@ -232,7 +237,7 @@ def test_mesh_that_takes_too_much_memory_is_refused_and_the_others_go_on(
     out = tmp_path / "out"
     few = ("--set", "candidates.max=1")
     said, errors = finish(start_build(meshes, out, 1, *few, fault="exit:1_box_a"))
-    line = "refused: 1_box_a: 1_box_a: preparing it was at work whenever its process vanished"
+    line = "refused: 1_box_a: preparing it was at work whenever its process vanished"
     assert line in said
     assert errors == "" or "nothing will train" in errors
     assert [entry.name for entry in read_manifest(out).objects] == ["2_box_b"]
@@ -320,8 +325,10 @@ def test_what_is_harmed_is_named_and_run_again(
 def test_full_disk_stops_and_goes_on(meshes: Path, undisturbed: Path, tmp_path: Path) -> None:
     """A limit on the size of files is what a full disk is to a shard with images."""
     out = tmp_path / "out"
-    shutil.copytree(undisturbed / "objects", out / "objects")
-    size = max(path.stat().st_size for path in undisturbed.glob("shards/*/*.h5")) - 1
+    begin(out, undisturbed, units=0)
+    largest = max(out.glob("shards/*/*.h5"), key=lambda path: path.stat().st_size)
+    size = largest.stat().st_size - 1
+    largest.unlink()
     process = start_build(meshes, out, workers=1, largest_file=size)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 1
@@ -376,8 +383,8 @@ def test_blank_image_never_becomes_data(
 def test_second_build_is_refused_before_it_starts(
     meshes: Path, undisturbed: Path, tmp_path: Path
 ) -> None:
-    out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
-    shutil.rmtree(out / "shards" / "1_box_a")
+    out = tmp_path / "out"
+    begin(out, undisturbed, units=2)
     first = start_build(meshes, out, workers=1)
     while not (out / "build.lock").exists():
         time.sleep(0.05)

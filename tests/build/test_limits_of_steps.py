@@ -91,7 +91,7 @@ def test_mesh_whose_preparing_hangs_is_refused_and_the_other_is_not(
     assert isinstance(entry, RefusedMesh)
     assert (name, entry.reason, entry.again) == (
         "1_box_a",
-        "1_box_a: preparing it passed its time limit",
+        "preparing it passed its time limit",
         False,
     )
     assert isinstance(prepare_one(innocent)[1], ObjectEntry)

@@ -37,7 +37,7 @@ def test_mesh_file_that_changes_during_the_build_is_refused(task: PrepareTask) -
     _, entry = prepare_one(replace(task, mesh_sha256="0" * 64))
     assert isinstance(entry, RefusedMesh)
     assert entry.mesh_sha256 == "0" * 64
-    assert entry.reason == "1_box: the mesh file changed during the build"
+    assert entry.reason == "the mesh file changed during the build"
     assert not Path(task.out).exists()
 
 

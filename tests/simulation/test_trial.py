@@ -311,34 +311,26 @@ def test_camera_stands_behind_the_palm(cube, config):
 
 @pytest.mark.slow
 def test_smaller_step_gives_the_same_verdicts(tmp_path, config, hand):
-    """At the default of 8 ms, and at 4 ms, 95 % of what is simulated ends as at 1 ms."""
+    """At the default of 8 ms 95 % of what is simulated ends as at 1 ms."""
     model = box_model(tmp_path, [0.05, 0.07, 0.15], name="1_box_tall")
-    X_TO, steps = standing(model), (0.008, 0.004)
-    rules = [
-        override_config(config, ["screen.mode=off", f"physics.time_step={step}"]) for step in steps
-    ]
-    fine = override_config(
-        config, ["screen.mode=off", "physics.time_step=0.001", "physics.coarse_steps=1"]
-    )
-    scenes = [build_scene(model, rule.physics, hand) for rule in (*rules, fine)]
+    X_TO, coarse = standing(model), override_config(config, ["screen.mode=off"])
+    fine = override_config(coarse, ["physics.time_step=0.001", "physics.coarse_steps=1"])
+    scenes = [build_scene(model, rule.physics, hand) for rule in (coarse, fine)]
 
     # Take attempts from the draw until there are 20 to compare, and three successes among them.
-    same: list[list[bool]] = []
+    same: list[bool] = []
     successes = 0
     for attempt in drawn_attempts(model, X_TO, config, 0):
-        records = [
-            run_attempt(scene, X_TO, attempt, rule)
-            for scene, rule in zip(scenes, rules, strict=False)
-        ]
-        if any(record.closed is not None for record in records):
-            truth = run_attempt(scenes[-1], X_TO, attempt, fine).outcome
-            same.append([record.outcome is truth for record in records])
+        record = run_attempt(scenes[0], X_TO, attempt, coarse)
+        if record.closed is not None:
+            truth = run_attempt(scenes[1], X_TO, attempt, fine).outcome
+            same.append(record.outcome is truth)
             successes += truth is Outcome.SUCCESS
         if len(same) >= 20 and successes >= 3:
             break
     assert len(same) >= 20
     assert successes >= 3
-    assert np.all(np.mean(same, axis=0) >= 0.95)
+    assert np.mean(same) >= 0.95
 
 
 def test_object_rests_on_the_table_after_an_attempt_that_ended_early(scene, cube, config):
