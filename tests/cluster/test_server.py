@@ -159,8 +159,10 @@ def test_slurm_workers_have_their_settings_and_are_replaced(
         monkeypatch.setenv(name, slurm[name])
     monkeypatch.setattr(launch, "REFILL_SECONDS", 2.0)
     request = ClusterRequest(kind="slurm", workers=3, cores=1, walltime="00:20:00")
+    # Over the defaults of dask-jobqueue, which another test's import may have read already.
     yaml = dask.config.collect(paths=[slurm["DASK_CONFIG"]], env={})
-    with dask.config.set(yaml), start_cluster(request, tmp_path) as client:
+    settings_of_site = dask.config.merge(dask.config.config, yaml)
+    with dask.config.set(settings_of_site), start_cluster(request, tmp_path) as client:
         client.wait_for_workers(3, timeout=PATIENCE)
         check_settings(client, 3, "tcp")
         for worker in settings(client).values():
