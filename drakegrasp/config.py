@@ -21,6 +21,7 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    PlainValidator,
     ValidationError,
     field_validator,
     model_validator,
@@ -75,6 +76,9 @@ class ObjectConfig(_Section):
 
     mass: Positive = 1.0  # [kg], the same for every object (paper, "Object representation")
     max_collision_faces: Annotated[int, Field(ge=12)] = 3000  # that decimation may leave
+    # Drops, the first upright (paper), the others from random orientations; each different pose at
+    # rest is used.
+    resting_poses: Annotated[int, Field(ge=1, le=100)] = 1
     min_diagonal: Positive = 0.01  # [m], a smaller bounding box diagonal is refused
     max_diagonal: Positive = 2.0  # [m], a larger one is refused
 
@@ -141,10 +145,24 @@ class SettleConfig(_Section):
     )
 
 
+#: Names of the samplers of palm poses.
+SAMPLER_NAMES = ("rotations", "normals")
+
+
+def _samplers(value: Any) -> str | tuple[str, ...]:
+    """Return the name of a sampler, or the names of those that take turns."""
+    names = value if isinstance(value, list | tuple) else [value]
+    if not names or any(name not in SAMPLER_NAMES for name in names):
+        known = ", ".join(SAMPLER_NAMES)
+        raise ValueError(f"must be one of {known}, or a list of them, got {value!r}")
+    return tuple(names) if names is value else str(value)
+
+
 class CandidateConfig(_Section):
     """The palm poses that are tried."""
 
-    method: Literal["rotations", "normals"] = "rotations"
+    # Sampler, or a list of samplers that take turns; one that is named twice has two turns.
+    method: Annotated[str | tuple[str, ...], PlainValidator(_samplers)] = "rotations"
     max: Count = 10_000  # per object; more are thinned at random, by the seed (paper)
     global_x_deg: Angles = tuple(range(0, 181, 30))  # paper, Table II
     global_y_deg: Angles = tuple(range(0, 360, 30))
@@ -161,6 +179,11 @@ class CandidateConfig(_Section):
     ) = None
 
     @property
+    def methods(self) -> tuple[str, ...]:
+        """The samplers that take turns."""
+        return (self.method,) if isinstance(self.method, str) else self.method
+
+    @property
     def drawn_standoffs(self) -> tuple[float, ...]:
         """The stand-offs, which `hand.file_format.with_hand_defaults` has filled in."""
         assert self.standoffs is not None
@@ -171,6 +194,18 @@ class CandidateConfig(_Section):
         """The spreads, which `hand.file_format.with_hand_defaults` has filled in."""
         assert self.spreads_deg is not None
         return self.spreads_deg
+
+
+class RefineConfig(_Section):
+    """More palm poses about those of grasps that may become samples.
+
+    A pose is moved by a normal draw along and about each axis of the palm.
+    """
+
+    children: Annotated[int, Field(ge=0, le=100)] = 0  # of each such grasp; 0 switches it off
+    generations: Annotated[int, Field(ge=1, le=4)] = 1  # children of children, and so on
+    shift: Positive = 0.0075  # [m], standard deviation along each axis of the palm
+    turn_deg: Positive = 7.5  # standard deviation about each axis of the palm
 
 
 class ScreenConfig(_Section):
@@ -211,6 +246,8 @@ class LiftConfig(_Section):
     max_acceleration: Positive = 1.0  # [m/s^2] of the wrist
     hold_time: NonNegative = 0.3  # [s] at the target before the final verdict
     check_period: Positive = 0.1  # [s] simulated between two checks, and up to a coarse step more
+    stop_slip: Positive = 0.010  # [m], an object that moved more in the hand becomes no sample
+    stop_turn_deg: Positive = 10.0  # nor one that turned more
 
 
 class CertifyConfig(_Section):
@@ -323,10 +360,8 @@ class VerifyConfig(_Section):
     max_angle_error_deg: Positive = 5.0  # of an object lifted by forces alone
 
 
-#: Palm poses in a work unit, and the most in one of an object that has many.
+#: Palm poses in the first work unit of an object, and the most in one.
 UNIT_CANDIDATES, LARGEST_UNIT = 50, 400
-#: With more candidates than this an object has many: its later units are larger.
-FEW_CANDIDATES = 1000
 
 
 #: Keys that change no shard: they act on assembled shards, or only say where to stop.
@@ -338,7 +373,7 @@ class Config(_Section):
 
     hand: str = "barrett"  # a hand in drakegrasp/models, or a path to a hand's YAML
     seed: Seed = 0
-    # Candidates in a work unit; None: 50, and of objects with more than 1,000 up to 400.
+    # Candidates in a work unit; None: 50, growing up to 400.
     unit_candidates: Count | None = None
     attempt_seconds: Positive = 60.0  # [s] of computing (CPU time) before an attempt is a `timeout`
     objects: ObjectConfig = ObjectConfig()
@@ -346,6 +381,7 @@ class Config(_Section):
     physics: PhysicsConfig = PhysicsConfig()
     settle: SettleConfig = SettleConfig()
     candidates: CandidateConfig = CandidateConfig()
+    refine: RefineConfig = RefineConfig()
     screen: ScreenConfig = ScreenConfig()
     close: CloseConfig = CloseConfig()
     lift: LiftConfig = LiftConfig()
@@ -364,8 +400,9 @@ class Config(_Section):
     def unit_ranges(self, candidates: int) -> Iterator[range]:
         """Yield the work units of an object, as ranges of its candidates.
 
-        The units of an object with many candidates grow from 50 to 400: fewer files and tasks, and
-        with `max_grasps` an object that has enough at once is not tried longer than before.
+        The units of an object grow from 50 to 400 candidates: fewer files and tasks, and an object
+        that has enough grasps at once is not tried for long. Only the last one depends on the
+        number of candidates, so that a dataset can grow.
 
         Args:
             candidates: Number of candidates of the object.
@@ -373,30 +410,27 @@ class Config(_Section):
         start = 0
         while start < candidates:
             size = self.unit_candidates or UNIT_CANDIDATES
-            if self._units_grow:
+            if self.unit_candidates is None:
                 size = min(max(size, start), LARGEST_UNIT)
             yield range(start, min(start + size, candidates))
             start += size
 
-    @property
-    def _units_grow(self) -> bool:
-        return self.unit_candidates is None and self.candidates.max > FEW_CANDIDATES
-
     def simulation_hash(self) -> str:
         """Return the hash (16 hex digits) of every value that decides what a shard holds.
 
-        Left out are filters and split, which act later on assembled shards, `max_grasps`, which
-        only says where to stop, the wall-clock limit, and `verify`.
+        Left out are filters and split, which act later on assembled shards, `max_grasps` and
+        `candidates.max`, which only say where to stop, the wall-clock limit, and `verify`.
         """
         values = self.to_dict()
         for key in POSTPROCESSING_KEYS:
             del values[key]
+        del values["candidates"]["max"]  # a dataset may grow
         if not self.certify.repeats:
             del values["certify"]  # without repeats the noise is not used
         if self.randomize == RandomizeConfig():
             del values["randomize"]  # nothing is drawn
-        if self.unit_candidates is None and not self._units_grow:
-            values["unit_candidates"] = UNIT_CANDIDATES  # the same units
+        if not self.refine.children:
+            del values["refine"]
         canonical = json.dumps(values, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 

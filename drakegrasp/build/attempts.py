@@ -24,9 +24,10 @@ from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.contact_fit import ContactFit, fit_contacts
+from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import release_memory
-from drakegrasp.simulation.candidates import Attempt, make_attempts
+from drakegrasp.simulation.candidates import Attempt, children, family_member, make_attempts
 from drakegrasp.simulation.randomization.conditions import usual_conditions
 from drakegrasp.simulation.randomization.draws import draw_conditions
 from drakegrasp.simulation.scene import Scene
@@ -46,7 +47,7 @@ class TrialSetup:
     """What every trial of an object needs.
 
     Attributes:
-        prepared: The object, its resting pose and its palm poses.
+        prepared: The object, its resting poses and its palm poses.
         config: All the rules.
         scene: Physics of object, table and hand. A scene in which Drake failed is replaced.
     """
@@ -109,27 +110,53 @@ def list_attempts(prepared: PreparedObject, indices: range, config: Config) -> l
     """Return the attempts of a range of an object's candidates, with their conditions."""
     model, rules, seed = prepared.model, with_hand_defaults(config).candidates, config.seed
     made = make_attempts(prepared.candidates, indices, rules, name=model.name, seed=seed)
-    return [
-        replace(
-            attempt,
-            conditions=draw_conditions(model, config, attempt.candidate, attempt.standoff_index),
-        )
-        for attempt in made
-    ]
+    return [_with_conditions(attempt, model, config) for attempt in made]
+
+
+def list_children(prepared: PreparedObject, parent: Attempt, config: Config) -> list[Attempt]:
+    """Return the attempts about that of a grasp that holds, with their conditions."""
+    model = prepared.model
+    made = children(parent, config.refine, name=model.name, seed=config.seed)
+    return [_with_conditions(attempt, model, config) for attempt in made]
+
+
+def find_attempt(
+    prepared: PreparedObject, candidate: int, standoff_index: int, child: int, config: Config
+) -> Attempt:
+    """Return an attempt by its identity in a dataset, with its conditions."""
+    first = list_attempts(prepared, range(candidate, candidate + 1), config)[standoff_index]
+    name, seed = prepared.model.name, config.seed
+    member = family_member(first, child, config.refine, name=name, seed=seed)
+    return _with_conditions(member, prepared.model, config)
+
+
+def _with_conditions(attempt: Attempt, model: ObjectModel, config: Config) -> Attempt:
+    place = attempt.candidate, attempt.standoff_index, attempt.child
+    return replace(attempt, conditions=draw_conditions(model, config, *place))
 
 
 def predict_attempts(setup: TrialSetup, attempts: Sequence[Attempt]) -> list[Prediction | None]:
     """Return what geometry says of each attempt; one call for all of them is much faster."""
     config, prepared = setup.config, setup.prepared
     hand = load_hand(config.hand)
-    return predict(prepared.model, hand, prepared.X_TO, attempts, config.screen)
+
+    # A call is about one resting pose.
+    found: list[Prediction | None] = [None] * len(attempts)
+    for k, X_TO in enumerate(prepared.resting_poses):
+        rows = [row for row, attempt in enumerate(attempts) if attempt.resting == k]
+        own = [attempts[row] for row in rows]
+        predictions = predict(prepared.model, hand, X_TO, own, config.screen)
+        for row, prediction in zip(rows, predictions, strict=True):
+            found[row] = prediction
+    return found
 
 
 def try_attempt(
     setup: TrialSetup, attempt: Attempt, prediction: Prediction | None = None
 ) -> TrialRecord:
     """Run the trial of one attempt; replace the scene if Drake failed in it."""
-    record = run_attempt(setup.scene, setup.prepared.X_TO, attempt, setup.config, prediction)
+    X_TO = setup.prepared.resting_poses[attempt.resting]
+    record = run_attempt(setup.scene, X_TO, attempt, setup.config, prediction)
     if record.outcome is Outcome.SOLVER_ERROR:
         forget_scenes()
         setup.scene = cached_scene(setup.prepared.model, setup.config.physics, setup.config.hand)

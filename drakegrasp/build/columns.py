@@ -11,7 +11,7 @@ from typing import Any
 
 from drakegrasp.build.attempts import TrialSetup, View
 from drakegrasp.dataset.hdf5 import AnyArray
-from drakegrasp.dataset.schema import CONTACT_NAMES, LOOK_FIELDS, sizes
+from drakegrasp.dataset.schema import CONTACT_NAMES, LINEAGE_NAMES, LOOK_FIELDS, sizes
 from drakegrasp.dataset.shards import trial_columns
 from drakegrasp.frames import pack_pose
 from drakegrasp.objects.contact_fit import ContactFit
@@ -83,6 +83,7 @@ def _trial_values(attempt: Attempt, record: TrialRecord, fit: ContactFit | None)
     values: dict[str, Any] = {
         "candidate": attempt.candidate,
         "standoff_index": attempt.standoff_index,
+        **{name: getattr(attempt, name) for name in LINEAGE_NAMES},
         "spread": attempt.spread,
         "seed": attempt.seed,
         "outcome": record.outcome,

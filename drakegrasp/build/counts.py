@@ -49,10 +49,11 @@ class Counts:
         self.named: list[str] = []
         self.errors: Counter[str] = Counter()
 
-        # Progress: all attempts, by outcome, and those that were there before.
+        # Progress: attempts of the first round, all by outcome, and those that were there before.
         self._pool, self._report = pool, report
         standoffs = len(manifest.config.candidates.drawn_standoffs)
         self._total = standoffs * sum(entry.candidates for entry in manifest.objects)
+        self._standoffs, self._done = standoffs, 0
         self._outcomes: Counter[Outcome] = Counter()
         self._reused_attempts = 0
 
@@ -79,7 +80,9 @@ class Counts:
         self._outcomes.update(outcomes)
         self._attempts[header.object_name] += sum(outcomes.values())
         self._ended[header.object_name] += sum(outcomes.get(outcome, 0) for outcome in ENDED)
-        self._reused_attempts += reused * sum(outcomes.values())
+        first_round = self._standoffs * (header.stop - header.start)
+        self._done += first_round
+        self._reused_attempts += reused * first_round
         if self._max_grasps is not None:
             self._close_gap(header, outcomes.get(Outcome.SUCCESS, 0))
         self.show()
@@ -105,7 +108,7 @@ class Counts:
                 figures[outcome.label] = self._outcomes[outcome]
         if self._pool is not None:
             figures["workers"] = self._pool.size
-        self._report(self._outcomes.total(), self._total, found=self._reused_attempts, **figures)
+        self._report(self._done, self._total, found=self._reused_attempts, **figures)
 
     def needs(self, header: ShardHeader) -> bool:
         """Return whether a unit's object has too few grasps in the units before the first gap."""

@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from drakegrasp.config import Config, parse_config
 from drakegrasp.dataset.manifest import ObjectEntry, RefusedMesh
 from drakegrasp.dataset.paths import model_path
@@ -23,7 +25,7 @@ from drakegrasp.runtime.fault_injection import inject_fault
 from drakegrasp.runtime.files import disk_full_named
 from drakegrasp.runtime.journal import GIVE_UP_DEATHS, PREPARE, Journal, Verdict, open_journal
 from drakegrasp.simulation.candidates import sample_candidates
-from drakegrasp.simulation.settle import settle
+from drakegrasp.simulation.settle import find_resting_poses
 
 #: Computing time after which preparing a mesh hangs [s].
 PREPARE_SECONDS = 1800.0
@@ -137,17 +139,19 @@ def prepare(source: MeshSource, config: Config) -> PreparedObject:
             not come to rest.
     """
     model = prepare_object(source, config.objects)
-    resting = settle(model, config)
+    resting = find_resting_poses(model, config)
 
     # What else a mesh alone decides: one whose distances hang or take too much memory costs the
     # mesh here, and would stop the build later.
     if config.screen.mode == "on":
         inject_fault(source.name, "distances")
         _ = model.field
+    poses = np.array([pose.X_TO for pose in resting])
     return PreparedObject(
-        model=replace(model, notes=(*model.notes, *resting.notes)),
-        X_TO=resting.X_TO,
-        candidates=sample_candidates(model, resting.X_TO, config.candidates, config.seed),
-        table_force=resting.table_force,
-        stopped=resting.stopped,
+        model=replace(model, notes=(*model.notes, *resting[0].notes)),
+        resting_poses=poses,
+        probability=np.array([pose.probability for pose in resting]),
+        table_force=np.array([pose.table_force for pose in resting]),
+        stopped=np.array([pose.stopped for pose in resting]),
+        candidates=sample_candidates(model, poses, config.candidates, config.seed),
     )

@@ -7,14 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from drakegrasp.build.attempts import TrialSetup, measure_contacts, try_attempt
+from drakegrasp.build.attempts import TrialSetup, find_attempt, measure_contacts, try_attempt
 from drakegrasp.build.columns import trial_rows
-from drakegrasp.build.work_unit import unit_attempts
 from drakegrasp.dataset.layout.opening import object_name, open_trials, read_trial
 from drakegrasp.dataset.manifest import Manifest, installed_versions, read_manifest
 from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
-from drakegrasp.dataset.shards import ShardHeader, trial_columns
+from drakegrasp.dataset.shards import trial_columns
 from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.blas import one_thread
@@ -99,8 +98,8 @@ def record_trial(out: str | Path, trial_id: int, path: str | Path) -> Outcome:
         OSError: If the file cannot be written.
     """
     stored = _stored_trial(Path(out), trial_id)
-    model, X_TO = stored.prepared.model, stored.prepared.X_TO
-    config = stored.manifest.config
+    X_TO = stored.prepared.resting_poses[stored.attempt.resting]
+    model, config = stored.prepared.model, stored.manifest.config
     return record_attempt(model, X_TO, stored.attempt, config, Path(path)).outcome
 
 
@@ -119,15 +118,8 @@ def _stored_trial(out: Path, trial_id: int) -> _StoredTrial:
     config = manifest.config
     row, name = _stored_row(out, trial_id)
     prepared = load_prepared(out, name, config)
-    candidate = int(row["candidate"])
-    header = ShardHeader(
-        config_hash=config.simulation_hash(),
-        mesh_sha256=prepared.model.mesh_sha256,
-        object_name=name,
-        start=candidate,
-        stop=candidate + 1,
-    )
-    attempt = unit_attempts(prepared, header, config)[int(row["standoff_index"])]
+    candidate, standoff, child = (int(row[key]) for key in ("candidate", "standoff_index", "child"))
+    attempt = find_attempt(prepared, candidate, standoff, child, config)
     return _StoredTrial(row=row, prepared=prepared, attempt=attempt, manifest=manifest)
 
 

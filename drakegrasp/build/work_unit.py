@@ -1,5 +1,8 @@
 """Work units: one object's attempts at a range of its candidates, from trials to a shard.
 
+Palm poses about those of grasps that hold are tried in the unit of these grasps: no unit waits for
+another.
+
 A work unit is plain data, so it can be sent to another process. Its header and the configuration
 alone decide what its shard holds: not who runs it, nor what ran before, nor how often its process
 died (see `drakegrasp.runtime.journal`).
@@ -20,6 +23,7 @@ import numpy as np
 from drakegrasp.build.attempts import (
     TrialSetup,
     list_attempts,
+    list_children,
     measure_contacts,
     predict_attempts,
     render_views,
@@ -50,6 +54,7 @@ from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.robustness import UNKNOWN, Certificate, certify
 from drakegrasp.simulation.screen import Prediction
 from drakegrasp.simulation.trial import TrialRecord
+from drakegrasp.simulation.verdict import may_become_sample
 
 #: An attempt that takes this many times its wall-clock limit hangs: it never checks the clock.
 HANG_FACTOR = 1.5
@@ -146,10 +151,10 @@ def _run_experiment(unit: WorkUnit, journal: Journal) -> UnitSummary:
         setup = _build_setup(out, header, config)
         attempts = unit_attempts(setup.prepared, header, config)
 
-    # Try each attempt: what geometry already decides is not simulated.
+    # Try each attempt, and palm poses about those that hold: what geometry already decides is not
+    # simulated.
     with timed(seconds, "try"):
-        predictions = _predict_all(setup, attempts, journal)
-        records = _try_all(setup, attempts, predictions, journal)
+        attempts, records = _try_generations(setup, attempts, journal)
 
     # Measure how the contacts of each lift lie on the object's true surface.
     with _stage(journal, "measure", header, seconds):
@@ -239,6 +244,36 @@ def _build_setup(out: Path, header: ShardHeader, config: Config) -> TrialSetup:
         raise DataError(f"{header.object_name}: Drake cannot build its scene: {error}") from None
 
 
+def _try_generations(
+    setup: TrialSetup, attempts: Sequence[Attempt], journal: Journal
+) -> tuple[list[Attempt], list[TrialRecord]]:
+    """Try attempts, then the children of those that may become samples, and so on.
+
+    Returns:
+        All attempts, generation by generation, and their records.
+    """
+    tried, records, newest = list[Attempt](), list[TrialRecord](), list(attempts)
+    while newest:
+        predictions = _predict_all(setup, newest, journal)
+        results = _try_all(setup, newest, predictions, journal, first=len(tried))
+        tried += newest
+        records += results
+        newest = [
+            child
+            for attempt, record in zip(newest, results, strict=True)
+            if setup.config.refine.children and _may_have_children(record, setup.config)
+            for child in list_children(setup.prepared, attempt, setup.config)
+        ]
+    return tried, records
+
+
+def _may_have_children(record: TrialRecord, config: Config) -> bool:
+    if record.lifted is None:
+        return False
+    motion = record.lifted.other_links, record.slip, record.turn
+    return bool(may_become_sample(record.outcome, *motion, config.lift))
+
+
 def _predict_all(
     setup: TrialSetup, attempts: Sequence[Attempt], journal: Journal
 ) -> list[Prediction | None]:
@@ -258,13 +293,14 @@ def _try_all(
     attempts: Sequence[Attempt],
     predictions: Sequence[Prediction | None],
     journal: Journal,
+    first: int,
 ) -> list[TrialRecord]:
-    """Return the records of attempts in their order.
+    """Return the records of attempts in their order; the first is in row `first` of the unit.
 
     Attempts in which an earlier process died, and that are not yet judged, run first: then a
     failing one is found at once.
     """
-    steps = [f"{ATTEMPT} {row}" for row in range(len(attempts))]
+    steps = [f"{ATTEMPT} {first + row}" for row in range(len(attempts))]
     unresolved = set(journal.unresolved)
     order = sorted(range(len(attempts)), key=lambda row: steps[row] not in unresolved)
     records = {
@@ -283,7 +319,8 @@ def _try_step(
     verdict = journal.verdict(step)
     if verdict is not None:
         outcome = Outcome.TIMEOUT if verdict is Verdict.HUNG else Outcome.CRASHED
-        return TrialRecord(outcome=outcome, X_TO=setup.prepared.X_TO, X_OG=attempt.X_OG)
+        X_TO = setup.prepared.resting_poses[attempt.resting]
+        return TrialRecord(outcome=outcome, X_TO=X_TO, X_OG=attempt.X_OG)
     with journal.step(step, HANG_FACTOR * setup.config.attempt_seconds):
         inject_fault(setup.prepared.model.name, attempt.candidate, attempt.standoff_index)
         return try_attempt(setup, attempt, prediction)
@@ -309,7 +346,8 @@ def _certify_step(setup: TrialSetup, attempt: Attempt, journal: Journal, step: s
     rules, config = setup.config.certify, setup.config
     simulations = rules.repeats + rules.friction_steps + 1
     with journal.step(step, CERTIFY_FACTOR * simulations * config.attempt_seconds):
-        return certify(setup.prepared.model, setup.prepared.X_TO, attempt, config)
+        X_TO = setup.prepared.resting_poses[attempt.resting]
+        return certify(setup.prepared.model, X_TO, attempt, config)
 
 
 @contextmanager

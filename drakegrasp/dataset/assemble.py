@@ -53,7 +53,9 @@ from drakegrasp.dataset.manifest import (
 from drakegrasp.dataset.paths import DATA_FILES, FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.rejections import AttemptKey, find_keys
 from drakegrasp.dataset.schema import OBJECT_FIELDS, SPLITS, SUCCESS_FIELDS, TRIAL_FIELDS
+from drakegrasp.dataset.weights import weigh_samples
 from drakegrasp.errors import DataError
+from drakegrasp.frames import Array
 from drakegrasp.runtime.executor import Executor, run_here
 from drakegrasp.runtime.file_set import replaced_together
 from drakegrasp.runtime.files import disk_full_named, new_hdf5, sweep_temporary, temporary_name
@@ -138,7 +140,10 @@ def assemble_locked(
             manifest = replace(manifest, rejected=find_keys(rejected, known, out))
         ids_rejected = [known[key] for key in manifest.rejected if key in known]
         removal = judge_successes(successes, manifest.config.filters, ids_rejected)
-        ids = _split_ids(manifest, successes, removal)
+        splits = _split_successes(manifest, successes, removal)
+        _remove_refined_tests(splits, successes, removal)
+        weights = _weights(successes, removal)
+        ids = {split: successes.trial_id[rows] for split, rows in splits.items()}
 
         # Write what is small, and room for all rows.
         seals = join_seals({survey.object: survey.seals for survey in surveys})
@@ -161,7 +166,8 @@ def assemble_locked(
                     )
 
             # Rows are packed in any order, and put into the files in theirs.
-            tasks = list(_pack_tasks(out, slices, ids, sizes))
+            own_weights = {split: weights[rows] for split, rows in splits.items()}
+            tasks = list(_pack_tasks(out, slices, ids, own_weights, sizes))
             for done, part in enumerate(_in_order(execute(pack_rows, tasks), tasks), start=1):
                 unpack_rows(part, columns, rows)
                 progress(len(surveys) + done, len(surveys) + len(tasks))
@@ -211,6 +217,7 @@ def _pack_tasks(
     out: Path,
     slices: Sequence[ShardSlice],
     ids: Mapping[str, npt.NDArray[np.int64]],
+    weights: Mapping[str, Array],
     sizes: Mapping[str, int],
 ) -> Iterator[PackTask]:
     """Yield the tasks that pack the rows, from the first to the last."""
@@ -229,6 +236,7 @@ def _pack_tasks(
             stop=stop,
             slices=tuple(takewhile(partial(_begins_before, stop=stop), within)),
             ids={split: ids[split][a:b] for split, (a, b) in bounds.items()},
+            weights={split: weights[split][a:b] for split, (a, b) in bounds.items()},
             sizes=sizes,
         )
 
@@ -276,9 +284,9 @@ def _texts(manifest: Manifest) -> dict[str, list[str]]:
 
 def _keys(manifest: Manifest, successes: Successes) -> dict[AttemptKey, int]:
     """Return the trial id of each success, by its identity."""
-    columns = (successes.object, successes.candidate, successes.standoff_index, successes.trial_id)
-    rows = zip(*(column.tolist() for column in columns), strict=True)
-    return {AttemptKey(manifest.objects[i].name, c, s): t for i, c, s, t in rows}
+    names = ("object", "candidate", "standoff_index", "child", "trial_id")
+    rows = zip(*(getattr(successes, name).tolist() for name in names), strict=True)
+    return {AttemptKey(manifest.objects[i].name, *key): t for i, *key, t in rows}
 
 
 def summarise(out: Path) -> Assembly:
@@ -323,16 +331,39 @@ def _write_removal(file: h5py.File, successes: Successes, removal: AnyArray) -> 
         write_field(group, field, values)
 
 
-def _split_ids(
+def _split_successes(
     manifest: Manifest, successes: Successes, removal: AnyArray
 ) -> dict[str, npt.NDArray[np.int64]]:
-    """Return the trial ids of the samples, by split."""
+    """Return which successes are samples of each split, in rising order."""
+    # A first-round attempt and all that was refined from it go to one split.
     kept = np.flatnonzero(removal == Removal.KEPT)
+    names = ("object", "candidate", "standoff_index")
+    keys = np.column_stack([getattr(successes, name)[kept] for name in names])
+    _, first, family = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+
     split = split_samples(
-        successes.object[kept],
+        successes.object[kept[first]],
         [entry.name for entry in manifest.objects],
         [entry.class_name for entry in manifest.objects],
         manifest.config.split,
         manifest.config.seed,
     )
-    return {name: successes.trial_id[kept[rows]] for name, rows in split.items()}
+    return {name: kept[np.isin(family.ravel(), families)] for name, families in split.items()}
+
+
+def _remove_refined_tests(
+    splits: dict[str, npt.NDArray[np.int64]], successes: Successes, removal: AnyArray
+) -> None:
+    """Leave first-round attempts alone in the test split: the others are drawn about held ones."""
+    refined = successes.child[splits["test"]] > 0
+    removal[splits["test"][refined]] = Removal.REFINED_TEST
+    splits["test"] = splits["test"][~refined]
+
+
+def _weights(successes: Successes, removal: AnyArray) -> Array:
+    """Return the weight (n,) of each success among the samples; NaN where it is none."""
+    kept = np.flatnonzero(removal == Removal.KEPT)
+    weights = np.full(len(removal), np.nan)
+    groups = np.column_stack([successes.object[kept], successes.resting[kept]])
+    weights[kept] = weigh_samples(groups, successes.X_OG[kept])
+    return weights

@@ -37,6 +37,7 @@ class Removal(IntEnum):
     # Values are stored in files: a filter that came later has the next number, not the next place.
     SUSPICIOUS = 12  # the suspicion score or a part of it is too high; before OUTLIER
     MISSING_FINGER = 13  # a fingertip that is not required does not touch; the first of all
+    REFINED_TEST = 14  # a refined palm pose whose split is test; after the split is drawn
 
     @property
     def label(self) -> str:
@@ -51,7 +52,9 @@ class Successes:
     Attributes:
         trial_id: (n,) int64, row of /trials.
         object: (n,) int32, row of /objects.
-        candidate, standoff_index: (n,), which of the object's palm poses, and of the stand-offs.
+        candidate, standoff_index, child: (n,), which attempt of its object.
+        resting: (n,), index of the object's resting pose.
+        X_OG: (n, 4, 4), pose of the palm at the start.
         grasp_T: (n, 6k), grasps in the table-top frame [m, -].
         held_O: (n, 6k), contacts at the end of the lift in {O} [m, -].
         complete: (n,) bool, whether every fingertip touches, after closing and after the lift.
@@ -72,6 +75,9 @@ class Successes:
     object: npt.NDArray[np.int32]
     candidate: npt.NDArray[np.integer]
     standoff_index: npt.NDArray[np.integer]
+    child: npt.NDArray[np.integer]
+    resting: npt.NDArray[np.integer]
+    X_OG: Array
     grasp_T: Array
     held_O: Array
     complete: npt.NDArray[np.bool_]

@@ -27,6 +27,7 @@ from drakegrasp.config import (
     NonNegative,
     Number,
     Positive,
+    Share,
     override_config,
     parse_config,
 )
@@ -70,6 +71,22 @@ Pose = Annotated[
 
 @with_config(ConfigDict(extra="forbid"))
 @dataclass(frozen=True, kw_only=True)
+class RestingEntry:
+    """A resting pose of an object, in the manifest.
+
+    Attributes:
+        X_TO: The pose, (12,): the first three rows of the 4x4 matrix [m, -].
+        probability: Share of the drops that ended in it.
+        rolled: Whether the object would have rolled on and was stopped.
+    """
+
+    X_TO: Pose
+    probability: Share
+    rolled: bool
+
+
+@with_config(ConfigDict(extra="forbid"))
+@dataclass(frozen=True, kw_only=True)
 class ObjectEntry:
     """An object that was prepared, in the manifest.
 
@@ -82,8 +99,7 @@ class ObjectEntry:
         density: Mass over volume [kg/m^3].
         friction: Its own coefficient with hand and table; None: the configuration's.
         collision_error: Largest distance between mesh and collision surface [m].
-        X_TO: Resting pose, (12,): the first three rows of the 4x4 matrix [m, -].
-        rolled: Whether the object would have rolled on and was stopped.
+        resting: Its resting poses.
         candidates: Number of palm poses to try, drawn from the distinct ones.
         combinations: Number of combinations of rotations that were considered.
         valid: Number of those above the table whose palm ray meets the bounding box.
@@ -101,8 +117,7 @@ class ObjectEntry:
     density: Positive
     friction: Positive | None
     collision_error: NonNegative
-    X_TO: Pose
-    rolled: bool
+    resting: Annotated[tuple[RestingEntry, ...], Field(min_length=1)]
     candidates: Whole
     combinations: Whole
     valid: Whole
@@ -255,13 +270,14 @@ def read_manifest(out: Path) -> Manifest:
 
     # The version first: another schema may have other keys.
     refuse_other_schema(path, tree.get("schema_version"))
-    stored = validated(path, content, _Stored)
+    stored = validated(path, _updated(tree, content), _Stored)
     try:
         config = parse_config(stored.config)
     except ConfigError as error:
         raise DataError(f"{path}: {error}") from None
 
-    if (mistake := next(_contradictions(stored, config), None)) is not None:
+    mistakes = _contradictions(stored, config, tree["schema_version"])
+    if (mistake := next(mistakes, None)) is not None:
         raise DataError(f"{path}: {mistake}")
     return Manifest(
         config=config,
@@ -271,6 +287,19 @@ def read_manifest(out: Path) -> Manifest:
         versions=stored.versions,
         fingers=stored.fingers,
     )
+
+
+def _updated(tree: dict[str, Any], content: bytes) -> bytes:
+    """Return the text of a manifest with the keys of this schema; `tree` is what it says."""
+    if tree["schema_version"] == SCHEMA_VERSION:
+        return content
+    # Version 3 knew one resting pose.
+    objects = tree.get("objects")
+    for entry in objects if isinstance(objects, list) else []:
+        if isinstance(entry, dict) and {"X_TO", "rolled"} <= set(entry):
+            pose = {key: entry.pop(key) for key in ("X_TO", "rolled")}
+            entry["resting"] = [{**pose, "probability": 1.0}]
+    return json.dumps(tree).encode()
 
 
 class _Stored(BaseModel):
@@ -287,13 +316,14 @@ class _Stored(BaseModel):
     rejected: tuple[AttemptKey, ...] = ()
 
 
-def _contradictions(stored: _Stored, config: Config) -> Iterator[str]:
+def _contradictions(stored: _Stored, config: Config, version: int) -> Iterator[str]:
     """Yield where a manifest contradicts itself, in words."""
     for key, said, must in (
         ("config_hash", stored.config_hash, config.simulation_hash()),
         ("seed", stored.seed, config.seed),
     ):
-        if said != must:
+        # Other keys decided the hash of an older schema.
+        if said != must and (key, version == SCHEMA_VERSION) != ("config_hash", False):
             yield f"{key} must be {must}, that of its config, got {said}"
 
     for name, count in Counter(entry.name for entry in stored.objects).items():

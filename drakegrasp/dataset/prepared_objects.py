@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.layout.opening import opened
 from drakegrasp.dataset.layout.plans import ARRAYS
-from drakegrasp.dataset.manifest import ObjectEntry
+from drakegrasp.dataset.manifest import ObjectEntry, RestingEntry
 from drakegrasp.dataset.paths import model_file_sha256, model_path, plan_path, refuse_changed_object
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array
@@ -30,17 +31,25 @@ class PreparedObject:
 
     Attributes:
         model: Meshes and mass properties.
-        X_TO: Resting pose (4, 4).
+        resting_poses: (r, 4, 4), resting poses X_TO; the first is the paper's.
+        probability: (r,), share of the drops that ended in each.
+        table_force: (r,), upward force of the table at rest [N].
+        stopped: (r,) bool, whether the object would have rolled on and was stopped, see
+            `settle.settle`.
         candidates: Palm poses and their rays.
-        table_force: Upward force of the table at rest [N].
-        stopped: Whether the object would have rolled on and was stopped, see `settle.settle`.
     """
 
     model: ObjectModel
-    X_TO: Array
+    resting_poses: Array
+    probability: Array
+    table_force: Array
+    stopped: npt.NDArray[np.bool_]
     candidates: Candidates
-    table_force: float
-    stopped: bool
+
+    @property
+    def X_TO(self) -> Array:
+        """The first resting pose, (4, 4)."""
+        return np.asarray(self.resting_poses[0])
 
     def entry(self) -> ObjectEntry:
         """Return the object's entry in the manifest."""
@@ -54,8 +63,17 @@ class PreparedObject:
             density=self.model.density,
             friction=self.model.friction,
             collision_error=self.model.collision_error,
-            X_TO=tuple(self.X_TO[:3].ravel().tolist()),
-            rolled=self.stopped,
+            resting=tuple(
+                RestingEntry(
+                    X_TO=tuple(X_TO[:3].ravel().tolist()), probability=share, rolled=rolled
+                )
+                for X_TO, share, rolled in zip(
+                    self.resting_poses,
+                    self.probability.tolist(),
+                    self.stopped.tolist(),
+                    strict=True,
+                )
+            ),
             candidates=len(self.candidates),
             combinations=self.candidates.combinations,
             valid=self.candidates.valid,
@@ -78,23 +96,20 @@ def save_prepared(prepared: PreparedObject, out: Path, config: Config) -> None:
         file.attrs["model_sha256"] = model_file_sha256(out, model.name)
         file.attrs["config_hash"] = config.simulation_hash()
         file.attrs["mesh_sha256"] = model.mesh_sha256
-        file.attrs["table_force"] = prepared.table_force
-        file.attrs["stopped"] = prepared.stopped
+        file.attrs["max"] = config.candidates.max
         for name in ("combinations", "valid", "distinct"):
             file.attrs[name] = getattr(candidates, name)
-        for name, values in (
-            ("X_TO", prepared.X_TO),
-            ("X_OG", candidates.X_OG),
-            ("distance", candidates.distance),
-        ):
-            file.create_dataset(name, data=values, dtype=np.float64)
+        arrays = {**vars(candidates), **vars(prepared), "X_TO": prepared.resting_poses}
+        for name, (dtype, _) in ARRAYS.items():
+            file.create_dataset(name, data=arrays[name], dtype=dtype)
 
 
 def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
     """Return an object as `save_prepared` wrote it.
 
     Raises:
-        DataError: If its files are missing, damaged or of another configuration.
+        DataError: If its files are missing, damaged, of another configuration or of another
+            number of palm poses.
         MeshError: If the file of its meshes is of another version.
     """
     path = plan_path(out, name)
@@ -110,20 +125,25 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
             f"got {attributes['config_hash']}"
         )
 
+    if attributes["max"] != config.candidates.max:
+        raise DataError(
+            f"{path}: must be of candidates.max {config.candidates.max}, got {attributes['max']}"
+        )
+
     model = load_object(model_path(out, name))
     if model.mesh_sha256 != attributes["mesh_sha256"]:
         raise DataError(f"{path}: must be of the same mesh as {name}.npz, got another")
 
     return PreparedObject(
         model=model,
-        X_TO=arrays["X_TO"],
+        resting_poses=arrays["X_TO"],
+        **{key: arrays[key] for key in ("probability", "table_force", "stopped")},
         candidates=Candidates(
-            X_OG=arrays["X_OG"],
-            distance=arrays["distance"],
+            **{
+                key: arrays[key] for key in ("X_OG", "distance", "resting", "source", "log_density")
+            },
             combinations=int(attributes["combinations"]),
             valid=int(attributes["valid"]),
             distinct=int(attributes["distinct"]),
         ),
-        table_force=float(attributes["table_force"]),
-        stopped=bool(attributes["stopped"]),
     )

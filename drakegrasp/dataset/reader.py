@@ -87,7 +87,7 @@ class GraspDataset:
             raise DataError(f"split must be one of {', '.join(SPLITS)}, got {split!r}")
         self.path, self.split = Path(path), split
         self._file: h5py.File | None = None
-        self._fields: dict[str, h5py.Dataset | ImageRows] = {}
+        self._fields: dict[str, h5py.Dataset | ImageRows | npt.NDArray[Any]] = {}
         self._process = -1
         with open_samples(self.path) as file:
             self._length = len(file[split]["grasps"])
@@ -168,7 +168,9 @@ class GraspDataset:
             DataError: If there is no such field.
         """
         _refuse_other_fields([name])
-        dataset = self._open()[self.split][name]
+        dataset = self._open()[self.split].get(name)
+        if dataset is None:
+            return FIELDS[name].empty(self._length, {})[start:stop]
         if FIELDS[name].dtype == "str":
             return np.asarray(dataset.asstr()[start:stop])
         return np.asarray(dataset[start:stop])
@@ -196,11 +198,14 @@ class GraspDataset:
     def __repr__(self) -> str:
         return f"GraspDataset({str(self.path)!r}, split={self.split!r}): {len(self)} grasps"
 
-    def _field(self, name: str) -> h5py.Dataset | ImageRows:
+    def _field(self, name: str) -> h5py.Dataset | ImageRows | npt.NDArray[Any]:
         """Return a field in the file of this process, which is kept open with it."""
         file = self._open()
         if name not in self._fields:
-            field = file[self.split][name]
+            field = file[self.split].get(name)
+            if field is None:
+                # A file of an older schema; all that it may lack is scalar.
+                field = FIELDS[name].empty(self._length, {})
             self._fields[name] = ImageRows(field) if FIELDS[name].sample else field
         return self._fields[name]
 

@@ -17,7 +17,9 @@ from drakegrasp.errors import DataError, printable
 from drakegrasp.outcomes import Outcome, Stage
 
 #: Goes up with every change of the table that an older reader cannot read.
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
+#: Versions that can be read; fields that a version lacks read as without a value.
+READABLE = (3, 4)
 #: What to do with a file of another version: its labels mean something else.
 OTHER_SCHEMA = "build the dataset again with this version of drakegrasp, in another directory"
 
@@ -66,6 +68,7 @@ class Field:
         stage: First stage at which a row has a value; before it floats are NaN, the rest 0.
         per_finger: Whether NaN stands for a finger that does not touch.
         sample: Whether it is an image, stored in one chunk per row.
+        since: First version of the schema that has it.
     """
 
     name: str
@@ -77,6 +80,7 @@ class Field:
     stage: Stage = Stage.PLACED
     per_finger: bool = False
     sample: bool = False
+    since: int = 3
 
     @property
     def axes(self) -> tuple[int | str, ...]:
@@ -97,10 +101,10 @@ class Field:
         return np.full((count, *self.row_shape(sizes)), fill, dtype=self.dtype)
 
 
-def is_this_schema(version: object) -> bool:
-    """Return whether an attribute or key `schema_version` is that of this schema."""
+def is_readable(version: object) -> bool:
+    """Return whether an attribute or key `schema_version` is that of a schema that can be read."""
     whole = isinstance(version, int | np.integer) and not isinstance(version, bool)
-    return whole and version == SCHEMA_VERSION
+    return whole and version in READABLE
 
 
 def refuse_other_schema(path: Path, version: object) -> None:
@@ -113,9 +117,10 @@ def refuse_other_schema(path: Path, version: object) -> None:
     Raises:
         DataError: If the version is another.
     """
-    if not is_this_schema(version):
+    if not is_readable(version):
         got = "none" if version is None else printable(str(version)[:40])
-        raise DataError(f"{path}: schema must be {SCHEMA_VERSION}, got {got}; {OTHER_SCHEMA}")
+        must = " or ".join(map(str, READABLE))
+        raise DataError(f"{path}: schema must be {must}, got {got}; {OTHER_SCHEMA}")
 
 
 def sizes(*, fingers: int, joints: int, image: int) -> dict[str, int]:
@@ -126,6 +131,11 @@ def sizes(*, fingers: int, joints: int, image: int) -> dict[str, int]:
 def _since(stage: Stage, *fields: Field) -> tuple[Field, ...]:
     """Return fields that have a value from a stage on."""
     return tuple(replace(field, stage=stage) for field in fields)
+
+
+def _new(*fields: Field) -> tuple[Field, ...]:
+    """Return fields that the schema has since version 4."""
+    return tuple(replace(field, since=4) for field in fields)
 
 
 def _contacts(prefix: str, when: str) -> tuple[Field, ...]:
@@ -173,6 +183,24 @@ _CLOSED = tuple(field for field in _contacts("closed", "when closing ended")
                 if field.name != "closed_object_on_table")
 _LIFTED = _contacts("lifted", "after the lift")
 
+# Where a palm pose comes from; an attempt's identity is object, candidate, stand-off and child.
+_LINEAGE = _new(
+    Field("resting", "", "uint8", "-", "-", "index of the object's resting pose"),
+    Field("source", "", "uint8", "-", "-",
+          "sampler of the palm pose: 0 rotations, 1 normals, 2 refine"),
+    Field("generation", "", "uint8", "-", "-",
+          "0: first round; else the number of refined palm poses up to this one"),
+    Field("child", "", "int32", "-", "-",
+          "number in the family of a first-round attempt, which is 0; children of n have the "
+          "numbers n c + 1 to n c + c, with c = refine.children"),
+    Field("parent", "", "int32", "-", "-",
+          "number of the parent in the family, of the same candidate and stand-off"),
+    Field("log_density", "", "float64", "-", "-",
+          "logarithm of the density of the palm pose's draw: among the different rotations; per "
+          "m^2 of surface and rad of roll; per m^3 rad^3 about the parent's"),
+)
+#: The lineage fields by the names of `simulation.candidates.Attempt`.
+LINEAGE_NAMES = tuple(field.name for field in _LINEAGE)
 # Fields of several tables.
 _SPREAD = Field("spread", "", "float64", "rad", "-", "angle of the spread joints")
 _X_TO = Field("X_TO", "12", "float64", "m, -", "T", "resting pose of the object")
@@ -232,6 +260,12 @@ DATA_FIELDS: tuple[Field, ...] = (
           "the same where the fingertips hold the object after the lift, on the resting object"),
     Field("trial_id", "", "int64", "-", "-", "row of trials.hdf5"),
     *(replace(field, name=f"grasp_props/{field.name}") for field in _WORDS),
+    *(replace(field, name=f"grasp_props/{field.name}",
+              dtype="float32" if field.dtype == "float64" else field.dtype)
+      for field in _LINEAGE),
+    *_new(Field("grasp_props/weight", "", "float32", "-", "-",
+                "1 / number of samples, itself included, of the same object and resting pose whose "
+                "palm is within 10 mm and 15 deg")),
     *(replace(field, name=f"grasp_props/{field.name}", dtype="float32")
       for field in (*_SLIP, *_RELEASED)),
     Field("grasp_props/other_links_held", "", "uint8", "-", "-",
@@ -289,12 +323,14 @@ TRIAL_FIELDS: tuple[Field, ...] = (
     Field("trial_id", "", "int64", "-", "-", "the row's own number"),
     Field("object", "", "int32", "-", "-", "row of /objects"),
     Field("candidate", "", "int32", "-", "-",
-          "index of the palm pose among its object's candidates"),
+          "index of the palm pose among its object's candidates; of a family's first attempt"),
     Field("standoff_index", "", "uint8", "-", "-",
           "index into the configuration's candidates.standoffs"),
+    *_LINEAGE,
     _SPREAD,
     Field("seed", "", "uint64", "-", "-",
-          "state of the candidate's random stream, from which the spread was drawn"),
+          "state of the candidate's random stream, from which the spread was drawn, or of the "
+          "refined palm pose's"),
     _verdict([outcome for outcome in Outcome if not outcome.verification_only]),
     _X_TO,
     Field("X_OG", "12", "float64", "m, -", "O",
@@ -355,7 +391,7 @@ SUCCESS_FIELDS: tuple[Field, ...] = (
     Field("removal", "", "uint8", "-", "-",
           "why it is no sample: 0 kept, 1 other_links, 2 slid, 3 turned, 4 not_seen, "
           "5 out_of_view, 6 bisects_table, 7 flat_depth, 8 off_surface, 9 normal_off, 10 outlier, "
-          "11 rejected, 12 suspicious, 13 missing_finger"),
+          "11 rejected, 12 suspicious, 13 missing_finger, 14 refined_test"),
     *CERTIFICATE_FIELDS,
 )
 

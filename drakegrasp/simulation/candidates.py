@@ -1,9 +1,11 @@
 """Stage "sample": palm poses around an object, and the attempts that follow from them.
 
-In: the object's box and mesh, and its resting pose. Out: up to `candidates.max` distinct palm poses
-X_OG and, for each, the distance along its palm ray to the object. The paper's method (`rotations`)
-multiplies a first palm pose with global and local rotations; `normals` is the baseline of its
-Figure 2.
+In: the object's box and mesh, and its resting poses. Out: up to `candidates.max` palm poses X_OG
+and, for each, its resting pose and the distance along its palm ray to the object. Each sampler of
+`SAMPLERS` gives a sequence of poses at a resting pose; resting poses and samplers take turns. The
+first n poses are the same for every `candidates.max` of at least n, so a dataset can grow. The
+paper's method (`rotations`) multiplies a first palm pose with global and local rotations; `normals`
+is the baseline of its Figure 2. `children` draws poses about that of a grasp that holds.
 
 Nothing here needs Drake. Poses are the same bits on every machine: sums, products and square roots
 have a stated order (`arithmetic`), limits are inclusive by more than rounding, poses are compared
@@ -12,15 +14,20 @@ as rounded integers, and random numbers come from `seeding`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 import trimesh
 
 from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos_deg
-from drakegrasp.config import CandidateConfig
+from drakegrasp.config import CandidateConfig, RefineConfig
+from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.mesh.rays import first_hits
 from drakegrasp.mesh.surfaces import on_faces
 from drakegrasp.objects.model import ObjectModel
@@ -38,6 +45,20 @@ EDGE = 1e-6
 #: Combinations whose poses are computed together: bounds the memory. With `jitter_deg` it also
 #: decides which word of the stream jitters which angle, so another number is another draw.
 CHUNK = 131_072
+#: Surface points that `normals` draws together; another number is another draw.
+BLOCK = 1000
+#: Log-densities are multiples of this: the last bits of a logarithm depend on the machine.
+_DENSITY_GRID = 2.0**-32
+#: Last numbers of the places of streams: of a sampler at a resting pose, and of a child.
+_SAMPLER, _CHILD = 2, 1
+
+
+class Source(IntEnum):
+    """The sampler of a palm pose. Values are stored in files: never renumber them."""
+
+    ROTATIONS = 0
+    NORMALS = 1
+    REFINE = 2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,13 +69,19 @@ class Candidates:
         X_OG: (n, 4, 4), the drawn poses, in drawing order.
         distance: (n,), from the palm's origin along +Gz to the object's surface [m]; NaN
             where the palm ray misses the object.
-        combinations: Number of combinations of rotations (or surface samples).
+        resting: (n,), index of the resting pose of each.
+        source: (n,), `Source` of each.
+        log_density: (n,), logarithm of the density of each draw, see the schema.
+        combinations: Number of combinations of rotations, or of surface points drawn.
         valid: Number of those above the table whose palm ray meets the bounding box.
         distinct: Number of different poses among the valid ones.
     """
 
     X_OG: Array
     distance: Array
+    resting: npt.NDArray[np.int64]
+    source: npt.NDArray[np.int64]
+    log_density: Array
     combinations: int
     valid: int
     distinct: int
@@ -85,19 +112,111 @@ class Pregrasp:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Attempt(Pregrasp):
-    """One candidate at one stand-off, as a dataset counts it.
+    """One palm pose to try, as a dataset counts it.
+
+    An attempt of the first round is a candidate at a stand-off. It is number 0 of its family; the
+    children of number n have the numbers n c + 1 to n c + c, where c is `refine.children`.
 
     Attributes:
         candidate: Index of the candidate of its object.
         standoff_index: Index into `candidates.standoffs`.
-        standoff: Distance of the palm from the surface point along -Gz [m].
+        standoff: Distance of the palm from the surface point along -Gz [m]; of the family's first
+            attempt.
         seed: Seed from which `spread` was drawn.
+        resting: Index of the object's resting pose.
+        source: The sampler.
+        log_density: Logarithm of the density of the draw, see the schema.
+        child, parent: Its number in its family, and that of its parent; 0 for the first.
+        generation: Number of parents before it.
     """
 
     candidate: int
     standoff_index: int
     standoff: float
     seed: int
+    resting: int = 0
+    source: Source = Source.ROTATIONS
+    log_density: float = np.nan
+    child: int = 0
+    parent: int = 0
+    generation: int = 0
+
+
+class Sampler(Protocol):
+    """A sequence of palm poses of an object at a resting pose, the same however many are taken.
+
+    Attributes:
+        log_density: Of the draw of each pose, see the schema.
+    """
+
+    log_density: float
+
+    @property
+    def limit(self) -> int | None:
+        """Number of poses that there are; None: any number."""
+
+    def poses(self, count: int) -> Array:
+        """Return the first poses (count, 4, 4)."""
+
+    def counts(self, count: int) -> tuple[int, int, int]:
+        """Return how many combinations, valid and distinct ones the first poses are drawn from."""
+
+
+class Rotations:
+    """The distinct poses of the paper's rotations in random order, see `rotation_candidates`."""
+
+    def __init__(
+        self, model: ObjectModel, X_TO: Array, config: CandidateConfig, stream: Stream
+    ) -> None:
+        """Enumerate and shuffle the poses."""
+        poses, combinations, valid = rotation_candidates(model.half_extents, X_TO, config, stream)
+        self._poses = poses[stream.permutation(len(poses))]
+        self._counts = combinations, valid, len(poses)
+        self.limit: int | None = len(poses)
+        self.log_density = _rounded(-math.log(max(len(poses), 1)))
+
+    def poses(self, count: int) -> Array:
+        """Return the first poses (count, 4, 4)."""
+        return self._poses[:count]
+
+    def counts(self, count: int) -> tuple[int, int, int]:
+        """Return the numbers of all combinations, valid and distinct ones."""
+        return self._counts
+
+
+class Normals:
+    """Poses that look at random surface points, see `normal_candidates`, above the table."""
+
+    def __init__(
+        self, model: ObjectModel, X_TO: Array, config: CandidateConfig, stream: Stream
+    ) -> None:
+        """Draw nothing yet; `config` has no say."""
+        self._model, self._X_TO, self._stream = model, X_TO, stream
+        self._poses, self._numbers, self._drawn = np.zeros((0, 4, 4)), np.zeros(0, dtype=int), 0
+        self.limit: int | None = None
+        self.log_density = _rounded(-math.log(model.visual.area * 2.0 * math.pi))
+
+    def poses(self, count: int) -> Array:
+        """Return the first poses (count, 4, 4)."""
+        # A solid has faces that look up, and the palms above them are above the table.
+        while len(self._poses) < count:
+            poses = normal_candidates(self._model, BLOCK, self._stream)
+            above = np.flatnonzero(above_table(poses[:, :3, 3], self._X_TO))
+            self._poses = np.concatenate([self._poses, poses[above]])
+            self._numbers = np.concatenate([self._numbers, self._drawn + above])
+            self._drawn += BLOCK
+        return self._poses[:count]
+
+    def counts(self, count: int) -> tuple[int, int, int]:
+        """Return the number of surface points up to the last pose, and twice that of the poses."""
+        return int(self._numbers[count - 1]) + 1 if count else 0, count, count
+
+
+#: The samplers by the names that a configuration has for them.
+SAMPLERS: Mapping[str, Callable[[ObjectModel, Array, CandidateConfig, Stream], Sampler]] = {
+    "rotations": Rotations,
+    "normals": Normals,
+}
 
 
 def sample_candidates(
@@ -107,28 +226,69 @@ def sample_candidates(
 
     Args:
         model: The object.
-        X_TO: Its resting pose in the table-top frame, (4, 4).
-        config: Method, rotations and number.
+        X_TO: Its resting poses in the table-top frame, (r, 4, 4), or one (4, 4).
+        config: Samplers, rotations and number.
         seed: Of the dataset.
     """
-    stream = Stream(seed, object_key(model.name))
-    X_TO = np.asarray(X_TO, dtype=float)
-    if config.method == "rotations":
-        poses, combinations, valid = rotation_candidates(model.half_extents, X_TO, config, stream)
-        distinct = len(poses)
-        poses = poses[stream.permutation(distinct)[: config.max]]
-    else:
-        poses = normal_candidates(model, config.max, stream)
-        combinations = len(poses)
-        poses = poses[above_table(poses[:, :3, 3], X_TO)]
-        valid = distinct = len(poses)
+    # A sampler for each method at each resting pose; they take turns.
+    resting = np.asarray(X_TO, dtype=float).reshape(-1, 4, 4)
+    places = [(k, method) for method in config.methods for k in range(len(resting))]
+    samplers = {
+        (k, method): SAMPLERS[method](
+            model, resting[k], config, _sampler_stream(model.name, seed, k, method)
+        )
+        for k, method in dict.fromkeys(places)
+    }
+    turns = _turns(places, {place: s.limit for place, s in samplers.items()}, config.max)
+
+    # What each of them gives, in the order of the turns.
+    used = Counter(place for place, _ in turns)
+    drawn = {place: sampler.poses(used[place]) for place, sampler in samplers.items()}
+    poses = np.array([drawn[place][i] for place, i in turns]).reshape(-1, 4, 4)
+    counts = [sampler.counts(used[place]) for place, sampler in samplers.items()]
+    combinations, valid, distinct = (sum(numbers) for numbers in zip(*counts, strict=True))
     return Candidates(
         X_OG=poses,
         distance=palm_ray_distance(model.collision, poses),
+        resting=np.array([k for (k, _), _ in turns], dtype=np.int64),
+        source=np.array([Source[method.upper()] for (_, method), _ in turns], dtype=np.int64),
+        log_density=np.array([samplers[place].log_density for place, _ in turns], dtype=float),
         combinations=combinations,
         valid=valid,
         distinct=distinct,
     )
+
+
+def _sampler_stream(name: str, seed: int, resting: int, method: str) -> Stream:
+    """Return the random numbers of a sampler at a resting pose of an object."""
+    # The paper's draw has the object's own stream.
+    if (resting, method) == (0, "rotations"):
+        return Stream(seed, object_key(name))
+    return Stream(seed, object_key(name), resting, Source[method.upper()], _SAMPLER)
+
+
+def _turns(
+    places: Sequence[tuple[int, str]], limits: Mapping[tuple[int, str], int | None], count: int
+) -> list[tuple[tuple[int, str], int]]:
+    """Return whose turn each pose is, and its number there, until none has more.
+
+    Args:
+        places: Who takes turns; one that is named twice has two.
+        limits: How many poses each has; None: any number.
+        count: Number of turns.
+    """
+    turns: list[tuple[tuple[int, str], int]] = []
+    taken = dict.fromkeys(places, 0)
+    while len(turns) < count:
+        begun = len(turns)
+        for place in places:
+            limit = limits[place]
+            if len(turns) < count and (limit is None or taken[place] < limit):
+                turns.append((place, taken[place]))
+                taken[place] += 1
+        if len(turns) == begun:
+            break
+    return turns
 
 
 def rotation_candidates(
@@ -181,11 +341,12 @@ def normal_candidates(model: ObjectModel, count: int, stream: Stream) -> Array:
     """Return poses (n, 4, 4) that look at random surface points against their normals.
 
     The points are uniform over the area, the roll about the normal is uniform, and the palm is two
-    half diagonals of the box away, outside of the object.
+    half diagonals of the box away, outside of the object. Each takes four numbers of the stream.
     """
     # Random points of the surface, with the outward normals of their faces.
     vertices, faces = model.visual_vertices, model.visual_faces.astype(np.int64)
-    points, picked = on_faces(vertices, faces, stream.uniform(3 * count).reshape(count, 3))
+    numbers = stream.uniform(4 * count).reshape(count, 4)
+    points, picked = on_faces(vertices, faces, numbers[:, :3])
     a, b, c = np.moveaxis(vertices[faces[picked]], 1, 0)
     outward = np.cross(b - a, c - a)
     z = -outward / norm(outward)[:, None]
@@ -194,7 +355,7 @@ def normal_candidates(model: ObjectModel, count: int, stream: Stream) -> Array:
     helper = np.where(np.abs(z[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     x = np.cross(helper, z)
     x /= norm(x)[:, None]
-    sine, cosine = sin_cos_deg(360.0 * stream.uniform(count)[:, None])
+    sine, cosine = sin_cos_deg(360.0 * numbers[:, 3:])
     x = cosine * x + sine * np.cross(z, x)
     R = np.stack([x, np.cross(z, x), z], axis=2)
     return _poses(R, points - 2.0 * z * norm(model.half_extents))
@@ -270,7 +431,79 @@ def make_attempts(
                 X_OG=X_OG,
                 ray_hits=bool(np.isfinite(distance)),
                 seed=stream.key,
+                resting=int(candidates.resting[i]),
+                source=Source(candidates.source[i]),
+                log_density=float(candidates.log_density[i]),
             )
+
+
+def children(parent: Attempt, config: RefineConfig, *, name: str, seed: int) -> list[Attempt]:
+    """Return the attempts about the palm pose of one that holds, none in the last generation.
+
+    Args:
+        parent: The attempt.
+        config: How many, and how far away.
+        name: The object's name.
+        seed: Of the dataset.
+    """
+    if parent.generation >= config.generations:
+        return []
+    first = parent.child * config.children + 1
+    return [
+        _child(parent, number, config, name=name, seed=seed)
+        for number in range(first, first + config.children)
+    ]
+
+
+def family_member(
+    first: Attempt, child: int, config: RefineConfig, *, name: str, seed: int
+) -> Attempt:
+    """Return an attempt by its number in the family of a first-round attempt, see `children`."""
+    # From the first through the numbers of its ancestors.
+    if child == 0:
+        return first
+    parent = family_member(first, (child - 1) // config.children, config, name=name, seed=seed)
+    return _child(parent, child, config, name=name, seed=seed)
+
+
+def _child(parent: Attempt, number: int, config: RefineConfig, *, name: str, seed: int) -> Attempt:
+    place = parent.candidate, parent.standoff_index, number
+    stream = Stream(seed, object_key(name), *place, _CHILD)
+    numbers = stream.normal(6)
+    X_GH = palm_motion(numbers, config.shift, np.deg2rad(config.turn_deg))
+
+    # The density of six normal numbers, for three lengths [m] and three angles [rad].
+    scale = config.shift * math.radians(config.turn_deg)
+    density = -0.5 * float(dot(numbers, numbers)) - 3.0 * math.log(2.0 * math.pi * scale)
+    return replace(
+        parent,
+        X_OG=multiply(parent.X_OG, X_GH),
+        ray_hits=True,
+        seed=stream.key,
+        source=Source.REFINE,
+        log_density=_rounded(density),
+        child=number,
+        parent=parent.child,
+        generation=parent.generation + 1,
+    )
+
+
+def palm_motion(numbers: Array, shift: float, turn: float) -> Array:
+    """Return a random pose (4, 4) of a palm in its frame before.
+
+    Args:
+        numbers: (6,), normal numbers: along the axes, then about them.
+        shift: Standard deviation along each axis [m].
+        turn: Standard deviation of each component of the rotation vector [rad].
+    """
+    vector = turn * numbers[3:]
+    angle = float(norm(vector))
+    axis = vector / angle if angle > 0.0 else np.array([0.0, 0.0, 1.0])
+    return make_pose(rotation_about(axis, angle), shift * numbers[:3])
+
+
+def _rounded(log_density: float) -> float:
+    return round(log_density / _DENSITY_GRID) * _DENSITY_GRID
 
 
 def _rotation_chunks(config: CandidateConfig, stream: Stream) -> Iterator[tuple[Array, Array]]:

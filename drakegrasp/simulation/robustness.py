@@ -13,14 +13,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drakegrasp.arithmetic import Array, multiply, norm
+from drakegrasp.arithmetic import Array, multiply
 from drakegrasp.config import CertifyConfig, Config
-from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.seeding import Stream
-from drakegrasp.simulation.candidates import Attempt
+from drakegrasp.simulation.candidates import Attempt, palm_motion
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.randomization.conditions import Materials, usual_conditions
 from drakegrasp.simulation.screen import Prediction, predict
@@ -115,7 +114,8 @@ def _noisy_attempts(stream: Stream, attempt: Attempt, rules: CertifyConfig) -> I
     known = _materials(attempt)
     for _ in range(rules.repeats):
         # The order of the draws is part of the seed's meaning: palm, friction, mass.
-        noisy = replace(attempt, X_OG=multiply(attempt.X_OG, _palm_noise(stream, rules)))
+        X_GH = palm_motion(stream.normal(6), rules.palm_noise, np.deg2rad(rules.palm_noise_deg))
+        noisy = replace(attempt, X_OG=multiply(attempt.X_OG, X_GH))
         friction = known.friction_hand * _noise_factor(stream, rules.friction_noise)
         mass = known.mass * _noise_factor(stream, rules.mass_noise)
         yield _with_materials(noisy, friction_hand=friction, mass=mass)
@@ -136,15 +136,6 @@ def _with_materials(attempt: Attempt, **changes: float) -> Attempt:
 def _noise_factor(stream: Stream, deviation: float) -> float:
     """Return exp(deviation times a normal number), a multiple of `FACTOR_GRID`."""
     return round(math.exp(deviation * stream.normal(1)[0]) / FACTOR_GRID) * FACTOR_GRID
-
-
-def _palm_noise(stream: Stream, rules: CertifyConfig) -> Array:
-    """Return the random pose (4, 4) of the palm in its nominal frame."""
-    shift = rules.palm_noise * stream.normal(3)
-    turn = np.deg2rad(rules.palm_noise_deg) * stream.normal(3)
-    angle = float(norm(turn))
-    axis = turn / angle if angle > 0.0 else np.array([0.0, 0.0, 1.0])
-    return make_pose(rotation_about(axis, angle), shift)
 
 
 class _Repeater:

@@ -6,16 +6,17 @@ In: a prepared object. Out: its resting pose X_TO, moved in x and y so that p_TO
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
-from drakegrasp.arithmetic import multiply, norm
+from drakegrasp.arithmetic import dot, multiply, norm
 from drakegrasp.config import Config
 from drakegrasp.errors import MeshError, first_line
 from drakegrasp.frames import X_WT, Array, invert_pose, make_pose, transform_points
 from drakegrasp.objects.model import ObjectModel
+from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.contacts import read_contacts
 from drakegrasp.simulation.scene import Scene, advance, reset_object
@@ -34,6 +35,10 @@ MAX_SINK, MAX_SETTINGS = 3e-4, 4
 NOTED_TILT = np.pi / 36.0
 #: Share of the longest time after which an object that still rolls is stopped; see `settle`.
 STOP_FRACTION = 0.6
+#: Resting poses whose upward directions in {O} differ by less are one [rad].
+SAME_UP = np.pi / 18.0
+#: Last number of the place of the stream of a drop's orientation.
+_PLACE = 3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,6 +51,7 @@ class Resting:
         table_force: Upward force of the table at rest [N].
         sink: Depth of its lowest point in the table [m].
         stopped: Whether it was stopped because it was still rolling.
+        probability: Share of the drops that ended so.
     """
 
     X_TO: Array
@@ -53,6 +59,7 @@ class Resting:
     table_force: float
     sink: float
     stopped: bool
+    probability: float = 1.0
 
     @property
     def tilt(self) -> float:
@@ -73,8 +80,40 @@ class Resting:
         return tuple(notes)
 
 
-def settle(model: ObjectModel, config: Config) -> Resting:
-    """Return the resting pose of an object dropped with {O} aligned to {W}.
+def find_resting_poses(model: ObjectModel, config: Config) -> list[Resting]:
+    """Return the different resting poses of an object; the first is that of `settle`.
+
+    Of `objects.resting_poses` drops the first has {O} aligned to {W}, and the others have random
+    orientations. A drop that does not come to rest, or ends like one before, adds no pose.
+
+    Raises:
+        MeshError: As `settle`, of the first drop.
+    """
+    found, counts = [settle(model, config)], [1]
+    for drop in range(1, config.objects.resting_poses):
+        stream = Stream(config.seed, object_key(model.name), drop, _PLACE)
+        # The direction of four normal numbers is a uniform quaternion (Muller 1959).
+        try:
+            resting = settle(model, config, _rotation(stream.normal(4)))
+        except MeshError:
+            continue
+
+        # The third row of R_TO is the upward direction in {O}.
+        cosines = [float(dot(resting.X_TO[2, :3], other.X_TO[2, :3])) for other in found]
+        nearest = int(np.argmax(cosines))
+        if cosines[nearest] > np.cos(SAME_UP):
+            counts[nearest] += 1
+        else:
+            found.append(resting)
+            counts.append(1)
+    return [
+        replace(resting, probability=count / sum(counts))
+        for resting, count in zip(found, counts, strict=True)
+    ]
+
+
+def settle(model: ObjectModel, config: Config, R_TO: Array | None = None) -> Resting:
+    """Return the resting pose of an object that is dropped.
 
     {O} begins at `settle.drop_height` above the table (Veres et al.), the lowest point of a taller
     object just on it.
@@ -83,26 +122,31 @@ def settle(model: ObjectModel, config: Config) -> Resting:
     `STOP_FRACTION` of `settle.max_time` each check therefore sets the velocity of an object that
     still moves to zero; the released code froze it.
 
+    Args:
+        model: The object.
+        config: How it settles.
+        R_TO: Its orientation when it is dropped, (3, 3); None: {O} is aligned to {T}.
+
     Raises:
         MeshError: If the object leaves the table, never comes to rest, or Drake cannot
             simulate it.
     """
     try:
-        return _settle(model, config)
+        return _settle(model, config, np.eye(3) if R_TO is None else R_TO)
     # A failed assertion within Drake arrives as SystemExit.
     except (RuntimeError, SystemExit) as error:
         reason = first_line(error)
         raise MeshError(f"{model.name}: Drake failed while dropping it: {reason}") from None
 
 
-def _settle(model: ObjectModel, config: Config) -> Resting:
+def _settle(model: ObjectModel, config: Config, R_TO: Array) -> Resting:
     # Free fall does not turn it, so the simulation begins where it touches the table. From above,
     # the first step in contact would find it millimetres deep, and throw it up and over.
     rules = config.settle
     scene = build_scene(model, config.physics.model_copy(update={"time_step": rules.time_step}))
-    lowest = float(model.collision_vertices[:, 2].min())
+    lowest = float(dot(model.collision_vertices, R_TO[2]).min())
     fall = max(rules.drop_height + lowest, 0.0)
-    reset_object(scene, multiply(X_WT, make_pose(np.eye(3), [0.0, 0.0, -lowest])))
+    reset_object(scene, multiply(X_WT, make_pose(R_TO, [0.0, 0.0, -lowest])))
     # The object is the only body that moves: angular, then linear velocity.
     speed = float(np.sqrt(2.0 * GRAVITY * fall))
     scene.plant.SetVelocities(scene.context, [0.0, 0.0, 0.0, 0.0, 0.0, -speed])
@@ -187,17 +231,21 @@ def snapped(X_TO: Array) -> Array:
     """
     # A quaternion and its negative give the same bits below: each term has two of its entries.
     wxyz = np.rint(RotationMatrix(X_TO[:3, :3]).ToQuaternion().wxyz() / POSE_GRID)
-    w, x, y, z = wxyz / norm(wxyz)
+    height = np.rint(X_TO[2, 3] / POSE_GRID) * POSE_GRID
+    return make_pose(_rotation(wxyz), [0.0, 0.0, height])
 
+
+def _rotation(wxyz: Array) -> Array:
+    """Return the rotation (3, 3) of a quaternion (4,) of any length."""
     # Written out, since the bits of SciPy's or Drake's conversion may depend on the CPU.
-    R_TO = np.array(
+    w, x, y, z = wxyz / norm(wxyz)
+    return np.array(
         [
             [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
             [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
             [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
         ]
     )
-    return make_pose(R_TO, [0.0, 0.0, np.rint(X_TO[2, 3] / POSE_GRID) * POSE_GRID])
 
 
 def _speeds(scene: Scene) -> tuple[float, float]:

@@ -27,9 +27,14 @@ from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.builtin.catalog import export_builtin
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.seeding import Stream
-from drakegrasp.simulation.candidates import make_attempts, normal_candidates, rotation_candidates
+from drakegrasp.simulation.candidates import (
+    make_attempts,
+    normal_candidates,
+    palm_motion,
+    rotation_candidates,
+)
 from drakegrasp.simulation.randomization.draws import draw_conditions
-from drakegrasp.simulation.robustness import _noise_factor, _palm_noise
+from drakegrasp.simulation.robustness import _noise_factor
 from drakegrasp.simulation.screen import predict
 from drakegrasp.vision.depth_sensor import DepthSensor, spoil_depth
 
@@ -124,7 +129,10 @@ def main(meshes: Path | None) -> dict[str, object]:
     config = load_config().certify
     stream = Stream(7, 1)
     found["certificate noise"] = digest(
-        *(_palm_noise(stream, config) for _ in range(100)),
+        *(
+            palm_motion(stream.normal(6), config.palm_noise, np.deg2rad(config.palm_noise_deg))
+            for _ in range(100)
+        ),
         np.array([_noise_factor(stream, 0.1) for _ in range(100)]),
     )
     clean = np.full((64, 64), 0.3, dtype=np.float32)

@@ -23,6 +23,7 @@ from drakegrasp.dataset.hdf5 import COLUMN_CHUNK, AnyArray, packed_chunk, read_c
 from drakegrasp.dataset.paths import model_path
 from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS, SPLITS, TRIAL_FIELDS
 from drakegrasp.dataset.shards import ShardHeader, open_shard, trial_columns
+from drakegrasp.frames import Array
 from drakegrasp.objects.model import ObjectModel, load_object
 from drakegrasp.runtime.files import disk_full_named, temporary_name
 
@@ -59,6 +60,7 @@ class PackTask:
         start, stop: The range, ids of trials; the start is that of a chunk.
         slices: The shards that have rows in it, in order.
         ids: Ids of the trials in it that are samples, in rising order, by split.
+        weights: Their weights.
         sizes: Lengths of the letters in the shapes of the fields.
     """
 
@@ -68,6 +70,7 @@ class PackTask:
     stop: int
     slices: tuple[ShardSlice, ...]
     ids: Mapping[str, npt.NDArray[np.int64]]
+    weights: Mapping[str, Array]
     sizes: Mapping[str, int]
 
 
@@ -242,7 +245,8 @@ def _add_samples(
     poses = {name: read_column(looks, name) for name in names}
     look_of = {row: k for k, row in enumerate(read_column(looks, "row").tolist())}
     for split, (start, stop) in bounds.items():
-        for trial_id in task.ids[split][start:stop].tolist():
+        ids, weights = (values[split][start:stop].tolist() for values in (task.ids, task.weights))
+        for trial_id, weight in zip(ids, weights, strict=True):
             row = trial_id - piece.first
             k = look_of[row]
             trial = {name: values[row] for name, values in trials.items()}
@@ -250,7 +254,8 @@ def _add_samples(
             samples[split].objects.append(piece.object)
             for camera in CAMERAS:
                 values = sample_values(model, trial, look, camera)
-                samples[split].add_record(camera, {**values, "trial_id": trial_id})
+                values |= {"trial_id": trial_id, "grasp_props/weight": weight}
+                samples[split].add_record(camera, values)
                 for name, own in IMAGES.items():
                     skipped, chunk = looks[f"{own}_{camera}"].id.read_direct_chunk(
                         (k, *_ORIGIN[name])

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.hdf5 import COLUMN_CHUNK, AnyArray, create_field
-from drakegrasp.dataset.schema import CAMERAS, CONDITION_FIELDS, DATA_FIELDS
+from drakegrasp.dataset.schema import CAMERAS, CONDITION_FIELDS, DATA_FIELDS, LINEAGE_NAMES
 from drakegrasp.frames import (
     X_WT,
     Array,
@@ -101,7 +101,7 @@ class SampleRows:
 def sample_values(
     model: ObjectModel, trial: Mapping[str, Any], look: Mapping[str, Any], camera: str
 ) -> dict[str, Any]:
-    """Return the numbers of a sample by the names of DATA_FIELDS, without its trial's id.
+    """Return the numbers of a sample that follow from its trial, by the names of DATA_FIELDS.
 
     Args:
         model: The object.
@@ -153,7 +153,7 @@ def _grasp_props(X_CO: Array, trial: Mapping[str, Any]) -> dict[str, Any]:
     """
     names = ("precision", "stable", "slip", "turn", "slip_released", "turn_released")
     return {
-        **{name: trial[name] for name in names},
+        **{name: trial[name] for name in (*names, *LINEAGE_NAMES)},
         "other_links_held": trial["lifted_other_links"],
         "X_CG": pack_pose(multiply(X_CO, unpack_pose(trial["X_OG"]))),
         "X_CG_held": pack_pose(multiply(X_CO, unpack_pose(trial["X_OG_lifted"]))),

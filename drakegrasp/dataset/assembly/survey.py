@@ -30,8 +30,8 @@ from drakegrasp.vision.camera import intrinsics, project
 
 #: Columns of `/trials` from which the filters' numbers follow, besides those of `suspicion`.
 _TRIALS = (
-    *("candidate", "standoff_index", "X_TO", "closed_p_OQ", "lifted_p_OQ", "lifted_nhat_Q_O"),
-    "lifted_touching",
+    *("candidate", "standoff_index", "child", "resting", "X_TO", "X_OG", "closed_p_OQ"),
+    *("lifted_p_OQ", "lifted_nhat_Q_O", "lifted_touching"),
 )
 #: Columns of `/looks`, besides the depths of the otm image.
 _LOOKS = (
@@ -210,6 +210,9 @@ def _successes(file: h5py.File, rows: AnyArray, task: SurveyTask, first: int) ->
     return Successes(
         candidate=trials["candidate"],
         standoff_index=trials["standoff_index"],
+        child=trials["child"],
+        resting=trials["resting"],
+        X_OG=unpack_pose(trials["X_OG"]),
         trial_id=first + rows.astype(np.int64),
         object=np.full(len(rows), task.object, dtype=np.int32),
         grasp_T=np.array(grasps).reshape(-1, length),

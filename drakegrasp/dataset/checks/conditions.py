@@ -43,7 +43,7 @@ def as_drawn(
                 expected[name][rows] = value
             continue
         for row in rows:
-            numbers = int(batch["candidate"][row]), int(batch["standoff_index"][row])
+            numbers = (int(batch[key][row]) for key in ("candidate", "standoff_index", "child"))
             for name, value in draw_conditions(known, config, *numbers).values().items():
                 expected[name][row] = value
 

@@ -19,7 +19,6 @@ from drakegrasp.dataset.schema import (
     CONVENTIONS,
     OTHER_SCHEMA,
     SCHEMA_VERSION,
-    is_this_schema,
 )
 from drakegrasp.errors import first_line
 from drakegrasp.runtime.json_text import parse_json
@@ -44,7 +43,7 @@ def read_config(name: str, file: h5py.File) -> tuple[Config | None, list[Violati
 def version(name: str, file: h5py.File) -> Iterator[Violation]:
     """The file is of this version of the schema."""
     got = file.attrs.get("schema_version", "none")
-    if not is_this_schema(got):
+    if not isinstance(got, int | np.integer) or got != SCHEMA_VERSION:
         what = f"attribute schema_version must be {SCHEMA_VERSION}"
         yield Violation(file=name, what=what, got=f"{got}; {OTHER_SCHEMA}")
 

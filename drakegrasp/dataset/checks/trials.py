@@ -213,10 +213,17 @@ def motion(batch: Batch) -> Iterator[Violation]:
         )
 
 
-def resting_poses(batch: Batch, X_TO: Sequence[Sequence[float]]) -> Iterator[Violation]:
-    """Every attempt starts from its object's resting pose X_TO (12,), given by object."""
-    expected = np.array(X_TO, dtype=float).reshape(-1, 12)[batch["object"].astype(int)]
-    off = np.abs(batch["X_TO"] - expected).max(axis=1)
+def resting_poses(batch: Batch, X_TO: Sequence[Sequence[Sequence[float]]]) -> Iterator[Violation]:
+    """Every attempt starts from one of its object's resting poses X_TO (12,), given by object."""
+    counts = np.array([len(poses) for poses in X_TO])
+    unknown = batch["resting"] >= counts[batch["object"].astype(int)]
+    yield from batch.broken(
+        "resting must be one of its object's resting poses", unknown, batch["resting"]
+    )
+
+    pairs = zip(batch["object"].tolist(), batch["resting"].tolist(), unknown, strict=True)
+    expected = np.array([X_TO[i][0 if bad else k] for i, k, bad in pairs]).reshape(-1, 12)
+    off = np.where(unknown, 0.0, np.abs(batch["X_TO"] - expected).max(axis=1))
     yield from batch.broken(
         "X_TO must be the object's resting pose in manifest.json",
         off > POSITION_TOLERANCE,

@@ -85,7 +85,8 @@ def _judge_trials(rows: Rows, findings: Findings) -> AnyArray:
         trial_rules.poses,
     ]
     if objects is not None and trials.count("objects") == len(objects):
-        last.append(partial(trial_rules.resting_poses, X_TO=[entry.X_TO for entry in objects]))
+        poses = [[pose.X_TO for pose in entry.resting] for entry in objects]
+        last.append(partial(trial_rules.resting_poses, X_TO=poses))
     if dataset is not None and trials.count("objects") == len(dataset.names):
         last.append(
             partial(

@@ -170,7 +170,11 @@ def read_trial(file: h5py.File, trial_id: int) -> dict[str, npt.NDArray[Any]]:
     count = len(trials["outcome"])
     if not 0 <= trial_id < count:
         raise DataError(f"{file.filename}: trial must be 0 to {count - 1}, got {trial_id}")
-    row = {f.name: np.asarray(trials[f.name][trial_id]) for f in TRIAL_FIELDS}
+    # Fields without a value in older files are scalars.
+    row = {
+        f.name: np.asarray(trials[f.name][trial_id] if f.name in trials else f.empty(1, {})[0])
+        for f in TRIAL_FIELDS
+    }
     refuse_other_codes(Path(file.filename), "/trials/outcome", row["outcome"][None], list(Outcome))
     return row
 

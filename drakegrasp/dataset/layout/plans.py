@@ -8,20 +8,24 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from drakegrasp.dataset.layout.attributes import COUNT, NUMBER, TEXT, TRUTH, attribute_mistakes
+from drakegrasp.dataset.layout.attributes import COUNT, TEXT, attribute_mistakes
 from drakegrasp.dataset.layout.opening import refuse_first
 
-#: Shapes of the arrays; None stands for the number of palm poses.
-ARRAYS: dict[str, tuple[int | None, ...]] = {
-    "X_TO": (4, 4),
-    "X_OG": (None, 4, 4),
-    "distance": (None,),
+#: Types and shapes of the arrays: `r` stands for the number of resting poses, `n` of palm poses.
+ARRAYS: dict[str, tuple[str, tuple[int | str, ...]]] = {
+    "X_TO": ("float64", ("r", 4, 4)),
+    "probability": ("float64", ("r",)),
+    "table_force": ("float64", ("r",)),
+    "stopped": ("bool", ("r",)),
+    "X_OG": ("float64", ("n", 4, 4)),
+    "distance": ("float64", ("n",)),
+    "resting": ("int64", ("n",)),
+    "source": ("int64", ("n",)),
+    "log_density": ("float64", ("n",)),
 }
 _ATTRIBUTES = {
     **dict.fromkeys(("model_sha256", "config_hash", "mesh_sha256"), TEXT),
-    **dict.fromkeys(("combinations", "valid", "distinct"), COUNT),
-    "table_force": NUMBER,
-    "stopped": TRUTH,
+    **dict.fromkeys(("combinations", "valid", "distinct", "max"), COUNT),
 }
 
 
@@ -37,16 +41,18 @@ def refuse_other_plan(path: Path, file: h5py.File) -> None:
 
 def _other_arrays(file: h5py.File) -> Iterator[str]:
     """Yield what the arrays of a plan have otherwise than `ARRAYS`, in words."""
-    count: int | None = None
-    for name, expected in ARRAYS.items():
+    lengths: dict[str, int] = {}
+    for name, (dtype, axes) in ARRAYS.items():
         dataset = file.get(name)
         if not isinstance(dataset, h5py.Dataset):
             yield f"/{name}: the dataset must be there, got none"
             continue
-        if dataset.dtype != np.float64:
-            yield f"/{name}: type must be float64, got {dataset.dtype}"
+        if dataset.dtype != np.dtype(dtype):
+            yield f"/{name}: type must be {dtype}, got {dataset.dtype}"
+        # The first array with a letter tells its length.
         found = dataset.shape or ()
-        count = found[0] if count is None and expected[0] is None and found else count
-        shape = tuple(count if length is None else length for length in expected)
+        if isinstance(axes[0], str) and found:
+            lengths.setdefault(axes[0], found[0])
+        shape = tuple(lengths.get(a, 0) if isinstance(a, str) else a for a in axes)
         if found != shape:
             yield f"/{name}: shape must be {shape}, got {dataset.shape}"

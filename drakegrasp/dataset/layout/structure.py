@@ -15,10 +15,12 @@ import numpy as np
 from drakegrasp.dataset.schema import (
     DATA_FIELDS,
     OBJECT_FIELDS,
+    SCHEMA_VERSION,
     SPLITS,
     SUCCESS_FIELDS,
     TRIAL_FIELDS,
     Field,
+    is_readable,
 )
 
 #: Fields of each group of a file, by the group's name.
@@ -63,6 +65,13 @@ def differences(
         thorough: Whether what hinders nobody from reading is a difference, too: more than the
             fields, and other attributes of them.
     """
+    # Older files have fewer fields.
+    version = file.attrs.get("schema_version")
+    version = version if is_readable(version) and not thorough else SCHEMA_VERSION
+    tables = {
+        name: tuple(f for f in fields if f.since <= version) for name, fields in tables.items()
+    }
+
     # The headers of all datasets, each looked at once.
     found = {name: _datasets(file, name, fields) for name, fields in tables.items()}
     lengths = _lengths(tables, found)

@@ -37,12 +37,12 @@ WORDS = {
     "friction_table": slice(17, 18),
     "mass": slice(18, 19),
 }
-#: Last number of the place of an attempt's stream; no other stream's place has four numbers.
+#: Last number of the place of an attempt's stream; streams of other things have other ones.
 _PLACE = 0
 
 
 def draw_conditions(
-    model: ObjectModel, config: Config, candidate: int, standoff_index: int
+    model: ObjectModel, config: Config, candidate: int, standoff_index: int, child: int = 0
 ) -> Conditions:
     """Return the conditions of an attempt; those that nothing is drawn for are the usual ones.
 
@@ -51,13 +51,15 @@ def draw_conditions(
         config: What is drawn, and the seed.
         candidate: Index of the attempt's candidate.
         standoff_index: Index of its stand-off.
+        child: Its number in the family of that first-round attempt.
     """
     usual, rules = usual_conditions(model, config.physics), config.randomize
     if rules == RandomizeConfig():
         return usual
 
     # One number in [0, 1) per word.
-    stream = Stream(config.seed, object_key(model.name), candidate, standoff_index, _PLACE)
+    place = (candidate, standoff_index, child) if child else (candidate, standoff_index)
+    stream = Stream(config.seed, object_key(model.name), *place, _PLACE)
     numbers = stream.uniform(max(words.stop for words in WORDS.values()))
     drawn = {name: numbers[words] for name, words in WORDS.items()}
 

@@ -62,6 +62,8 @@ def compare_samplers(out: Path, other: Path | None = None) -> SamplerComparison:
     """
     # The datasets by method.
     config = read_manifest(out).config
+    if isinstance(config.candidates.method, tuple) or config.objects.resting_poses > 1:
+        raise DataError(f"{out}: must be of one sampler and one resting pose, got several")
     datasets: dict[str, Path] = {config.candidates.method: out}
     if other is not None:
         datasets[_other_method(config)] = other
