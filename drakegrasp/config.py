@@ -19,9 +19,9 @@ import yaml
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
-    PlainValidator,
     ValidationError,
     field_validator,
     model_validator,
@@ -162,7 +162,7 @@ class CandidateConfig(_Section):
     """The palm poses that are tried."""
 
     # Sampler, or a list of samplers that take turns; one that is named twice has two turns.
-    method: Annotated[str | tuple[str, ...], PlainValidator(_samplers)] = "rotations"
+    method: Annotated[str | tuple[str, ...], BeforeValidator(_samplers)] = "rotations"
     max: Count = 10_000  # per object; more are thinned at random, by the seed (paper)
     global_x_deg: Angles = tuple(range(0, 181, 30))  # paper, Table II
     global_y_deg: Angles = tuple(range(0, 360, 30))
@@ -197,12 +197,12 @@ class CandidateConfig(_Section):
 
 
 class RefineConfig(_Section):
-    """More palm poses about those of grasps that may become samples.
+    """More palm poses about those of grasps that are samples by the default filters.
 
     A pose is moved by a normal draw along and about each axis of the palm.
     """
 
-    children: Annotated[int, Field(ge=0, le=100)] = 0  # of each such grasp; 0 switches it off
+    children: Annotated[int, Field(ge=0, le=100)] = 0  # of each sample; 0 switches it off
     generations: Annotated[int, Field(ge=1, le=4)] = 1  # children of children, and so on
     shift: Positive = 0.0075  # [m], standard deviation along each axis of the palm
     turn_deg: Positive = 7.5  # standard deviation about each axis of the palm
@@ -246,8 +246,6 @@ class LiftConfig(_Section):
     max_acceleration: Positive = 1.0  # [m/s^2] of the wrist
     hold_time: NonNegative = 0.3  # [s] at the target before the final verdict
     check_period: Positive = 0.1  # [s] simulated between two checks, and up to a coarse step more
-    stop_slip: Positive = 0.010  # [m], an object that moved more in the hand becomes no sample
-    stop_turn_deg: Positive = 10.0  # nor one that turned more
 
 
 class CertifyConfig(_Section):
@@ -365,7 +363,10 @@ UNIT_CANDIDATES, LARGEST_UNIT = 50, 400
 
 
 #: Keys that change no shard: they act on assembled shards, or only say where to stop.
-POSTPROCESSING_KEYS = ("filters", "split", "max_grasps", "attempt_seconds", "verify")
+POSTPROCESSING_KEYS = (
+    *("filters", "split", "max_grasps", "samples", "samples_per_object"),
+    *("attempt_seconds", "verify"),
+)
 
 
 class Config(_Section):
@@ -389,9 +390,19 @@ class Config(_Section):
     camera: CameraConfig = CameraConfig()
     randomize: RandomizeConfig = RandomizeConfig()
     max_grasps: Count | None = None  # successes per object after which no more are tried
+    # Samples, before the filter of outliers, after which no more is tried: of all objects, which
+    # share them in turns, and of each; an object may have fewer.
+    samples: Count | None = None
+    samples_per_object: Count | None = None
     filters: FilterConfig = FilterConfig()
     split: SplitConfig = SplitConfig()
     verify: VerifyConfig = VerifyConfig()
+
+    @model_validator(mode="after")
+    def _one_end(self) -> Config:
+        if self.max_grasps is not None and (self.samples or self.samples_per_object):
+            raise ValueError("max_grasps must be null with samples or samples_per_object, got both")
+        return self
 
     def to_dict(self) -> dict[str, Any]:
         """Return the resolved values as plain JSON types."""
@@ -418,8 +429,9 @@ class Config(_Section):
     def simulation_hash(self) -> str:
         """Return the hash (16 hex digits) of every value that decides what a shard holds.
 
-        Left out are filters and split, which act later on assembled shards, `max_grasps` and
-        `candidates.max`, which only say where to stop, the wall-clock limit, and `verify`.
+        Left out are filters and split, which act later on assembled shards, `max_grasps`,
+        `samples`, `samples_per_object` and `candidates.max`, which only say where to stop, the
+        wall-clock limit, and `verify`.
         """
         values = self.to_dict()
         for key in POSTPROCESSING_KEYS:

@@ -53,7 +53,8 @@ class Counts:
         self._pool, self._report = pool, report
         standoffs = len(manifest.config.candidates.drawn_standoffs)
         self._total = standoffs * sum(entry.candidates for entry in manifest.objects)
-        self._standoffs, self._done = standoffs, 0
+        self._standoffs, self._done, self._samples = standoffs, 0, 0
+        self._wanted = manifest.config.samples
         self._outcomes: Counter[Outcome] = Counter()
         self._reused_attempts = 0
 
@@ -74,9 +75,15 @@ class Counts:
             self.named.append(name)
 
     def add(
-        self, header: ShardHeader, outcomes: dict[Outcome, int], *, reused: bool = False
+        self,
+        header: ShardHeader,
+        outcomes: dict[Outcome, int],
+        *,
+        reused: bool = False,
+        samples: int | None = None,
     ) -> None:
-        """Count the attempts of a unit that is done, now or before (`reused`)."""
+        """Count the attempts of a unit that is done, now or before (`reused`), and its samples."""
+        self._samples += samples or 0
         self._outcomes.update(outcomes)
         self._attempts[header.object_name] += sum(outcomes.values())
         self._ended[header.object_name] += sum(outcomes.get(outcome, 0) for outcome in ENDED)
@@ -106,6 +113,8 @@ class Counts:
         for outcome in (Outcome.CRASHED, Outcome.TIMEOUT):
             if self._outcomes[outcome]:
                 figures[outcome.label] = self._outcomes[outcome]
+        if self._wanted is not None:
+            figures["samples"] = self._samples
         if self._pool is not None:
             figures["workers"] = self._pool.size
         self._report(self._done, self._total, found=self._reused_attempts, **figures)

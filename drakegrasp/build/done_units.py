@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drakegrasp.build.work_unit import find_outcomes
-from drakegrasp.dataset.assembly.survey import headers_by_object
+from drakegrasp.config import Config
+from drakegrasp.dataset.assembly.survey import count_samples, headers_by_object
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import shards_folder
 from drakegrasp.dataset.shards import ShardHeader
@@ -29,11 +30,13 @@ class FindTask:
         out: Directory of the dataset.
         headers: Its work units, in the order of their candidates.
         wanted: Number of grasps that it needs; None for all attempts.
+        config: Of the dataset, if samples are counted.
     """
 
     out: str
     headers: tuple[ShardHeader, ...]
     wanted: int | None
+    config: Config | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,27 +45,36 @@ class FoundUnits:
 
     Attributes:
         done: The work units whose shard is whole, with their numbers of attempts by outcome.
+        samples: Number of samples of each of them, if they are counted.
         damaged: Path within the dataset of each other shard, and what is wrong with it.
     """
 
     done: tuple[tuple[ShardHeader, dict[Outcome, int]], ...]
+    samples: tuple[int, ...]
     damaged: tuple[tuple[str, str], ...]
 
 
 def find_tasks(out: Path, manifest: Manifest) -> Iterator[FindTask]:
     """Yield the task of each object of which there may be a shard."""
+    config = manifest.config
+    counted = config.samples is not None or config.samples_per_object is not None
     try:
         folders = set(os.listdir(out / "shards"))
     except FileNotFoundError:
         return
     for headers in headers_by_object(manifest):
         if headers and shards_folder(out, headers[0].object_name).name in folders:
-            yield FindTask(out=str(out), headers=headers, wanted=manifest.config.max_grasps)
+            yield FindTask(
+                out=str(out),
+                headers=headers,
+                wanted=manifest.config.max_grasps,
+                config=manifest.config if counted else None,
+            )
 
 
 def find_units(task: FindTask) -> FoundUnits:
     """Look at the shards of an object, up to its last wanted grasp."""
-    out, done, damaged = Path(task.out), [], []
+    out, done, samples, damaged = Path(task.out), [], list[int](), []
     names = set(os.listdir(shards_folder(out, task.headers[0].object_name)))
     grasps, unbroken = 0, True
     for header in task.headers:
@@ -84,5 +96,7 @@ def find_units(task: FindTask) -> FoundUnits:
         if header.journal_path(out).name in names:
             header.journal_path(out).unlink(missing_ok=True)
         done.append((header, outcomes))
+        if task.config is not None:
+            samples.append(count_samples(out, header, task.config))
         grasps += outcomes.get(Outcome.SUCCESS, 0) * unbroken
-    return FoundUnits(done=tuple(done), damaged=tuple(damaged))
+    return FoundUnits(done=tuple(done), samples=tuple(samples), damaged=tuple(damaged))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,9 +18,11 @@ from drakegrasp.build.done_units import find_tasks, find_units
 from drakegrasp.build.events import BuildEvents
 from drakegrasp.build.payload import too_heavy
 from drakegrasp.build.prepare import PrepareTask, prepare_one
+from drakegrasp.build.target import Target, target_of
 from drakegrasp.build.work_unit import WorkUnit, run_unit
 from drakegrasp.config import Config, SplitConfig
 from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
+from drakegrasp.dataset.assembly.survey import headers_by_object
 from drakegrasp.dataset.card.files import write_card
 from drakegrasp.dataset.filters import may_train
 from drakegrasp.dataset.lock import Holder, build_lock
@@ -35,6 +37,7 @@ from drakegrasp.dataset.manifest import (
     write_manifest,
 )
 from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import is_assembled
 from drakegrasp.errors import DataError, DrakegraspError
 from drakegrasp.hand.description import load_hand
@@ -200,7 +203,8 @@ def _build(
 
     # Simulate the work units that are not done; killed workers leave temporary files.
     with progress_bar("simulate", "attempts", show=job.show) as report:
-        counts = _run_all(manifest, job, report)
+        counts, manifest = _run_all(manifest, job, report)
+    write_manifest(manifest, out)
     if job.pool is not None:
         sweep_temporary(out)
 
@@ -339,10 +343,14 @@ def _known_entry(
     return None
 
 
-def _run_all(manifest: Manifest, job: _Job, report: Report) -> Counts:
-    """Run the work units that are not done; return the counts of all."""
-    counts = Counts(manifest, job.pool, report)
-    config, restartable = manifest.config.to_dict(), job.pool is not None
+def _run_all(manifest: Manifest, job: _Job, report: Report) -> tuple[Counts, Manifest]:
+    """Run the work units that are not done.
+
+    Returns:
+        The counts of all, and the manifest with how far a target of samples was met.
+    """
+    every = replace(manifest, objects=tuple(replace(e, tried=None) for e in manifest.objects))
+    counts = Counts(every, job.pool, report)
 
     # The progress bar shows the number of workers as it changes.
     if job.pool is not None:
@@ -354,32 +362,66 @@ def _run_all(manifest: Manifest, job: _Job, report: Report) -> Counts:
         job.pool.on_change = change
 
     # What an earlier build has done is not done again.
-    done = _count_done(manifest, job, counts)
+    by_object = {units[0].object_name: units for units in headers_by_object(every) if units}
+    target = target_of(every.config, by_object)
+    done = _count_done(every, job, counts, target)
+    if target is None:
+        # An object may have enough grasps by the time that there is room for its next unit.
+        headers = (h for h in every.headers() if counts.needs(h) and h not in done)
+        _run_units(headers, every, job, counts, None)
+        return counts, every
 
-    # An object may have enough grasps by the time that there is room for its next unit.
-    def units() -> Iterator[WorkUnit]:
-        for header in manifest.headers():
-            if counts.needs(header) and header.start not in done[header.object_name]:
-                yield WorkUnit(
-                    out=str(job.out), header=header, config=config, restartable=restartable
-                )
+    # Round after round until the target is met.
+    while (plan := target.plan())[2]:
+        _run_units(target.next_units(), every, job, counts, target)
+    taken, _, _ = plan
+    objects = tuple(
+        replace(entry, tried=_tried(by_object.get(entry.name, ())[: taken.get(entry.name, 0)]))
+        for entry in every.objects
+    )
+    return counts, replace(every, objects=objects)
 
-    for summary in job.execute(run_unit, units()):
+
+def _tried(units: Sequence[ShardHeader]) -> int:
+    """Return the number of palm poses in the first units of an object."""
+    return units[-1].stop if units else 0
+
+
+def _run_units(
+    headers: Iterable[ShardHeader],
+    manifest: Manifest,
+    job: _Job,
+    counts: Counts,
+    target: Target | None,
+) -> None:
+    """Run work units, and count what they found."""
+    config, restartable = manifest.config.to_dict(), job.pool is not None
+    units = (
+        WorkUnit(out=str(job.out), header=header, config=config, restartable=restartable)
+        for header in headers
+    )
+    for summary in job.execute(run_unit, units):
         counts.simulated += 1
         counts.errors.update(summary.errors)
-        counts.add(summary.header, summary.outcomes)
+        if target is not None and summary.samples is not None:
+            target.add(summary.header, summary.samples)
+        counts.add(summary.header, summary.outcomes, samples=summary.samples)
         job.events.unit_done(summary)
-    return counts
 
 
-def _count_done(manifest: Manifest, job: _Job, counts: Counts) -> dict[str, set[int]]:
-    """Return where the work units begin that are done, by object; count them, and the damage."""
-    done: dict[str, set[int]] = {entry.name: set() for entry in manifest.objects}
+def _count_done(
+    manifest: Manifest, job: _Job, counts: Counts, target: Target | None
+) -> set[ShardHeader]:
+    """Return the work units that are done; count them, and the damage."""
+    done = set[ShardHeader]()
     for found in job.execute(find_units, find_tasks(job.out, manifest)):
-        for header, outcomes in found.done:
-            done[header.object_name].add(header.start)
+        samples = found.samples or (None,) * len(found.done)
+        for (header, outcomes), number in zip(found.done, samples, strict=True):
+            done.add(header)
             counts.reused += 1
-            counts.add(header, outcomes, reused=True)
+            counts.add(header, outcomes, reused=True, samples=number)
+            if target is not None and number is not None:
+                target.add(header, number)
         for path, reason in found.damaged:
             counts.add_damaged(path)
             job.events.damaged_shard(reason)

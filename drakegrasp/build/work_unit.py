@@ -14,7 +14,7 @@ import threading
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,9 @@ from drakegrasp.build.attempts import (
     try_attempt,
 )
 from drakegrasp.build.columns import empty_looks, fill_look, trial_rows
-from drakegrasp.config import Config, parse_config
+from drakegrasp.config import Config, FilterConfig, parse_config
+from drakegrasp.dataset.assembly.survey import count_samples, successes_of
+from drakegrasp.dataset.filters import Removal, judge_successes
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.prepared_objects import PreparedObject
 from drakegrasp.dataset.shards import Shard, ShardHeader, read_outcomes, write_shard
@@ -54,7 +56,7 @@ from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.robustness import UNKNOWN, Certificate, certify
 from drakegrasp.simulation.screen import Prediction
 from drakegrasp.simulation.trial import TrialRecord
-from drakegrasp.simulation.verdict import may_become_sample
+from drakegrasp.vision.camera import intrinsics
 
 #: An attempt that takes this many times its wall-clock limit hangs: it never checks the clock.
 HANG_FACTOR = 1.5
@@ -62,6 +64,9 @@ HANG_FACTOR = 1.5
 STAGE_SECONDS = 600.0
 #: A certificate hangs when it takes this many times the limit of all its simulations.
 CERTIFY_FACTOR = 2.0
+#: What a parent of refined palm poses passes: all default filters but that of outliers, which looks
+#: at all grasps of an object.
+PARENT_FILTERS = FilterConfig(outlier_sigma=0.0)
 #: What each step of a unit that is no attempt does, for error messages.
 _STEPS = {
     "build": "building its scene",
@@ -100,12 +105,14 @@ class UnitSummary:
         seconds: Wall clock by stage (`build`, `try`, `measure`, `look`, `certify` if there are
             repeats, `write`) [s]; for logs only. Empty if the shard was there already.
         errors: Number of solver errors by their message.
+        samples: Number of samples, see `count_samples`; None if there is no target of them.
     """
 
     header: ShardHeader
     outcomes: dict[Outcome, int]
     seconds: dict[str, float]
     errors: dict[str, int]
+    samples: int | None = None
 
 
 #: Two threads in one scene would mix up their results: only one unit runs at a time.
@@ -137,49 +144,104 @@ def run_unit(unit: WorkUnit) -> UnitSummary:
             summary = _run_experiment(unit, NO_JOURNAL)
         header.journal_path(out).unlink(missing_ok=True)
         trim_memory()
-        return summary
+        config = parse_config(unit.config)
+        if config.samples is None and config.samples_per_object is None:
+            return summary
+        return replace(summary, samples=count_samples(out, header, config))
 
 
 def _run_experiment(unit: WorkUnit, journal: Journal) -> UnitSummary:
-    """Tell the whole experiment: set up, predict, try, measure, render, certify, write."""
+    """Tell the whole experiment: set up, run round after round, write."""
     config, out, header = parse_config(unit.config), Path(unit.out), unit.header
     seconds: dict[str, float] = {}
     _refuse_crash_loop(journal, header)
 
     # Build the object's scene, or take the one of the unit before, and list the attempts.
-    with _stage(journal, "build", header, seconds):
+    with _stage(journal, "build", header.object_name, seconds):
         setup = _build_setup(out, header, config)
         attempts = unit_attempts(setup.prepared, header, config)
 
-    # Try each attempt, and palm poses about those that hold: what geometry already decides is not
-    # simulated.
-    with timed(seconds, "try"):
-        attempts, records = _try_generations(setup, attempts, journal)
-
-    # Measure how the contacts of each lift lie on the object's true surface.
-    with _stage(journal, "measure", header, seconds):
-        fits = [measure_contacts(setup, record) for record in records]
-
-    # Render both cameras' images of each success.
-    with timed(seconds, "look"):
-        looks = render_successes(setup, attempts, records, journal)
-
-    # Certify: simulate each success again with noise and with less friction, if asked for.
-    if config.certify.repeats:
-        with timed(seconds, "certify"):
-            _certify_successes(setup, attempts, looks, journal)
+    # Run the attempts, then those about the samples among them, and so on.
+    rounds = list[_Round]()
+    while attempts:
+        first = sum(len(done.attempts) for done in rounds)
+        rounds.append(_run_round(setup, attempts, first, journal, seconds))
+        attempts = _children_of_samples(setup, rounds[-1])
 
     # Write the shard: all of it or nothing.
-    with _stage(journal, "write", header, seconds):
-        trials = trial_rows(setup, attempts, records, fits)
+    with _stage(journal, "write", header.object_name, seconds):
+        trials = _joined([done.trials for done in rounds])
+        looks = _joined([done.looks for done in rounds])
         write_shard(out, Shard(header=header, trials=trials, looks=looks))
 
+    messages = [record.message for done in rounds for record in done.records if record.message]
     return UnitSummary(
         header=header,
         outcomes=count_outcomes(trials["outcome"]),
         seconds=seconds,
-        errors=dict(Counter(record.message for record in records if record.message)),
+        errors=dict(Counter(messages)),
     )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Round:
+    """Attempts of a unit, their records, and their columns of `/trials` and `/looks`."""
+
+    attempts: Sequence[Attempt]
+    records: Sequence[TrialRecord]
+    trials: dict[str, AnyArray]
+    looks: dict[str, AnyArray]
+
+
+def _run_round(
+    setup: TrialSetup,
+    attempts: Sequence[Attempt],
+    first: int,
+    journal: Journal,
+    seconds: dict[str, float],
+) -> _Round:
+    """Try attempts, the first of which is in row `first` of the unit; measure, render, certify."""
+    # Try each attempt: what geometry already decides is not simulated.
+    with timed(seconds, "try"):
+        predictions = _predict_all(setup, attempts, journal)
+        records = _try_all(setup, attempts, predictions, journal, first)
+
+    # Measure how the contacts of each lift lie on the object's true surface.
+    with _stage(journal, "measure", setup.prepared.model.name, seconds):
+        fits = [measure_contacts(setup, record) for record in records]
+
+    # Render both cameras' images of each success.
+    with timed(seconds, "look"):
+        looks = render_successes(setup, attempts, records, journal, first)
+
+    # Certify: simulate each success again with noise and with less friction, if asked for.
+    if setup.config.certify.repeats:
+        with timed(seconds, "certify"):
+            _certify_successes(setup, attempts, looks, journal, first)
+
+    trials = trial_rows(setup, attempts, records, fits)
+    return _Round(attempts=attempts, records=records, trials=trials, looks=looks)
+
+
+def _children_of_samples(setup: TrialSetup, done: _Round) -> list[Attempt]:
+    """Return attempts about each of a round that is a sample by the default filters."""
+    config = setup.config
+    if not config.refine.children:
+        return []
+    rows = np.flatnonzero(done.trials["outcome"] == Outcome.SUCCESS)
+    trials = {name: values[rows] for name, values in done.trials.items()}
+    depths = done.looks["image_otm"][:, 3]
+    successes = successes_of(trials, done.looks, depths, object=0, K=intrinsics(config.camera))
+    removal = judge_successes(successes, PARENT_FILTERS)
+    return [
+        child
+        for row in rows[removal == Removal.KEPT].tolist()
+        for child in list_children(setup.prepared, done.attempts[row], config)
+    ]
+
+
+def _joined(parts: Sequence[dict[str, AnyArray]]) -> dict[str, AnyArray]:
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def find_outcomes(out: Path, header: ShardHeader) -> dict[Outcome, int] | None:
@@ -210,8 +272,11 @@ def render_successes(
     attempts: Sequence[Attempt],
     records: Sequence[TrialRecord],
     journal: Journal = NO_JOURNAL,
+    first: int = 0,
 ) -> dict[str, AnyArray]:
     """Return the columns of `/looks`: both images of every success.
+
+    The first attempt is in row `first` of the unit.
 
     Raises:
         BlankImageError: If OpenGL renders blank images.
@@ -220,9 +285,9 @@ def render_successes(
     rows = [i for i, record in enumerate(records) if record.outcome is Outcome.SUCCESS]
     looks = empty_looks(setup, len(rows))
     for k, row in enumerate(rows):
-        step = f"look {row}"
+        step = f"look {first + row}"
         _refuse_failing(journal, step, setup.prepared.model.name)
-        looks["row"][k] = row
+        looks["row"][k] = first + row
         with journal.step(step, STAGE_SECONDS):
             fill_look(looks, k, render_views(setup, attempts[row], records[row]))
     return looks
@@ -242,36 +307,6 @@ def _build_setup(out: Path, header: ShardHeader, config: Config) -> TrialSetup:
     # A failed assertion within Drake arrives as SystemExit, which would end the worker.
     except SystemExit as error:
         raise DataError(f"{header.object_name}: Drake cannot build its scene: {error}") from None
-
-
-def _try_generations(
-    setup: TrialSetup, attempts: Sequence[Attempt], journal: Journal
-) -> tuple[list[Attempt], list[TrialRecord]]:
-    """Try attempts, then the children of those that may become samples, and so on.
-
-    Returns:
-        All attempts, generation by generation, and their records.
-    """
-    tried, records, newest = list[Attempt](), list[TrialRecord](), list(attempts)
-    while newest:
-        predictions = _predict_all(setup, newest, journal)
-        results = _try_all(setup, newest, predictions, journal, first=len(tried))
-        tried += newest
-        records += results
-        newest = [
-            child
-            for attempt, record in zip(newest, results, strict=True)
-            if setup.config.refine.children and _may_have_children(record, setup.config)
-            for child in list_children(setup.prepared, attempt, setup.config)
-        ]
-    return tried, records
-
-
-def _may_have_children(record: TrialRecord, config: Config) -> bool:
-    if record.lifted is None:
-        return False
-    motion = record.lifted.other_links, record.slip, record.turn
-    return bool(may_become_sample(record.outcome, *motion, config.lift))
 
 
 def _predict_all(
@@ -331,10 +366,11 @@ def _certify_successes(
     attempts: Sequence[Attempt],
     looks: dict[str, AnyArray],
     journal: Journal,
+    first: int,
 ) -> None:
     """Fill in the robustness of each success."""
     for k, row in enumerate(looks["row"].tolist()):
-        certificate = _certify_step(setup, attempts[row], journal, f"certify {row}")
+        certificate = _certify_step(setup, attempts[row - first], journal, f"certify {row}")
         looks["certified_share"][k] = certificate.share
         looks["certified_friction"][k] = certificate.friction
 
@@ -351,15 +387,13 @@ def _certify_step(setup: TrialSetup, attempt: Attempt, journal: Journal, step: s
 
 
 @contextmanager
-def _stage(
-    journal: Journal, step: str, header: ShardHeader, seconds: dict[str, float]
-) -> Iterator[None]:
+def _stage(journal: Journal, step: str, name: str, seconds: dict[str, float]) -> Iterator[None]:
     """Run and time a stage that is one step of the journal.
 
     Raises:
         MachineError: If the stage ended the process before.
     """
-    _refuse_failing(journal, step, header.object_name)
+    _refuse_failing(journal, step, name)
     with timed(seconds, step), journal.step(step, STAGE_SECONDS):
         yield
 

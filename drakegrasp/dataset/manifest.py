@@ -106,6 +106,7 @@ class ObjectEntry:
         distinct: Number of different palm poses among the valid ones.
         notes: What was repaired in the mesh.
         licence: Identifier of the mesh's licence; None: not stated.
+        tried: Number of palm poses up to which a target of samples was met; None: all.
     """
 
     name: Name
@@ -124,11 +125,13 @@ class ObjectEntry:
     distinct: Whole
     notes: tuple[str, ...]
     licence: Licence | None = None
+    tried: Whole | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry as JSON types, in the order of the manifest."""
         # What is not stated leaves no trace.
-        said = {key: v for key, v in asdict(self).items() if (key, v) != ("licence", None)}
+        optional = [("licence", None), ("tried", None)]
+        said = {key: v for key, v in asdict(self).items() if (key, v) not in optional}
         return {"class" if key == "class_name" else key: v for key, v in said.items()}
 
 
@@ -179,6 +182,8 @@ class Manifest:
         config_hash = self.config.simulation_hash()
         for entry in self.objects:
             for unit in self.config.unit_ranges(entry.candidates):
+                if entry.tried is not None and unit.start >= entry.tried:
+                    break
                 yield ShardHeader(
                     config_hash=config_hash,
                     mesh_sha256=entry.mesh_sha256,
@@ -190,7 +195,7 @@ class Manifest:
     @property
     def units(self) -> int:
         """Number of work units."""
-        return sum(len(tuple(self.config.unit_ranges(e.candidates))) for e in self.objects)
+        return sum(1 for _ in self.headers())
 
     def signature(self) -> str:
         """Return a hash of all in it that decides a row of the dataset, hexadecimal."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.config import LiftConfig
 from drakegrasp.outcomes import Outcome
 
 Outcomes = npt.NDArray[np.int64]
@@ -102,27 +101,6 @@ def is_stable(
 def _misses(touching: npt.ArrayLike, required: npt.ArrayLike) -> Flags:
     """Return (...,) whether a required fingertip does not touch, of (..., k)."""
     return np.asarray((~np.asarray(touching) & np.asarray(required)).any(axis=-1))
-
-
-def may_become_sample(
-    outcome: npt.ArrayLike,
-    other_links: npt.ArrayLike,
-    slip: npt.ArrayLike,
-    turn: npt.ArrayLike,
-    config: LiftConfig,
-) -> Flags:
-    """Return whether attempts (...,) hold so well that the filters may keep them.
-
-    Args:
-        outcome: (...,), values of `Outcome`.
-        other_links: (...,), number of other links that touch the object after the lift.
-        slip: (...,), how far the object moved in the hand [m].
-        turn: (...,), how far it turned in the hand [rad].
-        config: `stop_slip` and `stop_turn_deg`.
-    """
-    small = np.asarray(slip) <= config.stop_slip
-    small &= np.degrees(turn) <= config.stop_turn_deg
-    return np.asarray(is_precision(outcome, other_links) & small)
 
 
 def _first(*rules: tuple[npt.ArrayLike, Outcome]) -> Outcomes:

@@ -14,6 +14,7 @@ from drakegrasp.dataset.manifest import (
     Manifest,
     ObjectEntry,
     RefusedMesh,
+    RestingEntry,
     claim_directory,
     installed_versions,
     read_manifest,
@@ -35,21 +36,26 @@ ENTRIES = """ "objects": [
    "density": 1000.0,
    "friction": null,
    "collision_error": 0.0,
-   "X_TO": [
-    1.0,
-    0.0,
-    0.0,
-    0.30000000000000004,
-    0.0,
-    1.0,
-    0.0,
-    -0.0,
-    0.0,
-    0.0,
-    1.0,
-    1e-17
+   "resting": [
+    {
+     "X_TO": [
+      1.0,
+      0.0,
+      0.0,
+      0.30000000000000004,
+      0.0,
+      1.0,
+      0.0,
+      -0.0,
+      0.0,
+      0.0,
+      1.0,
+      1e-17
+     ],
+     "probability": 0.75,
+     "rolled": true
+    }
    ],
-   "rolled": true,
    "candidates": 7,
    "combinations": 40,
    "valid": 20,
@@ -79,8 +85,13 @@ MUG = ObjectEntry(
     density=1000.0,
     friction=None,
     collision_error=0.0,
-    X_TO=(1.0, 0.0, 0.0, 0.1 + 0.2, 0.0, 1.0, 0.0, -0.0, 0.0, 0.0, 1.0, 1e-17),
-    rolled=True,
+    resting=(
+        RestingEntry(
+            X_TO=(1.0, 0.0, 0.0, 0.1 + 0.2, 0.0, 1.0, 0.0, -0.0, 0.0, 0.0, 1.0, 1e-17),
+            probability=0.75,
+            rolled=True,
+        ),
+    ),
     candidates=7,
     combinations=40,
     valid=20,

@@ -136,6 +136,7 @@ def trial_row(model: ObjectModel, number: int, X_TO: Array, config: Config) -> d
         "standoff_index": number % 3,
         "spread": 0.1,
         "seed": 7,
+        "log_density": 0.0,
         "outcome": outcome,
         "X_TO": pack_pose(X_TO),
         "X_OG": pack_pose(make_pose(R_OG, -height * R_OG[:, 2])),
@@ -190,12 +191,20 @@ def resting(model: ObjectModel, X_TO: Array) -> PreparedObject:
     candidates = Candidates(
         X_OG=np.tile(np.eye(4), (4, 1, 1)),
         distance=np.full(4, np.nan),
+        resting=np.zeros(4, dtype=np.int64),
+        source=np.zeros(4, dtype=np.int64),
+        log_density=np.zeros(4),
         combinations=4,
         valid=4,
         distinct=4,
     )
     return PreparedObject(
-        model=model, X_TO=X_TO, candidates=candidates, table_force=9.81, stopped=False
+        model=model,
+        resting_poses=X_TO[None],
+        probability=np.ones(1),
+        table_force=np.full(1, 9.81),
+        stopped=np.zeros(1, dtype=bool),
+        candidates=candidates,
     )
 
 

@@ -9,13 +9,14 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 
-from drakegrasp.dataset.filters import Successes
+from drakegrasp.config import Config
+from drakegrasp.dataset.filters import Removal, Successes, judge_successes
 from drakegrasp.dataset.hdf5 import AnyArray, read_column
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.schema import CAMERAS, CERTIFICATE_FIELDS, sizes
@@ -28,8 +29,9 @@ from drakegrasp.runtime.executor import Executor, run_here
 from drakegrasp.runtime.files import read_seal
 from drakegrasp.vision.camera import intrinsics, project
 
-#: Columns of `/trials` from which the filters' numbers follow, besides those of `suspicion`.
-_TRIALS = (
+#: Columns of `/trials` from which the filters' numbers follow.
+SURVEYED = (
+    *COLUMNS,
     *("candidate", "standoff_index", "child", "resting", "X_TO", "X_OG", "closed_p_OQ"),
     *("lifted_p_OQ", "lifted_nhat_Q_O", "lifted_touching"),
 )
@@ -117,7 +119,12 @@ def survey_object(task: SurveyTask) -> Survey:
             left = None if left is None else left - len(hits)
             count = int(hits[-1]) + 1 if left == 0 else len(outcome)
 
-            parts.append(_successes(file, hits, task, first))
+            trials = {name: read_column(file["trials"], name)[hits] for name in SURVEYED}
+            looks = {name: read_column(file["looks"], name)[: len(hits)] for name in _LOOKS}
+            images = file["looks/image_otm"]
+            depths = images[: len(hits), 3] if len(hits) else np.zeros((0, 1, 1))
+            found = successes_of(trials, looks, depths, object=task.object, K=task.K)
+            parts.append(replace(found, trial_id=first + hits))
             letters = letters or sizes_of(file)
         digest.update(read_seal(header.path(out)))
         rows.append(count)
@@ -129,6 +136,18 @@ def survey_object(task: SurveyTask) -> Survey:
         successes=join_successes(parts),
         sizes=letters,
     )
+
+
+def count_samples(out: Path, header: ShardHeader, config: Config) -> int:
+    """Return how many successes of a shard pass the filters, but for that of outliers.
+
+    Raises:
+        DataError: If the shard is missing or damaged.
+    """
+    K, filters = intrinsics(config.camera), config.filters.model_copy(update={"outlier_sigma": 0.0})
+    task = SurveyTask(out=str(out), object=0, headers=(header,), wanted=None, K=K)
+    removal = judge_successes(survey_object(task).successes, filters)
+    return int(np.count_nonzero(removal == Removal.KEPT))
 
 
 def sizes_of(file: h5py.File) -> dict[str, int]:
@@ -179,21 +198,23 @@ def _read_seals(task: SurveyTask) -> tuple[int, bytes]:
     return task.object, digest.digest()
 
 
-def _successes(file: h5py.File, rows: AnyArray, task: SurveyTask, first: int) -> Successes:
-    """Return what the filters need of the successes of a shard.
+def successes_of(
+    trials: Mapping[str, AnyArray],
+    looks: Mapping[str, AnyArray],
+    depths: AnyArray,
+    *,
+    object: int,
+    K: Array,
+) -> Successes:
+    """Return what the filters need of n successes; their `trial_id` counts from 0.
 
     Args:
-        file: The shard.
-        rows: (n,), the successes among its rows.
-        task: Says which object it is of, and the camera.
-        first: Place of its first row among the object's rows.
+        trials: Their rows of `/trials`, by the names of `SURVEYED` and more.
+        looks: Their rows of `/looks`, without the images.
+        depths: (n, S, S), their otm depth images [m].
+        object: Row of their object in /objects.
+        K: Camera matrix (3, 3) [px].
     """
-    # Without successes only the shapes of the columns count.
-    names, columns = dict.fromkeys((*COLUMNS, *_TRIALS)), file["trials"]
-    trials = {name: read_column(columns, name)[rows] for name in names}
-    looks = {name: read_column(file["looks"], name)[: len(rows)] for name in _LOOKS}
-    depths = file["looks/image_otm"][: len(rows), 3] if len(rows) else np.zeros((0, 1, 1))
-
     # The grasps in {T}, and whether both cameras see all their contacts.
     X_TO = unpack_pose(trials["X_TO"])
     grasps = [
@@ -202,7 +223,7 @@ def _successes(file: h5py.File, rows: AnyArray, task: SurveyTask, first: int) ->
     ]
     length = 6 * trials["closed_touching"].shape[1]
     in_view = [
-        all(_in_view(task.K, looks[f"mask_{c}"][i], looks[f"X_TC_{c}"][i], grasp) for c in CAMERAS)
+        all(_in_view(K, looks[f"mask_{c}"][i], looks[f"X_TC_{c}"][i], grasp) for c in CAMERAS)
         for i, grasp in enumerate(grasps)
     ]
 
@@ -213,12 +234,12 @@ def _successes(file: h5py.File, rows: AnyArray, task: SurveyTask, first: int) ->
         child=trials["child"],
         resting=trials["resting"],
         X_OG=unpack_pose(trials["X_OG"]),
-        trial_id=first + rows.astype(np.int64),
-        object=np.full(len(rows), task.object, dtype=np.int32),
+        trial_id=np.arange(len(X_TO), dtype=np.int64),
+        object=np.full(len(X_TO), object, dtype=np.int32),
         grasp_T=np.array(grasps).reshape(-1, length),
         held_O=np.concatenate(
             [
-                trials[f"lifted_{name}"].reshape(len(rows), length // 2)
+                trials[f"lifted_{name}"].reshape(len(X_TO), length // 2)
                 for name in ("p_OQ", "nhat_Q_O")
             ],
             axis=1,
