@@ -398,12 +398,6 @@ class Config(_Section):
     split: SplitConfig = SplitConfig()
     verify: VerifyConfig = VerifyConfig()
 
-    @model_validator(mode="after")
-    def _one_end(self) -> Config:
-        if self.max_grasps is not None and (self.samples or self.samples_per_object):
-            raise ValueError("max_grasps must be null with samples or samples_per_object, got both")
-        return self
-
     def to_dict(self) -> dict[str, Any]:
         """Return the resolved values as plain JSON types."""
         return self.model_dump(mode="json")

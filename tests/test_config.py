@@ -26,9 +26,12 @@ seed: 7
 unit_candidates: 20
 attempt_seconds: 30.0
 max_grasps: 500
+samples: 300
+samples_per_object: 20
 objects:
   mass: 0.5
   max_collision_faces: 2000
+  resting_poses: 4
   min_diagonal: 0.02
   max_diagonal: 1.5
 builtin:
@@ -109,6 +112,11 @@ randomize:
   friction_hand: [0.8, 1.2]
   friction_table: [0.6, 1.4]
   mass: [0.9, 1.1]
+refine:
+  children: 3
+  generations: 2
+  shift: 0.01
+  turn_deg: 5.0
 filters:
   min_depth_variance: 0.002
   min_camera_height: 0.02
@@ -193,7 +201,15 @@ PAPER = {
 }
 
 #: They act on assembled shards or on predicted grasps, or say only where to stop.
-NOT_SIMULATED = ("filters", "split", "max_grasps", "attempt_seconds", "verify")
+NOT_SIMULATED = (
+    "filters",
+    "split",
+    "max_grasps",
+    "samples",
+    "samples_per_object",
+    "attempt_seconds",
+    "verify",
+)
 
 
 def leaves(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -420,25 +436,21 @@ def test_configuration_is_inert() -> None:
 @pytest.mark.parametrize("key", sorted(EVERYTHING))
 def test_simulation_hash_changes_with_what_is_simulated_and_nothing_else(key: str) -> None:
     """A shard is reused when the hash agrees: a key too few mixes data, one too many wastes it."""
-    # How robust a grasp is is asked only with repeats.
-    base = Config() if key == "certify.repeats" else load_config(overrides=["certify.repeats=1"])
+    # How robust a grasp is is asked only with repeats, how far to refine only with children.
+    needed = ["certify.repeats=1", "refine.children=1"]
+    base = load_config(overrides=[text for text in needed if not text.startswith(f"{key}=")])
     changed = override_config(base, [f"{key}={json.dumps(EVERYTHING[key])}"])
     assert changed != base
     same = changed.simulation_hash() == base.simulation_hash()
-    assert same is (key.split(".")[0] in NOT_SIMULATED)
+    assert same is (key.split(".")[0] in NOT_SIMULATED or key == "candidates.max")
 
 
-def test_hash_of_the_units_is_that_of_their_ranges() -> None:
-    few, many = ["candidates.max=1000"], ["candidates.max=1001"]
-    hashes = [
-        [
-            load_config(overrides=[*size, *units]).simulation_hash()
-            for units in ([], ["unit_candidates=50"])
-        ]
-        for size in (few, many)
-    ]
-    assert hashes[0][0] == hashes[0][1]
-    assert hashes[1][0] != hashes[1][1]
+def test_poses_that_nobody_refines_are_not_simulated() -> None:
+    wide = load_config(overrides=["refine.shift=0.1"])
+    assert wide.simulation_hash() == Config().simulation_hash()
+    refined = load_config(overrides=["refine.shift=0.1", "refine.children=1"])
+    narrow = load_config(overrides=["refine.children=1"])
+    assert refined.simulation_hash() != narrow.simulation_hash()
 
 
 def test_noise_of_no_repeats_is_not_simulated() -> None:

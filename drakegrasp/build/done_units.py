@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from drakegrasp.build.target import has_target
 from drakegrasp.build.work_unit import find_outcomes
 from drakegrasp.config import Config
 from drakegrasp.dataset.assembly.survey import count_samples, headers_by_object
@@ -56,8 +57,7 @@ class FoundUnits:
 
 def find_tasks(out: Path, manifest: Manifest) -> Iterator[FindTask]:
     """Yield the task of each object of which there may be a shard."""
-    config = manifest.config
-    counted = config.samples is not None or config.samples_per_object is not None
+    counted = has_target(manifest.config)
     try:
         folders = set(os.listdir(out / "shards"))
     except FileNotFoundError:

@@ -108,6 +108,11 @@ class Target:
         return level
 
 
+def has_target(config: Config) -> bool:
+    """Return whether a configuration says after how many samples to stop."""
+    return config.samples is not None or config.samples_per_object is not None
+
+
 def target_of(config: Config, units: Mapping[str, Sequence[ShardHeader]]) -> Target | None:
     """Return the target that a configuration states, or None.
 
@@ -115,6 +120,6 @@ def target_of(config: Config, units: Mapping[str, Sequence[ShardHeader]]) -> Tar
         config: `samples` and `samples_per_object`.
         units: Work units of each object, by its name, in their order.
     """
-    if config.samples is None and config.samples_per_object is None:
+    if not has_target(config):
         return None
     return Target(samples=config.samples, per_object=config.samples_per_object, units=units)

@@ -31,6 +31,7 @@ from drakegrasp.build.attempts import (
     try_attempt,
 )
 from drakegrasp.build.columns import empty_looks, fill_look, trial_rows
+from drakegrasp.build.target import has_target
 from drakegrasp.config import Config, FilterConfig, parse_config
 from drakegrasp.dataset.assembly.survey import count_samples, successes_of
 from drakegrasp.dataset.filters import Removal, judge_successes
@@ -145,7 +146,7 @@ def run_unit(unit: WorkUnit) -> UnitSummary:
         header.journal_path(out).unlink(missing_ok=True)
         trim_memory()
         config = parse_config(unit.config)
-        if config.samples is None and config.samples_per_object is None:
+        if not has_target(config):
             return summary
         return replace(summary, samples=count_samples(out, header, config))
 

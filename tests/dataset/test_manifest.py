@@ -131,7 +131,7 @@ def test_units_cover_the_candidates_of_each_object(manifest: Manifest) -> None:
 
 
 def test_units_of_many_candidates_grow(manifest: Manifest) -> None:
-    """So large datasets have few files and tasks; what one machine makes does not change."""
+    """So large datasets have few files and tasks."""
 
     def stops(candidates: int, *, most: int) -> list[int]:
         config = load_config(overrides=[f"candidates.max={most}"])
@@ -142,7 +142,7 @@ def test_units_of_many_candidates_grow(manifest: Manifest) -> None:
         assert grown.units == len(headers)
         return [h.stop for h in headers]
 
-    assert stops(1000, most=1000) == list(range(50, 1001, 50))
+    assert stops(70, most=1000) == [50, 70]
     assert stops(1001, most=10_000) == [50, 100, 200, 400, 800, 1001]
     assert len(stops(10_000, most=10_000)) == 28
 
