@@ -16,6 +16,8 @@ from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.schema import OBJECT_FIELDS, SPLITS
+from drakegrasp.dataset.weights import weigh_samples
+from drakegrasp.frames import unpack_pose
 
 
 def splits(data: OpenFile) -> Iterator[Violation]:
@@ -111,6 +113,41 @@ def kept_are_samples(data: OpenFile, trials: OpenFile) -> Iterator[Violation]:
     ):
         if others:
             yield of_file(data.name, what, f"{len(others)} otherwise: trials {sorted(others)[:5]}")
+
+
+def likeness(data: OpenFile, trials: OpenFile) -> Iterator[Violation]:
+    """No family is in two splits, no refined grasp is tested, and weights count what is alike."""
+    names = ("object", "candidate", "standoff_index", "child", "resting", "X_OG")
+    columns = {name: trials.groups["trials"][name][:] for name in names}
+    ids = {split: group["trial_id"][:] for split, group in data.groups.items()}
+    ids = {split: own[(own >= 0) & (own < len(columns["child"]))] for split, own in ids.items()}
+
+    # Families and their splits.
+    seen: dict[tuple[int, ...], str] = {}
+    for split, own in ids.items():
+        rows = np.column_stack([columns[name][own] for name in names[:3]]).tolist()
+        for row, key in enumerate(map(tuple, rows)):
+            if seen.setdefault(key, split) != split:
+                what = "a first-round attempt and all refined from it must be in one split"
+                got = f"others of the family in /{seen[key]}"
+                yield Violation(file=data.name, group=f"/{split}", row=row, what=what, got=got)
+        if split == "test":
+            for row in np.flatnonzero(columns["child"][own] > 0).tolist():
+                what, got = "a tested grasp must be of the first round", "a refined one"
+                yield Violation(file=data.name, group="/test", row=row, what=what, got=got)
+
+    # The weights, from the palms of all samples.
+    every = np.concatenate([np.zeros(0, dtype=np.int64), *ids.values()])
+    groups = np.column_stack([columns["object"][every], columns["resting"][every]])
+    due = weigh_samples(groups, unpack_pose(columns["X_OG"][every])).astype(np.float32)
+    for split, own in ids.items():
+        weights = data.groups[split]["grasp_props/weight"][:]
+        expected, due = np.split(due, [len(own)])
+        if len(weights) == len(expected):
+            for row in np.flatnonzero(weights != expected).tolist():
+                what = f"weight must be {expected[row]:g}, 1 / number of samples that are near"
+                got = f"{weights[row]:g}"
+                yield Violation(file=data.name, group=f"/{split}", row=row, what=what, got=got)
 
 
 def same_objects(trials: OpenFile, manifest: Manifest) -> Iterator[Violation]:

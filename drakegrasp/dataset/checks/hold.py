@@ -21,6 +21,7 @@ from drakegrasp.dataset.checks.findings import (
 )
 from drakegrasp.dataset.checks.samples import move_each, rotate_each
 from drakegrasp.dataset.filters import breaks_hold, breaks_surface
+from drakegrasp.dataset.schema import LINEAGE_NAMES
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.verdict import is_precision, is_stable
@@ -42,6 +43,7 @@ COPIES = {
     "q_held": "lifted_q",
     "area": "closed_area",
     "area_held": "lifted_area",
+    **{name: name for name in LINEAGE_NAMES},
 }
 
 

@@ -119,6 +119,8 @@ def _check_directory(
         check_data_file(data, camera, context)
         if trials is not None:
             context.add(data, consistency.kept_are_samples(data, trials))
+            if not findings.violations():
+                context.add(data, consistency.likeness(data, trials))
     if len(files) == len(CAMERAS) and all(data.config for data in files.values()):
         check_pair(files[CAMERAS[0]], files[CAMERAS[1]], findings)
     if not findings.violations():

@@ -23,6 +23,7 @@ from drakegrasp.dataset.checks.findings import (
 from drakegrasp.dataset.schema import TRIAL_FIELDS
 from drakegrasp.frames import invert_pose
 from drakegrasp.outcomes import Outcome, Stage
+from drakegrasp.simulation.candidates import Source
 from drakegrasp.simulation.verdict import is_precision, is_stable, judge_closed, judge_lifted
 
 #: Slip [m] and turn [rad] are as exact as the poses that they follow from; the angle of a rotation
@@ -74,6 +75,31 @@ def numbers(
         yield from batch.broken(
             f"standoff_index must be below {standoffs}", number >= standoffs, number
         )
+
+
+def lineage(batch: Batch, children: int | None) -> Iterator[Violation]:
+    """A refined palm pose has a number, a parent and a generation that fit; a first one has none.
+
+    Args:
+        batch: Rows of `/trials`.
+        children: Number of children of each parent, if known.
+    """
+    child, parent, generation = (batch[name] for name in ("child", "parent", "generation"))
+    refined = child > 0
+    yield from batch.broken("child must not be negative", child < 0, child)
+    yield from batch.broken(
+        "generation must be 0 for the first of a family and positive for others",
+        (generation > 0) != refined,
+        generation,
+    )
+    yield from batch.broken(
+        "source must be 2 (refine) for a refined palm pose, and 0 or 1 for another",
+        np.where(refined, batch["source"] != Source.REFINE, batch["source"] >= Source.REFINE),
+        batch["source"],
+    )
+    if children is not None:
+        due = np.where(refined, (child - 1) // max(children, 1), 0)
+        yield from batch.broken("parent must follow from child", parent != due, parent)
 
 
 def stages(batch: Batch) -> Iterator[Violation]:

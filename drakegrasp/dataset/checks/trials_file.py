@@ -102,7 +102,10 @@ def _judge_trials(rows: Rows, findings: Findings) -> AnyArray:
     successes = [np.zeros(0, dtype=np.int64)]
     for whole in trials.batches("trials", rows.start, rows.stop, TRIAL_ROWS, findings):
         successes.append(whole["trial_id"][whole["outcome"] == Outcome.SUCCESS])
-        batch = trials.judge(whole, findings, numbers)
+        children = trials.config.refine.children if trials.config else None
+        batch = trials.judge(
+            whole, findings, numbers, partial(trial_rules.lineage, children=children)
+        )
         batch = trials.judge(batch, findings, trial_rules.stages)
         batch = trials.judge(batch, findings, *last)
         trials.judge(batch, findings, trial_rules.motion)
