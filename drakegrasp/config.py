@@ -365,7 +365,7 @@ UNIT_CANDIDATES, LARGEST_UNIT = 50, 400
 #: Keys that change no shard: they act on assembled shards, or only say where to stop.
 POSTPROCESSING_KEYS = (
     *("filters", "split", "max_grasps", "samples", "samples_per_object"),
-    *("attempt_seconds", "verify"),
+    *("samples_patience", "attempt_seconds", "verify"),
 )
 
 
@@ -394,6 +394,8 @@ class Config(_Section):
     # share them in turns, and of each; an object may have fewer.
     samples: Count | None = None
     samples_per_object: Count | None = None
+    # Palm poses in a row without a sample after which an object is given up for such a number.
+    samples_patience: Count = 400
     filters: FilterConfig = FilterConfig()
     split: SplitConfig = SplitConfig()
     verify: VerifyConfig = VerifyConfig()
@@ -424,7 +426,7 @@ class Config(_Section):
         """Return the hash (16 hex digits) of every value that decides what a shard holds.
 
         Left out are filters and split, which act later on assembled shards, `max_grasps`,
-        `samples`, `samples_per_object` and `candidates.max`, which only say where to stop, the
+        `samples`, its kin and `candidates.max`, which only say where to stop, the
         wall-clock limit, and `verify`.
         """
         values = self.to_dict()

@@ -3,8 +3,8 @@
 In: the work units of each object in their order, and the numbers of samples of those that are done.
 Out: how many units of each object belong to the dataset, and which must be run next.
 
-The rule goes in rounds. In each round every object that still has units and is below a level runs
-its next unit. The level shares the target in turns: it is the least number of samples at which the
+The rule goes in rounds. In each round every object that still has units, has not been tried in vain
+for long, and is below a level runs its next unit. The level shares the target in turns: it is the least number of samples at which the
 objects that have more units would fill it up. So a dataset depends on the target alone, not on the
 workers, and that of a smaller target is part of it.
 """
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import takewhile
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.shards import ShardHeader
@@ -25,12 +26,14 @@ class Target:
     Attributes:
         samples: Number of samples of the dataset; None: no limit.
         per_object: Number of samples of each object; None: no limit.
+        patience: Palm poses in a row without a sample after which an object is given up.
         units: Work units of each object, by its name, in their order.
         found: Number of samples of each unit that is done.
     """
 
     samples: int | None
     per_object: int | None
+    patience: int
     units: Mapping[str, Sequence[ShardHeader]]
     found: dict[ShardHeader, int] = field(default_factory=dict)
 
@@ -85,9 +88,18 @@ class Target:
 
     def _active(self, taken: Mapping[str, int], counts: Mapping[str, int]) -> list[str]:
         """Return the objects that take part in the next round, given their units and samples."""
-        left = [name for name, units in self.units.items() if taken[name] < len(units)]
+        left = [
+            name
+            for name, units in self.units.items()
+            if taken[name] < len(units) and self._in_vain(units[: taken[name]]) < self.patience
+        ]
         level = self._level([counts[name] for name in left], sum(counts.values()))
         return [name for name in left if level is None or counts[name] < level]
+
+    def _in_vain(self, units: Sequence[ShardHeader]) -> int:
+        """Return how many palm poses the last of some units have without a sample."""
+        last = takewhile(lambda unit: not self.found.get(unit, 0), reversed(units))
+        return sum(unit.stop - unit.start for unit in last)
 
     def _level(self, counts: Sequence[int], total: int) -> int | None:
         """Return the number of samples below which an object takes part; None: any number."""
@@ -122,4 +134,9 @@ def target_of(config: Config, units: Mapping[str, Sequence[ShardHeader]]) -> Tar
     """
     if not has_target(config):
         return None
-    return Target(samples=config.samples, per_object=config.samples_per_object, units=units)
+    return Target(
+        samples=config.samples,
+        per_object=config.samples_per_object,
+        patience=config.samples_patience,
+        units=units,
+    )
