@@ -368,7 +368,9 @@ class Config(_Section):
         if self.lift.stop_when == "never":
             return self
         if self.filters.require == "held":
-            raise ValueError("filters.require must be limits with lift.stop_when, got held")
+            raise ValueError(
+                f"filters.require must be limits with lift.stop_when={self.lift.stop_when}, got held"
+            )
         for key, name in (("max_slip", "stop_slip"), ("max_turn_deg", "stop_turn_deg")):
             limit, stop = getattr(self.filters, key), getattr(self.lift, name)
             if limit is None or limit > stop:

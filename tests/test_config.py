@@ -467,13 +467,25 @@ def test_limits_that_end_no_lift_are_not_simulated() -> None:
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["filters.require=held"], r"filters\.require must be limits with lift\.stop_when, got held"),
+        (
+            ["filters.require=held"],
+            r"filters\.require must be limits with lift\.stop_when, got held",
+        ),
         (["filters.max_slip=null"], r"filters\.max_slip must be at most 0\.01, .*, got null"),
         (["filters.max_slip=0.0101"], r"filters\.max_slip must be at most 0\.01, .* got 0\.0101"),
-        (["lift.stop_slip=0.009"], r"max_slip must be at most 0\.009, .*lift\.stop_slip.* got 0\.01"),
-        (["filters.max_turn_deg=null"], r"filters\.max_turn_deg must be at most 10\.0, .*, got null"),
+        (
+            ["lift.stop_slip=0.009"],
+            r"max_slip must be at most 0\.009, .*lift\.stop_slip.* got 0\.01",
+        ),
+        (
+            ["filters.max_turn_deg=null"],
+            r"filters\.max_turn_deg must be at most 10\.0, .*, got null",
+        ),
         (["filters.max_turn_deg=11"], r"filters\.max_turn_deg must be at most 10\.0, .*, got 11"),
-        (["lift.stop_turn_deg=9"], r"max_turn_deg must be at most 9\.0, .*lift\.stop_turn_deg.*, got 10"),
+        (
+            ["lift.stop_turn_deg=9"],
+            r"max_turn_deg must be at most 9\.0, .*lift\.stop_turn_deg.*, got 10",
+        ),
     ],
 )
 def test_filters_that_keep_more_than_lifts_that_ended_are_refused(

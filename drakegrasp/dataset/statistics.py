@@ -215,8 +215,8 @@ def held_note(funnel: Funnel) -> str:
     if not moved:
         return ""
     return (
-        f"the number of held grasps is a lower bound: {moved:,} lifts were ended without a verdict "
-        "because the object moved more in the hand than a sample may (moved)"
+        "the number of held grasps is a lower bound: lifts that were ended without a verdict, as "
+        f"the object moved more in the hand than a sample may (moved): {moved:,}"
     )
 
 
