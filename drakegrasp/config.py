@@ -369,7 +369,8 @@ class Config(_Section):
             return self
         if self.filters.require == "held":
             raise ValueError(
-                f"filters.require must be limits with lift.stop_when={self.lift.stop_when}, got held"
+                f"filters.require must be limits where lift.stop_when is {self.lift.stop_when}, "
+                "got held"
             )
         for key, name in (("max_slip", "stop_slip"), ("max_turn_deg", "stop_turn_deg")):
             limit, stop = getattr(self.filters, key), getattr(self.lift, name)
