@@ -469,7 +469,7 @@ def test_limits_that_end_no_lift_are_not_simulated() -> None:
     [
         (
             ["filters.require=held"],
-            r"filters\.require must be limits where lift\.stop_when, got held",
+            r"filters\.require must be limits where lift\.stop_when is .*, got held",
         ),
         (["filters.max_slip=null"], r"filters\.max_slip must be at most 0\.01, .*, got null"),
         (["filters.max_slip=0.0101"], r"filters\.max_slip must be at most 0\.01, .* got 0\.0101"),

@@ -92,9 +92,12 @@ def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
     # The manifest has more objects than the files while a build goes on that adds some.
     funnel = funnel_of(trials)
     entries = [entry for entry in manifest.objects if entry.name in funnel.names]
+
+    # The known limits, and one that follows from the counts.
     limits = [*LIMITS]
     if note := held_note(funnel):
         limits.append((f"{note[0].upper()}{note[1:]}.", "reference/outcomes.md"))
+
     return {
         "title": f"Simulated grasps of {len(entries)} object{'s' * (len(entries) != 1)}",
         "hand": Path(manifest.config.hand).stem,
