@@ -246,6 +246,11 @@ class LiftConfig(_Section):
     max_acceleration: Positive = 1.0  # [m/s^2] of the wrist
     hold_time: NonNegative = 0.3  # [s] at the target before the final verdict
     check_period: Positive = 0.1  # [s] simulated between two checks, and up to a coarse step more
+    # "lost_sample" ends a lift, as `moved`, when the object moved more in the hand than the next
+    # two say at a check: no filter may then let such a grasp become a sample.
+    stop_when: Literal["never", "lost_sample"] = "never"
+    stop_slip: Positive = 0.010  # [m], of the object in the hand since it is free
+    stop_turn_deg: Positive = 10.0  # of the object in the hand since it is free
 
 
 class CertifyConfig(_Section):
@@ -400,6 +405,25 @@ class Config(_Section):
     split: SplitConfig = SplitConfig()
     verify: VerifyConfig = VerifyConfig()
 
+    @model_validator(mode="after")
+    def _filters_within_stop(self) -> Config:
+        # A grasp that a looser filter would keep may be among the lifts that were ended.
+        if self.lift.stop_when == "never":
+            return self
+        if self.filters.require == "held":
+            raise ValueError(
+                f"filters.require must be limits where lift.stop_when is {self.lift.stop_when}, "
+                "got held"
+            )
+        for key, name in (("max_slip", "stop_slip"), ("max_turn_deg", "stop_turn_deg")):
+            limit, stop = getattr(self.filters, key), getattr(self.lift, name)
+            if limit is None or limit > stop:
+                raise ValueError(
+                    f"filters.{key} must be at most {stop}, where lift.{name} ended the lifts, "
+                    f"got {'null' if limit is None else limit}"
+                )
+        return self
+
     def to_dict(self) -> dict[str, Any]:
         """Return the resolved values as plain JSON types."""
         return self.model_dump(mode="json")
@@ -439,6 +463,9 @@ class Config(_Section):
             del values["randomize"]  # nothing is drawn
         if not self.refine.children:
             del values["refine"]
+        if self.lift.stop_when == "never":
+            for key in ("stop_when", "stop_slip", "stop_turn_deg"):
+                del values["lift"][key]  # as before there was a choice
         canonical = json.dumps(values, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
@@ -503,6 +530,12 @@ def override_config(config: Config, overrides: Sequence[str]) -> Config:
     for text in overrides:
         _apply_override(tree, text)
     return parse_config(_with_absolute_hand(tree) if tree["hand"] != config.hand else tree)
+
+
+def with_whole_lifts(config: Config) -> Config:
+    """Return a configuration whose lifts end only when it is certain whether the hand holds."""
+    lift = config.lift.model_copy(update={"stop_when": "never"})
+    return config.model_copy(update={"lift": lift})
 
 
 def absolute_hand(name_or_yaml: str | Path) -> str:

@@ -31,6 +31,9 @@ class Outcome(IntEnum):
     CRASHED = 12  # the attempt killed its process; says nothing about the grasp
     UNREACHABLE = 13  # verification only: no wrist pose brings the fingertips to the contacts
     OFF_SURFACE = 14  # verification only: a predicted contact is not on the object's surface
+    # The lift was ended early because the object moved more in the hand than a sample may: it is
+    # no sample, but whether the hand would have held it is unknown.
+    MOVED = 15
 
     @property
     def label(self) -> str:
@@ -46,6 +49,11 @@ class Outcome(IntEnum):
     def verification_only(self) -> bool:
         """Whether only verification gives this outcome; no file of a dataset holds it."""
         return self in (Outcome.UNREACHABLE, Outcome.OFF_SURFACE)
+
+    @property
+    def dataset_only(self) -> bool:
+        """Whether only attempts of a dataset have this outcome: verification tries whole lifts."""
+        return self is Outcome.MOVED
 
     @property
     def stage(self) -> Stage:
@@ -69,4 +77,5 @@ _STAGE = {
     Outcome.CRASHED: Stage.PLACED,
     Outcome.UNREACHABLE: Stage.PLACED,
     Outcome.OFF_SURFACE: Stage.PLACED,
+    Outcome.MOVED: Stage.LIFTED,
 }

@@ -13,7 +13,14 @@ import pytest
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from drakegrasp.config import Config, load_config, override_config, parse_config, preset_names
+from drakegrasp.config import (
+    Config,
+    load_config,
+    override_config,
+    parse_config,
+    preset_names,
+    with_whole_lifts,
+)
 from drakegrasp.errors import ConfigError, DrakegraspError
 from drakegrasp.hand.file_format import with_hand_defaults
 
@@ -28,6 +35,7 @@ attempt_seconds: 30.0
 max_grasps: 500
 samples: 300
 samples_per_object: 20
+samples_patience: 700
 objects:
   mass: 0.5
   max_collision_faces: 2000
@@ -87,6 +95,10 @@ lift:
   max_acceleration: 2.0
   hold_time: 0.5
   check_period: 0.05
+  # The default, as the other value excludes `filters.require: held`.
+  stop_when: never
+  stop_slip: 0.03
+  stop_turn_deg: 30.0
 certify:
   repeats: 5
   palm_noise: 0.001
@@ -248,7 +260,7 @@ def test_one_of_everything_misses_no_field() -> None:
 
 def test_one_of_everything_has_no_default() -> None:
     same = [key for key, value in EVERYTHING.items() if value == DEFAULT_VALUES[key]]
-    assert not same
+    assert same == ["lift.stop_when"]
 
 
 def test_one_of_everything_arrives_as_written(tmp_path: Path) -> None:
@@ -263,7 +275,7 @@ def test_resolved_values_load_again_to_the_same(tmp_path: Path) -> None:
 
 
 def test_presets_are_listed() -> None:
-    assert preset_names() == ["paper", "randomized", "released"]
+    assert preset_names() == ["fast", "paper", "randomized", "released"]
 
 
 def test_paper_is_the_default_and_states_the_papers_numbers() -> None:
@@ -387,7 +399,7 @@ def test_file_that_is_no_configuration_is_refused(tmp_path: Path, text: str, mes
 @pytest.mark.parametrize("name", ["papper", "no/such.yaml", "."])
 def test_missing_file_is_refused_with_the_presets_there_are(name: str) -> None:
     with pytest.raises(
-        ConfigError, match=rf"presets paper, randomized, released, got '{re.escape(name)}'"
+        ConfigError, match=rf"presets fast, paper, randomized, released, got '{re.escape(name)}'"
     ):
         load_config(name)
 
@@ -431,9 +443,12 @@ def test_configuration_is_inert() -> None:
 @pytest.mark.parametrize("key", sorted(EVERYTHING))
 def test_simulation_hash_changes_with_what_is_simulated_and_nothing_else(key: str) -> None:
     """A shard is reused when the hash agrees: a key too few mixes data, one too many wastes it."""
-    # How robust a grasp is is asked only with repeats, how far to refine only with children.
+    # How robust a grasp is is asked only with repeats, how far to refine only with children, and
+    # how far it moved if that ends lifts.
     needed = ["certify.repeats=1", "refine.children=1"]
     base = load_config(overrides=[text for text in needed if not text.startswith(f"{key}=")])
+    if key.startswith("lift.stop_"):
+        base = override_config(base, ["lift.stop_when=lost_sample"])
     changed = override_config(base, [f"{key}={json.dumps(EVERYTHING[key])}"])
     assert changed != base
     same = changed.simulation_hash() == base.simulation_hash()
@@ -451,6 +466,55 @@ def test_poses_that_nobody_refines_are_not_simulated() -> None:
 def test_noise_of_no_repeats_is_not_simulated() -> None:
     noisy = load_config(overrides=["certify.palm_noise=0.01"])
     assert noisy.simulation_hash() == Config().simulation_hash()
+
+
+def test_limits_that_end_no_lift_are_not_simulated() -> None:
+    limits = load_config(overrides=["lift.stop_slip=0.02", "lift.stop_turn_deg=20"])
+    assert limits.simulation_hash() == Config().simulation_hash()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (
+            ["filters.require=held"],
+            r"filters\.require must be limits where lift\.stop_when is .*, got held",
+        ),
+        (["filters.max_slip=null"], r"filters\.max_slip must be at most 0\.01, .*, got null"),
+        (["filters.max_slip=0.0101"], r"filters\.max_slip must be at most 0\.01, .* got 0\.0101"),
+        (
+            ["lift.stop_slip=0.009"],
+            r"max_slip must be at most 0\.009, .*lift\.stop_slip.* got 0\.01",
+        ),
+        (
+            ["filters.max_turn_deg=null"],
+            r"filters\.max_turn_deg must be at most 10\.0, .*, got null",
+        ),
+        (["filters.max_turn_deg=11"], r"filters\.max_turn_deg must be at most 10\.0, .*, got 11"),
+        (
+            ["lift.stop_turn_deg=9"],
+            r"max_turn_deg must be at most 9\.0, .*lift\.stop_turn_deg.*, got 10",
+        ),
+    ],
+)
+def test_filters_that_keep_more_than_lifts_that_ended_are_refused(
+    overrides: list[str], message: str
+) -> None:
+    load_config(overrides=overrides)
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_config(overrides=["lift.stop_when=lost_sample", *overrides])
+    assert "\n" not in str(caught.value)
+
+
+def test_filters_may_be_as_strict_as_the_lifts_or_stricter() -> None:
+    stopped = load_config(overrides=["lift.stop_when=lost_sample"])
+    override_config(stopped, ["lift.stop_slip=0.02", "lift.stop_turn_deg=20"])
+    override_config(stopped, ["filters.max_slip=0.005", "filters.max_turn_deg=5"])
+
+
+def test_whole_lifts_differ_in_when_they_end_alone() -> None:
+    stopped = load_config(overrides=["lift.stop_when=lost_sample", "lift.drive=torque", "seed=3"])
+    assert with_whole_lifts(stopped) == override_config(stopped, ["lift.stop_when=never"])
 
 
 def test_simulation_hash_does_not_depend_on_the_order_of_keys(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ TABLE = [
     ("crashed", 12, PLACED, True),
     ("unreachable", 13, PLACED, False),
     ("off_surface", 14, PLACED, False),
+    ("moved", 15, LIFTED, False),
 ]
 
 
@@ -56,9 +57,13 @@ def test_stages_are_ordered_and_frozen() -> None:
 
 
 def test_number_of_no_outcome_is_refused() -> None:
-    with pytest.raises(ValueError, match="15"):
-        Outcome(15)
+    with pytest.raises(ValueError, match="99"):
+        Outcome(99)
 
 
 def test_no_file_of_a_dataset_holds_what_only_verification_tells() -> None:
     assert {o.label for o in Outcome if o.verification_only} == {"unreachable", "off_surface"}
+
+
+def test_no_verification_ends_a_lift_early() -> None:
+    assert {o.label for o in Outcome if o.dataset_only} == {"moved"}

@@ -41,7 +41,8 @@ T = TypeVar("T")
 #: What a lift is in the dataset: a sample, held but removed by the filters, or lost.
 Group = Literal["sample", "removed", "lost"]
 GROUPS: tuple[Group, ...] = get_args(Group)
-#: Outcomes of lifts that were lost; after closing, `table_contact` is no lift.
+#: Outcomes of lifts that were lost; after closing, `table_contact` is no lift. What `moved` has no
+#: verdict to compare, and is in no group.
 LOST = (Outcome.SLIPPED, Outcome.DROPPED, Outcome.TABLE_CONTACT)
 #: Probability that the true share lies in the interval that is printed.
 CONFIDENCE = 0.95

@@ -16,7 +16,7 @@ import numpy as np
 import trimesh
 
 from drakegrasp.build.attempts import TrialSetup, predict_attempts, try_attempt
-from drakegrasp.config import Config, override_config
+from drakegrasp.config import Config, override_config, with_whole_lifts
 from drakegrasp.errors import ConfigError
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
@@ -91,8 +91,16 @@ def compare_labels(
         Counts of each variant under "fidelity", and how many labels depend on the drive under
         "drive".
     """
-    labels = [one.record.outcome for one in simulated]
-    lifted = [one.record.lifted is not None for one in simulated]
+    # Verdicts are compared: what was ended without one is lifted again, to its end.
+    bench = replace(bench, config=with_whole_lifts(bench.config))
+    records = [
+        try_attempt(bench, one.attempt, one.prediction)
+        if one.record.outcome is Outcome.MOVED
+        else one.record
+        for one in simulated
+    ]
+    labels = [record.outcome for record in records]
+    lifted = [record.lifted is not None for record in records]
     decided = [
         one.prediction is not None and one.prediction.outcome is not None for one in simulated
     ]

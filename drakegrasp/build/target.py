@@ -4,9 +4,9 @@ In: the work units of each object in their order, and the numbers of samples of 
 Out: how many units of each object belong to the dataset, and which must be run next.
 
 The rule goes in rounds. In each round every object that still has units, has not been tried in vain
-for long, and is below a level runs its next unit. The level shares the target in turns: it is the least number of samples at which the
-objects that have more units would fill it up. So a dataset depends on the target alone, not on the
-workers, and that of a smaller target is part of it.
+for long, and is below a level runs its next unit. The level shares the target in turns: it is the
+least number of samples at which the objects that have more units would fill it up. So a dataset
+depends on the target alone, not on the workers, and that of a smaller target is part of it.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from drakegrasp.dataset.filters import Removal
-from drakegrasp.dataset.statistics import Funnel, SplitCount, Unfinished
+from drakegrasp.dataset.statistics import Funnel, SplitCount, Unfinished, held_note
 from drakegrasp.errors import printable
 from drakegrasp.objects.audit import AuditRow
 from drakegrasp.objects.memory import needed_limit
@@ -29,6 +29,7 @@ _OUTCOME_HEADS = {
     Outcome.TABLE_CONTACT: "table\ncontact",
     Outcome.DROPPED: "dropped",
     Outcome.SLIPPED: "slipped",
+    Outcome.MOVED: "moved",
     Outcome.SOLVER_ERROR: "solver\nerror",
     Outcome.TIMEOUT: "timeout",
     Outcome.CRASHED: "crashed",
@@ -42,6 +43,7 @@ _COMPACT_HEADS = {
     "collis.": (Outcome.START_COLLISION, Outcome.SCREENED),
     "no grip": (Outcome.MISSING_FINGERTIP, Outcome.HAND_CONTACT, Outcome.TABLE_CONTACT),
     "lost": (Outcome.DROPPED, Outcome.SLIPPED),
+    "moved": (Outcome.MOVED,),
     "errors": (Outcome.SOLVER_ERROR, Outcome.TIMEOUT, Outcome.CRASHED),
     "success": (Outcome.SUCCESS,),
 }
@@ -61,7 +63,11 @@ def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
         compact: Whether to group outcomes; otherwise columns that are all zero are left out.
     """
     shown = [o for o in _OUTCOME_HEADS if funnel.outcomes[:, o].any() or o is Outcome.SUCCESS]
-    groups = _COMPACT_HEADS if compact else {_OUTCOME_HEADS[o]: (o,) for o in shown}
+    groups: dict[str, tuple[Outcome, ...]] = {_OUTCOME_HEADS[o]: (o,) for o in shown}
+    if compact:
+        # Room is scarce, and few datasets have lifts that were ended.
+        moved = funnel.outcomes[:, Outcome.MOVED].any()
+        groups = {head: g for head, g in _COMPACT_HEADS.items() if moved or head != "moved"}
     removed = [r for r in Removal if r is not Removal.KEPT and funnel.removals[:, r].any()]
     heads = ["poses", "attempts", *groups]
     heads += [] if compact else [f"- {r.label}".replace("_", "\n") for r in removed]
@@ -111,6 +117,8 @@ def hold_table(funnel: Funnel) -> Table:
         "held: the outcome success; precision: with the fingertips alone; stable: of these, moved "
         "by less than 5 mm and 5° in the hand"
     )
+    if note := held_note(funnel):
+        table.caption += f"\n{note}"
     table.caption_justify = "left"
     return table
 

@@ -15,7 +15,7 @@ import trimesh
 
 from drakegrasp.commissioning.finding import Finding
 from drakegrasp.commissioning.pinch import Pinch, find_opposition, find_pinch, reach
-from drakegrasp.config import Config, ObjectConfig
+from drakegrasp.config import Config, ObjectConfig, with_whole_lifts
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.file_format import Drive
@@ -61,7 +61,8 @@ def check_grasp(hand: Hand, config: Config, shape: str) -> Finding:
     Fingers that can be pushed open may lose what nothing centres between them. Of such a hand the
     finding says whether it holds with locked fingers, and what becomes of that grasp without.
     """
-    # Try until one holds.
+    # Try until one holds, which a whole lift shows.
+    config = with_whole_lifts(config)
     drive = drive_of(hand, config.lift)
     rules = _with_drive(config, "locked" if drive == "torque" else drive)
     outcomes: Counter[str] = Counter()

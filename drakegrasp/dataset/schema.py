@@ -181,6 +181,7 @@ CONTACT_NAMES = tuple(field.name for field in _CONTACTS)
 # table.
 _CLOSED = tuple(field for field in _contacts("closed", "when closing ended")
                 if field.name != "closed_object_on_table")
+# Of a lift that ends early: when it ends.
 _LIFTED = _contacts("lifted", "after the lift")
 
 # Where a palm pose comes from; an attempt's identity is object, candidate, stand-off and child.
@@ -208,7 +209,7 @@ _TIME_CLOSE = Field("time_close", "", "float64", "s", "-",
                     "simulated time at which closing ended")
 _TIME_LIFT = Field(
     "time_lift", "", "float64", "s", "-",
-    "simulated time of the lift with its hold; shorter where its end was known before")
+    "simulated time of the lift with its hold; shorter where it ended early")
 _SLIP = (
     Field("slip", "", "float64", "m", "G",
           "distance that the object moved in the hand during the lift"),
@@ -421,7 +422,7 @@ OBJECT_FIELDS: tuple[Field, ...] = (
 VERIFICATION_FIELDS: tuple[Field, ...] = (
     Field("object", "", "str", "-", "-", "name of the object"),
     Field("method", "", "str", "-", "-", "how it was verified: hand, or forces alone"),
-    _verdict(list(Outcome)),
+    _verdict([outcome for outcome in Outcome if not outcome.dataset_only]),
     *_WORDS,
     Field("reason", "", "str", "-", "-", "why, in words"),
     _X_TO,

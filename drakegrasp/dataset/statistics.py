@@ -209,6 +209,17 @@ def funnel_of(path: Path) -> Funnel:
     )
 
 
+def held_note(funnel: Funnel) -> str:
+    """Return why there may be more held grasps than were counted; empty if there are not."""
+    moved = int(funnel.outcomes[:, Outcome.MOVED].sum())
+    if not moved:
+        return ""
+    return (
+        "the number of held grasps is a lower bound: lifts that were ended without a verdict, as "
+        f"the object moved more in the hand than a sample may (moved): {moved:,}"
+    )
+
+
 def count_splits(out: Path) -> list[SplitCount]:
     """Return samples, objects and classes of each split.
 

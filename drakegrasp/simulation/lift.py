@@ -9,6 +9,10 @@ changing the verdict:
   needs no fine steps. A second diagram takes the coarse steps; it takes over the state.
 * The lift ends early when the verdict is certain: nothing of the hand touches the object any more,
   or object and fingers stand still and a fingertip has clearly lost the object.
+
+With `lift.stop_when: lost_sample` a lift also ends, without a verdict, at the first check at which
+the object has moved more in the hand than a sample may. What is certain at that check, or at the
+end, goes first: a verdict says more than its absence.
 """
 
 from __future__ import annotations
@@ -38,6 +42,7 @@ from drakegrasp.simulation.scene import (
 from drakegrasp.simulation.screen import extra_margin
 from drakegrasp.simulation.stepping import TrialLimits
 from drakegrasp.simulation.trajectory import lift_duration
+from drakegrasp.simulation.verdict import is_lost_sample
 
 #: An object that moved less than this in the hand since the last check is still held [m], [rad].
 HELD_SHIFT, HELD_ANGLE = 5e-4, np.deg2rad(0.5)
@@ -63,6 +68,7 @@ class Lift:
         slip: Distance that {O} moved in {G} since the object is free [m].
         turn: Angle that it turned in {G} since then [rad].
         slip_released, turn_released: The same before the wrist moved.
+        moved: Whether it was ended early because the object moved too far in the hand.
     """
 
     contacts: Contacts
@@ -74,6 +80,7 @@ class Lift:
     turn: float
     slip_released: float
     turn_released: float
+    moved: bool
 
 
 def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
@@ -92,8 +99,8 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
     X_GO_start, start = _object_in_hand(scene), scene.time
 
     # `scene` takes fine steps, `current` is the one that takes the steps that are needed now.
-    now, current, monitor, certain = start, scene, _Monitor(scene), False
-    slip_released, turn_released, used = 0.0, 0.0, [scene]
+    now, current, monitor, used = start, scene, _Monitor(scene), [scene]
+    slip_released, turn_released, certain, moved = 0.0, 0.0, False, False
     try:
         # Free the object in the hand; later the wrist goes to its target.
         release(scene)
@@ -101,8 +108,9 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
         motion = _plan_motion(scene, config)
         end = motion.begin + motion.duration + config.lift.hold_time
 
-        # Simulate from check to check until the target was held, or the verdict is certain.
-        while now < end and not certain:
+        # Simulate from check to check until the target was held, the verdict is certain, or the
+        # object moved too far.
+        while now < end and not certain and not moved:
             check = min(_next_check(now, config), motion.begin if now < motion.begin else end)
             # Stop just before a step, so that rounding moves no step across a check.
             margin = ROUNDING * current.physics.time_step if check < end else 0.0
@@ -110,12 +118,16 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
             certain = monitor.update(current, check - now, config.close.stop_speed)
             now = check
 
-            # How far the object moved in the hand before the wrist moves.
+            # How far the object moved in the hand, and how far of it before the wrist moves.
+            X_GO = _object_in_hand(current)
+            slip, turn = _motion(X_GO_start, X_GO)
             if now <= motion.begin:
-                slip_released, turn_released = _motion(X_GO_start, _object_in_hand(current))
+                slip_released, turn_released = slip, turn
+            if now < end and not certain:
+                moved = bool(is_lost_sample(slip, turn, config.lift))
 
             # Choose the step for what comes next; the state moves to the diagram that has it.
-            if now < end and not certain:
+            if now < end and not certain and not moved:
                 chosen = _scene_for(scene, monitor.at_rest)
                 if chosen is not current:
                     used.append(chosen)
@@ -124,12 +136,11 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
                     hand_over(chosen, current)
                 current = chosen
 
-        # Read what the hand holds now, and how far the object slipped in it.
-        contacts, X_GO = read_contacts(current), _object_in_hand(current)
+        # Read what the hand holds now.
+        contacts = read_contacts(current)
     finally:
         for stage in used:
             disengage(stage)
-    slip, turn = _motion(X_GO_start, X_GO)
     return Lift(
         contacts=contacts,
         q=hand_positions(current),
@@ -140,6 +151,7 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
         turn=turn,
         slip_released=slip_released,
         turn_released=turn_released,
+        moved=moved,
     )
 
 

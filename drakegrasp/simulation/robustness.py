@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drakegrasp.arithmetic import Array, multiply
-from drakegrasp.config import CertifyConfig, Config
+from drakegrasp.config import CertifyConfig, Config, with_whole_lifts
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
@@ -145,7 +145,8 @@ class _Repeater:
         """Take an object, its resting pose (4, 4) and the rules of the attempts."""
         step = STEP_RATIO * config.physics.time_step
         physics = config.physics.model_copy(update={"time_step": step, "coarse_steps": 1})
-        self._config = config.model_copy(update={"physics": physics})
+        # Whether a grasp holds is the verdict of a whole lift.
+        self._config = with_whole_lifts(config).model_copy(update={"physics": physics})
         self._model, self._X_TO, self._hand = model, X_TO, load_hand(config.hand)
         self._scene = build_scene(model, physics, self._hand)
 

@@ -152,14 +152,15 @@ def run_attempt(
         # Lift: object and wrist are free, and the wrist moves to its target.
         end = lift(scene, limits, config)
 
-        # Judge the lifted object: all fingertips must still hold it, clear of the table.
+        # Judge the lifted object: all fingertips must still hold it, clear of the table. A lift
+        # that was ended because the object moved has no such verdict.
         lifted = end.contacts
         verdict = judge_lifted(
             lifted.touching, lifted.other_links, lifted.object_on_table, required=required
         )
         return replace(
             record,
-            outcome=Outcome(int(verdict)),
+            outcome=Outcome.MOVED if end.moved else Outcome(int(verdict)),
             lifted=lifted,
             q_lifted=end.q,
             time_lift=end.duration,

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from drakegrasp.config import LiftConfig
 from drakegrasp.outcomes import Outcome
 
 Outcomes = npt.NDArray[np.int64]
@@ -66,6 +67,18 @@ def judge_lifted(
         (_misses(touching, required), Outcome.SLIPPED),
         (object_on_table, Outcome.TABLE_CONTACT),
     )
+
+
+def is_lost_sample(slip: npt.ArrayLike, turn: npt.ArrayLike, rules: LiftConfig) -> Flags:
+    """Return (...,) whether a lift ends at a check because the grasp can become no sample.
+
+    Args:
+        slip: (...,), distance that the object moved in the hand since it is free [m].
+        turn: (...,), angle that it turned in the hand [rad].
+        rules: When lifts end.
+    """
+    too_far = (np.asarray(slip) > rules.stop_slip) | (np.degrees(turn) > rules.stop_turn_deg)
+    return np.asarray((rules.stop_when == "lost_sample") & too_far)
 
 
 def is_precision(outcome: npt.ArrayLike, other_links: npt.ArrayLike) -> Flags:

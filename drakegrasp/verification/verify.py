@@ -13,7 +13,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from drakegrasp.config import Config
+from drakegrasp.config import Config, with_whole_lifts
 from drakegrasp.errors import OffSurfaceError
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
@@ -92,9 +92,11 @@ def verify_contacts(
         p_OQ: (k, 3), contact points [m]; they are rounded to 0.1 mm.
         nhat_Q_O: (k, 3), outward unit normals.
         method: "hand" or "forces".
-        config: Hand, physics, lift and limits.
+        config: Hand, physics, lift and limits. `lift.stop_when` is without effect: the verdict is
+            that of a whole lift.
     """
     # Round the contacts; adding zero turns -0.0 into 0.0.
+    config = with_whole_lifts(config)
     rules, seconds = config.verify, dict[str, float]()
     p_OQ, nhat_Q_O = np.round(p_OQ, POINT_DIGITS) + 0.0, np.round(nhat_Q_O, NORMAL_DIGITS) + 0.0
     nhat_Q_O /= np.linalg.norm(nhat_Q_O, axis=1, keepdims=True)

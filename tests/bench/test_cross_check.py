@@ -8,7 +8,15 @@ from collections import Counter
 import h5py
 import pytest
 from click.testing import CliRunner
-from helpers.datasets import AFTER_LIFT, BOXES, OUTCOMES, TRIALS, make_dataset
+from helpers.datasets import (
+    AFTER_LIFT,
+    BOXES,
+    OUTCOMES,
+    SLIPPED,
+    TRIALS,
+    change,
+    make_dataset,
+)
 
 from drakegrasp.bench.cross_check import GROUPS, agreement, draw_lifts, wilson_interval
 from drakegrasp.cli.main import main
@@ -62,6 +70,13 @@ def test_hand_on_the_table_after_closing_is_no_lift(dataset):
     drawn = {lift.trial_id for lift in draw_lifts(dataset, 1000)}
     on_table = [i for i, outcome in enumerate(OUTCOMES) if outcome is Outcome.TABLE_CONTACT]
     assert drawn & set(on_table) == {AFTER_LIFT}
+
+
+def test_lift_without_a_verdict_is_no_lost_one(dataset, tmp_path):
+    out = make_dataset(tmp_path / "data", tmp_path)
+    change(out, TRIALS, "trials/outcome", SLIPPED, lambda _: Outcome.MOVED)
+    drawn = [{lift.trial_id for lift in draw_lifts(each, 1000)} for each in (dataset, out)]
+    assert drawn[0] - drawn[1] == {SLIPPED}
 
 
 def test_groups_and_objects_take_turns(dataset, tmp_path):

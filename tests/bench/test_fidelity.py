@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 from helpers.objects import CUBE, box_model
 
 from drakegrasp.bench import fidelity
+from drakegrasp.build.attempts import TrialSetup
 from drakegrasp.config import load_config
 from drakegrasp.hand.description import load_hand
 from drakegrasp.mesh.surfaces import signed_volume
 from drakegrasp.outcomes import Outcome
+
+
+def bench_of(*overrides):
+    return TrialSetup(prepared=None, config=load_config(overrides=overrides), scene=None)
 
 
 def test_finer_surface_is_the_same_surface(tmp_path):
@@ -67,15 +73,41 @@ def test_label_depends_on_the_drive_if_any_other_drive_changes_it(monkeypatch):
     }
     same = [Outcome.SUCCESS] * 3
 
-    class Bench:
-        config = load_config()
-
     def simulate(bench, attempts, variant, count):
         return outcomes.get("".join(variant.overrides), same)
 
     monkeypatch.setattr(fidelity, "_simulate", simulate)
     lifts = [fidelity.Simulated(None, Record(), None)] * 3
-    report = fidelity.compare_labels(Bench(), lifts, lambda outcome: None)
+    report = fidelity.compare_labels(bench_of(), lifts, lambda outcome: None)
     assert report["drive"] == {"attempts": 3, "lifted": 3, "flips": 2}
     assert report["fidelity"]["drive_torque"]["flips"] == 1
     assert fidelity.sum_drive([report["drive"]] * 2)["flip_share_of_lifted"] == 4 / 6
+
+
+def test_lift_that_was_ended_is_compared_by_its_whole(monkeypatch):
+    """Two lifts, of which the second has no verdict yet; all variants hold both."""
+    tried, configs = [], []
+
+    def lift_again(bench, attempt, prediction):
+        tried.append(attempt)
+        configs.append(bench.config)
+        return SimpleNamespace(outcome=Outcome.SUCCESS, lifted=object())
+
+    def simulate(bench, attempts, variant, count):
+        configs.append(bench.config)
+        return [Outcome.SUCCESS] * 2
+
+    monkeypatch.setattr(fidelity, "try_attempt", lift_again)
+    monkeypatch.setattr(fidelity, "_simulate", simulate)
+    records = [
+        SimpleNamespace(outcome=outcome, lifted=object())
+        for outcome in (Outcome.SUCCESS, Outcome.MOVED)
+    ]
+    lifts = [fidelity.Simulated(i, record, None) for i, record in enumerate(records)]
+    report = fidelity.compare_labels(
+        bench_of("lift.stop_when=lost_sample"), lifts, lambda outcome: None
+    )
+    assert tried == [1]
+    assert {config.lift.stop_when for config in configs} == {"never"}
+    assert report["fidelity"]["sap"]["lifted"] == 2
+    assert report["fidelity"]["sap"]["flips"] == 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 
 from drakegrasp.build.target import Target
@@ -98,5 +100,5 @@ def test_workers_have_work_while_a_round_ends() -> None:
 
 def test_a_smaller_target_is_part_of_a_larger_one() -> None:
     reached = [run(make_target(samples))[0] for samples in range(1, 120, 7)]
-    for fewer, more in zip(reached, reached[1:], strict=False):
+    for fewer, more in pairwise(reached):
         assert all(fewer[name] <= more[name] for name in YIELDS)

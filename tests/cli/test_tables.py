@@ -38,6 +38,14 @@ def test_hold_table_tells_what_share_of_the_held_ones_is_stable() -> None:
     assert ["1_mug", "1,200", "20", "12", "9", "45%", "12"] in lines
     assert ["2_[box]", "7", "0", "0", "0", "-", "0"] in lines
     assert ["all", "1,207", "20", "12", "9", "45%", "12"] in lines
+    assert "lower bound" not in text.getvalue()
+
+    # What was ended might have been held.
+    outcomes[1, Outcome.MOVED] = 1234
+    text = StringIO()
+    Console(width=400, file=text).print(hold_table(funnel))
+    assert "lower bound" in text.getvalue()
+    assert "(moved): 1,234" in text.getvalue()
 
 
 @pytest.mark.parametrize("compact", [False, True])
@@ -66,8 +74,15 @@ def test_columns_of_the_funnel_add_up_to_the_attempts(compact: bool) -> None:
     numbers = [int(cell.replace(",", "")) for cell in row if cell.replace(",", "").isdigit()]
     # The number of grasps is also that of the samples.
     assert sum(set(numbers) - {count[0]}) == count[0]
+    assert "moved" in text.getvalue()
     if compact:
         lost = 2 ** built.index(Outcome.DROPPED) + 2 ** built.index(Outcome.SLIPPED)
         assert lost in numbers
     else:
         assert {2**k for k in range(len(built))} <= set(numbers)
+
+    # Without one there is no column of lifts that were ended.
+    outcomes[0, Outcome.MOVED] = 0
+    text = StringIO()
+    Console(width=400, file=text).print(funnel_table(funnel, compact=compact))
+    assert "moved" not in text.getvalue()

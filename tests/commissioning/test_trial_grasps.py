@@ -13,7 +13,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.scene import hand_positions
-from drakegrasp.simulation.trial import run_attempt
+from drakegrasp.simulation.trial import TrialRecord, run_attempt
 
 
 def test_a_pinch_is_where_the_pads_leave_its_width(tmp_path) -> None:
@@ -60,3 +60,20 @@ def test_slip_of_fingers_that_are_pushed_open_is_told() -> None:
     assert "slips by 0.1" in locked
     assert own.startswith("slips by 3.")
     assert own.endswith("with its own, which are pushed open")
+
+
+def test_trial_grasps_are_lifted_to_their_end(monkeypatch) -> None:
+    """The one with locked fingers and the one with its own."""
+    configs = []
+
+    def hold(scene, X_TO, attempt, config):
+        configs.append(config)
+        return TrialRecord(outcome=Outcome.SUCCESS, X_TO=X_TO, X_OG=attempt.X_OG)
+
+    module = "drakegrasp.commissioning.trial_grasps"
+    monkeypatch.setattr(f"{module}.build_scene", lambda *_: None)
+    monkeypatch.setattr(f"{module}.run_attempt", hold)
+    config = load_config(overrides=["lift.drive=torque", "lift.stop_when=lost_sample"])
+    assert check_grasp(load_hand("allegro"), config, "box").ok
+    assert [each.lift.drive for each in configs] == ["locked", "torque"]
+    assert {each.lift.stop_when for each in configs} == {"never"}

@@ -23,7 +23,7 @@ from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.lock import FILE_NAME, build_lock
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.schema import CAMERAS
-from drakegrasp.errors import DataError
+from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.frames import (
     invert_pose,
     make_pose,
@@ -231,6 +231,17 @@ def test_contact_is_in_view_within_the_image_and_before_the_camera(
 def test_limits_of_the_hold_change_without_a_simulation(out: Path) -> None:
     assert assemble(out, overrides=[f"filters.max_slip={SLIP / 2}"]).removed == {Removal.SLID: 9}
     assert assemble(out, overrides=["filters.require=held"]).removed == {Removal.KEPT: 9}
+
+
+@pytest.mark.parametrize("override", ["filters.require=held", "filters.max_slip=null"])
+def test_filters_that_lifts_were_ended_by_cannot_be_looser(tmp_path: Path, override: str) -> None:
+    """Of the lifts that ended nobody knows whether they would be samples then."""
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes", "lift.stop_when=lost_sample")
+    before = {path: path.read_bytes() for path in out.iterdir() if path.is_file()}
+    with pytest.raises(ConfigError, match=rf"{override.partition('=')[0]} must be"):
+        assemble(out, overrides=[override])
+    assert {path: path.read_bytes() for path in out.iterdir() if path.is_file()} == before
+    assert assemble(out, overrides=["filters.max_slip=0.009"]).samples
 
 
 def test_rejected_trials_become_no_samples(out: Path) -> None:

@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
-from helpers.datasets import TRIALS, change, set_at
+from helpers.datasets import SLIPPED, TRIALS, change, end_lift, set_at
 from helpers.pages import ATTACK, Tags, coded, get, numbered, state_of
 from matplotlib.image import imread
 from starlette.testclient import TestClient
@@ -108,6 +108,14 @@ def test_failed_attempt_is_shown_as_far_as_it_got(client: TestClient) -> None:
     assert 'data-state="closed"' not in page
     assert "data-decide" not in page
     assert "Only successes have images" in page
+
+
+def test_lift_that_was_ended_is_said_to_have_no_verdict(client: TestClient, out: Path) -> None:
+    end_lift(out, SLIPPED, 0.02)
+    gallery = get(client, "/?outcome=moved").text
+    assert gallery.count("lift ended, not judged") == 1
+    assert "moved: no images" in gallery
+    assert "lift ended, not judged" not in get(client, "/?outcome=dropped").text
 
 
 def test_meshes_are_glb_files(client: TestClient) -> None:

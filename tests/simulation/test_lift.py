@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections import Counter
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from helpers.objects import CUBE, STANDOFF, from_above, standing
 from pydrake.math import RigidTransform
 
-from drakegrasp.config import override_config
+from drakegrasp.config import load_config, override_config
 from drakegrasp.frames import X_WT, make_pose, rotation_about
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
@@ -30,7 +31,7 @@ from drakegrasp.simulation.scene import (
 )
 from drakegrasp.simulation.stepping import start_limits
 from drakegrasp.simulation.trajectory import lift_duration
-from drakegrasp.simulation.trial import run_attempt
+from drakegrasp.simulation.trial import TrialRecord, run_attempt
 
 pytestmark = pytest.mark.sim
 
@@ -138,6 +139,81 @@ def test_lift_ends_when_the_object_is_lost(cube, config, hand):
     assert record.outcome is Outcome.DROPPED
     whole = lift_duration(0.60 - CUBE - STANDOFF, slippery) + slippery.lift.hold_time
     assert record.time_lift < 0.7 * whole
+
+
+@pytest.fixture(scope="module")
+def sliding(scene, cube):
+    """Lifts of a cube by fingers that it pushes open: it slides by 22 mm and turns by 8 degrees."""
+
+    def run(*overrides: str) -> TrialRecord:
+        rules = load_config(overrides=["lift.drive=torque", *overrides])
+        return run_attempt(scene, standing(cube), from_above(cube, STANDOFF), rules)
+
+    return run
+
+
+LOST_SAMPLE = "lift.stop_when=lost_sample"
+
+
+def same_bits(one: TrialRecord, other: TrialRecord) -> bool:
+    return pickle.dumps(one) == pickle.dumps(other)
+
+
+@pytest.mark.parametrize("limits", [[], ["lift.stop_slip=1", "lift.stop_turn_deg=4"]])
+def test_lift_ends_when_its_sample_is_lost(sliding, limits):
+    """By 10 mm or by an angle; the object, still held, is measured as it is then."""
+    whole, ended = sliding(), sliding(LOST_SAMPLE, *limits, "filters.max_turn_deg=4")
+    assert (whole.outcome, ended.outcome) == (Outcome.SUCCESS, Outcome.MOVED)
+    assert ended.time_lift < 0.5 * whole.time_lift
+    assert ended.slip < 0.6 * whole.slip
+    assert (ended.slip > 0.010) or limits
+    assert ended.lifted.touching.all()
+    assert same_bits(ended.closed, whole.closed)
+    X_GO = np.linalg.inv(ended.X_OG_lifted) @ ended.X_OG
+    assert np.linalg.norm(X_GO[:3, 3]) > 0.9 * ended.slip
+
+
+def test_lift_of_a_sample_is_the_same_with_and_without_a_limit(sliding, scene, cube, config):
+    wide = ["lift.stop_slip=0.03", "lift.stop_turn_deg=20"]
+    assert same_bits(sliding(), sliding(LOST_SAMPLE, *wide))
+    attempt, rules = from_above(cube, STANDOFF), override_config(config, [LOST_SAMPLE])
+    records = [run_attempt(scene, standing(cube), attempt, each) for each in (config, rules)]
+    assert same_bits(*records)
+
+
+def test_lift_ends_beyond_the_limit_and_not_at_it(sliding):
+    """The object slides on between two checks."""
+    ended = sliding(LOST_SAMPLE)
+    below = float(np.nextafter(ended.slip, 0.0))
+    assert below > 0.010
+    again = sliding(LOST_SAMPLE, f"lift.stop_slip={below!r}")
+    at = sliding(LOST_SAMPLE, f"lift.stop_slip={ended.slip!r}")
+    assert same_bits(again, ended)
+    assert at.outcome is Outcome.MOVED
+    assert at.time_lift > ended.time_lift
+
+
+def test_verdict_at_the_end_of_a_whole_lift_goes_first(sliding):
+    """Here there are two checks: before the wrist moves, and at the end."""
+    whole = sliding("lift.check_period=9")
+    assert whole.outcome is Outcome.SUCCESS
+    assert whole.slip_released < 0.010 < whole.slip
+    assert same_bits(sliding("lift.check_period=9", LOST_SAMPLE), whole)
+
+
+def test_certain_verdict_goes_before_a_lost_sample(cube, hand):
+    """Between two checks the object slides from 29 to 60 mm, out of the hand."""
+    slippery = load_config(overrides=["physics.friction_hand=0.05"])
+    scene = build_scene(cube, slippery.physics, hand)
+    records = {}
+    for limit in (0.02, 0.04):
+        rules = override_config(slippery, [LOST_SAMPLE, f"lift.stop_slip={limit}"])
+        records[limit] = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), rules)
+    assert records[0.02].outcome is Outcome.MOVED
+    assert records[0.02].slip < 0.04 < records[0.04].slip
+    whole = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), slippery)
+    assert whole.outcome is Outcome.DROPPED
+    assert same_bits(records[0.04], whole)
 
 
 def test_slip_before_the_wrist_moves_is_told_apart(scene, cube, config):

@@ -123,6 +123,14 @@ def test_repeats_are_simulated_at_half_the_step_throughout(cube, config, monkeyp
         assert (physics.time_step, physics.coarse_steps) == (half, 1)
 
 
+def test_repeats_are_lifted_to_their_end(cube, config, monkeypatch):
+    """Whether a grasp holds is not known of a lift that ends when its sample is lost."""
+    seen = Seen(monkeypatch)
+    ended = override_config(config, ["lift.stop_when=lost_sample"])
+    certify(cube, standing(cube), from_above(cube, STANDOFF), ended)
+    assert {each.lift.stop_when for each in seen.configs} == {"never"}
+
+
 NOISE = {"palm_noise": 0.0, "palm_noise_deg": 0.0, "friction_noise": 0.0, "mass_noise": 0.0}
 
 

@@ -7,10 +7,12 @@ from itertools import product
 import numpy as np
 import pytest
 
+from drakegrasp.config import load_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.verdict import (
     STABLE_SLIP,
     STABLE_TURN,
+    is_lost_sample,
     is_precision,
     is_stable,
     judge_closed,
@@ -94,6 +96,24 @@ def test_stable_is_a_precision_grasp_that_stays(
     assert is_precision(outcome, other_links) == precision
     assert is_stable(outcome, other_links, slip, turn) == stable
     assert STABLE_SLIP == 5e-3
+
+
+@pytest.mark.parametrize(
+    ("slip", "turn", "lost"),
+    [
+        (0.02, np.deg2rad(30.0), False),
+        (np.nextafter(0.02, 1.0), 0.0, True),
+        (0.0, np.deg2rad(30.000001), True),
+    ],
+)
+def test_sample_is_lost_beyond_either_limit_where_that_ends_lifts(
+    slip: float, turn: float, lost: bool
+) -> None:
+    """At the limit itself a filter with the same limit keeps it."""
+    limits = ["lift.stop_slip=0.02", "lift.stop_turn_deg=30"]
+    for stop, ends in (("lost_sample", lost), ("never", False)):
+        rules = load_config(overrides=[*limits, f"lift.stop_when={stop}"]).lift
+        assert is_lost_sample(slip, turn, rules) == ends
 
 
 def test_a_fingertip_that_is_not_required_may_miss() -> None:

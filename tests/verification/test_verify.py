@@ -363,6 +363,19 @@ def test_as_many_palm_poses_are_tried_as_may_be(
         assert (found.outcome, found.tries) == (outcome, most)
 
 
+def test_verdict_is_that_of_a_whole_lift(
+    held: dg.Verification, cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
+) -> None:
+    """Whatever moves in the hand ends the lifts of the dataset's configuration at once."""
+    limits = ["lift.stop_slip=1e-9", "filters.max_slip=1e-9"]
+    config = override_config(CONFIG, ["lift.stop_when=lost_sample", *limits])
+    found = verify_contacts(cube, *grasp, method="hand", config=config)
+    assert found.outcome is Outcome.SUCCESS
+    assert found.trial is not None and held.trial is not None
+    assert found.trial.time_lift == held.trial.time_lift
+    assert found.config.lift.stop_when == "never"
+
+
 @pytest.mark.parametrize(("collisions", "shares"), [(0, [1.0]), (1, [1.0, 0.5]), (2, [1.0, 0.5])])
 def test_fingers_are_opened_until_the_hand_is_clear(
     held: dg.Verification,

@@ -18,7 +18,7 @@ from drakegrasp.dataset.layout.opening import open_samples
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry, read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, SPLITS
-from drakegrasp.dataset.statistics import Funnel, funnel_of, splits_of
+from drakegrasp.dataset.statistics import Funnel, funnel_of, held_note, splits_of
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file, hand_names
 from drakegrasp.outcomes import Outcome
@@ -92,6 +92,12 @@ def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
     # The manifest has more objects than the files while a build goes on that adds some.
     funnel = funnel_of(trials)
     entries = [entry for entry in manifest.objects if entry.name in funnel.names]
+
+    # The known limits, and one that follows from the counts.
+    limits = [*LIMITS]
+    if note := held_note(funnel):
+        limits.append((f"{note[0].upper()}{note[1:]}.", "reference/outcomes.md"))
+
     return {
         "title": f"Simulated grasps of {len(entries)} object{'s' * (len(entries) != 1)}",
         "hand": Path(manifest.config.hand).stem,
@@ -106,7 +112,7 @@ def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
         "refused": {mesh.name: mesh.reason for mesh in manifest.refused},
         "files": FILES,
         "conventions": CONVENTIONS,
-        "limits": [{"limit": text, "docs": f"docs/{page}"} for text, page in LIMITS],
+        "limits": [{"limit": text, "docs": f"docs/{page}"} for text, page in limits],
     }
 
 

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from drakegrasp.config import LiftConfig
 from drakegrasp.dataset.checks.findings import (
     POSITION_TOLERANCE,
     AnyArray,
@@ -24,7 +25,13 @@ from drakegrasp.dataset.schema import TRIAL_FIELDS
 from drakegrasp.frames import invert_pose
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.simulation.candidates import Source
-from drakegrasp.simulation.verdict import is_precision, is_stable, judge_closed, judge_lifted
+from drakegrasp.simulation.verdict import (
+    is_lost_sample,
+    is_precision,
+    is_stable,
+    judge_closed,
+    judge_lifted,
+)
 
 #: Slip [m] and turn [rad] are as exact as the poses that they follow from; the angle of a rotation
 #: close to none is less exact than its matrix.
@@ -53,7 +60,9 @@ def numbers(
         "trial_id must be the row's number", batch["trial_id"] != batch.rows, batch["trial_id"]
     )
     outcome, known = batch["outcome"], [o.value for o in Outcome if not o.verification_only]
-    yield from batch.broken(f"outcome must be 0..{max(known)}", ~np.isin(outcome, known), outcome)
+    yield from batch.broken(
+        f"outcome must be one of {', '.join(map(str, known))}", ~np.isin(outcome, known), outcome
+    )
 
     # Its object, and its candidate among the object's.
     index, candidate = batch["object"], batch["candidate"]
@@ -125,12 +134,15 @@ def stages(batch: Batch) -> Iterator[Violation]:
         yield from batch.broken(what, bad, lambda i: _outcome(batch, i))
 
 
-def verdicts(batch: Batch, required: Sequence[bool]) -> Iterator[Violation]:
-    """The outcome is what follows from the recorded contacts (`simulation.verdict`).
+def verdicts(
+    batch: Batch, required: Sequence[bool], rules: LiftConfig | None
+) -> Iterator[Violation]:
+    """The outcome is what follows from the recorded contacts and motion (`simulation.verdict`).
 
     Args:
         batch: Rows of `/trials`.
         required: Whether a grasp needs each fingertip on the object.
+        rules: When lifts end, if known.
     """
     # What the contacts of each stage say.
     closed = judge_closed(
@@ -145,6 +157,18 @@ def verdicts(batch: Batch, required: Sequence[bool]) -> Iterator[Violation]:
         batch["lifted_object_on_table"],
         required=required,
     )
+
+    # A lift that was ended has no verdict, but a reason.
+    moved = batch["outcome"] == Outcome.MOVED
+    lifted = np.where(moved, Outcome.MOVED.value, lifted)
+    if rules is not None:
+        yield from batch.broken(
+            "outcome must be moved only where lift.stop_when, stop_slip and stop_turn_deg say so",
+            moved & ~is_lost_sample(batch["slip"], batch["turn"], rules),
+            lambda i: (
+                f"a slip of {batch['slip'][i]:.4g} m and a turn of {batch['turn'][i]:.4g} rad"
+            ),
+        )
 
     # A hand that may not lift has no second verdict.
     expected = np.where(closed != Outcome.SUCCESS, closed, lifted)

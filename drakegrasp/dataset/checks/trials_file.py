@@ -79,7 +79,11 @@ def _judge_trials(rows: Rows, findings: Findings) -> AnyArray:
     named = "fingers" not in wrong and "fingers" in trials.file.attrs
     fingers = json.loads(trials.file.attrs["fingers"]) if named else {}
     last: list[Rule] = [
-        partial(trial_rules.verdicts, required=list(fingers.values()) or [True]),
+        partial(
+            trial_rules.verdicts,
+            required=list(fingers.values()) or [True],
+            rules=trials.config.lift if trials.config else None,
+        ),
         trial_rules.words,
         trial_rules.contacts,
         trial_rules.poses,

@@ -10,7 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from helpers.datasets import make_dataset
+from helpers.datasets import SLIPPED, end_lift, make_dataset
 
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.card.content import card_content, content_of
@@ -74,6 +74,17 @@ def test_text_has_the_counts_and_nothing_that_is_markup(dataset: Path) -> None:
     assert "| &lt;b&gt;a\\|b\\\\\\|c | brick | 1,234,567 |" in text
     for each in content["limits"]:
         assert each["limit"] in text
+
+
+def test_card_says_that_held_grasps_are_a_lower_bound(dataset: Path) -> None:
+    """Where lifts were ended, and only there."""
+    assert "lower bound" not in card_text(card_content(dataset))
+    end_lift(dataset, SLIPPED, 0.02)
+    content = card_content(dataset)
+    assert content["counts"]["outcomes"]["moved"] == 1
+    (limit,) = [each for each in content["limits"] if "lower bound" in each["limit"]]
+    assert limit["limit"].endswith("(moved): 1.")
+    assert limit["docs"] == "docs/reference/outcomes.md"
 
 
 def test_limits_name_pages_that_exist(dataset: Path) -> None:

@@ -18,6 +18,7 @@ from helpers.datasets import (
     TRIALS,
     Edit,
     change,
+    end_lift,
     found,
     make_dataset,
     mirrored,
@@ -30,7 +31,7 @@ from drakegrasp.outcomes import Outcome
 
 TRIAL_CASES: Mapping[str, tuple[str, int, Edit, str]] = {
     "trial_id": ("trial_id", MISSING, lambda i: i + 1, "trial_id must be the row's number"),
-    "outcome": ("outcome", BELOW, lambda _: 99, "outcome must be 0..12"),
+    "outcome": ("outcome", BELOW, lambda _: 99, "outcome must be one of 0, 1, 2"),
     "object": ("object", BELOW, lambda _: 3, "object must be a row of /objects, 0..2"),
     "negative object": ("object", BELOW, lambda _: -1, "object must be a row of /objects, 0..2"),
     "candidate": ("candidate", BELOW, lambda _: 4, "candidate must be one of"),
@@ -91,6 +92,31 @@ def test_a_wrong_value_of_a_trial_is_found(out: Path, case: str) -> None:
     name, row, edit, what = TRIAL_CASES[case]
     change(out, TRIALS, f"trials/{name}", row, edit)
     must_find(out, (TRIALS, "/trials", row, what))
+
+
+@pytest.mark.parametrize(
+    ("override", "slip", "sound"),
+    [
+        ("lift.stop_when=lost_sample", 0.011, True),
+        ("lift.stop_when=lost_sample", 0.010, False),
+        ("lift.stop_when=never", 0.011, False),
+    ],
+)
+def test_lift_is_ended_only_where_the_configuration_says_so(
+    tmp_path: Path, override: str, slip: float, sound: bool
+) -> None:
+    """Whatever its contacts say then."""
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes", override)
+    end_lift(out, SLIPPED, slip)
+    what = (TRIALS, "/trials", SLIPPED, "outcome must be moved only where lift.stop_when")
+    must_find(out / TRIALS, *([] if sound else [what]))
+
+
+def test_hand_that_may_not_lift_ends_no_lift(tmp_path: Path) -> None:
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes", "lift.stop_when=lost_sample")
+    end_lift(out, SLIPPED, 0.02)
+    change(out, TRIALS, "trials/closed_other_links", SLIPPED, lambda _: 1)
+    must_find(out, (TRIALS, "/trials", SLIPPED, "outcome must follow from the contacts"))
 
 
 def test_contact_that_slides_may_be_pressed_from_any_side(out: Path) -> None:
