@@ -28,7 +28,7 @@ from drakegrasp.config import (
     Number,
     Positive,
     override_config,
-    parse_config,
+    parse_stored,
 )
 from drakegrasp.dataset import log as build_log
 from drakegrasp.dataset.layout.json_files import Name, read_mapping, validated
@@ -36,6 +36,7 @@ from drakegrasp.dataset.paths import FILE_NAME, OWN_FILES, OWN_FOLDERS
 from drakegrasp.dataset.rejections import AttemptKey, key_to_json
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, refuse_other_schema
 from drakegrasp.dataset.shards import ShardHeader
+from drakegrasp.dataset.split import Rule, split_rule
 from drakegrasp.errors import ConfigError, DataError, GraspError
 from drakegrasp.frames import read_pose, unpack_pose
 from drakegrasp.hand.file_format import read_hand_file
@@ -90,6 +91,7 @@ class ObjectEntry:
         distinct: Number of different palm poses among the valid ones.
         notes: What was repaired in the mesh.
         licence: Identifier of the mesh's licence; None: not stated.
+        group: What it shares with others of the same mesh, which stay in one split; None: its name.
     """
 
     name: Name
@@ -109,11 +111,13 @@ class ObjectEntry:
     distinct: Whole
     notes: tuple[str, ...]
     licence: Licence | None = None
+    group: Name | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry as JSON types, in the order of the manifest."""
         # What is not stated leaves no trace.
-        said = {key: v for key, v in asdict(self).items() if (key, v) != ("licence", None)}
+        unsaid = {("licence", None), ("group", None)}
+        said = {key: v for key, v in asdict(self).items() if (key, v) not in unsaid}
         return {"class" if key == "class_name" else key: v for key, v in said.items()}
 
 
@@ -177,6 +181,17 @@ class Manifest:
         """Number of work units."""
         return sum(len(tuple(self.config.unit_ranges(e.candidates))) for e in self.objects)
 
+    @property
+    def groups(self) -> list[str]:
+        """Group of each object, see `split.split_rule`."""
+        return [entry.group or entry.name for entry in self.objects]
+
+    @property
+    def split_rule(self) -> Rule:
+        """What `split.by` of the configuration stands for with these objects."""
+        classes = [entry.class_name for entry in self.objects]
+        return split_rule(self.config.split, classes, self.groups)
+
     def signature(self) -> str:
         """Return a hash of all in it that decides a row of the dataset, hexadecimal."""
         unlicensed = tuple(replace(entry, licence=None) for entry in self.objects)
@@ -225,6 +240,7 @@ def _content(manifest: Manifest) -> dict[str, Any]:
         "config_hash": manifest.config.simulation_hash(),
         "seed": manifest.config.seed,
         "config": manifest.config.to_dict(),
+        "split_by": manifest.split_rule,
         "versions": manifest.versions,
         "fingers": manifest.fingers,
         "objects": [entry.to_json() for entry in manifest.objects],
@@ -257,13 +273,11 @@ def read_manifest(out: Path) -> Manifest:
     refuse_other_schema(path, tree.get("schema_version"))
     stored = validated(path, content, _Stored)
     try:
-        config = parse_config(stored.config)
+        config = parse_stored(stored.config)
     except ConfigError as error:
         raise DataError(f"{path}: {error}") from None
 
-    if (mistake := next(_contradictions(stored, config), None)) is not None:
-        raise DataError(f"{path}: {mistake}")
-    return Manifest(
+    manifest = Manifest(
         config=config,
         objects=stored.objects,
         refused=stored.refused,
@@ -271,6 +285,9 @@ def read_manifest(out: Path) -> Manifest:
         versions=stored.versions,
         fingers=stored.fingers,
     )
+    if (mistake := next(_contradictions(stored, manifest), None)) is not None:
+        raise DataError(f"{path}: {mistake}")
+    return manifest
 
 
 class _Stored(BaseModel):
@@ -280,6 +297,7 @@ class _Stored(BaseModel):
     config_hash: Hex
     seed: int
     config: dict[str, Any]
+    split_by: Rule | None = None
     versions: dict[str, str]
     fingers: dict[str, bool] = {}
     objects: tuple[ObjectEntry, ...]
@@ -287,14 +305,17 @@ class _Stored(BaseModel):
     rejected: tuple[AttemptKey, ...] = ()
 
 
-def _contradictions(stored: _Stored, config: Config) -> Iterator[str]:
+def _contradictions(stored: _Stored, manifest: Manifest) -> Iterator[str]:
     """Yield where a manifest contradicts itself, in words."""
+    config = manifest.config
     for key, said, must in (
         ("config_hash", stored.config_hash, config.simulation_hash()),
         ("seed", stored.seed, config.seed),
     ):
         if said != must:
             yield f"{key} must be {must}, that of its config, got {said}"
+    if stored.split_by not in (None, manifest.split_rule):
+        yield f"split_by must be {manifest.split_rule} with its objects, got {stored.split_by}"
 
     for name, count in Counter(entry.name for entry in stored.objects).items():
         if count > 1:

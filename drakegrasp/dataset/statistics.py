@@ -218,6 +218,16 @@ def count_splits(out: Path) -> list[SplitCount]:
     return splits_of(out / DATA_FILES["oto"])
 
 
+def rule_of_split(out: Path) -> str:
+    """Return by what the samples are split, `class` or `object`.
+
+    Raises:
+        DataError: If the data files are missing or damaged.
+    """
+    with open_samples(out / DATA_FILES["oto"]) as file:
+        return str(file.attrs.get("split_by", "class"))
+
+
 def splits_of(path: Path) -> list[SplitCount]:
     """Return what a data file tells of its splits, as `count_splits`."""
     with open_samples(path) as file:

@@ -100,6 +100,7 @@ def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
         "seed": manifest.config.seed,
         "config_hash": manifest.config.simulation_hash(),
         "settings": _settings(manifest.config),
+        "split_by": manifest.split_rule,
         "versions": manifest.versions,
         "licences": licences(entries),
         "counts": _counts(data, funnel),
