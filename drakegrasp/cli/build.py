@@ -138,11 +138,12 @@ def print_stats(out: Path) -> None:
         split_table,
         unfinished_line,
     )
+    from drakegrasp.dataset.paths import DATA_FILES
     from drakegrasp.dataset.statistics import (
         count_funnel,
         count_splits,
         count_unfinished,
-        rule_of_split,
+        split_rule_of,
     )
 
     console, unfinished = make_console(), count_unfinished(out)
@@ -158,7 +159,7 @@ def print_stats(out: Path) -> None:
     if unfinished is None:
         splits = count_splits(out)
         console.print(split_table(splits))
-        say(split_line(rule_of_split(out), funnel, splits))
+        say(split_line(split_rule_of(out / DATA_FILES["oto"]), funnel, splits))
         samples = {row.split: row.samples for row in splits}
         if any(samples.values()) and not samples["train"]:
             say(

@@ -218,13 +218,13 @@ def count_splits(out: Path) -> list[SplitCount]:
     return splits_of(out / DATA_FILES["oto"])
 
 
-def rule_of_split(out: Path) -> str:
-    """Return by what the samples are split, `class` or `object`.
+def split_rule_of(path: Path) -> str:
+    """Return by what the samples of a data file are split, `class` or `object`.
 
     Raises:
-        DataError: If the data files are missing or damaged.
+        DataError: If the file is missing or damaged.
     """
-    with open_samples(out / DATA_FILES["oto"]) as file:
+    with open_samples(path) as file:
         return str(file.attrs.get("split_by", "class"))
 
 
