@@ -115,7 +115,7 @@ and `hand_contact` were closed; `table_contact` was closed, and lifted if `time_
 
 
 _ATTRIBUTES = """
-Further attributes: `schema_version`, `camera`, camera matrix `K` [px], `near` and `far` [m],
+Further attributes: `schema_version`, `camera`, `split_by`, camera matrix `K` [px], `near` and `far` [m],
 `config` and `versions` (JSON), `config_hash`, `seed`, and of what the file was assembled from:
 `signature`, a hash of all in the manifest that decides a row, and `shards`, a hash of their seals.
 """

@@ -198,6 +198,12 @@ def test_changed_class_is_in_the_files_without_a_simulation(
     again = build(find_meshes(meshes), out, small_config, _nothing_runs, show=False)
     assert not again.assembled
 
+    # A group does not even need the object to be prepared.
+    said = "objects: {11_box_slim: {class: carton, group: box}}\n"
+    (meshes / "objects.yaml").write_text(said)
+    again = build(find_meshes(meshes), out, small_config, _nothing_runs, show=False)
+    assert again.assembled and read_manifest(out).objects[1].group == "box"
+
 
 def test_shard_that_is_not_the_assembled_one_is_assembled(
     small_meshes: Path, small_dataset: Path, small_config: Config, tmp_path: Path
