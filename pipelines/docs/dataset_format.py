@@ -115,9 +115,10 @@ and `hand_contact` were closed; `table_contact` was closed, and lifted if `time_
 
 
 _ATTRIBUTES = """
-Further attributes: `schema_version`, `camera`, `split_by`, camera matrix `K` [px], `near` and `far` [m],
-`config` and `versions` (JSON), `config_hash`, `seed`, and of what the file was assembled from:
-`signature`, a hash of all in the manifest that decides a row, and `shards`, a hash of their seals.
+Further attributes: `schema_version`, `camera` and `split_by` (`class` or `object`) of the data
+files, camera matrix `K` [px], `near` and `far` [m], `config` and `versions` (JSON), `config_hash`,
+`seed`, and of what the file was assembled from: `signature`, a hash of all in the manifest that
+decides a row, and `shards`, a hash of their seals.
 """
 
 _DATA = """## grasping_oto.hdf5 and grasping_otm.hdf5
