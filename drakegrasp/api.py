@@ -73,7 +73,7 @@ def build_dataset(
         objects: Directory of meshes, or "builtin" for the built-in objects, of which
             `config.builtin` says how many.
         out: Directory of the dataset; it must be visible to every worker.
-        config: All the rules; the preset `paper` if None.
+        config: All the rules; the defaults if None.
         units: Unit of length of the meshes: m, cm or mm.
         manifest: YAML file with units and classes per mesh, if it is not beside the meshes.
         workers: Processes on this machine; one per core if None.
@@ -196,7 +196,7 @@ def verify_grasp(
         method: "hand" closes a simulated hand on the contacts and lifts; "forces" lifts by
             forces at the contacts alone.
         config: Physics, lift and limits; if None that of the dataset or of the placed object,
-            else the preset `paper`.
+            else the defaults.
         dataset: Instead of a mesh: a data file of a dataset; its row defines the object, its
             pose and the camera's.
         row: The row of the dataset's split that the grasp is for.

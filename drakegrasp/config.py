@@ -1,8 +1,9 @@
 """The configuration: inert, typed data with a unit and a default for every value.
 
-The defaults are the paper's numbers (preset `paper`); a preset or a user's YAML file states
-only what differs. Angles are in degrees here, where YAML is read, and have `_deg` in their names;
-everywhere else they are in radians. Use `load_config` to get a configuration.
+The defaults are the paper's numbers, but for the split: `paper` states that of the paper. A preset
+or a user's YAML file states only what differs. Angles are in degrees here, where YAML is read, and
+have `_deg` in their names; everywhere else they are in radians. Use `load_config` to get a
+configuration.
 """
 
 from __future__ import annotations
@@ -343,11 +344,29 @@ class FilterConfig(_Section):
 
 
 class SplitConfig(_Section):
-    """How the samples are split for training, validation and test."""
+    """How the samples are split for training, validation and test; docs/reference/outcomes.md."""
 
+    # class: the paper's rule. object: whole objects are drawn. auto: by object where each class
+    # has one mesh and no class is named in `train_classes`, else by class.
+    by: Literal["auto", "class", "object"] = "auto"
+    # Of the objects; without effect by class, where one object of each class is tested.
+    test_fraction: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.15
+    # Of the objects; by class, of the samples that do not test.
     valid_fraction: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.1
-    # Names of the classes that train, with their only object too; None: all with two or more.
+    # By class: names of the classes that train, with their only object too; None: all with two or
+    # more.
     train_classes: tuple[str, ...] | None = None
+
+    @model_validator(mode="after")
+    def _of_one_rule(self) -> SplitConfig:
+        if self.by == "object" and self.train_classes is not None:
+            raise ValueError("by must be class or auto where train_classes is given, got object")
+        if self.by != "class" and self.test_fraction + self.valid_fraction >= 1.0:
+            raise ValueError(
+                "test_fraction and valid_fraction together must be less than 1, unless by is "
+                f"class, got {self.test_fraction} and {self.valid_fraction}"
+            )
+        return self
 
 
 class VerifyConfig(_Section):
@@ -486,7 +505,7 @@ def load_config(
     """Return the configuration of a preset or YAML file, with overrides applied.
 
     Args:
-        source: A preset's name, or a path to a YAML file; None is the preset `paper`.
+        source: A preset's name, or a path to a YAML file; None: the defaults.
         overrides: `"a.b=c"` strings, c read as YAML; later ones win.
         values: Top-level fields, e.g. `seed=1`; they win over the overrides.
 
@@ -494,7 +513,7 @@ def load_config(
         ConfigError: If a key is unknown, or a value is of the wrong type or impossible;
             one line with the key's path, what it must be, and what it was.
     """
-    tree = _read_source("paper" if source is None else source)
+    tree = {} if source is None else _read_source(source)
     own = copy.deepcopy(tree)
     for text in overrides:
         _apply_override(tree, text)
@@ -574,6 +593,19 @@ def parse_config(tree: dict[str, Any]) -> Config:
             for place, mistake in mistakes.items()
         ]
         raise ConfigError("; ".join(lines)) from None
+
+
+def parse_stored(tree: Any) -> Config:
+    """Return the configuration that a file of a dataset holds, as JSON.
+
+    Without `split.by` it was written when there was the split by class alone.
+
+    Raises:
+        ConfigError: See `load_config`.
+    """
+    if isinstance(tree, dict) and isinstance(split := tree.get("split"), dict):
+        tree = {**tree, "split": {"by": "class", **split}}
+    return parse_config(tree)
 
 
 def _read_source(source: str | Path) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from drakegrasp.config import (
     load_config,
     override_config,
     parse_config,
+    parse_stored,
     preset_names,
     with_whole_lifts,
 )
@@ -145,6 +146,8 @@ filters:
   max_normal_sum: 0.5
 split:
   valid_fraction: 0.2
+  by: class
+  test_fraction: 0.2
   train_classes: [mug, bottle]
 verify:
   max_surface_distance: 0.02
@@ -181,9 +184,10 @@ RELEASED = {
     "filters.max_normal_angle_deg": None,
     "camera.distance": 0.30,
     "camera.far": 0.70,
+    "split.by": "class",
 }
 
-#: The paper's numbers (design.md, 1): the defaults.
+#: The paper's numbers (design.md, 1): the defaults but for `split.by`.
 PAPER = {
     "objects.mass": 1.0,
     "physics.friction_hand": 0.71,
@@ -209,6 +213,7 @@ PAPER = {
     "filters.min_depth_variance": 1e-3,
     "filters.outlier_sigma": 4.0,
     "split.valid_fraction": 0.1,
+    "split.by": "class",
     "split.train_classes": None,
 }
 
@@ -278,10 +283,31 @@ def test_presets_are_listed() -> None:
     assert preset_names() == ["fast", "paper", "randomized", "released"]
 
 
-def test_paper_is_the_default_and_states_the_papers_numbers() -> None:
-    assert load_config() == load_config("paper") == Config()
-    values = dict(leaves(with_hand_defaults(load_config()).to_dict()))
+def test_the_defaults_are_the_papers_numbers_but_for_the_split() -> None:
+    assert load_config() == Config()
+    paper = load_config("paper")
+    assert dict(leaves(paper.to_dict())) == {**DEFAULT_VALUES, "split.by": "class"}
+    values = dict(leaves(with_hand_defaults(paper).to_dict()))
     assert {key: values[key] for key in PAPER} == PAPER
+
+
+def test_a_stored_configuration_without_the_rule_is_of_the_split_by_class() -> None:
+    tree = Config().to_dict()
+    assert parse_stored(tree) == Config()
+    del tree["split"]["by"]
+    assert parse_stored(tree) == load_config("paper")
+
+
+def test_a_split_by_object_has_no_classes_to_train_and_leaves_some_objects_to_train() -> None:
+    by_class = "split: by must be class or auto where train_classes is given, got object"
+    with pytest.raises(ConfigError, match=by_class):
+        load_config(overrides=["split.by=object", "split.train_classes=[a]"])
+    large = ["split.test_fraction=0.6", "split.valid_fraction=0.4"]
+    less = "together must be less than 1, unless by is class, got 0.6 and 0.4"
+    for by in ("auto", "object"):
+        with pytest.raises(ConfigError, match=less):
+            load_config(overrides=[*large, f"split.by={by}"])
+    assert load_config("paper", large).split.valid_fraction == 0.4
 
 
 def test_released_differs_from_the_paper_in_exactly_the_published_numbers() -> None:
@@ -289,7 +315,7 @@ def test_released_differs_from_the_paper_in_exactly_the_published_numbers() -> N
     assert values == {**DEFAULT_VALUES, **RELEASED}
 
 
-def test_randomized_is_the_paper_with_every_draw_on() -> None:
+def test_randomized_is_the_defaults_with_every_draw_on() -> None:
     values, off = load_config("randomized").to_dict(), Config().to_dict()
     drawn, nothing = values.pop("randomize"), off.pop("randomize")
     assert values == off

@@ -24,7 +24,6 @@ from drakegrasp.config import Config, SplitConfig
 from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
 from drakegrasp.dataset.assembly.survey import headers_by_object
 from drakegrasp.dataset.card.files import write_card
-from drakegrasp.dataset.filters import may_train
 from drakegrasp.dataset.lock import Holder, build_lock
 from drakegrasp.dataset.manifest import (
     Manifest,
@@ -38,6 +37,7 @@ from drakegrasp.dataset.manifest import (
 )
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.shards import ShardHeader
+from drakegrasp.dataset.split import may_train, split_rule
 from drakegrasp.dataset.statistics import is_assembled
 from drakegrasp.errors import ConfigError, DataError, DrakegraspError
 from drakegrasp.hand.description import load_hand
@@ -244,7 +244,10 @@ def _build(
 
 def nothing_trains(sources: Sequence[MeshSource], split: SplitConfig) -> str | None:
     """Return a warning if no sample of these meshes can be in the split `train`, else None."""
-    counts = Counter(source.class_name for source in sources)
+    classes = [source.class_name for source in sources]
+    if split_rule(split, classes, [source.group or source.name for source in sources]) == "object":
+        return None
+    counts = Counter(classes)
     if any(may_train(name, count, split) for name, count in counts.items()):
         return None
     if split.train_classes is not None:
@@ -252,9 +255,9 @@ def nothing_trains(sources: Sequence[MeshSource], split: SplitConfig) -> str | N
     else:
         why = "every class has one object, which is tested"
     return (
-        f"nothing will train: {why}. Give classes more objects (--per-class for built-in ones; "
-        "objects.yaml says which meshes are of one class), or name the classes to train on, e.g. "
-        f"--set split.train_classes=[{min(counts)}]"
+        f"nothing will train: {why}. Split by object (--set split.by=object), give classes more "
+        "objects (--per-class for built-in ones; objects.yaml says which meshes are of one class), "
+        f"or name the classes to train on, e.g. --set split.train_classes=[{min(counts)}]"
     )
 
 
@@ -309,8 +312,8 @@ def _prepare_all(
         job.events.mesh_done(entry)
         report(len(entries), len(sources), found=known)
 
-    # The licence is no matter of the mesh file, and changes nothing that was done.
-    licences = {source.name: source.licence for source in sources}
+    # Licence and group are no matter of the mesh file, and change nothing that was simulated.
+    said = {source.name: (source.licence, source.group) for source in sources}
     ordered = [entries[source.name] for source in sources]
 
     # A rejected grasp of another mesh was another grasp.
@@ -319,7 +322,7 @@ def _prepare_all(
     return replace(
         manifest,
         objects=tuple(
-            replace(entry, licence=licences[entry.name])
+            replace(entry, licence=said[entry.name][0], group=said[entry.name][1])
             for entry in ordered
             if isinstance(entry, ObjectEntry)
         ),

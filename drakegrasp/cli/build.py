@@ -134,10 +134,17 @@ def print_stats(out: Path) -> None:
         funnel_table,
         hold_table,
         make_console,
+        split_line,
         split_table,
         unfinished_line,
     )
-    from drakegrasp.dataset.statistics import count_funnel, count_splits, count_unfinished
+    from drakegrasp.dataset.paths import DATA_FILES
+    from drakegrasp.dataset.statistics import (
+        count_funnel,
+        count_splits,
+        count_unfinished,
+        split_rule_of,
+    )
 
     console, unfinished = make_console(), count_unfinished(out)
     funnel = count_funnel(out) if unfinished is None else unfinished.funnel
@@ -152,11 +159,12 @@ def print_stats(out: Path) -> None:
     if unfinished is None:
         splits = count_splits(out)
         console.print(split_table(splits))
+        say(split_line(split_rule_of(out / DATA_FILES["oto"]), funnel, splits))
         samples = {row.split: row.samples for row in splits}
         if any(samples.values()) and not samples["train"]:
             say(
-                "no sample is for training: a class trains if two of its objects have samples, or "
-                "if split.train_classes names it"
+                "no sample is for training: by class, a class trains if two of its objects have "
+                "samples, or if split.train_classes names it; --set split.by=object trains on any"
             )
     else:
         say(f"{out}: {unfinished_line(unfinished)}")

@@ -96,7 +96,7 @@ _OPTIONS = (
         "--config",
         metavar="YAML|PRESET",
         help="Configuration: a file, or the preset paper, randomized or released.  [default: "
-        "paper]",
+        "paper, but with split.by=auto]",
     ),
     set_option,
     click.option(

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from rich.box import SIMPLE
 from rich.console import Console
 from rich.markup import escape
@@ -132,6 +133,17 @@ def split_table(counts: Sequence[SplitCount]) -> Table:
     for count in counts:
         table.add_row(count.split, f"{count.samples:,}", f"{count.objects:,}", f"{count.classes:,}")
     return table
+
+
+def split_line(rule: str, funnel: Funnel, counts: Sequence[SplitCount]) -> str:
+    """Return by what the samples are split, and how many objects are tested, as a line."""
+    objects = {count.split: count.objects for count in counts}
+    total = np.count_nonzero(funnel.removals[:, Removal.KEPT])
+    # By class the objects that validate are those that train.
+    valid = f", {objects['valid']:,} valid" if rule == "object" else ""
+    return (
+        f"split by {rule}: {total:,} objects with samples, {objects['test']:,} of them test{valid}"
+    )
 
 
 def unfinished_line(unfinished: Unfinished) -> str:

@@ -69,7 +69,7 @@ if TYPE_CHECKING:
     "--config",
     metavar="YAML|PRESET",
     help="Configuration: a file, or the preset paper, randomized or released.  [default: that of "
-    "the dataset, else paper]",
+    "the dataset, else the defaults]",
 )
 @set_option
 @click.option(

@@ -33,7 +33,7 @@ def check_hand(
 
     Args:
         name_or_yaml: A hand that comes with the package, or a hand file.
-        config: The rules of its trial grasps; the preset `paper` if None.
+        config: The rules of its trial grasps; the defaults if None.
         report: Is called with each finding when it is there.
     """
     findings = []

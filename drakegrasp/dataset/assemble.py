@@ -39,7 +39,7 @@ from drakegrasp.dataset.assembly.survey import (
 )
 from drakegrasp.dataset.card.content import content_of
 from drakegrasp.dataset.card.files import card_files
-from drakegrasp.dataset.filters import Removal, Successes, judge_successes, split_samples
+from drakegrasp.dataset.filters import Removal, Successes, judge_successes
 from drakegrasp.dataset.hdf5 import AnyArray, create_field, write_field
 from drakegrasp.dataset.layout.opening import open_samples, open_trials, read_codes
 from drakegrasp.dataset.lock import build_lock
@@ -53,6 +53,7 @@ from drakegrasp.dataset.manifest import (
 from drakegrasp.dataset.paths import DATA_FILES, FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.rejections import AttemptKey, find_keys
 from drakegrasp.dataset.schema import OBJECT_FIELDS, SPLITS, SUCCESS_FIELDS, TRIAL_FIELDS
+from drakegrasp.dataset.split import split_samples
 from drakegrasp.dataset.weights import weigh_samples
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array
@@ -159,7 +160,8 @@ def assemble_locked(
             rows = {}
             for camera, name in DATA_FILES.items():
                 file = stack.enter_context(new_hdf5(paths[name]))
-                _write_attributes(file, manifest, {**origin, "camera": camera})
+                own = {"camera": camera, "split_by": manifest.split_rule}
+                _write_attributes(file, manifest, {**origin, **own})
                 for split in SPLITS:
                     rows[split, camera] = SampleRows(
                         file, split, len(ids[split]), sizes, _texts(manifest)
@@ -345,6 +347,7 @@ def _split_successes(
         successes.object[kept[first]],
         [entry.name for entry in manifest.objects],
         [entry.class_name for entry in manifest.objects],
+        manifest.groups,
         manifest.config.split,
         manifest.config.seed,
     )

@@ -1,4 +1,4 @@
-"""Postprocessing: which successes become samples, and in which split.
+"""Postprocessing: which successes become samples.
 
 Pure functions of arrays. A filter removes a grasp from the two data files, never from
 trials.hdf5. A removal has one reason: the first filter that applies. The filters of images and
@@ -7,16 +7,15 @@ contacts are the paper's (Veres et al., "Postprocessing"); those of the hold are
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.config import FilterConfig, SplitConfig
+from drakegrasp.config import FilterConfig
 from drakegrasp.frames import Array
-from drakegrasp.seeding import Stream, object_key
 
 
 class Removal(IntEnum):
@@ -197,62 +196,3 @@ def is_outlier(values: Array, sigma: float) -> npt.NDArray[np.bool_]:
     """
     deviation = values.std(axis=0)
     return np.any(np.abs(values - values.mean(axis=0)) > sigma * deviation, axis=1)
-
-
-def may_train(class_name: str, count: int, config: SplitConfig) -> bool:
-    """Return whether samples of a class with `count` objects train or validate."""
-    if config.train_classes is None:
-        return count > 1
-    return class_name in config.train_classes
-
-
-def split_samples(
-    objects: npt.NDArray[np.int32],
-    names: Sequence[str],
-    classes: Sequence[str],
-    config: SplitConfig,
-    seed: int,
-) -> dict[str, npt.NDArray[np.int64]]:
-    """Return the indices of the samples of each split, in rising order.
-
-    From each class one object is drawn; all its samples go to the test split. Of the samples of
-    the other objects a share goes to the validation split and the rest to the training split. A
-    class goes to the test split as a whole if only one of its objects has samples and
-    `train_classes` does not name it, or if `train_classes` leaves it out. A class with one object
-    that `train_classes` names is not tested. The draw of a class depends on its own objects alone.
-
-    Args:
-        objects: (n,), row of /objects of each sample.
-        names: Names of the objects, by row.
-        classes: Classes of the objects, by row.
-        config: Share of the validation split, and classes to train on.
-        seed: Seed of the dataset.
-    """
-    # The objects that have samples, by class.
-    members: dict[str, list[int]] = {}
-    for index in np.unique(objects).tolist():
-        members.setdefault(classes[index], []).append(index)
-
-    splits: Mapping[str, list[npt.NDArray[np.int64]]] = {"train": [], "valid": [], "test": []}
-    for class_name in sorted(members):
-        indices = sorted(members[class_name], key=lambda i: names[i])
-        # A key of three numbers: never the stream of a candidate of an object of that name.
-        stream = Stream(seed, object_key(class_name), 0, 1)
-        # The test object, or all of them, or none.
-        if not may_train(class_name, len(indices), config):
-            tested, others = indices, []
-        elif len(indices) < 2:
-            tested, others = [], indices
-        else:
-            tested = [indices[int(stream.integers(len(indices), 1)[0])]]
-            others = [i for i in indices if i not in tested]
-        splits["test"].append(np.flatnonzero(np.isin(objects, tested)))
-
-        # The samples of the others, shuffled.
-        pool = np.flatnonzero(np.isin(objects, others))
-        shuffled = pool[stream.permutation(len(pool))]
-        count = round(config.valid_fraction * len(pool))
-        splits["valid"].append(shuffled[:count])
-        splits["train"].append(shuffled[count:])
-    empty = [np.zeros(0, dtype=np.int64)]
-    return {name: np.sort(np.concatenate(empty + rows)) for name, rows in splits.items()}

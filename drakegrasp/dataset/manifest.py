@@ -29,7 +29,7 @@ from drakegrasp.config import (
     Positive,
     Share,
     override_config,
-    parse_config,
+    parse_stored,
 )
 from drakegrasp.dataset import log as build_log
 from drakegrasp.dataset.layout.json_files import Name, read_mapping, validated
@@ -37,6 +37,7 @@ from drakegrasp.dataset.paths import FILE_NAME, OWN_FILES, OWN_FOLDERS
 from drakegrasp.dataset.rejections import AttemptKey, key_to_json
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, refuse_other_schema
 from drakegrasp.dataset.shards import ShardHeader
+from drakegrasp.dataset.split import Rule, split_rule
 from drakegrasp.errors import ConfigError, DataError, GraspError
 from drakegrasp.frames import read_pose, unpack_pose
 from drakegrasp.hand.file_format import read_hand_file
@@ -107,6 +108,7 @@ class ObjectEntry:
         notes: What was repaired in the mesh.
         licence: Identifier of the mesh's licence; None: not stated.
         tried: Number of palm poses up to which a target of samples was met; None: all.
+        group: What it shares with others of the same mesh, which stay in one split; None: its name.
     """
 
     name: Name
@@ -126,12 +128,13 @@ class ObjectEntry:
     notes: tuple[str, ...]
     licence: Licence | None = None
     tried: Whole | None = None
+    group: Name | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry as JSON types, in the order of the manifest."""
         # What is not stated leaves no trace.
-        optional = [("licence", None), ("tried", None)]
-        said = {key: v for key, v in asdict(self).items() if (key, v) not in optional}
+        unsaid = {("licence", None), ("tried", None), ("group", None)}
+        said = {key: v for key, v in asdict(self).items() if (key, v) not in unsaid}
         return {"class" if key == "class_name" else key: v for key, v in said.items()}
 
 
@@ -197,6 +200,17 @@ class Manifest:
         """Number of work units."""
         return sum(1 for _ in self.headers())
 
+    @property
+    def groups(self) -> list[str]:
+        """Group of each object, see `split.split_rule`."""
+        return [entry.group or entry.name for entry in self.objects]
+
+    @property
+    def split_rule(self) -> Rule:
+        """What `split.by` of the configuration stands for with these objects."""
+        classes = [entry.class_name for entry in self.objects]
+        return split_rule(self.config.split, classes, self.groups)
+
     def signature(self) -> str:
         """Return a hash of all in it that decides a row of the dataset, hexadecimal."""
         unlicensed = tuple(replace(entry, licence=None) for entry in self.objects)
@@ -245,6 +259,7 @@ def _content(manifest: Manifest) -> dict[str, Any]:
         "config_hash": manifest.config.simulation_hash(),
         "seed": manifest.config.seed,
         "config": manifest.config.to_dict(),
+        "split_by": manifest.split_rule,
         "versions": manifest.versions,
         "fingers": manifest.fingers,
         "objects": [entry.to_json() for entry in manifest.objects],
@@ -277,14 +292,11 @@ def read_manifest(out: Path) -> Manifest:
     refuse_other_schema(path, tree.get("schema_version"))
     stored = validated(path, _updated(tree, content), _Stored)
     try:
-        config = parse_config(stored.config)
+        config = parse_stored(stored.config)
     except ConfigError as error:
         raise DataError(f"{path}: {error}") from None
 
-    mistakes = _contradictions(stored, config, tree["schema_version"])
-    if (mistake := next(mistakes, None)) is not None:
-        raise DataError(f"{path}: {mistake}")
-    return Manifest(
+    manifest = Manifest(
         config=config,
         objects=stored.objects,
         refused=stored.refused,
@@ -292,6 +304,9 @@ def read_manifest(out: Path) -> Manifest:
         versions=stored.versions,
         fingers=stored.fingers,
     )
+    if (mistake := next(_contradictions(stored, manifest), None)) is not None:
+        raise DataError(f"{path}: {mistake}")
+    return manifest
 
 
 def _updated(tree: dict[str, Any], content: bytes) -> bytes:
@@ -314,6 +329,7 @@ class _Stored(BaseModel):
     config_hash: Hex
     seed: int
     config: dict[str, Any]
+    split_by: Rule | None = None
     versions: dict[str, str]
     fingers: dict[str, bool] = {}
     objects: tuple[ObjectEntry, ...]
@@ -321,15 +337,19 @@ class _Stored(BaseModel):
     rejected: tuple[AttemptKey, ...] = ()
 
 
-def _contradictions(stored: _Stored, config: Config, version: int) -> Iterator[str]:
+def _contradictions(stored: _Stored, manifest: Manifest) -> Iterator[str]:
     """Yield where a manifest contradicts itself, in words."""
+    config = manifest.config
     for key, said, must in (
         ("config_hash", stored.config_hash, config.simulation_hash()),
         ("seed", stored.seed, config.seed),
     ):
         # Other keys decided the hash of an older schema.
-        if said != must and (key, version == SCHEMA_VERSION) != ("config_hash", False):
+        old = stored.schema_version < SCHEMA_VERSION and key == "config_hash"
+        if said != must and not old:
             yield f"{key} must be {must}, that of its config, got {said}"
+    if stored.split_by not in (None, manifest.split_rule):
+        yield f"split_by must be {manifest.split_rule} with its objects, got {stored.split_by}"
 
     for name, count in Counter(entry.name for entry in stored.objects).items():
         if count > 1:

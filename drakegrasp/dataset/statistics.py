@@ -229,6 +229,16 @@ def count_splits(out: Path) -> list[SplitCount]:
     return splits_of(out / DATA_FILES["oto"])
 
 
+def split_rule_of(path: Path) -> str:
+    """Return by what the samples of a data file are split, `class` or `object`.
+
+    Raises:
+        DataError: If the file is missing or damaged.
+    """
+    with open_samples(path) as file:
+        return str(file.attrs.get("split_by", "class"))
+
+
 def splits_of(path: Path) -> list[SplitCount]:
     """Return what a data file tells of its splits, as `count_splits`."""
     with open_samples(path) as file:

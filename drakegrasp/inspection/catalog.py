@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.config import Config, parse_config
+from drakegrasp.config import Config, parse_stored
 from drakegrasp.dataset.hdf5 import read_texts
 from drakegrasp.dataset.layout.opening import open_trials
 from drakegrasp.dataset.manifest import Manifest, read_manifest
@@ -276,7 +276,7 @@ def _read_assembled(out: Path, stamps: Mapping[Path, Stamp]) -> tuple[Snapshot, 
     path = out / TRIALS_FILE
     with open_trials(path) as file:
         try:
-            config = parse_config(parse_json(file.attrs["config"]))
+            config = parse_stored(parse_json(file.attrs["config"]))
         except ValueError as error:
             raise DataError(f"{path}: attribute config must be one, got {error}") from None
         names, classes, meshes = (

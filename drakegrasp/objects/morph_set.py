@@ -1,8 +1,8 @@
 """Morphs of all meshes of a directory: meshes come in, a directory of new ones goes out.
 
 The files are `<class>_<name>_m<k>.obj` in metres, +z up. An `objects.yaml` beside them keeps the
-class of the mesh that each comes from: else each would be a class of its own, and a split by class
-would have nothing to train on.
+class of the mesh that each comes from, else each would be a class of its own, and its name as their
+group: in a split by object all morphs of a mesh, and the mesh itself, stay together.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def morph_meshes(
             if original.crossing:
                 crossing[source.name] = original.crossing
 
-        # The manifest, which keeps their classes.
+        # The manifest, which keeps their classes and groups.
         if not draws:
             raise MeshError(f"{directory}: one mesh must have morphs, got none: {refused[0]}")
         content = {"units": "m", "objects": entries}
@@ -139,7 +139,7 @@ def _entry(source: MeshSource) -> dict[str, Any]:
     """Return what the manifest says of a morph: what is known of its original."""
     keys = ("mass", "density", "friction", "licence")
     said = {key: getattr(source, key) for key in keys if getattr(source, key) is not None}
-    return {"class": source.class_name, **said}
+    return {"class": source.class_name, "group": source.group or source.name, **said}
 
 
 @contextmanager

@@ -15,6 +15,10 @@ and what no file of triangles says:
     objects:
       95_boots_final: {units: m, class: boots, name: boots, mass: 0.4, friction: 0.9}
       7_scan: {scale: 1.02, up: +y, density: 700}
+      8_scan_bent: {group: 7_scan}
+
+Objects of a group are of one mesh, as morphs are: a split by object keeps them together. An object
+that names no group has its own name for one.
 """
 
 from __future__ import annotations
@@ -52,7 +56,7 @@ UPRIGHT = {
     "-z": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
 }
 #: Keys of an object in the manifest.
-_KEYS = "units, scale, up, class, name, mass, density, friction, licence"
+_KEYS = "units, scale, up, class, name, mass, density, friction, licence, group"
 MANIFEST_NAME = "objects.yaml"
 
 
@@ -70,6 +74,7 @@ class MeshSource:
         density: [kg/m^3], instead of the mass.
         friction: Effective coefficient with hand and table; None: those of the configuration.
         licence: Identifier of the mesh's licence, e.g. of spdx.org/licenses; None: not stated.
+        group: What it shares with other objects of the same mesh; None: its name.
     """
 
     name: str
@@ -81,9 +86,11 @@ class MeshSource:
     density: float | None = None
     friction: float | None = None
     licence: str | None = None
+    group: str | None = None
 
     def __post_init__(self) -> None:
-        for what, text in (("name", self.name), ("class", self.class_name)):
+        names = {"name": self.name, "class": self.class_name, "group": self.group or self.name}
+        for what, text in names.items():
             if not is_name(text):
                 raise MeshError(f"{self.path.name}: the {what} must be {NAME_RULE}, got {text!r}")
         for what in ("scale", "mass", "density", "friction"):
@@ -122,6 +129,7 @@ class _Entry(pydantic.BaseModel):
     density: _Factor | None = None
     friction: _Factor | None = None
     licence: _Line | None = None
+    group: str | None = None
 
     @pydantic.field_validator("scale", "mass", "density", "friction", mode="before")
     @classmethod
@@ -253,6 +261,7 @@ def _source(path: Path, stem: str, table: _Manifest, units: str) -> MeshSource:
         density=entry.density,
         friction=entry.friction,
         licence=entry.licence or table.licence,
+        group=entry.group,
     )
 
 
@@ -274,7 +283,7 @@ def _refuse_twins(directory: Path, names: dict[Path, str]) -> None:
 def source_sha256(source: MeshSource) -> str:
     """Return the SHA-256 of a mesh file's bytes and of what is said of it, hexadecimal.
 
-    Name, class and licence do not count.
+    Name, class, licence and group do not count.
 
     Raises:
         MeshError: If the file cannot be read.

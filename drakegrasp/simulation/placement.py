@@ -79,7 +79,7 @@ def place_object(
             a file wins.
         X_TO: Pose of the object on the table; dropped as in a build if None.
         config: Mass, friction and how it settles; that of an object that was placed before, else
-            the preset `paper`, if None.
+            the defaults, if None.
 
     Raises:
         MeshError: If the mesh cannot be simulated or does not come to rest.
@@ -117,7 +117,7 @@ def place_object(
 
 
 def config_of(mesh: object) -> Config:
-    """Return the configuration of a placed object, and the preset `paper` for any other mesh."""
+    """Return the configuration of a placed object, and the defaults for any other mesh."""
     return mesh.config if isinstance(mesh, PlacedObject) else load_config()
 
 

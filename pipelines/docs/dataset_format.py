@@ -117,9 +117,10 @@ grasps. `moved` says that the attempt is no sample, not that the hand would have
 
 
 _ATTRIBUTES = """
-Further attributes: `schema_version`, `camera`, camera matrix `K` [px], `near` and `far` [m],
-`config` and `versions` (JSON), `config_hash`, `seed`, and of what the file was assembled from:
-`signature`, a hash of all in the manifest that decides a row, and `shards`, a hash of their seals.
+Further attributes: `schema_version`, `camera` and `split_by` (`class` or `object`) of the data
+files, camera matrix `K` [px], `near` and `far` [m], `config` and `versions` (JSON), `config_hash`,
+`seed`, and of what the file was assembled from: `signature`, a hash of all in the manifest that
+decides a row, and `shards`, a hash of their seals.
 """
 
 _DATA = """## grasping_oto.hdf5 and grasping_otm.hdf5

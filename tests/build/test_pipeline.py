@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -197,6 +198,12 @@ def test_changed_class_is_in_the_files_without_a_simulation(
     again = build(find_meshes(meshes), out, small_config, _nothing_runs, show=False)
     assert not again.assembled
 
+    # A group does not even need the object to be prepared.
+    said = "objects: {11_box_slim: {class: carton, group: box}}\n"
+    (meshes / "objects.yaml").write_text(said)
+    again = build(find_meshes(meshes), out, small_config, _nothing_runs, show=False)
+    assert again.assembled and read_manifest(out).objects[1].group == "box"
+
 
 def test_shard_that_is_not_the_assembled_one_is_assembled(
     small_meshes: Path, small_dataset: Path, small_config: Config, tmp_path: Path
@@ -300,22 +307,23 @@ def test_refused_meshes_are_listed_and_the_others_go_on(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("classes", "named", "warning"),
+    ("classes", "split", "warning"),
     [
-        (["a", "b"], None, "every class has one object, which is tested"),
-        (["a", "b", "b"], None, None),
-        (["a", "b"], ("b",), None),
-        (["a", "a"], ("c",), "split.train_classes names none of the classes"),
+        (["a", "b"], {"by": "class"}, "every class has one object, which is tested"),
+        (["a", "b"], {}, None),
+        (["a", "b", "b"], {}, None),
+        (["a", "b"], {"train_classes": ("b",)}, None),
+        (["a", "a"], {"train_classes": ("c",)}, "split.train_classes names none of the classes"),
     ],
 )
 def test_a_split_that_trains_nothing_is_a_warning(
-    classes: list[str], named: tuple[str, ...] | None, warning: str | None
+    classes: list[str], split: dict[str, Any], warning: str | None
 ) -> None:
     sources = [
         MeshSource(name=f"{i}_{name}", class_name=name, path=Path("x.obj"))
         for i, name in enumerate(classes)
     ]
-    said = nothing_trains(sources, SplitConfig(train_classes=named))
+    said = nothing_trains(sources, SplitConfig(**split))
     assert (said is None) == (warning is None)
     if said is not None and warning is not None:
         assert said.startswith(f"nothing will train: {warning}. ")
@@ -334,7 +342,7 @@ def test_a_build_that_trains_nothing_says_so_before_it_prepares(
 
     for show in (True, False):
         with pytest.raises(KeyboardInterrupt):
-            build(find_meshes(meshes), out, load_config(), stop, show=show)
+            build(find_meshes(meshes), out, load_config("paper"), stop, show=show)
         said = capsys.readouterr().err
         assert ("nothing will train: every class has one object" in said) is show
     notices = [event["text"] for event in read_log(out) if event["event"] == "notice"]

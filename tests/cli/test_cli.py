@@ -314,9 +314,13 @@ def test_stats_say_that_the_files_are_of_another_state(small_dataset: Path, tmp_
 def test_stats_say_that_nothing_trains(tmp_path: Path) -> None:
     (tmp_path / "meshes").mkdir()
     out = make_dataset(tmp_path / "out", tmp_path / "meshes")
-    assert "no sample is for training" not in run("stats", out).stdout
+    said = run("stats", out).stdout
+    assert "no sample is for training" not in said
+    assert "split by class: 3 objects with samples, 2 of them test\n" in said
     assemble(out, overrides=["split.train_classes=[]"])
     assert "no sample is for training" in run("stats", out).stdout
+    said = run("assemble", out, "--set", "split={by: object}").stdout
+    assert "split by object: 3 objects with samples, 1 of them test, 1 valid\n" in said
 
 
 @pytest.mark.sim

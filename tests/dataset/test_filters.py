@@ -1,4 +1,4 @@
-"""Filters and split on made-up successes."""
+"""Filters on made-up successes."""
 
 from __future__ import annotations
 
@@ -9,14 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drakegrasp.config import FilterConfig, SplitConfig
+from drakegrasp.config import FilterConfig
 from drakegrasp.dataset.filters import (
     Removal,
     Successes,
     is_outlier,
     judge_successes,
-    may_train,
-    split_samples,
 )
 
 
@@ -235,61 +233,3 @@ def test_seventeen_equal_values_and_one_far_off_make_an_outlier() -> None:
     values = np.zeros((18, 2))
     values[3, 1] = 1.0
     assert np.flatnonzero(is_outlier(values, 4.0)).tolist() == [3]
-
-
-NAMES = ["a1", "a2", "a3", "b1", "c1", "c2"]
-CLASSES = ["a", "a", "a", "b", "c", "c"]
-OBJECTS = np.repeat(np.arange(6), 50).astype(np.int32)
-
-
-@given(seed=st.integers(0, 2**32))
-def test_split_is_a_partition_without_leaks(seed: int) -> None:
-    split = split_samples(OBJECTS, NAMES, CLASSES, SplitConfig(), seed)
-    together = np.sort(np.concatenate(list(split.values())))
-    assert np.array_equal(together, np.arange(len(OBJECTS)))
-    tested = set(OBJECTS[split["test"]])
-    assert not tested & set(OBJECTS[np.concatenate([split["train"], split["valid"]])])
-    by_class = {c: {i for i in tested if CLASSES[i] == c} for c in set(CLASSES)}
-    assert {c: len(found) for c, found in by_class.items()} == {"a": 1, "b": 1, "c": 1}
-    assert len(split["valid"]) == 10 + 5
-
-
-def test_split_depends_on_the_seed_and_on_nothing_else() -> None:
-    one = split_samples(OBJECTS, NAMES, CLASSES, SplitConfig(), 3)
-    two = split_samples(OBJECTS, NAMES, CLASSES, SplitConfig(), 3)
-    assert all(np.array_equal(one[k], two[k]) for k in one)
-    others = [split_samples(OBJECTS, NAMES, CLASSES, SplitConfig(), s)["test"] for s in range(20)]
-    assert any(not np.array_equal(one["test"], other) for other in others)
-
-
-def test_classes_that_do_not_train_are_tested_whole() -> None:
-    split = split_samples(OBJECTS, NAMES, CLASSES, SplitConfig(train_classes=("a",)), 0)
-    assert {CLASSES[i] for i in set(OBJECTS[split["train"]])} == {"a"}
-    assert {3, 4, 5} <= set(OBJECTS[split["test"]])
-
-
-def test_a_named_class_trains_with_its_only_object() -> None:
-    split = split_samples(OBJECTS, NAMES, CLASSES, SplitConfig(train_classes=("b",)), 0)
-    trained = np.concatenate([split["train"], split["valid"]])
-    assert set(OBJECTS[trained]) == {3}
-    assert len(split["valid"]) == 5
-    assert set(OBJECTS[split["test"]]) == {0, 1, 2, 4, 5}
-
-
-@pytest.mark.parametrize(
-    ("named", "count", "trains"),
-    [(None, 1, False), (None, 2, True), (("a",), 1, True), (("b",), 9, False)],
-)
-def test_which_classes_train(named: tuple[str, ...] | None, count: int, trains: bool) -> None:
-    assert may_train("a", count, SplitConfig(train_classes=named)) is trains
-
-
-def test_another_class_does_not_change_a_classs_draw() -> None:
-    whole = split_samples(OBJECTS, NAMES, CLASSES, SplitConfig(), 1)
-    part = split_samples(OBJECTS[:150], NAMES, CLASSES, SplitConfig(), 1)
-    assert np.array_equal(part["valid"], whole["valid"][whole["valid"] < 150])
-
-
-def test_no_samples_make_empty_splits() -> None:
-    split = split_samples(np.zeros(0, np.int32), [], [], SplitConfig(), 0)
-    assert {k: len(v) for k, v in split.items()} == {"train": 0, "valid": 0, "test": 0}

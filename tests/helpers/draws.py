@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_info
 
 from drakegrasp.build.prepare import prepare
 from drakegrasp.config import BuiltinConfig, SplitConfig, load_config
-from drakegrasp.dataset.filters import split_samples
+from drakegrasp.dataset.split import split_samples
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.builtin.catalog import export_builtin
@@ -118,14 +118,17 @@ def main(meshes: Path | None) -> dict[str, object]:
     X_TO[2, 3] = half[2]
     poses, *_ = rotation_candidates(half, X_TO, jittered, Stream(7, 3))
     found["jittered palm poses"] = digest(poses)
-    split = split_samples(
-        np.repeat(np.arange(12, dtype=np.int32), 40),
-        [f"{i}_thing" for i in range(12)],
-        [f"class {i // 3}" for i in range(12)],
-        SplitConfig(),
-        7,
-    )
-    found["split"] = digest(*split.values())
+    names = [f"{i}_thing" for i in range(12)]
+    for by in ("class", "object"):
+        split = split_samples(
+            np.repeat(np.arange(12, dtype=np.int32), 40),
+            names,
+            [f"class {i // 3}" for i in range(12)],
+            names,
+            SplitConfig(by=by),
+            7,
+        )
+        found[f"split by {by}"] = digest(*split.values())
     config = load_config().certify
     stream = Stream(7, 1)
     found["certificate noise"] = digest(

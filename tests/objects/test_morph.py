@@ -101,6 +101,7 @@ def test_directory_has_every_morph_with_its_class_and_the_same_bytes(tmp_path: P
         ("pot", 600.0, 1.0),
         ("stool", None, 1.0),
     ]
+    assert [s.group for s in found] == ["c"] * 3 + ["3_stool_a"] * 3
     assert prepare_object(found[0]).density == pytest.approx(600.0)
     assert len({s.path.read_bytes() for s in found}) == 6
 

@@ -131,6 +131,18 @@ def test_wrong_directories_are_refused(tmp_path):
         find_meshes(tmp_path, manifest=tmp_path / "gone.yaml")
 
 
+def test_a_group_is_a_name_and_changes_nothing_that_is_simulated(tmp_path):
+    write(tmp_path / "a.obj", box())
+    (alone,) = find_meshes(tmp_path)
+    (tmp_path / "objects.yaml").write_text("objects: {a: {group: b}}\n")
+    (grouped,) = find_meshes(tmp_path)
+    assert (alone.group, grouped.group) == (None, "b")
+    assert source_sha256(alone) == source_sha256(grouped)
+    (tmp_path / "objects.yaml").write_text("objects: {a: {group: ../b}}\n")
+    with pytest.raises(MeshError, match=r"a\.obj: the group must be .*, got '\.\./b'"):
+        find_meshes(tmp_path)
+
+
 def test_licences_are_stated_for_the_set_and_for_a_mesh(tmp_path):
     for name in "ab":
         write(tmp_path / f"{name}.obj", box())

@@ -18,7 +18,13 @@ from drakegrasp.dataset.layout.opening import open_samples
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry, read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, SPLITS
-from drakegrasp.dataset.statistics import Funnel, funnel_of, held_note, splits_of
+from drakegrasp.dataset.statistics import (
+    Funnel,
+    funnel_of,
+    held_note,
+    split_rule_of,
+    splits_of,
+)
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file, hand_names
 from drakegrasp.outcomes import Outcome
@@ -106,6 +112,7 @@ def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
         "seed": manifest.config.seed,
         "config_hash": manifest.config.simulation_hash(),
         "settings": _settings(manifest.config),
+        "split_by": split_rule_of(data),
         "versions": manifest.versions,
         "licences": licences(entries),
         "counts": _counts(data, funnel),

@@ -78,7 +78,11 @@ def _how_many(content: Mapping[str, Any]) -> str:
 
     # Tables that would be empty are left out.
     tables = [
-        ("Samples by split", ("split", "samples", "objects", "classes"), splits),
+        (
+            f"Samples by split, which is by {content['split_by']}",
+            ("split", "samples", "objects", "classes"),
+            splits,
+        ),
         ("By class", ("class", "objects", *_COUNTS), classes),
         ("By object", ("object", "class", *_COUNTS), objects),
         ("Outcomes of the attempts", ("outcome", "attempts"), list(counts["outcomes"].items())),

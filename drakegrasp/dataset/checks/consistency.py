@@ -6,7 +6,7 @@ of numbers and names are read whole; images are not read.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
@@ -20,8 +20,13 @@ from drakegrasp.dataset.weights import weigh_samples
 from drakegrasp.frames import unpack_pose
 
 
-def splits(data: OpenFile) -> Iterator[Violation]:
-    """A trial is one sample; a tested object, or a class left out, is in no other split."""
+def splits(data: OpenFile, groups: Mapping[str, str]) -> Iterator[Violation]:
+    """A trial is one sample; a tested object, or a class left out, is in no other split.
+
+    Args:
+        data: The data file.
+        groups: Group of each object by its name, as far as they are known.
+    """
     # Each trial once; meanwhile gather the objects and their classes by split.
     seen: dict[int, str] = {}
     objects: dict[str, dict[str, str]] = {}
@@ -37,7 +42,17 @@ def splits(data: OpenFile) -> Iterator[Violation]:
         )
         objects[split] = dict(zip(names.tolist(), classes.tolist(), strict=True))
 
-    # Outside of the test split: no tested object, and only the classes to train on.
+    # By object: no object in two splits, nor another one of its mesh.
+    if data.file.attrs.get("split_by") == "object":
+        home: dict[str, str] = {}
+        for split, members in objects.items():
+            for group in sorted({groups.get(name, name) for name in members}):
+                if home.setdefault(group, split) != split:
+                    what = "an object and its group must be in one split"
+                    yield of_file(data.name, what, f"{group}, in /{home[group]} too", f"/{split}")
+        return
+
+    # By class, outside of the test split: no tested object, and only the classes to train on.
     tested = objects.pop("test", {})
     allowed = data.config.split.train_classes if data.config else None
     for split, members in objects.items():
@@ -184,6 +199,9 @@ def same_configuration(files: Iterable[OpenFile], manifest: Manifest) -> Iterato
         elif file.config != manifest.config:
             what = f"filters, split and limits must be those of {FILE_NAME}"
             yield of_file(file.name, what, "others; run `drakegrasp assemble` again")
+        if file.file.attrs.get("split_by", manifest.split_rule) != manifest.split_rule:
+            what = f"split_by must be that of {FILE_NAME}, {manifest.split_rule}"
+            yield of_file(file.name, what, str(file.file.attrs["split_by"]))
     if len(states) > 1:
         what = "the three files must be of one assembly"
         yield of_file(TRIALS_FILE, what, f"{len(states)}; run `drakegrasp assemble` again")

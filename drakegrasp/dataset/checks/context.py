@@ -52,6 +52,11 @@ class Dataset:
         """Names of the objects, by row of /objects."""
         return [entry.name for entry in self.manifest.objects]
 
+    @property
+    def groups(self) -> dict[str, str]:
+        """Group of each object by its name."""
+        return dict(zip(self.names, self.manifest.groups, strict=True))
+
 
 @dataclass(kw_only=True, eq=False)
 class Context:

@@ -57,7 +57,8 @@ def check_data_file(data: OpenFile, camera: str, context: Context) -> None:
     """
     if data.config is None:
         return  # a finding already; without a lens no image can be judged
-    context.add(data, consistency.splits(data))
+    groups = {} if context.dataset is None else context.dataset.groups
+    context.add(data, consistency.splits(data, groups))
     judge_rows(_tasks(data, camera, context.dataset), data, context)
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import h5py
 import numpy as np
 
-from drakegrasp.config import Config, parse_config
+from drakegrasp.config import Config, parse_stored
 from drakegrasp.dataset.checks.findings import Violation
 from drakegrasp.dataset.layout.attributes import OF_CAMERA, ORIGIN, attribute_mistakes
 from drakegrasp.dataset.layout.structure import Difference, Tables, differences
@@ -31,7 +31,7 @@ CAMERA_TOLERANCE = 1e-9
 def read_config(name: str, file: h5py.File) -> tuple[Config | None, list[Violation]]:
     """Return the configuration in a file, if it is sound, and what is wrong with it."""
     try:
-        return parse_config(parse_json(str(file.attrs["config"]))), []
+        return parse_stored(parse_json(str(file.attrs["config"]))), []
     except KeyError:
         got = "none"
     except ValueError as error:  # no JSON, or no configuration

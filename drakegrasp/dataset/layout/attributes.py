@@ -77,11 +77,12 @@ ORIGIN: Mapping[str, Rule] = {
     "far": _POSITIVE,
 }
 #: Those that files of before they were written may lack.
-_YOUNG = ("fingers",)
+_YOUNG = ("fingers", "split_by")
 #: And of the data files.
 OF_CAMERA: Mapping[str, Rule] = {
     **ORIGIN,
     "camera": (f"one of {', '.join(CAMERAS)}", lambda v: isinstance(v, str) and v in CAMERAS),
+    "split_by": ("class or object", lambda v: isinstance(v, str) and v in ("class", "object")),
 }
 
 

@@ -99,6 +99,15 @@ def test_the_same_dataset_has_the_same_bytes(dataset: Path) -> None:
     assert [(dataset / name).read_bytes() for name in CARD_FILES] == before
 
 
+def test_the_rule_of_the_split_is_named(dataset: Path) -> None:
+    for rule in ("class", "object"):
+        assemble(dataset, overrides=[f"split.by={rule}"])
+        assert json.loads((dataset / CARD_FILES[0]).read_text(encoding="utf-8"))["split_by"] == rule
+        assert (
+            f"### Samples by split, which is by {rule}\n" in (dataset / CARD_FILES[1]).read_text()
+        )
+
+
 def test_licences_are_those_of_the_manifest(dataset: Path) -> None:
     manifest = read_manifest(dataset)
     first, *others = manifest.objects

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -10,6 +11,8 @@ import numpy as np
 import pytest
 from helpers.datasets import BOTH, OTM, OTO, TRIALS, change, found, moved, must_find
 
+from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.outcomes import Outcome
 
 #: How the rule of classes goes on.
@@ -100,6 +103,40 @@ def test_a_named_class_with_two_objects_is_tested(out: Path) -> None:
         config["split"]["train_classes"] = ["cup"]
         file.attrs["config"] = json.dumps(config, sort_keys=True)
     assert (OTO, "", None, f"class cup must have one object in /test{OUTSIDE}") in found(out / OTO)
+
+
+def test_by_object_no_object_is_in_two_splits_nor_another_of_its_mesh(out: Path) -> None:
+    assemble(out, overrides=["split.by=object"])
+    assert not found(out)
+    with h5py.File(out / OTO) as file:
+        home = {
+            file[f"{split}/object_props/object_name"].asstr()[0]: split
+            for split in ("train", "valid", "test")
+        }
+    assert len(home) == 3
+
+    # Of two objects that are said to be of one mesh one is in another split.
+    manifest = read_manifest(out)
+    members = {split: name for name, split in home.items()}
+    objects = tuple(
+        replace(entry, group=members["train"]) if entry.name == members["valid"] else entry
+        for entry in manifest.objects
+    )
+    write_manifest(replace(manifest, objects=objects), out)
+    what = "an object and its group must be in one split"
+    assert {(name, "/valid", None, what) for name in BOTH} <= found(out)
+
+    # A sample of the objects that train is in the split that validates.
+    with h5py.File(out / OTO, "r+") as file:
+        file["valid/object_props/object_name"][0] = members["train"]
+    assert (OTO, "/valid", None, what) in found(out / OTO)
+
+
+def test_the_rule_of_the_split_is_that_of_the_manifest(out: Path) -> None:
+    with h5py.File(out / OTO, "r+") as file:
+        file.attrs["split_by"] = "object"
+    what = "split_by must be that of manifest.json, class"
+    assert (OTO, "", None, what) in found(out)
 
 
 def test_both_data_files_must_agree(out: Path) -> None:

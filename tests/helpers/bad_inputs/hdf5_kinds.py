@@ -215,7 +215,7 @@ DATA: tuple[Kind, ...] = (
     ),
     *(dataset_kind("train/grasps", way) for way in _TURNS if way != "one row less"),
     *(dataset_kind("test/images", way) for way in _TURNS if way != "one row less"),
-    *attribute_kinds({**_ORIGIN, "camera": ()}),
+    *attribute_kinds({**_ORIGIN, "camera": (), "split_by": ("missing",)}),
     attribute_kind("camera", "unknown", "stereo"),
     attribute_kind("schema_version", "of the future", 999),
     attribute_kind("K", "NaN inside", np.full((3, 3), np.nan)),

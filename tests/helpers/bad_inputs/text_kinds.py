@@ -97,6 +97,7 @@ CONFIG: tuple[Kind, ...] = (
             "camera.size": (*_NO_NUMBER, "null", "negative", "zero", "huge"),
             "candidates.standoffs": (*_NO_NUMBER, "negative", "list of lists"),
             "hand": ("list", "mapping", "truth value", "zero", "null"),
+            "split.by": ("text", "list", "mapping", "truth value", "null", "zero"),
             "split.train_classes": ("text", "mapping", "zero"),
             "physics": ("text", "list", "truth value", "negative"),
         }
@@ -117,6 +118,7 @@ OBJECTS: tuple[Kind, ...] = (
             "objects.1_box_a.up": ("text", "list", "mapping", "truth value", "null", "zero"),
             "objects.1_box_a.class": ("list", "mapping", "truth value"),
             "objects.1_box_a.name": ("list", "mapping", "truth value"),
+            "objects.1_box_a.group": ("list", "mapping", "truth value"),
         }
     ),
 )

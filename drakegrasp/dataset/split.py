@@ -1,0 +1,156 @@
+"""Postprocessing: which samples train, validate and test, by class or by object.
+
+Pure functions of names and numbers. By class is the paper's rule (Veres et al.): of each class one
+object is tested. By object is for meshes that are each of a class of their own, of which that rule
+would test all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.config import SplitConfig
+from drakegrasp.seeding import Stream, object_key
+
+Rule = Literal["class", "object"]
+Rows = npt.NDArray[np.int64]
+
+
+def split_rule(config: SplitConfig, classes: Sequence[str], groups: Sequence[str]) -> Rule:
+    """Return the rule of the split: that of the configuration, or what `auto` stands for.
+
+    `auto` is by object where no class has objects of two groups and `train_classes` names none.
+    Objects without samples count, too, so that the rule does not depend on which grasps held.
+
+    Args:
+        config: Of the split.
+        classes: Classes of the objects.
+        groups: Of each object what it shares with others of the same mesh, e.g. its morphs.
+    """
+    if config.by != "auto":
+        return config.by
+    one_each = len(set(zip(classes, groups, strict=True))) == len(set(classes))
+    return "object" if one_each and config.train_classes is None else "class"
+
+
+def may_train(class_name: str, count: int, config: SplitConfig) -> bool:
+    """Return whether by class samples of a class with `count` objects train or validate."""
+    if config.train_classes is None:
+        return count > 1
+    return class_name in config.train_classes
+
+
+def split_samples(
+    objects: npt.NDArray[np.int32],
+    names: Sequence[str],
+    classes: Sequence[str],
+    groups: Sequence[str],
+    config: SplitConfig,
+    seed: int,
+) -> dict[str, Rows]:
+    """Return the indices of the samples of each split, in rising order.
+
+    Args:
+        objects: (n,), row of /objects of each sample.
+        names: Names of the objects, by row.
+        classes: Classes of the objects, by row.
+        groups: Groups of the objects, by row, see `split_rule`.
+        config: The rule and its shares.
+        seed: Seed of the dataset.
+    """
+    if split_rule(config, classes, groups) == "object":
+        return _split_by_object(objects, groups, config, seed)
+    return _split_by_class(objects, names, classes, config, seed)
+
+
+def _split_by_class(
+    objects: npt.NDArray[np.int32],
+    names: Sequence[str],
+    classes: Sequence[str],
+    config: SplitConfig,
+    seed: int,
+) -> dict[str, Rows]:
+    """Return the indices of the samples of each split by class.
+
+    From each class one object is drawn; all its samples go to the test split. Of the samples of
+    the other objects a share goes to the validation split and the rest to the training split. A
+    class goes to the test split as a whole if only one of its objects has samples and
+    `train_classes` does not name it, or if `train_classes` leaves it out. A class with one object
+    that `train_classes` names is not tested. The draw of a class depends on its own objects alone.
+    """
+    # The objects that have samples, by class.
+    members: dict[str, list[int]] = {}
+    for index in np.unique(objects).tolist():
+        members.setdefault(classes[index], []).append(index)
+
+    splits: Mapping[str, list[Rows]] = {"train": [], "valid": [], "test": []}
+    for class_name in sorted(members):
+        indices = sorted(members[class_name], key=lambda i: names[i])
+        # A key of three numbers: never the stream of a candidate of an object of that name.
+        stream = Stream(seed, object_key(class_name), 0, 1)
+        # The test object, or all of them, or none.
+        if not may_train(class_name, len(indices), config):
+            tested, others = indices, []
+        elif len(indices) < 2:
+            tested, others = [], indices
+        else:
+            tested = [indices[int(stream.integers(len(indices), 1)[0])]]
+            others = [i for i in indices if i not in tested]
+        splits["test"].append(np.flatnonzero(np.isin(objects, tested)))
+
+        # The samples of the others, shuffled.
+        pool = np.flatnonzero(np.isin(objects, others))
+        shuffled = pool[stream.permutation(len(pool))]
+        count = round(config.valid_fraction * len(pool))
+        splits["valid"].append(shuffled[:count])
+        splits["train"].append(shuffled[count:])
+    empty = [np.zeros(0, dtype=np.int64)]
+    return {name: np.sort(np.concatenate(empty + rows)) for name, rows in splits.items()}
+
+
+def _split_by_object(
+    objects: npt.NDArray[np.int32], groups: Sequence[str], config: SplitConfig, seed: int
+) -> dict[str, Rows]:
+    """Return the indices of the samples of each split by object.
+
+    Each group of objects draws a number from the seed and its own name. In the order of these the
+    first share of the groups that have samples is tested, the last one validates, and those
+    between train. So one group more moves at most one other across each of the two borders, and
+    none from test to valid or back.
+    """
+    # The groups that have samples, in the order of their numbers.
+    present = {groups[i] for i in np.unique(objects).tolist()}
+    # Another place than that of a class: it may have the same name.
+    number = {group: int(Stream(seed, object_key(group), 0, 2).words(1)[0]) for group in present}
+    ordered = sorted(present, key=lambda group: (number[group], group))
+
+    tested, valid = _shares(len(ordered), config)
+    last = len(ordered) - valid
+    members = {"train": ordered[tested:last], "valid": ordered[last:], "test": ordered[:tested]}
+    return {
+        name: np.flatnonzero(
+            np.isin(objects, [i for i, group in enumerate(groups) if group in chosen])
+        )
+        for name, chosen in members.items()
+    }
+
+
+def _shares(count: int, config: SplitConfig) -> tuple[int, int]:
+    """Return how many of the groups test and validate: their shares, and one at least.
+
+    Of few groups one trains before any is tested, and one is tested before any validates.
+    """
+    tested, valid = (
+        max(1, round(share * count)) if share else 0
+        for share in (config.test_fraction, config.valid_fraction)
+    )
+    while tested + valid > max(count - 1, 0):
+        if valid >= tested:
+            valid -= 1
+        else:
+            tested -= 1
+    return tested, valid
