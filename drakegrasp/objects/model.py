@@ -28,7 +28,7 @@ from drakegrasp.mesh.components import count_parts
 from drakegrasp.mesh.decimation import decimate
 from drakegrasp.mesh.distance_field import DistanceField, make_distance_field
 from drakegrasp.mesh.repair import repair_solid
-from drakegrasp.mesh.subdivision import subdivide
+from drakegrasp.mesh.resting_hull import resting_hull
 from drakegrasp.mesh.surfaces import Solid, diagonal, signed_volume
 from drakegrasp.objects.sources import (
     MANIFEST_NAME,
@@ -45,9 +45,6 @@ from drakegrasp.seeding import object_key
 #: Smaller objects are sheets or specks, which hydroelastic contact does not resolve.
 MIN_EXTENT = 0.5e-3  # [m]
 MIN_VOLUME = 1e-9  # [m^3]
-#: Longest edge of a collision mesh [m], and the number of faces up to which longer ones are split.
-#: A base carries to within about a quarter of the longest edge from its rim.
-MAX_EDGE, MAX_SUBDIVIDED_FACES = 0.02, 12_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,7 +58,7 @@ class ObjectModel:
         visual_vertices: (n, 3) float64, in {O}, full resolution.
         visual_faces: (m, 3) int32, counter-clockwise seen from outside.
         collision_vertices: (k, 3) float64, in {O}.
-        collision_faces: (l, 3) int32, without long edges, see `drakegrasp.mesh.subdivision`.
+        collision_faces: (l, 3) int32.
         mass: [kg]
         p_OOcm: (3,) centre of mass.
         I_OOcm_O: (3, 3) rotational inertia about the centre of mass, in axes of {O} [kg m^2].
@@ -135,6 +132,11 @@ class ObjectModel:
     def collision(self) -> trimesh.Trimesh:
         """The collision surface in {O}."""
         return trimesh.Trimesh(self.collision_vertices, self.collision_faces, process=False)
+
+    @cached_property
+    def resting_surface(self) -> Solid:
+        """The surface in {O} that a table meets: the convex hull of the collision surface."""
+        return resting_hull(self.collision_vertices)
 
     @cached_property
     def field(self) -> DistanceField:
@@ -227,7 +229,6 @@ def make_object(
     visual = Solid(vertices=solid.vertices - centre, faces=solid.faces)
     p_OOcm, I_OOcm_O = _mass_properties(visual, config.mass)
     collision, error = decimate(visual, config.max_collision_faces)
-    collision = subdivide(collision, MAX_EDGE, MAX_SUBDIVIDED_FACES)
 
     notes = (*reduced, *solid.notes)
     parts = count_parts(solid.vertices, solid.faces)

@@ -61,6 +61,7 @@ from drakegrasp.hand.description import Hand
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.parsing import add_model, make_parser
 from drakegrasp.hand.shapes import hull_corners
+from drakegrasp.mesh.surfaces import Solid
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import ObjectModel, object_colour
 from drakegrasp.simulation.scene import HandHandles, Scene
@@ -91,37 +92,53 @@ def build_scene(
     hand: Hand | None = None,
     *,
     meshcat: Meshcat | None = None,
+    resting_surface: Solid | None = None,
 ) -> Scene:
     """Return the scene of an object and the table, with the hand if one is given.
 
     With a hand, `Scene.coarse_scene` builds the scene with coarse steps when it is first called.
 
-    The object is a rigid hydroelastic surface of its exact collision mesh. The table and every part
-    of the hand are compliant, so that each contact with the object is hydroelastic.
+    The object has two rigid hydroelastic surfaces: the hand meets its exact collision mesh, the
+    table a surface that carries well. The table and every part of the hand are compliant, so that
+    each contact with the object is hydroelastic.
 
     Args:
         model: The object; its own friction, if it has one, wins.
         physics: Materials, solver and time step.
         hand: The hand.
         meshcat: Where to show the scene while it is simulated; the results are the same bits.
+        resting_surface: What the table meets, in {O}; the object's `resting_surface` if None.
     """
     physics = model.own_physics(physics)
-    scene = _build(model, physics, hand, meshcat)
+    table_side = resting_surface or model.resting_surface
+    scene = _build(model, physics, hand, meshcat, table_side)
     if hand is None or physics.coarse_steps == 1:
         return scene
     time_step = physics.coarse_steps * physics.time_step
     coarse = physics.model_copy(update={"time_step": time_step})
-    return replace(scene, coarse_scene=cache(partial(_build, model, coarse, hand, meshcat)))
+    build_coarse = partial(_build, model, coarse, hand, meshcat, table_side)
+    return replace(scene, coarse_scene=cache(build_coarse))
 
 
 def _build(
-    model: ObjectModel, physics: PhysicsConfig, hand: Hand | None, meshcat: Meshcat | None
+    model: ObjectModel,
+    physics: PhysicsConfig,
+    hand: Hand | None,
+    meshcat: Meshcat | None,
+    table_side: Solid,
 ) -> Scene:
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(_plant_config(physics), builder)
 
     # The free object and the table.
-    object_body = _add_object(plant, model, physics)
+    object_body = plant.AddRigidBody(
+        "object", plant.AddModelInstance("object"), object_inertia(model, model.mass)
+    )
+    collision = Solid(
+        vertices=model.collision_vertices, faces=model.collision_faces.astype(np.int64)
+    )
+    hand_side_id = _add_surface(plant, object_body, "hand", collision, physics)
+    table_side_id = _add_surface(plant, object_body, "table", table_side, physics)
     table = _add_table(plant, scene_graph, physics)
     if meshcat is not None:
         _add_visual(plant, object_body, model)
@@ -139,6 +156,7 @@ def _build(
     plant.Finalize()
 
     # What needs the finalized plant: collision filters and the wrist's input.
+    _part_surfaces(plant, scene_graph, table, handles, hand_side_id, table_side_id)
     if handles is not None:
         _filter_within_hand(plant, scene_graph, handles)
         builder.Connect(
@@ -154,6 +172,7 @@ def _build(
         plant=plant,
         scene_graph=scene_graph,
         object=object_body,
+        table_side=table_side_id,
         table=table,
         handles=handles,
         physics=physics,
@@ -175,23 +194,16 @@ def _plant_config(physics: PhysicsConfig) -> MultibodyPlantConfig:
     )
 
 
-def _add_object(plant: MultibodyPlant, model: ObjectModel, physics: PhysicsConfig) -> RigidBody:
-    instance = plant.AddModelInstance("object")
-    body = plant.AddRigidBody("object", instance, object_inertia(model, model.mass))
-
-    # The collision mesh as a rigid hydroelastic surface.
-    text = obj_text(model.collision_vertices, model.collision_faces, normals=False)
+def _add_surface(
+    plant: MultibodyPlant, body: RigidBody, name: str, surface: Solid, physics: PhysicsConfig
+) -> GeometryId:
+    """Add a rigid hydroelastic surface in {O} to the object, named after what it meets."""
+    text = obj_text(surface.vertices, surface.faces, normals=False)
     properties = ProximityProperties()
     AddRigidHydroelasticProperties(properties)
     _add_material(properties, object_friction(physics), physics)
-    plant.RegisterCollisionGeometry(
-        body,
-        RigidTransform(),
-        Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", model.name))),
-        "surface",
-        properties,
-    )
-    return body
+    mesh = Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", name)))
+    return plant.RegisterCollisionGeometry(body, RigidTransform(), mesh, name, properties)
 
 
 def object_inertia(model: ObjectModel, mass: float) -> SpatialInertia:
@@ -366,6 +378,23 @@ def _make_compliant_hand(
         AddCompliantHydroelasticProperties(RESOLUTION_HINT, modulus, properties)
         _add_material(properties, mu, physics)
         _assign_proximity(plant, scene_graph, plant.get_body(index), properties)
+
+
+def _part_surfaces(
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    table: RigidBody,
+    handles: HandHandles | None,
+    hand_side: GeometryId,
+    table_side: GeometryId,
+) -> None:
+    """Let the table meet one surface of the object only, and the hand the other one only."""
+    parts = [] if handles is None else [geometry for geometry, _ in handles.parts]
+    slab = plant.GetCollisionGeometriesForBody(table)
+    manager, declare = scene_graph.collision_filter_manager(), CollisionFilterDeclaration()
+    declare.ExcludeBetween(GeometrySet(hand_side), GeometrySet(slab))
+    declare.ExcludeBetween(GeometrySet(table_side), GeometrySet(parts))
+    manager.Apply(declare)
 
 
 def _filter_within_hand(

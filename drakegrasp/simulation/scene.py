@@ -67,6 +67,7 @@ class Scene:
         simulator: Owns the diagram's context.
         plant, scene_graph: The two systems of the diagram.
         object, table: The bodies.
+        table_side: The object's surface that meets the table; the hand meets the other one.
         handles: The parts of the hand, or None in a scene without a hand.
         physics: The configuration that it was built with.
         coarse_scene: Returns the scene whose step is `physics.coarse_steps` times as long; every
@@ -78,6 +79,7 @@ class Scene:
     plant: MultibodyPlant
     scene_graph: SceneGraph
     object: RigidBody
+    table_side: GeometryId
     table: RigidBody
     handles: HandHandles | None
     physics: PhysicsConfig
@@ -174,10 +176,10 @@ def _let_object_meet_table(scene: Scene, meet: bool) -> None:
         scene.scene_graph.GetMyMutableContextFromRoot(scene.simulator.get_mutable_context())
     )
     declare = CollisionFilterDeclaration()
-    sides = [
-        GeometrySet(scene.plant.GetCollisionGeometriesForBody(body))
-        for body in (scene.object, scene.table)
-    ]
+    sides = (
+        GeometrySet(scene.table_side),
+        GeometrySet(scene.plant.GetCollisionGeometriesForBody(scene.table)),
+    )
     manager.Apply(declare.AllowBetween(*sides) if meet else declare.ExcludeBetween(*sides))
 
 
