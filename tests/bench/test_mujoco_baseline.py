@@ -11,6 +11,7 @@ from helpers.objects import CUBE, box_model, from_above, standing
 from drakegrasp.config import Config, load_config, override_config
 from drakegrasp.frames import X_WT, make_pose
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.file_format import PAD_BAND
 from drakegrasp.hand.kinematics import fingertip_poses
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
@@ -201,19 +202,18 @@ def test_worm_yields_beyond_its_strength(
     assert trial.slip > 5e-3
 
 
-def test_contact_beside_the_pad_is_of_another_link(
+def test_contact_beside_the_pad_and_its_band_is_of_another_link(
     cube: ObjectModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The fingertips meet the cube 55 mm from the distal joint."""
-    attempt = from_above(cube, STANDOFF)
-    at = (0.055, 0.006, 0.0)
-    bounds = ((1.0, 0.0, 0.0, 0.054), (-1.0, 0.0, 0.0, -0.056))
-    weak(monkeypatch, pad_region=bounds, pad_point=at)
+    """A corner of each fingertip's shape meets the cube, 54.7 mm from the distal joint."""
+    attempt, x = from_above(cube, STANDOFF), 0.0547
+    at = (0.06, 0.0, 0.0)
+    weak(monkeypatch, pad_region=((1.0, 0.0, 0.0, x + 0.5 * PAD_BAND),), pad_point=at)
     baseline = peer(cube)
     assert baseline.run(attempt).outcome is Outcome.SUCCESS
     assert baseline._contacts().other_links == 0
 
-    weak(monkeypatch, pad_region=((1.0, 0.0, 0.0, 0.06),), pad_point=(0.06, 0.0, 0.0))
+    weak(monkeypatch, pad_region=((1.0, 0.0, 0.0, x + 1.5 * PAD_BAND),), pad_point=at)
     baseline = peer(cube)
     assert baseline.run(attempt).outcome is Outcome.MISSING_FINGERTIP
     assert baseline._contacts().other_links == 3
