@@ -145,21 +145,27 @@ def agreement(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         rows: Of `cross_check`, under "lifts".
 
     Returns:
-        Numbers of lifts drawn, lifted and held; the share of the lifted that hold with its
-        interval, None if nothing is lifted; the outcomes of those that are not.
+        Numbers of lifts drawn, lifted and held; of all that were drawn and of those lifted there,
+        the share that holds with its interval, None of nothing; the outcomes of the others.
     """
     lifted = [row for row in rows if row["lifted"]]
     held = sum(_holds(row) for row in lifted)
-    low, high = wilson_interval(held, len(lifted)) if lifted else (None, None)
     return {
         "drawn": len(rows),
         "lifted": len(lifted),
         "held": held,
-        "share": held / len(lifted) if lifted else None,
-        "low": low,
-        "high": high,
+        "of_all": _share(held, len(rows)),
+        "of_lifted": _share(held, len(lifted)),
         "not_lifted": dict(Counter(row["there"] for row in rows if not row["lifted"])),
     }
+
+
+def _share(hits: int, count: int) -> dict[str, float] | None:
+    """Return a share with its interval, None of nothing."""
+    if not count:
+        return None
+    low, high = wilson_interval(hits, count)
+    return {"share": hits / count, "low": low, "high": high}
 
 
 def wilson_interval(hits: int, count: int, confidence: float = CONFIDENCE) -> tuple[float, float]:

@@ -19,6 +19,7 @@ from drakegrasp.bench.mujoco_scene import (
     IMMOVABLE,
     TIME_STEP,
     build_mujoco_scene,
+    pair_friction,
     quaternion,
 )
 from drakegrasp.config import Config
@@ -134,8 +135,8 @@ class MujocoBaseline:
             scale = 1.0 / factor if name.endswith("invweight0") else factor
             getattr(m, name)[at] = scale * self._weights[name]
         self._object_inertia = m.dof_M0[self._object_v].copy()
-        m.geom_friction[:, 0] = materials.friction_hand
-        m.geom_friction[self._table, 0] = materials.friction_table
+        m.geom_friction[:] = pair_friction(materials.friction_hand)
+        m.geom_friction[self._table] = pair_friction(materials.friction_table)
 
     def run(self, attempt: Pregrasp) -> PeerTrial:
         """Return the result of one attempt; its fingers close from the open hand."""

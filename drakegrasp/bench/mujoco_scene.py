@@ -58,11 +58,9 @@ CARRIER_MASS, CARRIER_INERTIA, ARMATURE = 0.01, 1e-5, 2e-4
 #: Inertia that is added to what no contact may move [kg, kg m^2]: the wrist, which follows its path
 #: exactly, and the object while the hand closes.
 IMMOVABLE = 1e4
-#: Torsional friction [m], the torsion radius of a fingertip's patch in Drake: the median of 336
-#: patches of the Barrett Hand on built-in objects (pipelines/measurements/torsion_radius.py).
-TURNING = 0.0029
-#: Rolling friction [m], MuJoCo's default.
-ROLLING = 0.0001
+#: Torsion radius of a fingertip's patch in Drake [m]: the median of 336 patches of the Barrett Hand
+#: on built-in objects (pipelines/measurements/torsion_radius.py).
+TORSION_RADIUS = 0.0029
 #: Bits of MuJoCo's collision masks.
 _HAND, _OBJECT, _TABLE = 1, 2, 4
 
@@ -122,6 +120,16 @@ def quaternion(R: Array) -> Array:
     return found
 
 
+def pair_friction(coefficient: float) -> list[float]:
+    """Return what MuJoCo calls the friction of a geom, for a pair's coefficient of friction.
+
+    These are the coefficients of sliding and of turning about the normal, and of rolling, which
+    contacts here do not have. That of turning is torque per normal force [m], so it depends on the
+    coefficient of the pair.
+    """
+    return [coefficient, coefficient * TORSION_RADIUS, 0.0]
+
+
 def _convex_parts(model: ObjectModel) -> list[Array]:
     """Return the corners of an object's convex parts, each (n, 3) in {O} [m]."""
     coacd.set_log_level("error")
@@ -153,7 +161,7 @@ def _add_table(spec: mujoco.MjSpec, config: Config) -> None:
         size=[0.8, 0.8, thickness],
         contype=_TABLE,
         conaffinity=_HAND | _OBJECT,
-        friction=[config.physics.friction_table, TURNING, ROLLING],
+        friction=pair_friction(config.physics.friction_table),
         solref=STIFF,
         condim=4,
         # Its friction decides, not the larger one of the pair.
@@ -174,7 +182,7 @@ def _add_object(
             meshname=f"part_{k}",
             contype=_OBJECT,
             conaffinity=_HAND | _TABLE,
-            friction=[config.physics.friction_hand, TURNING, ROLLING],
+            friction=pair_friction(config.physics.friction_hand),
             solref=STIFF,
             condim=4,
         )
@@ -311,7 +319,7 @@ def _add_link(
             quat=quaternion(X_LS.rotation().matrix()),
             contype=_HAND,
             conaffinity=_OBJECT | _TABLE,
-            friction=[friction, TURNING, ROLLING],
+            friction=pair_friction(friction),
             solref=STIFF,
             condim=4,
         )

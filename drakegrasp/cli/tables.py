@@ -351,23 +351,24 @@ _GROUP_HEADS = {"sample": "samples", "removed": "held, no samples", "lost": "los
 
 
 def cross_check_table(groups: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Return how many stored lifts are lifted in MuJoCo, and how many of these hold, by group."""
+    """Return how many stored lifts hold in MuJoCo, of all and of those lifted there, by group."""
     table = _table("Stored lifts, tried again in MuJoCo")
     table.add_column("in the dataset", no_wrap=True)
-    heads = ("lifts", "not lifted\nthere", "lifted\nthere", "of these\nhold", "share")
-    for head in (*heads, "95 %\nconfidence"):
+    heads = ("lifts", "hold\nthere", "share", "95 %\nconfidence")
+    for head in (*heads, "lifted\nthere", "share\nof these", "95 %\nconfidence"):
         table.add_column(head, justify="right", no_wrap=True)
 
     for group, counts in groups.items():
-        drawn, lifted, held = (counts[key] for key in ("drawn", "lifted", "held"))
-        cells = [f"{n:,}" for n in (drawn, drawn - lifted, lifted, held)]
-        cells += (
-            [f"{counts['share']:.1%}", f"{counts['low']:.1%} to {counts['high']:.1%}"]
-            if lifted
-            else ["-", "-"]
-        )
-        table.add_row(_GROUP_HEADS[group], *cells)
+        cells = [f"{counts[key]:,}" for key in ("drawn", "held")]
+        cells += [*_share_cells(counts["of_all"]), f"{counts['lifted']:,}"]
+        table.add_row(_GROUP_HEADS[group], *cells, *_share_cells(counts["of_lifted"]))
     return table
+
+
+def _share_cells(share: Mapping[str, float] | None) -> list[str]:
+    if share is None:
+        return ["-", "-"]
+    return [f"{share['share']:.1%}", f"{share['low']:.1%} to {share['high']:.1%}"]
 
 
 def cross_check_lines(report: Mapping[str, Any]) -> list[str]:

@@ -9,6 +9,7 @@ A joint turns, and its positions are angles [rad], or it slides, and they are le
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import sqrt
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -42,6 +43,10 @@ Vector = tuple[Finite, Finite, Finite]
 HalfSpace = tuple[Finite, Finite, Finite, Finite]
 #: What a closing joint does when it is pushed open; see docs/explanation/physics.md, "Drive".
 Drive = Literal["worm", "torque", "locked"]
+#: Contact this far beside a pad region counts as the pad's [m]. Shapes are polyhedra, MuJoCo's
+#: contacts are at their corners, and a border is drawn along an edge: that of the Barrett Hand
+#: misses the corners of the tip by 0.9 mm. A patch is nine times as wide.
+PAD_BAND = 0.001
 _STRICT = ConfigDict(frozen=True, extra="forbid")
 
 
@@ -77,7 +82,7 @@ class Finger:
     holding_torque: Positive | None = None  # what a stalled worm holds, turning [N m]
     holding_force: Positive | None = None  # what it holds, sliding [N]
     coupled: tuple[Coupling, ...] = ()
-    pad_region: tuple[HalfSpace, ...] = ()  # in Fi [m]; only there a contact is a fingertip's
+    pad_region: tuple[HalfSpace, ...] = ()  # in Fi [m]; elsewhere contact is another link's
     pad_point: Vector  # usual contact point, in Fi [m]
     required: bool = True  # whether a grasp needs this fingertip on the object
 
@@ -104,7 +109,7 @@ class Finger:
         for i, (*normal, _) in enumerate(self.pad_region):
             if not any(normal):
                 raise ValueError(f"pad_region.{i} must have a normal that is not zero, got zero")
-        if not self.on_pad(self.p_FiP):
+        if self.beside_pad(self.p_FiP) > 0.0:
             raise ValueError(f"pad_point must lie in the pad_region, got {list(self.pad_point)}")
 
     @property
@@ -135,12 +140,23 @@ class Finger:
         return np.array(self.pad_point)
 
     def on_pad(self, p_FiQ: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Return (...,) whether points (..., 3) of the fingertip link [m] belong to the pad."""
+        """Return (...,) whether contact at (..., 3) of the fingertip link [m] is the pad's.
+
+        It is in the pad region, and as far as `PAD_BAND` beside it.
+        """
+        return np.asarray(self.beside_pad(p_FiQ) <= PAD_BAND)
+
+    def beside_pad(self, p_FiQ: npt.ArrayLike) -> Array:
+        """Return (...,) how far points (..., 3) of the fingertip link are beside the region [m].
+
+        It is the distance from the farthest of the region's planes, negative within.
+        """
         points = np.asarray(p_FiQ, dtype=float)
-        inside = np.ones(points.shape[:-1], dtype=np.bool_)
+        beside = np.full(points.shape[:-1], -np.inf)
         for nx, ny, nz, d in self.pad_region:
-            inside &= nx * points[..., 0] + ny * points[..., 1] + nz * points[..., 2] >= d
-        return inside
+            height = nx * points[..., 0] + ny * points[..., 1] + nz * points[..., 2]
+            beside = np.maximum(beside, (d - height) / sqrt(nx * nx + ny * ny + nz * nz))
+        return beside
 
 
 @with_config(_STRICT)

@@ -8,7 +8,7 @@ geometry only, without a simulation. Closing angles are lengths where the closin
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, lru_cache
 
 import numpy as np
@@ -18,7 +18,7 @@ from scipy.spatial import ConvexHull
 from drakegrasp.arithmetic import dot, multiply, norm
 from drakegrasp.frames import Array, invert_pose
 from drakegrasp.hand.description import Hand
-from drakegrasp.hand.file_format import Finger
+from drakegrasp.hand.file_format import PAD_BAND, Finger
 from drakegrasp.hand.kinematics import coordinate_limits, link_poses
 from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.mesh.distance_field import DistanceField, make_distance_field
@@ -211,12 +211,8 @@ def pad_points(hand: Hand) -> tuple[Array, ...]:
 
 def _near_pad(finger: Finger, p_FiQ: Array) -> npt.NDArray[np.bool_]:
     """Return which points (n, 3) [m] of a fingertip are on its pad, or next to one that may be."""
-    # The points are samples of the surface: one beside the region stands for some within.
-    wider = tuple(
-        (nx, ny, nz, d - TIP_SPACING * float(norm(np.array([nx, ny, nz]))))
-        for nx, ny, nz, d in finger.pad_region
-    )
-    return replace(finger, pad_region=wider).on_pad(p_FiQ)
+    # The points are samples of the surface: one beside the pad stands for some within.
+    return np.asarray(finger.beside_pad(p_FiQ) <= PAD_BAND + TIP_SPACING)
 
 
 def _triangles(corners: Array) -> Array:

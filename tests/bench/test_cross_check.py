@@ -135,11 +135,15 @@ def test_agreement_counts_what_is_lifted_there():
         row(Outcome.TABLE_CONTACT, False),
     ]
     found = agreement(rows)
-    assert (found["drawn"], found["lifted"], found["held"], found["share"]) == (7, 4, 3, 0.75)
+    assert (found["drawn"], found["lifted"], found["held"]) == (7, 4, 3)
     assert found["not_lifted"] == {"missing_fingertip": 2, "table_contact": 1}
-    assert (found["low"], found["high"]) == wilson_interval(3, 4)
-    nothing = agreement(rows[4:])
-    assert nothing["share"] is nothing["low"] is nothing["high"] is None
+    for of, count in (("of_all", 7), ("of_lifted", 4)):
+        share = found[of]
+        assert share["share"] == 3 / count
+        assert (share["low"], share["high"]) == wilson_interval(3, count)
+    assert agreement(rows[4:])["of_all"]["share"] == 0.0
+    assert agreement(rows[4:])["of_lifted"] is None
+    assert agreement([])["of_all"] is None
 
 
 @pytest.mark.parametrize(

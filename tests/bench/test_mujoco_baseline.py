@@ -11,6 +11,7 @@ from helpers.objects import CUBE, box_model, from_above, standing
 from drakegrasp.config import Config, load_config, override_config
 from drakegrasp.frames import X_WT, make_pose
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.file_format import PAD_BAND
 from drakegrasp.hand.kinematics import fingertip_poses
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
@@ -21,9 +22,15 @@ pytest.importorskip("coacd")
 
 import mujoco
 
-from drakegrasp.bench import mujoco_baseline
+from drakegrasp.bench import mujoco_baseline, mujoco_scene
 from drakegrasp.bench.mujoco_baseline import MujocoBaseline
-from drakegrasp.bench.mujoco_scene import TIME_STEP, build_mujoco_scene
+from drakegrasp.bench.mujoco_scene import (
+    STIFF,
+    TIME_STEP,
+    TORSION_RADIUS,
+    build_mujoco_scene,
+    pair_friction,
+)
 
 pytestmark = pytest.mark.sim
 
@@ -155,6 +162,30 @@ def test_friction_is_that_of_coulomb(pinched: ObjectModel) -> None:
     assert lost.slip > 5e-3
 
 
+@pytest.mark.parametrize("coefficient", [0.3, 0.71, 1.5])
+def test_sphere_turns_on_a_plane_beyond_friction_times_torsion_radius(coefficient: float) -> None:
+    """What a model says of turning is torque per normal force, whatever the coefficient."""
+    radius, force, spec = 0.02, 10.0, mujoco_scene._spec()
+    spec.option.gravity = [0.0, 0.0, 0.0]
+    surface = {"friction": pair_friction(coefficient), "solref": STIFF, "condim": 4}
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1.0, 1.0, 0.1], **surface)
+    ball = spec.worldbody.add_body(name="ball", pos=[0.0, 0.0, radius])
+    ball.add_freejoint()
+    kind = mujoco.mjtGeom.mjGEOM_SPHERE
+    ball.add_geom(type=kind, size=[radius, 0.0, 0.0], mass=0.1, **surface)
+    model = spec.compile()
+
+    def speed(share: float) -> float:
+        data = mujoco.MjData(model)
+        torque = share * coefficient * TORSION_RADIUS * force
+        data.body("ball").xfrc_applied[[2, 5]] = -force, torque
+        mujoco.mj_step(model, data, 250)
+        return float(data.qvel[5])
+
+    assert speed(0.97) < 0.1
+    assert speed(1.03) > 1.0
+
+
 def weak(monkeypatch: pytest.MonkeyPatch, **changes: object) -> None:
     """Let the hand of the next peers have other fingers."""
     hand = load_hand()
@@ -171,19 +202,18 @@ def test_worm_yields_beyond_its_strength(
     assert trial.slip > 5e-3
 
 
-def test_contact_beside_the_pad_is_of_another_link(
+def test_contact_beside_the_pad_and_its_band_is_of_another_link(
     cube: ObjectModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The fingertips meet the cube 55 mm from the distal joint."""
-    attempt = from_above(cube, STANDOFF)
-    at = (0.055, 0.006, 0.0)
-    bounds = ((1.0, 0.0, 0.0, 0.054), (-1.0, 0.0, 0.0, -0.056))
-    weak(monkeypatch, pad_region=bounds, pad_point=at)
+    """A corner of each fingertip's shape meets the cube, 54.7 mm from the distal joint."""
+    attempt, x = from_above(cube, STANDOFF), 0.0547
+    at = (0.06, 0.0, 0.0)
+    weak(monkeypatch, pad_region=((1.0, 0.0, 0.0, x + 0.5 * PAD_BAND),), pad_point=at)
     baseline = peer(cube)
     assert baseline.run(attempt).outcome is Outcome.SUCCESS
     assert baseline._contacts().other_links == 0
 
-    weak(monkeypatch, pad_region=((1.0, 0.0, 0.0, 0.06),), pad_point=(0.06, 0.0, 0.0))
+    weak(monkeypatch, pad_region=((1.0, 0.0, 0.0, x + 1.5 * PAD_BAND),), pad_point=at)
     baseline = peer(cube)
     assert baseline.run(attempt).outcome is Outcome.MISSING_FINGERTIP
     assert baseline._contacts().other_links == 3
@@ -213,6 +243,7 @@ def test_own_friction_of_the_object_is_that_of_both_pairs(cube: ObjectModel) -> 
     body = own.body("object").id
     assert own.geom("table").friction[0] == 0.2
     assert set(own.geom_friction[own.geom_bodyid == body, 0].tolist()) == {0.2}
+    np.testing.assert_allclose(own.geom_friction[:, 1], own.geom_friction[:, 0] * TORSION_RADIUS)
 
 
 def test_wrist_waits_while_the_object_is_released(

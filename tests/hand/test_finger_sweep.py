@@ -58,15 +58,15 @@ def test_points_leave_no_gap_on_a_surface():
 
 
 def test_points_of_the_pad_come_first(hand):
-    """They are those of the pad region and next to it; the points are 3 mm apart."""
+    """They are those of the pad, which has a band of 1 mm, and next to it: they are 3 mm apart."""
     for i, finger in enumerate(hand.fingers):
         path = hand_paths(hand, 0.0).fingers[i]
         X_FG = invert_pose(fingertip_poses(hand, spread=0.0, closing=np.zeros(3))[i])
         p_FQ = transform_points(X_FG, path.points[0, : path.tip].astype(float))
         x, y = p_FQ[:, 0], p_FQ[:, 1]
-        above = 0.085 * x + y - (0.00153 - 0.003 * np.hypot(0.085, 1.0))
-        near = (x > 0.015 + 1e-6) & (above > 1e-6)
-        off = (x < 0.015 - 1e-6) | (above < -1e-6)
+        above = 0.085 * x + y - (0.00153 - 0.004 * np.hypot(0.085, 1.0))
+        near = (x > 0.014 + 1e-6) & (above > 1e-6)
+        off = (x < 0.014 - 1e-6) | (above < -1e-6)
         assert near[: path.pad].sum() == near.sum() > 100
         assert off[path.pad :].sum() == off.sum() > 100
         assert np.allclose(pad_points(hand)[i], p_FQ[: path.pad], atol=1e-6)

@@ -11,7 +11,7 @@ from helpers.objects import CUBE, STANDOFF, from_above, standing
 from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, invert_pose, make_pose, transform_points
 from drakegrasp.hand.description import Hand
-from drakegrasp.hand.file_format import HalfSpace
+from drakegrasp.hand.file_format import PAD_BAND, HalfSpace
 from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation import contacts as contacts_module
@@ -68,10 +68,10 @@ def test_contact_off_the_pad_is_one_of_another_link(closed):
 
 
 def test_patch_over_the_border_is_the_fingertips(closed):
-    """As a whole, where most of it is on the pad: its force, area and point do not change."""
+    """As a whole, where most of it is on the pad or its band: nothing of it changes."""
     whole = with_pads(closed, EVERYWHERE, EVERYWHERE, EVERYWHERE)
     x = _contact_in_link(closed, whole)
-    part = with_pads(closed, ((1.0, 0.0, 0.0, x - 1e-3),), EVERYWHERE, EVERYWHERE)
+    part = with_pads(closed, ((1.0, 0.0, 0.0, x + 0.5 * PAD_BAND),), EVERYWHERE, EVERYWHERE)
     assert part.other_links == 0
     assert np.array_equal(part.f_Q_O, whole.f_Q_O)
     assert np.array_equal(part.p_OQ, whole.p_OQ)
@@ -83,7 +83,7 @@ def test_patch_mostly_beside_the_pad_is_split(closed, scale):
     """The pad's part is a fingertip's contact, and the rest is one of another link."""
     whole = with_pads(closed, EVERYWHERE, EVERYWHERE, EVERYWHERE)
     x = _contact_in_link(closed, whole)
-    beyond = (scale, 0.0, 0.0, scale * (x + 1e-3))
+    beyond = (scale, 0.0, 0.0, scale * (x + PAD_BAND + 1e-3))
     part = with_pads(closed, (beyond,), EVERYWHERE, EVERYWHERE)
     assert part.touching.all()
     assert part.other_links == 1
@@ -107,10 +107,13 @@ def _contact_in_link(scene: Scene, contacts: Contacts) -> float:
 
 
 def test_barretts_pad_is_the_front_of_its_fingertip(closed):
-    """It begins 18 mm along the link and has the round tip, but neither back nor sides."""
+    """It begins 18 mm along the link and has the round tip, but neither back nor sides.
+
+    Its band of 1 mm has the corners of the tip.
+    """
     (finger, *_) = closed.handles.hand.fingers
-    on = np.array([[0.04, 0.011, 0.0], [0.0183, 0.0, 0.01], [0.0589, -0.003, 0.0]])
-    off = np.array([[0.0179, 0.01, 0.0], [0.03, -0.002, 0.011], [0.059, -0.004, 0.0]])
+    on = np.array([[0.04, 0.011, 0.0], [0.0171, 0.0, 0.01], [0.0593, -0.0044, 0.005]])
+    off = np.array([[0.0169, 0.01, 0.0], [0.03, -0.0021, 0.011], [0.059, -0.0046, 0.0]])
     assert finger.on_pad(on).all()
     assert not finger.on_pad(off).any()
 

@@ -19,6 +19,7 @@ from helpers.objects import (
 
 from drakegrasp.config import load_config, override_config
 from drakegrasp.frames import X_WT, invert_pose, make_pose
+from drakegrasp.hand.file_format import PAD_BAND
 from drakegrasp.objects.model import prepare_object
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.outcomes import Outcome, Stage
@@ -346,7 +347,7 @@ def test_object_rests_on_the_table_after_an_attempt_that_ended_early(scene, cube
 
 
 def test_hand_that_presses_beside_a_pad_does_not_lift(scene, cube, config, held):
-    """The patch of the first fingertip lies mostly beside a pad that begins where it is."""
+    """The patch of the first fingertip lies mostly beside a pad with its band."""
     tip = scene.handles.fingertips[0]
     reset_attempt(
         scene,
@@ -357,7 +358,8 @@ def test_hand_that_presses_beside_a_pad_does_not_lift(scene, cube, config, held)
     )
     X_FO = invert_pose(scene.pose(tip)) @ scene.pose(scene.object)
     x = float((X_FO[:3, :3] @ held.closed.p_OQ[0] + X_FO[:3, 3])[0])
-    beyond = {"pad_region": ((1.0, 0.0, 0.0, x + 1e-3),), "pad_point": (x + 0.01, 0.01, 0.0)}
+    begin = x + PAD_BAND + 1e-3
+    beyond = {"pad_region": ((1.0, 0.0, 0.0, begin),), "pad_point": (x + 0.01, 0.01, 0.0)}
     first, *others = scene.handles.hand.fingers
     fingers = (replace(first, **beyond), *others)
     handles = replace(scene.handles, hand=replace(scene.handles.hand, fingers=fingers))
