@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy.typing as npt
 
+from drakegrasp.build.counts import NAMED
 from drakegrasp.build.pipeline import BuildReport, build_locked
 from drakegrasp.build.request import BUILTIN
+from drakegrasp.build.target import refuse_two_ends
 from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.certificates import security_of
 from drakegrasp.cluster.connect import connect, dashboard_line, has_dashboard
@@ -24,7 +26,7 @@ from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import claim_directory
 from drakegrasp.dataset.paths import BUILTIN_FOLDER
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.errors import ConfigError, GraspError
+from drakegrasp.errors import ConfigError, GraspError, MeshError
 from drakegrasp.frames import as_numbers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import with_hand_defaults
@@ -59,6 +61,7 @@ def build_dataset(
     config: Config | None = None,
     units: str = "m",
     manifest: str | Path | None = None,
+    only: Sequence[str] = (),
     workers: int | None = None,
     scheduler: str | None = None,
     scheduler_file: str | Path | None = None,
@@ -76,6 +79,7 @@ def build_dataset(
         config: All the rules; the defaults if None.
         units: Unit of length of the meshes: m, cm or mm.
         manifest: YAML file with units and classes per mesh, if it is not beside the meshes.
+        only: Names of the objects to build; all if empty.
         workers: Processes on this machine; one per core if None.
         scheduler: Address of a running Dask scheduler to use instead.
         scheduler_file: Its JSON file, instead of the address.
@@ -96,7 +100,7 @@ def build_dataset(
     sources = find_sources(objects, units, manifest)
     security = None if tls_files is None else security_of(tls_files)
     cluster = _announced(connect(workers, scheduler, scheduler_file, security=security), show)
-    return build_on(cluster, sources, out, config, show=show)
+    return build_on(cluster, sources, out, config, only=only, show=show)
 
 
 @contextmanager
@@ -127,6 +131,7 @@ def build_on(
     out: Path,
     config: Config,
     *,
+    only: Sequence[str] = (),
     show: bool = True,
 ) -> BuildReport:
     """Build a dataset on the workers of a cluster; see `build_dataset`.
@@ -139,13 +144,17 @@ def build_on(
         sources: The meshes; None for the built-in objects.
         out: Directory of the dataset, absolute.
         config: All the rules.
+        only: As for `build_dataset`.
         show: Whether to show progress on standard error.
 
     Raises:
+        ConfigError: If the configuration states a number of grasps and of samples to stop at.
         DataError: If `out` cannot be used, another process builds there, or no mesh can be
             simulated.
+        MeshError: If `only` names no object.
         MachineError: If a worker would give other results than this machine.
     """
+    refuse_two_ends(config)
     config = with_hand_defaults(config)
     with build_lock(out) as dead, ExitStack() as stack:
         # A directory that cannot be used is refused before workers start.
@@ -157,10 +166,26 @@ def build_on(
         if sources is None:
             with progress_bar("objects", "meshes", show=show) as report:
                 sources = builtin_sources(out / BUILTIN_FOLDER, config.builtin, report)
+        sources = _chosen(sources, only)
 
         execute = DaskExecutor(client, resubmissions=RESUBMISSIONS)
         execute.pool.kernel = kernel
         return build_locked(sources, out, config, execute, dead=dead, pool=execute.pool, show=show)
+
+
+def _chosen(sources: Sequence[MeshSource], only: Sequence[str]) -> list[MeshSource]:
+    """Return the meshes of the named objects; all if none is named.
+
+    Raises:
+        MeshError: If there is no object of a name.
+    """
+    names = [source.name for source in sources]
+    unknown = [name for name in only if name not in names]
+    if unknown:
+        more = ", ..." * (len(names) > NAMED)
+        known = f"{', '.join(names[:NAMED])}{more}"
+        raise MeshError(f"only must be names of objects ({known}), got {unknown[0]!r}")
+    return [source for source in sources if not only or source.name in only]
 
 
 def verify_grasp(

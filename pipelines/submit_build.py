@@ -107,7 +107,10 @@ def main(
 
     sources = find_sources(request.objects, request.units, request.manifest)
     running = _present(start_cluster(cluster, request.out), request.show)
-    print_report(build_on(running, sources, request.out, request.config, show=request.show))
+    report = build_on(
+        running, sources, request.out, request.config, only=request.only, show=request.show
+    )
+    print_report(report)
 
 
 @contextmanager

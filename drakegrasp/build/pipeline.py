@@ -18,7 +18,7 @@ from drakegrasp.build.done_units import find_tasks, find_units
 from drakegrasp.build.events import BuildEvents
 from drakegrasp.build.payload import too_heavy
 from drakegrasp.build.prepare import PrepareTask, prepare_one
-from drakegrasp.build.target import Target, has_target, target_of
+from drakegrasp.build.target import Target, refuse_two_ends, target_of
 from drakegrasp.build.work_unit import WorkUnit, run_unit
 from drakegrasp.config import Config, SplitConfig
 from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
@@ -39,7 +39,7 @@ from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.split import may_train, split_rule
 from drakegrasp.dataset.statistics import is_assembled
-from drakegrasp.errors import ConfigError, DataError, DrakegraspError
+from drakegrasp.errors import DataError, DrakegraspError
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.sources import MeshSource, source_sha256
@@ -121,8 +121,7 @@ def build(
         DiskFullError: If there is no room; the same call goes on when there is.
         MachineError: If the workers cannot do the work.
     """
-    if config.max_grasps is not None and has_target(config):
-        raise ConfigError("max_grasps must be null with samples or samples_per_object, got both")
+    refuse_two_ends(config)
     config = with_hand_defaults(config)
     drive_of(load_hand(config.hand), config.lift)
     with build_lock(out) as dead:

@@ -24,6 +24,7 @@ class BuildRequest:
         config: All the rules.
         units: Unit of length of the meshes.
         manifest: YAML file with units and classes by mesh.
+        only: Names of the objects to build; all if empty.
         show: Whether to show progress on standard error.
     """
 
@@ -32,4 +33,5 @@ class BuildRequest:
     config: Config
     units: str
     manifest: Path | None
+    only: tuple[str, ...]
     show: bool

@@ -17,6 +17,7 @@ from itertools import takewhile
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.shards import ShardHeader
+from drakegrasp.errors import ConfigError
 
 
 @dataclass(kw_only=True)
@@ -123,6 +124,16 @@ class Target:
 def has_target(config: Config) -> bool:
     """Return whether a configuration says after how many samples to stop."""
     return config.samples is not None or config.samples_per_object is not None
+
+
+def refuse_two_ends(config: Config) -> None:
+    """Refuse a number of grasps together with a number of samples after which to stop.
+
+    Raises:
+        ConfigError: If both are stated.
+    """
+    if config.max_grasps is not None and has_target(config):
+        raise ConfigError("max_grasps must be null with samples or samples_per_object, got both")
 
 
 def target_of(config: Config, units: Mapping[str, Sequence[ShardHeader]]) -> Target | None:

@@ -66,6 +66,7 @@ def build(
         config=request.config,
         units=request.units,
         manifest=request.manifest,
+        only=request.only,
         workers=workers,
         scheduler=scheduler,
         scheduler_file=scheduler_file,

@@ -109,6 +109,25 @@ _OPTIONS = (
         help="Stop an object after N successes.  [default: no limit]",
     ),
     click.option(
+        "--samples",
+        type=int,
+        metavar="N",
+        help="Stop when there are N samples, which the objects share in turns; a larger N goes on "
+        "from there.  [default: no limit]",
+    ),
+    click.option(
+        "--samples-per-object",
+        type=int,
+        metavar="N",
+        help="Stop an object when it has N samples.  [default: no limit]",
+    ),
+    click.option(
+        "--only",
+        multiple=True,
+        metavar="NAME",
+        help="Build this object only; may be given several times.",
+    ),
+    click.option(
         "--certify",
         type=click.IntRange(min=0),
         metavar="K",
@@ -229,6 +248,9 @@ def parse_request(
     overrides: Sequence[str],
     candidates: int | None,
     max_grasps: int | None,
+    samples: int | None,
+    samples_per_object: int | None,
+    only: tuple[str, ...],
     certify: int | None,
     seed: int | None,
     units: str,
@@ -251,13 +273,19 @@ def parse_request(
         chosen.append(f"candidates.max={candidates}")
     if certify is not None:
         chosen.append(f"certify.repeats={certify}")
-    resolved = load_config(config, chosen, seed=seed, max_grasps=max_grasps)
+    stops = {
+        "max_grasps": max_grasps,
+        "samples": samples,
+        "samples_per_object": samples_per_object,
+    }
+    resolved = load_config(config, chosen, seed=seed, **stops)
     return BuildRequest(
         objects=objects,
         out=out.absolute(),
         config=with_hand_defaults(resolved),
         units=units,
         manifest=manifest,
+        only=only,
         show=not quiet,
     )
 

@@ -76,6 +76,13 @@ def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
     table.add_column("object", no_wrap=True, overflow="ellipsis", max_width=24)
     for head in [*heads, "samples"]:
         table.add_column(head, justify="right", no_wrap=True)
+    if funnel.refined.any():
+        tried, held, samples = (f"{n:,}" for n in funnel.refined.sum(axis=0).tolist())
+        table.caption = (
+            f"Besides, palm poses about those of samples (refined): {tried} attempts, {held} held, "
+            f"{samples} samples"
+        )
+        table.caption_justify = "left"
 
     def row(outcomes: Sequence[int], removals: Sequence[int], poses: int) -> list[str]:
         cells = [poses, sum(outcomes), *(sum(outcomes[o] for o in g) for g in groups.values())]
@@ -128,10 +135,14 @@ def split_table(counts: Sequence[SplitCount]) -> Table:
     """Return the paper's Table III with a column of objects."""
     table = _table("Samples by split")
     table.add_column("split")
-    for head in ("samples", "objects", "classes"):
+    for head in ("samples", "in effect", "objects", "classes"):
         table.add_column(head, justify="right")
     for count in counts:
-        table.add_row(count.split, f"{count.samples:,}", f"{count.objects:,}", f"{count.classes:,}")
+        effective = "-" if np.isnan(count.effective) else f"{count.effective:,.0f}"
+        numbers = (f"{n:,}" for n in (count.objects, count.classes))
+        table.add_row(count.split, f"{count.samples:,}", effective, *numbers)
+    table.caption = "in effect: where samples with almost the same palm count as one"
+    table.caption_justify = "left"
     return table
 
 

@@ -9,6 +9,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+import h5py
 import numpy as np
 import numpy.typing as npt
 
@@ -20,6 +21,7 @@ from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.dataset.shards import read_trials
+from drakegrasp.dataset.weights import effective_number
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import Executor, run_here
@@ -34,14 +36,18 @@ WORDS = ("precision", "stable")
 class Funnel:
     """Numbers of candidates, outcomes and removals, by object, for m objects.
 
+    All but `refined` count palm poses of the first round: those about grasps that hold succeed far
+    more often.
+
     Attributes:
         names, classes: (m,), of the objects.
-        candidates: (m,), palm poses to try, drawn from the distinct ones.
+        candidates: (m,), palm poses that were tried, or are to be, drawn from the distinct ones.
         distinct: (m,), different palm poses among the valid ones.
         valid: (m,), combinations of rotations above the table whose palm ray meets the object.
         outcomes: (m, 1 + max(Outcome)), attempts by object and outcome.
         precision, stable: (m,), successes that are precision grasps, and stable ones of these.
         removals: (m, 1 + max(Removal)), successes by object and reason of removal.
+        refined: (m, 3), attempts, successes and samples of refined palm poses.
     """
 
     names: tuple[str, ...]
@@ -53,14 +59,20 @@ class Funnel:
     precision: npt.NDArray[np.int64]
     stable: npt.NDArray[np.int64]
     removals: npt.NDArray[np.int64]
+    refined: npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True)
 class SplitCount:
-    """A row of the paper's Table III: numbers of samples, objects and classes of a split."""
+    """A row of the paper's Table III: numbers of samples, objects and classes of a split.
+
+    `effective` is how many of the samples count where those that are alike count once, see
+    `weights.effective_number`; NaN in files of an older schema.
+    """
 
     split: str
     samples: int
+    effective: float
     objects: int
     classes: int
 
@@ -141,15 +153,19 @@ def count_unfinished(out: Path) -> Unfinished | None:
     rows = {name: i for i, name in enumerate(names)}
     outcomes, done = np.zeros((len(names), 1 + max(Outcome)), dtype=np.int64), 0
     words = {word: np.zeros(len(names), dtype=np.int64) for word in WORDS}
+    refined = np.zeros((len(names), 3), dtype=np.int64)
     for header in manifest.headers():
         try:
-            unit = read_trials(header.path(out), header, ("outcome", *WORDS), verify_seal=False)
+            columns = ("outcome", "generation", *WORDS)
+            unit = read_trials(header.path(out), header, columns, verify_seal=False)
         except DataError:
             continue
-        row = rows[header.object_name]
-        outcomes[row] += np.bincount(unit["outcome"], minlength=1 + max(Outcome))
+        row, first = rows[header.object_name], unit["generation"] == 0
+        outcomes[row] += np.bincount(unit["outcome"][first], minlength=1 + max(Outcome))
         for word in WORDS:
-            words[word][row] += np.count_nonzero(unit[word])
+            words[word][row] += np.count_nonzero(unit[word][first])
+        held = unit["outcome"][~first] == Outcome.SUCCESS
+        refined[row] += (len(held), np.count_nonzero(held), 0)
         done += 1
 
     funnel = Funnel(
@@ -162,6 +178,7 @@ def count_unfinished(out: Path) -> Unfinished | None:
         precision=words["precision"],
         stable=words["stable"],
         removals=np.zeros((len(names), 1 + max(Removal)), dtype=np.int64),
+        refined=refined,
     )
     return Unfinished(funnel=funnel, done=done, total=manifest.units)
 
@@ -181,31 +198,47 @@ def funnel_of(path: Path) -> Funnel:
     with open_trials(path) as file:
         objects, trials, successes = (file[name] for name in ("objects", "trials", "successes"))
         names, classes = (read_texts(objects[key]) for key in ("name", "class_name"))
-        counts = {key: objects[key][:] for key in ("candidates", "distinct", "valid")}
+        counts = {key: objects[key][:] for key in ("distinct", "valid")}
         count, rows = len(names), len(trials["outcome"])
         success = read_codes(successes["trial_id"], rows)
         removal = read_codes(successes["removal"], list(Removal))
         outcomes = np.zeros((count, 1 + max(Outcome)), dtype=np.int64)
         held = {word: np.zeros(count, dtype=np.int64) for word in WORDS}
         owner = np.zeros(len(success), dtype=np.int32)
+        born = np.zeros(len(success), dtype=np.bool_)
+        candidates, refined = np.zeros(count, np.int64), np.zeros((count, 3), np.int64)
         for start in range(0, rows, BLOCK):
             block = slice(start, start + BLOCK)
             index = read_codes(trials["object"], count, block)
             outcome = read_codes(trials["outcome"], list(Outcome), block)
-            outcomes += _count_pairs(index, outcome, count, 1 + max(Outcome))
-            for word, numbers in held.items():
-                numbers += np.bincount(index[trials[word][block]], minlength=count)
-            here = (success >= start) & (success < start + BLOCK)
-            owner[here] = index[success[here] - start]
+            # In files of an older schema all are of the first round.
+            later = np.zeros(len(index), dtype=np.bool_)
+            if "generation" in trials:
+                later = trials["generation"][block] > 0
 
+            # Palm poses, outcomes and words of the first round; what was refined from it.
+            first = index[~later]
+            begun = first[trials["standoff_index"][block][~later] == 0]
+            candidates += np.bincount(begun, minlength=count)
+            outcomes += _count_pairs(first, outcome[~later], count, 1 + max(Outcome))
+            for word, numbers in held.items():
+                numbers += np.bincount(index[trials[word][block] & ~later], minlength=count)
+            refined[:, 0] += np.bincount(index[later], minlength=count)
+            here = (success >= start) & (success < start + BLOCK)
+            owner[here], born[here] = index[success[here] - start], later[success[here] - start]
+
+    refined[:, 1] = np.bincount(owner[born], minlength=count)
+    refined[:, 2] = np.bincount(owner[born & (removal == Removal.KEPT)], minlength=count)
     return Funnel(
         names=names,
         classes=classes,
+        candidates=candidates,
         **counts,
         outcomes=outcomes,
         precision=held["precision"],
         stable=held["stable"],
-        removals=_count_pairs(owner, removal, count, 1 + max(Removal)),
+        removals=_count_pairs(owner[~born], removal[~born], count, 1 + max(Removal)),
+        refined=refined,
     )
 
 
@@ -246,11 +279,17 @@ def splits_of(path: Path) -> list[SplitCount]:
             SplitCount(
                 split=split,
                 samples=len(file[split]["grasps"]),
+                effective=_effective(file[split]),
                 objects=len(set(read_names(file[split]["object_props/object_name"]))),
                 classes=len(set(read_names(file[split]["object_props/class_name"]))),
             )
             for split in SPLITS
         ]
+
+
+def _effective(group: h5py.Group) -> float:
+    weights = group.get("grasp_props/weight")
+    return np.nan if weights is None else effective_number(weights[:])
 
 
 def _count_pairs(

@@ -11,6 +11,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from drakegrasp.config import Config
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.hdf5 import read_names
@@ -168,7 +170,12 @@ def _counts(data: Path, funnel: Funnel) -> dict[str, Any]:
             r.label: int(removals[r]) for r in Removal if r is not Removal.KEPT and removals[r]
         },
         "splits": {
-            row.split: {"samples": row.samples, "objects": row.objects, "classes": row.classes}
+            row.split: {
+                "samples": row.samples,
+                "in effect": None if np.isnan(row.effective) else round(row.effective),
+                "objects": row.objects,
+                "classes": row.classes,
+            }
             for row in splits_of(data)
         },
         "classes": {
@@ -193,7 +200,10 @@ def _row(
         "held": int(funnel.outcomes[places, Outcome.SUCCESS].sum()),
         "precision": int(funnel.precision[places].sum()),
         "stable": int(funnel.stable[places].sum()),
-        "samples": int(funnel.removals[places, Removal.KEPT].sum()),
+        "refined": int(funnel.refined[places, 2].sum()),
+        "samples": int(
+            funnel.removals[places, Removal.KEPT].sum() + funnel.refined[places, 2].sum()
+        ),
         **{split: sum(samples[split].get(name, 0) for name in names) for split in SPLITS},
     }
 

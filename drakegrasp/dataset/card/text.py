@@ -6,7 +6,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 #: Counts of a row, in the order of the tables.
-_COUNTS = ("attempts", "held", "precision", "stable", "samples", "train", "valid", "test")
+_COUNTS = (
+    *("attempts", "held", "precision", "stable", "refined", "samples"),
+    *("train", "valid", "test"),
+)
 
 
 def card_text(content: Mapping[str, Any]) -> str:
@@ -80,7 +83,7 @@ def _how_many(content: Mapping[str, Any]) -> str:
     tables = [
         (
             f"Samples by split, which is by {content['split_by']}",
-            ("split", "samples", "objects", "classes"),
+            ("split", "samples", "in effect", "objects", "classes"),
             splits,
         ),
         ("By class", ("class", "objects", *_COUNTS), classes),
@@ -94,7 +97,9 @@ def _how_many(content: Mapping[str, Any]) -> str:
 
 *Held* are the attempts that lifted the object and kept it in the hand; *precision* grasps are those
 of them that the fingertips held alone; *stable* those of these in which the object moved by less
-than 5 mm and 5 degrees in the hand; *samples* the held grasps that passed all filters."""
+than 5 mm and 5 degrees in the hand. These count palm poses of the first round. *Refined* are
+samples whose palm pose was drawn about that of another sample; *samples* all held grasps that
+passed all filters; *in effect* their number where those with almost the same palm count as one."""
     return "\n\n".join([head, *parts])
 
 
