@@ -133,8 +133,8 @@ class ObjectEntry:
     def to_json(self) -> dict[str, Any]:
         """Return the entry as JSON types, in the order of the manifest."""
         # What is not stated leaves no trace.
-        unsaid = {("licence", None), ("tried", None), ("group", None)}
-        said = {key: v for key, v in asdict(self).items() if (key, v) not in unsaid}
+        unsaid = [k for k in ("licence", "tried", "group") if getattr(self, k) is None]
+        said = {key: v for key, v in asdict(self).items() if key not in unsaid}
         return {"class" if key == "class_name" else key: v for key, v in said.items()}
 
 
