@@ -43,7 +43,7 @@ def splits(data: OpenFile, groups: Mapping[str, str]) -> Iterator[Violation]:
         objects[split] = dict(zip(names.tolist(), classes.tolist(), strict=True))
 
     # By object: no object in two splits, nor another one of its mesh.
-    if data.file.attrs.get("split_by") == "object":
+    if str(data.file.attrs.get("split_by")) == "object":
         home: dict[str, str] = {}
         for split, members in objects.items():
             for group in sorted({groups.get(name, name) for name in members}):
@@ -199,9 +199,10 @@ def same_configuration(files: Iterable[OpenFile], manifest: Manifest) -> Iterato
         elif file.config != manifest.config:
             what = f"filters, split and limits must be those of {FILE_NAME}"
             yield of_file(file.name, what, "others; run `drakegrasp assemble` again")
-        if file.file.attrs.get("split_by", manifest.split_rule) != manifest.split_rule:
+        rule = str(file.file.attrs.get("split_by", manifest.split_rule))
+        if rule != manifest.split_rule:
             what = f"split_by must be that of {FILE_NAME}, {manifest.split_rule}"
-            yield of_file(file.name, what, str(file.file.attrs["split_by"]))
+            yield of_file(file.name, what, rule)
     if len(states) > 1:
         what = "the three files must be of one assembly"
         yield of_file(TRIALS_FILE, what, f"{len(states)}; run `drakegrasp assemble` again")
