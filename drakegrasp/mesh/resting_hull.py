@@ -1,8 +1,8 @@
-"""The resting hull: points of a solid come in; its convex hull in triangles that carry goes out.
+"""The resting hull: points of a solid come in; their convex hull in triangles that carry goes out.
 
 A face of a rigid hydroelastic surface gives one contact polygon, and a polygon has one point of
-force. So each plane facet of the hull becomes a fan of triangles about a point inside it, within a
-rim of narrow triangles whose points of force are near its border.
+force. So each plane facet of the hull becomes a fan of triangles about a point inside it: a base of
+n corners carries at n points around its middle, and at its rim once it tilts.
 """
 
 from __future__ import annotations
@@ -12,78 +12,66 @@ import trimesh
 
 from drakegrasp.arithmetic import dot
 from drakegrasp.frames import Array
-from drakegrasp.mesh.surfaces import Faces, Solid, face_areas, half_edges
+from drakegrasp.mesh.surfaces import Faces, Solid, compact, face_areas, half_edges
 
-#: Triangles of the hull whose corners are within this distance of a plane are one facet [m].
-FLATNESS = 1e-5
-#: And whose normals are within this angle of it, as a cosine.
-ALIKE = 0.99
-#: Width of the rim, as a fraction of the distance from the inner point to the border.
-RIM = 0.2
+#: Triangles of the hull are one facet where their corners are this near to the plane of its largest
+#: one [m], and their normals agree with its normal to this cosine.
+FLATNESS, ALIKE = 1e-5, 0.99
+#: Facets of a smaller extent stay as they are: a point of force is near their rim anyway [m].
+SMALL = 0.01
 
 
-def resting_hull(points: Array, *, rim: float = RIM, small: float = 0.0) -> Solid:
-    """Return the convex hull of points (n, 3) [m] as a closed surface that carries well."""
+def resting_hull(points: Array) -> Solid:
+    """Return the convex hull of points (n, 3) [m], its facets as fans.
+
+    Facets that are plane to within `FLATNESS` are made of the corners of their border alone.
+    """
     hull = trimesh.convex.convex_hull(points)
     vertices, faces = np.asarray(hull.vertices), np.asarray(hull.faces, dtype=np.int64)
-
-    corners = [vertices]
-    triangles = []
-    count = len(vertices)
-    for loop, inner in _facets(vertices, faces):
-        n = len(loop)
-        after = np.roll(loop, -1)
-        size = np.ptp(vertices[loop], axis=0).max()
-        if n == 3 and size < small:
-            triangles.append(loop[None])
+    centres, triangles = list[Array](), list[Faces]()
+    for facet in _facets(vertices, faces):
+        border = _border(facet)
+        if border is None or np.ptp(vertices[border], axis=0).max() < SMALL:
+            triangles.append(facet)
             continue
-        if rim > 0.0:
-            corners.append(inner + (1 - rim) * (vertices[loop] - inner))
-            ring = count + np.arange(n)
-            ring_after = np.roll(ring, -1)
-            count += n
-            triangles.append(np.column_stack((loop, after, ring_after)))
-            triangles.append(np.column_stack((loop, ring_after, ring)))
-            loop, after = ring, ring_after
-        corners.append(inner[None])
-        triangles.append(np.column_stack((loop, after, np.full(n, count))))
-        count += 1
-    return Solid(vertices=np.vstack(corners), faces=np.vstack(triangles))
+
+        # About the centroid, which is inside, as facets are convex.
+        weights = face_areas(vertices, facet)
+        centroid = weights @ vertices[facet].mean(axis=1) / weights.sum()
+        new = np.full(len(border), len(vertices) + len(centres))
+        triangles.append(np.column_stack((border, np.roll(border, -1), new)))
+        centres.append(centroid)
+    vertices, faces = compact(np.vstack((vertices, *centres)), np.vstack(triangles))
+    return Solid(vertices=vertices, faces=faces)
 
 
-def _facets(vertices: Array, faces: Faces):
+def _facets(vertices: Array, faces: Faces) -> list[Faces]:
+    """Return the facets of a convex surface, each as its triangles (m, 3), largest first."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     areas = face_areas(vertices, faces)
     normals = np.cross(b - a, c - a) / np.maximum(2.0 * areas, 1e-300)[:, None]
-    free = np.ones(len(faces), dtype=bool)
-    for seed in np.argsort(-areas, kind="stable"):
-        if not free[seed]:
-            continue
-        near = np.abs(dot(vertices - a[seed], normals[seed])) <= FLATNESS
-        members = np.flatnonzero(
-            free & near[faces].all(axis=1) & (dot(normals, normals[seed]) >= ALIKE)
-        )
-        loop = _border(faces[members])
-        if loop is None:
-            members = np.array([seed])
-            loop = faces[seed]
-        free[members] = False
-        weight = areas[members, None]
-        inner = (weight * vertices[faces[members]].mean(axis=1)).sum(axis=0) / weight.sum()
-        yield loop, inner
+
+    # The largest triangle that is left takes those in its plane.
+    facets, free = [], np.ones(len(faces), dtype=bool)
+    for largest in np.argsort(-areas, kind="stable"):
+        if free[largest]:
+            near = np.abs(dot(vertices - a[largest], normals[largest])) <= FLATNESS
+            alike = dot(normals, normals[largest]) >= ALIKE
+            members = free & alike & near[faces].all(axis=1)
+            members[largest] = True
+            free &= ~members
+            facets.append(faces[members])
+    return facets
 
 
-def _border(faces: Faces) -> Faces | None:
-    """Return the corners (n,) of the one border of a patch, in their order; None if it has more."""
-    halves = half_edges(faces)
-    inner = set(map(tuple, halves.tolist()))
-    follow = {a: b for a, b in inner if (b, a) not in inner}
-    if sum((b, a) not in inner for a, b in inner) != len(follow):
+def _border(facet: Faces) -> Faces | None:
+    """Return the corners (n,) around a facet in order; None if it has more than one border."""
+    halves = {(int(start), int(end)) for start, end in half_edges(facet)}
+    rim = [(start, end) for start, end in halves if (end, start) not in halves]
+    after = dict(rim)
+    if len(after) < len(rim):
         return None
-    start = next(iter(follow))
-    loop = [start]
-    while (after := follow[loop[-1]]) != start:
-        loop.append(after)
-        if len(loop) > len(follow):
-            return None
-    return np.array(loop) if len(loop) == len(follow) else None
+    corners = [min(after)]
+    while (corner := after[corners[-1]]) != corners[0]:
+        corners.append(corner)
+    return np.array(corners) if len(corners) == len(rim) else None

@@ -133,6 +133,11 @@ class ObjectModel:
         """The collision surface in {O}."""
         return trimesh.Trimesh(self.collision_vertices, self.collision_faces, process=False)
 
+    @property
+    def collision_solid(self) -> Solid:
+        """The collision surface in {O}, which a hand meets."""
+        return Solid(vertices=self.collision_vertices, faces=self.collision_faces.astype(np.int64))
+
     @cached_property
     def resting_surface(self) -> Solid:
         """The surface in {O} that a table meets: the convex hull of the collision surface."""

@@ -110,13 +110,13 @@ def build_scene(
         resting_surface: What the table meets, in {O}; the object's `resting_surface` if None.
     """
     physics = model.own_physics(physics)
-    table_side = resting_surface or model.resting_surface
-    scene = _build(model, physics, hand, meshcat, table_side)
+    resting_surface = resting_surface or model.resting_surface
+    scene = _build(model, physics, hand, meshcat, resting_surface)
     if hand is None or physics.coarse_steps == 1:
         return scene
     time_step = physics.coarse_steps * physics.time_step
     coarse = physics.model_copy(update={"time_step": time_step})
-    build_coarse = partial(_build, model, coarse, hand, meshcat, table_side)
+    build_coarse = partial(_build, model, coarse, hand, meshcat, resting_surface)
     return replace(scene, coarse_scene=cache(build_coarse))
 
 
@@ -125,7 +125,7 @@ def _build(
     physics: PhysicsConfig,
     hand: Hand | None,
     meshcat: Meshcat | None,
-    table_side: Solid,
+    resting_surface: Solid,
 ) -> Scene:
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(_plant_config(physics), builder)
@@ -134,11 +134,8 @@ def _build(
     object_body = plant.AddRigidBody(
         "object", plant.AddModelInstance("object"), object_inertia(model, model.mass)
     )
-    collision = Solid(
-        vertices=model.collision_vertices, faces=model.collision_faces.astype(np.int64)
-    )
-    hand_side_id = _add_surface(plant, object_body, "hand", collision, physics)
-    table_side_id = _add_surface(plant, object_body, "table", table_side, physics)
+    hand_side = _add_surface(plant, object_body, "hand", model.collision_solid, physics)
+    table_side = _add_surface(plant, object_body, "table", resting_surface, physics)
     table = _add_table(plant, scene_graph, physics)
     if meshcat is not None:
         _add_visual(plant, object_body, model)
@@ -156,7 +153,7 @@ def _build(
     plant.Finalize()
 
     # What needs the finalized plant: collision filters and the wrist's input.
-    _part_surfaces(plant, scene_graph, table, handles, hand_side_id, table_side_id)
+    _part_surfaces(plant, scene_graph, hand_side, table_side, table, handles)
     if handles is not None:
         _filter_within_hand(plant, scene_graph, handles)
         builder.Connect(
@@ -172,7 +169,7 @@ def _build(
         plant=plant,
         scene_graph=scene_graph,
         object=object_body,
-        table_side=table_side_id,
+        table_side=table_side,
         table=table,
         handles=handles,
         physics=physics,
@@ -383,18 +380,18 @@ def _make_compliant_hand(
 def _part_surfaces(
     plant: MultibodyPlant,
     scene_graph: SceneGraph,
-    table: RigidBody,
-    handles: HandHandles | None,
     hand_side: GeometryId,
     table_side: GeometryId,
+    table: RigidBody,
+    handles: HandHandles | None,
 ) -> None:
-    """Let the table meet one surface of the object only, and the hand the other one only."""
-    parts = [] if handles is None else [geometry for geometry, _ in handles.parts]
+    """Let the hand meet one surface of the object alone, and the table the other one alone."""
     slab = plant.GetCollisionGeometriesForBody(table)
-    manager, declare = scene_graph.collision_filter_manager(), CollisionFilterDeclaration()
+    parts = [] if handles is None else [geometry for geometry, _ in handles.parts]
+    declare = CollisionFilterDeclaration()
     declare.ExcludeBetween(GeometrySet(hand_side), GeometrySet(slab))
     declare.ExcludeBetween(GeometrySet(table_side), GeometrySet(parts))
-    manager.Apply(declare)
+    scene_graph.collision_filter_manager().Apply(declare)
 
 
 def _filter_within_hand(

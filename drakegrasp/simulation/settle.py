@@ -186,10 +186,7 @@ def _settle(model: ObjectModel, config: Config, R_TO: Array) -> Resting:
 
 def settling_surface(model: ObjectModel) -> Solid:
     """Return the object's collision surface without long edges, which decides how it lands."""
-    collision = Solid(
-        vertices=model.collision_vertices, faces=model.collision_faces.astype(np.int64)
-    )
-    return subdivide(collision, MAX_EDGE, MAX_FACES)
+    return subdivide(model.collision_solid, MAX_EDGE, MAX_FACES)
 
 
 def _wait_for_rest(scene: Scene, config: Config) -> bool:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
 from helpers.objects import from_above, model_of, standing
 from pydrake.multibody.plant import DiscreteContactApproximation
-from pydrake.multibody.tree import RigidBody
+from pydrake.multibody.tree import BodyIndex, RigidBody
 
 from drakegrasp.config import Config, override_config
 from drakegrasp.frames import X_WT
@@ -25,7 +27,9 @@ from drakegrasp.simulation.scene import (
     closing_angles,
     closing_rates,
     finger_speed,
+    release,
     reset_attempt,
+    reset_object,
 )
 
 pytestmark = pytest.mark.sim
@@ -174,3 +178,62 @@ def test_only_fingertips_of_different_fingers_meet(scene: Scene) -> None:
             }
             different = a.name() != b.name() and {a.name(), b.name()} <= tips
             assert meet <= {different}, (a.name(), b.name())
+
+
+def partners(scene: Scene, name: str) -> set[str]:
+    """Return the bodies that one of the object's surfaces meets now, by name."""
+    plant, inspector = scene.plant, scene.plant.EvalSceneGraphInspector(scene.context)
+    geometries = plant.GetCollisionGeometriesForBody(scene.object)
+    (surface,) = [g for g in geometries if inspector.GetName(g) == f"object::{name}"]
+    bodies = [plant.get_body(i) for i in map(BodyIndex, range(plant.num_bodies()))]
+    return {
+        body.name()
+        for body in bodies
+        if any(
+            not inspector.CollisionFiltered(surface, g)
+            for g in plant.GetCollisionGeometriesForBody(body)
+            if g != surface
+        )
+    }
+
+
+def test_hand_and_table_meet_a_surface_of_their_own(
+    scene: Scene, cube: ObjectModel, config: Config, hand: Hand
+) -> None:
+    """Whatever part of an attempt comes next, and whatever was allowed before."""
+    X_WO = X_WT @ standing(cube)
+    X_WG = X_WO @ from_above(cube, 0.1).X_OG
+    handles = scene.handles
+    assert handles is not None
+    links = {scene.plant.get_body(i).name() for i in scene.plant.GetBodyIndices(handles.instance)}
+    for _ in range(2):
+        reset_attempt(scene, X_WO, X_WG, spread=0.0)
+        assert (partners(scene, "hand"), partners(scene, "table")) == (links, set())
+        release(scene)
+        assert (partners(scene, "hand"), partners(scene, "table")) == (links, {"table"})
+
+    alone = build_scene(cube, config.physics)
+    assert (partners(alone, "hand"), partners(alone, "table")) == (set(), {"table"})
+    reset_object(alone, X_WO)
+    assert (partners(alone, "hand"), partners(alone, "table")) == (set(), {"table"})
+
+
+def test_hand_meets_the_collision_mesh_and_the_table_its_hull(
+    config: Config, hand: Hand, tmp_path: Path
+) -> None:
+    """The hull of a ring has no hole."""
+    ring = trimesh.creation.annulus(r_min=0.03, r_max=0.04, height=0.02, sections=32)
+    model = model_of(ring, tmp_path)
+    assert len(model.collision_faces) == len(ring.faces)
+    scene = build_scene(model, config.physics, hand)
+    coarse = scene.coarse_scene
+    assert coarse is not None
+    for stage in (scene, coarse()):
+        inspector, faces = stage.scene_graph.model_inspector(), {}
+        for geometry in stage.plant.GetCollisionGeometriesForBody(stage.object):
+            surface = inspector.maybe_get_hydroelastic_mesh(geometry)
+            faces[inspector.GetName(geometry)] = surface.num_triangles()
+        assert faces == {
+            "object::hand": len(ring.faces),
+            "object::table": len(model.resting_surface.faces),
+        }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,15 +15,17 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
+from drakegrasp.arithmetic import norm
 from drakegrasp.config import Config, load_config, override_config
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import X_WT, make_pose
+from drakegrasp.mesh.surfaces import half_edges, signed_volume
 from drakegrasp.objects.model import ObjectModel, make_object, prepare_object
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.simulation import settle as settle_module
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.contacts import Contacts
-from drakegrasp.simulation.scene import Scene, reset_object
+from drakegrasp.simulation.scene import Scene, advance, reset_object
 from drakegrasp.simulation.settle import Resting, settle, snapped
 
 pytestmark = pytest.mark.sim
@@ -68,6 +71,39 @@ def test_shape_with_a_base_of_few_triangles_rests_as_it_was_dropped(name: str, c
     assert tilt_deg(resting) < 0.5
     assert abs(resting.sink) < 1e-5
     assert resting.seconds < 2.0 and not resting.stopped and resting.notes == ()
+
+
+@pytest.mark.parametrize("name", list(SHAPES))
+def test_trial_keeps_standing_what_rests(name: str, config: Config):
+    """On the surface and with the step of a trial; a plain hull of two triangles a side tips."""
+    model = as_dropped(SHAPES[name])
+    X_TO = settle(model, config).X_TO
+    scene = build_scene(model, config.physics)
+    reset_object(scene, X_WT @ X_TO)
+    for _ in range(4):
+        advance(scene, 0.25)
+        R_WO = scene.pose(scene.object)[:3, :3]
+        assert np.degrees(np.arccos(np.clip(R_WO[2, 2] / norm(R_WO[2]), -1.0, 1.0))) < 0.5
+        assert -1e-4 < settle_module._sink(scene) < 3e-4
+
+
+def test_surface_that_lands_is_the_collision_mesh_without_long_edges(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+):
+    """Not its hull, on which some objects rest otherwise."""
+    built, build = [], settle_module.build_scene
+
+    def watch(*args: Any, **kwargs: Any) -> Scene:
+        built.append(kwargs["resting_surface"])
+        return build(*args, **kwargs)
+
+    monkeypatch.setattr(settle_module, "build_scene", watch)
+    ring = trimesh.creation.annulus(r_min=0.03, r_max=0.06, height=0.05, sections=16)
+    settle(as_dropped(ring), config)
+    (landed,) = built
+    a, b = landed.vertices[half_edges(landed.faces)].swapaxes(0, 1)
+    assert norm(b - a).max() <= 0.02 * (1.0 + 1e-6)
+    assert signed_volume(landed.vertices, landed.faces) == pytest.approx(ring.volume, rel=1e-6)
 
 
 #: The examples depend on what else is loaded; the search for a simpler failure takes minutes.
