@@ -1,0 +1,178 @@
+"""A build whose palm poses are refined, of two samplers and several resting poses."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from helpers.assertions import assert_same_dataset
+from helpers.meshes import write_fixed
+
+from drakegrasp.build.pipeline import build
+from drakegrasp.build.replay import replay_trial
+from drakegrasp.config import Config, load_config, override_config
+from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.filters import Removal
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.statistics import count_funnel, count_splits
+from drakegrasp.frames import unpack_pose
+from drakegrasp.objects.sources import MeshSource, find_meshes
+from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.executor import run_here
+
+pytestmark = [pytest.mark.sim, pytest.mark.slow]
+
+CHILDREN = 2
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return load_config(
+        overrides=[
+            *("candidates.max=20", "unit_candidates=10", "candidates.method=[normals, rotations]"),
+            *(f"refine.children={CHILDREN}", "refine.generations=2", "objects.resting_poses=3"),
+            *("filters.outlier_sigma=0", "split.by=object", "objects.mass=0.2"),
+            "physics.friction_hand=1.5",
+        ]
+    )
+
+
+@pytest.fixture(scope="module")
+def sources(tmp_path_factory: pytest.TempPathFactory) -> list[MeshSource]:
+    folder = tmp_path_factory.mktemp("meshes")
+    write_fixed(folder, "8_wineglass_flute")
+    shutil.copy(folder / "8_wineglass_flute.obj", folder / "9_wineglass_twin.obj")
+    return find_meshes(folder)
+
+
+@pytest.fixture(scope="module")
+def refined(
+    sources: list[MeshSource], config: Config, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    """The dataset. Read only."""
+    out = tmp_path_factory.mktemp("refined") / "out"
+    build(sources, out, config, run_here, show=False)
+    return out
+
+
+def trials(out: Path) -> dict[str, np.ndarray]:
+    with h5py.File(out / "trials.hdf5") as file:
+        return {name: values[:] for name, values in file["trials"].items()}
+
+
+def test_check_finds_nothing(refined: Path) -> None:
+    assert [str(v) for v in check_dataset(refined)] == []
+
+
+def test_samplers_and_resting_poses_take_turns(refined: Path) -> None:
+    columns = trials(refined)
+    first = (columns["generation"] == 0) & (columns["standoff_index"] == 0)
+    manifest = json.loads((refined / "manifest.json").read_text())
+    for i, entry in enumerate(manifest["objects"]):
+        own = first & (columns["object"] == i)
+        poses = len(entry["resting"])
+        assert poses > 1
+        turns = np.arange(own.sum())
+        np.testing.assert_array_equal(columns["resting"][own], turns % poses)
+        np.testing.assert_array_equal(columns["source"][own], 1 - turns // poses % 2)
+        for k, resting in enumerate(entry["resting"]):
+            rows = columns["X_TO"][(columns["object"] == i) & (columns["resting"] == k)]
+            assert np.all(rows == resting["X_TO"])
+
+
+def test_children_are_those_of_samples_and_near_them(refined: Path) -> None:
+    columns = trials(refined)
+    names = ("object", "candidate", "standoff_index", "child")
+    keys = list(zip(*(columns[name].tolist() for name in names), strict=True))
+    row_of = {key: row for row, key in enumerate(keys)}
+    later = np.flatnonzero(columns["generation"] > 0)
+    assert set(columns["generation"][later].tolist()) == {1, 2}
+    for row in later.tolist():
+        parent = row_of[*keys[row][:3], int(columns["parent"][row])]
+        assert columns["outcome"][parent] == Outcome.SUCCESS and columns["precision"][parent]
+        assert columns["generation"][row] == columns["generation"][parent] + 1
+        assert columns["resting"][row] == columns["resting"][parent]
+        # Five standard deviations of 7.5 mm, in three directions.
+        X_GP, X_GC = (unpack_pose(columns["X_OG"][i]) for i in (parent, row))
+        assert 0.0 < np.linalg.norm(X_GP[:3, 3] - X_GC[:3, 3]) < 5 * 0.0075 * np.sqrt(3)
+
+    # Every sample of the first generations has all of its children.
+    with h5py.File(refined / "trials.hdf5") as file:
+        removal, ids = file["successes/removal"][:], file["successes/trial_id"][:]
+    sample = ids[np.isin(removal, [Removal.KEPT, Removal.REFINED_TEST])]
+    parents = sample[columns["generation"][sample] < 2]
+    assert len(later) == CHILDREN * len(parents) > 0
+
+
+def test_refined_trial_replays_bit_for_bit(refined: Path) -> None:
+    generation = trials(refined)["generation"]
+    for wanted in (1, 2):
+        again = replay_trial(refined, int(np.flatnonzero(generation == wanted)[-1]))
+        assert again.same, again.differences
+
+
+def test_refined_grasps_train_and_never_test(refined: Path) -> None:
+    child = {
+        split: GraspDataset(refined / "grasping_oto.hdf5", split=split).column("grasp_props/child")
+        for split in ("train", "test")
+    }
+    assert (child["train"] > 0).any() and (child["train"] == 0).any()
+    assert len(child["test"]) and not child["test"].any()
+    with h5py.File(refined / "trials.hdf5") as file:
+        assert (file["successes/removal"][:] == Removal.REFINED_TEST).any()
+
+
+def test_counts_are_of_the_first_round(refined: Path, config: Config) -> None:
+    funnel, columns = count_funnel(refined), trials(refined)
+    assert funnel.outcomes.sum() == np.count_nonzero(columns["generation"] == 0) == 2 * 20 * 3
+    assert funnel.candidates.tolist() == [20, 20]
+    assert funnel.refined[:, 0].sum() == np.count_nonzero(columns["generation"])
+    samples = sum(row.samples for row in count_splits(refined))
+    assert samples == funnel.removals[:, Removal.KEPT].sum() + funnel.refined[:, 2].sum()
+    for row in count_splits(refined):
+        assert 0 < row.effective <= row.samples or row.samples == row.effective == 0
+
+
+def test_more_palm_poses_extend_a_dataset(
+    refined: Path, sources: list[MeshSource], config: Config, tmp_path: Path
+) -> None:
+    """Ten and then twenty give what twenty give at once; only the last unit is run."""
+    fewer = override_config(config, ["candidates.max=10"])
+    build(sources, tmp_path, fewer, run_here, show=False)
+    report = build(sources, tmp_path, config, run_here, show=False)
+    assert (report.simulated, report.reused) == (2, 2)
+    assert_same_dataset(tmp_path, refined)
+
+
+def test_target_is_met_and_extended(
+    refined: Path, sources: list[MeshSource], config: Config, tmp_path: Path
+) -> None:
+    # All units are done; the target says which of them belong to the dataset.
+    out = tmp_path / "out"
+    shutil.copytree(refined, out)
+    few = override_config(config, ["samples=2"])
+    build(sources, out, few, run_here, show=False)
+    assert [str(v) for v in check_dataset(out)] == []
+    with h5py.File(out / "trials.hdf5") as file:
+        before = {row.tobytes() for row in file["trials/X_OG"][:]}
+    assert len(before) < len(trials(refined)["outcome"])
+
+    # More than there can be: all palm poses are tried.
+    most = override_config(config, ["samples=1000", "samples_patience=1000"])
+    assert build(sources, out, most, run_here, show=False).simulated == 0
+    columns = trials(out)
+    for name, values in trials(refined).items():
+        np.testing.assert_array_equal(columns[name], values)
+    assert before <= {row.tobytes() for row in columns["X_OG"]}
+
+
+def test_assembling_again_gives_the_same(refined: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(refined, copy)
+    assemble(copy)
+    assert_same_dataset(copy, refined)
