@@ -73,7 +73,7 @@ test-cluster: $(STAMP)  ## with a real SLURM and a real sshd, which it installs;
 	apt-get update -qq
 	DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends \
 	    slurm-wlm munge openssh-server openssh-client
-	$(BIN)/python -m pip install --quiet --editable '.[dev,slurm,ssh,tls]'
+	$(BIN)/python -m pip install --quiet --editable '.[dev,slurm,ssh]'
 	$(BIN)/python -m pytest -m server
 
 lint: $(STAMP)   ## style, types, and docs that are made from code
