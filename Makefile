@@ -9,7 +9,9 @@ PYTHON ?= $(or $(shell for python in python3.13 python3.12 python3.11 python3; d
 VENV   ?= .venv
 DEMO   ?= demo
 BIN    := $(VENV)/bin
+# What is installed: the package, and all that its tests, lint and docs need.
 STAMP  := $(VENV)/.installed
+DEV    := $(VENV)/.installed-dev
 
 # Software OpenGL must not start threads beside the workers, and nothing needs the network.
 export LP_NUM_THREADS := 0
@@ -20,7 +22,7 @@ export DRAKE_ALLOW_NETWORK := none
 help:            ## what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
-install: $(STAMP)  ## the virtual environment with the package and what its tests need
+install: $(DEV)  ## the virtual environment with the package and what its tests need
 
 # An environment that was made here is made anew for another Python that was asked for, or for a
 # newer one that was found. One of a newer Python is kept, and so is one that was not made here.
@@ -44,6 +46,10 @@ FORCE:
 
 $(STAMP): pyproject.toml $(VENV)/pyvenv.cfg
 	$(BIN)/python -m pip install --quiet --upgrade pip
+	PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --editable .
+	@touch $@
+
+$(DEV): $(STAMP)
 	PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --editable '.[dev]'
 	@touch $@
 
@@ -51,14 +57,14 @@ demo: $(STAMP)   ## a small dataset of built-in objects, its funnel and a contac
 	$(BIN)/drakegrasp doctor
 	$(BIN)/python pipelines/demo.py $(DEMO)
 
-test: $(STAMP)   ## the whole test suite
+test: $(DEV)   ## the whole test suite
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
-test-fast: $(STAMP)  ## without simulations and clusters
+test-fast: $(DEV)  ## without simulations and clusters
 	$(BIN)/python -m pytest -n 2 -m 'not sim and not cluster and not slow'
 
 # Without root or apt-get the tests of pages run where Chromium is there, and else skip.
-test-browser: $(STAMP)  ## the pages in Chromium, which it installs as root on Debian
+test-browser: $(DEV)  ## the pages in Chromium, which it installs as root on Debian
 	@command -v chromium >/dev/null || command -v chromium-browser >/dev/null || \
 	if test "$$(id -u)" = 0 && command -v apt-get >/dev/null; then \
 	  apt-get update -qq && DEBIAN_FRONTEND=noninteractive \
@@ -69,28 +75,28 @@ test-browser: $(STAMP)  ## the pages in Chromium, which it installs as root on D
 	fi
 	$(BIN)/python -m pytest -m browser tests/inspection
 
-test-cluster: $(STAMP)  ## with a real SLURM and a real sshd, which it installs; as root, on Debian
+test-cluster: $(DEV)  ## with a real SLURM and a real sshd, which it installs; as root, on Debian
 	apt-get update -qq
 	DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends \
 	    slurm-wlm munge openssh-server openssh-client
-	$(BIN)/python -m pip install --quiet --editable '.[dev,slurm,ssh,tls]'
+	$(BIN)/python -m pip install --quiet --editable '.[dev,slurm,ssh]'
 	$(BIN)/python -m pytest -m server
 
-lint: $(STAMP)   ## style, types, and docs that are made from code
+lint: $(DEV)   ## style, types, and docs that are made from code
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python pipelines/docs/dataset_format.py --check docs/reference/dataset-format.md
 	$(BIN)/python pipelines/docs/builtin_objects.py --check docs/reference/builtin-objects.md
 
-format: $(STAMP) ## let ruff lay out the code
+format: $(DEV) ## let ruff lay out the code
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
 docs: docs-pages ## the site of the docs in site/; every link must lead somewhere
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-docs-pages: $(STAMP)  ## write the pages of the docs that are made from code
+docs-pages: $(DEV)  ## write the pages of the docs that are made from code
 	$(BIN)/python pipelines/docs/dataset_format.py docs/reference/dataset-format.md
 	$(BIN)/python pipelines/docs/builtin_objects.py docs/reference/builtin-objects.md
 

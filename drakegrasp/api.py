@@ -105,9 +105,9 @@ def build_dataset(
 
 @contextmanager
 def _announced(cluster: AbstractContextManager[Client], show: bool) -> Iterator[Client]:
-    """Enter a cluster, and say where its dashboard is."""
+    """Enter a cluster, and say where its dashboard is; workers that are started here have none."""
     with cluster as client:
-        if show and has_dashboard():
+        if show and has_dashboard() and client.dashboard_link:
             sys.stderr.write(f"{dashboard_line(client)}\n")
         yield client
 

@@ -63,7 +63,9 @@ from drakegrasp.cluster.request import KINDS, ClusterRequest, describe, worker_c
     "--interface", metavar="NAME", help="Network interface on which scheduler and workers listen."
 )
 @click.option("--host", metavar="ADDRESS", help="Address on which the scheduler listens, instead.")
-@click.option("--tls", is_flag=True, help="Encrypt, with certificates made for this run.")
+@click.option(
+    "--tls", is_flag=True, help="Encrypt, with certificates made for this run; local always does."
+)
 @tls_options
 @times_option
 @click.option("--dry-run", is_flag=True, help="Only print what would run.")
@@ -117,7 +119,7 @@ def main(
 def _present(cluster: AbstractContextManager[Client], show: bool) -> Iterator[Client]:
     """Enter a cluster, say where its dashboard is, and wait for its first worker."""
     with cluster as client:
-        if show:
+        if show and client.dashboard_link:  # workers on this machine have none
             click.echo(dashboard_line(client), err=True)
         if not client.nthreads():
             click.echo("waiting for the first worker", err=True)

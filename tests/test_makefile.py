@@ -48,7 +48,11 @@ def fake(folder: Path, name: str, version: str) -> None:
   "-m venv") for last; do :; done
              test "$3" = --clear && rm -rf "$last"
              mkdir -p "$last/bin"; cp "$0" "$last/bin/python"
+             for tool in drakegrasp ruff mypy mkdocs; do
+               ln -s {shutil.which("true")} "$last/bin/$tool"
+             done
              echo "{version}" > "$last/pyvenv.cfg" ;;
+  "-m pip") echo "$@" >> "${{0%/bin/python}}/pip.log" ;;
   "-c "*) exec {sys.executable} "$@" ;;
 esac""",
     )
@@ -114,6 +118,25 @@ def test_what_was_not_made_here_is_not_cleared(path: Path) -> None:
     assert environment(path) == "3 11"
     assert environment(path, "PYTHON=python3.12") == "3 11"
     assert kept.exists()
+
+
+def test_demo_installs_the_package_and_the_others_what_they_need_beside_it(path: Path) -> None:
+    fake(path, "python3.11", "3 11")
+    log, package, rest = path.parent / "venv" / "pip.log", "--editable .", "--editable .[dev]"
+
+    def added(target: str) -> list[str]:
+        """Return what pip is asked to install for a target."""
+        before = log.read_text() if log.exists() else ""
+        make(path, target)
+        words = log.read_text().removeprefix(before).splitlines()
+        return [line[line.index("--editable") :] for line in words if "--editable" in line]
+
+    assert added("demo") == [package]
+    assert added("demo") == []
+    for target in ("install", "test", "test-fast", "lint", "format", "docs"):
+        (path.parent / "venv" / ".installed-dev").unlink(missing_ok=True)
+        assert added(target) == [rest]
+        assert added(target) == added("demo") == []
 
 
 def test_help_starts_no_python(path: Path) -> None:

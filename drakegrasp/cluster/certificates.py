@@ -22,29 +22,8 @@ def make_certificates(folder: Path) -> tuple[Path, Path, Path]:
     """Write an authority, a certificate and its key to a folder: ca.pem, cert.pem, key.pem.
 
     Anybody who can read them can use the cluster, so the folder must be private.
-
-    Raises:
-        MachineError: If the package cryptography is missing.
     """
-    return _write(temporary_security(), folder)
-
-
-def temporary_security() -> Security:
-    """Return an authority and a certificate that exist in this process's memory only.
-
-    Raises:
-        MachineError: If the package cryptography is missing.
-    """
-    try:
-        return Security.temporary()
-    except ImportError:
-        raise MachineError(
-            "--tls needs the package cryptography: pip install 'drakegrasp[tls]'"
-        ) from None
-
-
-def _write(security: Security, folder: Path) -> tuple[Path, Path, Path]:
-    """Write an authority, its only certificate and the key to a private folder."""
+    security = Security.temporary()
     paths = folder / "ca.pem", folder / "cert.pem", folder / "key.pem"
     texts = security.tls_ca_file, security.tls_worker_cert, security.tls_worker_key
     for path, text in zip(paths, texts, strict=True):

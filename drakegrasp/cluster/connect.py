@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import logging
-import signal
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
 import dask
-from distributed import Client, LocalCluster, SpecCluster
+from distributed import Client, SpecCluster
 from distributed.security import Security
-from distributed.utils import LoopRunner
-from tornado.ioloop import IOLoop
 
 from drakegrasp.cluster.admission import SATURATION, SILENCE_SECONDS, worker_environment
+from drakegrasp.cluster.local import PrivateCluster, undisturbed_loop
 from drakegrasp.errors import MachineError
 from drakegrasp.runtime.allocator import own_environment
 from drakegrasp.runtime.environment import available_cores
@@ -80,7 +76,8 @@ def connect(
         workers: Processes of a cluster on this machine; one per core if None.
         scheduler: Address of a running scheduler.
         scheduler_file: Its JSON file, instead of the address.
-        security: Certificates; without them nothing is encrypted.
+        security: Certificates; without them a cluster on this machine makes its own, and
+            connections to a running scheduler are not encrypted.
         memory: Limit per process on this machine, e.g. "2GB"; an equal share of it if None.
 
     Raises:
@@ -128,59 +125,12 @@ def _names_scheduler(file: Path) -> bool:
 def _start_local(
     workers: int | None, security: Security | None, memory: str | None
 ) -> Iterator[Client]:
-    with _undisturbed_loop() as loop:
-        cluster = _LocalCluster(
-            loop=loop,
-            n_workers=workers or available_cores(),
-            threads_per_worker=1,
-            dashboard_address="127.0.0.1:0",
-            silence_logs=logging.CRITICAL,
-            security=security,
-            memory_limit=memory or "auto",
+    with undisturbed_loop() as loop:
+        cluster = PrivateCluster(
+            workers or available_cores(), loop=loop, security=security, memory=memory or "auto"
         )
         with closing_cluster(cluster), Client(cluster) as client:
             yield client
-
-
-class _LocalCluster(LocalCluster):
-    """A cluster on this machine whose start may be interrupted.
-
-    Dask cannot close a cluster that has not started, and at the end of the program a traceback
-    would say so (distributed 2026.8). Its processes end with this one all the same.
-    """
-
-    def __init__(self, **options: Any) -> None:
-        """Start the cluster, with the options of a `LocalCluster`."""
-        try:
-            super().__init__(**options)
-        except BaseException:
-            self._instances.discard(self)
-            # A nanny whose worker did not start would tell this loop's log, which nobody reads.
-            options["loop"].asyncio_loop.set_exception_handler(lambda loop, context: None)
-            raise
-
-
-@contextmanager
-def _undisturbed_loop() -> Iterator[IOLoop]:
-    """Run an event loop in a thread that no Ctrl-C reaches, nor the processes that it starts.
-
-    At a terminal Ctrl-C goes to every process. The client stops then, and its workers with it; one
-    that has just begun to start would print a traceback instead.
-    """
-    # The first process that a thread starts also starts this one, and clears the thread's mask.
-    resource_tracker.ensure_running()
-    runner = LoopRunner()
-    runner.start()
-    try:
-        runner.run_sync(_block_interrupts)
-        yield runner.loop
-    finally:
-        runner.stop()
-
-
-async def _block_interrupts() -> None:
-    # Threads and processes that this thread starts inherit the mask.
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
 
 
 class _RemoteClient(Client):

@@ -24,10 +24,11 @@ from itertools import islice
 from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar, cast
 
-from distributed import Client, Future, KilledWorker, LocalCluster
+from distributed import Client, Future, KilledWorker
 from distributed.core import Status
 from distributed.deploy import Cluster
 
+from drakegrasp.cluster.local import PrivateCluster
 from drakegrasp.errors import BlankImageError, MachineError
 from drakegrasp.runtime.executor import WorkerPool
 
@@ -236,7 +237,7 @@ class DaskExecutor:
             self._workers, self.pool.size = workers, len(workers)
             self.pool.on_change(joined, left)
 
-        if isinstance(self._client.cluster, LocalCluster):
+        if isinstance(self._client.cluster, PrivateCluster):
             self._client.cluster.loop.add_callback(_reopen, self._client.cluster)
         self._check_empty(now)
 
@@ -268,7 +269,7 @@ def _may_come(cluster: Cluster | None) -> bool:
     return cluster is None or hasattr(cluster, "job_script")
 
 
-def _reopen(cluster: LocalCluster) -> None:
+def _reopen(cluster: PrivateCluster) -> None:
     """Replace the nannies of a cluster on this machine that gave up.
 
     A nanny gives up when its worker dies while it starts; Dask drops a nanny whose worker is away

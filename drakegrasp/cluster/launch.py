@@ -29,7 +29,6 @@ from drakegrasp.cluster.certificates import (
     private_directory,
     security_of,
     server_options,
-    temporary_security,
 )
 from drakegrasp.cluster.connect import NANNY_PRELOAD, closing_cluster, connect, dask_settings
 from drakegrasp.cluster.request import (
@@ -277,10 +276,8 @@ def _security(request: ClusterRequest, out: Path) -> Iterator[Security | None]:
     """Yield the certificates; those that are made for this run are removed."""
     if request.tls_files is not None:
         yield security_of(request.tls_files)
-    elif not request.tls:
-        yield None
-    elif request.kind == "local":
-        yield temporary_security()
+    elif request.kind == "local" or not request.tls:
+        yield None  # workers on this machine have certificates of their own
     else:
         with private_directory(out) as folder:
             yield security_of(make_certificates(folder))

@@ -54,7 +54,7 @@ class ClusterRequest:
         walltime: Time limit of each SLURM job, as SLURM writes it: [D-]HH:MM:SS.
         host: Address on which the scheduler listens.
         interface: Name of the network interface on which scheduler and workers listen.
-        tls: Whether to make certificates for this run.
+        tls: Whether to make certificates for this run; workers on this machine always have them.
         tls_files: Files in PEM format that every machine sees: authority, certificate and
             private key.
     """
@@ -97,7 +97,7 @@ def describe(request: ClusterRequest) -> list[str]:
             "slurm": f"{count} workers in SLURM jobs{_job_size(request)}",
         }.get(request.kind, f"the workers of {' '.join(request.where)}")
     ]
-    encrypted = request.tls or request.tls_files is not None
+    encrypted = request.kind == "local" or request.tls or request.tls_files is not None
     lines.append(f"connections: {'TLS' if encrypted else 'not encrypted'}")
     if not encrypted and _listens_beyond(request):
         lines.append(

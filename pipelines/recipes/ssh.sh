@@ -2,7 +2,7 @@
 # A build on machines that this one reaches by ssh without a password; the first runs the
 # scheduler, too. All of them see this environment and OUT at the same paths. Users, ports
 # and keys of the machines belong into ~/.ssh/config, their host keys into ~/.ssh/known_hosts.
-# Needs: pip install 'drakegrasp[ssh,tls]'.
+# Needs: pip install 'drakegrasp[ssh]'.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 import trimesh
 from dask.utils import parse_timedelta
-from distributed import Client, LocalCluster, get_worker
+from distributed import Client, LocalCluster, SpecCluster, get_worker
 from helpers.assertions import assert_same_dataset
 from helpers.builds import FAST, finish, start_build, wait_for_shards, workers_of
 
@@ -400,12 +400,12 @@ def test_second_build_is_refused_before_it_starts(
 
 @pytest.mark.cluster
 def test_worker_that_takes_its_time_to_end_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    def late(cluster: LocalCluster, timeout: float | None = None) -> None:
+    def late(cluster: SpecCluster, timeout: float | None = None) -> None:
         close(cluster, timeout)
         raise TimeoutError
 
-    close = LocalCluster.close
-    monkeypatch.setattr(LocalCluster, "close", late)
+    close = SpecCluster.close
+    monkeypatch.setattr(SpecCluster, "close", late)
     with connect(workers=1) as client:
         assert client.submit(abs, -1).result() == 1
     with pytest.raises(KeyboardInterrupt), connect(workers=1):

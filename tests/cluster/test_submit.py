@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import asyncio
 import gc
 import os
 import stat
@@ -17,7 +18,8 @@ import dask
 import psutil
 import pytest
 from click.testing import CliRunner, Result
-from distributed import Client
+from distributed import Client, rpc
+from distributed.security import Security
 from helpers.assertions import assert_same_dataset
 from helpers.meshes import write_fixed
 from helpers.scripts import PIPELINES, load_script
@@ -194,20 +196,25 @@ def test_dashboard_is_linked_where_it_is_served(
 
 
 @pytest.fixture
-def secure(tmp_path: Path) -> Iterator[Client]:
-    """A cluster of one worker with certificates made for it."""
-    with start_cluster(ClusterRequest(kind="local", workers=1, tls=True), tmp_path) as client:
+def local() -> Iterator[Client]:
+    """Workers on this machine, as a build without options starts them; one of them."""
+    with connect(workers=1) as client:
         yield client
+
+
+def addresses(client: Client) -> list[str]:
+    """Return the addresses of the scheduler, and of the only worker and its nanny."""
+    ((worker, about),) = client.scheduler_info()["workers"].items()
+    return [client.scheduler.address, worker, about["nanny"]]
 
 
 @pytest.mark.cluster
 @pytest.mark.slow
 def test_scheduler_with_tls_refuses_a_client_without_a_certificate(
-    secure: Client, box: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    local: Client, box: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("drakegrasp.cluster.connect.CONNECT_SECONDS", 2)
-    address = secure.scheduler.address
-    assert address.startswith("tls://")
+    address = local.scheduler.address
     # The garbage collector must not be needed: it may run while another client starts.
     gc.collect()
     gc.disable()
@@ -221,7 +228,7 @@ def test_scheduler_with_tls_refuses_a_client_without_a_certificate(
         clients = [o for o in gc.get_objects() if issubclass(type(o), Client)]
     finally:
         gc.enable()
-    assert [client for client in clients if client.status != "closed"] == [secure]
+    assert [client for client in clients if client.status != "closed"] == [local]
     strange = make_certificates(tmp_path)
     options = ["--tls-ca-file", strange[0], "--tls-cert", strange[1], "--tls-key", strange[2]]
     for given in ([], options):
@@ -229,20 +236,44 @@ def test_scheduler_with_tls_refuses_a_client_without_a_certificate(
         result = run(*arguments, address, *given)
         assert result.exit_code == 1
         assert "must be a running Dask scheduler" in result.stderr.splitlines()[-1]
-    assert secure.submit(int, 7).result() == 7
+    assert local.submit(int, 7).result() == 7
+
+
+def ask(address: str, security: Security) -> None:
+    """Ask a process of a cluster what it is; raise an OSError if it does not answer."""
+
+    async def identity() -> None:
+        process = rpc(address, connection_args=security.get_connection_args("client"), timeout=2)
+        try:
+            await asyncio.wait_for(process.identity(), 5)
+        finally:
+            await process.close_rpc()
+
+    asyncio.run(identity())
 
 
 @pytest.mark.cluster
 @pytest.mark.slow
-def test_nothing_listens_beyond_this_machine(secure: Client) -> None:
+def test_nobody_without_the_certificate_reaches_a_process_of_this_machine(local: Client) -> None:
+    for address in addresses(local):
+        ask(address, local.security)
+        with pytest.raises(OSError):
+            ask(address, Security.temporary())
+        with pytest.raises(OSError):
+            ask(address.replace("tls://", "tcp://"), Security())
+
+
+@pytest.mark.cluster
+@pytest.mark.slow
+def test_only_the_loopback_address_is_listened_on_and_not_for_http(local: Client) -> None:
     listening = [
-        connection.laddr.ip
+        f"tls://{connection.laddr.ip}:{connection.laddr.port}"
         for process in (psutil.Process(), *psutil.Process().children(recursive=True))
         for connection in process.net_connections("tcp")
         if connection.status == psutil.CONN_LISTEN
     ]
-    assert len(listening) >= 3
-    assert set(listening) == {"127.0.0.1"}
+    assert sorted(listening) == sorted(addresses(local))
+    assert all(address.startswith("tls://127.0.0.1:") for address in listening)
 
 
 @pytest.mark.cluster
@@ -298,10 +329,11 @@ def test_script_builds_what_a_plain_loop_builds(box: Path, tmp_path: Path) -> No
     build(find_meshes(box), tmp_path / "here", load_config(overrides=TINY), run_here, show=False)
     command = [sys.executable, PIPELINES / "submit_build.py", "--objects", box, *TINY_OPTIONS]
     out = tmp_path / "out"
-    options = ["--out", out, "--workers", "2", "--memory", "2GB", "--tls"]
+    options = ["--out", out, "--workers", "2", "--memory", "2GB"]
     result = subprocess.run([*command, *options], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
     assert "2 work units simulated" in result.stdout
-    assert "dashboard: " in result.stderr
+    assert "connections: TLS" in result.stdout
+    assert "dashboard: " not in result.stderr
     assert_same_dataset(tmp_path / "here", out)
     assert dask.config.get("distributed.worker.profile.enabled") is True  # and nothing is left set
