@@ -19,7 +19,8 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Protocol
+from functools import lru_cache
+from typing import Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -47,6 +48,13 @@ EDGE = 1e-6
 CHUNK = 131_072
 #: Surface points that `normals` draws together; another number is another draw.
 BLOCK = 1000
+#: The angles of the rotations in a configuration, global ones first.
+_AXES = (
+    *("global_x_deg", "global_y_deg", "global_z_deg"),
+    *("local_x_deg", "local_y_deg", "local_z_deg"),
+)
+#: Rotations R_OG (n, 3, 3), directions (n, 3) of p_OG, and how many combinations give each (n,).
+_Rotations: TypeAlias = tuple[Array, Array, npt.NDArray[np.int64]]
 #: Log-densities are multiples of this: the last bits of a logarithm depend on the machine.
 _DENSITY_GRID = 2.0**-32
 #: Last numbers of the places of streams: of a sampler at a resting pose, and of a child.
@@ -313,28 +321,66 @@ def rotation_candidates(
         Poses (n, 4, 4), sorted by their rotation's entries, row by row, and then by position,
         as rounded integers; the number of combinations; of valid ones.
     """
-    # Keep the valid combinations, chunk by chunk.
+    # Keep the valid combinations, block by block. Without jitter equal poses were counted before:
+    # they are valid for the same objects.
     half = np.asarray(half_extents, dtype=float)
     radius = float(norm(half))
-    rotations, positions, combinations = [], [], 0
-    for R_global, R_local in _rotation_chunks(config, stream):
-        combinations += len(R_global)
-        p_OG = radius * R_global[:, :, 2]
-        keep = above_table(p_OG, X_TO)
-        R_OG = multiply(R_global[keep] * np.diag(R_OG0), R_local[keep])
-        p_OG = p_OG[keep]
-        hits = ray_meets_box(p_OG, R_OG[:, :, 2], half)
-        rotations.append(R_OG[hits])
-        positions.append(p_OG[hits])
+    blocks = (
+        _rotation_chunks(config, stream) if config.jitter_deg else [_distinct_rotations(config)]
+    )
+    rotations, positions, combinations, valid = [], [], 0, 0
+    for R_OG, direction, count in blocks:
+        combinations += int(count.sum())
+        p_OG = radius * direction
+        keep = np.flatnonzero(above_table(p_OG, X_TO))
+        keep = keep[ray_meets_box(p_OG[keep], R_OG[keep, :, 2], half)]
+        rotations.append(R_OG[keep])
+        positions.append(p_OG[keep])
+        valid += int(count[keep].sum())
     R, p = np.concatenate(rotations), np.concatenate(positions)
+    first, _ = _first_of_equal(R, p / radius)
+    return _poses(R[first], p[first]), combinations, valid
 
-    # Sort by rounded integers: equal poses become neighbours, and the first of them is kept.
-    key = np.rint(np.hstack([R.reshape(-1, 9), p / radius]) / SAME_POSE).astype(np.int64)
+
+def _first_of_equal(R: Array, direction: Array) -> tuple[npt.NDArray[np.int64], ...]:
+    """Return the first of each set of equal poses, and how many there are of each.
+
+    Args:
+        R: (n, 3, 3), rotations.
+        direction: (n, 3), positions relative to the object's size.
+
+    Returns:
+        Indices (m,), sorted by the entries of rotation and position as rounded integers, and for
+        each pose (n,) the place of its set among them.
+    """
+    key = np.rint(np.hstack([R.reshape(-1, 9), direction]) / SAME_POSE).astype(np.int32)
     order = np.lexsort(key.T[::-1])
     new = np.ones(len(order), dtype=np.bool_)
     new[1:] = (key[order[1:]] != key[order[:-1]]).any(axis=1)
-    first = order[new]
-    return _poses(R[first], p[first]), combinations, len(R)
+    places = np.empty(len(order), dtype=np.int64)
+    places[order] = np.cumsum(new) - 1
+    return order[new], places
+
+
+def _distinct_rotations(config: CandidateConfig) -> _Rotations:
+    """Return the different rotations and directions of all combinations, and how many give each."""
+    return _enumerated(tuple(getattr(config, axis) for axis in _AXES))
+
+
+@lru_cache(maxsize=2)
+def _enumerated(angles_deg: tuple[tuple[float, ...], ...]) -> _Rotations:
+    """Enumerate combinations of angles, see `_distinct_rotations`; once in a process."""
+    config = CandidateConfig.model_validate(dict(zip(_AXES, angles_deg, strict=True)))
+    parts = zip(*map(_without_equals, _rotation_chunks(config, None)), strict=True)
+    R, direction, count = map(np.concatenate, parts)
+    return _without_equals((R, direction, count))
+
+
+def _without_equals(rotations: _Rotations) -> _Rotations:
+    """Return the first of each set of equal rotations and directions, with their number."""
+    R, direction, count = rotations
+    first, places = _first_of_equal(R, direction)
+    return R[first], direction[first], np.bincount(places, weights=count).astype(np.int64)
 
 
 def normal_candidates(model: ObjectModel, count: int, stream: Stream) -> Array:
@@ -506,8 +552,13 @@ def _rounded(log_density: float) -> float:
     return round(log_density / _DENSITY_GRID) * _DENSITY_GRID
 
 
-def _rotation_chunks(config: CandidateConfig, stream: Stream) -> Iterator[tuple[Array, Array]]:
-    """Yield R_global and R_local, (m, 3, 3) each, of all combinations, in chunks."""
+def _rotation_chunks(config: CandidateConfig, stream: Stream | None) -> Iterator[_Rotations]:
+    """Yield R_OG, the palm's direction and the number 1 of all combinations, in chunks.
+
+    Args:
+        config: The angles.
+        stream: Draws the jitter; None: there is none.
+    """
     grid_global = _angle_grid(config.global_x_deg, config.global_y_deg, config.global_z_deg)
     grid_local = _angle_grid(config.local_x_deg, config.local_y_deg, config.local_z_deg)
     per_chunk = max(1, CHUNK // len(grid_local))
@@ -515,11 +566,13 @@ def _rotation_chunks(config: CandidateConfig, stream: Stream) -> Iterator[tuple[
         block = grid_global[start : start + per_chunk]
         angles_global = np.repeat(block, len(grid_local), axis=0)
         angles_local = np.tile(grid_local, (len(block), 1))
-        if config.jitter_deg:
+        if stream is not None:
             drawn = np.floor(config.jitter_deg * stream.uniform(6 * len(angles_global)))
             jitter_global, jitter_local = drawn.reshape(2, -1, 3)
             angles_global, angles_local = angles_global + jitter_global, angles_local + jitter_local
-        yield _rotation_xyz(angles_global), _rotation_xyz(angles_local)
+        R_global, R_local = _rotation_xyz(angles_global), _rotation_xyz(angles_local)
+        R_OG = multiply(R_global * np.diag(R_OG0), R_local)
+        yield R_OG, R_global[:, :, 2], np.ones(len(R_OG), dtype=np.int64)
 
 
 def _angle_grid(*axes_deg: tuple[float, ...]) -> Array:
