@@ -242,7 +242,8 @@ def test_point_contacts_are_counted(closed: Scene) -> None:
 def test_rest_of_a_split_patch_counts_by_its_own_force(closed: Scene) -> None:
     """It carries what the pad does not."""
     whole = with_pads(closed, EVERYWHERE, EVERYWHERE, EVERYWHERE)
-    beyond = (1.0, 0.0, 0.0, _contact_in_link(closed, whole) + 1e-3)
+    x = _contact_in_link(closed, whole)
+    beyond = (1.0, 0.0, 0.0, x + PAD_BAND + 1e-3)
     part = with_pads(closed, (beyond,), EVERYWHERE, EVERYWHERE)
     rest = float(np.linalg.norm(whole.f_Q_O[0] - part.f_Q_O[0]))
     for factor, count in ((0.99, 1), (1.01, 0)):
