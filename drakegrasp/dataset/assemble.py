@@ -37,6 +37,7 @@ from drakegrasp.dataset.assembly.survey import (
     survey_object,
     survey_tasks,
 )
+from drakegrasp.dataset.assembly.weights import weigh_samples
 from drakegrasp.dataset.card.content import content_of
 from drakegrasp.dataset.card.files import card_files
 from drakegrasp.dataset.filters import Removal, Successes, judge_successes
@@ -54,7 +55,6 @@ from drakegrasp.dataset.paths import DATA_FILES, FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.rejections import AttemptKey, find_keys
 from drakegrasp.dataset.schema import OBJECT_FIELDS, SPLITS, SUCCESS_FIELDS, TRIAL_FIELDS
 from drakegrasp.dataset.split import split_samples
-from drakegrasp.dataset.weights import weigh_samples
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array
 from drakegrasp.runtime.executor import Executor, run_here

@@ -53,6 +53,13 @@ class PreparedObject:
 
     def entry(self) -> ObjectEntry:
         """Return the object's entry in the manifest."""
+        columns = self.resting_poses, self.probability.tolist(), self.stopped.tolist()
+        resting = tuple(
+            RestingEntry(X_TO=tuple(X_TO[:3].ravel().tolist()), probability=share, rolled=rolled)
+            for X_TO, share, rolled in zip(*columns, strict=True)
+        )
+
+        # What is known of the object, its poses at rest, and how many palm poses there are.
         return ObjectEntry(
             name=self.model.name,
             class_name=self.model.class_name,
@@ -63,17 +70,7 @@ class PreparedObject:
             density=self.model.density,
             friction=self.model.friction,
             collision_error=self.model.collision_error,
-            resting=tuple(
-                RestingEntry(
-                    X_TO=tuple(X_TO[:3].ravel().tolist()), probability=share, rolled=rolled
-                )
-                for X_TO, share, rolled in zip(
-                    self.resting_poses,
-                    self.probability.tolist(),
-                    self.stopped.tolist(),
-                    strict=True,
-                )
-            ),
+            resting=resting,
             candidates=len(self.candidates),
             combinations=self.candidates.combinations,
             valid=self.candidates.valid,

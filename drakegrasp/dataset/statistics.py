@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.assembly.survey import shards_sha256
+from drakegrasp.dataset.assembly.weights import effective_number
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.hdf5 import open_hdf5, read_names, read_texts
 from drakegrasp.dataset.layout.opening import open_samples, open_trials, read_codes
@@ -21,7 +22,6 @@ from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.dataset.shards import read_trials
-from drakegrasp.dataset.weights import effective_number
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import Executor, run_here
@@ -67,7 +67,7 @@ class SplitCount:
     """A row of the paper's Table III: numbers of samples, objects and classes of a split.
 
     `effective` is how many of the samples count where those that are alike count once, see
-    `weights.effective_number`; NaN in files of an older schema.
+    `assembly.weights.effective_number`; NaN in files of an older schema.
     """
 
     split: str

@@ -10,13 +10,13 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
+from drakegrasp.dataset.assembly.weights import weigh_samples
 from drakegrasp.dataset.checks.findings import AnyArray, Violation, of_file
 from drakegrasp.dataset.checks.open_file import OpenFile, column
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.schema import OBJECT_FIELDS, SPLITS
-from drakegrasp.dataset.weights import weigh_samples
 from drakegrasp.frames import unpack_pose
 
 
@@ -192,6 +192,8 @@ def same_configuration(files: Iterable[OpenFile], manifest: Manifest) -> Iterato
         states.add(tuple(str(file.file.attrs.get(key)) for key in ("signature", "shards")))
         if file.config is None:
             continue
+
+        # The configuration, and the split that follows from it.
         own = file.config.simulation_hash()
         if own != expected:
             what = f"configuration must be that of {FILE_NAME}, {expected}"
