@@ -19,8 +19,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from functools import lru_cache
-from typing import Protocol, TypeAlias
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -34,27 +33,10 @@ from drakegrasp.mesh.surfaces import on_faces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.randomization.conditions import Conditions
+from drakegrasp.simulation.rotations import above_table, make_poses, rotation_candidates
 
-#: The first palm's axes in {O}: +Gz looks down onto the object, Gx = Ox.
-R_OG0 = np.diag([1.0, -1.0, -1.0])
-#: Poses that agree to this in every rotation entry, and in position relative to the object's size,
-#: are one pose: different Euler angles give equal rotations up to rounding.
-SAME_POSE = 1e-6
-#: A palm this far below the table, or a palm ray this far beside the bounding box, is still valid
-#: [m]: far above rounding, far below what matters.
-EDGE = 1e-6
-#: Combinations whose poses are computed together: bounds the memory. With `jitter_deg` it also
-#: decides which word of the stream jitters which angle, so another number is another draw.
-CHUNK = 131_072
 #: Surface points that `normals` draws together; another number is another draw.
 BLOCK = 1000
-#: The angles of the rotations in a configuration, global ones first.
-_AXES = (
-    *("global_x_deg", "global_y_deg", "global_z_deg"),
-    *("local_x_deg", "local_y_deg", "local_z_deg"),
-)
-#: Rotations R_OG (n, 3, 3), directions (n, 3) of p_OG, and how many combinations give each (n,).
-_Rotations: TypeAlias = tuple[Array, Array, npt.NDArray[np.int64]]
 #: Log-densities are multiples of this: the last bits of a logarithm depend on the machine.
 _DENSITY_GRID = 2.0**-32
 #: Last numbers of the places of streams: of a sampler at a resting pose, and of a child.
@@ -299,90 +281,6 @@ def _turns(
     return turns
 
 
-def rotation_candidates(
-    half_extents: npt.ArrayLike,
-    X_TO: Array,
-    config: CandidateConfig,
-    stream: Stream,
-) -> tuple[Array, int, int]:
-    """Return the distinct valid poses of the paper's method, and two counts.
-
-    X_OG = R_global X_OG0 R_local with R = Rx Ry Rz each, and X_OG0 on +Oz at the distance
-    of the box's corner from its centre, looking at it (Veres et al., equation 1). Valid:
-    the palm's origin is above the table and the ray along +Gz meets the box, edges included.
-
-    Args:
-        half_extents: (3,), of the box about the origin of {O} [m].
-        X_TO: Resting pose (4, 4).
-        config: The rotations; with `jitter_deg` each angle gets a random addition.
-        stream: Draws the jitter.
-
-    Returns:
-        Poses (n, 4, 4), sorted by their rotation's entries, row by row, and then by position,
-        as rounded integers; the number of combinations; of valid ones.
-    """
-    # Keep the valid combinations, block by block. Without jitter equal poses were counted before:
-    # they are valid for the same objects.
-    half = np.asarray(half_extents, dtype=float)
-    radius = float(norm(half))
-    blocks = (
-        _rotation_chunks(config, stream) if config.jitter_deg else [_distinct_rotations(config)]
-    )
-    rotations, positions, combinations, valid = [], [], 0, 0
-    for R_OG, direction, count in blocks:
-        combinations += int(count.sum())
-        p_OG = radius * direction
-        keep = np.flatnonzero(above_table(p_OG, X_TO))
-        keep = keep[ray_meets_box(p_OG[keep], R_OG[keep, :, 2], half)]
-        rotations.append(R_OG[keep])
-        positions.append(p_OG[keep])
-        valid += int(count[keep].sum())
-    R, p = np.concatenate(rotations), np.concatenate(positions)
-    first, _ = _first_of_equal(R, p / radius)
-    return _poses(R[first], p[first]), combinations, valid
-
-
-def _first_of_equal(R: Array, direction: Array) -> tuple[npt.NDArray[np.int64], ...]:
-    """Return the first of each set of equal poses, and how many there are of each.
-
-    Args:
-        R: (n, 3, 3), rotations.
-        direction: (n, 3), positions relative to the object's size.
-
-    Returns:
-        Indices (m,), sorted by the entries of rotation and position as rounded integers, and for
-        each pose (n,) the place of its set among them.
-    """
-    key = np.rint(np.hstack([R.reshape(-1, 9), direction]) / SAME_POSE).astype(np.int32)
-    order = np.lexsort(key.T[::-1])
-    new = np.ones(len(order), dtype=np.bool_)
-    new[1:] = (key[order[1:]] != key[order[:-1]]).any(axis=1)
-    places = np.empty(len(order), dtype=np.int64)
-    places[order] = np.cumsum(new) - 1
-    return order[new], places
-
-
-def _distinct_rotations(config: CandidateConfig) -> _Rotations:
-    """Return the different rotations and directions of all combinations, and how many give each."""
-    return _enumerated(tuple(getattr(config, axis) for axis in _AXES))
-
-
-@lru_cache(maxsize=2)
-def _enumerated(angles_deg: tuple[tuple[float, ...], ...]) -> _Rotations:
-    """Enumerate combinations of angles, see `_distinct_rotations`; once in a process."""
-    config = CandidateConfig.model_validate(dict(zip(_AXES, angles_deg, strict=True)))
-    parts = zip(*map(_without_equals, _rotation_chunks(config, None)), strict=True)
-    R, direction, count = map(np.concatenate, parts)
-    return _without_equals((R, direction, count))
-
-
-def _without_equals(rotations: _Rotations) -> _Rotations:
-    """Return the first of each set of equal rotations and directions, with their number."""
-    R, direction, count = rotations
-    first, places = _first_of_equal(R, direction)
-    return R[first], direction[first], np.bincount(places, weights=count).astype(np.int64)
-
-
 def normal_candidates(model: ObjectModel, count: int, stream: Stream) -> Array:
     """Return poses (n, 4, 4) that look at random surface points against their normals.
 
@@ -404,34 +302,7 @@ def normal_candidates(model: ObjectModel, count: int, stream: Stream) -> Array:
     sine, cosine = sin_cos_deg(360.0 * numbers[:, 3:])
     x = cosine * x + sine * np.cross(z, x)
     R = np.stack([x, np.cross(z, x), z], axis=2)
-    return _poses(R, points - 2.0 * z * norm(model.half_extents))
-
-
-def _poses(R: Array, p: Array) -> Array:
-    """Return poses (n, 4, 4) of rotations (n, 3, 3) and positions (n, 3)."""
-    poses = np.tile(np.eye(4), (len(R), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = R, p
-    return poses
-
-
-def above_table(p_OG: Array, X_TO: Array) -> npt.NDArray[np.bool_]:
-    """Return for points (n, 3) in {O} whether they lie above the table or on it."""
-    return dot(p_OG, X_TO[2, :3]) + X_TO[2, 3] > -EDGE
-
-
-def ray_meets_box(p_OG: Array, z_O: Array, half: Array) -> npt.NDArray[np.bool_]:
-    """Return for rays from (n, 3) along (n, 3) whether they meet the box of half extents (3,)."""
-    # The slab test (Kay and Kajiya 1986) needs exact zeros: they divide to infinity. Rounding may
-    # leave 1e-17 instead.
-    direction = np.where(np.abs(z_O) < 1e-12, 0.0, z_O)
-    wide = half + EDGE
-    with np.errstate(divide="ignore", invalid="ignore"):
-        t1, t2 = (-wide - p_OG) / direction, (wide - p_OG) / direction
-
-    # 0/0, a ray within a slab's face, constrains nothing: fmax and fmin skip the NaN.
-    entry = np.fmax.reduce(np.minimum(t1, t2), axis=1)
-    leave = np.fmin.reduce(np.maximum(t1, t2), axis=1)
-    return leave >= np.maximum(entry, 0.0)
+    return make_poses(R, points - 2.0 * z * norm(model.half_extents))
 
 
 def palm_ray_distance(mesh: trimesh.Trimesh, X_OG: Array) -> Array:
@@ -550,43 +421,3 @@ def palm_motion(numbers: Array, shift: float, turn: float) -> Array:
 
 def _rounded(log_density: float) -> float:
     return round(log_density / _DENSITY_GRID) * _DENSITY_GRID
-
-
-def _rotation_chunks(config: CandidateConfig, stream: Stream | None) -> Iterator[_Rotations]:
-    """Yield R_OG, the palm's direction and the number 1 of all combinations, in chunks.
-
-    Args:
-        config: The angles.
-        stream: Draws the jitter; None: there is none.
-    """
-    grid_global = _angle_grid(config.global_x_deg, config.global_y_deg, config.global_z_deg)
-    grid_local = _angle_grid(config.local_x_deg, config.local_y_deg, config.local_z_deg)
-    per_chunk = max(1, CHUNK // len(grid_local))
-    for start in range(0, len(grid_global), per_chunk):
-        block = grid_global[start : start + per_chunk]
-        angles_global = np.repeat(block, len(grid_local), axis=0)
-        angles_local = np.tile(grid_local, (len(block), 1))
-        if stream is not None:
-            drawn = np.floor(config.jitter_deg * stream.uniform(6 * len(angles_global)))
-            jitter_global, jitter_local = drawn.reshape(2, -1, 3)
-            angles_global, angles_local = angles_global + jitter_global, angles_local + jitter_local
-        R_global, R_local = _rotation_xyz(angles_global), _rotation_xyz(angles_local)
-        R_OG = multiply(R_global * np.diag(R_OG0), R_local)
-        yield R_OG, R_global[:, :, 2], np.ones(len(R_OG), dtype=np.int64)
-
-
-def _angle_grid(*axes_deg: tuple[float, ...]) -> Array:
-    """Return all combinations (n, 3) of angles [degree]; 360 and 0 count once."""
-    unique = [np.unique(np.mod(np.asarray(axis, dtype=float), 360.0)) for axis in axes_deg]
-    return np.stack(np.meshgrid(*unique, indexing="ij"), axis=-1).reshape(-1, 3)
-
-
-def _rotation_xyz(angles_deg: Array) -> Array:
-    """Return Rx Ry Rz, (n, 3, 3), of angles (n, 3) [degree]."""
-    (sx, sy, sz), (cx, cy, cz) = (np.moveaxis(f, -1, 0) for f in sin_cos_deg(angles_deg))
-    rows = [
-        [cy * cz, -cy * sz, sy],
-        [cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy],
-        [sx * sz - cx * sy * cz, sx * cz + cx * sy * sz, cx * cy],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)

@@ -15,11 +15,11 @@ from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.simulation.candidates import (
-    R_OG0,
     Attempt,
     make_attempts,
     sample_candidates,
 )
+from drakegrasp.simulation.rotations import R_OG0
 
 #: Edge of the cube that the hand can grasp from above [m].
 CUBE = 0.07

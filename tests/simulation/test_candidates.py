@@ -26,10 +26,9 @@ from drakegrasp.simulation.candidates import (
     make_attempts,
     normal_candidates,
     palm_ray_distance,
-    ray_meets_box,
-    rotation_candidates,
     sample_candidates,
 )
+from drakegrasp.simulation.rotations import ray_meets_box, rotation_candidates
 
 #: Full extents of three of the paper's meshes [m]; their files are in centimetres. Counts
 #: of valid and of distinct poses, and the distinct ones of an earlier reference that took
@@ -292,6 +291,18 @@ def test_ray_within_a_face_touches_the_box(p: tuple[float, ...]) -> None:
     """0/0 in a slab constrains nothing, as the code's comment says."""
     direction = np.array([[0.0, 0.0, -1.0]])
     assert ray_meets_box(np.array([p], dtype=float), direction, np.ones(3)).all()
+
+
+@pytest.mark.parametrize("axes", [CandidateConfig(), COARSE])
+def test_distinct_rotations_are_what_every_combination_gives(axes: CandidateConfig) -> None:
+    """To the bit: a jitter of whole degrees below one adds nothing, and looks at each of them."""
+    each = axes.model_copy(update={"jitter_deg": 1.0})
+    leaning = make_pose(euler([(25, 40, 10)])[0], [0.0, 0.0, 0.06])
+    for half, X_TO in (((0.03, 0.05, 0.02), leaning), ((0.04,) * 3, standing(np.full(3, 0.04)))):
+        poses, *counts = rotation_candidates(half, X_TO, axes, stream())
+        expected, *expected_counts = rotation_candidates(half, X_TO, each, stream())
+        assert counts == expected_counts
+        np.testing.assert_array_equal(poses, expected)
 
 
 def test_jitter_keeps_the_number_of_combinations() -> None:

@@ -18,9 +18,10 @@ from drakegrasp.errors import GraspError, OffSurfaceError
 from drakegrasp.frames import X_WT, invert_pose, make_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.candidates import R_OG0, Pregrasp
+from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.placement import PlacedObject
+from drakegrasp.simulation.rotations import R_OG0
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.verification import verify as verifying
 from drakegrasp.verification.verify import verify_contacts

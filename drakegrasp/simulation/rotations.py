@@ -1,0 +1,214 @@
+"""The paper's palm poses: products of global and local rotations of a first palm pose.
+
+In: the half extents of an object's box, its resting pose, and the angles. Out: the distinct valid
+poses X_OG, in a stated order. Relative to the size of the box they are the same for all objects, so
+without jitter the hundreds of thousands of combinations are compared once per process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.arithmetic import Array, dot, multiply, norm, sin_cos_deg
+from drakegrasp.config import CandidateConfig
+from drakegrasp.seeding import Stream
+
+#: The first palm's axes in {O}: +Gz looks down onto the object, Gx = Ox.
+R_OG0 = np.diag([1.0, -1.0, -1.0])
+#: Poses that agree to this in every rotation entry, and in position relative to the object's size,
+#: are one pose: different Euler angles give equal rotations up to rounding.
+SAME_POSE = 1e-6
+#: A palm this far below the table, or a palm ray this far beside the bounding box, is still valid
+#: [m]: far above rounding, far below what matters.
+EDGE = 1e-6
+#: Combinations whose poses are computed together: bounds the memory. With `jitter_deg` it also
+#: decides which word of the stream jitters which angle, so another number is another draw.
+CHUNK = 131_072
+#: Bits of one rounded entry, -1e6 to 1e6, and how many of them go into one 64-bit integer.
+BITS, PER_WORD = 21, 3
+
+Numbers = npt.NDArray[np.int64]
+#: The angles of three axes [degree].
+Axes = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]
+
+
+def rotation_candidates(
+    half_extents: npt.ArrayLike,
+    X_TO: Array,
+    config: CandidateConfig,
+    stream: Stream,
+) -> tuple[Array, int, int]:
+    """Return the distinct valid poses of the paper's method, and two counts.
+
+    X_OG = R_global X_OG0 R_local with R = Rx Ry Rz each, and X_OG0 on +Oz at the distance
+    of the box's corner from its centre, looking at it (Veres et al., equation 1). Valid:
+    the palm's origin is above the table and the ray along +Gz meets the box, edges included.
+
+    Args:
+        half_extents: (3,), of the box about the origin of {O} [m].
+        X_TO: Resting pose (4, 4).
+        config: The rotations; with `jitter_deg` each angle gets a random addition.
+        stream: Draws the jitter.
+
+    Returns:
+        Poses (n, 4, 4), sorted by their rotation's entries, row by row, and then by position,
+        as rounded integers; the number of combinations; of valid ones.
+    """
+    half, radius = np.asarray(half_extents, dtype=float), float(norm(half_extents))
+    axes_global = (config.global_x_deg, config.global_y_deg, config.global_z_deg)
+    axes_local = (config.local_x_deg, config.local_y_deg, config.local_z_deg)
+    grids = _angle_grid(axes_global), _angle_grid(axes_local)
+    combinations = len(grids[0]) * len(grids[1])
+
+    # With jitter the poses are drawn: compare the valid ones, and keep the first of equal ones.
+    if config.jitter_deg:
+        rotations, positions = [], []
+        for R_global, R_local in _jittered(*grids, config.jitter_deg, stream):
+            p_OG = radius * R_global[:, :, 2]
+            keep = np.flatnonzero(above_table(p_OG, X_TO))
+            R_OG = multiply(R_global[keep] * np.diag(R_OG0), R_local[keep])
+            hits = ray_meets_box(p_OG[keep], R_OG[:, :, 2], half)
+            rotations.append(R_OG[hits])
+            positions.append(p_OG[keep[hits]])
+        R, p = np.concatenate(rotations), np.concatenate(positions)
+        first, _ = _distinct(_words(R, p / radius), np.ones(len(R), dtype=np.int64))
+        return make_poses(R[first], p[first]), combinations, len(R)
+
+    # Without, equal poses are valid together or not at all: test the first of each.
+    numbers, members = _distinct_combinations(axes_global, axes_local)
+    R_global, R_local = map(_rotation_xyz, grids)
+    p_OG, R_first = radius * R_global[:, :, 2], R_global * np.diag(R_OG0)
+    i, j = np.divmod(numbers, len(R_local))
+    keep = np.flatnonzero(above_table(p_OG, X_TO)[i])
+    z_O = dot(R_first[i[keep]], R_local[j[keep], None, :, 2])
+    keep = keep[ray_meets_box(p_OG[i[keep]], z_O, half)]
+    i, j = i[keep], j[keep]
+    poses = make_poses(multiply(R_first[i], R_local[j]), p_OG[i])
+    return poses, combinations, int(members[keep].sum())
+
+
+def make_poses(R: Array, p: Array) -> Array:
+    """Return poses (n, 4, 4) of rotations (n, 3, 3) and positions (n, 3)."""
+    poses = np.tile(np.eye(4), (len(R), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = R, p
+    return poses
+
+
+def above_table(p_OG: Array, X_TO: Array) -> npt.NDArray[np.bool_]:
+    """Return for points (n, 3) in {O} whether they lie above the table or on it."""
+    return dot(p_OG, X_TO[2, :3]) + X_TO[2, 3] > -EDGE
+
+
+def ray_meets_box(p_OG: Array, z_O: Array, half: Array) -> npt.NDArray[np.bool_]:
+    """Return for rays from (n, 3) along (n, 3) whether they meet the box of half extents (3,)."""
+    # The slab test (Kay and Kajiya 1986) needs exact zeros: they divide to infinity. Rounding may
+    # leave 1e-17 instead.
+    direction = np.where(np.abs(z_O) < 1e-12, 0.0, z_O)
+    wide = half + EDGE
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t1, t2 = (-wide - p_OG) / direction, (wide - p_OG) / direction
+
+    # 0/0, a ray within a slab's face, constrains nothing: fmax and fmin skip the NaN.
+    entry = np.fmax.reduce(np.minimum(t1, t2), axis=1)
+    leave = np.fmin.reduce(np.maximum(t1, t2), axis=1)
+    return leave >= np.maximum(entry, 0.0)
+
+
+# Combinations of angles
+
+
+def _axes(config: CandidateConfig) -> tuple[Axes, Axes]:
+    """Return the global and the local angles."""
+    return (
+        (config.global_x_deg, config.global_y_deg, config.global_z_deg),
+        (config.local_x_deg, config.local_y_deg, config.local_z_deg),
+    )
+
+
+@lru_cache(maxsize=1)
+def _distinct_combinations(global_deg: Axes, local_deg: Axes) -> tuple[Numbers, Numbers]:
+    """Return the first combination (n,) of each distinct pose, and how many (n,) give it.
+
+    Combination i m + j is of the global rotation i and the local rotation j of m. The poses are in
+    the order of `rotation_candidates`.
+    """
+    # Compare the poses of each chunk, so that fewer are left to compare.
+    R_global, R_local = (_rotation_xyz(_angle_grid(axes)) for axes in (global_deg, local_deg))
+    total = len(R_global) * len(R_local)
+    words, numbers, counts = [], [], []
+    for start in range(0, total, CHUNK):
+        i, j = np.divmod(np.arange(start, min(start + CHUNK, total)), len(R_local))
+        R_OG = multiply(R_global[i] * np.diag(R_OG0), R_local[j])
+        key = _words(R_OG, R_global[i, :, 2])
+        first, count = _distinct(key, np.ones(len(key), dtype=np.int64))
+        words.append(key[first])
+        numbers.append(start + first)
+        counts.append(count)
+
+    # Compare what is left; of equal ones the earliest is the first.
+    first, members = _distinct(np.concatenate(words), np.concatenate(counts))
+    number = np.concatenate(numbers)[first]
+    for array in (number, members):
+        array.setflags(write=False)
+    return number, members
+
+
+def _words(R: Array, p: Array) -> Numbers:
+    """Return poses as integers (n, 4), which are equal and sort as their rounded entries do.
+
+    Args:
+        R: Rotations (n, 3, 3).
+        p: Positions relative to the object's size (n, 3).
+    """
+    entries = np.rint(np.hstack([R.reshape(-1, 9), p]) / SAME_POSE).astype(np.int64)
+    a, b, c = np.moveaxis((entries + (1 << BITS - 1)).reshape(-1, 4, 3), 2, 0)
+    return np.asarray((a << 2 * BITS) | (b << BITS) | c)
+
+
+def _distinct(words: Numbers, weights: Numbers) -> tuple[Numbers, Numbers]:
+    """Return the first row (k,) of each set of equal rows, sorted, and its sum of weights (k,).
+
+    Args:
+        words: (n, 4).
+        weights: (n,).
+    """
+    order = np.lexsort(words.T[::-1])
+    new = np.ones(len(order), dtype=np.bool_)
+    new[1:] = (words[order[1:]] != words[order[:-1]]).any(axis=1)
+    return order[new], np.add.reduceat(weights[order], np.flatnonzero(new))
+
+
+def _jittered(
+    grid_global: Array, grid_local: Array, jitter_deg: float, stream: Stream
+) -> Iterator[tuple[Array, Array]]:
+    """Yield R_global and R_local, (m, 3, 3) each, of all combinations, in chunks."""
+    per_chunk = max(1, CHUNK // len(grid_local))
+    for start in range(0, len(grid_global), per_chunk):
+        block = grid_global[start : start + per_chunk]
+        angles_global = np.repeat(block, len(grid_local), axis=0)
+        angles_local = np.tile(grid_local, (len(block), 1))
+        drawn = np.floor(jitter_deg * stream.uniform(6 * len(angles_global)))
+        jitter_global, jitter_local = drawn.reshape(2, -1, 3)
+        angles_global, angles_local = angles_global + jitter_global, angles_local + jitter_local
+        yield _rotation_xyz(angles_global), _rotation_xyz(angles_local)
+
+
+def _angle_grid(axes_deg: Axes) -> Array:
+    """Return all combinations (n, 3) of angles [degree]; 360 and 0 count once."""
+    unique = [np.unique(np.mod(np.asarray(axis, dtype=float), 360.0)) for axis in axes_deg]
+    return np.stack(np.meshgrid(*unique, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _rotation_xyz(angles_deg: Array) -> Array:
+    """Return Rx Ry Rz, (n, 3, 3), of angles (n, 3) [degree]."""
+    (sx, sy, sz), (cx, cy, cz) = (np.moveaxis(f, -1, 0) for f in sin_cos_deg(angles_deg))
+    rows = [
+        [cy * cz, -cy * sz, sy],
+        [cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy],
+        [sx * sz - cx * sy * cz, sx * cz + cx * sy * sz, cx * cy],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
