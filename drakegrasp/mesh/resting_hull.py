@@ -18,9 +18,8 @@ from drakegrasp.mesh.surfaces import Faces, Solid, compact, face_areas, half_edg
 #: Triangles of the hull are one facet where their corners are this near to the plane of its largest
 #: one [m], and their normals agree with its normal to this cosine.
 FLATNESS, ALIKE = 1e-5, 0.99
-#: Facets of a smaller extent stay as they are, and those with shorter edges, as round ones have,
-#: get no rim [m].
-SMALL = 0.01
+#: Facets of a smaller extent stay as they are; those with a longer edge get a rim [m].
+SMALL, LONG = 0.01, 0.02
 #: Width of the rim, as a fraction of the way from the border to the inner point.
 RIM = 0.1
 
@@ -45,7 +44,7 @@ def resting_hull(points: Array) -> Solid:
         centroid = weights @ vertices[facet].mean(axis=1) / weights.sum()
 
         # Two narrow triangles within each edge.
-        if norm(np.roll(corners, -1, axis=0) - corners).max() > SMALL:
+        if norm(np.roll(corners, -1, axis=0) - corners).max() > LONG:
             inner = count + np.arange(len(border))
             after, inner_after = np.roll(border, -1), np.roll(inner, -1)
             triangles.append(np.column_stack((border, after, inner_after)))
