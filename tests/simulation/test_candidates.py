@@ -13,8 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from scipy.stats import norm
 
-from drakegrasp.config import CandidateConfig, Config, load_config
+from drakegrasp.config import CandidateConfig, Config, RefineConfig, load_config
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.model import ObjectModel, prepare_object
@@ -23,6 +25,9 @@ from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.candidates import (
     Attempt,
     Candidates,
+    Source,
+    children,
+    family_member,
     make_attempts,
     normal_candidates,
     palm_ray_distance,
@@ -356,6 +361,69 @@ def test_other_seed_or_other_name_draws_others(
         assert len(shared) < 0.5 * len(first)
 
 
+@pytest.mark.parametrize("method", ["normals", ("normals", "normals", "rotations")])
+def test_smaller_number_of_turns_is_a_prefix(box: ObjectModel, method: str) -> None:
+    upside_down = BOX_X_TO @ np.diag([1.0, -1.0, -1.0, 1.0])
+    poses = np.stack([BOX_X_TO, upside_down])
+    many, few = (
+        sample_candidates(box, poses, COARSE.model_copy(update={"method": method, "max": n}), 0)
+        for n in (1500, 40)
+    )
+    assert (len(many), len(few)) == (1500, 40)
+    for name in ("X_OG", "distance", "resting", "source", "log_density"):
+        np.testing.assert_array_equal(getattr(many, name)[:40], getattr(few, name))
+
+
+def test_turns_go_on_without_a_sampler_that_has_no_more(box: ObjectModel) -> None:
+    narrow = COARSE.model_copy(update={"local_y_deg": (0,), "local_z_deg": (0,)})
+    distinct = len(rotation_candidates(box.half_extents, BOX_X_TO, narrow, stream())[0])
+    update = {"method": ("rotations", "normals"), "max": 3 * distinct}
+    drawn = sample_candidates(box, BOX_X_TO, narrow.model_copy(update=update), 0)
+    turns = np.resize([Source.ROTATIONS, Source.NORMALS], 2 * distinct)
+    np.testing.assert_array_equal(drawn.source[: 2 * distinct], turns)
+    assert np.all(drawn.source[2 * distinct :] == Source.NORMALS)
+    # Each rotation is one of those that there are; a normal one of the area and the circle.
+    densities = [-np.log(distinct), -np.log(box.visual.area * 2.0 * np.pi)]
+    np.testing.assert_allclose(drawn.log_density[:2], densities, atol=1e-9)
+
+
+def test_children_are_drawn_about_their_parent() -> None:
+    rules = RefineConfig(children=50, generations=2, shift=0.01, turn_deg=5.0)
+    (parent, *_) = attempts(range(4, 5))
+    born = children(parent, rules, name="thing", seed=0)
+    assert [child.child for child in born] == list(range(1, 51))
+    assert {(c.generation, c.parent, c.source) for c in born} == {(1, 0, Source.REFINE)}
+    assert {(c.candidate, c.standoff_index, c.spread) for c in born} == {
+        (parent.candidate, parent.standoff_index, parent.spread)
+    }
+
+    # Four standard deviations of those of 150 numbers.
+    X_GH = np.stack([np.linalg.inv(parent.X_OG) @ child.X_OG for child in born])
+    turns = Rotation.from_matrix(X_GH[:, :3, :3]).as_rotvec(degrees=True)
+    for moved, sigma in ((X_GH[:, :3, 3], 0.01), (turns, 5.0)):
+        assert moved.std() == pytest.approx(sigma, rel=4 / np.sqrt(2 * 150))
+        assert np.abs(moved.mean(axis=0)).max() < 4 * sigma / np.sqrt(50)
+
+    # The density is that of the draw, in metres and radians.
+    sigmas = np.repeat([0.01, np.deg2rad(5.0)], 3)
+    vector = np.hstack([X_GH[:, :3, 3], np.deg2rad(turns)])
+    expected = norm.logpdf(vector, scale=sigmas).sum(axis=1)
+    np.testing.assert_allclose([c.log_density for c in born], expected, atol=1e-6)
+
+
+def test_member_of_a_family_is_found_by_its_number() -> None:
+    rules = RefineConfig(children=3, generations=2)
+    (parent, *_) = attempts(range(4, 5))
+    first = children(parent, rules, name="thing", seed=0)
+    second = children(first[1], rules, name="thing", seed=0)
+    assert [child.child for child in second] == [7, 8, 9]
+    assert children(second[0], rules, name="thing", seed=0) == []
+    for member in (parent, *first, *second):
+        found = family_member(parent, member.child, rules, name="thing", seed=0)
+        np.testing.assert_array_equal(found.X_OG, member.X_OG)
+        assert (found.child, found.parent, found.seed) == (member.child, member.parent, member.seed)
+
+
 def test_smaller_number_is_a_prefix(box: ObjectModel) -> None:
     """So more candidates can be tried later without losing the shards of the first."""
     many, few = (
@@ -456,9 +524,9 @@ def test_normals_spread_over_the_area_and_roll_freely(box: ObjectModel) -> None:
 
 def test_normals_that_start_under_the_table_are_dropped(box: ObjectModel) -> None:
     drawn = sample_candidates(box, BOX_X_TO, CandidateConfig(method="normals", max=400), 0)
-    assert drawn.combinations == 400
+    assert len(drawn) == drawn.valid == drawn.distinct == 400
     # The bottom's share of the area is 0.0048 / 0.0376.
-    assert 400 * 0.75 < len(drawn) == drawn.valid == drawn.distinct < 400
+    assert 400 < drawn.combinations < 400 / 0.75
     assert (drawn.X_OG[:, 2, 3] > -0.05).all()
     assert not (drawn.X_OG[:, 2, 2] > 0.5).any()
 
@@ -474,7 +542,16 @@ def some_candidates(n: int = 30) -> Candidates:
     X_OG = np.tile(make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.3]), (n, 1, 1))
     distance = np.linspace(0.2, 0.25, n)
     distance[1] = np.nan
-    return Candidates(X_OG=X_OG, distance=distance, combinations=n, valid=n, distinct=n)
+    return Candidates(
+        X_OG=X_OG,
+        distance=distance,
+        resting=np.zeros(n, dtype=np.int64),
+        source=np.zeros(n, dtype=np.int64),
+        log_density=np.zeros(n),
+        combinations=n,
+        valid=n,
+        distinct=n,
+    )
 
 
 def attempts(indices: range, *, name: str = "thing", seed: int = 0) -> list[Attempt]:
