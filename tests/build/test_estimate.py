@@ -79,7 +79,8 @@ def test_plan_keeps_the_bounds_of_any_schedule(objects: int, workers: int, candi
     """No faster than the work shared evenly, no slower than that and one longest unit."""
     config = load_config(overrides=[f"candidates.max={candidates}"])
     plan = plan_build(objects, config, workers, EVEN)
-    work, longest = 0.1 * plan.attempts, 0.1 * 3 * min(50, candidates)
+    longest = 0.1 * 3 * max(map(len, config.unit_ranges(candidates)))
+    work = 0.1 * plan.attempts
     assert work / workers <= plan.stages["simulate"] + 1e-6
     assert plan.stages["simulate"] <= work / workers + longest + 0.003 * plan.units
 

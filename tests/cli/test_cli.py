@@ -163,7 +163,10 @@ def test_options_of_built_in_objects_are_refused_with_other_meshes(
 
 def test_options_of_built_in_objects_are_values_of_the_configuration(tmp_path: Path) -> None:
     request = dict.fromkeys(
-        ("config", "candidates", "max_grasps", "certify", "seed", "manifest", "quiet")
+        [
+            *("config", "candidates", "max_grasps", "samples", "samples_per_object", "certify"),
+            *("seed", "manifest", "quiet", "only"),
+        ]
     ) | {"objects": "builtin", "out": tmp_path, "overrides": ["builtin.seed=9"], "units": "m"}
     for per_class, seed, expected in ((3, None, (3, 9)), (None, 4, (2, 4)), (None, None, (2, 9))):
         config = parse_request(**request, per_class=per_class, objects_seed=seed).config

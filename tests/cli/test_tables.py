@@ -31,6 +31,7 @@ def test_hold_table_tells_what_share_of_the_held_ones_is_stable() -> None:
         precision=np.array([12, 0]),
         stable=np.array([9, 0]),
         removals=removals,
+        refined=np.zeros_like(removals[:, :3]),
     )
     text = StringIO()
     Console(width=80, file=text).print(hold_table(funnel))
@@ -67,6 +68,7 @@ def test_columns_of_the_funnel_add_up_to_the_attempts(compact: bool) -> None:
         precision=removals[:, 0],
         stable=removals[:, 0],
         removals=removals,
+        refined=np.zeros_like(removals[:, :3]),
     )
     text = StringIO()
     Console(width=400, file=text).print(funnel_table(funnel, compact=compact))

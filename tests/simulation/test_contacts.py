@@ -253,9 +253,9 @@ def test_rest_of_a_split_patch_counts_by_its_own_force(closed: Scene) -> None:
 
 
 def test_palm_on_the_object_is_another_link(scene: Scene, cube: ObjectModel) -> None:
-    """Open fingers, and the palm a millimetre deep in the top of the cube."""
+    """Open fingers, and the pad of the palm less than half of its thickness in the top."""
     X_WO = X_WT @ standing(cube)
-    reset_attempt(scene, X_WO, X_WO @ from_above(cube, -0.001).X_OG, spread=0.0)
+    reset_attempt(scene, X_WO, X_WO @ from_above(cube, 0.001).X_OG, spread=0.0)
     found = read_contacts(scene)
     assert not found.touching.any()
     assert found.other_links == 1

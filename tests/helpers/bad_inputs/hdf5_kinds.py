@@ -184,7 +184,12 @@ TRIALS: tuple[Kind, ...] = (
     *field_kinds("objects", OBJECT_FIELDS, _TURNS),
     *field_kinds("trials", TRIAL_FIELDS, _TURNS),
     *field_kinds("successes", SUCCESS_FIELDS, _TURNS[1:]),
-    *(dataset_kind("trials/outcome", way) for way in _TURNS if way != "without rows"),
+    # The ways that did not have their turn.
+    *(
+        kind
+        for kind in (dataset_kind("trials/outcome", way) for way in _TURNS)
+        if kind.name not in {k.name for k in field_kinds("trials", TRIAL_FIELDS, _TURNS)}
+    ),
     *attribute_kinds(_ORIGIN),
     attribute_kind("schema_version", "of the future", 999),
     attribute_kind("schema_version", "before", 1),
@@ -253,7 +258,7 @@ PLAN: tuple[Kind, ...] = (
     *ANY_FILE,
     *(
         dataset_kind(name, way)
-        for name in ("X_TO", "X_OG", "distance")
+        for name in ("X_TO", "stopped", "X_OG", "distance", "resting")
         for way in _TURNS
         if (name, way) != ("distance", "a group")
     ),
@@ -262,8 +267,7 @@ PLAN: tuple[Kind, ...] = (
             "model_sha256": (),
             "config_hash": ("a text",),  # `replay` compares them
             "mesh_sha256": ("a text",),
-            "table_force": ("a number",),
-            "stopped": (),
+            "max": ("a number",),
             "combinations": ("a number",),
             "valid": ("a number",),
             "distinct": ("a number",),

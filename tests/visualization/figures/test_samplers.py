@@ -70,7 +70,14 @@ def test_rays_end_on_the_surface(boxes: Path) -> None:
     poses = np.tile(np.diag([1.0, -1.0, -1.0, 1.0]), (3, 1, 1))
     poses[:, 2, 3] = [0.3, 0.4, 0.5]
     candidates = Candidates(
-        X_OG=poses, distance=np.array([0.25, np.nan, 0.45]), combinations=3, valid=3, distinct=3
+        X_OG=poses,
+        distance=np.array([0.25, np.nan, 0.45]),
+        resting=np.zeros(3, dtype=np.int64),
+        source=np.zeros(3, dtype=np.int64),
+        log_density=np.zeros(3),
+        combinations=3,
+        valid=3,
+        distinct=3,
     )
     rays = palm_rays(candidates, 0.12, 10)
     np.testing.assert_allclose(rays[:, 1], [[0.0, 0.0, 0.05], [0.0, 0.0, 0.05]], atol=1e-12)
