@@ -100,8 +100,9 @@ def _text_type(values: Any) -> Any:
 
 
 def field_kinds(group: str, fields: Iterable[Field], ways: Sequence[str]) -> Iterator[Kind]:
-    """Yield a kind for each field, the ways in turn."""
-    for field, way in zip(fields, cycle(ways), strict=False):
+    """Yield a kind for each field, the ways in turn; texts cannot be spoilt by texts."""
+    for field, turn in zip(fields, cycle(ways), strict=False):
+        way = "missing" if (field.dtype, turn) == ("str", "of texts") else turn
         yield dataset_kind(f"{group}/{field.name}", way)
 
 
