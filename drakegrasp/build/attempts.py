@@ -123,7 +123,14 @@ def list_children(prepared: PreparedObject, parent: Attempt, config: Config) -> 
 def find_attempt(
     prepared: PreparedObject, candidate: int, standoff_index: int, child: int, config: Config
 ) -> Attempt:
-    """Return an attempt by its identity in a dataset, with its conditions."""
+    """Return an attempt by its identity in a dataset, with its conditions.
+
+    Raises:
+        DataError: If there is no such number in a family.
+    """
+    most = sum(config.refine.children**k for k in range(1, config.refine.generations + 1))
+    if not 0 <= child <= most:
+        raise DataError(f"child must be 0 to {most}, got {child}")
     first = list_attempts(prepared, range(candidate, candidate + 1), config)[standoff_index]
     name, seed = prepared.model.name, config.seed
     member = family_member(first, child, config.refine, name=name, seed=seed)

@@ -414,7 +414,7 @@ def test_replay_gives_the_same_bits(small_dataset: Path, stage: str) -> None:
 def test_replay_says_what_differs(small_dataset: Path, tmp_path: Path) -> None:
     """In every column, but for those that say which attempt it is."""
     out = _copy(small_dataset, tmp_path)
-    names = {f.name for f in trial_columns()} - {"candidate", "standoff_index"}
+    names = {f.name for f in trial_columns()} - {"candidate", "standoff_index", "child"}
     with h5py.File(out / "trials.hdf5", "r+") as file:
         number = int(np.flatnonzero(file["trials/outcome"][:] == Outcome.SUCCESS)[0])
         for name in names:
@@ -427,6 +427,12 @@ def test_replay_says_what_differs(small_dataset: Path, tmp_path: Path) -> None:
     assert again.differences["spread"] == again.differences["outcome"] == pytest.approx(1.0)
     with pytest.raises(DataError, match="trial must be 0 to 359, got 360"):
         replay_trial(out, 360)
+
+    # Nothing was refined here.
+    with h5py.File(out / "trials.hdf5", "r+") as file:
+        file["trials/child"][number] = 1
+    with pytest.raises(DataError, match="child must be 0 to 0, got 1"):
+        replay_trial(out, number)
 
 
 def test_reject_list_takes_samples_out(small_dataset: Path, tmp_path: Path) -> None:
