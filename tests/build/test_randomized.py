@@ -93,13 +93,13 @@ def test_replay_gives_the_same_bits(randomized: Path, tmp_path: Path, outcome: O
 
 
 def test_images_differ_in_light_and_colour(randomized: Path) -> None:
-    data = GraspDataset(randomized / "grasping_oto.hdf5", split="test")
+    data = GraspDataset(randomized / "grasping_oto.hdf5", split="train")
     means = np.array([s.image[:3, s.mask == 1].mean(axis=1) for s in data])
     assert np.ptp(means, axis=0).min() > 0.1
 
 
 def test_grasps_are_verified_with_their_own_friction_and_mass(randomized: Path) -> None:
-    data = GraspDataset(randomized / "grasping_oto.hdf5", split="test")
+    data = GraspDataset(randomized / "grasping_oto.hdf5", split="train")
     rows = [0, 1]
     grasps = np.array([data[row].grasp for row in rows])
     for row, verdict in zip(
