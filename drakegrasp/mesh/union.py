@@ -23,7 +23,7 @@ from drakegrasp.mesh.surfaces import (
     signed_volume,
     stack,
     to_manifold,
-    winding_numbers,
+    whole_windings,
 )
 
 #: Triangles lower than this fraction of the diagonal are slivers, made by rounding.
@@ -229,6 +229,6 @@ def _is_dent(piece: manifold3d.Manifold, pieces: list[manifold3d.Manifold]) -> b
 def _changed_share(candidate: tuple[Array, Faces], vertices: Array, faces: Faces) -> float:
     """Return the fraction of a solid's volume that a candidate has lost or added."""
     points = vertices.min(axis=0) + np.ptp(vertices, axis=0) * even_points(CHECK_POINTS)
-    before = winding_numbers(points, vertices, faces) > 0.5
-    after = winding_numbers(points, *candidate) > 0.5
+    before = whole_windings(points, vertices, faces) > 0.5
+    after = whole_windings(points, *candidate) > 0.5
     return float((before != after).sum() / max(1, before.sum()))

@@ -25,7 +25,12 @@ from drakegrasp.errors import MeshError
 from drakegrasp.mesh.components import part_touching_edges
 from drakegrasp.mesh.loading import load_mesh
 from drakegrasp.mesh.repair import weld
-from drakegrasp.mesh.surfaces import is_solid_surface, signed_volume, winding_numbers
+from drakegrasp.mesh.surfaces import (
+    is_solid_surface,
+    signed_volume,
+    whole_windings,
+    winding_numbers,
+)
 from drakegrasp.objects.model import prepare_object
 from drakegrasp.objects.sources import find_meshes
 
@@ -180,6 +185,26 @@ def test_winding_numbers_of_a_box():
     points = np.array([[0.0, 0.0, 0.0], [0.029, 0.049, 0.019], [0.031, 0.0, 0.0], [5.0, 5.0, 5.0]])
     w = winding_numbers(points, np.array(cube.vertices), np.array(cube.faces))
     np.testing.assert_allclose(w, [1.0, 1.0, 0.0, 0.0], atol=1e-9)
+
+
+def test_whole_windings_are_those_of_the_solid_angles():
+    """Overlaps, a cavity, a part inside out; and below and above corners and edges."""
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.03)
+    leaning = box((0.05, 0.04, 0.06), (0.03, 0.02, 0.0))
+    leaning.apply_transform(trimesh.transformations.euler_matrix(0.4, 0.3, 0.2))
+    hole = flipped(box((0.01, 0.02, 0.01)))
+    outside = flipped(box((0.02,) * 3, (0.0, 0.09, 0.0)))
+    parts = trimesh.util.concatenate([ball, box(), leaning, hole, outside])
+    vertices, faces = np.array(parts.vertices), np.array(parts.faces)
+
+    points = np.random.default_rng(3).uniform(-0.08, 0.12, (4000, 3))
+    columns = np.vstack([vertices, vertices[faces[:, :2]].mean(axis=1)])
+    heights = np.linspace(-0.0717, 0.0713, 12)
+    for z in heights:
+        points = np.vstack([points, np.column_stack([columns[:, :2], np.full(len(columns), z)])])
+    expected = winding_numbers(points, vertices, faces)
+    assert set(np.rint(expected)) == {-1.0, 0.0, 1.0, 2.0, 3.0}
+    np.testing.assert_allclose(whole_windings(points, vertices, faces), expected, atol=1e-9)
 
 
 @settings(max_examples=10, deadline=None)
