@@ -33,7 +33,7 @@ from drakegrasp.mesh.surfaces import on_faces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.randomization.conditions import Conditions
-from drakegrasp.simulation.rotations import above_table, make_poses, rotation_candidates
+from drakegrasp.simulation.sampling.rotations import above_table, make_poses, rotation_candidates
 
 #: Surface points that `normals` draws together; another number is another draw.
 BLOCK = 1000

@@ -34,7 +34,7 @@ from drakegrasp.simulation.candidates import (
 )
 from drakegrasp.simulation.randomization.draws import draw_conditions
 from drakegrasp.simulation.robustness import _noise_factor
-from drakegrasp.simulation.rotations import rotation_candidates
+from drakegrasp.simulation.sampling.rotations import rotation_candidates
 from drakegrasp.simulation.screen import predict
 from drakegrasp.vision.depth_sensor import DepthSensor, spoil_depth
 

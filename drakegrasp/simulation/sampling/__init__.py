@@ -1,0 +1,1 @@
+"""Samplers of palm poses that are more than a function."""
