@@ -183,7 +183,7 @@ def test_fault_costs_what_is_guilty_and_nothing_else(
     faults = "crash:1_box_a:3:1 hang:1_box_a:5:0 freeze:2_box_b:4:2 crash:3_box_c"
     out = tmp_path / "out"
     # A hang that does not compute takes many times as long, and is tried twice.
-    limit = ("--set", "attempt_seconds=1")
+    limit = ("--set", "attempt_seconds=2")
     said, errors = finish(start_build(more, out, 2, *limit, fault=faults))
     assert "refused: 3_box_c: preparing it crashed its process" in said
     assert errors == ""
