@@ -75,8 +75,10 @@ def object_draws(source: MeshSource) -> Iterator[tuple[str, str]]:
         )
     )
     yield "mesh", digest(model.visual_vertices, model.collision_vertices, model.collision_faces)
-    # The resting pose is simulated, and on a fine grid: its last step may depend on the CPU.
-    yield "X_TO", digest(np.round(prepared.X_TO, 4) + 0.0)
+    # The cylinder turns about its axis by some microradians while it settles, and by how many depends
+    # on the CPU: of it only height and upward direction are compared.
+    round_base = source.name == "2_cylinder"
+    yield "X_TO", digest(np.round(prepared.X_TO[2], 4) + 0.0 if round_base else prepared.X_TO)
     yield "palm poses", digest(candidates.X_OG, candidates.distance)
     yield "counts", f"{candidates.combinations} {candidates.valid} {candidates.distinct}"
     yield (
