@@ -75,8 +75,8 @@ def object_draws(source: MeshSource) -> Iterator[tuple[str, str]]:
         )
     )
     yield "mesh", digest(model.visual_vertices, model.collision_vertices, model.collision_faces)
-    # The cylinder turns about its axis by some microradians while it settles, and by how many depends
-    # on the CPU: of it only height and upward direction are compared.
+    # The resting pose is simulated. That of the cylinder, which may turn about its axis, was not
+    # the same on every machine: of it only height and upward direction are compared.
     round_base = source.name == "2_cylinder"
     yield "X_TO", digest(np.round(prepared.X_TO[2], 4) + 0.0 if round_base else prepared.X_TO)
     yield "palm poses", digest(candidates.X_OG, candidates.distance)
