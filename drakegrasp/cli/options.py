@@ -95,7 +95,7 @@ _OPTIONS = (
     click.option(
         "--config",
         metavar="YAML|PRESET",
-        help="Configuration: a file, or the preset paper, randomized or released.  [default: "
+        help="Configuration: a file, or the preset paper, fast, randomized or released.  [default: "
         "paper, but with split.by=auto]",
     ),
     set_option,

@@ -68,8 +68,8 @@ if TYPE_CHECKING:
 @click.option(
     "--config",
     metavar="YAML|PRESET",
-    help="Configuration: a file, or the preset paper, randomized or released.  [default: that of "
-    "the dataset, else the defaults]",
+    help="Configuration: a file, or the preset paper, fast, randomized or released.  [default: "
+    "that of the dataset, else the defaults]",
 )
 @set_option
 @click.option(

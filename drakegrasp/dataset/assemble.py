@@ -48,6 +48,7 @@ from drakegrasp.dataset.manifest import (
     Manifest,
     manifest_text,
     read_manifest,
+    refuse_older,
     with_postprocessing,
     write_origin,
 )
@@ -108,7 +109,9 @@ def assemble(
     if not out.is_dir():
         read_manifest(out)
     with build_lock(out):
-        manifest = with_postprocessing(read_manifest(out), overrides)
+        manifest = read_manifest(out)
+        refuse_older(manifest, out)
+        manifest = with_postprocessing(manifest, overrides)
         return assemble_locked(out, manifest, rejected=rejected, execute=execute, progress=progress)
 
 

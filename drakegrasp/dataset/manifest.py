@@ -35,7 +35,12 @@ from drakegrasp.dataset import log as build_log
 from drakegrasp.dataset.layout.json_files import Name, read_mapping, validated
 from drakegrasp.dataset.paths import FILE_NAME, OWN_FILES, OWN_FOLDERS
 from drakegrasp.dataset.rejections import AttemptKey, key_to_json
-from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, refuse_other_schema
+from drakegrasp.dataset.schema import (
+    CONVENTIONS,
+    OTHER_SCHEMA,
+    SCHEMA_VERSION,
+    refuse_other_schema,
+)
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.split import Rule, split_rule
 from drakegrasp.errors import ConfigError, DataError, GraspError
@@ -171,6 +176,7 @@ class Manifest:
         rejected: Attempts that an inspection rejects: successes that are no samples.
         versions: Versions of the packages that made the dataset, and a hash of the hand's files.
         fingers: Name of each finger in grasp order, and whether a grasp needs its fingertip.
+        schema_version: Version of the schema of the dataset's files.
     """
 
     config: Config
@@ -179,6 +185,7 @@ class Manifest:
     rejected: tuple[AttemptKey, ...] = ()
     versions: dict[str, str]
     fingers: dict[str, bool] = field(default_factory=dict)
+    schema_version: int = SCHEMA_VERSION
 
     def headers(self) -> Iterator[ShardHeader]:
         """Yield the work units of the dataset in the order of its rows."""
@@ -303,10 +310,24 @@ def read_manifest(out: Path) -> Manifest:
         rejected=stored.rejected,
         versions=stored.versions,
         fingers=stored.fingers,
+        schema_version=stored.schema_version,
     )
     if (mistake := next(_contradictions(stored, manifest), None)) is not None:
         raise DataError(f"{path}: {mistake}")
     return manifest
+
+
+def refuse_older(manifest: Manifest, out: Path) -> None:
+    """Refuse a dataset of an older schema: its files are read, but nothing is simulated by them.
+
+    Raises:
+        DataError: If it is.
+    """
+    if manifest.schema_version < SCHEMA_VERSION:
+        raise DataError(
+            f"{out}: schema must be {SCHEMA_VERSION} for anything but reading, "
+            f"got {manifest.schema_version}; {OTHER_SCHEMA}"
+        )
 
 
 def _updated(tree: dict[str, Any], content: bytes) -> bytes:
@@ -396,6 +417,7 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
 
     # With a manifest it must continue the same dataset.
     manifest = read_manifest(out)
+    refuse_older(manifest, out)
     if manifest.config.simulation_hash() != config.simulation_hash():
         raise DataError(
             f"{out}: must be empty or hold this configuration's dataset, got one that differs in "

@@ -16,8 +16,14 @@ import numpy.typing as npt
 from drakegrasp.config import Config
 from drakegrasp.dataset.layout.opening import opened
 from drakegrasp.dataset.layout.plans import ARRAYS
-from drakegrasp.dataset.manifest import ObjectEntry, RestingEntry
-from drakegrasp.dataset.paths import model_file_sha256, model_path, plan_path, refuse_changed_object
+from drakegrasp.dataset.manifest import ObjectEntry, RestingEntry, read_manifest, refuse_older
+from drakegrasp.dataset.paths import (
+    FILE_NAME,
+    model_file_sha256,
+    model_path,
+    plan_path,
+    refuse_changed_object,
+)
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array
 from drakegrasp.objects.model import ObjectModel, load_object, save_object
@@ -111,11 +117,16 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
     """
     path = plan_path(out, name)
 
-    # Both files must be as they were written, and of this configuration.
-    refuse_changed_object(out, name)
-    with opened(path, "the plan of an object") as file:
-        attributes = dict(file.attrs)
-        arrays = {key: file[key][:] for key in ARRAYS}
+    # Both files must be as they were written, and of this configuration. Plans have no version.
+    try:
+        refuse_changed_object(out, name)
+        with opened(path, "the plan of an object") as file:
+            attributes = dict(file.attrs)
+            arrays = {key: file[key][:] for key in ARRAYS}
+    except DataError:
+        if (out / FILE_NAME).exists():
+            refuse_older(read_manifest(out), out)
+        raise
     if attributes["config_hash"] != config.simulation_hash():
         raise DataError(
             f"{path}: must be of configuration {config.simulation_hash()}, "

@@ -18,9 +18,9 @@ from drakegrasp.dataset.assembly.weights import effective_number
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.hdf5 import open_hdf5, read_names, read_texts
 from drakegrasp.dataset.layout.opening import open_samples, open_trials, read_codes
-from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.manifest import read_manifest, refuse_older
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRIALS_FILE
-from drakegrasp.dataset.schema import SPLITS
+from drakegrasp.dataset.schema import SCHEMA_VERSION, SPLITS
 from drakegrasp.dataset.shards import read_trials
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome
@@ -102,8 +102,10 @@ def is_assembled(out: Path, *, verify_shards: bool = False, execute: Executor = 
     Raises:
         DataError: If a file has values that lie elsewhere, or a shard is missing.
     """
+    # The signature of an older schema was of other keys.
     manifest = read_manifest(out)
-    expected = {"signature": manifest.signature()}
+    older = manifest.schema_version < SCHEMA_VERSION
+    expected = {} if older else {"signature": manifest.signature()}
     if verify_shards:
         expected["shards"] = shards_sha256(out, manifest, execute)
     try:
@@ -149,6 +151,7 @@ def count_unfinished(out: Path) -> Unfinished | None:
 
     # Add up the outcomes and words of the shards that exist.
     manifest = read_manifest(out)
+    refuse_older(manifest, out)
     names = [entry.name for entry in manifest.objects]
     rows = {name: i for i, name in enumerate(names)}
     outcomes, done = np.zeros((len(names), 1 + max(Outcome)), dtype=np.int64), 0

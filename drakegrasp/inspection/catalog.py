@@ -31,6 +31,7 @@ from drakegrasp.dataset.paths import (
     model_path,
 )
 from drakegrasp.dataset.rejections import AttemptKey
+from drakegrasp.dataset.schema import SCHEMA_VERSION
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.errors import DataError
 from drakegrasp.inspection.table import (
@@ -318,7 +319,9 @@ def _other_manifest(out: Path, signature: str) -> Manifest | None:
         manifest = read_manifest(out)
     except DataError:
         return None  # the files are all that there is
-    return None if manifest.signature() == signature else manifest
+    # No build goes on with an older schema.
+    same = manifest.schema_version < SCHEMA_VERSION or manifest.signature() == signature
+    return None if same else manifest
 
 
 def _count_newer(state: Snapshot, manifest: Manifest) -> int:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.hdf5 import open_hdf5
+from drakegrasp.dataset.layout.opening import read_cell
 from drakegrasp.dataset.paths import DATA_FILES, shards_folder
 from drakegrasp.dataset.schema import CERTIFICATE_FIELDS, SPLITS, TRIAL_FIELDS
 from drakegrasp.dataset.shards import ASSEMBLED_FIELDS
@@ -27,6 +28,7 @@ from drakegrasp.visualization.style import HIDDEN
 THUMBNAIL = ("X_TO", "X_OG", "X_C0C", "closed_p_OQ", "closed_nhat_Q_O")
 #: Length of the arrows along the normals [m].
 ARROW = 0.03
+_FIELDS = {field.name: field for field in TRIAL_FIELDS}
 _CAMERA_POSES = {"oto": camera_pose_oto, "otm": camera_pose_otm}
 
 
@@ -86,7 +88,7 @@ def read_rows(
                 if not snapshot.assembled and not _is_shard_of(snapshot, i, files[number]):
                     raise ValueError(f"{snapshot.sources[number]} is of another mesh")
             trials = files[number]["trials"]
-            rows.append({name: np.asarray(trials[name][table.row[i]]) for name in columns})
+            rows.append({name: read_cell(trials, _FIELDS[name], table.row[i]) for name in columns})
     except (OSError, KeyError, ValueError, IndexError) as error:
         raise DataError(f"{snapshot.out}: files have changed meanwhile ({error})") from None
     finally:

@@ -26,7 +26,7 @@ from drakegrasp.dataset.checks.object_files import ObjectFound, check_object, ob
 from drakegrasp.dataset.checks.open_file import OpenFile, open_file
 from drakegrasp.dataset.checks.trials_file import check_trials_file
 from drakegrasp.dataset.hdf5 import open_hdf5
-from drakegrasp.dataset.manifest import Manifest, read_manifest
+from drakegrasp.dataset.manifest import Manifest, read_manifest, refuse_older
 from drakegrasp.dataset.paths import CARD_FILES, DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.schema import CAMERAS, refuse_other_schema
 from drakegrasp.errors import DataError, first_line
@@ -94,6 +94,7 @@ def _check_directory(
     """Check the files of a dataset, each with its objects, its shards and the other files."""
     # Open the files; the trials come under the camera "".
     manifest = read_manifest(out)
+    refuse_older(manifest, out)
     files = _open_files(out, stack, findings)
     rows = sum(map(_rows, files.values()))
     findings.add(consistency.same_configuration(files.values(), manifest))

@@ -24,7 +24,7 @@ from drakegrasp.dataset.layout.attributes import (
     attribute_mistakes,
 )
 from drakegrasp.dataset.layout.structure import DATA_TABLES, TRIAL_TABLES, Tables, differences
-from drakegrasp.dataset.schema import TRIAL_FIELDS, refuse_other_schema
+from drakegrasp.dataset.schema import READABLE, TRIAL_FIELDS, Field, refuse_other_schema
 from drakegrasp.errors import DataError, first_line, printable
 from drakegrasp.outcomes import Outcome
 
@@ -170,13 +170,21 @@ def read_trial(file: h5py.File, trial_id: int) -> dict[str, npt.NDArray[Any]]:
     count = len(trials["outcome"])
     if not 0 <= trial_id < count:
         raise DataError(f"{file.filename}: trial must be 0 to {count - 1}, got {trial_id}")
-    # Fields without a value in older files are scalars.
-    row = {
-        f.name: np.asarray(trials[f.name][trial_id] if f.name in trials else f.empty(1, {})[0])
-        for f in TRIAL_FIELDS
-    }
+    row = {f.name: read_cell(trials, f, trial_id) for f in TRIAL_FIELDS}
     refuse_other_codes(Path(file.filename), "/trials/outcome", row["outcome"][None], list(Outcome))
     return row
+
+
+def read_cell(trials: h5py.Group, field: Field, row: int) -> npt.NDArray[Any]:
+    """Return a value of a row of /trials: NaN or 0 if it is newer than the file.
+
+    Raises:
+        KeyError: If a field is missing that every file has.
+    """
+    # Fields that older files lack are scalars.
+    if field.since > min(READABLE) and field.name not in trials:
+        return np.asarray(field.empty(1, {})[0])
+    return np.asarray(trials[field.name][row])
 
 
 def object_name(file: h5py.File, row: Mapping[str, npt.NDArray[Any]]) -> str:
