@@ -30,7 +30,7 @@ from drakegrasp.errors import ConfigError, GraspError, MeshError
 from drakegrasp.frames import as_numbers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import with_hand_defaults
-from drakegrasp.objects.builtin.catalog import builtin_sources
+from drakegrasp.objects.builtin.catalog import builtin_sources, draw_builtin
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.runtime.environment import available_cores
 from drakegrasp.runtime.executor import run_here
@@ -155,6 +155,8 @@ def build_on(
         MachineError: If a worker would give other results than this machine.
     """
     refuse_two_ends(config)
+    known = draw_builtin(config.builtin) if sources is None else sources
+    _refuse_unknown(only, [each.name for each in known])
     config = with_hand_defaults(config)
     with build_lock(out) as dead, ExitStack() as stack:
         # A directory that cannot be used is refused before workers start.
@@ -166,26 +168,24 @@ def build_on(
         if sources is None:
             with progress_bar("objects", "meshes", show=show) as report:
                 sources = builtin_sources(out / BUILTIN_FOLDER, config.builtin, report)
-        sources = _chosen(sources, only)
+        sources = [source for source in sources if not only or source.name in only]
 
         execute = DaskExecutor(client, resubmissions=RESUBMISSIONS)
         execute.pool.kernel = kernel
         return build_locked(sources, out, config, execute, dead=dead, pool=execute.pool, show=show)
 
 
-def _chosen(sources: Sequence[MeshSource], only: Sequence[str]) -> list[MeshSource]:
-    """Return the meshes of the named objects; all if none is named.
+def _refuse_unknown(only: Sequence[str], names: Sequence[str]) -> None:
+    """Refuse a name that is not among those of the objects.
 
     Raises:
-        MeshError: If there is no object of a name.
+        MeshError: If there is one.
     """
-    names = [source.name for source in sources]
     unknown = [name for name in only if name not in names]
     if unknown:
         more = ", ..." * (len(names) > NAMED)
         known = f"{', '.join(names[:NAMED])}{more}"
         raise MeshError(f"only must be names of objects ({known}), got {unknown[0]!r}")
-    return [source for source in sources if not only or source.name in only]
 
 
 def verify_grasp(

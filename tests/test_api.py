@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from distributed import Client
 
-from drakegrasp.api import verify_grasp, verify_grasps
+from drakegrasp.api import build_on, verify_grasp, verify_grasps
 from drakegrasp.cluster.connect import connect
-from drakegrasp.config import load_config
+from drakegrasp.config import Config, load_config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import ConfigError, GraspError, MeshError
+from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.progress import silent
 from drakegrasp.simulation.placement import PlacedObject, place_object
@@ -206,3 +210,19 @@ def test_other_mass_than_the_datasets_is_refused(test_split: GraspDataset) -> No
             dataset=test_split,
             config=load_config(overrides=["objects.mass=2"]),
         )
+
+
+@pytest.mark.parametrize("objects", [True, False], ids=["files", "builtin"])
+def test_unknown_object_is_refused_before_anything_starts(
+    small_meshes: Path, tmp_path: Path, objects: bool
+) -> None:
+    sources = find_meshes(small_meshes) if objects else None
+    with pytest.raises(MeshError, match=r"only must be names of objects \(.*\), got '9_cup'"):
+        build_on(_never(), sources, tmp_path / "out", Config(), only=["9_cup"])
+    assert not (tmp_path / "out").exists()
+
+
+@contextmanager
+def _never() -> Iterator[Client]:
+    pytest.fail("a cluster was started")
+    yield

@@ -205,8 +205,9 @@ def _build(
 
     # Simulate the work units that are not done; killed workers leave temporary files.
     with progress_bar("simulate", "attempts", show=job.show) as report:
-        counts, manifest = _run_all(manifest, job, report)
+        counts, manifest, target = _run_all(manifest, job, report)
     write_manifest(manifest, out)
+    notices += [] if target is None else target.shortfall()
     if job.pool is not None:
         sweep_temporary(out)
 
@@ -348,11 +349,14 @@ def _known_entry(
     return None
 
 
-def _run_all(manifest: Manifest, job: _Job, report: Report) -> tuple[Counts, Manifest]:
+def _run_all(
+    manifest: Manifest, job: _Job, report: Report
+) -> tuple[Counts, Manifest, Target | None]:
     """Run the work units that are not done.
 
     Returns:
-        The counts of all, and the manifest with how far a target of samples was met.
+        The counts of all, the manifest with how many palm poses a target of samples took, and the
+        target.
     """
     every = replace(manifest, objects=tuple(replace(e, tried=None) for e in manifest.objects))
     counts = Counts(every, job.pool, report)
@@ -374,7 +378,7 @@ def _run_all(manifest: Manifest, job: _Job, report: Report) -> tuple[Counts, Man
         # An object may have enough grasps by the time that there is room for its next unit.
         headers = (h for h in every.headers() if counts.needs(h) and h not in done)
         _run_units(headers, every, job, counts, None)
-        return counts, every
+        return counts, every, None
 
     # Round after round until the target is met.
     while (plan := target.plan())[2]:
@@ -384,7 +388,7 @@ def _run_all(manifest: Manifest, job: _Job, report: Report) -> tuple[Counts, Man
         replace(entry, tried=_tried(by_object.get(entry.name, ())[: taken.get(entry.name, 0)]))
         for entry in every.objects
     )
-    return counts, replace(every, objects=objects)
+    return counts, replace(every, objects=objects), target
 
 
 def _tried(units: Sequence[ShardHeader]) -> int:

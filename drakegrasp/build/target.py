@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import takewhile
 
+from drakegrasp.build.counts import NAMED
 from drakegrasp.config import Config
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.errors import ConfigError
@@ -86,6 +87,29 @@ class Target:
                 return
             ahead.add(free[0])
             yield free[0]
+
+    def shortfall(self) -> list[str]:
+        """Return what a target that has been run could not give, in words; empty if it is met."""
+        taken, counts, _ = self.plan()
+        total, lines = sum(counts.values()), list[str]()
+        if self.samples is not None and total >= self.samples:
+            return lines
+        if self.samples is not None and self.per_object is None:
+            lines.append(f"{total:,} samples were found of {self.samples:,}")
+
+        # Each object ended at its last palm pose, or after many in vain.
+        short = [n for n in self.units if self.per_object is None or counts[n] < self.per_object]
+        vain = [n for n in short if self._in_vain(self.units[n][: taken[n]]) >= self.patience]
+        spent = [n for n in short if n not in vain and taken[n] == len(self.units[n])]
+        for names, why in (
+            (vain, f"given up after {self.patience} palm poses without a sample"),
+            (spent, "all palm poses were tried, --candidates allows more"),
+        ):
+            if names:
+                said = ", ".join(f"{name} ({counts[name]:,})" for name in names[:NAMED])
+                more = f" and {len(names) - NAMED:,} more" if len(names) > NAMED else ""
+                lines.append(f"too few samples, {why}: {said}{more}")
+        return lines
 
     def _active(self, taken: Mapping[str, int], counts: Mapping[str, int]) -> list[str]:
         """Return the objects that take part in the next round, given their units and samples."""

@@ -132,6 +132,7 @@ def print_stats(out: Path) -> None:
 
     from drakegrasp.cli.tables import (
         WIDTH,
+        barren_lines,
         funnel_table,
         hold_table,
         make_console,
@@ -161,6 +162,8 @@ def print_stats(out: Path) -> None:
         splits = count_splits(out)
         console.print(split_table(splits))
         say(split_line(split_rule_of(out / DATA_FILES["oto"]), funnel, splits))
+        for line in barren_lines(funnel):
+            say(line)
         samples = {row.split: row.samples for row in splits}
         if any(samples.values()) and not samples["train"]:
             say(

@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from drakegrasp.dataset.filters import Removal
-from drakegrasp.dataset.statistics import Funnel, SplitCount, Unfinished, held_note
+from drakegrasp.dataset.statistics import Funnel, SplitCount, Unfinished, held_note, why_no_samples
 from drakegrasp.errors import printable
 from drakegrasp.objects.audit import AuditRow
 from drakegrasp.objects.memory import needed_limit
@@ -50,6 +50,8 @@ _COMPACT_HEADS = {
 }
 
 
+#: Objects without samples of which it is said why.
+BARREN = 10
 #: Width of a terminal from which the audit has all of its columns [characters].
 ROOMY = 110
 #: Width of the console where standard output is not a terminal [characters]: tables fit always.
@@ -155,6 +157,13 @@ def split_line(rule: str, funnel: Funnel, counts: Sequence[SplitCount]) -> str:
     return (
         f"split by {rule}: {total:,} objects with samples, {objects['test']:,} of them test{valid}"
     )
+
+
+def barren_lines(funnel: Funnel) -> list[str]:
+    """Return why objects have no sample, a line for each of the first and one for the others."""
+    why = [f"no sample of {_safe(name)}: {text}" for name, text in why_no_samples(funnel).items()]
+    more = [f"no sample of {len(why) - BARREN:,} other objects"] if len(why) > BARREN else []
+    return why[:BARREN] + more
 
 
 def unfinished_line(unfinished: Unfinished) -> str:

@@ -23,7 +23,7 @@ from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRI
 from drakegrasp.dataset.schema import SCHEMA_VERSION, SPLITS
 from drakegrasp.dataset.shards import read_trials
 from drakegrasp.errors import DataError
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.runtime.executor import Executor, run_here
 
 #: Rows that are read at a time.
@@ -243,6 +243,29 @@ def funnel_of(path: Path) -> Funnel:
         removals=_count_pairs(owner[~born], removal[~born], count, 1 + max(Removal)),
         refined=refined,
     )
+
+
+def why_no_samples(funnel: Funnel) -> dict[str, str]:
+    """Return how far the attempts came of each object that has no sample, by its name."""
+    kept = funnel.removals[:, Removal.KEPT] + funnel.refined[:, 2]
+    return {funnel.names[i]: _furthest(funnel, i) for i in np.flatnonzero(kept == 0).tolist()}
+
+
+def _furthest(funnel: Funnel, i: int) -> str:
+    """Return in words where the attempts at object i end that come furthest."""
+    by = {outcome: int(funnel.outcomes[i, outcome]) for outcome in Outcome}
+    held, lifted = by[Outcome.SUCCESS], sum(by[o] for o in Outcome if o.stage is Stage.LIFTED)
+    closed = sum(by[o] for o in Outcome if o.stage is Stage.CLOSED)
+    if held:
+        reason = Removal(int(np.argmax(funnel.removals[i])))
+        return f"{held:,} held, none a sample: mostly {reason.label}"
+    if lifted:
+        return f"always lost: {lifted:,} lifts, none held"
+    if closed:
+        return f"never gripped: the hand closed {closed:,} times, never with fingertips alone"
+    if by[Outcome.START_COLLISION] > by[Outcome.SCREENED]:
+        return "never reached, the open hand collides: too flat or too large for it"
+    return "never reached: no palm pose from which all fingertips meet it"
 
 
 def held_note(funnel: Funnel) -> str:

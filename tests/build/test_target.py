@@ -6,8 +6,10 @@ from itertools import pairwise
 
 import pytest
 
-from drakegrasp.build.target import Target
+from drakegrasp.build.target import Target, refuse_two_ends
+from drakegrasp.config import Config
 from drakegrasp.dataset.shards import ShardHeader
+from drakegrasp.errors import ConfigError
 
 
 def units(name: str, count: int) -> list[ShardHeader]:
@@ -102,3 +104,31 @@ def test_a_smaller_target_is_part_of_a_larger_one() -> None:
     reached = [run(make_target(samples))[0] for samples in range(1, 120, 7)]
     for fewer, more in pairwise(reached):
         assert all(fewer[name] <= more[name] for name in YIELDS)
+
+
+def test_target_that_is_met_lacks_nothing() -> None:
+    target = make_target(40)
+    run(target)
+    assert target.shortfall() == []
+
+
+def test_shortfall_names_what_was_tried_to_its_end() -> None:
+    """The short object has two units; the barren one is given up after ten of its fifty."""
+    target = make_target(None, per_object=5, patience=10)
+    run(target)
+    assert target.shortfall() == [
+        "too few samples, given up after 10 palm poses without a sample: barren (0)",
+        "too few samples, all palm poses were tried, --candidates allows more: short (3)",
+    ]
+
+
+def test_shortfall_tells_how_many_there_are_of_a_total() -> None:
+    target = make_target(1000)
+    run(target)
+    assert target.shortfall()[0] == "228 samples were found of 1,000"
+
+
+def test_grasps_and_samples_are_not_both_an_end() -> None:
+    refuse_two_ends(Config(max_grasps=3))
+    with pytest.raises(ConfigError, match="max_grasps must be null with samples"):
+        refuse_two_ends(Config(max_grasps=3, samples_per_object=2))

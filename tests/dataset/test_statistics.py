@@ -5,11 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 
 import h5py
+import pytest
 from helpers.datasets import SLIPPED, SUCCESS, TRIALS, change
 
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.filters import Removal
-from drakegrasp.dataset.statistics import count_funnel, count_splits, count_unfinished
+from drakegrasp.dataset.statistics import (
+    count_funnel,
+    count_splits,
+    count_unfinished,
+    why_no_samples,
+)
 from drakegrasp.outcomes import Outcome
 
 
@@ -66,3 +72,25 @@ def test_splits_are_counted(out: Path) -> None:
     assert counts["test"] == (6, 2, 2)
     assert counts["train"][0] + counts["valid"][0] == 3
     assert counts["train"][1:] == counts["valid"][1:] == (1, 1)
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "removals", "why"),
+    [
+        ({Outcome.START_COLLISION: 8, Outcome.SCREENED: 2}, {}, "never reached, the open hand"),
+        ({Outcome.START_COLLISION: 2, Outcome.SCREENED: 8}, {}, "never reached: no palm pose"),
+        ({Outcome.SCREENED: 9, Outcome.HAND_CONTACT: 1}, {}, "never gripped: the hand closed 1 "),
+        ({Outcome.HAND_CONTACT: 9, Outcome.MOVED: 3}, {}, "always lost: 3 lifts"),
+        ({Outcome.DROPPED: 9, Outcome.SUCCESS: 2}, {Removal.TURNED: 2}, "2 held, none a sample"),
+    ],
+)
+def test_object_without_samples_says_how_far_it_came(
+    sound: Path, outcomes: dict[Outcome, int], removals: dict[Removal, int], why: str
+) -> None:
+    funnel = count_funnel(sound)
+    assert not why_no_samples(funnel)
+    for counts, row in ((funnel.outcomes, outcomes), (funnel.removals, removals)):
+        counts[1] = 0
+        counts[1, list(row)] = list(row.values())
+    assert list(why_no_samples(funnel)) == [funnel.names[1]]
+    assert why_no_samples(funnel)[funnel.names[1]].startswith(why)
