@@ -2,10 +2,13 @@
 
     python pipelines/measurements/attempts_again.py OUT MESHES --units cm --count 1000
     python pipelines/measurements/attempts_again.py OUT MESHES --set physics.time_step=0.004
+    python pipelines/measurements/attempts_again.py OUT MESHES --lifts 9 --set lift.stop_when=never
 
-OUT may be of an older schema: resting poses X_TO and palm poses X_OG are those of its files, and
-the objects are prepared anew from their meshes. Prints JSON: CPU seconds, and how many labels are
-others than the stored ones; attempts that geometry alone decided are left out.
+`--lifts N` takes N samples and N lifts that gave none. OUT may be of an older schema: resting poses
+X_TO and palm poses X_OG are those of its files, and the objects are prepared anew from their
+meshes. Prints JSON: CPU seconds; how many labels are others than the stored ones; of the grasps
+that are samples then and now, what was measured. Attempts that geometry alone decided are left out,
+and so are the image filters: a sample here is a grasp that passed the filters of the hold.
 """
 
 from __future__ import annotations
@@ -24,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.build.prepare import prepare
-from drakegrasp.config import override_config
+from drakegrasp.config import FilterConfig, override_config
 from drakegrasp.dataset.filters import breaks_hold
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import TRIALS_FILE
@@ -39,18 +42,38 @@ from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.trial import run_attempt
 
-#: Columns of the stored attempts.
-COLUMNS = ("object", "outcome", "X_TO", "X_OG", "spread", "lifted_other_links", "slip", "turn")
+QUANTILES = (0.1, 0.5, 0.9)
+#: Columns that say what a lift is, and all that are read.
+HOLD = ("outcome", "lifted_other_links", "slip", "turn")
+COLUMNS = ("object", "X_TO", "X_OG", "spread", "lifted_f_Q_O", *HOLD)
 
 
-def stored_attempts(out: Path, count: int) -> tuple[dict[str, npt.NDArray[Any]], list[str]]:
-    """Return columns of `count` simulated attempts, drawn by seed 0, and the objects' names."""
+def stored_attempts(
+    out: Path, count: int, lifts: int, filters: FilterConfig
+) -> tuple[dict[str, npt.NDArray[Any]], list[str]]:
+    """Return columns of simulated attempts, drawn by seed 0, and the objects' names.
+
+    Args:
+        out: Directory of a dataset.
+        count: Number of attempts, if `lifts` is 0.
+        lifts: Number of samples, and of other lifts.
+        filters: What a sample is.
+    """
     with h5py.File(out / TRIALS_FILE) as file:
-        simulated = np.flatnonzero(np.isfinite(file["trials/time_close"][()]))
-        order = np.array(Stream(0).permutation(len(simulated)))
-        rows = np.sort(simulated[order[:count]])
-        columns = {name: file["trials"][name][()][rows] for name in COLUMNS}
+        trials = file["trials"]
+        simulated = np.isfinite(trials["time_close"][()])
+        groups = [(simulated, count)]
+        if lifts:
+            sample = _is_sample({name: trials[name][()] for name in HOLD}, filters)
+            lifted = np.isfinite(trials["slip"][()])
+            groups = [(sample, lifts), (lifted & ~sample, lifts)]
+        rows = np.sort(np.concatenate([_drawn(np.flatnonzero(g), n) for g, n in groups]))
+        columns = {name: trials[name][()][rows] for name in COLUMNS}
         return columns, list(file["objects/name"].asstr()[()])
+
+
+def _drawn(rows: npt.NDArray[np.int64], count: int) -> npt.NDArray[np.int64]:
+    return rows[np.array(Stream(0).permutation(len(rows)), dtype=np.int64)[:count]]
 
 
 @one_thread
@@ -61,18 +84,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("meshes", type=Path, help="directory of its meshes")
     parser.add_argument("--units", default="m", choices=("m", "cm", "mm"))
     parser.add_argument("--count", type=int, default=1000, help="attempts (default: 1000)")
+    parser.add_argument("--lifts", type=int, default=0, help="this many samples and other lifts")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings")
     arguments = parser.parse_args(argv)
 
     # The attempts as they are stored, and each object as this version prepares it.
     config = override_config(read_manifest(arguments.dataset).config, arguments.settings)
-    columns, names = stored_attempts(arguments.dataset, arguments.count)
+    columns, names = stored_attempts(
+        arguments.dataset, arguments.count, arguments.lifts, config.filters
+    )
     sources = {s.name: s for s in find_meshes(arguments.meshes, units=arguments.units)}
     kept = {
         "then": _is_sample(columns, config.filters),
         "now": np.zeros(len(columns["outcome"]), dtype=bool),
     }
     outcomes, seconds = np.zeros(len(kept["now"]), dtype=int), 0.0
+    measured = _measured(columns["slip"], columns["turn"], columns["lifted_f_Q_O"])
+    again = {name: np.full(len(values), np.nan) for name, values in measured.items()}
     with progress_bar("Attempts", "attempt") as report:
         done = 0
         for number in np.unique(columns["object"]):
@@ -95,11 +123,15 @@ def main(argv: Sequence[str] | None = None) -> int:
                         "turn": [record.turn],
                     }
                     kept["now"][i] = _is_sample(row, config.filters)[0]
+                    values = _measured(record.slip, record.turn, record.lifted.f_Q_O)
+                    for name, value in values.items():
+                        again[name][i] = value
                 report(done := done + 1, len(outcomes))
 
     # What changed.
     pairs = zip(columns["outcome"].tolist(), outcomes.tolist(), strict=True)
     changed = Counter(f"{Outcome(a).label} -> {Outcome(b).label}" for a, b in pairs if a != b)
+    both = kept["then"] & kept["now"]
     held = [columns["outcome"] == Outcome.SUCCESS, outcomes == Outcome.SUCCESS]
     result = {
         "settings": arguments.settings,
@@ -109,16 +141,35 @@ def main(argv: Sequence[str] | None = None) -> int:
         "held": _counts(*held),
         "sample": _counts(kept["then"], kept["now"]),
         "changed": dict(changed.most_common()),
+        "of_samples_10_50_90_percent": {
+            name: {
+                "then": np.quantile(then[both], QUANTILES).round(2).tolist(),
+                "now": np.quantile(again[name][both], QUANTILES).round(2).tolist(),
+                "difference": np.quantile(again[name][both] - then[both], QUANTILES)
+                .round(2)
+                .tolist(),
+            }
+            for name, then in measured.items()
+            if both.any()
+        },
     }
     sys.stdout.write(json.dumps(result, indent=1) + "\n")
     return 0
 
 
-def _is_sample(columns: Any, filters: Any) -> npt.NDArray[np.bool_]:
+def _is_sample(columns: Any, filters: FilterConfig) -> npt.NDArray[np.bool_]:
     """Return whether attempts are held, and the filters of the hold keep them."""
     held = np.asarray(columns["outcome"]) == Outcome.SUCCESS
     limits = breaks_hold(filters, *(columns[k] for k in ("lifted_other_links", "slip", "turn")))
     return np.asarray(held & ~np.any([broken for _, broken in limits], axis=0))
+
+
+def _measured(
+    slip: npt.ArrayLike, turn: npt.ArrayLike, f_Q_O: npt.ArrayLike
+) -> dict[str, npt.NDArray[np.float64]]:
+    """Return slip [mm], turn [deg] and the sum of the fingertips' forces [N] of lifts."""
+    forces = np.linalg.norm(f_Q_O, axis=-1).sum(axis=-1)
+    return {"slip": 1e3 * np.asarray(slip), "turn": np.rad2deg(turn), "force": forces}
 
 
 def _counts(then: npt.NDArray[np.bool_], now: npt.NDArray[np.bool_]) -> dict[str, int]:

@@ -22,7 +22,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.build.attempts import list_attempts
+from drakegrasp.build.attempts import find_attempt
 from drakegrasp.config import Config, override_config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import TRIALS_FILE
@@ -68,27 +68,26 @@ def lift_again(
     fingers = tuple(replace(finger, holding_torque=UNLIMITED) for finger in hand.fingers)
     strong = replace(hand, fingers=fingers)
     with h5py.File(dataset / TRIALS_FILE) as file:
-        keys = ("object", "candidate", "standoff_index")
+        keys = ("object", "candidate", "standoff_index", "child")
         place = {key: file["trials"][key][()][rows] for key in keys}
         names = file["objects/name"].asstr()[()]
 
     for index in np.unique(place["object"]):
-        # The scenes and attempts of one object.
+        # The scenes of one object.
         prepared = load_prepared(dataset, names[index], config)
         scene, unlimited = (
             build_scene(prepared.model, other.physics, each) for each in (hand, strong)
         )
-        count = range(len(prepared.candidates))
-        made = list_attempts(prepared, count, rules)
-        attempts = {(a.candidate, a.standoff_index): a for a in made}
 
         # Its lifts again.
         for i in np.flatnonzero(place["object"] == index):
-            attempt = attempts[place["candidate"][i], place["standoff_index"][i]]
-            record = run_attempt(scene, prepared.X_TO, attempt, other)
+            candidate, standoff, child = (int(place[key][i]) for key in keys[1:])
+            attempt = find_attempt(prepared, candidate, standoff, child, rules)
+            X_TO = prepared.resting_poses[attempt.resting]
+            record = run_attempt(scene, X_TO, attempt, other)
             angle = strong_angle = opening(hand, record)
             if angle > OPENED:
-                again = run_attempt(unlimited, prepared.X_TO, attempt, other)
+                again = run_attempt(unlimited, X_TO, attempt, other)
                 strong_angle = opening(hand, again)
             report(int(i) + 1, len(rows))
             yield record, angle, strong_angle
