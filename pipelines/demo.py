@@ -1,4 +1,4 @@
-"""Build a small dataset of six built-in objects in a minute or less and show its contents.
+"""Build a small dataset of six built-in objects in less than a minute and show its contents.
 
 Writes DIR/meshes (the objects), DIR/dataset (the dataset) and DIR/contact_sheet.png. The
 same command continues an interrupted build.
