@@ -23,7 +23,7 @@ from drakegrasp.config import Config
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.hdf5 import read_names
 from drakegrasp.dataset.layout.opening import open_trials, read_codes
-from drakegrasp.dataset.manifest import installed_versions, read_manifest
+from drakegrasp.dataset.manifest import installed_versions, read_manifest, refuse_older
 from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.errors import DataError
@@ -59,6 +59,7 @@ class StoredLift:
         object_name: Its object.
         group: What it is in the dataset.
         outcome: Its verdict there.
+        resting: Index of the object's resting pose.
         pregrasp: The palm pose and the spread from which the hand closed.
         materials: The friction and mass with which it was tried.
     """
@@ -67,6 +68,7 @@ class StoredLift:
     object_name: str
     group: Group
     outcome: Outcome
+    resting: int
     pregrasp: Pregrasp
     materials: Materials
 
@@ -83,7 +85,9 @@ def draw_lifts(out: Path, count: int) -> list[StoredLift]:
     Raises:
         DataError: If there is no dataset, or no lift in it.
     """
-    seed = read_manifest(out).config.seed
+    manifest = read_manifest(out)
+    refuse_older(manifest, out)
+    seed = manifest.config.seed
     lifts = _read_lifts(out)
     if not lifts:
         raise DataError(f"{out}: must be a dataset with lifts, got one in which nothing was lifted")
@@ -114,14 +118,15 @@ def cross_check(out: Path, count: int, *, progress: Report = silent) -> dict[str
         DataError: If there is no dataset, or no lift in it, or its objects are damaged.
         ConfigError: If the dataset's hand cannot have its drive.
     """
-    config = read_manifest(out).config
+    manifest = read_manifest(out)
+    config = manifest.config
     lifts = draw_lifts(out, count)
     rows: list[dict[str, Any]] = []
 
     # An object is cut into convex parts once.
     progress(0, len(lifts))
     for name, same in groupby(sorted(lifts, key=_by_object), key=lambda lift: lift.object_name):
-        for row in _try_object(out, name, list(same), config):
+        for row in _try_object(out, name, list(same), manifest.config_of(name)):
             rows.append(row)
             progress(len(rows), len(lifts), held=sum(_holds(row) for row in rows))
 
@@ -193,7 +198,7 @@ def _read_lifts(out: Path) -> list[StoredLift]:
         names = read_names(file["objects/name"])
         objects = read_codes(trials["object"], len(names))
         outcomes = read_codes(trials["outcome"], list(Outcome))
-        X_OG, spreads = trials["X_OG"][:], trials["spread"][:]
+        X_OG, spreads, resting = (trials[name][:] for name in ("X_OG", "spread", "resting"))
         materials = {f.name: trials[f.name][:] for f in fields(Materials)}
         # Only what was lifted has the time of a lift.
         lifted = np.isfinite(trials["time_lift"][:])
@@ -210,6 +215,7 @@ def _read_lifts(out: Path) -> list[StoredLift]:
                 object_name=names[objects[row]],
                 group=held if outcome is Outcome.SUCCESS else "lost",
                 outcome=outcome,
+                resting=int(resting[row]),
                 pregrasp=Pregrasp(X_OG=unpack_pose(X_OG[row]), spread=float(spreads[row])),
                 materials=Materials(**{k: float(v[row]) for k, v in materials.items()}),
             )
@@ -235,6 +241,7 @@ def _try_object(
     peer = MujocoBaseline(prepared.model, prepared.X_TO, config)
     usual = usual_conditions(prepared.model, config.physics)
     for lift in lifts:
+        peer.place(prepared.resting_poses[lift.resting])
         conditions = replace(usual, materials=lift.materials)
         trial = peer.run(replace(lift.pregrasp, conditions=conditions))
         yield {

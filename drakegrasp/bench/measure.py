@@ -221,6 +221,7 @@ def _run_baseline(
         baseline = MujocoBaseline(prepared.model, prepared.X_TO, config)
     outcomes: Counter[str] = Counter()
     for attempt in attempts:
+        baseline.place(prepared.resting_poses[attempt.resting])
         with _cpu_timed(seconds, "try"):
             outcome = baseline.run(attempt).outcome
         outcomes[outcome.label] += 1

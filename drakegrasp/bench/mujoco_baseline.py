@@ -93,7 +93,7 @@ class MujocoBaseline:
         """
         self._config, self._hand = config, load_hand(config.hand)
         self._usual = usual_materials(model, config.physics)
-        self._X_WO = X_WT @ X_TO
+        self.place(X_TO)
         scene = build_mujoco_scene(model, self._hand, config)
         self.parts, self._spreads = scene.parts, scene.spreads
         self._model, self._data = scene.model, mujoco.MjData(scene.model)
@@ -137,6 +137,10 @@ class MujocoBaseline:
         self._object_inertia = m.dof_M0[self._object_v].copy()
         m.geom_friction[:] = pair_friction(materials.friction_hand)
         m.geom_friction[self._table] = pair_friction(materials.friction_table)
+
+    def place(self, X_TO: Array) -> None:
+        """Let the object rest in a pose (4, 4) from the next attempt on."""
+        self._X_WO = X_WT @ X_TO
 
     def run(self, attempt: Pregrasp) -> PeerTrial:
         """Return the result of one attempt; its fingers close from the open hand."""

@@ -117,6 +117,31 @@ def assemble(out: Path, reject: Path | None, overrides: tuple[str, ...], workers
 
 
 @click.command()
+@click.argument("into", type=PathType(path_type=Path))
+@click.argument(
+    "outs",
+    type=PathType(path_type=Path, exists=True, file_okay=False),
+    metavar="OUT OUT...",
+    nargs=-1,
+    required=True,
+)
+@processes_option
+def merge(into: Path, outs: tuple[Path, ...], workers: int) -> None:
+    """Make one dataset of several, in the new directory INTO.
+
+    Each OUT is the directory of a dataset: of other objects, or of the same objects under another
+    seed. What two of them hold is taken once. Configurations, hands and versions must be equal.
+    """
+    from drakegrasp.dataset.merge import merge as merge_files
+    from drakegrasp.runtime.executor import processes
+    from drakegrasp.runtime.progress import progress_bar
+
+    with processes(workers) as execute, progress_bar("merge", "tasks") as progress:
+        merge_files(into, outs, execute=execute, progress=progress)
+    print_stats(into)
+
+
+@click.command()
 @out_argument
 def stats(out: Path) -> None:
     """Count outcomes, how well grasps hold, and samples.

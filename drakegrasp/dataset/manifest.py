@@ -114,6 +114,7 @@ class ObjectEntry:
         licence: Identifier of the mesh's licence; None: not stated.
         tried: Number of palm poses up to which a target of samples was met; None: all.
         group: What it shares with others of the same mesh, which stay in one split; None: its name.
+        seed: With which its attempts were drawn, after a merge; None: the configuration's.
     """
 
     name: Name
@@ -134,11 +135,12 @@ class ObjectEntry:
     licence: Licence | None = None
     tried: Whole | None = None
     group: Name | None = None
+    seed: Whole | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry as JSON types, in the order of the manifest."""
         # What is not stated leaves no trace.
-        unsaid = [k for k in ("licence", "tried", "group") if getattr(self, k) is None]
+        unsaid = [k for k in ("licence", "tried", "group", "seed") if getattr(self, k) is None]
         said = {key: v for key, v in asdict(self).items() if key not in unsaid}
         return {"class" if key == "class_name" else key: v for key, v in said.items()}
 
@@ -189,18 +191,35 @@ class Manifest:
 
     def headers(self) -> Iterator[ShardHeader]:
         """Yield the work units of the dataset in the order of its rows."""
-        config_hash = self.config.simulation_hash()
+        hashes: dict[int | None, str] = {}
         for entry in self.objects:
+            if entry.seed not in hashes:
+                hashes[entry.seed] = self._config_of(entry).simulation_hash()
             for unit in self.config.unit_ranges(entry.candidates):
                 if entry.tried is not None and unit.start >= entry.tried:
                     break
                 yield ShardHeader(
-                    config_hash=config_hash,
+                    config_hash=hashes[entry.seed],
                     mesh_sha256=entry.mesh_sha256,
                     object_name=entry.name,
                     start=unit.start,
                     stop=unit.stop,
                 )
+
+    def config_of(self, name: str) -> Config:
+        """Return the configuration of an object: after a merge each may have a seed of its own.
+
+        Raises:
+            DataError: If there is no object of that name.
+        """
+        for entry in self.objects:
+            if entry.name == name:
+                return self._config_of(entry)
+        raise DataError(f"the name must be that of an object of the dataset, got {name!r}")
+
+    def _config_of(self, entry: ObjectEntry) -> Config:
+        seed = self.config.seed if entry.seed is None else entry.seed
+        return self.config.model_copy(update={"seed": seed})
 
     @property
     def units(self) -> int:
@@ -480,9 +499,14 @@ def with_postprocessing(manifest: Manifest, overrides: Sequence[str]) -> Manifes
 
 def _differences(theirs: Config, ours: Config) -> str:
     """Return the values that differ and change the simulation, in words."""
+    return ", ".join(differing_values(theirs, ours, POSTPROCESSING_KEYS))
+
+
+def differing_values(theirs: Config, ours: Config, but: Sequence[str] = ()) -> list[str]:
+    """Return each value that differs, in words, but for sections and values of some names."""
     a, b = _flatten(theirs.to_dict()), _flatten(ours.to_dict())
-    keys = [k for k in a if a[k] != b[k] and k.partition(".")[0] not in POSTPROCESSING_KEYS]
-    return ", ".join(f"{k} ({a[k]} there, {b[k]} here)" for k in keys)
+    keys = [k for k in a if a[k] != b[k] and k.partition(".")[0] not in but]
+    return [f"{k} ({a[k]} there, {b[k]} here)" for k in keys]
 
 
 def _flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -263,15 +263,19 @@ def _targets_of_rows(
         config: Of the dataset.
         in_camera: Whether the grasps are in {C}.
     """
-    # The object and the camera of each row.
+    # The object, its resting pose, and the camera of each row.
     names = dataset.column("object_props/object_name")[rows]
+    resting = dataset.column("grasp_props/resting")[rows]
     X_TC = unpack_pose(dataset.column(f"object_props/frame_work2cam_{dataset.camera}")[rows])
 
-    # Each object once, with its grasps.
-    targets = []
-    for name in dict.fromkeys(names.tolist()):
-        indices = np.flatnonzero(names == name)
-        placed = place_object(load_prepared(dataset.path.parent, name, config), config=config)
+    # Each object in each resting pose once, with its grasps.
+    targets, out = [], dataset.path.parent
+    manifest = read_manifest(out)
+    for name, k in dict.fromkeys(zip(names.tolist(), resting.tolist(), strict=True)):
+        indices = np.flatnonzero((names == name) & (resting == k))
+        prepared = load_prepared(out, name, manifest.config_of(name))
+        X_TO = prepared.resting_poses[k]
+        placed = PlacedObject(model=prepared.model, X_TO=X_TO, config=config)
         poses = read_pose(X_TC[indices], "the camera's pose") if in_camera else None
         targets.append(_Target(placed=placed, indices=indices, X_TC=poses))
     return targets

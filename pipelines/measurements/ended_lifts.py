@@ -64,7 +64,8 @@ def try_both(
         found = {}
         for name in (*rules,)[:: 1 if turn % 2 else -1]:
             start = time.process_time()
-            record = run_attempt(scene, prepared.X_TO, attempt, rules[name], prediction)
+            X_TO = prepared.resting_poses[attempt.resting]
+            record = run_attempt(scene, X_TO, attempt, rules[name], prediction)
             found[name] = record, time.process_time() - start
         yield found
 

@@ -96,22 +96,22 @@ def _largest(values: npt.NDArray[Any]) -> Array:
 
 
 def read_approaches(out: Path, number: int, name: str, config: Config) -> ObjectApproaches:
-    """Return from where an object was approached.
+    """Return from where an object was approached in its first resting pose.
 
     Args:
         out: Directory of the dataset.
         number: Of the object, row of `/objects`.
         name: Of the object.
-        config: Of the dataset.
+        config: Of the object, see `Manifest.config_of`.
 
     Raises:
         DataError: If a file is missing or damaged.
     """
-    # The attempts of the object, which are beside each other.
+    # The attempts of the object, which are beside each other. A picture shows one pose.
     prepared = load_prepared(out, name, config)
     with open_trials(out / TRIALS_FILE) as file:
         trials = file["trials"]
-        (rows,) = np.nonzero(trials["object"][:] == number)
+        (rows,) = np.nonzero((trials["object"][:] == number) & (trials["resting"][:] == 0))
         part = slice(int(rows[0]), int(rows[-1]) + 1) if len(rows) else slice(0, 0)
         own = rows - part.start
         outcome, packed, standoff, precision, stable = (

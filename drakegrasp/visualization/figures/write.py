@@ -258,7 +258,8 @@ def _approaches(data: _Dataset) -> _Drawn:
     if not shown:
         raise DataError("no attempt succeeded")
     names = data.funnel.names
-    items = [read_approaches(data.out, i, names[i], data.config) for i in shown]
+    config_of = read_manifest(data.out).config_of
+    items = [read_approaches(data.out, i, names[i], config_of(names[i])) for i in shown]
     figure = approaches_figure(items, left_out=int(np.count_nonzero(held)) - len(shown))
     numbers = {
         item.name: {
