@@ -287,12 +287,14 @@ def _furthest(funnel: Funnel, i: int) -> str:
     """Return in words where the attempts at object i end that come furthest."""
     by = {outcome: int(funnel.outcomes[i, outcome]) for outcome in Outcome}
     held, lifted = by[Outcome.SUCCESS], sum(by[o] for o in Outcome if o.stage is Stage.LIFTED)
-    closed = sum(by[o] for o in Outcome if o.stage is Stage.CLOSED)
+    closed = sum(by[o] for o in Outcome if o.stage is Stage.CLOSED) - by[Outcome.NOT_LIFTED]
     if held:
         reason = Removal(int(np.argmax(funnel.removals[i])))
         return f"{held:,} held, none a sample: mostly {reason.label}"
     if lifted:
         return f"always lost: {lifted:,} lifts, none held"
+    if by[Outcome.NOT_LIFTED]:
+        return f"never lifted: {by[Outcome.NOT_LIFTED]:,} hands that closed with a small chance"
     if closed:
         return f"never gripped: the hand closed {closed:,} times, never with fingertips alone"
     if by[Outcome.START_COLLISION] > by[Outcome.SCREENED]:

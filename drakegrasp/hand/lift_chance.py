@@ -39,7 +39,6 @@ class ClosedGrasp:
         touching: (..., k), whether each fingertip touches the object.
         p_OQ, nhat_Q_O, f_Q_O: (..., k, 3), contact points [m], unit normals out of the object, and
             forces on it [N]; NaN or 0 where not touching.
-        penetration: (..., k), largest depths of the object's surface in the fingertips [m].
         X_TO: (..., 4, 4), pose of the object.
         p_OOcm: (3,), its centre of mass [m].
         friction_hand: (...,), coefficient of friction between hand and object.
@@ -49,14 +48,13 @@ class ClosedGrasp:
     p_OQ: Array
     nhat_Q_O: Array
     f_Q_O: Array
-    penetration: Array
     X_TO: Array
     p_OOcm: Array
     friction_hand: Array
 
 
 #: The contact fields of a closed grasp, by the names of `simulation.contacts.Contacts`.
-GRASP_CONTACTS = ("touching", "p_OQ", "nhat_Q_O", "f_Q_O", "penetration")
+GRASP_CONTACTS = ("touching", "p_OQ", "nhat_Q_O", "f_Q_O")
 
 
 @dataclass(frozen=True)
@@ -123,27 +121,26 @@ def features(grasp: ClosedGrasp) -> dict[str, Array]:
     # Cosines of the angles between the normals of each two contacts.
     pairs = list(combinations(range(nhat.shape[-2]), 2))
     cosines = np.stack([dot(nhat[..., i, :], nhat[..., j, :]) for i, j in pairs], axis=-1)
+    rest = _unbalanced(on, p_PQ / np.maximum(radius, LEAST)[..., None, None], nhat, grasp)
     values = (
         norm(_total(nhat, axis=-2)) / count,
         cosines.max(axis=-1),
-        _unbalanced(on, p_PQ / np.maximum(radius, LEAST)[..., None, None], nhat, grasp),
+        rest,
+        np.sqrt(rest),
         moment / np.maximum(_total(force) * radius, LEAST),
         least / np.maximum(force.max(axis=-1), LEAST),
         norm(across),
-        radius,
-        np.where(grasp.touching, grasp.penetration, np.inf).min(axis=-1),
     )
     return dict(zip(FEATURES, values, strict=True))
 
 
 #: The features: length of the mean normal; largest cosine between two normals; what is left of the
-#: wrench of a unit of normal force, see `_unbalanced`; moment of the forces about the centre of
-#: mass, over their sum and the contacts' radius; smallest force over largest; horizontal distance
-#: of the centre of mass from the contacts' centre [m]; their root mean square radius about it [m];
-#: smallest penetration [m].
+#: wrench of a unit of normal force, see `_unbalanced`, and its root; moment of the forces about the
+#: centre of mass, over their sum and the contacts' radius; smallest force over largest; horizontal
+#: distance of the centre of mass from the contacts' centre [m].
 FEATURES = (
-    *("normal_sum", "least_opposed", "unbalanced", "moment", "evenness", "across", "radius"),
-    "penetration",
+    *("normal_sum", "least_opposed", "unbalanced", "root_unbalanced", "moment", "evenness"),
+    "across",
 )
 
 

@@ -117,6 +117,8 @@ def stages(batch: Batch) -> Iterator[Violation]:
     for f in TRIAL_FIELDS:
         values = batch[f.name]
         reached = stage >= f.stage
+
+        # What a value must be depends on its kind.
         if np.dtype(f.dtype).kind != "f":
             bad = ~reached & ~all_per_row(values == 0)
             what = f"{f.name} must be 0 before the stage {f.stage.name.lower()}"
