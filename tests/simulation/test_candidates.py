@@ -412,19 +412,15 @@ def test_children_are_drawn_about_their_parent() -> None:
 
 
 def test_one_attempt_in_ten_is_audited_whatever_is_tried_with_it() -> None:
-    """Each draws for itself: its spread does not tell, nor does that of its parent."""
-    made = attempts(range(400))
-    audited = np.array([each.audited for each in made])
-    assert audited.mean() == pytest.approx(0.1, abs=4 * np.sqrt(0.09 / len(made)))
-    assert [each.audited for each in attempts(range(30, 60))] == audited[90:180].tolist()
-    born = [
-        c.audited
-        for each in made
-        for c in children(each, RefineConfig(children=2), name="thing", seed=0)
-    ]
-    assert np.mean(born) == pytest.approx(0.1, abs=4 * np.sqrt(0.09 / len(born)))
-    both = np.mean(np.repeat(audited, 2) & born)
-    assert both == pytest.approx(0.01, abs=4 * np.sqrt(0.0099 / len(born)))
+    """A child draws for itself."""
+    rules, made, born = RefineConfig(children=1), [], []
+    for seed in range(40):
+        first = attempts(range(30), seed=seed)
+        made += [each.audited for each in first]
+        born += [children(each, rules, name="thing", seed=seed)[0].audited for each in first]
+    assert [each.audited for each in attempts(range(10, 20))] == made[30:60]
+    for audited, share in ((made, 0.1), (born, 0.1), (np.array(made) & born, 0.01)):
+        assert np.mean(audited) == pytest.approx(share, abs=4 * np.sqrt(share / len(made)))
 
 
 def test_member_of_a_family_is_found_by_its_number() -> None:

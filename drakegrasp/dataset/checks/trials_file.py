@@ -93,6 +93,7 @@ def _judge_trials(rows: Rows, findings: Findings) -> AnyArray:
         trial_rules.contacts,
         trial_rules.poses,
     ]
+    sound: list[Rule] = [trial_rules.motion]
     if objects is not None and trials.count("objects") == len(objects):
         poses = [[pose.X_TO for pose in entry.resting] for entry in objects]
         last.append(partial(trial_rules.resting_poses, X_TO=poses))
@@ -109,7 +110,7 @@ def _judge_trials(rows: Rows, findings: Findings) -> AnyArray:
         hand = dataset.manifest.config.hand
         with suppress(HandError):
             if hand_digest(hand) == dataset.manifest.versions.get("hand"):
-                last.append(
+                sound.append(
                     partial(
                         chance_rules.as_computed,
                         required=list(fingers.values()) or [True],
@@ -120,7 +121,7 @@ def _judge_trials(rows: Rows, findings: Findings) -> AnyArray:
                 )
 
     # Numbers, then stages, which need a legal outcome, then what needs finite values, then what
-    # needs sound poses.
+    # needs sound poses and contacts.
     successes = [np.zeros(0, dtype=np.int64)]
     for whole in trials.batches("trials", rows.start, rows.stop, TRIAL_ROWS, findings):
         successes.append(whole["trial_id"][whole["outcome"] == Outcome.SUCCESS])
@@ -130,5 +131,5 @@ def _judge_trials(rows: Rows, findings: Findings) -> AnyArray:
         )
         batch = trials.judge(batch, findings, trial_rules.stages)
         batch = trials.judge(batch, findings, *last)
-        trials.judge(batch, findings, trial_rules.motion)
+        trials.judge(batch, findings, *sound)
     return np.concatenate(successes)
