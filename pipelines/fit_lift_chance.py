@@ -6,7 +6,8 @@ Both are datasets of one hand and of different objects, in which all closed hand
 `build --config fast --set lift.least_chance=0 --candidates 240`. Without `--write` nothing is
 fitted: the hand's own weights are tried. Prints JSON: of both datasets the area under the curve
 (AUC) of the chance and of the length of the mean normal alone, the share of samples in the better
-half of the lifts, and for some least chances which shares of samples and of lifts have less.
+half of the lifts, and for some least chances which shares of samples and of lifts have less. The
+chances in TRAIN are those of models of its other objects.
 """
 
 from __future__ import annotations
@@ -44,6 +45,8 @@ from drakegrasp.outcomes import Outcome
 
 #: Weight of the squares of the standardized weights.
 RIDGE = 3.0
+#: Parts of the objects, of each of which a model of the others tells the chances.
+FOLDS = 7
 #: Least chances of which shares are told.
 THRESHOLDS = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2)
 HEAD = """\
@@ -61,13 +64,17 @@ class Lifts:
         features: (n, m), of the hands when they had closed, in the order of `FEATURES`.
         sample: (n,), whether the filters of the hold keep them.
         first: (n,), whether they are of the first round.
-        objects: Number of objects.
+        object: (n,), number of the object.
     """
 
     features: Array
     sample: npt.NDArray[np.bool_]
     first: npt.NDArray[np.bool_]
-    objects: int
+    object: npt.NDArray[np.int64]
+
+    def part(self, rows: npt.NDArray[np.bool_]) -> Lifts:
+        """Return some of the lifts."""
+        return Lifts(**{name: values[rows] for name, values in vars(self).items()})
 
 
 def read_lifts(out: Path) -> Lifts:
@@ -97,8 +104,12 @@ def read_lifts(out: Path) -> Lifts:
     sample = columns["outcome"] == Outcome.SUCCESS
     for _, broken in breaks_hold(FilterConfig(), *hold):
         sample &= ~broken
-    first = columns["generation"] == 0
-    return Lifts(features=values, sample=sample, first=first, objects=len(objects))
+    return Lifts(
+        features=values,
+        sample=sample,
+        first=columns["generation"] == 0,
+        object=columns["object"].astype(np.int64),
+    )
 
 
 def fit(lifts: Lifts) -> LiftChance:
@@ -125,18 +136,33 @@ def auc(score: Array, sample: npt.NDArray[np.bool_]) -> float:
     return round(float(ranks / (held * (len(sample) - held))), 3)
 
 
-def describe(lifts: Lifts, model: LiftChance) -> dict[str, Any]:
-    """Return how well the model orders lifts, of all and of the first round."""
+def chances(lifts: Lifts, model: LiftChance) -> Array:
+    """Return the chances (n,) of lifts."""
     values = dict(zip(FEATURES, lifts.features.T, strict=True))
     score = model.bias + sum(weight * values[name] for name, weight in model.weights.items())
-    chance, told = 1.0 / (1.0 + np.exp(-score)), dict[str, Any](objects=lifts.objects)
+    return np.asarray(1.0 / (1.0 + np.exp(-score)))
+
+
+def held_out(lifts: Lifts) -> Array:
+    """Return the chances (n,) of lifts, each by a model of other objects."""
+    found = np.zeros(len(lifts.sample))
+    for fold in range(FOLDS):
+        own = lifts.object % FOLDS == fold
+        found[own] = chances(lifts.part(own), fit(lifts.part(~own)))
+    return found
+
+
+def describe(lifts: Lifts, chance: Array) -> dict[str, Any]:
+    """Return how well chances (n,) order lifts, all and those of the first round."""
+    told: dict[str, Any] = {"objects": len(np.unique(lifts.object))}
+    normal_sum = lifts.features[:, FEATURES.index("normal_sum")]
     for name, rows in (("all", lifts.first | True), ("first round", lifts.first)):
         sample, own = lifts.sample[rows], chance[rows]
         told[name] = {
             "lifts": len(sample),
             "samples": int(sample.sum()),
             "AUC": auc(own, sample),
-            "AUC of -normal_sum": auc(-values["normal_sum"][rows], sample),
+            "AUC of -normal_sum": auc(-normal_sum[rows], sample),
             "samples in the better half": round(float((own[sample] >= np.median(own)).mean()), 3),
             "samples and lifts below": {
                 str(least): [round(float((part < least).mean()), 3) for part in (own[sample], own)]
@@ -162,15 +188,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     else:
         model = fit(train)
         text = HEAD.format(
-            lifts=len(train.sample), objects=train.objects, samples=int(train.sample.sum())
+            lifts=len(train.sample),
+            objects=len(np.unique(train.object)),
+            samples=int(train.sample.sum()),
         )
         text += f"bias: {model.bias}\nweights:\n"
         text += "".join(f"  {name}: {weight}\n" for name, weight in model.weights.items())
         arguments.write.write_text(text, encoding="utf-8")
 
-    result = {"train": describe(train, model)}
+    result = {"train": describe(train, held_out(train))}
     if arguments.test is not None:
-        result["test"] = describe(read_lifts(arguments.test), model)
+        test = read_lifts(arguments.test)
+        result["test"] = describe(test, chances(test, model))
     sys.stdout.write(json.dumps(result, indent=1) + "\n")
     return 0
 
