@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
-from drakegrasp.arithmetic import Array, dot, norm
+from drakegrasp.arithmetic import Array, dot, multiply, norm
 from drakegrasp.errors import HandError, one_line
 from drakegrasp.hand.files import chance_file
 from drakegrasp.yaml_text import parse_yaml
@@ -156,32 +156,33 @@ def _unbalanced(on: npt.NDArray[np.bool_], p_PQ: Array, nhat: Array, grasp: Clos
         nhat: (..., k, 3), unit normals, 0 where nothing touches.
         grasp: Says how much friction there is.
     """
+    # Sum, moment and normal force of forces (3k,) are A f; the first six are to be 0, the last 1.
+    lead, k = nhat.shape[:-2], nhat.shape[-2]
+    x, y, z = np.moveaxis(p_PQ, -1, 0)
+    o = np.zeros_like(x)
+    arms = np.moveaxis(np.array([[o, -z, y], [z, o, -x], [-y, x, o]]), (0, 1), (-2, -1))
+    ones = np.broadcast_to(np.eye(3), arms.shape)
+    blocks = np.concatenate([ones, arms, -nhat[..., None, :]], axis=-2)
+    A = np.moveaxis(blocks, -3, -2).reshape(*lead, 7, 3 * k)
+
+    # A step is against the gradient of half the squared rest, whose Hessian is below 3 k.
+    size, goal = 1.0 / (3.0 * k), np.eye(7)[:, -1:]
+    gain = np.swapaxes(A, -1, -2) * size
+    keep, push = np.eye(3 * k) - multiply(gain, A), multiply(gain, goal)
+
     mu = SHARE * np.asarray(grasp.friction_hand)[..., None, None]
-    start = -nhat / np.maximum(_total(on, axis=-2), 1.0)[..., None, :]
-    f = start
+    f = -nhat / np.maximum(_total(on, axis=-2), 1.0)[..., None, :]
     for _ in range(STEPS):
-        # Against the gradient of half the squared rest: its Hessian is below 1 + 1 + 1 per finger.
-        net, moment, excess = _rest(f, p_PQ, nhat)
-        gradient = net[..., None, :] + np.cross(moment[..., None, :], p_PQ)
-        f = f - (gradient - excess[..., None, None] * nhat) / (3.0 * nhat.shape[-2])
+        f = (multiply(keep, f.reshape(*lead, -1, 1)) + push).reshape(nhat.shape)
 
         # To the nearest force in the cone.
         normal = -dot(f, nhat)[..., None]
         tangential = f + normal * nhat
         length = np.maximum(norm(tangential)[..., None], LEAST)
         pushed = np.maximum((mu * length + normal) / (mu * mu + 1.0), 0.0)
-        inside = length <= mu * normal
         nearest = mu * pushed / length * tangential - pushed * nhat
-        f = np.where(on, np.where(inside, f, nearest), 0.0)
-
-    net, moment, excess = _rest(f, p_PQ, nhat)
-    return np.asarray(np.sqrt(dot(net, net) + dot(moment, moment) + excess * excess))
-
-
-def _rest(f: Array, p_PQ: Array, nhat: Array) -> tuple[Array, Array, Array]:
-    """Return sum and moment of forces (..., k, 3), and by how much they push more than 1."""
-    excess = -_total(dot(f, nhat)) - 1.0
-    return _total(f, axis=-2), _total(np.cross(p_PQ, f), axis=-2), excess
+        f = np.where(on, np.where(length <= mu * normal, f, nearest), 0.0)
+    return norm((multiply(A, f.reshape(*lead, -1, 1)) - goal)[..., 0])
 
 
 def _total(values: npt.NDArray[Any], axis: int = -1) -> Array:
