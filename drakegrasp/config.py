@@ -252,6 +252,8 @@ class LiftConfig(_Section):
     stop_when: Literal["never", "lost_sample"] = "never"
     stop_slip: Positive = 0.010  # [m], of the object in the hand since it is free
     stop_turn_deg: Positive = 10.0  # of the object in the hand since it is free
+    # Closed hands with a smaller chance of a sample are not lifted, but for a tenth; 0: all are.
+    least_chance: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
 
 
 class CertifyConfig(_Section):
@@ -485,6 +487,8 @@ class Config(_Section):
         if self.lift.stop_when == "never":
             for key in ("stop_when", "stop_slip", "stop_turn_deg"):
                 del values["lift"][key]  # as before there was a choice
+        if not self.lift.least_chance:
+            del values["lift"]["least_chance"]
         canonical = json.dumps(values, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
@@ -552,8 +556,8 @@ def override_config(config: Config, overrides: Sequence[str]) -> Config:
 
 
 def with_whole_lifts(config: Config) -> Config:
-    """Return a configuration whose lifts end only when it is certain whether the hand holds."""
-    lift = config.lift.model_copy(update={"stop_when": "never"})
+    """Return a configuration that lifts each closed hand until it is certain whether it holds."""
+    lift = config.lift.model_copy(update={"stop_when": "never", "least_chance": 0.0})
     return config.model_copy(update={"lift": lift})
 
 

@@ -34,6 +34,9 @@ class Outcome(IntEnum):
     # The lift was ended early because the object moved more in the hand than a sample may: it is
     # no sample, but whether the hand would have held it is unknown.
     MOVED = 15
+    # The closed hand might lift, but its chance of a sample was below `lift.least_chance`: whether
+    # it would have held the object is unknown.
+    NOT_LIFTED = 16
 
     @property
     def label(self) -> str:
@@ -53,7 +56,7 @@ class Outcome(IntEnum):
     @property
     def dataset_only(self) -> bool:
         """Whether only attempts of a dataset have this outcome: verification tries whole lifts."""
-        return self is Outcome.MOVED
+        return self in (Outcome.MOVED, Outcome.NOT_LIFTED)
 
     @property
     def stage(self) -> Stage:
@@ -78,4 +81,5 @@ _STAGE = {
     Outcome.UNREACHABLE: Stage.PLACED,
     Outcome.OFF_SURFACE: Stage.PLACED,
     Outcome.MOVED: Stage.LIFTED,
+    Outcome.NOT_LIFTED: Stage.CLOSED,
 }

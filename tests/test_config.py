@@ -100,6 +100,7 @@ lift:
   stop_when: never
   stop_slip: 0.03
   stop_turn_deg: 30.0
+  least_chance: 0.3
 certify:
   repeats: 5
   palm_noise: 0.001
@@ -541,6 +542,8 @@ def test_filters_may_be_as_strict_as_the_lifts_or_stricter() -> None:
 def test_whole_lifts_differ_in_when_they_end_alone() -> None:
     stopped = load_config(overrides=["lift.stop_when=lost_sample", "lift.drive=torque", "seed=3"])
     assert with_whole_lifts(stopped) == override_config(stopped, ["lift.stop_when=never"])
+    chosen = load_config(overrides=["lift.least_chance=0.2", "lift.drive=torque", "seed=3"])
+    assert with_whole_lifts(chosen) == override_config(chosen, ["lift.least_chance=0"])
 
 
 def test_simulation_hash_does_not_depend_on_the_order_of_keys(tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ TABLE = [
     ("unreachable", 13, PLACED, False),
     ("off_surface", 14, PLACED, False),
     ("moved", 15, LIFTED, False),
+    ("not_lifted", 16, CLOSED, False),
 ]
 
 
@@ -66,4 +67,4 @@ def test_no_file_of_a_dataset_holds_what_only_verification_tells() -> None:
 
 
 def test_no_verification_ends_a_lift_early() -> None:
-    assert {o.label for o in Outcome if o.dataset_only} == {"moved"}
+    assert {o.label for o in Outcome if o.dataset_only} == {"moved", "not_lifted"}

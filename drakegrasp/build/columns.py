@@ -86,6 +86,8 @@ def _trial_values(attempt: Attempt, record: TrialRecord, fit: ContactFit | None)
         **{name: getattr(attempt, name) for name in LINEAGE_NAMES},
         "spread": attempt.spread,
         "seed": attempt.seed,
+        "audited": attempt.audited,
+        "chance": record.chance,
         "outcome": record.outcome,
         "X_TO": pack_pose(record.X_TO),
         "X_OG": pack_pose(record.X_OG),

@@ -28,6 +28,7 @@ _OUTCOME_HEADS = {
     Outcome.MISSING_FINGERTIP: "missing\ntip",
     Outcome.HAND_CONTACT: "hand\ncontact",
     Outcome.TABLE_CONTACT: "table\ncontact",
+    Outcome.NOT_LIFTED: "not\nlifted",
     Outcome.DROPPED: "dropped",
     Outcome.SLIPPED: "slipped",
     Outcome.MOVED: "moved",
@@ -43,11 +44,13 @@ _COMPACT_HEADS = {
     "no ray": (Outcome.RAY_MISS, Outcome.BELOW_TABLE),
     "collis.": (Outcome.START_COLLISION, Outcome.SCREENED),
     "no grip": (Outcome.MISSING_FINGERTIP, Outcome.HAND_CONTACT, Outcome.TABLE_CONTACT),
+    "left": (Outcome.NOT_LIFTED,),
     "lost": (Outcome.DROPPED, Outcome.SLIPPED),
     "moved": (Outcome.MOVED,),
     "errors": (Outcome.SOLVER_ERROR, Outcome.TIMEOUT, Outcome.CRASHED),
     "success": (Outcome.SUCCESS,),
 }
+_RARE = ("left", "moved")
 
 
 #: Objects without samples of which it is said why.
@@ -68,9 +71,9 @@ def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
     shown = [o for o in _OUTCOME_HEADS if funnel.outcomes[:, o].any() or o is Outcome.SUCCESS]
     groups: dict[str, tuple[Outcome, ...]] = {_OUTCOME_HEADS[o]: (o,) for o in shown}
     if compact:
-        # Room is scarce, and few datasets have lifts that were ended.
-        moved = funnel.outcomes[:, Outcome.MOVED].any()
-        groups = {head: g for head, g in _COMPACT_HEADS.items() if moved or head != "moved"}
+        # Room is scarce, and few datasets have lifts that were ended or left out.
+        there = funnel.outcomes.any(axis=0)
+        groups = {h: g for h, g in _COMPACT_HEADS.items() if h not in _RARE or there[g[0]]}
     removed = [r for r in Removal if r is not Removal.KEPT and funnel.removals[:, r].any()]
     heads = ["poses", "attempts", *groups]
     heads += [] if compact else [f"- {r.label}".replace("_", "\n") for r in removed]
@@ -107,22 +110,25 @@ def hold_table(funnel: Funnel) -> Table:
     for head in ("attempts", "held", "precision", "stable", "stable\nof held", "samples"):
         table.add_column(head, justify="right", no_wrap=True)
 
-    # A column per count, with the sum of all objects below.
+    # A column per count, with the sum of all objects below. Where the chance chose the lifts, the
+    # audited ones tell the share.
+    held = funnel.outcomes[:, Outcome.SUCCESS]
     columns = (
         funnel.outcomes.sum(axis=1),
-        funnel.outcomes[:, Outcome.SUCCESS],
+        held,
         funnel.precision,
         funnel.stable,
         funnel.removals[:, Removal.KEPT],
+        *((held, funnel.stable) if funnel.all_lifted else funnel.audited.T[1:3]),
     )
     rows = [(_safe(name), [int(c[i]) for c in columns]) for i, name in enumerate(funnel.names)]
     rows.append(("all", [int(c.sum()) for c in columns]))
-    for i, (name, (attempts, held, precision, stable, samples)) in enumerate(rows):
+    for i, (name, (attempts, *counts, samples, whole, part)) in enumerate(rows):
         if i == len(rows) - 1:
             table.add_section()
-        share = f"{stable / held:.0%}" if held else "-"
-        counts = [f"{n:,}" for n in (attempts, held, precision, stable)]
-        table.add_row(name, *counts, share, f"{samples:,}")
+        share = f"{part / whole:.0%}" if whole else "-"
+        cells = [f"{n:,}" for n in (attempts, *counts)]
+        table.add_row(name, *cells, share, f"{samples:,}")
     table.caption = (
         "held: the outcome success; precision: with the fingertips alone; stable: of these, moved "
         "by less than 5 mm and 5° in the hand"

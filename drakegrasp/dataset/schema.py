@@ -68,6 +68,7 @@ class Field:
         stage: First stage at which a row has a value; before it floats are NaN, the rest 0.
         per_finger: Whether NaN stands for a finger that does not touch.
         sample: Whether it is an image, stored in one chunk per row.
+        some: Whether rows that reached the stage may lack a value.
         since: First version of the schema that has it.
     """
 
@@ -80,6 +81,7 @@ class Field:
     stage: Stage = Stage.PLACED
     per_finger: bool = False
     sample: bool = False
+    some: bool = False
     since: int = 3
 
     @property
@@ -337,7 +339,17 @@ TRIAL_FIELDS: tuple[Field, ...] = (
     Field("X_OG", "12", "float64", "m, -", "O",
           "pose of the palm at the start; the candidate's where the palm ray misses"),
     *CONDITION_FIELDS,
+    *_new(
+        Field("audited", "", "bool", "-", "-",
+              "whether a closed hand that may lift is lifted whatever its chance: one in ten"),
+    ),
     *_since(Stage.CLOSED, _TIME_CLOSE, *_CLOSED),
+    *_since(
+        Stage.CLOSED,
+        *_new(Field("chance", "", "float64", "-", "-",
+                    "chance of a sample, of a closed hand that may lift; NaN for hands without "
+                    "weights of it", some=True)),
+    ),
     *_since(
         Stage.LIFTED,
         Field("surface_distance", "k", "float64", "m", "-",

@@ -48,6 +48,8 @@ class Funnel:
         precision, stable: (m,), successes that are precision grasps, and stable ones of these.
         removals: (m, 1 + max(Removal)), successes by object and reason of removal.
         refined: (m, 3), attempts, successes and samples of refined palm poses.
+        audited: (m, 4), lifts, successes, stable ones and samples among audited attempts: they say
+            how often lifts end so where others were chosen by their chance.
     """
 
     names: tuple[str, ...]
@@ -60,6 +62,12 @@ class Funnel:
     stable: npt.NDArray[np.int64]
     removals: npt.NDArray[np.int64]
     refined: npt.NDArray[np.int64]
+    audited: npt.NDArray[np.int64]
+
+    @property
+    def all_lifted(self) -> bool:
+        """Whether each closed hand that may lift was lifted."""
+        return not self.outcomes[:, Outcome.NOT_LIFTED].any()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,9 +165,10 @@ def count_unfinished(out: Path) -> Unfinished | None:
     outcomes, done = np.zeros((len(names), 1 + max(Outcome)), dtype=np.int64), 0
     words = {word: np.zeros(len(names), dtype=np.int64) for word in WORDS}
     refined = np.zeros((len(names), 3), dtype=np.int64)
+    audited = np.zeros((len(names), 4), dtype=np.int64)
     for header in manifest.headers():
         try:
-            columns = ("outcome", "generation", *WORDS)
+            columns = ("outcome", "generation", "audited", "slip", *WORDS)
             unit = read_trials(header.path(out), header, columns, verify_seal=False)
         except DataError:
             continue
@@ -169,6 +178,9 @@ def count_unfinished(out: Path) -> Unfinished | None:
             words[word][row] += np.count_nonzero(unit[word][first])
         held = unit["outcome"][~first] == Outcome.SUCCESS
         refined[row] += (len(held), np.count_nonzero(held), 0)
+        chosen = unit["audited"] & first
+        ends = _audited_ends(unit["outcome"], unit["slip"], unit["stable"])
+        audited[row, :3] += [np.count_nonzero(end & chosen) for end in ends]
         done += 1
 
     funnel = Funnel(
@@ -182,6 +194,7 @@ def count_unfinished(out: Path) -> Unfinished | None:
         stable=words["stable"],
         removals=np.zeros((len(names), 1 + max(Removal)), dtype=np.int64),
         refined=refined,
+        audited=audited,
     )
     return Unfinished(funnel=funnel, done=done, total=manifest.units)
 
@@ -209,6 +222,7 @@ def funnel_of(path: Path) -> Funnel:
         held = {word: np.zeros(count, dtype=np.int64) for word in WORDS}
         owner = np.zeros(len(success), dtype=np.int32)
         born = np.zeros(len(success), dtype=np.bool_)
+        fair, audited = np.zeros(len(success), np.bool_), np.zeros((count, 4), np.int64)
         candidates, refined = np.zeros(count, np.int64), np.zeros((count, 3), np.int64)
         for start in range(0, rows, BLOCK):
             block = slice(start, start + BLOCK)
@@ -227,9 +241,19 @@ def funnel_of(path: Path) -> Funnel:
             for word, numbers in held.items():
                 numbers += np.bincount(index[trials[word][block] & ~later], minlength=count)
             refined[:, 0] += np.bincount(index[later], minlength=count)
-            here = (success >= start) & (success < start + BLOCK)
-            owner[here], born[here] = index[success[here] - start], later[success[here] - start]
 
+            # The audited of the first round, and whose the successes are.
+            chosen = np.zeros(len(index), dtype=np.bool_)
+            if "audited" in trials:
+                chosen = trials["audited"][block] & ~later
+            ends = _audited_ends(outcome, trials["slip"][block], trials["stable"][block])
+            for k, end in enumerate(ends):
+                audited[:, k] += np.bincount(index[end & chosen], minlength=count)
+            here = (success >= start) & (success < start + BLOCK)
+            own = success[here] - start
+            owner[here], born[here], fair[here] = index[own], later[own], chosen[own]
+
+    audited[:, 3] = np.bincount(owner[fair & (removal == Removal.KEPT)], minlength=count)
     refined[:, 1] = np.bincount(owner[born], minlength=count)
     refined[:, 2] = np.bincount(owner[born & (removal == Removal.KEPT)], minlength=count)
     return Funnel(
@@ -242,7 +266,15 @@ def funnel_of(path: Path) -> Funnel:
         stable=held["stable"],
         removals=_count_pairs(owner[~born], removal[~born], count, 1 + max(Removal)),
         refined=refined,
+        audited=audited,
     )
+
+
+def _audited_ends(
+    outcome: npt.NDArray[np.generic], slip: npt.NDArray[np.generic], stable: npt.NDArray[np.generic]
+) -> tuple[npt.NDArray[np.bool_], ...]:
+    """Return which attempts (n,) were lifted, which are held and which are stable."""
+    return np.isfinite(slip), outcome == Outcome.SUCCESS, stable.astype(bool)
 
 
 def why_no_samples(funnel: Funnel) -> dict[str, str]:
@@ -255,12 +287,14 @@ def _furthest(funnel: Funnel, i: int) -> str:
     """Return in words where the attempts at object i end that come furthest."""
     by = {outcome: int(funnel.outcomes[i, outcome]) for outcome in Outcome}
     held, lifted = by[Outcome.SUCCESS], sum(by[o] for o in Outcome if o.stage is Stage.LIFTED)
-    closed = sum(by[o] for o in Outcome if o.stage is Stage.CLOSED)
+    closed = sum(by[o] for o in Outcome if o.stage is Stage.CLOSED) - by[Outcome.NOT_LIFTED]
     if held:
         reason = Removal(int(np.argmax(funnel.removals[i])))
         return f"{held:,} held, none a sample: mostly {reason.label}"
     if lifted:
         return f"always lost: {lifted:,} lifts, none held"
+    if by[Outcome.NOT_LIFTED]:
+        return f"never lifted: {by[Outcome.NOT_LIFTED]:,} hands that closed with a small chance"
     if closed:
         return f"never gripped: the hand closed {closed:,} times, never with fingertips alone"
     if by[Outcome.START_COLLISION] > by[Outcome.SCREENED]:
@@ -270,13 +304,21 @@ def _furthest(funnel: Funnel, i: int) -> str:
 
 def held_note(funnel: Funnel) -> str:
     """Return why there may be more held grasps than were counted; empty if there are not."""
-    moved = int(funnel.outcomes[:, Outcome.MOVED].sum())
-    if not moved:
-        return ""
-    return (
-        "the number of held grasps is a lower bound: lifts that were ended without a verdict, as "
-        f"the object moved more in the hand than a sample may (moved): {moved:,}"
-    )
+    moved, left = funnel.outcomes[:, [Outcome.MOVED, Outcome.NOT_LIFTED]].sum(axis=0).tolist()
+    reasons = []
+    if moved:
+        reasons.append(
+            "lifts that were ended without a verdict, as the object moved more in the hand than a "
+            f"sample may (moved): {moved:,}"
+        )
+    if left:
+        lifts, held, stable, samples = funnel.audited.sum(axis=0).tolist()
+        reasons.append(
+            f"closed hands that were not lifted, as their chance of a sample is small: {left:,}; "
+            f"of {lifts:,} that were lifted whatever their chance {held:,} are held, {stable:,} "
+            f"stable and {samples:,} samples"
+        )
+    return f"the number of held grasps is a lower bound: {'; '.join(reasons)}" if reasons else ""
 
 
 def count_splits(out: Path) -> list[SplitCount]:

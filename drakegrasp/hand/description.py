@@ -12,7 +12,7 @@ it, J a joint.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ from drakegrasp.hand.chains import (
 )
 from drakegrasp.hand.file_format import Drive, Finger, HandFile, Spread, read_hand_file
 from drakegrasp.hand.files import find_packages, hand_file, hand_files
+from drakegrasp.hand.lift_chance import LiftChance, read_lift_chance
 from drakegrasp.hand.parsing import ModelFile, add_model
 from drakegrasp.hand.shapes import pad_surfaces
 
@@ -65,6 +66,7 @@ class Hand:
     joint_limits: Array  # (n, 2), lower and upper [rad or m]
     chains: tuple[Chain, ...]  # one per finger, to its fingertip
     link_chains: dict[str, Chain]  # one per link that the palm carries, including the palm
+    lift_chance: LiftChance | None  # of a sample, when it has closed; most hands have none
 
     @property
     def num_fingers(self) -> int:
@@ -124,6 +126,7 @@ def load_hand(name_or_yaml: str | Path = "barrett") -> Hand:
         packages = find_packages(folder, described.model, described.packages)
         model = ModelFile(folder / described.model, tuple(sorted(packages.items())), stamp)
         hand = _build_hand(path.stem.removesuffix("_hand"), described, model)
+        hand = replace(hand, lift_chance=read_lift_chance(path))
         _refuse_empty_pads(hand)
     except HandError as error:
         raise HandError(f"{path}: {error}") from None
@@ -196,6 +199,7 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
             for name, body in bodies.items()
             if is_carried(joints, body, base)
         },
+        lift_chance=None,
     )
 
 

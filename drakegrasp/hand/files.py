@@ -41,6 +41,18 @@ def hand_file(name_or_yaml: str | Path) -> Path:
     return path
 
 
+def chance_file(name_or_yaml: str | Path) -> Path:
+    """Return the file of the weights by which lifts are chosen, which few hands have.
+
+    It lies beside the hand file: `<name>_chance.yaml` of `<name>_hand.yaml`.
+
+    Raises:
+        HandError: If there is no such hand.
+    """
+    path = hand_file(name_or_yaml)
+    return path.with_name(f"{path.stem.removesuffix('_hand')}_chance.yaml")
+
+
 def find_packages(folder: Path, model: str, packages: Mapping[str, str]) -> dict[str, Path]:
     """Return the folder of each package whose files a hand's model may name.
 
@@ -68,7 +80,7 @@ def find_packages(folder: Path, model: str, packages: Mapping[str, str]) -> dict
 
 
 def hand_digest(name_or_yaml: str | Path) -> str:
-    """Return a hash (16 hex digits) of a hand's YAML, its model and the meshes in it.
+    """Return a hash (16 hex digits) of a hand's YAML, its model, meshes and weights.
 
     It distinguishes two hands of the same name. A missing file counts as empty; refusing it is
     left to `description.load_hand`.
@@ -83,7 +95,7 @@ def hand_digest(name_or_yaml: str | Path) -> str:
 
 
 def hand_files(name_or_yaml: str | Path) -> list[Path]:
-    """Return the files of a hand: its YAML, its model, and the meshes in that; some may not exist.
+    """Return the files of a hand: YAML, model, weights of lifts, meshes; some may not exist.
 
     Raises:
         HandError: If there is no such hand.
@@ -102,7 +114,8 @@ def hand_files(name_or_yaml: str | Path) -> list[Path]:
     if _PACKAGE.encode() in text:
         folders = find_packages(path.parent, name, {}) | folders
     uris = sorted({(one or other).decode() for one, other in _URIS.findall(text)})
-    return [path, model, *(_mesh_file(uri, model.parent, folders) for uri in uris)]
+    meshes = [_mesh_file(uri, model.parent, folders) for uri in uris]
+    return [path, model, chance_file(path), *meshes]
 
 
 def _mesh_file(uri: str, folder: Path, packages: Mapping[str, Path]) -> Path:

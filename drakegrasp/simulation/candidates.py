@@ -39,8 +39,11 @@ from drakegrasp.simulation.sampling.rotations import above_table, make_poses, ro
 BLOCK = 1000
 #: Log-densities are multiples of this: the last bits of a logarithm depend on the machine.
 _DENSITY_GRID = 2.0**-32
-#: Last numbers of the places of streams: of a sampler at a resting pose, and of a child.
-_SAMPLER, _CHILD = 2, 1
+#: Last numbers of the places of streams: of a sampler at a resting pose, of a child, and of the
+#: draw of whom to audit.
+_SAMPLER, _CHILD, _AUDIT = 2, 1, 3
+#: One of so many attempts is lifted whatever its chance of a sample.
+AUDIT = 10
 
 
 class Source(IntEnum):
@@ -91,6 +94,7 @@ class Pregrasp:
             hand.
         ray_hits: Whether the palm ray meets the object; true if no ray places the palm.
         conditions: Friction, mass, looks and cameras; None are the usual ones.
+        audited: Whether the closed hand is lifted whatever its chance of a sample.
     """
 
     X_OG: Array
@@ -98,6 +102,7 @@ class Pregrasp:
     closing: Array | None = None
     ray_hits: bool = True
     conditions: Conditions | None = None
+    audited: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -351,6 +356,7 @@ def make_attempts(
                 resting=int(candidates.resting[i]),
                 source=Source(candidates.source[i]),
                 log_density=float(candidates.log_density[i]),
+                audited=_is_audited(seed, object_key(name), i, j, 0),
             )
 
 
@@ -402,7 +408,13 @@ def _child(parent: Attempt, number: int, config: RefineConfig, *, name: str, see
         child=number,
         parent=parent.child,
         generation=parent.generation + 1,
+        audited=_is_audited(seed, object_key(name), *place),
     )
+
+
+def _is_audited(seed: int, *place: int) -> bool:
+    """Return whether an attempt is audited: object, candidate, stand-off and child decide."""
+    return int(Stream(seed, *place, _AUDIT).integers(AUDIT, 1)[0]) == 0
 
 
 def palm_motion(numbers: Array, shift: float, turn: float) -> Array:

@@ -16,6 +16,7 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
 from drakegrasp.errors import first_line
 from drakegrasp.frames import X_WT, Array
+from drakegrasp.hand.lift_chance import GRASP_CONTACTS, ClosedGrasp
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import Contacts, open_hand_collides, read_contacts
@@ -57,6 +58,7 @@ class TrialRecord:
         slip: Distance that {O} moved in {G} during the lift [m].
         turn: Angle that it turned in {G} [rad].
         slip_released, turn_released: The same while the object is free and the wrist still stands.
+        chance: Of a sample, of a closed hand that may lift; NaN if nothing is known of it.
         message: First line of the error for `solver_error`, else empty.
     """
 
@@ -75,6 +77,7 @@ class TrialRecord:
     turn: float = np.nan
     slip_released: float = np.nan
     turn_released: float = np.nan
+    chance: float = np.nan
     message: str = field(default="")
 
 
@@ -149,6 +152,11 @@ def run_attempt(
         if verdict != Outcome.SUCCESS:
             return replace(record, outcome=Outcome(int(verdict)))
 
+        # Choose what is worth a lift, by what is known now; some are lifted all the same.
+        record = replace(record, chance=_chance(scene, X_TO, attempt, closed))
+        if not attempt.audited and record.chance < config.lift.least_chance:
+            return replace(record, outcome=Outcome.NOT_LIFTED)
+
         # Lift: object and wrist are free, and the wrist moves to its target.
         end = lift(scene, limits, config)
 
@@ -185,6 +193,21 @@ def _predict(scene: Scene, X_TO: Array, attempt: Pregrasp, config: Config) -> Pr
         return None
     (prediction,) = predict(scene.model, scene.handles.hand, X_TO, [attempt], config.screen)
     return prediction
+
+
+def _chance(scene: Scene, X_TO: Array, attempt: Pregrasp, closed: Contacts) -> float:
+    """Return the chance that lifting a closed hand gives a sample; NaN for a hand without one."""
+    assert scene.handles is not None
+    model = scene.handles.hand.lift_chance
+    if model is None:
+        return np.nan
+    grasp = ClosedGrasp(
+        **{name: getattr(closed, name) for name in GRASP_CONTACTS},
+        X_TO=X_TO,
+        p_OOcm=scene.model.p_OOcm,
+        friction_hand=np.array(_materials(scene, attempt).friction_hand),
+    )
+    return float(model.of(grasp))
 
 
 def _materials(scene: Scene, attempt: Pregrasp) -> Materials:

@@ -110,7 +110,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 scene.coarse_scene()  # it is built once, and not at the cost of the first lift
             for i in np.flatnonzero(columns["object"] == number):
                 X_TO, X_OG = (unpack_pose(columns[name][i]) for name in ("X_TO", "X_OG"))
-                attempt = Pregrasp(X_OG=X_OG, spread=columns["spread"][i])
+                attempt = Pregrasp(X_OG=X_OG, spread=columns["spread"][i], audited=True)
                 start = time.process_time()
                 record = run_attempt(scene, X_TO, attempt, config)
                 seconds += time.process_time() - start

@@ -24,7 +24,10 @@ DECIDED: dict[str, tuple[tuple[Outcome, ...], str]] = {
     "start": ((Outcome.START_COLLISION,), "#98a3b3"),
     "screen": ((Outcome.SCREENED,), "#5f6f86"),
     "closing": (
-        (Outcome.MISSING_FINGERTIP, Outcome.HAND_CONTACT, Outcome.TABLE_CONTACT),
+        (
+            *(Outcome.MISSING_FINGERTIP, Outcome.HAND_CONTACT, Outcome.TABLE_CONTACT),
+            Outcome.NOT_LIFTED,
+        ),
         "#e3b23c",
     ),
     "lift": ((Outcome.DROPPED, Outcome.SLIPPED, Outcome.MOVED), "#d9722e"),

@@ -111,7 +111,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     stable = is_stable(outcomes, links, slip, turn)
 
     # Simulate them again.
-    other = override_config(read_manifest(arguments.dataset).config, arguments.settings)
+    everything = ["lift.least_chance=0", *arguments.settings]
+    other = override_config(read_manifest(arguments.dataset).config, everything)
     with progress_bar("Lifts", "lift") as report:
         again = list(lift_again(arguments.dataset, rows, other, report))
 

@@ -32,6 +32,7 @@ def test_hold_table_tells_what_share_of_the_held_ones_is_stable() -> None:
         stable=np.array([9, 0]),
         removals=removals,
         refined=np.zeros_like(removals[:, :3]),
+        audited=np.zeros_like(removals[:, :4]),
     )
     text = StringIO()
     Console(width=80, file=text).print(hold_table(funnel))
@@ -47,6 +48,31 @@ def test_hold_table_tells_what_share_of_the_held_ones_is_stable() -> None:
     Console(width=400, file=text).print(hold_table(funnel))
     assert "lower bound" in text.getvalue()
     assert "(moved): 1,234" in text.getvalue()
+
+
+def test_share_of_stable_ones_is_that_of_audited_lifts_where_lifts_were_chosen() -> None:
+    outcomes = np.zeros((1, 1 + max(Outcome)), dtype=np.int64)
+    outcomes[0, [Outcome.SUCCESS, Outcome.NOT_LIFTED]] = 20, 100
+    count = outcomes.sum(axis=1)
+    funnel = Funnel(
+        names=("1_mug",),
+        classes=("mug",),
+        candidates=count,
+        distinct=count,
+        valid=count,
+        outcomes=outcomes,
+        precision=np.array([12]),
+        stable=np.array([9]),
+        removals=np.zeros((1, 1 + max(Removal)), dtype=np.int64),
+        refined=np.zeros((1, 3), dtype=np.int64),
+        audited=np.array([[11, 5, 4, 3]]),
+    )
+    text = StringIO()
+    Console(width=400, file=text).print(hold_table(funnel))
+    assert ["1_mug", "120", "20", "12", "9", "80%", "0"] in map(
+        str.split, text.getvalue().split("\n")
+    )
+    assert "small: 100; of 11" in " ".join(text.getvalue().split())
 
 
 @pytest.mark.parametrize("compact", [False, True])
@@ -69,6 +95,7 @@ def test_columns_of_the_funnel_add_up_to_the_attempts(compact: bool) -> None:
         stable=removals[:, 0],
         removals=removals,
         refined=np.zeros_like(removals[:, :3]),
+        audited=np.zeros_like(removals[:, :4]),
     )
     text = StringIO()
     Console(width=400, file=text).print(funnel_table(funnel, compact=compact))

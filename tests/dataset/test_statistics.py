@@ -6,7 +6,7 @@ from pathlib import Path
 
 import h5py
 import pytest
-from helpers.datasets import SLIPPED, SUCCESS, TRIALS, change
+from helpers.datasets import MISSING, SLIPPED, SUCCESS, TRIALS, change
 
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.filters import Removal
@@ -40,6 +40,14 @@ def test_words_of_a_build_that_runs_are_those_of_its_shards(out: Path) -> None:
     assert unfinished.funnel.precision.tolist() == [3, 2, 3]
     assert unfinished.funnel.stable.tolist() == [3, 2, 3]
     assert not unfinished.funnel.removals[:, Removal.KEPT].any()
+
+
+def test_audited_attempts_of_the_first_round_are_counted(out: Path) -> None:
+    """Of the first object a sample, a lost lift and a missed one; the fourth is refined."""
+    for row in (SUCCESS, SLIPPED, MISSING, 3):
+        change(out, TRIALS, "trials/audited", row, lambda _: True)
+    change(out, TRIALS, "trials/generation", 3, lambda _: 1)
+    assert count_funnel(out).audited.tolist() == [[2, 1, 1, 1], [0] * 4, [0] * 4]
 
 
 def test_removals_are_counted_by_object(out: Path) -> None:
@@ -81,6 +89,7 @@ def test_splits_are_counted(out: Path) -> None:
         ({Outcome.START_COLLISION: 2, Outcome.SCREENED: 8}, {}, "never reached: no palm pose"),
         ({Outcome.SCREENED: 9, Outcome.HAND_CONTACT: 1}, {}, "never gripped: the hand closed 1 "),
         ({Outcome.HAND_CONTACT: 9, Outcome.MOVED: 3}, {}, "always lost: 3 lifts"),
+        ({Outcome.HAND_CONTACT: 9, Outcome.NOT_LIFTED: 3}, {}, "never lifted: 3 hands"),
         ({Outcome.DROPPED: 9, Outcome.SUCCESS: 2}, {Removal.TURNED: 2}, "2 held, none a sample"),
     ],
 )

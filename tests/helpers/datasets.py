@@ -18,10 +18,11 @@ from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import Manifest, installed_versions, write_manifest
 from drakegrasp.dataset.prepared_objects import PreparedObject, save_prepared
-from drakegrasp.dataset.schema import LOOK_FIELDS, sizes
+from drakegrasp.dataset.schema import LOOK_FIELDS, TRIAL_FIELDS, sizes
 from drakegrasp.dataset.shards import Shard, ShardHeader, trial_columns, write_shard
 from drakegrasp.frames import Array, invert_pose, make_pose, pack_pose, rotation_about, unpack_pose
 from drakegrasp.hand.file_format import with_hand_defaults
+from drakegrasp.hand.lift_chance import GRASP_CONTACTS, ClosedGrasp, read_lift_chance
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.outcomes import Outcome, Stage
@@ -150,6 +151,8 @@ def trial_row(model: ObjectModel, number: int, X_TO: Array, config: Config) -> d
         row |= {"time_close": 1.0, "closed_other_links": outcome is Outcome.HAND_CONTACT}
         row["closed_hand_on_table"] = outcome is Outcome.TABLE_CONTACT and not after_lift
     if stage >= Stage.LIFTED:
+        row["chance"] = chance_of(model, row)
+    if stage >= Stage.LIFTED:
         touch = touch & (outcome is not Outcome.DROPPED)
         touch[0] &= outcome is not Outcome.SLIPPED
         row |= {f"lifted_{k}": v for k, v in contacts(model, touch, SLIP).items()}
@@ -158,6 +161,16 @@ def trial_row(model: ObjectModel, number: int, X_TO: Array, config: Config) -> d
         row |= {"X_TO_lifted": pack_pose(X_TO), "surface_distance": np.zeros(3)}
         row |= {"normal_angle": np.zeros(3), **hold(row)}
     return row
+
+
+def chance_of(model: ObjectModel, row: dict[str, Any]) -> float:
+    """Return the chance of a sample of a hand that has closed as a row of `/trials` says."""
+    known = read_lift_chance("barrett")
+    assert known is not None
+    closed = {name: row[f"closed_{name}"] for name in GRASP_CONTACTS}
+    X_TO, friction = unpack_pose(row["X_TO"]), np.array(row["friction_hand"])
+    grasp = ClosedGrasp(**closed, X_TO=X_TO, p_OOcm=model.p_OOcm, friction_hand=friction)
+    return float(known.of(grasp))
 
 
 def make_shard(model: ObjectModel, header: ShardHeader, X_TO: Array, config: Config) -> Shard:
@@ -268,6 +281,16 @@ def end_lift(out: Path, row: int, slip: float) -> None:
         X_OG = unpack_pose(trials["X_OG"][row])
         trials["X_OG_lifted"][row] = pack_pose(X_OG @ invert_pose(turn))
         trials["slip"][row], trials["outcome"][row] = slip, Outcome.MOVED
+
+
+def leave_closed(out: Path, row: int) -> None:
+    """Let the hand of a row of /trials have closed and lifted nothing."""
+    with h5py.File(out / TRIALS, "r+") as file:
+        trials = file["trials"]
+        for field in TRIAL_FIELDS:
+            if field.stage is Stage.LIFTED:
+                trials[field.name][row] = field.empty(1, SIZES)[0]
+        trials["outcome"][row] = Outcome.NOT_LIFTED
 
 
 Edit = Callable[[np.ndarray], Any]

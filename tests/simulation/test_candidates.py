@@ -411,6 +411,18 @@ def test_children_are_drawn_about_their_parent() -> None:
     np.testing.assert_allclose([c.log_density for c in born], expected, atol=1e-6)
 
 
+def test_one_attempt_in_ten_is_audited_whatever_is_tried_with_it() -> None:
+    """A child draws for itself."""
+    rules, made, born = RefineConfig(children=1), [], []
+    for seed in range(40):
+        first = attempts(range(30), seed=seed)
+        made += [each.audited for each in first]
+        born += [children(each, rules, name="thing", seed=seed)[0].audited for each in first]
+    assert [each.audited for each in attempts(range(10, 20))] == made[30:60]
+    for audited, share in ((made, 0.1), (born, 0.1), (np.array(made) & born, 0.01)):
+        assert np.mean(audited) == pytest.approx(share, abs=4 * np.sqrt(share / len(made)))
+
+
 def test_member_of_a_family_is_found_by_its_number() -> None:
     rules = RefineConfig(children=3, generations=2)
     (parent, *_) = attempts(range(4, 5))

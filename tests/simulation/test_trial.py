@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -50,6 +51,31 @@ GRAVITY = 9.81
 def held(scene, cube, config) -> TrialRecord:
     """The cube grasped across its faces."""
     return run_attempt(scene, standing(cube), from_above(cube, STANDOFF), config)
+
+
+def test_closed_hand_with_a_smaller_chance_is_not_lifted(scene, cube, held):
+    attempt = from_above(cube, STANDOFF)
+    records = []
+    for least in (held.chance, np.nextafter(held.chance, 1.0)):
+        rules = load_config(overrides=[f"lift.least_chance={float(least)!r}"])
+        records.append(run_attempt(scene, standing(cube), attempt, rules))
+        audited = run_attempt(scene, standing(cube), replace(attempt, audited=True), rules)
+        assert pickle.dumps(audited) == pickle.dumps(held)
+    at, below = records
+    assert pickle.dumps(at) == pickle.dumps(held)
+    assert below.outcome is Outcome.NOT_LIFTED
+    assert pickle.dumps(below.closed) == pickle.dumps(held.closed)
+    assert below.lifted is None
+    assert below.chance == held.chance
+
+
+def test_hand_without_weights_lifts_all_that_it_may(scene, cube, held):
+    hand = replace(scene.handles.hand, lift_chance=None)
+    bare = replace(scene, handles=replace(scene.handles, hand=hand))
+    rules = load_config(overrides=["lift.least_chance=0.99"])
+    record = run_attempt(bare, standing(cube), from_above(cube, STANDOFF), rules)
+    assert record.outcome is Outcome.SUCCESS
+    assert np.isnan(record.chance)
 
 
 def test_resting_cube_presses_on_the_table_with_its_weight(cube, config):

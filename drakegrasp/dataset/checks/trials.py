@@ -117,6 +117,8 @@ def stages(batch: Batch) -> Iterator[Violation]:
     for f in TRIAL_FIELDS:
         values = batch[f.name]
         reached = stage >= f.stage
+
+        # What a value must be depends on its kind.
         if np.dtype(f.dtype).kind != "f":
             bad = ~reached & ~all_per_row(values == 0)
             what = f"{f.name} must be 0 before the stage {f.stage.name.lower()}"
@@ -126,6 +128,9 @@ def stages(batch: Batch) -> Iterator[Violation]:
             due = touching.reshape(*touching.shape, *(1,) * (values.ndim - 2))
             bad = ~all_per_row(_as_due(values, due))
             what = f"{f.name} must be finite where the finger touches and NaN elsewhere"
+        elif f.some:
+            bad = ~reached & ~np.isnan(values)
+            what = f"{f.name} must be NaN before the stage {f.stage.name.lower()}"
         else:
             due = reached.reshape(-1, *(1,) * (values.ndim - 1))
             bad = ~all_per_row(_as_due(values, due))
@@ -170,9 +175,20 @@ def verdicts(
             ),
         )
 
+    # Neither has a closed hand that was not lifted.
+    judged, left = _stages(batch) >= Stage.CLOSED, batch["outcome"] == Outcome.NOT_LIFTED
+    lifted = np.where(left, Outcome.NOT_LIFTED.value, lifted)
+    if rules is not None:
+        unlikely = (batch["chance"] < rules.least_chance) & ~batch["audited"]
+        yield from batch.broken(
+            "outcome must be not_lifted exactly where the hand may lift, the chance is below "
+            "lift.least_chance and the trial is not audited",
+            judged & (closed == Outcome.SUCCESS) & (left != unlikely),
+            batch["chance"],
+        )
+
     # A hand that may not lift has no second verdict.
     expected = np.where(closed != Outcome.SUCCESS, closed, lifted)
-    judged = _stages(batch) >= Stage.CLOSED
     yield from batch.broken(
         "outcome must follow from the contacts",
         judged & (expected != batch["outcome"]),

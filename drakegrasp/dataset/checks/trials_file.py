@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import partial
 
 import numpy as np
 
+from drakegrasp.dataset.checks import chances as chance_rules
 from drakegrasp.dataset.checks import conditions as condition_rules
 from drakegrasp.dataset.checks import consistency
 from drakegrasp.dataset.checks import trials as trial_rules
@@ -19,6 +21,9 @@ from drakegrasp.dataset.checks.context import Context, Dataset, Rows, RowsTask, 
 from drakegrasp.dataset.checks.findings import AnyArray, Findings
 from drakegrasp.dataset.checks.open_file import OpenFile, Rule
 from drakegrasp.dataset.layout.attributes import ORIGIN, attribute_mistakes
+from drakegrasp.errors import HandError
+from drakegrasp.hand.files import hand_digest
+from drakegrasp.hand.lift_chance import read_lift_chance
 from drakegrasp.outcomes import Outcome
 
 #: Trials in a batch: some 10 MB.
@@ -88,6 +93,7 @@ def _judge_trials(rows: Rows, findings: Findings) -> AnyArray:
         trial_rules.contacts,
         trial_rules.poses,
     ]
+    sound: list[Rule] = [trial_rules.motion]
     if objects is not None and trials.count("objects") == len(objects):
         poses = [[pose.X_TO for pose in entry.resting] for entry in objects]
         last.append(partial(trial_rules.resting_poses, X_TO=poses))
@@ -100,9 +106,22 @@ def _judge_trials(rows: Rows, findings: Findings) -> AnyArray:
                 config=dataset.manifest.config_of,
             )
         )
+        # Other files of the hand may have other weights.
+        hand = dataset.manifest.config.hand
+        with suppress(HandError):
+            if hand_digest(hand) == dataset.manifest.versions.get("hand"):
+                sound.append(
+                    partial(
+                        chance_rules.as_computed,
+                        required=list(fingers.values()) or [True],
+                        names=dataset.names,
+                        model=rows.model,
+                        chance=read_lift_chance(hand),
+                    )
+                )
 
     # Numbers, then stages, which need a legal outcome, then what needs finite values, then what
-    # needs sound poses.
+    # needs sound poses and contacts.
     successes = [np.zeros(0, dtype=np.int64)]
     for whole in trials.batches("trials", rows.start, rows.stop, TRIAL_ROWS, findings):
         successes.append(whole["trial_id"][whole["outcome"] == Outcome.SUCCESS])
@@ -112,5 +131,5 @@ def _judge_trials(rows: Rows, findings: Findings) -> AnyArray:
         )
         batch = trials.judge(batch, findings, trial_rules.stages)
         batch = trials.judge(batch, findings, *last)
-        trials.judge(batch, findings, trial_rules.motion)
+        trials.judge(batch, findings, *sound)
     return np.concatenate(successes)

@@ -74,8 +74,8 @@ def test_a_contact_off_the_image_of_the_object_is_found(out: Path, edit: Edit, w
     must_find(out / OTO, (OTO, "/test", 3, what))
 
 
-def change_contact(out: Path, edit_p: Edit, edit_n: Edit) -> tuple[str, int]:
-    """Change the first contact of the first test sample, alike in all files; return its row."""
+def change_contact(out: Path, edit_p: Edit, edit_n: Edit) -> int:
+    """Change the first contact of the first test sample, alike in all files; return its trial."""
     with h5py.File(out / TRIALS, "r+") as trials, h5py.File(out / OTO) as data:
         number = int(data["test/trial_id"][0])
         p = trials["trials/closed_p_OQ"][number]
@@ -96,19 +96,21 @@ def change_contact(out: Path, edit_p: Edit, edit_n: Edit) -> tuple[str, int]:
                 [(p @ X_CO[:3, :3].T + X_CO[:3, 3]).ravel(), (n @ X_CO[:3, :3].T).ravel()]
             )
             file["test/grasp_props/f_Q_C"][0] = f @ X_CO[:3, :3].T
-    return "/test", 0
+    return number
 
 
 def test_a_contact_inside_the_object_is_found(out: Path) -> None:
-    group, row = change_contact(out, lambda p: p - [0.004, 0.0, 0.0], lambda n: n)
+    trial = change_contact(out, lambda p: p - [0.004, 0.0, 0.0], lambda n: n)
     what = "contact of finger 1 must be on the object's mesh within 0.002 m"
-    must_find(out, *((name, group, row, what) for name in BOTH))
+    chance = (TRIALS, "/trials", trial, "chance must follow from the contacts after closing")
+    must_find(out, *((name, "/test", 0, what) for name in BOTH), chance)
 
 
 def test_a_normal_into_the_object_is_found(out: Path) -> None:
-    group, row = change_contact(out, lambda p: p, lambda n: -n)
+    trial = change_contact(out, lambda p: p, lambda n: -n)
     what = "normal of finger 1 must point out of the object"
-    must_find(out, *((name, group, row, what) for name in BOTH))
+    chance = (TRIALS, "/trials", trial, "chance must follow from the contacts after closing")
+    must_find(out, *((name, "/test", 0, what) for name in BOTH), chance)
 
 
 def test_object_pixels_are_checked_against_the_mesh(out: Path) -> None:

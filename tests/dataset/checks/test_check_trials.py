@@ -20,6 +20,7 @@ from helpers.datasets import (
     change,
     end_lift,
     found,
+    leave_closed,
     make_dataset,
     mirrored,
     moved,
@@ -83,6 +84,9 @@ TRIAL_CASES: Mapping[str, tuple[str, int, Edit, str]] = {
     "other link": ("closed_other_links", SUCCESS, lambda _: 1, "outcome must follow from the con"),
     "hand on table": ("closed_hand_on_table", SUCCESS, lambda _: True, "outcome must follow from"),
     "on table": ("lifted_object_on_table", SUCCESS, lambda _: True, "outcome must follow"),
+    "chance": ("chance", SUCCESS, lambda c: c - 0.01, "chance must follow from the contacts aft"),
+    "chance of none": ("chance", HAND, lambda _: 0.5, "chance must follow from the contacts after"),
+    "early chance": ("chance", BELOW, lambda _: 0.5, "chance must be NaN before the stage closed"),
     "verdict": ("outcome", SLIPPED, lambda _: Outcome.DROPPED, "outcome must follow from the"),
 }
 
@@ -109,6 +113,31 @@ def test_lift_is_ended_only_where_the_configuration_says_so(
     out = make_dataset(tmp_path / "out", tmp_path / "meshes", override)
     end_lift(out, SLIPPED, slip)
     what = (TRIALS, "/trials", SLIPPED, "outcome must be moved only where lift.stop_when")
+    must_find(out / TRIALS, *([] if sound else [what]))
+
+
+@pytest.mark.parametrize(
+    ("least", "audited", "left", "sound"),
+    [
+        (1e-6, False, False, True),
+        (1e-6, False, True, False),
+        (0.999, False, True, True),
+        (0.999, True, True, False),
+        (0.999, True, False, True),
+        (0.999, False, False, False),
+    ],
+)
+def test_hand_is_not_lifted_exactly_where_its_chance_says_so(
+    tmp_path: Path, least: float, audited: bool, left: bool, sound: bool
+) -> None:
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes", f"lift.least_chance={least}")
+    others = [row for row in range(36) if row != SLIPPED] if least > 0.5 else []
+    for row in others:
+        change(out, TRIALS, "trials/audited", row, lambda _: True)
+    change(out, TRIALS, "trials/audited", SLIPPED, lambda _: audited)
+    if left:
+        leave_closed(out, SLIPPED)
+    what = (TRIALS, "/trials", SLIPPED, "outcome must be not_lifted exactly where")
     must_find(out / TRIALS, *([] if sound else [what]))
 
 
