@@ -203,6 +203,8 @@ def test_commands_of_the_docs_run(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     out = Path(shutil.copytree(made, tmp_path / "OUT"))
+    for part in {"OUT1", "OUT2"} & set(line.split()):
+        shutil.copytree(made, tmp_path / part)
     if "MESHES" in line:
         meshes(tmp_path / "MESHES")
     with h5py.File(out / "trials.hdf5") as file:
