@@ -36,16 +36,18 @@ def half(sound: Path, out: Path, names: Sequence[str]) -> Path:
     return out
 
 
-@pytest.fixture
-def halves(sound: Path, tmp_path: Path) -> list[Path]:
-    """Two datasets that have one object in common."""
-    return [half(sound, tmp_path / str(i), NAMES[2 - 2 * i : 4 - 2 * i]) for i in range(2)]
+@pytest.fixture(scope="module")
+def halves(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two datasets of the objects, the last ones first. Read only."""
+    folder = tmp_path_factory.mktemp("halves")
+    return [half(sound, folder / str(i), NAMES[2 - 2 * i : 4 - 2 * i]) for i in range(2)]
 
 
-@pytest.fixture
-def seeds(sound: Path, tmp_path: Path) -> list[Path]:
-    """The same objects under two seeds."""
-    return [sound, make_dataset(tmp_path / "seed", tmp_path / "meshes", "seed=7")]
+@pytest.fixture(scope="module")
+def seeds(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """The same objects under two seeds. Read only."""
+    folder = tmp_path_factory.mktemp("seeds")
+    return [sound, make_dataset(folder / "seed", folder / "meshes", "seed=7")]
 
 
 def rows(out: Path, name: str, group: str) -> dict[Any, list[Any]]:
@@ -67,7 +69,7 @@ def rows(out: Path, name: str, group: str) -> dict[Any, list[Any]]:
 def test_halves_equal_the_whole_but_for_order(
     sound: Path, halves: list[Path], tmp_path: Path
 ) -> None:
-    merge(tmp_path / "into", [halves[0], half(sound, tmp_path / "rest", NAMES[:2])])
+    merge(tmp_path / "into", halves)
     tables = [(TRIALS, "trials")]
     tables += [(name, split) for name in DATA_FILES.values() for split in ("train", "test")]
     for name, group in tables:
