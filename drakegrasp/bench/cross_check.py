@@ -114,14 +114,15 @@ def cross_check(out: Path, count: int, *, progress: Report = silent) -> dict[str
         DataError: If there is no dataset, or no lift in it, or its objects are damaged.
         ConfigError: If the dataset's hand cannot have its drive.
     """
-    config = read_manifest(out).config
+    manifest = read_manifest(out)
+    config = manifest.config
     lifts = draw_lifts(out, count)
     rows: list[dict[str, Any]] = []
 
     # An object is cut into convex parts once.
     progress(0, len(lifts))
     for name, same in groupby(sorted(lifts, key=_by_object), key=lambda lift: lift.object_name):
-        for row in _try_object(out, name, list(same), config):
+        for row in _try_object(out, name, list(same), manifest.config_of(name)):
             rows.append(row)
             progress(len(rows), len(lifts), held=sum(_holds(row) for row in rows))
 

@@ -9,8 +9,9 @@ import numpy as np
 
 from drakegrasp.build.attempts import TrialSetup, find_attempt, measure_contacts, try_attempt
 from drakegrasp.build.columns import trial_rows
+from drakegrasp.config import Config
 from drakegrasp.dataset.layout.opening import object_name, open_trials, read_trial
-from drakegrasp.dataset.manifest import Manifest, installed_versions, read_manifest
+from drakegrasp.dataset.manifest import installed_versions, read_manifest
 from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
 from drakegrasp.dataset.shards import trial_columns
@@ -59,7 +60,7 @@ def replay_trial(out: str | Path, trial_id: int) -> Replay:
         DataError: If the dataset or the trial is not there.
     """
     stored = _stored_trial(Path(out), trial_id)
-    prepared, config = stored.prepared, stored.manifest.config
+    prepared, config = stored.prepared, stored.config
 
     # Run the attempt as a work unit would, up to the row that it would store.
     scene = build_scene(prepared.model, config.physics, load_hand(config.hand))
@@ -71,7 +72,7 @@ def replay_trial(out: str | Path, trial_id: int) -> Replay:
     now = installed_versions(config)
     return Replay(
         trial_id=trial_id,
-        object_name=prepared.model.name,
+        object_name=stored.name,
         recorded=Outcome(int(stored.row["outcome"])),
         found=Outcome(int(row["outcome"][0])),
         differences={
@@ -81,7 +82,7 @@ def replay_trial(out: str | Path, trial_id: int) -> Replay:
         },
         versions={
             key: f"{then} -> {now.get(key)}"
-            for key, then in stored.manifest.versions.items()
+            for key, then in stored.versions.items()
             if now.get(key) != then
         },
     )
@@ -99,28 +100,37 @@ def record_trial(out: str | Path, trial_id: int, path: str | Path) -> Outcome:
     """
     stored = _stored_trial(Path(out), trial_id)
     X_TO = stored.prepared.resting_poses[stored.attempt.resting]
-    model, config = stored.prepared.model, stored.manifest.config
+    model, config = stored.prepared.model, stored.config
     return record_attempt(model, X_TO, stored.attempt, config, Path(path)).outcome
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _StoredTrial:
-    """A row of trials.hdf5, and what to run it again with."""
+    """A row of trials.hdf5 with the name of its object, and what to run it again with."""
 
     row: dict[str, np.ndarray]
+    name: str
     prepared: PreparedObject
     attempt: Attempt
-    manifest: Manifest
+    config: Config
+    versions: dict[str, str]
 
 
 def _stored_trial(out: Path, trial_id: int) -> _StoredTrial:
     manifest = read_manifest(out)
-    config = manifest.config
     row, name = _stored_row(out, trial_id)
+    config = manifest.config_of(name)
     prepared = load_prepared(out, name, config)
     candidate, standoff, child = (int(row[key]) for key in ("candidate", "standoff_index", "child"))
     attempt = find_attempt(prepared, candidate, standoff, child, config)
-    return _StoredTrial(row=row, prepared=prepared, attempt=attempt, manifest=manifest)
+    return _StoredTrial(
+        row=row,
+        name=name,
+        prepared=prepared,
+        attempt=attempt,
+        config=config,
+        versions=manifest.versions,
+    )
 
 
 def _stored_row(out: Path, trial_id: int) -> tuple[dict[str, np.ndarray], str]:

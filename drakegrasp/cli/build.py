@@ -1,4 +1,4 @@
-"""`drakegrasp build`, `assemble` and `stats`, and what they print."""
+"""`drakegrasp build`, `assemble`, `merge` and `stats`, and what they print."""
 
 from __future__ import annotations
 
@@ -114,6 +114,25 @@ def assemble(out: Path, reject: Path | None, overrides: tuple[str, ...], workers
     print_stats(out)
     for sentence in unused_rejections(out, rejected, read_manifest(out).rejected):
         say(sentence)
+
+
+@click.command()
+@click.argument("into", type=PathType(path_type=Path), metavar="INTO")
+@click.argument("outs", type=PathType(path_type=Path), metavar="OUT...", nargs=-1, required=True)
+@processes_option
+def merge(into: Path, outs: tuple[Path, ...], workers: int) -> None:
+    """Make one dataset of several that were built apart.
+
+    Their objects or their seeds may differ, and nothing else. INTO must be new or empty, and
+    appears when it is complete; each OUT stays as it is.
+    """
+    from drakegrasp.build.merge import merge as merge_datasets
+    from drakegrasp.runtime.executor import processes
+    from drakegrasp.runtime.progress import progress_bar
+
+    with processes(workers) as execute, progress_bar("merge", "tasks") as progress:
+        merge_datasets(into, outs, execute=execute, progress=progress)
+    print_stats(into)
 
 
 @click.command()

@@ -15,7 +15,7 @@ import click
 
 from drakegrasp.cli.audit import audit
 from drakegrasp.cli.bench import bench
-from drakegrasp.cli.build import assemble, build, stats
+from drakegrasp.cli.build import assemble, build, merge, stats
 from drakegrasp.cli.errors import say
 from drakegrasp.cli.export import export
 from drakegrasp.cli.group import main
@@ -151,8 +151,8 @@ objects.add_command(morph)
 
 # The help lists them in this order.
 for _command in (
-    *(doctor, objects, audit, hand, build, assemble, check, stats, inspect_, figures, replay),
-    *(verify, export, bench),
+    *(doctor, objects, audit, hand, build, assemble, merge, check, stats, inspect_, figures),
+    *(replay, verify, export, bench),
 ):
     main.add_command(_command)
 

@@ -348,7 +348,7 @@ def _split_successes(
 
     split = split_samples(
         successes.object[kept[first]],
-        [entry.name for entry in manifest.objects],
+        [entry.mesh_name for entry in manifest.objects],
         [entry.class_name for entry in manifest.objects],
         manifest.groups,
         manifest.config.split,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata
@@ -27,6 +27,7 @@ from drakegrasp.config import (
     NonNegative,
     Number,
     Positive,
+    Seed,
     Share,
     override_config,
     parse_stored,
@@ -114,6 +115,9 @@ class ObjectEntry:
         licence: Identifier of the mesh's licence; None: not stated.
         tried: Number of palm poses up to which a target of samples was met; None: all.
         group: What it shares with others of the same mesh, which stay in one split; None: its name.
+        seed: Of its draws, in a merged dataset; None: that of the configuration.
+        drawn_as: Name in its files, where a merged dataset has the mesh under several seeds; None:
+            its name.
     """
 
     name: Name
@@ -134,11 +138,23 @@ class ObjectEntry:
     licence: Licence | None = None
     tried: Whole | None = None
     group: Name | None = None
+    seed: Seed | None = None
+    drawn_as: Name | None = None
+
+    @property
+    def mesh_name(self) -> str:
+        """Name of its mesh: under several seeds it is one object of the split."""
+        return self.drawn_as or self.name
+
+    def config_in(self, config: Config) -> Config:
+        """Return the configuration of the object in a dataset's: with the seed of its draws."""
+        return config if self.seed is None else config.model_copy(update={"seed": self.seed})
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry as JSON types, in the order of the manifest."""
         # What is not stated leaves no trace.
-        unsaid = [k for k in ("licence", "tried", "group") if getattr(self, k) is None]
+        optional = ("licence", "tried", "group", "seed", "drawn_as")
+        unsaid = [key for key in optional if getattr(self, key) is None]
         said = {key: v for key, v in asdict(self).items() if key not in unsaid}
         return {"class" if key == "class_name" else key: v for key, v in said.items()}
 
@@ -189,18 +205,26 @@ class Manifest:
 
     def headers(self) -> Iterator[ShardHeader]:
         """Yield the work units of the dataset in the order of its rows."""
-        config_hash = self.config.simulation_hash()
+        hashes: dict[int | None, str] = {}
         for entry in self.objects:
+            if entry.seed not in hashes:
+                hashes[entry.seed] = entry.config_in(self.config).simulation_hash()
             for unit in self.config.unit_ranges(entry.candidates):
                 if entry.tried is not None and unit.start >= entry.tried:
                     break
                 yield ShardHeader(
-                    config_hash=config_hash,
+                    config_hash=hashes[entry.seed],
                     mesh_sha256=entry.mesh_sha256,
                     object_name=entry.name,
                     start=unit.start,
                     stop=unit.stop,
+                    drawn_as=entry.drawn_as,
                 )
+
+    def config_of(self, name: str) -> Config:
+        """Return the configuration of an object by its name, see `ObjectEntry.config_in`."""
+        own = (entry.config_in(self.config) for entry in self.objects if entry.name == name)
+        return next(own, self.config)
 
     @property
     def units(self) -> int:
@@ -210,7 +234,7 @@ class Manifest:
     @property
     def groups(self) -> list[str]:
         """Group of each object, see `split.split_rule`."""
-        return [entry.group or entry.name for entry in self.objects]
+        return [entry.group or entry.mesh_name for entry in self.objects]
 
     @property
     def split_rule(self) -> Rule:
@@ -421,7 +445,12 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
     if manifest.config.simulation_hash() != config.simulation_hash():
         raise DataError(
             f"{out}: must be empty or hold this configuration's dataset, got one that differs in "
-            f"{_differences(manifest.config, config)}; choose another --out"
+            f"{differences(manifest.config, config)}; choose another --out"
+        )
+    if any(entry.seed is not None for entry in manifest.objects):
+        raise DataError(
+            f"{out}: must be of one seed to be built on, got a merged dataset of several; build on "
+            "those that it was merged of"
         )
     installed = installed_versions(config)
     for name in REQUIRED_VERSIONS:
@@ -473,15 +502,17 @@ def with_postprocessing(manifest: Manifest, overrides: Sequence[str]) -> Manifes
     if config.simulation_hash() != manifest.config.simulation_hash():
         raise ConfigError(
             "assemble may change values of filters and split only, got one that changes what was "
-            f"simulated: {_differences(manifest.config, config)}"
+            f"simulated: {differences(manifest.config, config)}"
         )
     return replace(manifest, config=config)
 
 
-def _differences(theirs: Config, ours: Config) -> str:
-    """Return the values that differ and change the simulation, in words."""
+def differences(
+    theirs: Config, ours: Config, ignored: Collection[str] = POSTPROCESSING_KEYS
+) -> str:
+    """Return the values that differ, in words; by default those that change the simulation."""
     a, b = _flatten(theirs.to_dict()), _flatten(ours.to_dict())
-    keys = [k for k in a if a[k] != b[k] and k.partition(".")[0] not in POSTPROCESSING_KEYS]
+    keys = [k for k in a if a[k] != b[k] and k.partition(".")[0] not in ignored]
     return ", ".join(f"{k} ({a[k]} there, {b[k]} here)" for k in keys)
 
 

@@ -97,7 +97,7 @@ def _judge_trials(rows: Rows, findings: Findings) -> AnyArray:
                 condition_rules.as_drawn,
                 names=dataset.names,
                 model=rows.model,
-                config=dataset.manifest.config,
+                config=dataset.manifest.config_of,
             )
         )
 

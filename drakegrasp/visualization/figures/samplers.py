@@ -61,7 +61,8 @@ def compare_samplers(out: Path, other: Path | None = None) -> SamplerComparison:
             none of the objects.
     """
     # The datasets by method.
-    config = read_manifest(out).config
+    manifest = read_manifest(out)
+    config = manifest.config
     if isinstance(config.candidates.method, tuple) or config.objects.resting_poses > 1:
         raise DataError(f"{out}: must be of one sampler and one resting pose, got several")
     datasets: dict[str, Path] = {config.candidates.method: out}
@@ -75,7 +76,8 @@ def compare_samplers(out: Path, other: Path | None = None) -> SamplerComparison:
     own = funnels[config.candidates.method]
     wins = {name: int(own.outcomes[own.names.index(name), Outcome.SUCCESS]) for name in names}
     name = max(names, key=lambda name: wins[name])
-    shown = load_prepared(out, name, config)
+    own_config = manifest.config_of(name)
+    shown = load_prepared(out, name, own_config)
 
     # Palm poses of that object, and numbers.
     candidates: dict[str, Candidates] = {}
@@ -84,13 +86,13 @@ def compare_samplers(out: Path, other: Path | None = None) -> SamplerComparison:
     for method in METHODS:
         if method in datasets:
             path, funnel = datasets[method], funnels[method]
-            settings = read_manifest(path).config
-            covers = {each: _cover(load_prepared(path, each, settings)) for each in names}
-            candidates[method] = load_prepared(path, name, settings).candidates
+            settings = read_manifest(path).config_of
+            covers = {each: _cover(load_prepared(path, each, settings(each))) for each in names}
+            candidates[method] = load_prepared(path, name, settings(name)).candidates
             of_shown[method] = _numbers({name: covers[name]}, funnel)
             of_all[method] = _numbers(covers, funnel)
         else:
-            drawn = replace(shown, candidates=_draw(shown, config, method))
+            drawn = replace(shown, candidates=_draw(shown, own_config, method))
             candidates[method] = drawn.candidates
             of_shown[method] = _numbers({name: _cover(drawn)}, None)
     return SamplerComparison(

@@ -78,11 +78,11 @@ def load_trial(out: Path, trial_id: int, *, table_size: float = TABLE_SIZE) -> T
         DataError: If the trial does not exist, or ended before the lift.
     """
     # Read the trial.
-    config = read_manifest(out).config
     path = out / TRIALS_FILE
     with open_trials(path) as file:
         row = read_trial(file, trial_id)
         name = object_name(file, row)
+    config = read_manifest(out).config_of(name)
     outcome = Outcome(int(row["outcome"]))
     if outcome.stage is not Stage.LIFTED:
         raise DataError(f"{path}: trial {trial_id} must have been lifted, got {outcome.label}")
