@@ -201,6 +201,7 @@ def _merged_manifest(manifests: Mapping[Path, Manifest], parts: Iterable[_Part])
         replace(key, object=names[out, key.object])
         for out, manifest in manifests.items()
         for key in manifest.rejected
+        if (out, key.object) in names
     ]
     return replace(
         first,

@@ -19,6 +19,7 @@ from typing import Annotated, Any
 
 import h5py
 import numpy as np
+import numpy.typing as npt
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, with_config
 
 from drakegrasp.config import (
@@ -33,6 +34,7 @@ from drakegrasp.config import (
     parse_stored,
 )
 from drakegrasp.dataset import log as build_log
+from drakegrasp.dataset.assembly.weights import number_poses
 from drakegrasp.dataset.layout.json_files import Name, read_mapping, validated
 from drakegrasp.dataset.paths import FILE_NAME, OWN_FILES, OWN_FOLDERS
 from drakegrasp.dataset.rejections import AttemptKey, key_to_json
@@ -241,6 +243,12 @@ class Manifest:
         """What `split.by` of the configuration stands for with these objects."""
         classes = [entry.class_name for entry in self.objects]
         return split_rule(self.config.split, classes, self.groups)
+
+    def pose_numbers(self) -> list[npt.NDArray[np.int64]]:
+        """Return a number (r,) of each resting pose of each object, see `number_poses`."""
+        # The third row of X_TO is the table's normal in {O}, and the height.
+        up = [[pose.X_TO[8:11] for pose in entry.resting] for entry in self.objects]
+        return number_poses([entry.mesh_name for entry in self.objects], up)
 
     def signature(self) -> str:
         """Return a hash of all in it that decides a row of the dataset, hexadecimal."""
