@@ -118,7 +118,7 @@ def _refuse_differences(manifests: Mapping[Path, Manifest]) -> None:
         if differing := differences(known.config, config, _FREE):
             raise DataError(
                 f"{out}: must be of the configuration of {first} but for the seed, got one that "
-                f"differs in {differing.replace(' there, ', f' in {first}, ')}"
+                f"differs in {differing}"
             )
         for name in REQUIRED_VERSIONS:
             if manifest.versions.get(name) != known.versions.get(name):
