@@ -197,12 +197,15 @@ def test_images_of_each_seed_are_inspected(sound: Path, other: Path, tmp_path: P
 
 
 def with_manifest(edit: Callable[[dict], object]) -> Callable[[Path, Path], list[Path]]:
-    """Return two datasets, the second with another manifest."""
+    """Return two datasets, the second with another manifest, of which its files are."""
 
     def spoil(sound: Path, copy: Path) -> list[Path]:
         tree = json.loads((copy / "manifest.json").read_bytes())
         edit(tree)
         (copy / "manifest.json").write_text(json.dumps(tree))
+        for name in (*BOTH, TRIALS):
+            with h5py.File(copy / name, "r+") as file:
+                file.attrs["signature"] = read_manifest(copy).signature()
         return [sound, copy]
 
     return spoil
@@ -251,7 +254,7 @@ def under_another_seed(edit: Callable[[dict], object]) -> Callable[[Path, Path],
             built_with("physics.friction_hand=0.5"),
             "differs in physics.friction_hand (0.71 there, 0.5 here)",
         ),
-        (built_with("camera.fov_deg=50"), "differs in camera.fov_deg"),
+        (built_with("camera.fov_y_deg=40"), "differs in camera.fov_y_deg"),
         (built_with("candidates.max=99"), "differs in candidates.max"),
         (built_with("filters.max_slip=0.004"), "differs in filters.max_slip"),
         (with_manifest(lambda m: m["versions"].update(drake="1.0")), "must be of drake "),
