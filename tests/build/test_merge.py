@@ -26,6 +26,7 @@ from drakegrasp.dataset.manifest import claim_directory, read_manifest, write_ma
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.rejections import AttemptKey
 from drakegrasp.errors import DataError
+from drakegrasp.hand.files import MODELS
 from drakegrasp.inspection.catalog import Catalog
 from drakegrasp.inspection.rows import read_look
 from drakegrasp.objects.sources import find_meshes
@@ -117,6 +118,16 @@ def test_halves_by_seeds_keep_everything(sound: Path, other: Path, tmp_path: Pat
                     name,
                     key,
                 )
+
+
+def test_a_hand_counts_by_its_files_and_not_by_their_folder(tmp_path: Path) -> None:
+    outs = []
+    for seed in "01":
+        folder = shutil.copytree(MODELS, tmp_path / f"hands{seed}")
+        changed = (f"seed={seed}", f"hand={folder / 'barrett_hand.yaml'}")
+        outs.append(make_dataset(tmp_path / seed, tmp_path / "meshes", *changed))
+    merge(tmp_path / "into", outs)
+    assert check_dataset(tmp_path / "into") == []
 
 
 @pytest.mark.parametrize("rule", ["class", "object"])
