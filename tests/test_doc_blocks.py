@@ -39,6 +39,7 @@ NOT_RUN = {
     "drakegrasp objects export ": "makes hundreds of meshes; tests/objects/test_builtin.py",
     "drakegrasp inspect ": "serves until Ctrl-C; tests/inspection/test_serve.py",
     "drakegrasp figures OUT --compare ": "wants two datasets; tests/visualization/figures",
+    "drakegrasp merge ": "wants two datasets; tests/build/test_merge.py",
     "drakegrasp hand check ": "tests/commissioning/test_tutorial_hand.py runs it",
 }
 #: A page whose commands measure for minutes to hours; test_docs.py knows their options.

@@ -118,13 +118,13 @@ def assemble(out: Path, reject: Path | None, overrides: tuple[str, ...], workers
 
 @click.command()
 @click.argument("into", type=PathType(path_type=Path), metavar="INTO")
-@click.argument("outs", type=PathType(path_type=Path), metavar="OUT...", nargs=-1, required=True)
+@click.argument("outs", type=PathType(path_type=Path), metavar="OUTS", nargs=-1, required=True)
 @processes_option
 def merge(into: Path, outs: tuple[Path, ...], workers: int) -> None:
-    """Make one dataset of several that were built apart.
+    """Make one dataset of several, OUTS, that were built apart.
 
     Their objects or their seeds may differ, and nothing else. INTO must be new or empty, and
-    appears when it is complete; each OUT stays as it is.
+    appears when it is complete; OUTS stay as they are.
     """
     from drakegrasp.build.merge import merge as merge_datasets
     from drakegrasp.runtime.executor import processes
