@@ -121,7 +121,7 @@ def assemble(out: Path, reject: Path | None, overrides: tuple[str, ...], workers
 @click.argument("outs", type=PathType(path_type=Path), metavar="OUTS", nargs=-1, required=True)
 @processes_option
 def merge(into: Path, outs: tuple[Path, ...], workers: int) -> None:
-    """Make one dataset of several, OUTS, that were built apart.
+    """Make one dataset of several that were built apart.
 
     Their objects or their seeds may differ, and nothing else. INTO must be new or empty, and
     appears when it is complete; OUTS stay as they are.
