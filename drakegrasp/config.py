@@ -13,7 +13,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from importlib import resources
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Annotated, Any, Literal
 
 import yaml
@@ -472,9 +472,10 @@ class Config(_Section):
 
         Left out are filters and split, which act later on assembled shards, `max_grasps`,
         `samples`, its kin and `candidates.max`, which only say where to stop, the
-        wall-clock limit, and `verify`.
+        wall-clock limit, and `verify`. A hand's files count by their digest, which is in the
+        manifest's versions, and not by their folder.
         """
-        values = self.to_dict()
+        values = {**self.to_dict(), "hand": PurePath(self.hand).stem}
         for key in POSTPROCESSING_KEYS:
             del values[key]
         del values["candidates"]["max"]  # a dataset may grow

@@ -39,6 +39,7 @@ NOT_RUN = {
     "drakegrasp objects export ": "makes hundreds of meshes; tests/objects/test_builtin.py",
     "drakegrasp inspect ": "serves until Ctrl-C; tests/inspection/test_serve.py",
     "drakegrasp figures OUT --compare ": "wants two datasets; tests/visualization/figures",
+    "drakegrasp merge ": "wants two datasets; tests/build/test_merge.py",
     "drakegrasp hand check ": "tests/commissioning/test_tutorial_hand.py runs it",
 }
 #: A page whose commands measure for minutes to hours; test_docs.py knows their options.
@@ -203,8 +204,6 @@ def test_commands_of_the_docs_run(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     out = Path(shutil.copytree(made, tmp_path / "OUT"))
-    for part in {"OUT1", "OUT2"} & set(line.split()):
-        shutil.copytree(made, tmp_path / part)
     if "MESHES" in line:
         meshes(tmp_path / "MESHES")
     with h5py.File(out / "trials.hdf5") as file:

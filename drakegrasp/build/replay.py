@@ -106,7 +106,7 @@ def record_trial(out: str | Path, trial_id: int, path: str | Path) -> Outcome:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _StoredTrial:
-    """A row of trials.hdf5, and what to run it again with."""
+    """A row of trials.hdf5 with the name of its object, and what to run it again with."""
 
     row: dict[str, np.ndarray]
     name: str

@@ -14,7 +14,7 @@ import threading
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -139,7 +139,7 @@ def run_unit(unit: WorkUnit) -> UnitSummary:
             # A process died after it wrote the shard and before it answered.
             summary = UnitSummary(header=header, outcomes=outcomes, seconds={}, errors={})
         elif unit.restartable:
-            with open_journal(header.journal_path(out), asdict(header)) as journal:
+            with open_journal(header.journal_path(out), header.stored) as journal:
                 summary = _run_experiment(unit, journal)
         else:
             summary = _run_experiment(unit, NO_JOURNAL)

@@ -1,4 +1,4 @@
-"""`drakegrasp build`, `assemble` and `stats`, and what they print."""
+"""`drakegrasp build`, `assemble`, `merge` and `stats`, and what they print."""
 
 from __future__ import annotations
 
@@ -117,27 +117,21 @@ def assemble(out: Path, reject: Path | None, overrides: tuple[str, ...], workers
 
 
 @click.command()
-@click.argument("into", type=PathType(path_type=Path))
-@click.argument(
-    "outs",
-    type=PathType(path_type=Path, exists=True, file_okay=False),
-    metavar="OUT OUT...",
-    nargs=-1,
-    required=True,
-)
+@click.argument("into", type=PathType(path_type=Path), metavar="INTO")
+@click.argument("outs", type=PathType(path_type=Path), metavar="OUTS", nargs=-1, required=True)
 @processes_option
 def merge(into: Path, outs: tuple[Path, ...], workers: int) -> None:
-    """Make one dataset of several, in the new directory INTO.
+    """Make one dataset of several that were built apart.
 
-    Each OUT is the directory of a dataset: of other objects, or of the same objects under another
-    seed. What two of them hold is taken once. Configurations, hands and versions must be equal.
+    Their objects or their seeds may differ, and nothing else. INTO must be new or empty, and
+    appears when it is complete; OUTS stay as they are.
     """
-    from drakegrasp.dataset.merge import merge as merge_files
+    from drakegrasp.build.merge import merge as merge_datasets
     from drakegrasp.runtime.executor import processes
     from drakegrasp.runtime.progress import progress_bar
 
     with processes(workers) as execute, progress_bar("merge", "tasks") as progress:
-        merge_files(into, outs, execute=execute, progress=progress)
+        merge_datasets(into, outs, execute=execute, progress=progress)
     print_stats(into)
 
 

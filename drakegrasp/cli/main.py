@@ -151,7 +151,7 @@ objects.add_command(morph)
 
 # The help lists them in this order.
 for _command in (
-    *(doctor, objects, audit, hand, build, merge, assemble, check, stats, inspect_, figures),
+    *(doctor, objects, audit, hand, build, assemble, merge, check, stats, inspect_, figures),
     *(replay, verify, export, bench),
 ):
     main.add_command(_command)

@@ -146,7 +146,7 @@ def assemble_locked(
         removal = judge_successes(successes, manifest.config.filters, ids_rejected)
         splits = _split_successes(manifest, successes, removal)
         _remove_refined_tests(splits, successes, removal)
-        weights = _weights(successes, removal)
+        weights = _weights(manifest, successes, removal)
         ids = {split: successes.trial_id[rows] for split, rows in splits.items()}
 
         # Write what is small, and room for all rows.
@@ -348,7 +348,7 @@ def _split_successes(
 
     split = split_samples(
         successes.object[kept[first]],
-        [entry.name for entry in manifest.objects],
+        [entry.mesh_name for entry in manifest.objects],
         [entry.class_name for entry in manifest.objects],
         manifest.groups,
         manifest.config.split,
@@ -366,10 +366,11 @@ def _remove_refined_tests(
     splits["test"] = splits["test"][~refined]
 
 
-def _weights(successes: Successes, removal: AnyArray) -> Array:
+def _weights(manifest: Manifest, successes: Successes, removal: AnyArray) -> Array:
     """Return the weight (n,) of each success among the samples; NaN where it is none."""
     kept = np.flatnonzero(removal == Removal.KEPT)
     weights = np.full(len(removal), np.nan)
-    groups = np.column_stack([successes.object[kept], successes.resting[kept]])
-    weights[kept] = weigh_samples(groups, successes.X_OG[kept])
+    numbers, rows = manifest.pose_numbers(), zip(successes.object, successes.resting, strict=True)
+    poses = np.array([numbers[i][k] for i, k in rows], dtype=np.int64)[kept]
+    weights[kept] = weigh_samples(poses, successes.X_OG[kept])
     return weights

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata
@@ -19,6 +19,7 @@ from typing import Annotated, Any
 
 import h5py
 import numpy as np
+import numpy.typing as npt
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, with_config
 
 from drakegrasp.config import (
@@ -27,11 +28,13 @@ from drakegrasp.config import (
     NonNegative,
     Number,
     Positive,
+    Seed,
     Share,
     override_config,
     parse_stored,
 )
 from drakegrasp.dataset import log as build_log
+from drakegrasp.dataset.assembly.weights import number_poses
 from drakegrasp.dataset.layout.json_files import Name, read_mapping, validated
 from drakegrasp.dataset.paths import FILE_NAME, OWN_FILES, OWN_FOLDERS
 from drakegrasp.dataset.rejections import AttemptKey, key_to_json
@@ -114,7 +117,9 @@ class ObjectEntry:
         licence: Identifier of the mesh's licence; None: not stated.
         tried: Number of palm poses up to which a target of samples was met; None: all.
         group: What it shares with others of the same mesh, which stay in one split; None: its name.
-        seed: With which its attempts were drawn, after a merge; None: the configuration's.
+        seed: Of its draws, in a merged dataset; None: that of the configuration.
+        drawn_as: Name in its files, where a merged dataset has the mesh under several seeds; None:
+            its name.
     """
 
     name: Name
@@ -135,12 +140,23 @@ class ObjectEntry:
     licence: Licence | None = None
     tried: Whole | None = None
     group: Name | None = None
-    seed: Whole | None = None
+    seed: Seed | None = None
+    drawn_as: Name | None = None
+
+    @property
+    def mesh_name(self) -> str:
+        """Name of its mesh: under several seeds it is one object of the split."""
+        return self.drawn_as or self.name
+
+    def config_in(self, config: Config) -> Config:
+        """Return the configuration of the object in a dataset's: with the seed of its draws."""
+        return config if self.seed is None else config.model_copy(update={"seed": self.seed})
 
     def to_json(self) -> dict[str, Any]:
         """Return the entry as JSON types, in the order of the manifest."""
         # What is not stated leaves no trace.
-        unsaid = [k for k in ("licence", "tried", "group", "seed") if getattr(self, k) is None]
+        optional = ("licence", "tried", "group", "seed", "drawn_as")
+        unsaid = [key for key in optional if getattr(self, key) is None]
         said = {key: v for key, v in asdict(self).items() if key not in unsaid}
         return {"class" if key == "class_name" else key: v for key, v in said.items()}
 
@@ -194,7 +210,7 @@ class Manifest:
         hashes: dict[int | None, str] = {}
         for entry in self.objects:
             if entry.seed not in hashes:
-                hashes[entry.seed] = self._config_of(entry).simulation_hash()
+                hashes[entry.seed] = entry.config_in(self.config).simulation_hash()
             for unit in self.config.unit_ranges(entry.candidates):
                 if entry.tried is not None and unit.start >= entry.tried:
                     break
@@ -204,22 +220,13 @@ class Manifest:
                     object_name=entry.name,
                     start=unit.start,
                     stop=unit.stop,
+                    drawn_as=entry.drawn_as,
                 )
 
     def config_of(self, name: str) -> Config:
-        """Return the configuration of an object: after a merge each may have a seed of its own.
-
-        Raises:
-            DataError: If there is no object of that name.
-        """
-        for entry in self.objects:
-            if entry.name == name:
-                return self._config_of(entry)
-        raise DataError(f"the name must be that of an object of the dataset, got {name!r}")
-
-    def _config_of(self, entry: ObjectEntry) -> Config:
-        seed = self.config.seed if entry.seed is None else entry.seed
-        return self.config.model_copy(update={"seed": seed})
+        """Return the configuration of an object by its name, see `ObjectEntry.config_in`."""
+        own = (entry.config_in(self.config) for entry in self.objects if entry.name == name)
+        return next(own, self.config)
 
     @property
     def units(self) -> int:
@@ -229,13 +236,19 @@ class Manifest:
     @property
     def groups(self) -> list[str]:
         """Group of each object, see `split.split_rule`."""
-        return [entry.group or entry.name for entry in self.objects]
+        return [entry.group or entry.mesh_name for entry in self.objects]
 
     @property
     def split_rule(self) -> Rule:
         """What `split.by` of the configuration stands for with these objects."""
         classes = [entry.class_name for entry in self.objects]
         return split_rule(self.config.split, classes, self.groups)
+
+    def pose_numbers(self) -> list[npt.NDArray[np.int64]]:
+        """Return a number (r,) of each resting pose of each object, see `number_poses`."""
+        # The third row of X_TO is the table's normal in {O}, and the height.
+        up = [[pose.X_TO[8:11] for pose in entry.resting] for entry in self.objects]
+        return number_poses([entry.mesh_name for entry in self.objects], up)
 
     def signature(self) -> str:
         """Return a hash of all in it that decides a row of the dataset, hexadecimal."""
@@ -440,7 +453,12 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
     if manifest.config.simulation_hash() != config.simulation_hash():
         raise DataError(
             f"{out}: must be empty or hold this configuration's dataset, got one that differs in "
-            f"{_differences(manifest.config, config)}; choose another --out"
+            f"{differences(manifest.config, config)}; choose another --out"
+        )
+    if any(entry.seed is not None for entry in manifest.objects):
+        raise DataError(
+            f"{out}: must be of one seed to be built on, got a merged dataset of several; build on "
+            "those that it was merged of"
         )
     installed = installed_versions(config)
     for name in REQUIRED_VERSIONS:
@@ -492,21 +510,18 @@ def with_postprocessing(manifest: Manifest, overrides: Sequence[str]) -> Manifes
     if config.simulation_hash() != manifest.config.simulation_hash():
         raise ConfigError(
             "assemble may change values of filters and split only, got one that changes what was "
-            f"simulated: {_differences(manifest.config, config)}"
+            f"simulated: {differences(manifest.config, config)}"
         )
     return replace(manifest, config=config)
 
 
-def _differences(theirs: Config, ours: Config) -> str:
-    """Return the values that differ and change the simulation, in words."""
-    return ", ".join(differing_values(theirs, ours, POSTPROCESSING_KEYS))
-
-
-def differing_values(theirs: Config, ours: Config, but: Sequence[str] = ()) -> list[str]:
-    """Return each value that differs, in words, but for sections and values of some names."""
+def differences(
+    theirs: Config, ours: Config, ignored: Collection[str] = POSTPROCESSING_KEYS
+) -> str:
+    """Return the values that differ, in words; by default those that change the simulation."""
     a, b = _flatten(theirs.to_dict()), _flatten(ours.to_dict())
-    keys = [k for k in a if a[k] != b[k] and k.partition(".")[0] not in but]
-    return [f"{k} ({a[k]} there, {b[k]} here)" for k in keys]
+    keys = [k for k in a if a[k] != b[k] and k.partition(".")[0] not in ignored]
+    return ", ".join(f"{k} ({a[k]} there, {b[k]} here)" for k in keys)
 
 
 def _flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -52,6 +52,7 @@ class ShardHeader:
         mesh_sha256: Hash of the object's mesh file and of what is said of it.
         object_name: Name of the object.
         start, stop: Range of its candidates.
+        drawn_as: Name of the object in the file, where it is another, see `ObjectEntry`.
     """
 
     config_hash: str
@@ -59,6 +60,13 @@ class ShardHeader:
     object_name: str
     start: int
     stop: int
+    drawn_as: str | None = None
+
+    @property
+    def stored(self) -> dict[str, str | int]:
+        """What the shard's file says of itself."""
+        said = {key: value for key, value in asdict(self).items() if key != "drawn_as"}
+        return {**said, "object_name": self.drawn_as or self.object_name}
 
     @property
     def label(self) -> str:
@@ -107,7 +115,7 @@ def write_shard(out: Path, shard: Shard) -> Path:
     path = shard.header.path(out)
     tables = (("trials", trial_columns(), shard.trials), ("looks", LOOK_FIELDS, shard.looks))
     with atomic_hdf5(path, sealed=True) as file:
-        file.attrs.update(asdict(shard.header))
+        file.attrs.update(shard.header.stored)
         file.attrs["schema_version"] = SCHEMA_VERSION
         for name, fields, columns in tables:
             group = file.create_group(name)
@@ -209,7 +217,7 @@ def open_shard(
             start=int(file.attrs["start"]),
             stop=int(file.attrs["stop"]),
         )
-        if header is not None and own_header != header:
+        if header is not None and own_header.stored != header.stored:
             raise DataError(
                 f"{path}: must be a shard of {header.label}, got one of {own_header.label}"
             )

@@ -56,7 +56,7 @@ def split_samples(
 
     Args:
         objects: (n,), row of /objects of each sample.
-        names: Names of the objects, by row.
+        names: Names of the objects' meshes, by row; a mesh under several seeds is one object.
         classes: Classes of the objects, by row.
         groups: Groups of the objects, by row, see `split_rule`.
         config: The rule and its shares.
@@ -83,27 +83,27 @@ def _split_by_class(
     that `train_classes` names is not tested. The draw of a class depends on its own objects alone.
     """
     # The objects that have samples, by class.
-    members: dict[str, list[int]] = {}
+    members: dict[str, set[str]] = {}
     for index in np.unique(objects).tolist():
-        members.setdefault(classes[index], []).append(index)
+        members.setdefault(classes[index], set()).add(names[index])
 
     splits: Mapping[str, list[Rows]] = {"train": [], "valid": [], "test": []}
     for class_name in sorted(members):
-        indices = sorted(members[class_name], key=lambda i: names[i])
+        own = sorted(members[class_name])
         # A key of three numbers: never the stream of a candidate of an object of that name.
         stream = Stream(seed, object_key(class_name), 0, 1)
         # The test object, or all of them, or none.
-        if not may_train(class_name, len(indices), config):
-            tested, others = indices, []
-        elif len(indices) < 2:
-            tested, others = [], indices
+        if not may_train(class_name, len(own), config):
+            tested, others = own, []
+        elif len(own) < 2:
+            tested, others = [], own
         else:
-            tested = [indices[int(stream.integers(len(indices), 1)[0])]]
-            others = [i for i in indices if i not in tested]
-        splits["test"].append(np.flatnonzero(np.isin(objects, tested)))
+            tested = [own[int(stream.integers(len(own), 1)[0])]]
+            others = [name for name in own if name not in tested]
+        splits["test"].append(_rows_of(objects, names, tested))
 
         # The samples of the others, shuffled.
-        pool = np.flatnonzero(np.isin(objects, others))
+        pool = _rows_of(objects, names, others)
         shuffled = pool[stream.permutation(len(pool))]
         count = round(config.valid_fraction * len(pool))
         splits["valid"].append(shuffled[:count])
@@ -131,12 +131,12 @@ def _split_by_object(
     tested, valid = _shares(len(ordered), config)
     last = len(ordered) - valid
     members = {"train": ordered[tested:last], "valid": ordered[last:], "test": ordered[:tested]}
-    return {
-        name: np.flatnonzero(
-            np.isin(objects, [i for i, group in enumerate(groups) if group in chosen])
-        )
-        for name, chosen in members.items()
-    }
+    return {name: _rows_of(objects, groups, chosen) for name, chosen in members.items()}
+
+
+def _rows_of(objects: npt.NDArray[np.int32], texts: Sequence[str], chosen: Sequence[str]) -> Rows:
+    """Return the indices of the samples of the objects whose text is one of those chosen."""
+    return np.flatnonzero(np.isin(objects, [i for i, text in enumerate(texts) if text in chosen]))
 
 
 def _shares(count: int, config: SplitConfig) -> tuple[int, int]:

@@ -63,6 +63,7 @@ class Snapshot:
         out: Directory of the dataset.
         config: Its configuration.
         config_hash: Hash of what decides a shard, as its files have it.
+        own_hashes: That of each object with a seed of its own, by its name.
         names, classes: Of the objects, by their number.
         meshes: Hashes of the objects' meshes, hexadecimal.
         table: The attempts.
@@ -83,6 +84,7 @@ class Snapshot:
     sources: tuple[Path, ...]
     sample_ids: dict[str, npt.NDArray[np.int64]]
     assembled: bool
+    own_hashes: Mapping[str, str] = field(default_factory=dict)
     stamps: Mapping[Path, Stamp] = field(default_factory=dict)
     missing: tuple[str, ...]
 
@@ -307,10 +309,24 @@ def _read_assembled(out: Path, stamps: Mapping[Path, Stamp]) -> tuple[Snapshot, 
         sources=(path,),
         sample_ids=read_sample_ids(out),
         assembled=True,
+        own_hashes=_own_hashes(out),
         stamps={path: stamp for path, stamp in stamps.items() if path.name in ASSEMBLED_FILES},
         missing=tuple(missing),
     )
     return state, signature
+
+
+def _own_hashes(out: Path) -> dict[str, str]:
+    """Return what `Snapshot.own_hashes` is; nothing if the files are all that there is."""
+    try:
+        manifest = read_manifest(out)
+    except DataError:
+        return {}
+    return {
+        entry.name: entry.config_in(manifest.config).simulation_hash()
+        for entry in manifest.objects
+        if entry.seed is not None
+    }
 
 
 def _other_manifest(out: Path, signature: str) -> Manifest | None:

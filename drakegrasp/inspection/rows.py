@@ -147,9 +147,10 @@ def _shard_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
 
 def _is_shard_of(snapshot: Snapshot, i: int, file: h5py.File) -> bool:
     """Return whether a shard is of the configuration and the mesh of an attempt."""
-    mesh = snapshot.meshes[snapshot.table.object[i]]
+    number = snapshot.table.object[i]
+    due = snapshot.own_hashes.get(snapshot.names[number], snapshot.config_hash)
     identity = (file.attrs["config_hash"], file.attrs["mesh_sha256"])
-    return identity == (snapshot.config_hash, mesh)
+    return identity == (due, snapshot.meshes[number])
 
 
 def _shard_path(snapshot: Snapshot, i: int) -> Path:

@@ -136,7 +136,7 @@ def place_grasps(grasps: npt.ArrayLike, arguments: VerifyArguments) -> list[Plac
         targets = [_target_of_mesh(arguments, config, len(points))]
     else:
         rows = _choose_rows(arguments.dataset, arguments.rows, len(points))
-        targets = _targets_of_rows(arguments.dataset, rows, known, in_camera=frame == "camera")
+        targets = _targets_of_rows(arguments.dataset, rows, in_camera=frame == "camera")
 
     # Express the contacts in {O} of their objects.
     placed_grasps: list[PlacedGrasp] = []
@@ -253,14 +253,13 @@ def _target_of_mesh(arguments: VerifyArguments, config: Config, count: int) -> _
 
 
 def _targets_of_rows(
-    dataset: GraspDataset, rows: npt.NDArray[np.int64], config: Config, *, in_camera: bool
+    dataset: GraspDataset, rows: npt.NDArray[np.int64], *, in_camera: bool
 ) -> list[_Target]:
     """Return the objects of a dataset's rows.
 
     Args:
         dataset: The data file.
         rows: (n,), the row of each grasp.
-        config: Of the dataset.
         in_camera: Whether the grasps are in {C}.
     """
     # The object, its resting pose, and the camera of each row.
@@ -269,11 +268,12 @@ def _targets_of_rows(
     X_TC = unpack_pose(dataset.column(f"object_props/frame_work2cam_{dataset.camera}")[rows])
 
     # Each object in each resting pose once, with its grasps.
-    targets, out = [], dataset.path.parent
+    out, targets = dataset.path.parent, []
     manifest = read_manifest(out)
     for name, k in dict.fromkeys(zip(names.tolist(), resting.tolist(), strict=True)):
         indices = np.flatnonzero((names == name) & (resting == k))
-        prepared = load_prepared(out, name, manifest.config_of(name))
+        config = manifest.config_of(name)
+        prepared = load_prepared(out, name, config)
         X_TO = prepared.resting_poses[k]
         placed = PlacedObject(model=prepared.model, X_TO=X_TO, config=config)
         poses = read_pose(X_TC[indices], "the camera's pose") if in_camera else None

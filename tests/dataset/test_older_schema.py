@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
+from drakegrasp.build.merge import merge
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import claim_directory, read_manifest
@@ -71,8 +72,9 @@ def test_older_attempts_are_inspected(older: Path) -> None:
         assemble,
         check_dataset,
         lambda out: claim_directory(out, read_manifest(out).config),
+        lambda out: merge(out.parent / "into", [out]),
     ],
-    ids=["assemble", "check", "build"],
+    ids=["assemble", "check", "build", "merge"],
 )
 def test_older_dataset_is_for_reading_alone(older: Path, act: Callable[[Path], object]) -> None:
     with pytest.raises(DataError, match="schema must be 4 for anything but reading, got 3"):

@@ -7,7 +7,7 @@ palm is near, itself included). Imports NumPy only.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +39,34 @@ def weigh_samples(groups: npt.ArrayLike, X_OG: Array) -> Array:
             near = (shift <= NEAR_SHIFT) & (cosine >= np.cos(NEAR_TURN))
             count[rows[part]] = near.sum(axis=1)
     return 1.0 / count
+
+
+def number_poses(meshes: Sequence[str], up: Sequence[npt.ArrayLike]) -> list[npt.NDArray[np.int64]]:
+    """Return a number (r,) of each resting pose of each object.
+
+    It is another for each pose; but a mesh that has several seeds has drops of each, and poses of
+    these that are near count as one.
+
+    Args:
+        meshes: Names of the objects' meshes.
+        up: (r, 3) of each object: upward directions in {O} of its resting poses.
+    """
+    known: dict[str, tuple[Array, npt.NDArray[np.int64]]] = {}
+    numbers, count = list[npt.NDArray[np.int64]](), 0
+    for mesh, directions in zip(meshes, map(np.asarray, up), strict=True):
+        own = np.arange(count, count + len(directions))
+        count += len(directions)
+        if mesh not in known:
+            known[mesh] = directions, own
+        else:
+            # The nearest pose of another seed.
+            theirs, places = known[mesh]
+            cosine = dot(directions[:, None], theirs[None])
+            near = cosine.max(axis=1) >= np.cos(NEAR_TURN)
+            own = np.where(near, places[cosine.argmax(axis=1)], own)
+            known[mesh] = np.concatenate([theirs, directions]), np.concatenate([places, own])
+        numbers.append(own)
+    return numbers
 
 
 def effective_number(weights: npt.ArrayLike) -> float:

@@ -111,7 +111,7 @@ def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
         "hand": Path(manifest.config.hand).stem,
         "fingers": list(manifest.fingers),
         "schema_version": SCHEMA_VERSION,
-        "seed": manifest.config.seed,
+        "seeds": sorted({entry.config_in(manifest.config).seed for entry in entries}),
         "config_hash": manifest.config.simulation_hash(),
         "settings": _settings(manifest.config),
         "split_by": split_rule_of(data),

@@ -52,9 +52,10 @@ def _files(content: Mapping[str, Any]) -> str:
 def _how(content: Mapping[str, Any]) -> str:
     settings = _table(("setting", "value"), [(f"`{k}`", v) for k, v in content["settings"].items()])
     versions = ", ".join(f"{name} {version}" for name, version in content["versions"].items())
+    seeds = ", ".join(map(str, content["seeds"]))
     return f"""## How it was made
 
-Schema {content["schema_version"]}, seed {content["seed"]}, configuration
+Schema {content["schema_version"]}, seed {seeds}, configuration
 `{content["config_hash"]}`.
 
 {settings}

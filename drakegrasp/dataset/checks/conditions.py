@@ -29,23 +29,22 @@ def as_drawn(
         batch: Rows of `/trials`.
         names: Names of the objects, by row of `/objects`.
         model: Returns an object by its name, None where its file is broken.
-        config: Returns by the name of an object what is drawn, and the seed.
+        config: Returns what is drawn of an object, and the seed, by its name.
     """
     expected = {f.name: np.array(batch[f.name]) for f in CONDITION_FIELDS}
     for index in np.unique(batch["object"]).tolist():
         known = model(names[index])
         if known is None:
             continue  # a finding already
-        rules = config(names[index])
-        rows = np.flatnonzero(batch["object"] == index)
+        rows, own = np.flatnonzero(batch["object"] == index), config(names[index])
         # Where nothing is drawn all attempts of an object have the same conditions.
-        if rules.randomize == RandomizeConfig():
-            for name, value in draw_conditions(known, rules, 0, 0).values().items():
+        if own.randomize == RandomizeConfig():
+            for name, value in draw_conditions(known, own, 0, 0).values().items():
                 expected[name][rows] = value
             continue
         for row in rows:
             numbers = (int(batch[key][row]) for key in ("candidate", "standoff_index", "child"))
-            for name, value in draw_conditions(known, rules, *numbers).values().items():
+            for name, value in draw_conditions(known, own, *numbers).values().items():
                 expected[name][row] = value
 
     for name, values in expected.items():

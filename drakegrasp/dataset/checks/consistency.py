@@ -20,12 +20,15 @@ from drakegrasp.dataset.schema import OBJECT_FIELDS, SPLITS
 from drakegrasp.frames import unpack_pose
 
 
-def splits(data: OpenFile, groups: Mapping[str, str]) -> Iterator[Violation]:
+def splits(
+    data: OpenFile, groups: Mapping[str, str], meshes: Mapping[str, str]
+) -> Iterator[Violation]:
     """A trial is one sample; a tested object, or a class left out, is in no other split.
 
     Args:
         data: The data file.
         groups: Group of each object by its name, as far as they are known.
+        meshes: Name of its mesh, likewise; under several seeds it is one object.
     """
     # Each trial once; meanwhile gather the objects and their classes by split.
     seen: dict[int, str] = {}
@@ -53,6 +56,10 @@ def splits(data: OpenFile, groups: Mapping[str, str]) -> Iterator[Violation]:
         return
 
     # By class, outside of the test split: no tested object, and only the classes to train on.
+    objects = {
+        split: {meshes.get(name, name): kind for name, kind in members.items()}
+        for split, members in objects.items()
+    }
     tested = objects.pop("test", {})
     allowed = data.config.split.train_classes if data.config else None
     for split, members in objects.items():
@@ -130,7 +137,7 @@ def kept_are_samples(data: OpenFile, trials: OpenFile) -> Iterator[Violation]:
             yield of_file(data.name, what, f"{len(others)} otherwise: trials {sorted(others)[:5]}")
 
 
-def likeness(data: OpenFile, trials: OpenFile) -> Iterator[Violation]:
+def likeness(data: OpenFile, trials: OpenFile, manifest: Manifest) -> Iterator[Violation]:
     """No family is in two splits, no refined grasp is tested, and weights count what is alike."""
     names = ("object", "candidate", "standoff_index", "child", "resting", "X_OG")
     columns = {name: trials.groups["trials"][name][:] for name in names}
@@ -153,8 +160,10 @@ def likeness(data: OpenFile, trials: OpenFile) -> Iterator[Violation]:
 
     # The weights, from the palms of all samples.
     every = np.concatenate([np.zeros(0, dtype=np.int64), *ids.values()])
-    groups = np.column_stack([columns["object"][every], columns["resting"][every]])
-    due = weigh_samples(groups, unpack_pose(columns["X_OG"][every])).astype(np.float32)
+    numbers = manifest.pose_numbers()
+    rows = zip(columns["object"][every], columns["resting"][every], strict=True)
+    poses = np.array([numbers[i][k] for i, k in rows], dtype=np.int64)
+    due = weigh_samples(poses, unpack_pose(columns["X_OG"][every])).astype(np.float32)
     for split, own in ids.items():
         weights = data.groups[split]["grasp_props/weight"][:]
         expected, due = np.split(due, [len(own)])

@@ -57,6 +57,11 @@ class Dataset:
         """Group of each object by its name."""
         return dict(zip(self.names, self.manifest.groups, strict=True))
 
+    @property
+    def meshes(self) -> dict[str, str]:
+        """Name of the mesh of each object by its name."""
+        return {entry.name: entry.mesh_name for entry in self.manifest.objects}
+
 
 @dataclass(kw_only=True, eq=False)
 class Context:

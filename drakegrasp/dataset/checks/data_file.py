@@ -57,8 +57,9 @@ def check_data_file(data: OpenFile, camera: str, context: Context) -> None:
     """
     if data.config is None:
         return  # a finding already; without a lens no image can be judged
-    groups = {} if context.dataset is None else context.dataset.groups
-    context.add(data, consistency.splits(data, groups))
+    known = context.dataset
+    groups, meshes = ({}, {}) if known is None else (known.groups, known.meshes)
+    context.add(data, consistency.splits(data, groups, meshes))
     judge_rows(_tasks(data, camera, context.dataset), data, context)
 
 

@@ -121,7 +121,7 @@ def _check_directory(
         if trials is not None:
             context.add(data, consistency.kept_are_samples(data, trials))
             if not findings.violations():
-                context.add(data, consistency.likeness(data, trials))
+                context.add(data, consistency.likeness(data, trials, manifest))
     if len(files) == len(CAMERAS) and all(data.config for data in files.values()):
         check_pair(files[CAMERAS[0]], files[CAMERAS[1]], findings)
     if not findings.violations():

@@ -76,7 +76,8 @@ def compare_samplers(out: Path, other: Path | None = None) -> SamplerComparison:
     own = funnels[config.candidates.method]
     wins = {name: int(own.outcomes[own.names.index(name), Outcome.SUCCESS]) for name in names}
     name = max(names, key=lambda name: wins[name])
-    shown = load_prepared(out, name, manifest.config_of(name))
+    own_config = manifest.config_of(name)
+    shown = load_prepared(out, name, own_config)
 
     # Palm poses of that object, and numbers.
     candidates: dict[str, Candidates] = {}
@@ -85,14 +86,13 @@ def compare_samplers(out: Path, other: Path | None = None) -> SamplerComparison:
     for method in METHODS:
         if method in datasets:
             path, funnel = datasets[method], funnels[method]
-            config_of = read_manifest(path).config_of
-            objects = {each: load_prepared(path, each, config_of(each)) for each in names}
-            covers = {each: _cover(prepared) for each, prepared in objects.items()}
-            candidates[method] = objects[name].candidates
+            settings = read_manifest(path).config_of
+            covers = {each: _cover(load_prepared(path, each, settings(each))) for each in names}
+            candidates[method] = load_prepared(path, name, settings(name)).candidates
             of_shown[method] = _numbers({name: covers[name]}, funnel)
             of_all[method] = _numbers(covers, funnel)
         else:
-            drawn = replace(shown, candidates=_draw(shown, config, method))
+            drawn = replace(shown, candidates=_draw(shown, own_config, method))
             candidates[method] = drawn.candidates
             of_shown[method] = _numbers({name: _cover(drawn)}, None)
     return SamplerComparison(

@@ -19,9 +19,8 @@ import matplotlib.style
 import numpy as np
 from matplotlib.figure import Figure
 
-from drakegrasp.config import Config
 from drakegrasp.dataset.filters import Removal
-from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.manifest import Manifest, read_manifest
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.statistics import Funnel, count_funnel
 from drakegrasp.errors import DataError, MachineError
@@ -74,7 +73,7 @@ class _Dataset:
     """What several figures need of a dataset."""
 
     out: Path
-    config: Config
+    manifest: Manifest
     funnel: Funnel
     held: HeldGrasps
 
@@ -108,7 +107,7 @@ def write_figures(
         OSError: If a file cannot be written.
     """
     held = read_held(out)
-    data = _Dataset(out=out, config=read_manifest(out).config, funnel=count_funnel(out), held=held)
+    data = _Dataset(out=out, manifest=read_manifest(out), funnel=count_funnel(out), held=held)
     drawings: dict[str, Callable[[], _Drawn]] = {
         "palm_poses": lambda: _palm_poses(data, compare),
         "phases": lambda: _phases(data, trial_id),
@@ -257,8 +256,7 @@ def _approaches(data: _Dataset) -> _Drawn:
     shown = [int(i) for i in order[:OBJECTS] if held[i]]
     if not shown:
         raise DataError("no attempt succeeded")
-    names = data.funnel.names
-    config_of = read_manifest(data.out).config_of
+    names, config_of = data.funnel.names, data.manifest.config_of
     items = [read_approaches(data.out, i, names[i], config_of(names[i])) for i in shown]
     figure = approaches_figure(items, left_out=int(np.count_nonzero(held)) - len(shown))
     numbers = {

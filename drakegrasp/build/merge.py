@@ -1,0 +1,254 @@
+"""Datasets that were built apart, as one: halves by objects, or by seeds.
+
+In: directories of datasets of one configuration, whose seeds may differ. Out: a directory with the
+files of their objects and shards, under names that tell seeds apart, and what assembling makes of
+them. A mesh under several seeds is one object of the split.
+"""
+
+from __future__ import annotations
+
+import filecmp
+import os
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePath
+
+from drakegrasp.config import Config
+from drakegrasp.dataset.assemble import Assembly, assemble_locked
+from drakegrasp.dataset.assembly.survey import headers_by_object
+from drakegrasp.dataset.lock import build_lock
+from drakegrasp.dataset.manifest import (
+    REQUIRED_VERSIONS,
+    Manifest,
+    ObjectEntry,
+    differences,
+    read_manifest,
+    refuse_older,
+    write_manifest,
+)
+from drakegrasp.dataset.paths import model_path, plan_path, shards_folder
+from drakegrasp.dataset.shards import ShardHeader
+from drakegrasp.dataset.statistics import is_assembled
+from drakegrasp.errors import DataError
+from drakegrasp.runtime.executor import Executor, run_here
+from drakegrasp.runtime.files import atomic_folder, disk_full_named, sync
+from drakegrasp.runtime.progress import Report, silent
+
+#: Keys in which datasets may differ; the merged one has the first's seed and no target.
+_FREE = ("seed", "samples", "samples_per_object", "samples_patience")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Part:
+    """An object of one of the datasets.
+
+    Attributes:
+        out: Directory of the dataset.
+        entry: The object there.
+        headers: Its work units.
+        merged: What it is in the merged dataset.
+    """
+
+    out: Path
+    entry: ObjectEntry
+    headers: tuple[ShardHeader, ...]
+    merged: ObjectEntry
+
+
+def merge(
+    into: Path,
+    outs: Sequence[Path],
+    *,
+    execute: Executor = run_here,
+    progress: Report = silent,
+) -> Assembly:
+    """Make one dataset of several, which stay as they are; it appears when it is complete.
+
+    An object that several have with the same seed is taken once. Files are hard links where the
+    file system allows.
+
+    Args:
+        into: Directory of the merged dataset, new or empty.
+        outs: Directories of the datasets, whose objects come in this order.
+        execute: Does the work of assembling.
+        progress: Called with the number of its tasks that are done and to do.
+
+    Raises:
+        DataError: If the directory is in use, a dataset is not complete, or two of them are not of
+            one configuration, one hand and one version, or differ in what both have.
+        DiskFullError: If there is no room.
+    """
+    # Refuse what cannot be done before anything is written.
+    if into.exists() and (not into.is_dir() or any(into.iterdir())):
+        raise DataError(f"{into}: must be a new or empty directory, got one that is in use")
+    manifests = {out: _read_complete(out, execute) for out in outs}
+    _refuse_differences(manifests)
+    parts = _parts(manifests)
+    manifest = _merged_manifest(manifests, parts)
+
+    with disk_full_named(into), atomic_folder(into) as folder, build_lock(folder):
+        for part in parts:
+            _take_files(part, folder)
+        write_manifest(manifest, folder)
+        return assemble_locked(folder, manifest, execute=execute, progress=progress)
+
+
+def _read_complete(out: Path, execute: Executor) -> Manifest:
+    """Return the manifest of a dataset that no build has to go on with."""
+    manifest = read_manifest(out)
+    refuse_older(manifest, out)
+    if not is_assembled(out, verify_shards=True, execute=execute):
+        raise DataError(
+            f"{out}: must be a complete dataset, got one whose files are not of all its shards; "
+            "complete it with `drakegrasp build` or `assemble`"
+        )
+    return manifest
+
+
+def _refuse_differences(manifests: Mapping[Path, Manifest]) -> None:
+    """Refuse datasets whose labels cannot be compared.
+
+    Raises:
+        DataError: If there are any.
+    """
+    (first, known), *others = manifests.items()
+    for out, manifest in others:
+        config = _with_hand_of(known.config, manifest.config)
+        if differing := differences(known.config, config, _FREE):
+            raise DataError(
+                f"{out}: must be of the configuration of {first} but for the seed, got one that "
+                f"differs in {differing}"
+            )
+        for name in REQUIRED_VERSIONS:
+            if manifest.versions.get(name) != known.versions.get(name):
+                raise DataError(
+                    f"{out}: must be of {name} {known.versions.get(name)}, as {first} is, "
+                    f"got {manifest.versions.get(name)}"
+                )
+
+
+def _with_hand_of(known: Config, config: Config) -> Config:
+    """Return a configuration with the same hand elsewhere: its files count, by their digest."""
+    if PurePath(known.hand).stem != PurePath(config.hand).stem:
+        return config
+    return config.model_copy(update={"hand": known.hand})
+
+
+def _parts(manifests: Mapping[Path, Manifest]) -> list[_Part]:
+    """Return the objects of all datasets, with their names and seeds in the merged one.
+
+    Raises:
+        DataError: If one has a name for which another has another mesh.
+    """
+    seed = next(iter(manifests.values())).config.seed
+    entries = [
+        (out, entry, headers, entry.config_in(manifest.config).seed)
+        for out, manifest in manifests.items()
+        for entry, headers in zip(manifest.objects, headers_by_object(manifest), strict=True)
+    ]
+
+    # The seeds of each mesh.
+    meshes, seeds = dict[str, tuple[Path, ObjectEntry]](), dict[str, set[int]]()
+    for out, entry, _, own in entries:
+        seeds.setdefault(entry.mesh_name, set()).add(own)
+        first, known = meshes.setdefault(entry.mesh_name, (out, entry))
+        for key in ("mesh_sha256", "class_name", "group"):
+            if getattr(known, key) != getattr(entry, key):
+                raise DataError(
+                    f"{out}: {entry.mesh_name} must have the {key} that it has in {first}, "
+                    f"{getattr(known, key)}, got {getattr(entry, key)}"
+                )
+
+    # A mesh keeps its name under the first seed, and where it has one seed only.
+    parts = []
+    for out, entry, headers, own in entries:
+        mesh, alone = entry.mesh_name, own == seed or len(seeds[entry.mesh_name]) == 1
+        merged = replace(
+            entry,
+            name=mesh if alone else f"{mesh}-seed-{own}",
+            seed=None if own == seed else own,
+            drawn_as=None if alone else mesh,
+        )
+        parts.append(_Part(out=out, entry=entry, headers=headers, merged=merged))
+    return parts
+
+
+def _merged_manifest(manifests: Mapping[Path, Manifest], parts: Iterable[_Part]) -> Manifest:
+    """Return the manifest of the merged dataset.
+
+    Raises:
+        DataError: If two parts are one object and differ, or have one name and differ in seed.
+    """
+    # Each object once; of two that are equal, the one that was tried for longer.
+    objects, names = dict[str, ObjectEntry](), dict[tuple[Path, str], str]()
+    for part in parts:
+        names[part.out, part.entry.name] = part.merged.name
+        known = objects.setdefault(part.merged.name, part.merged)
+        tried = (
+            None
+            if None in (known.tried, part.merged.tried)
+            else (max(known.tried or 0, part.merged.tried or 0))
+        )
+        longer = replace(known, tried=tried)
+        if longer != replace(part.merged, tried=tried):
+            raise _unequal(part, known)
+        objects[part.merged.name] = longer
+
+    first = next(iter(manifests.values()))
+    refused = [mesh for manifest in manifests.values() for mesh in manifest.refused]
+    rejected = [
+        replace(key, object=names[out, key.object])
+        for out, manifest in manifests.items()
+        for key in manifest.rejected
+        if (out, key.object) in names
+    ]
+    return replace(
+        first,
+        config=first.config.model_copy(update={"samples": None, "samples_per_object": None}),
+        objects=tuple(objects.values()),
+        refused=tuple({mesh.name: mesh for mesh in refused if mesh.name not in objects}.values()),
+        rejected=tuple(dict.fromkeys(rejected)),
+    )
+
+
+def _take_files(part: _Part, folder: Path) -> None:
+    """Put the files of an object into a folder.
+
+    Raises:
+        DataError: If another part has put others there.
+    """
+    old, new = part.entry.name, part.merged.name
+    pairs = [(path(part.out, old), path(folder, new)) for path in (model_path, plan_path)]
+    for header in part.headers:
+        # Behind the last wanted grasp there need be none.
+        if header.path(part.out).exists():
+            pairs.append((header.path(part.out), shards_folder(folder, new) / header.file_name))
+    for source, target in pairs:
+        if not target.exists():
+            _link(source, target)
+        elif not filecmp.cmp(source, target, shallow=False):
+            raise DataError(
+                f"{source}: must be equal in all datasets with {part.entry.mesh_name} under the "
+                "same seed, got another"
+            )
+
+
+def _link(source: Path, target: Path) -> None:
+    """Give a file a second name, or copy it where that cannot be."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)
+        sync(target)
+
+
+def _unequal(part: _Part, known: ObjectEntry) -> DataError:
+    """Return the refusal of an object that another dataset has, too, and says otherwise of it."""
+    theirs, ours = known.to_json(), part.merged.to_json()
+    keys = [key for key in {**theirs, **ours} if theirs.get(key) != ours.get(key)]
+    return DataError(
+        f"{part.out}: {part.merged.name} must be equal in all datasets that have it under the same "
+        f"seed, got others in {', '.join(key for key in keys if key != 'tried')}"
+    )
