@@ -344,6 +344,7 @@ def test_merged_builds_replay_bit_equal(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "into" / TRIALS) as file:
         owner, outcome, child = (file["trials"][key][:] for key in ("object", "outcome", "child"))
     assert len(np.unique(owner)) == 4
+    assert len(np.unique(owner[child > 0])) > 1
     for number in range(4):
         lifted = np.flatnonzero((owner == number) & (outcome == Outcome.SUCCESS))
         for row in (
