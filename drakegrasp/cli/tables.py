@@ -72,7 +72,7 @@ def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
     groups: dict[str, tuple[Outcome, ...]] = {_OUTCOME_HEADS[o]: (o,) for o in shown}
     if compact:
         # Room is scarce, and few datasets have lifts that were ended or left out.
-        there = funnel.outcomes.any(axis=0)
+        there = funnel.outcomes.sum(axis=0)
         groups = {h: g for h, g in _COMPACT_HEADS.items() if h not in _RARE or there[g[0]]}
     removed = [r for r in Removal if r is not Removal.KEPT and funnel.removals[:, r].any()]
     heads = ["poses", "attempts", *groups]
