@@ -12,18 +12,22 @@ import pytest
 from helpers.assertions import assert_same_dataset
 from helpers.meshes import write_fixed
 
+from drakegrasp.bench.cross_check import cross_check
 from drakegrasp.build.pipeline import build
 from drakegrasp.build.replay import replay_trial
 from drakegrasp.config import Config, load_config, override_config
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.filters import Removal
+from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.statistics import count_funnel, count_splits
 from drakegrasp.frames import unpack_pose
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
+from drakegrasp.verification.placed_grasp import VerifyArguments, place_grasps
+from drakegrasp.visualization.figures.held_grasps import read_approaches
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
@@ -114,6 +118,55 @@ def test_refined_trial_replays_bit_for_bit(refined: Path) -> None:
     for wanted in (1, 2):
         again = replay_trial(refined, int(np.flatnonzero(generation == wanted)[-1]))
         assert again.same, again.differences
+
+
+def test_samples_are_verified_as_they_lay(refined: Path) -> None:
+    """Grasps of all rows, those of other resting poses too, are put on the table as tried."""
+    dataset = GraspDataset(refined / "grasping_oto.hdf5")
+    rows = trials(refined)
+    tried, grasps = dataset.column("trial_id"), dataset.column("grasps")
+    arguments = VerifyArguments(dataset=dataset, rows=list(range(len(grasps))), method="forces")
+    placed = place_grasps(grasps, arguments)
+    assert sorted(each.index for each in placed) == list(range(len(grasps)))
+    assert len(np.unique(rows["resting"][tried])) > 1
+    for each in placed:
+        X_TO = unpack_pose(rows["X_TO"][tried[each.index]])
+        np.testing.assert_array_equal(each.placed.X_TO, X_TO)
+
+
+def test_lifts_are_tried_elsewhere_as_they_lay(
+    refined: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mujoco_baseline = pytest.importorskip("drakegrasp.bench.mujoco_baseline")
+    stood: list[np.ndarray] = []
+
+    class Peer:
+        """Says where the object stood when a lift was tried."""
+
+        def __init__(self, *_: object) -> None:
+            pass
+
+        def place(self, X_TO: np.ndarray) -> None:
+            self.X_TO = X_TO
+
+        def run(self, _: object) -> object:
+            stood.append(self.X_TO)
+            return mujoco_baseline.PeerTrial(outcome=Outcome.MOVED)
+
+    monkeypatch.setattr(mujoco_baseline, "MujocoBaseline", Peer)
+    lifts = cross_check(refined, 12)["lifts"]
+    columns = trials(refined)
+    ids = [lift["trial_id"] for lift in lifts]
+    assert len(np.unique(columns["resting"][ids])) > 1
+    np.testing.assert_array_equal(stood, [unpack_pose(columns["X_TO"][i]) for i in ids])
+
+
+def test_picture_of_approaches_is_of_one_resting_pose(refined: Path) -> None:
+    columns, name = trials(refined), "8_wineglass_flute"
+    own = (columns["object"] == 0) & (columns["outcome"] == Outcome.SUCCESS)
+    shown = read_approaches(refined, 0, name, read_manifest(refined).config_of(name))
+    assert (columns["resting"][own] > 0).any()
+    assert len(shown.successes) == np.count_nonzero(own & (columns["resting"] == 0))
 
 
 def test_refined_grasps_train_and_never_test(refined: Path) -> None:
