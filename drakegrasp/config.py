@@ -207,6 +207,9 @@ class RefineConfig(_Section):
     generations: Annotated[int, Field(ge=1, le=4)] = 1  # children of children, and so on
     shift: Positive = 0.0075  # [m], standard deviation along each axis of the palm
     turn_deg: Positive = 7.5  # standard deviation about each axis of the palm
+    # Share of the objects without any: those that a split by object tests first, where refined
+    # palm poses are no samples.
+    spared: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
 
 
 class ScreenConfig(_Section):

@@ -37,7 +37,7 @@ from drakegrasp.dataset.manifest import (
 )
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.shards import ShardHeader
-from drakegrasp.dataset.split import may_train, split_rule
+from drakegrasp.dataset.split import may_train, split_rule, test_rank
 from drakegrasp.dataset.statistics import is_assembled
 from drakegrasp.errors import DataError, DrakegraspError
 from drakegrasp.hand.description import load_hand
@@ -396,6 +396,14 @@ def _tried(units: Sequence[ShardHeader]) -> int:
     return units[-1].stop if units else 0
 
 
+def _spared(manifest: Manifest) -> set[str]:
+    """Return the names of the objects whose palm poses are not refined."""
+    share, seed = manifest.config.refine.spared, manifest.config.seed
+    ranks = [test_rank(group, seed) for group in manifest.groups]
+    names = [entry.name for entry in manifest.objects]
+    return {name for name, rank in zip(names, ranks, strict=True) if rank < share}
+
+
 def _run_units(
     headers: Iterable[ShardHeader],
     manifest: Manifest,
@@ -405,8 +413,15 @@ def _run_units(
 ) -> None:
     """Run work units, and count what they found."""
     config, restartable = manifest.config.to_dict(), job.pool is not None
+    spared = _spared(manifest)
     units = (
-        WorkUnit(out=str(job.out), header=header, config=config, restartable=restartable)
+        WorkUnit(
+            out=str(job.out),
+            header=header,
+            config=config,
+            refined=header.object_name not in spared,
+            restartable=restartable,
+        )
         for header in headers
     )
     for summary in job.execute(run_unit, units):

@@ -86,6 +86,7 @@ class WorkUnit:
         out: Directory of the dataset, visible to every worker.
         header: Object and range of candidates.
         config: `Config.to_dict()`.
+        refined: Whether palm poses about those of samples are tried, if the configuration has any.
         restartable: Whether the process that runs it is started again when it dies. If so, a
             crash or a hang costs only the attempt; if not, it propagates to the caller.
     """
@@ -93,6 +94,7 @@ class WorkUnit:
     out: str
     header: ShardHeader
     config: dict[str, Any]
+    refined: bool = True
     restartable: bool = False
 
 
@@ -167,7 +169,7 @@ def _run_experiment(unit: WorkUnit, journal: Journal) -> UnitSummary:
     while attempts:
         first = sum(len(done.attempts) for done in rounds)
         rounds.append(_run_round(setup, attempts, first, journal, seconds))
-        attempts = _children_of_samples(setup, rounds[-1])
+        attempts = _children_of_samples(setup, rounds[-1]) if unit.refined else []
 
     # Write the shard: all of it or nothing.
     with _stage(journal, "write", header.object_name, seconds):

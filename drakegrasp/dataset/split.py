@@ -112,6 +112,15 @@ def _split_by_class(
     return {name: np.sort(np.concatenate(empty + rows)) for name, rows in splits.items()}
 
 
+def test_rank(group: str, seed: int) -> float:
+    """Return the number in [0, 1) of a group of objects; those with the lowest are tested.
+
+    It is uniform over seeds, so the share x of all groups has a number below x, more or less.
+    """
+    # Another place than that of a class: it may have the same name.
+    return float(Stream(seed, object_key(group), 0, 2).uniform(1)[0])
+
+
 def _split_by_object(
     objects: npt.NDArray[np.int32], groups: Sequence[str], config: SplitConfig, seed: int
 ) -> dict[str, Rows]:
@@ -124,9 +133,7 @@ def _split_by_object(
     """
     # The groups that have samples, in the order of their numbers.
     present = {groups[i] for i in np.unique(objects).tolist()}
-    # Another place than that of a class: it may have the same name.
-    number = {group: int(Stream(seed, object_key(group), 0, 2).words(1)[0]) for group in present}
-    ordered = sorted(present, key=lambda group: (number[group], group))
+    ordered = sorted(present, key=lambda group: (test_rank(group, seed), group))
 
     tested, valid = _shares(len(ordered), config)
     last = len(ordered) - valid

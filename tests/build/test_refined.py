@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import h5py
@@ -15,12 +16,14 @@ from helpers.meshes import write_fixed
 from drakegrasp.bench.cross_check import cross_check
 from drakegrasp.build.pipeline import build
 from drakegrasp.build.replay import replay_trial
+from drakegrasp.build.work_unit import WorkUnit, run_unit
 from drakegrasp.config import Config, load_config, override_config
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.split import split_samples, test_rank
 from drakegrasp.dataset.statistics import count_funnel, count_splits
 from drakegrasp.frames import unpack_pose
 from drakegrasp.objects.sources import MeshSource, find_meshes
@@ -178,6 +181,44 @@ def test_refined_grasps_train_and_never_test(refined: Path) -> None:
     assert len(child["test"]) and not child["test"].any()
     with h5py.File(refined / "trials.hdf5") as file:
         assert (file["successes/removal"][:] == Removal.REFINED_TEST).any()
+
+
+def test_objects_that_are_tested_first_are_spared(
+    sources: list[MeshSource], config: Config, tmp_path: Path
+) -> None:
+    units: list[WorkUnit] = []
+
+    def execute(function: Callable[..., object], items: Iterable[object]) -> Iterator[object]:
+        if function is run_unit:
+            units.extend(items)  # type: ignore[arg-type]
+            raise KeyboardInterrupt
+        return run_here(function, items)
+
+    first, last = sorted(sources, key=lambda source: test_rank(source.name, config.seed))
+    between = np.mean([test_rank(source.name, config.seed) for source in sources])
+    spared = override_config(config, [f"refine.spared={between}"])
+    with pytest.raises(KeyboardInterrupt):
+        build(sources, tmp_path, spared, execute, show=False)
+    refined = {unit.header.object_name: unit.refined for unit in units}
+    assert refined == {first.name: False, last.name: True}
+
+    # What is spared is what is tested.
+    objects, names = np.arange(2, dtype=np.int32), [source.name for source in sources]
+    split = split_samples(objects, names, names, names, config.split, config.seed)
+    assert [names[i] for i in split["test"]] == [first.name]
+
+
+def test_unit_that_is_not_refined_has_the_first_round_alone(refined: Path, tmp_path: Path) -> None:
+    shutil.copytree(refined, tmp_path, dirs_exist_ok=True)
+    manifest = read_manifest(tmp_path)
+    header = next(manifest.headers())
+    header.path(tmp_path).unlink()
+    values = manifest.config.to_dict()
+    run_unit(WorkUnit(out=str(tmp_path), header=header, config=values, refined=False))
+    with h5py.File(header.path(tmp_path)) as shard, h5py.File(header.path(refined)) as whole:
+        generation = shard["trials/generation"][:]
+        assert len(generation) < len(whole["trials/generation"])
+        assert not generation.any()
 
 
 def test_counts_are_of_the_first_round(refined: Path, config: Config) -> None:
