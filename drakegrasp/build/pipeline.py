@@ -37,7 +37,7 @@ from drakegrasp.dataset.manifest import (
 )
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.shards import ShardHeader
-from drakegrasp.dataset.split import may_train, split_rule, test_rank
+from drakegrasp.dataset.split import may_train, rank_in_split, split_rule
 from drakegrasp.dataset.statistics import is_assembled
 from drakegrasp.errors import DataError, DrakegraspError
 from drakegrasp.hand.description import load_hand
@@ -399,7 +399,7 @@ def _tried(units: Sequence[ShardHeader]) -> int:
 def _spared(manifest: Manifest) -> set[str]:
     """Return the names of the objects whose palm poses are not refined."""
     share, seed = manifest.config.refine.spared, manifest.config.seed
-    ranks = [test_rank(group, seed) for group in manifest.groups]
+    ranks = [rank_in_split(group, seed) for group in manifest.groups]
     names = [entry.name for entry in manifest.objects]
     return {name for name, rank in zip(names, ranks, strict=True) if rank < share}
 

@@ -112,7 +112,7 @@ def _split_by_class(
     return {name: np.sort(np.concatenate(empty + rows)) for name, rows in splits.items()}
 
 
-def test_rank(group: str, seed: int) -> float:
+def rank_in_split(group: str, seed: int) -> float:
     """Return the number in [0, 1) of a group of objects; those with the lowest are tested.
 
     It is uniform over seeds, so the share x of all groups has a number below x, more or less.
@@ -133,7 +133,7 @@ def _split_by_object(
     """
     # The groups that have samples, in the order of their numbers.
     present = {groups[i] for i in np.unique(objects).tolist()}
-    ordered = sorted(present, key=lambda group: (test_rank(group, seed), group))
+    ordered = sorted(present, key=lambda group: (rank_in_split(group, seed), group))
 
     tested, valid = _shares(len(ordered), config)
     last = len(ordered) - valid

@@ -23,7 +23,7 @@ from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.split import split_samples, test_rank
+from drakegrasp.dataset.split import rank_in_split, split_samples
 from drakegrasp.dataset.statistics import count_funnel, count_splits
 from drakegrasp.frames import unpack_pose
 from drakegrasp.objects.sources import MeshSource, find_meshes
@@ -194,8 +194,8 @@ def test_objects_that_are_tested_first_are_spared(
             raise KeyboardInterrupt
         return run_here(function, items)
 
-    first, last = sorted(sources, key=lambda source: test_rank(source.name, config.seed))
-    between = np.mean([test_rank(source.name, config.seed) for source in sources])
+    first, last = sorted(sources, key=lambda source: rank_in_split(source.name, config.seed))
+    between = np.mean([rank_in_split(source.name, config.seed) for source in sources])
     spared = override_config(config, [f"refine.spared={between}"])
     with pytest.raises(KeyboardInterrupt):
         build(sources, tmp_path, spared, execute, show=False)
