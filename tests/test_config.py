@@ -131,6 +131,7 @@ refine:
   generations: 2
   shift: 0.01
   turn_deg: 5.0
+  spared: 0.2
 filters:
   min_depth_variance: 0.002
   min_camera_height: 0.02
