@@ -95,7 +95,7 @@ def compare_labels(
     bench = replace(bench, config=with_whole_lifts(bench.config))
     records = [
         try_attempt(bench, one.attempt, one.prediction)
-        if one.record.outcome is Outcome.MOVED
+        if one.record.outcome.dataset_only
         else one.record
         for one in simulated
     ]

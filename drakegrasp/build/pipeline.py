@@ -398,10 +398,10 @@ def _tried(units: Sequence[ShardHeader]) -> int:
 
 def _spared(manifest: Manifest) -> set[str]:
     """Return the names of the objects whose palm poses are not refined."""
+    # By the name, which a shard is of; a group can be said anew, and is for morphs alone another.
     share, seed = manifest.config.refine.spared, manifest.config.seed
-    ranks = [rank_in_split(group, seed) for group in manifest.groups]
-    names = [entry.name for entry in manifest.objects]
-    return {name for name, rank in zip(names, ranks, strict=True) if rank < share}
+    names = (entry.name for entry in manifest.objects)
+    return {name for name in names if rank_in_split(name, seed) < share}
 
 
 def _run_units(

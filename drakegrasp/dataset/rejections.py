@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -213,9 +213,6 @@ def unused_rejections(
 
 
 def key_to_json(key: AttemptKey) -> dict[str, Any]:
-    """Return the identity of an attempt as JSON types."""
-    return {
-        "object": key.object,
-        "candidate": key.candidate,
-        "standoff_index": key.standoff_index,
-    }
+    """Return the identity of an attempt as JSON types; that of the first round has no child."""
+    said = asdict(key)
+    return said if key.child else {name: said[name] for name in said if name != "child"}

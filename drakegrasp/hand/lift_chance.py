@@ -89,14 +89,17 @@ def read_lift_chance(name_or_yaml: str | Path) -> LiftChance | None:
         return None
     try:
         tree: Any = parse_yaml(path.read_text(encoding="utf-8"))
-        weights = {str(name): float(value) for name, value in tree["weights"].items()}
+        weights = {str(name): float(value) for name, value in dict(tree["weights"]).items()}
         model = LiftChance(float(tree["bias"]), weights)
     except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
         raise HandError(
             f"{path}: must be YAML with a number bias and numbers weights, got {one_line(error)}"
         ) from None
-    if unknown := weights.keys() - set(FEATURES):
-        raise HandError(f"{path}: weights must be of {', '.join(FEATURES)}, got {min(unknown)!r}")
+    if weights.keys() != set(FEATURES):
+        got = ", ".join(sorted(weights)) or "none"
+        raise HandError(f"{path}: weights must be of {', '.join(FEATURES)}, got {got}")
+    if not np.isfinite([model.bias, *weights.values()]).all():
+        raise HandError(f"{path}: bias and weights must be finite, got {model}")
     return model
 
 

@@ -107,32 +107,34 @@ class Snapshot:
         """Return the identity of an attempt by its place in the table."""
         table = self.table
         name = self.names[table.object[i]]
-        return AttemptKey(name, int(table.candidate[i]), int(table.standoff_index[i]))
+        numbers = (table.candidate[i], table.standoff_index[i], table.child[i])
+        return AttemptKey(name, *(int(number) for number in numbers))
 
     def label(self, i: int) -> str:
         """Return the identity of an attempt for addresses: `9f86d081884c-345-2`.
 
+        A refined one has its number in the family behind: `9f86d081884c-345-2-7`.
         The files of a later state have the same label for it, and for no other attempt.
         """
         table = self.table
         code = self.codes[table.object[i]]
-        return f"{code}-{table.candidate[i]}-{table.standoff_index[i]}"
+        refined = f"-{table.child[i]}" if table.child[i] else ""
+        return f"{code}-{table.candidate[i]}-{table.standoff_index[i]}{refined}"
 
     def find(self, label: str) -> int | None:
         """Return the place of the attempt of a label, or None if there is none."""
         code, *numbers = label.split("-")
-        if len(numbers) != 2 or not all(n.isascii() and n.isdecimal() for n in numbers):
+        if len(numbers) not in (2, 3) or not all(n.isascii() and n.isdecimal() for n in numbers):
             return None
         number = self.numbers.get(code)
-        candidate, standoff = (int(n) for n in numbers)
-        return None if number is None else self.table.find(number, candidate, standoff)
+        return None if number is None else self.table.find(number, *map(int, numbers))
 
     def find_key(self, key: AttemptKey) -> int | None:
         """Return the place of an attempt by its identity, or None if it is not there."""
         if key.object not in self.names:
             return None
         number = self.names.index(key.object)
-        return self.table.find(number, key.candidate, key.standoff_index)
+        return self.table.find(number, key.candidate, key.standoff_index, key.child)
 
     def trial_id(self, i: int) -> int | None:
         """Return the row of an attempt in trials.hdf5, or None before there is one."""
@@ -257,6 +259,7 @@ class Catalog:
             sources=tuple(header.path(self.out) for header in parts),
             sample_ids={},
             assembled=False,
+            own_hashes=_own_hashes(self.out),
             missing=tuple(missing),
         )
 

@@ -161,7 +161,8 @@ def number_text(snapshot: Snapshot, i: int) -> str:
     if trial is not None:
         return f"trial {trial}"
     key = snapshot.key(i)
-    return f"pose {key.candidate}, stand-off {key.standoff_index}"
+    refined = f", refined {key.child}" if key.child else ""
+    return f"pose {key.candidate}, stand-off {key.standoff_index}{refined}"
 
 
 def words_of(snapshot: Snapshot, i: int) -> list[str]:

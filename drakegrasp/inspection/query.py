@@ -78,8 +78,6 @@ DECISIONS = ("rejected", "kept", "open")
 SPLIT_CHOICES = ("samples", *SPLITS, "none")
 #: Cards on a page of the gallery.
 PAGE = 24
-#: Makes one number of object, palm pose and stand-off, whose type has eight bits.
-_CODE = np.array([1 << 40, 1 << 8, 1], dtype=np.int64)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,7 +268,7 @@ def _decided(snapshot: Snapshot, decision: str, decisions: Decisions) -> npt.NDA
     )
     numbers = {name: i for i, name in enumerate(snapshot.names)}
     wanted = [
-        (numbers[key.object], key.candidate, key.standoff_index)
+        (numbers[key.object], key.candidate, key.standoff_index, key.child)
         for key in keys
         if key.object in numbers
     ]
@@ -278,9 +276,11 @@ def _decided(snapshot: Snapshot, decision: str, decisions: Decisions) -> npt.NDA
     # Compare identities as single numbers: there may be thousands of decisions.
     table = snapshot.table
     (hits,) = np.nonzero(table.outcome == Outcome.SUCCESS)
-    columns = (table.object[hits], table.candidate[hits], table.standoff_index[hits])
-    codes = np.array(wanted, dtype=np.int64).reshape(-1, 3) @ _CODE
-    decided = np.isin(np.stack(columns, axis=1).astype(np.int64) @ _CODE, codes)
+    columns = (table.object, table.candidate, table.standoff_index, table.child)
+    own = np.stack([column[hits] for column in columns], axis=1).astype(np.int64)
+    both = np.concatenate([np.array(wanted, dtype=np.int64).reshape(-1, 4), own])
+    _, codes = np.unique(both, axis=0, return_inverse=True)
+    decided = np.isin(codes[len(wanted) :], codes[: len(wanted)])
     found = np.zeros(len(table), dtype=bool)
     found[hits[~decided if decision == "open" else decided]] = True
     return found

@@ -137,7 +137,8 @@ def _shard_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
         # The row of the attempt in its shard, then that of its images.
         trials, looks = file["trials"], file["looks"]
         here = trials["candidate"][:] == key.candidate
-        (rows,) = np.nonzero(here & (trials["standoff_index"][:] == key.standoff_index))
+        here &= trials["standoff_index"][:] == key.standoff_index
+        (rows,) = np.nonzero(here & (trials["child"][:] == key.child))
         (found,) = np.nonzero(looks["row"][:] == rows[0])
         if not len(found):
             return None

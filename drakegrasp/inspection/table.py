@@ -39,13 +39,14 @@ FEATURES = (*EXTRA, *(part.name for part in PARTS))
 #: Columns of `/trials` that a table is made from.
 READ = (
     *COLUMNS,
-    *("candidate", "standoff_index", "precision", "stable", "closed_f_Q_O"),
+    *("candidate", "standoff_index", "child", "precision", "stable", "closed_f_Q_O"),
 )
 #: Columns of a table with a value per attempt.
 _DTYPES: dict[str, type[np.generic]] = {
     "object": np.int32,
     "candidate": np.int32,
     "standoff_index": np.uint8,
+    "child": np.int32,
     "outcome": np.uint8,
     "removal": np.uint8,
     "split": np.uint8,
@@ -65,6 +66,7 @@ class AttemptTable:
     Attributes:
         object: (n,) int32, number of the object.
         candidate, standoff_index: (n,), which of the object's palm poses, and of the stand-offs.
+        child: (n,) int32, number in the family of that attempt, see the schema.
         outcome: (n,) uint8, `Outcome`.
         removal: (n,) uint8, `Removal` of a success; NONE for others, or where none is decided.
         split: (n,) uint8, index into SPLITS; NONE for what is no sample.
@@ -78,6 +80,7 @@ class AttemptTable:
     object: npt.NDArray[np.int32]
     candidate: npt.NDArray[np.int32]
     standoff_index: npt.NDArray[np.uint8]
+    child: npt.NDArray[np.int32]
     outcome: npt.NDArray[np.uint8]
     removal: npt.NDArray[np.uint8]
     split: npt.NDArray[np.uint8]
@@ -103,12 +106,13 @@ class AttemptTable:
         there = k < len(self.closed) and self.closed[k] == i
         return float(self.features[name][k]) if there else float("nan")
 
-    def find(self, object_: int, candidate: int, standoff_index: int) -> int | None:
+    def find(self, object_: int, candidate: int, standoff_index: int, child: int = 0) -> int | None:
         """Return the place of an attempt, or None if it is not there."""
         (found,) = np.nonzero(
             (self.object == object_)
             & (self.candidate == candidate)
             & (self.standoff_index == standoff_index)
+            & (self.child == child)
         )
         return int(found[0]) if len(found) else None
 
@@ -130,8 +134,10 @@ def read_trials_table(path: Path) -> AttemptTable:
         ends = []
         for start in range(0, count, BLOCK):
             rows = slice(start, min(start + BLOCK, count))
-            columns = {name: trials[name][rows] for name in READ}
             number = trials["object"][rows]
+            # Files of an older schema have the first round alone.
+            columns = {name: trials[name][rows] for name in READ if name in trials}
+            columns.setdefault("child", np.zeros(len(number), np.int32))
             refuse_other_codes(path, "/trials/object", number, objects)
             refuse_other_codes(path, "/trials/outcome", columns["outcome"], list(Outcome))
             place = np.arange(rows.start, rows.stop, dtype=np.int32)
@@ -263,6 +269,7 @@ def _part(
         object=objects.astype(np.int32),
         candidate=columns["candidate"].astype(np.int32),
         standoff_index=columns["standoff_index"].astype(np.uint8),
+        child=columns["child"].astype(np.int32),
         outcome=columns["outcome"].astype(np.uint8),
         removal=np.full(count, NONE, dtype=np.uint8),
         split=np.full(count, NONE, dtype=np.uint8),

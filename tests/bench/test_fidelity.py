@@ -85,7 +85,7 @@ def test_label_depends_on_the_drive_if_any_other_drive_changes_it(monkeypatch):
 
 
 def test_lift_that_was_ended_is_compared_by_its_whole(monkeypatch):
-    """Two lifts, of which the second has no verdict yet; all variants hold both."""
+    """Three closed hands, of which only the first has a verdict yet; all variants hold."""
     tried, configs = [], []
 
     def lift_again(bench, attempt, prediction):
@@ -95,19 +95,19 @@ def test_lift_that_was_ended_is_compared_by_its_whole(monkeypatch):
 
     def simulate(bench, attempts, variant, count):
         configs.append(bench.config)
-        return [Outcome.SUCCESS] * 2
+        return [Outcome.SUCCESS] * 3
 
     monkeypatch.setattr(fidelity, "try_attempt", lift_again)
     monkeypatch.setattr(fidelity, "_simulate", simulate)
     records = [
         SimpleNamespace(outcome=outcome, lifted=object())
-        for outcome in (Outcome.SUCCESS, Outcome.MOVED)
+        for outcome in (Outcome.SUCCESS, Outcome.MOVED, Outcome.NOT_LIFTED)
     ]
     lifts = [fidelity.Simulated(i, record, None) for i, record in enumerate(records)]
     report = fidelity.compare_labels(
         bench_of("lift.stop_when=lost_sample"), lifts, lambda outcome: None
     )
-    assert tried == [1]
+    assert tried == [1, 2]
     assert {config.lift.stop_when for config in configs} == {"never"}
-    assert report["fidelity"]["sap"]["lifted"] == 2
+    assert report["fidelity"]["sap"]["lifted"] == 3
     assert report["fidelity"]["sap"]["flips"] == 0

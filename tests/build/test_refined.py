@@ -23,14 +23,22 @@ from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.rejections import (
+    AttemptKey,
+    Decisions,
+    read_decisions,
+    write_decisions,
+)
 from drakegrasp.dataset.split import rank_in_split, split_samples
 from drakegrasp.dataset.statistics import count_funnel, count_splits
 from drakegrasp.frames import unpack_pose
+from drakegrasp.inspection.catalog import Catalog
+from drakegrasp.inspection.query import Query, select
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.verification.placed_grasp import VerifyArguments, place_grasps
-from drakegrasp.visualization.figures.held_grasps import read_approaches
+from drakegrasp.visualization.figures.held_grasps import read_approaches, read_held
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
@@ -164,12 +172,38 @@ def test_lifts_are_tried_elsewhere_as_they_lay(
     np.testing.assert_array_equal(stood, [unpack_pose(columns["X_TO"][i]) for i in ids])
 
 
-def test_picture_of_approaches_is_of_one_resting_pose(refined: Path) -> None:
+def test_pictures_are_of_the_first_round_in_one_resting_pose(refined: Path) -> None:
     columns, name = trials(refined), "8_wineglass_flute"
     own = (columns["object"] == 0) & (columns["outcome"] == Outcome.SUCCESS)
+    first = columns["generation"] == 0
+    counts = np.bincount(columns["resting"][own & first])
+    assert (own & ~first).any() and 0 < counts.max() < counts.sum()
     shown = read_approaches(refined, 0, name, read_manifest(refined).config_of(name))
-    assert (columns["resting"][own] > 0).any()
-    assert len(shown.successes) == np.count_nonzero(own & (columns["resting"] == 0))
+    assert len(shown.successes) == counts.max()
+    pose = (columns["object"] == 0) & first & (columns["resting"] == counts.argmax())
+    assert shown.attempts == np.count_nonzero(pose)
+    held = first & (columns["outcome"] == Outcome.SUCCESS)
+    assert read_held(refined).trial_ids.tolist() == np.flatnonzero(held).tolist()
+
+
+def test_each_of_a_family_is_inspected_by_itself(refined: Path) -> None:
+    """A page, a decision and an image are of the attempt itself, not of the first of its family."""
+    snapshot, columns = Catalog(refined).current(), trials(refined)
+    places = np.flatnonzero(columns["outcome"] == Outcome.SUCCESS)
+    labels = {snapshot.label(int(i)) for i in places}
+    assert len(labels) == len(places)
+    refined_ones = [int(i) for i in places if columns["child"][i]]
+    for i in refined_ones:
+        assert snapshot.find(snapshot.label(i)) == snapshot.find_key(snapshot.key(i)) == i
+    key = snapshot.key(refined_ones[0])
+    decisions = Decisions(rejected=frozenset({key}))
+    assert select(snapshot, Query(decision="rejected"), decisions).tolist() == [refined_ones[0]]
+
+
+def test_rejected_child_is_written_and_read(refined: Path, tmp_path: Path) -> None:
+    key = AttemptKey("8_wineglass_flute", 3, 1, 7)
+    write_decisions(tmp_path / "reject.json", Decisions(rejected=frozenset({key})))
+    assert read_decisions(tmp_path / "reject.json").rejected == {key}
 
 
 def test_refined_grasps_train_and_never_test(refined: Path) -> None:

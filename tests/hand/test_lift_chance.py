@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from helpers.hands import write_pincer
 
 from drakegrasp.arithmetic import Array
@@ -135,7 +136,11 @@ def test_weights_lie_beside_the_hand(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("bias: 1\nweights: {colour: 1}\n", "weights must be of .*, got 'colour'"),
+        ("bias: 1\nweights: {colour: 1}\n", "weights must be of .*, got colour"),
+        ("bias: 1\nweights: {}\n", "weights must be of .*, got none"),
+        ("bias: 1\nweights:\n", "must be YAML with a number bias"),
+        ("bias: 1\nweights: [1, 2]\n", "must be YAML with a number bias"),
+        (yaml.safe_dump({"bias": 1, "weights": dict.fromkeys(FEATURES, np.nan)}), "must be finite"),
         ("bias: 1\n", "must be YAML with a number bias"),
         ("bias: many\nweights: {across: 1}\n", "must be YAML with a number bias"),
         ("[1]\n", "must be YAML with a number bias"),

@@ -48,7 +48,7 @@ class HeldGrasps:
 
 
 def read_held(out: Path) -> HeldGrasps:
-    """Return the successes of a dataset.
+    """Return the successes of a dataset's first round.
 
     Raises:
         DataError: If trials.hdf5 is missing or damaged.
@@ -59,7 +59,10 @@ def read_held(out: Path) -> HeldGrasps:
     path = out / TRIALS_FILE
     with open_trials(path) as file:
         trials = file["trials"]
-        (rows,) = np.nonzero(trials["outcome"][:] == Outcome.SUCCESS)
+        held = trials["outcome"][:] == Outcome.SUCCESS
+        if "generation" in trials:
+            held &= trials["generation"][:] == 0
+        (rows,) = np.nonzero(held)
         for start in range(0, len(trials["outcome"]), BLOCK):
             picked = rows[(rows >= start) & (rows < start + BLOCK)] - start
             ids.append(picked + start)
@@ -96,7 +99,7 @@ def _largest(values: npt.NDArray[Any]) -> Array:
 
 
 def read_approaches(out: Path, number: int, name: str, config: Config) -> ObjectApproaches:
-    """Return from where an object was approached in its first resting pose.
+    """Return from where an object was approached first, in the resting pose that held most.
 
     Args:
         out: Directory of the dataset.
@@ -111,7 +114,11 @@ def read_approaches(out: Path, number: int, name: str, config: Config) -> Object
     prepared = load_prepared(out, name, config)
     with open_trials(out / TRIALS_FILE) as file:
         trials = file["trials"]
-        (rows,) = np.nonzero((trials["object"][:] == number) & (trials["resting"][:] == 0))
+        own_round = (trials["object"][:] == number) & (trials["generation"][:] == 0)
+        resting = trials["resting"][:]
+        won = own_round & (trials["outcome"][:] == Outcome.SUCCESS)
+        pose = int(np.bincount(resting[won], minlength=1).argmax())
+        (rows,) = np.nonzero(own_round & (resting == pose))
         part = slice(int(rows[0]), int(rows[-1]) + 1) if len(rows) else slice(0, 0)
         own = rows - part.start
         outcome, packed, standoff, precision, stable = (
@@ -122,14 +129,15 @@ def read_approaches(out: Path, number: int, name: str, config: Config) -> Object
 
     # Attempts whose palm ray misses do not approach the object.
     won, approached = outcome == Outcome.SUCCESS, outcome != Outcome.RAY_MISS
-    directions = approach_directions(prepared.X_TO, X_OG)
+    X_TO = prepared.resting_poses[pose]
+    directions = approach_directions(X_TO, X_OG)
     reach = np.array(config.candidates.drawn_standoffs)[standoff[won]]
     p_OG, z_O = X_OG[won, :3, 3], X_OG[won, :3, 2]
     return ObjectApproaches(
         name=name,
         vertices=prepared.model.visual_vertices,
         faces=prepared.model.visual_faces,
-        R_TO=prepared.X_TO[:3, :3],
+        R_TO=X_TO[:3, :3],
         attempts=len(rows),
         directions=directions[approached & ~won],
         rays=np.stack([p_OG, p_OG + reach[:, None] * z_O], axis=1),
