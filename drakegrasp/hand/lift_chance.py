@@ -95,7 +95,7 @@ def read_lift_chance(name_or_yaml: str | Path) -> LiftChance | None:
         raise HandError(
             f"{path}: must be YAML with a number bias and numbers weights, got {one_line(error)}"
         ) from None
-    if weights.keys() != set(FEATURES):
+    if not weights or weights.keys() - set(FEATURES):
         got = ", ".join(sorted(weights)) or "none"
         raise HandError(f"{path}: weights must be of {', '.join(FEATURES)}, got {got}")
     if not np.isfinite([model.bias, *weights.values()]).all():
