@@ -32,6 +32,7 @@ from drakegrasp.dataset.filters import breaks_hold
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.errors import DataError
 from drakegrasp.frames import unpack_pose
 from drakegrasp.hand.lift_chance import (
     FEATURES,
@@ -78,8 +79,15 @@ class Lifts:
 
 
 def read_lifts(out: Path) -> Lifts:
-    """Return the lifts of a dataset."""
-    config = read_manifest(out).config
+    """Return the lifts of a dataset.
+
+    Raises:
+        DataError: If a chance chose which hands were lifted: what was lost would be missing.
+    """
+    manifest = read_manifest(out)
+    if manifest.config.lift.least_chance > 0.0:
+        got = manifest.config.lift.least_chance
+        raise DataError(f"{out}: must be built with lift.least_chance=0, got {got:g}")
     names = (*(f"closed_{name}" for name in GRASP_CONTACTS), "X_TO", "friction_hand")
     judged = ("outcome", "lifted_other_links", "slip", "turn", "generation", "object")
     with h5py.File(out / TRIALS_FILE) as file:
@@ -95,7 +103,7 @@ def read_lifts(out: Path) -> Lifts:
         grasp = ClosedGrasp(
             **{each: columns[f"closed_{each}"][own] for each in GRASP_CONTACTS},
             X_TO=unpack_pose(columns["X_TO"][own]),
-            p_OOcm=load_prepared(out, name, config).model.p_OOcm,
+            p_OOcm=load_prepared(out, name, manifest.config_of(name)).model.p_OOcm,
             friction_hand=columns["friction_hand"][own],
         )
         values[own] = np.stack(list(features(grasp).values()), axis=-1)

@@ -118,7 +118,7 @@ def assemble(out: Path, reject: Path | None, overrides: tuple[str, ...], workers
 
 @click.command()
 @click.argument("into", type=PathType(path_type=Path), metavar="INTO")
-@click.argument("outs", type=PathType(path_type=Path), metavar="OUTS", nargs=-1, required=True)
+@click.argument("outs", type=PathType(path_type=Path), metavar="OUTS...", nargs=-1, required=True)
 @processes_option
 def merge(into: Path, outs: tuple[Path, ...], workers: int) -> None:
     """Make one dataset of several that were built apart.
