@@ -313,10 +313,12 @@ def held_note(funnel: Funnel) -> str:
         )
     if left:
         lifts, held, stable, samples = funnel.audited.sum(axis=0).tolist()
+        # Before the files are assembled nobody knows what is a sample.
+        found = [f"{held:,} are held", f"{stable:,} stable"]
+        found += [f"{samples:,} samples"] if funnel.removals.any() else []
         reasons.append(
             f"closed hands that were not lifted, as their chance of a sample is small: {left:,}; "
-            f"of {lifts:,} that were lifted whatever their chance {held:,} are held, {stable:,} "
-            f"stable and {samples:,} samples"
+            f"of {lifts:,} that were lifted whatever their chance {', '.join(found)}"
         )
     return f"the number of held grasps is a lower bound: {'; '.join(reasons)}" if reasons else ""
 

@@ -92,8 +92,8 @@ def verify_contacts(
         p_OQ: (k, 3), contact points [m]; they are rounded to 0.1 mm.
         nhat_Q_O: (k, 3), outward unit normals.
         method: "hand" or "forces".
-        config: Hand, physics, lift and limits. `lift.stop_when` is without effect: the verdict is
-            that of a whole lift.
+        config: Hand, physics, lift and limits. `lift.stop_when` and `lift.least_chance` are without
+            effect: the verdict is that of a whole lift.
     """
     # Round the contacts; adding zero turns -0.0 into 0.0.
     config = with_whole_lifts(config)
