@@ -162,7 +162,7 @@ def build_on(
         # A directory that cannot be used is refused before workers start.
         claim_directory(out, config)
         client = stack.enter_context(cluster)
-        kernel = stack.enter_context(admitted_workers(client, config))
+        stack.enter_context(admitted_workers(client, config))
 
         # The built-in objects become mesh files of the dataset.
         if sources is None:
@@ -171,7 +171,6 @@ def build_on(
         sources = [source for source in sources if not only or source.name in only]
 
         execute = DaskExecutor(client, resubmissions=RESUBMISSIONS)
-        execute.pool.kernel = kernel
         return build_locked(sources, out, config, execute, dead=dead, pool=execute.pool, show=show)
 
 

@@ -11,10 +11,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from drakegrasp.build.work_unit import UnitSummary
-from drakegrasp.dataset.log import BuildLog, read_log
+from drakegrasp.dataset.log import BuildLog
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry, RefusedMesh
 from drakegrasp.errors import printable
-from drakegrasp.runtime.blas import running_kernel
 from drakegrasp.runtime.executor import WorkerPool
 
 
@@ -33,23 +32,6 @@ class BuildEvents:
         self._out, self._pool, self._show = out, pool, show
         self._log = BuildLog(out)
 
-    def kernel(self) -> str | None:
-        """Return the BLAS kernel of the processes that do the work; None if they differ."""
-        return running_kernel() if self._pool is None else self._pool.kernel
-
-    def kernel_notice(self) -> list[str]:
-        """Return a notice if the last build in the directory ran another BLAS kernel."""
-        started = [event for event in read_log(self._out) if event.get("event") == "started"]
-        if not started or "kernel" not in started[-1]:
-            return []
-        before, now = started[-1]["kernel"], self.kernel()
-        if before == now:
-            return []
-        return [
-            f"begun with BLAS kernel {before or 'several'}, goes on with {now or 'several'}: "
-            "last bits of simulated values may differ"
-        ]
-
     def started(self, manifest: Manifest, notices: Sequence[str]) -> None:
         """Log who builds what, and listen to the workers."""
         self._log(
@@ -58,7 +40,6 @@ class BuildEvents:
             host=socket.gethostname(),
             config_hash=manifest.config.simulation_hash(),
             seed=manifest.config.seed,
-            kernel=self.kernel(),
             versions=manifest.versions,
         )
         for notice in notices:

@@ -186,7 +186,6 @@ def _build(
     new = Manifest(config=config, versions=installed_versions(config), fingers=finger_names(config))
     manifest = replace(known or new, config=config)
     write_manifest(manifest, out)
-    notices += job.events.kernel_notice()
     job.events.started(manifest, notices)
     if (warning := nothing_trains(sources, config.split)) is not None:
         job.events.warn(warning)

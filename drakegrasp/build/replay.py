@@ -53,7 +53,7 @@ class Replay:
 def replay_trial(out: str | Path, trial_id: int) -> Replay:
     """Run one trial of a dataset again, from its prepared object and its candidate.
 
-    The same machine, versions and BLAS kernel give the same bits. `versions` says which packages
+    The same machine and versions give the same bits. `versions` says which packages
     have other versions now.
 
     Raises:

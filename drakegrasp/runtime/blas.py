@@ -1,4 +1,4 @@
-"""The linear algebra of this process: one thread, and which kernel it runs.
+"""The linear algebra of this process: one thread.
 
 OpenBLAS divides large products among its threads and adds up in another order for each number of
 them, so the last bits differ. With one thread, workers and callers' own processes compute the same
@@ -14,11 +14,6 @@ from typing import ParamSpec, TypeVar
 import scipy.linalg  # noqa: F401  # loads SciPy's own BLAS, so that threadpoolctl finds it
 from threadpoolctl import ThreadpoolController
 
-from drakegrasp.runtime.kernels import chosen_kernel
-
-#: The selection counts as it was when the libraries were loaded; later changes have no effect.
-_CHOSEN = chosen_kernel()
-
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -32,18 +27,6 @@ def one_thread(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **kwargs)
 
     return limited
-
-
-def running_kernel() -> str:
-    """Return the BLAS kernel of this process: the selected one, or the one that OpenBLAS chose.
-
-    Returns:
-        Its name, e.g. "Haswell"; "unknown" for a BLAS that does not tell.
-    """
-    if _CHOSEN is not None:
-        return _CHOSEN
-    libraries = _libraries().select(user_api="blas").info()
-    return "+".join(sorted({library.get("architecture", "unknown") for library in libraries}))
 
 
 @cache

@@ -39,13 +39,11 @@ class WorkerPool:
 
     Attributes:
         size: Number of workers now.
-        kernel: BLAS kernel that the workers run; None if they have none in common.
         on_change: Called with the addresses of workers that joined and of those that left.
         on_none: Called once when there has been no worker for long, and the work waits for one.
     """
 
     size: int = 0
-    kernel: str | None = None
     on_change: Callable[[set[str], set[str]], None] = lambda joined, left: None
     on_none: Callable[[], None] = lambda: None
 
