@@ -11,23 +11,34 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from drakegrasp.api import build_dataset, verify_grasp, verify_grasps
-    from drakegrasp.build.replay import replay_trial
+    from drakegrasp.build.pipeline import BuildReport
+    from drakegrasp.build.replay import Replay, replay_trial
     from drakegrasp.config import Config, load_config
+    from drakegrasp.dataset.checks.findings import Violation
     from drakegrasp.dataset.checks.run import check_dataset
-    from drakegrasp.dataset.reader import GraspDataset
+    from drakegrasp.dataset.reader import GraspDataset, Sample
+    from drakegrasp.errors import DrakegraspError
     from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp
-    from drakegrasp.hand.description import load_hand
+    from drakegrasp.hand.description import Hand, load_hand
     from drakegrasp.outcomes import Outcome
-    from drakegrasp.simulation.placement import place_object
+    from drakegrasp.simulation.placement import PlacedObject, place_object
     from drakegrasp.verification.result import Verification
 
 __version__ = metadata.version("drakegrasp")
 
+#: The module of each name.
 _HOMES = {
+    "BuildReport": "build.pipeline",
     "Config": "config",
+    "DrakegraspError": "errors",
     "GraspDataset": "dataset.reader",
+    "Hand": "hand.description",
     "Outcome": "outcomes",
+    "PlacedObject": "simulation.placement",
+    "Replay": "build.replay",
+    "Sample": "dataset.reader",
     "Verification": "verification.result",
+    "Violation": "dataset.checks.findings",
     "build_dataset": "api",
     "check_dataset": "dataset.checks.run",
     "load_config": "config",
@@ -42,10 +53,17 @@ _HOMES = {
 }
 
 __all__ = [
+    "BuildReport",
     "Config",
+    "DrakegraspError",
     "GraspDataset",
+    "Hand",
     "Outcome",
+    "PlacedObject",
+    "Replay",
+    "Sample",
     "Verification",
+    "Violation",
     "build_dataset",
     "check_dataset",
     "load_config",
@@ -67,4 +85,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted([*__all__, "__version__"])

@@ -212,6 +212,7 @@ def test_no_package_hides_a_public_name() -> None:
 def test_public_names_are_sorted_and_exist() -> None:
     """Also after every module was imported."""
     assert drakegrasp.__all__ == sorted(drakegrasp.__all__)
+    assert dir(drakegrasp) == sorted([*drakegrasp.__all__, "__version__"])
     for name in MODULE_NAMES:
         importlib.import_module(f"drakegrasp.{name}")
     for name in drakegrasp.__all__:
