@@ -9,7 +9,7 @@ number of attempts. Imports no Drake.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -58,7 +58,7 @@ from drakegrasp.dataset.schema import OBJECT_FIELDS, SPLITS, SUCCESS_FIELDS, TRI
 from drakegrasp.dataset.split import split_samples
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array
-from drakegrasp.runtime.executor import Executor, run_here
+from drakegrasp.runtime.executor import Executor, in_order, run_here
 from drakegrasp.runtime.file_set import replaced_together
 from drakegrasp.runtime.files import disk_full_named, new_hdf5, sweep_temporary, temporary_name
 from drakegrasp.runtime.progress import Report, silent
@@ -173,7 +173,7 @@ def assemble_locked(
             # Rows are packed in any order, and put into the files in theirs.
             own_weights = {split: weights[rows] for split, rows in splits.items()}
             tasks = list(_pack_tasks(out, slices, ids, own_weights, sizes))
-            for done, part in enumerate(_in_order(execute(pack_rows, tasks), tasks), start=1):
+            for done, part in enumerate(_packed(execute, tasks), start=1):
                 unpack_rows(part, columns, rows)
                 progress(len(surveys) + done, len(surveys) + len(tasks))
             for split_rows in rows.values():
@@ -195,12 +195,12 @@ def _survey_all(out: Path, manifest: Manifest, execute: Executor, progress: Repo
         DataError: If a shard is missing or damaged, or there is none.
     """
     surveys = []
-    for survey in execute(survey_object, survey_tasks(out, manifest)):
+    for survey in in_order(execute)(survey_object, survey_tasks(out, manifest)):
         surveys.append(survey)
         progress(len(surveys), 2 * len(manifest.objects))
     if not surveys:
         raise DataError(f"{out}: no object has a palm pose to try")
-    return sorted(surveys, key=lambda survey: survey.object)
+    return surveys
 
 
 def _placed_rows(
@@ -250,21 +250,12 @@ def _begins_before(piece: ShardSlice, stop: int) -> bool:
     return piece.first < stop
 
 
-def _in_order(parts: Iterable[Part], tasks: Sequence[PackTask]) -> Iterator[Part]:
-    """Yield parts, which come in any order, in that of the tasks; remove those that are left."""
+def _packed(execute: Executor, tasks: Sequence[PackTask]) -> Iterator[Part]:
+    """Yield the parts in the order of the tasks; remove those that are left at the end."""
     try:
-        waiting: dict[int, Part] = {}
-        turn = iter(tasks)
-        due = next(turn).start
-        for part in parts:
-            waiting[part.start] = part
-            while (ready := waiting.pop(due, None)) is not None:
-                yield ready
-                due = next((task.start for task in turn), -1)
+        # When this generator is closed, that of the tasks is, first: none writes any more.
+        yield from in_order(execute)(pack_rows, tasks)
     finally:
-        # First no task writes any more.
-        if isinstance(parts, Generator):
-            parts.close()
         for task in tasks:
             Path(task.part).unlink(missing_ok=True)
 

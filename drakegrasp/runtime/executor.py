@@ -15,6 +15,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from multiprocessing import resource_tracker
 from multiprocessing.connection import wait as wait_for
@@ -51,6 +52,30 @@ class WorkerPool:
 def run_here(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
     """Run in this process, one item after the other: for tests and debuggers."""
     return (function(item) for item in items)
+
+
+def in_order(execute: Executor) -> Executor:
+    """Return an executor that yields the results in the order of the items.
+
+    Results that come early wait in memory.
+    """
+
+    def run(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+        early: dict[int, R] = {}
+        due = 0
+        for number, result in execute(partial(_numbered, function), enumerate(items)):
+            early[number] = result
+            while due in early:
+                yield early.pop(due)
+                due += 1
+
+    return run
+
+
+def _numbered(function: Callable[[T], R], item: tuple[int, T]) -> tuple[int, R]:
+    """Return the number of an item with its result."""
+    number, argument = item
+    return number, function(argument)
 
 
 @contextmanager

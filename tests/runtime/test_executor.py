@@ -7,12 +7,18 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterable, Iterator
+from itertools import islice
 from pathlib import Path
+from typing import TypeVar
 
 import pytest
 
 from drakegrasp.errors import MachineError
-from drakegrasp.runtime.executor import processes
+from drakegrasp.runtime.executor import in_order, processes
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 def touch_late(path: Path) -> Path:
@@ -32,6 +38,23 @@ def test_what_is_begun_ends_before_the_executor_does(tmp_path: Path) -> None:
         assert len(there) < len(paths)
         time.sleep(1.5)
         assert set(tmp_path.iterdir()) == there
+
+
+def test_results_come_in_the_order_of_the_items() -> None:
+    taken = []
+
+    def backwards(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+        """Return results in threes, the last one first."""
+        remaining = iter(items)
+        while some := list(islice(remaining, 3)):
+            for item in reversed(some):
+                taken.append(item)
+                yield function(item)
+
+    results = in_order(backwards)(abs, iter([-5, 1, -4, 3, -2]))
+    assert next(results) == 5
+    assert len(taken) == 3  # and not all of them
+    assert list(results) == [1, 4, 3, 2]
 
 
 def test_process_that_dies_is_one_error() -> None:

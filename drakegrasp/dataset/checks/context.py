@@ -21,7 +21,7 @@ from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import FILE_NAME, model_path
 from drakegrasp.errors import MeshError, first_line
 from drakegrasp.objects.model import ObjectModel, load_object
-from drakegrasp.runtime.executor import Executor
+from drakegrasp.runtime.executor import Executor, in_order
 from drakegrasp.runtime.progress import Report
 
 #: Objects whose meshes, with their search trees, stay in memory during a task; samples are ordered
@@ -126,7 +126,6 @@ class RowsTask:
     """Rows of a group to which rules are to be applied, by any process.
 
     Attributes:
-        number: Of the task, from 0 on.
         judge: Applies the rules.
         file: The file.
         group: The group.
@@ -135,7 +134,6 @@ class RowsTask:
         trials: The trials of that dataset, with the bad ones among those that count here.
     """
 
-    number: int
     judge: Judge
     file: FilePlace
     group: str
@@ -151,14 +149,12 @@ class RowsFound:
     """What a task found.
 
     Attributes:
-        number: Of the task.
         group, rows: The group, and how many rows of it the task had.
         findings: Its violations.
         bad: (n,), rows that break a rule or cannot be read.
         noted: (m,), what its judge returned.
     """
 
-    number: int
     group: str
     rows: int
     findings: Findings
@@ -178,16 +174,11 @@ def judge_rows(
     """
     bad: dict[str, list[npt.NDArray[np.int64]]] = {group: [] for group in file.groups}
     noted = [np.zeros(0, dtype=np.int64)]
-    waiting: dict[int, RowsFound] = {}
-    due = 0
-    for result in context.execute(_judge, tasks):
-        context.advance(result.rows)
-        waiting[result.number] = result
-        while (found := waiting.pop(due, None)) is not None:
-            context.findings.merge(found.findings)
-            bad[found.group].append(found.bad)
-            noted.append(found.noted)
-            due += 1
+    for found in in_order(context.execute)(_judge, tasks):
+        context.advance(found.rows)
+        context.findings.merge(found.findings)
+        bad[found.group].append(found.bad)
+        noted.append(found.noted)
     for group, parts in bad.items():
         file.mark_bad(group, np.concatenate([np.zeros(0, dtype=np.int64), *parts]))
     return np.concatenate(noted)
@@ -216,7 +207,6 @@ def _judge(task: RowsTask) -> RowsFound:
         )
         noted = task.judge(rows, findings)
         return RowsFound(
-            number=task.number,
             group=task.group,
             rows=task.stop - task.start,
             findings=findings,

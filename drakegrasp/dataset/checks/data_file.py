@@ -81,14 +81,13 @@ def check_pair(oto: OpenFile, otm: OpenFile, findings: Findings) -> None:
 
 
 def _tasks(data: OpenFile, camera: str, dataset: Dataset | None) -> Iterator[RowsTask]:
-    place, number = data.place({}), 0
+    place = data.place({})
     for split in data.groups:
         count = data.count(split)
         for start in range(0, count, TASK_ROWS):
             stop = min(start + TASK_ROWS, count)
             trials = None if dataset is None else dataset.trials
             yield RowsTask(
-                number=number,
                 judge=partial(_judge_samples, camera=camera),
                 file=place,
                 group=split,
@@ -98,7 +97,6 @@ def _tasks(data: OpenFile, camera: str, dataset: Dataset | None) -> Iterator[Row
                 manifest=None if dataset is None else dataset.manifest,
                 trials=None if trials is None else _trials_of(trials, data, split, start, stop),
             )
-            number += 1
 
 
 def _trials_of(trials: OpenFile, data: OpenFile, split: str, start: int, stop: int) -> FilePlace:

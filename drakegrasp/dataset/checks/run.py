@@ -22,7 +22,7 @@ from drakegrasp.dataset.checks import consistency
 from drakegrasp.dataset.checks.context import Context, Dataset
 from drakegrasp.dataset.checks.data_file import check_data_file, check_pair
 from drakegrasp.dataset.checks.findings import Findings, Violation, of_file
-from drakegrasp.dataset.checks.object_files import ObjectFound, check_object, object_tasks
+from drakegrasp.dataset.checks.object_files import check_object, object_tasks
 from drakegrasp.dataset.checks.open_file import OpenFile, open_file
 from drakegrasp.dataset.checks.trials_file import check_trials_file
 from drakegrasp.dataset.hdf5 import open_hdf5
@@ -30,7 +30,7 @@ from drakegrasp.dataset.manifest import Manifest, read_manifest, refuse_older
 from drakegrasp.dataset.paths import CARD_FILES, DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.schema import CAMERAS, refuse_other_schema
 from drakegrasp.errors import DataError, first_line
-from drakegrasp.runtime.executor import Executor, run_here
+from drakegrasp.runtime.executor import Executor, in_order, run_here
 from drakegrasp.runtime.file_set import refuse_half_replaced
 from drakegrasp.runtime.progress import Report, silent
 
@@ -154,16 +154,14 @@ def _check_objects(out: Path, manifest: Manifest, context: Context) -> str | Non
     Returns:
         What `shards_sha256` is; None where a shard is missing or broken.
     """
-    results: dict[int, ObjectFound] = {}
-    for found in context.execute(check_object, object_tasks(out, manifest)):
-        results[found.object] = found
+    seals, whole = dict[int, bytes](), True
+    for found in in_order(context.execute)(check_object, object_tasks(out, manifest)):
         context.advance(found.candidates)
-    seals = dict[int, bytes]()
-    for i, found in sorted(results.items()):
         context.findings.merge(found.findings)
-        if found.candidates and found.seals is not None:
-            seals[i] = found.seals
-    whole = all(found.seals is not None for found in results.values())
+        if found.seals is None:
+            whole = False
+        elif found.candidates:
+            seals[found.object] = found.seals
     return join_seals(seals) if whole else None
 
 

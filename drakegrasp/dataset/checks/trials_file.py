@@ -54,9 +54,8 @@ def check_trials_file(trials: OpenFile, context: Context) -> None:
 
 def _tasks(trials: OpenFile, dataset: Dataset | None) -> Iterator[RowsTask]:
     count, place = trials.count("trials"), trials.place({})
-    for number, start in enumerate(range(0, count, TASK_ROWS)):
+    for start in range(0, count, TASK_ROWS):
         yield RowsTask(
-            number=number,
             judge=_judge_trials,
             file=place,
             group="trials",
