@@ -100,7 +100,7 @@ def compare_labels(
         for one in simulated
     ]
     labels = [record.outcome for record in records]
-    lifted = [record.lifted is not None for record in records]
+    lifted = [record.lift is not None for record in records]
     decided = [
         one.prediction is not None and one.prediction.outcome is not None for one in simulated
     ]

@@ -176,9 +176,10 @@ def measure_contacts(setup: TrialSetup, record: TrialRecord) -> ContactFit | Non
     Returns:
         Distances and angles; None if the hand lifted nothing.
     """
-    if record.closed is None or record.lifted is None:
+    if record.closed is None or record.lift is None:
         return None
-    return fit_contacts(setup.prepared.model, record.closed.p_OQ, record.closed.nhat_Q_O)
+    closed = record.closed.contacts
+    return fit_contacts(setup.prepared.model, closed.p_OQ, closed.nhat_Q_O)
 
 
 def render_views(setup: TrialSetup, attempt: Attempt, record: TrialRecord) -> dict[str, View]:

@@ -15,8 +15,10 @@ from drakegrasp.dataset.schema import CONTACT_NAMES, LINEAGE_NAMES, LOOK_FIELDS,
 from drakegrasp.dataset.shards import trial_columns
 from drakegrasp.frames import pack_pose
 from drakegrasp.objects.contact_fit import ContactFit
+from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.contacts import Contacts
+from drakegrasp.simulation.lift import Lift
 from drakegrasp.simulation.randomization.conditions import usual_conditions
 from drakegrasp.simulation.scene import hand_joint_names
 from drakegrasp.simulation.trial import TrialRecord
@@ -94,29 +96,26 @@ def _trial_values(attempt: Attempt, record: TrialRecord, fit: ContactFit | None)
     }
 
     # What a stage did not reach keeps the column's fill value.
-    if record.closed is not None:
-        values |= {"time_close": record.time_close, "closed_q": record.q_closed}
-        values |= _contact_values("closed", record.closed)
-    if record.lifted is not None and record.X_TO_lifted is not None:
-        values |= {"time_lift": record.time_lift, "lifted_q": record.q_lifted}
-        values |= _contact_values("lifted", record.lifted)
-        values |= _hold_values(record, record.lifted)
-        values["X_TO_lifted"] = pack_pose(record.X_TO_lifted)
-        if record.X_OG_lifted is not None:
-            values["X_OG_lifted"] = pack_pose(record.X_OG_lifted)
+    if (closed := record.closed) is not None:
+        values |= {"time_close": closed.duration, "closed_q": closed.q}
+        values |= _contact_values("closed", closed.contacts)
+    if (lift := record.lift) is not None:
+        values |= {"time_lift": lift.duration, "lifted_q": lift.q}
+        values |= _contact_values("lifted", lift.contacts)
+        values |= {"X_TO_lifted": pack_pose(lift.X_TO), "X_OG_lifted": pack_pose(lift.X_OG)}
+        values |= _hold_values(record.outcome, lift)
     if fit is not None:
         values |= {"surface_distance": fit.distance, "normal_angle": fit.normal_angle}
     return values
 
 
-def _hold_values(record: TrialRecord, lifted: Contacts) -> dict[str, Any]:
-    """Return how the object moved in the hand, and the words that follow from it."""
-    motion = {
-        name: getattr(record, name) for name in ("slip", "turn", "slip_released", "turn_released")
-    }
-    return motion | {
-        "precision": is_precision(record.outcome, lifted.other_links),
-        "stable": is_stable(record.outcome, lifted.other_links, record.slip, record.turn),
+def _hold_values(outcome: Outcome, lift: Lift) -> dict[str, Any]:
+    """Return how the object moved in the hand, and the labels that follow from it."""
+    names = ("slip", "turn", "slip_released", "turn_released")
+    other_links = lift.contacts.other_links
+    return {name: getattr(lift, name) for name in names} | {
+        "precision": is_precision(outcome, other_links),
+        "stable": is_stable(outcome, other_links, lift.slip, lift.turn),
     }
 
 

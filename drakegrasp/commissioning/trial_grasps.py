@@ -96,9 +96,9 @@ def _with_drive(config: Config, drive: Drive) -> Config:
 
 def _slip(record: TrialRecord) -> str:
     """Return how far an object slipped in the lift, in words."""
-    if record.outcome is not Outcome.SUCCESS:
+    if record.outcome is not Outcome.SUCCESS or record.lift is None:
         return f"is {record.outcome.label}"
-    return f"slips by {1e3 * record.slip:.2f} mm and {np.rad2deg(record.turn):.1f}°"
+    return f"slips by {1e3 * record.lift.slip:.2f} mm and {np.rad2deg(record.lift.turn):.1f}°"
 
 
 def trial_grasps(hand: Hand, shape: str) -> Iterator[TrialGrasp]:

@@ -21,7 +21,7 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import Contacts, open_hand_collides, read_contacts
 from drakegrasp.simulation.drive import drive_of
-from drakegrasp.simulation.lift import lift
+from drakegrasp.simulation.lift import Lift, lift
 from drakegrasp.simulation.randomization.conditions import Materials, usual_materials
 from drakegrasp.simulation.randomization.materials import set_materials
 from drakegrasp.simulation.scene import (
@@ -43,21 +43,29 @@ BEYOND = np.deg2rad(2.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Closed:
+    """How the fingers closed.
+
+    Attributes:
+        contacts: Contacts at the end.
+        q: Positions of the hand's joints [rad or m], in the plant's order.
+        duration: Simulated time [s].
+    """
+
+    contacts: Contacts
+    q: Array
+    duration: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class TrialRecord:
-    """The result of one attempt; measurements of a stage that was not reached are None.
+    """The result of one attempt; a stage that was not reached is None.
 
     Attributes:
         outcome: The verdict.
         X_TO, X_OG: Resting pose of the object and start pose of the palm, (4, 4).
-        closed, lifted: Contacts after closing and after the lift.
-        q_closed, q_lifted: Positions of the hand's joints at these times [rad or m], in the
-            plant's order.
-        time_close, time_lift: Simulated time of the two stages [s].
-        X_TO_lifted: Pose of the object after the lift, (4, 4).
-        X_OG_lifted: Pose of the palm then, (4, 4).
-        slip: Distance that {O} moved in {G} during the lift [m].
-        turn: Angle that it turned in {G} [rad].
-        slip_released, turn_released: The same while the object is free and the wrist still stands.
+        closed: How the fingers closed.
+        lift: How the lift ended.
         chance: Of a sample, of a closed hand that may lift; NaN if nothing is known of it.
         message: First line of the error for `solver_error`, else empty.
     """
@@ -65,18 +73,8 @@ class TrialRecord:
     outcome: Outcome
     X_TO: Array
     X_OG: Array
-    closed: Contacts | None = None
-    lifted: Contacts | None = None
-    q_closed: Array | None = None
-    q_lifted: Array | None = None
-    time_close: float = 0.0
-    time_lift: float = 0.0
-    X_TO_lifted: Array | None = None
-    X_OG_lifted: Array | None = None
-    slip: float = np.nan
-    turn: float = np.nan
-    slip_released: float = np.nan
-    turn_released: float = np.nan
+    closed: Closed | None = None
+    lift: Lift | None = None
     chance: float = np.nan
     message: str = field(default="")
 
@@ -140,45 +138,35 @@ def run_attempt(
         if prediction is not None:
             reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=prediction.closing)
         _close(scene, limits, config, prediction)
-        closed = read_contacts(scene)
-        record = replace(
-            start, closed=closed, q_closed=hand_positions(scene), time_close=scene.time
-        )
+        contacts = read_contacts(scene)
+        closed = Closed(contacts=contacts, q=hand_positions(scene), duration=scene.time)
+        record = replace(start, closed=closed)
 
         # Judge the closed hand: it lifts only what it holds with all fingertips and nothing else.
         verdict = judge_closed(
-            closed.touching, closed.other_links, closed.hand_on_table, required=required
+            contacts.touching, contacts.other_links, contacts.hand_on_table, required=required
         )
         if verdict != Outcome.SUCCESS:
             return replace(record, outcome=Outcome(int(verdict)))
 
         # Choose what is worth a lift, by what is known now; some are lifted all the same.
-        record = replace(record, chance=_chance(scene, X_TO, attempt, closed))
+        record = replace(record, chance=_chance(scene, X_TO, attempt, contacts))
         if not attempt.audited and record.chance < config.lift.least_chance:
             return replace(record, outcome=Outcome.NOT_LIFTED)
 
         # Lift: object and wrist are free, and the wrist moves to its target.
         end = lift(scene, limits, config)
+        record = replace(record, lift=end)
 
         # Judge the lifted object: all fingertips must still hold it, clear of the table. A lift
         # that was ended because the object moved has no such verdict.
-        lifted = end.contacts
+        if end.moved:
+            return replace(record, outcome=Outcome.MOVED)
+        contacts = end.contacts
         verdict = judge_lifted(
-            lifted.touching, lifted.other_links, lifted.object_on_table, required=required
+            contacts.touching, contacts.other_links, contacts.object_on_table, required=required
         )
-        return replace(
-            record,
-            outcome=Outcome.MOVED if end.moved else Outcome(int(verdict)),
-            lifted=lifted,
-            q_lifted=end.q,
-            time_lift=end.duration,
-            X_TO_lifted=end.X_TO,
-            X_OG_lifted=end.X_OG,
-            slip=end.slip,
-            turn=end.turn,
-            slip_released=end.slip_released,
-            turn_released=end.turn_released,
-        )
+        return replace(record, outcome=Outcome(int(verdict)))
     except TrialTimeout:
         return replace(start, outcome=Outcome.TIMEOUT)
     except (MemoryError, OSError):
@@ -221,7 +209,7 @@ def _close(
     scene: Scene, limits: TrialLimits, config: Config, prediction: Prediction | None
 ) -> None:
     """Close the fingers on the static object until they stop, or one has missed it."""
-    # Closing that geometry skipped counts as time, and an angle beyond its last contact as a miss.
+    # Closed that geometry skipped counts as time, and an angle beyond its last contact as a miss.
     end, last = config.close.max_time, np.array(np.inf)
     if prediction is not None:
         assert scene.handles is not None

@@ -13,6 +13,7 @@ from drakegrasp.frames import Array
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import Contacts
+from drakegrasp.simulation.lift import Lift
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.trial import TrialRecord
 from drakegrasp.simulation.verdict import is_precision, is_stable
@@ -104,12 +105,12 @@ class Verification:
     @property
     def slip(self) -> float:
         """Distance that the object moved in the hand during the lift [m]."""
-        return np.nan if self.trial is None else self.trial.slip
+        return np.nan if self._lift is None else self._lift.slip
 
     @property
     def turn(self) -> float:
         """Angle that the object turned in the hand during the lift [rad]."""
-        return np.nan if self.trial is None else self.trial.turn
+        return np.nan if self._lift is None else self._lift.turn
 
     @property
     def other_links(self) -> int:
@@ -128,7 +129,7 @@ class Verification:
 
     @property
     def closing(self) -> Array | None:
-        """Closing positions (k,) at which the fingertips meet the predicted points [rad or m]."""
+        """Closed positions (k,) at which the fingertips meet the predicted points [rad or m]."""
         return None if self.fit is None else self.fit.closing
 
     @property
@@ -143,23 +144,18 @@ class Verification:
 
     @property
     def closed(self) -> Contacts | None:
-        """Contacts after closing."""
-        return None if self.trial is None else self.trial.closed
+        """Contacts after closing; `trial.closed` has the joints then, too."""
+        end = None if self.trial is None else self.trial.closed
+        return None if end is None else end.contacts
 
     @property
     def lifted(self) -> Contacts | None:
-        """Contacts after the lift."""
-        return None if self.trial is None else self.trial.lifted
+        """Contacts after the lift; `trial.lift` has joints and poses then, too."""
+        return None if self._lift is None else self._lift.contacts
 
     @property
-    def q_closed(self) -> Array | None:
-        """Positions of the hand's joints after closing [rad or m], in the plant's order."""
-        return None if self.trial is None else self.trial.q_closed
-
-    @property
-    def q_lifted(self) -> Array | None:
-        """Positions of the hand's joints after the lift [rad or m], in the plant's order."""
-        return None if self.trial is None else self.trial.q_lifted
+    def _lift(self) -> Lift | None:
+        return None if self.trial is None else self.trial.lift
 
     def save_html(self, path: str | Path) -> None:
         """Write an HTML file that plays the simulation in a browser, from any side.

@@ -22,11 +22,13 @@ from drakegrasp.dataset.hdf5 import AnyArray, write_field
 from drakegrasp.dataset.manifest import finger_names, installed_versions, write_origin
 from drakegrasp.dataset.schema import CONTACT_NAMES, VERIFICATION_FIELDS, Field, sizes
 from drakegrasp.errors import DataError
-from drakegrasp.frames import Array, pack_pose
+from drakegrasp.frames import pack_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.runtime.files import atomic_hdf5, probe_folder, sync_and_rename
 from drakegrasp.simulation.contacts import Contacts
+from drakegrasp.simulation.lift import Lift
 from drakegrasp.simulation.placement import canonical_pose
+from drakegrasp.simulation.trial import Closed
 from drakegrasp.verification.result import Verification
 
 #: Group of the HDF5 file that holds the fields.
@@ -140,7 +142,7 @@ def as_dict(index: int, result: Verification) -> dict[str, Any]:
         result: Its verdict.
     """
     # In the order in which a person reads them: verdict, contacts, hand, lift, margin.
-    fit, lift = result.fit, result.lift
+    fit, trial, lift = result.fit, result.trial, result.lift
 
     return {
         "index": index,
@@ -166,8 +168,8 @@ def as_dict(index: int, result: Verification) -> dict[str, Any]:
         "solver": None
         if fit is None
         else {"status": fit.status, "message": fit.message, "iterations": fit.iterations},
-        "closed": _contacts_as_dict(result.closed, result.q_closed),
-        "lifted": _contacts_as_dict(result.lifted, result.q_lifted),
+        "closed": None if trial is None else _end_as_dict(trial.closed),
+        "lifted": None if trial is None else _end_as_dict(trial.lift),
         "slip": result.slip,
         "turn_deg": math.degrees(result.turn),
         "epsilon": result.epsilon,
@@ -190,12 +192,13 @@ def as_dict(index: int, result: Verification) -> dict[str, Any]:
     }
 
 
-def _contacts_as_dict(contacts: Contacts | None, q: Array | None) -> dict[str, Any] | None:
-    """Return the JSON object of contacts with joint positions q [rad or m]; None without."""
-    if contacts is None:
+def _end_as_dict(stage: Closed | Lift | None) -> dict[str, Any] | None:
+    """Return the JSON object of the contacts and joint positions at the end of a stage."""
+    if stage is None:
         return None
     names = ("touching", "p_OQ", "nhat_Q_O", "f_Q_O", "other_links", "hand_on_table")
-    return {name: getattr(contacts, name) for name in (*names, "object_on_table")} | {"q": q}
+    values = {name: getattr(stage.contacts, name) for name in (*names, "object_on_table")}
+    return values | {"q": stage.q}
 
 
 def _plain(value: Any) -> Any:
@@ -278,22 +281,20 @@ def _row(result: Verification) -> dict[str, Any]:
     if result.pregrasp is not None:
         row["closing_start"] = result.pregrasp.closing
     if trial is not None and trial.closed is not None:
-        row |= {"time_close": trial.time_close, "closed_q": trial.q_closed}
-        row |= _contact_values("closed", trial.closed)
-    if trial is not None and trial.lifted is not None:
-        row |= {"time_lift": trial.time_lift, "lifted_q": trial.q_lifted}
-        row |= _contact_values("lifted", trial.lifted)
-        row |= {"slip": trial.slip, "turn": trial.turn}
+        row |= {"time_close": trial.closed.duration, "closed_q": trial.closed.q}
+        row |= _contact_values("closed", trial.closed.contacts)
+    if trial is not None and trial.lift is not None:
+        row |= {"time_lift": trial.lift.duration, "lifted_q": trial.lift.q}
+        row |= _contact_values("lifted", trial.lift.contacts)
+        row |= {"slip": trial.lift.slip, "turn": trial.lift.turn}
+        row["X_TO_lifted"] = pack_pose(trial.lift.X_TO)
 
     # The lift by forces.
     if lift is not None:
         names = ("planned_force", "planned_share", "applied_force", "position_error", "angle_error")
         row |= {name: getattr(lift, name) for name in names}
-
-    # One of the two lifted the object.
-    for record in (trial, lift):
-        if record is not None and record.X_TO_lifted is not None:
-            row["X_TO_lifted"] = pack_pose(record.X_TO_lifted)
+        if lift.X_TO_lifted is not None:
+            row["X_TO_lifted"] = pack_pose(lift.X_TO_lifted)
     return row
 
 

@@ -269,8 +269,9 @@ def _judge(result: Verification, config: Config) -> Verification:
     # A hand that closes on other points has not tried the predicted grasp. Fingertips that need
     # not touch, and do not, have no point.
     required = load_hand(config.hand).required
-    if trial.closed is not None and trial.closed.touching[required].all():
-        error = np.linalg.norm(trial.closed.p_OQ - result.p_OQ, axis=1)
+    closed = result.closed
+    if closed is not None and closed.touching[required].all():
+        error = np.linalg.norm(closed.p_OQ - result.p_OQ, axis=1)
         finger = int(np.argmax(np.nan_to_num(error)))
         if error[finger] > config.verify.max_contact_error:
             outcome = Outcome.UNREACHABLE

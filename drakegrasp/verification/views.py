@@ -23,7 +23,6 @@ from drakegrasp.mesh.rays import first_hits
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.placement import canonical_pose
-from drakegrasp.simulation.trial import TrialRecord
 from drakegrasp.vision.camera import Picture
 from drakegrasp.visualization.style import ARROW, HIDDEN, LIFTED, PREDICTED, REACHED
 from drakegrasp.visualization.third_person import (
@@ -112,11 +111,10 @@ def render_views(verified: Verification) -> list[View]:
     # The contacts: predicted ones, those after closing, and where these are after the lift.
     renderer = _Renderer(verified.placed.model, load_hand(verified.config.hand))
     X_WO = X_WT @ canonical_pose(verified.placed.X_TO)
-    closed = None if verified.trial is None else verified.trial.closed
     marks = [
         _predicted(verified),
-        *_reached(closed, _force_scale(verified)),
-        *_moved(verified.trial),
+        *_reached(verified.closed, _force_scale(verified)),
+        *_moved(verified.closed, verified.lifted),
     ]
 
     # The object from two sides, then the last state that was reached.
@@ -141,20 +139,15 @@ def _last_view(
     # After the lift, by forces or by the hand.
     if lift is not None and lift.X_TO_lifted is not None:
         return [renderer.object_view("end of the lift", X_WT @ lift.X_TO_lifted, marks, azimuth)]
-    if (
-        trial is not None
-        and trial.X_TO_lifted is not None
-        and trial.X_OG_lifted is not None
-        and trial.q_lifted is not None
-    ):
-        X_WO = X_WT @ trial.X_TO_lifted
-        snapshot = Snapshot(X_WG=X_WO @ trial.X_OG_lifted, X_WO=X_WO, q=trial.q_lifted)
-        reached = _reached(trial.lifted, _force_scale(verified), kind="lifted", colour=LIFTED)
+    if trial is not None and trial.lift is not None:
+        X_WO = X_WT @ trial.lift.X_TO
+        snapshot = Snapshot(X_WG=X_WO @ trial.lift.X_OG, X_WO=X_WO, q=trial.lift.q)
+        reached = _reached(verified.lifted, _force_scale(verified), kind="lifted", colour=LIFTED)
         return [renderer.hand_view("end of the lift, with forces", snapshot, reached)]
 
     # Before it: the closed hand, or the palm pose that comes closest.
-    if trial is not None and trial.q_closed is not None:
-        snapshot = Snapshot(X_WG=X_WO @ trial.X_OG, X_WO=X_WO, q=trial.q_closed)
+    if trial is not None and trial.closed is not None:
+        snapshot = Snapshot(X_WG=X_WO @ trial.X_OG, X_WO=X_WO, q=trial.closed.q)
         return [renderer.hand_view("after closing", snapshot, marks)]
     if fit is not None:
         q = renderer.positions(fit.spread, fit.closing)
@@ -237,17 +230,17 @@ def _reached(
     ]
 
 
-def _moved(trial: TrialRecord | None) -> list[Marks]:
+def _moved(closed: Contacts | None, lifted: Contacts | None) -> list[Marks]:
     """Return the contacts after the lift, with arrows from where they were after closing.
 
     They are on the object as it lay: an arrow is how far a fingertip slid over its surface.
     """
-    if trial is None or trial.closed is None or trial.lifted is None:
+    if closed is None or lifted is None:
         return []
-    both = trial.closed.touching & trial.lifted.touching
+    both = closed.touching & lifted.touching
     if not both.any():
         return []
-    p, n = trial.lifted.p_OQ[both], trial.lifted.nhat_Q_O[both]
+    p, n = lifted.p_OQ[both], lifted.nhat_Q_O[both]
     return [
         Marks(
             kind="lifted",
@@ -255,7 +248,7 @@ def _moved(trial: TrialRecord | None) -> list[Marks]:
             size=4.0,
             p_OQ=p,
             nhat_Q_O=n,
-            tail_O=trial.closed.p_OQ[both],
+            tail_O=closed.p_OQ[both],
             tip_O=p,
             names=[""] * len(p),
         )
@@ -264,9 +257,8 @@ def _moved(trial: TrialRecord | None) -> list[Marks]:
 
 def largest_force(verified: Verification) -> float:
     """Return the largest force on a fingertip that is drawn [N]; inf if there is none."""
-    trial = verified.trial
-    stages = [] if trial is None else [trial.closed, trial.lifted]
-    forces = [float(np.linalg.norm(c.f_Q_O, axis=1).max()) for c in stages if c is not None]
+    ends = (verified.closed, verified.lifted)
+    forces = [float(np.linalg.norm(c.f_Q_O, axis=1).max()) for c in ends if c is not None]
     return max(forces, default=0.0) or np.inf
 
 

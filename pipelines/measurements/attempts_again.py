@@ -115,15 +115,17 @@ def main(argv: Sequence[str] | None = None) -> int:
                 record = run_attempt(scene, X_TO, attempt, config)
                 seconds += time.process_time() - start
                 outcomes[i] = record.outcome
-                if record.lifted is not None:
+                if record.lift is not None:
                     row = {
                         "outcome": [record.outcome],
-                        "lifted_other_links": [record.lifted.other_links],
-                        "slip": [record.slip],
-                        "turn": [record.turn],
+                        "lifted_other_links": [record.lift.contacts.other_links],
+                        "slip": [record.lift.slip],
+                        "turn": [record.lift.turn],
                     }
                     kept["now"][i] = _is_sample(row, config.filters)[0]
-                    values = _measured(record.slip, record.turn, record.lifted.f_Q_O)
+                    values = _measured(
+                        record.lift.slip, record.lift.turn, record.lift.contacts.f_Q_O
+                    )
                     for name, value in values.items():
                         again[name][i] = value
                 report(done := done + 1, len(outcomes))

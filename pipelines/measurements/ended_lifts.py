@@ -72,9 +72,11 @@ def try_both(
 
 def is_sample(record: TrialRecord, config: Config) -> bool:
     """Return whether the filters of the hold keep a grasp."""
-    if record.outcome is not Outcome.SUCCESS or record.lifted is None:
+    if record.outcome is not Outcome.SUCCESS or record.lift is None:
         return False
-    limits = breaks_hold(config.filters, [record.lifted.other_links], [record.slip], [record.turn])
+    limits = breaks_hold(
+        config.filters, [record.lift.contacts.other_links], [record.lift.slip], [record.lift.turn]
+    )
     return not any(bad[0] for _, bad in limits)
 
 
@@ -104,7 +106,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             try:
                 for found in try_both(source, rules):
                     (whole, _), (ended, _) = found["never"], found["lost_sample"]
-                    lifted = whole.lifted is not None
+                    lifted = whole.lift is not None
                     counts.update(simulated=1, lifts=lifted, held=whole.outcome is Outcome.SUCCESS)
                     for rule, (_, spent) in found.items():
                         seconds[rule]["all"] += spent
@@ -115,8 +117,9 @@ def main(argv: Sequence[str] | None = None) -> int:
                         counts["others that differ"] += pickle.dumps(whole) != pickle.dumps(ended)
                         continue
                     moved[whole.outcome.label] += 1
-                    if sample:
-                        lost.append({"slip": ended.slip, "slip of the whole lift": whole.slip})
+                    if sample and ended.lift is not None and whole.lift is not None:
+                        slips = {"slip": ended.lift.slip, "slip of the whole lift": whole.lift.slip}
+                        lost.append(slips)
             except MeshError as error:
                 sys.stderr.write(f"{source.name}: {error}\n")
             report(done, len(sources))

@@ -70,8 +70,8 @@ def search(source: MeshSource, config: Config) -> tuple[int, int, bool]:
         for attempt, prediction in zip(attempts, predict_attempts(setup, attempts), strict=True):
             record = try_attempt(setup, attempt, prediction)
             held += record.outcome is Outcome.SUCCESS
-            lifted = record.lifted
-            if lifted is not None and is_precision(record.outcome.value, lifted.other_links):
+            lift = record.lift
+            if lift and is_precision(record.outcome.value, lift.contacts.other_links):
                 return attempt.candidate + 1, held, True
     return count, held, False
 

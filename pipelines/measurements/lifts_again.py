@@ -42,10 +42,10 @@ UNLIMITED = 1e6
 
 def opening(hand: Hand, record: TrialRecord) -> float:
     """Return by how much the closing joint opened that opened most, after closing [rad]."""
-    if record.q_lifted is None or record.q_closed is None:
+    if record.lift is None or record.closed is None:
         return 0.0
     joints = [hand.joint_names.index(finger.closing_joint) for finger in hand.fingers]
-    return float((record.q_closed - record.q_lifted)[joints].max())
+    return float((record.closed.q - record.lift.q)[joints].max())
 
 
 def lift_again(
@@ -119,8 +119,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     # What they are now. A lift that has no measurements is not stable.
     now = np.array([record.outcome for record, *_ in again])
     stable_now = [
-        record.lifted is not None
-        and bool(is_stable(record.outcome, record.lifted.other_links, record.slip, record.turn))
+        record.lift is not None
+        and bool(
+            is_stable(
+                record.outcome, record.lift.contacts.other_links, record.lift.slip, record.lift.turn
+            )
+        )
         for record, *_ in again
     ]
     changed = Counter(

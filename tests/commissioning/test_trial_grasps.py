@@ -43,9 +43,9 @@ def test_a_pinched_box_slips_by_less_than_a_millimetre(name: str, drive: str) ->
     scene = build_scene(grasp.model, config.physics, hand)
     record = run_attempt(scene, grasp.X_TO, grasp.pregrasp, config)
     assert record.outcome is Outcome.SUCCESS
-    assert record.closed.touching.all()
-    assert record.slip < 1e-3
-    assert record.turn < np.deg2rad(1.0)
+    assert record.closed.contacts.touching.all()
+    assert record.lift.slip < 1e-3
+    assert record.lift.turn < np.deg2rad(1.0)
     q = dict(zip(hand.joint_names, hand_positions(scene), strict=True))
     for joint, position in hand.preshape.items():
         assert q[joint] == position

@@ -58,17 +58,17 @@ def test_lift_with_coarse_steps_ends_as_one_without(scene, cube, config, hand, m
     attempt = from_above(cube, STANDOFF)
     by_coarse = run_attempt(scene, standing(cube), attempt, config)
     long = config.physics.coarse_steps * config.physics.time_step
-    assert simulated[long] > 0.4 * by_coarse.time_lift
+    assert simulated[long] > 0.4 * by_coarse.lift.duration
     fine = override_config(config, ["physics.coarse_steps=1"])
     throughout = build_scene(cube, fine.physics, hand)
     assert throughout.coarse_scene is None
     by_fine = run_attempt(throughout, standing(cube), attempt, fine)
     assert by_coarse.outcome is by_fine.outcome is Outcome.SUCCESS
     # The wrist starts where a step of the longest kind begins.
-    assert by_coarse.time_lift == pytest.approx(by_fine.time_lift, abs=long)
-    assert np.allclose(by_coarse.X_TO_lifted[:3, 3], by_fine.X_TO_lifted[:3, 3], atol=1e-3)
-    assert np.allclose(by_coarse.X_TO_lifted[:3, :3], by_fine.X_TO_lifted[:3, :3], atol=0.02)
-    assert np.allclose(by_coarse.lifted.f_Q_O, by_fine.lifted.f_Q_O, atol=1.0)
+    assert by_coarse.lift.duration == pytest.approx(by_fine.lift.duration, abs=long)
+    assert np.allclose(by_coarse.lift.X_TO[:3, 3], by_fine.lift.X_TO[:3, 3], atol=1e-3)
+    assert np.allclose(by_coarse.lift.X_TO[:3, :3], by_fine.lift.X_TO[:3, :3], atol=0.02)
+    assert np.allclose(by_coarse.lift.contacts.f_Q_O, by_fine.lift.contacts.f_Q_O, atol=1.0)
 
 
 @pytest.mark.parametrize("back", [False, True])
@@ -138,7 +138,7 @@ def test_lift_ends_when_the_object_is_lost(cube, config, hand):
     record = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), slippery)
     assert record.outcome is Outcome.DROPPED
     whole = lift_duration(0.60 - CUBE - STANDOFF, slippery) + slippery.lift.hold_time
-    assert record.time_lift < 0.7 * whole
+    assert record.lift.duration < 0.7 * whole
 
 
 @pytest.fixture(scope="module")
@@ -164,13 +164,13 @@ def test_lift_ends_when_its_sample_is_lost(sliding, limits):
     """By 10 mm or by an angle; the object, still held, is measured as it is then."""
     whole, ended = sliding(), sliding(LOST_SAMPLE, *limits, "filters.max_turn_deg=4")
     assert (whole.outcome, ended.outcome) == (Outcome.SUCCESS, Outcome.MOVED)
-    assert ended.time_lift < 0.5 * whole.time_lift
-    assert ended.slip < 0.6 * whole.slip
-    assert (ended.slip > 0.010) or limits
-    assert ended.lifted.touching.all()
-    assert same_bits(ended.closed, whole.closed)
-    X_GO = np.linalg.inv(ended.X_OG_lifted) @ ended.X_OG
-    assert np.linalg.norm(X_GO[:3, 3]) > 0.9 * ended.slip
+    assert ended.lift.duration < 0.5 * whole.lift.duration
+    assert ended.lift.slip < 0.6 * whole.lift.slip
+    assert (ended.lift.slip > 0.010) or limits
+    assert ended.lift.contacts.touching.all()
+    assert same_bits(ended.closed.contacts, whole.closed.contacts)
+    X_GO = np.linalg.inv(ended.lift.X_OG) @ ended.X_OG
+    assert np.linalg.norm(X_GO[:3, 3]) > 0.9 * ended.lift.slip
 
 
 def test_lift_of_a_sample_is_the_same_with_and_without_a_limit(sliding, scene, cube, config):
@@ -184,20 +184,20 @@ def test_lift_of_a_sample_is_the_same_with_and_without_a_limit(sliding, scene, c
 def test_lift_ends_beyond_the_limit_and_not_at_it(sliding):
     """The object slides on between two checks."""
     ended = sliding(LOST_SAMPLE)
-    below = float(np.nextafter(ended.slip, 0.0))
+    below = float(np.nextafter(ended.lift.slip, 0.0))
     assert below > 0.010
     again = sliding(LOST_SAMPLE, f"lift.stop_slip={below!r}")
-    at = sliding(LOST_SAMPLE, f"lift.stop_slip={ended.slip!r}")
+    at = sliding(LOST_SAMPLE, f"lift.stop_slip={ended.lift.slip!r}")
     assert same_bits(again, ended)
     assert at.outcome is Outcome.MOVED
-    assert at.time_lift > ended.time_lift
+    assert at.lift.duration > ended.lift.duration
 
 
 def test_verdict_at_the_end_of_a_whole_lift_goes_first(sliding):
     """Here there are two checks: before the wrist moves, and at the end."""
     whole = sliding("lift.check_period=9")
     assert whole.outcome is Outcome.SUCCESS
-    assert whole.slip_released < 0.010 < whole.slip
+    assert whole.lift.slip_released < 0.010 < whole.lift.slip
     assert same_bits(sliding("lift.check_period=9", LOST_SAMPLE), whole)
 
 
@@ -210,7 +210,7 @@ def test_certain_verdict_goes_before_a_lost_sample(cube, hand):
         rules = override_config(slippery, [LOST_SAMPLE, f"lift.stop_slip={limit}"])
         records[limit] = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), rules)
     assert records[0.02].outcome is Outcome.MOVED
-    assert records[0.02].slip < 0.04 < records[0.04].slip
+    assert records[0.02].lift.slip < 0.04 < records[0.04].lift.slip
     whole = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), slippery)
     assert whole.outcome is Outcome.DROPPED
     assert same_bits(records[0.04], whole)
@@ -222,9 +222,9 @@ def test_slip_before_the_wrist_moves_is_told_apart(scene, cube, config):
     still = override_config(torque, ["lift.p_TG=[0, 0, 0.13]"])
     moved = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), torque)
     waited = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), still)
-    assert 1e-6 < moved.slip_released < 0.5 * moved.slip
-    assert moved.slip_released == pytest.approx(waited.slip_released, rel=1e-6)
-    assert 1e-6 < moved.turn_released < moved.turn
+    assert 1e-6 < moved.lift.slip_released < 0.5 * moved.lift.slip
+    assert moved.lift.slip_released == pytest.approx(waited.lift.slip_released, rel=1e-6)
+    assert 1e-6 < moved.lift.turn_released < moved.lift.turn
 
 
 def test_long_steps_are_for_what_stands_still_in_the_hand(cube, config, hand, monkeypatch):
@@ -244,7 +244,7 @@ def test_long_steps_are_for_what_stands_still_in_the_hand(cube, config, hand, mo
         simulated.clear()
         drawn = override_config(config, [f"lift.drive={drive}"])
         record = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), drawn)
-        shares[drive] = simulated[long] / record.time_lift
+        shares[drive] = simulated[long] / record.lift.duration
     assert shares["worm"] > 0.7
     assert shares["torque"] < 0.3
 

@@ -47,11 +47,11 @@ def test_good_grasp_is_simulated_from_just_before_it_touches(cube, hand, config,
     record = run_attempt(scene, standing(cube), attempt, config)
     slow = run_attempt(scene, standing(cube), attempt, OFF)
     assert record.outcome is slow.outcome is Outcome.SUCCESS
-    assert record.time_close < 0.5 * slow.time_close
+    assert record.closed.duration < 0.5 * slow.closed.duration
     # The same end: joints to a tenth of a degree, contacts to a fraction of a millimetre.
-    assert np.allclose(record.q_closed, slow.q_closed, atol=2e-3)
-    assert np.allclose(record.closed.p_OQ, slow.closed.p_OQ, atol=5e-4)
-    closed = record.q_closed[[1, 4, 6]]
+    assert np.allclose(record.closed.q, slow.closed.q, atol=2e-3)
+    assert np.allclose(record.closed.contacts.p_OQ, slow.closed.contacts.p_OQ, atol=5e-4)
+    closed = record.closed.q[[1, 4, 6]]
     assert np.all(found.closing < closed)
     assert np.all(closed < found.closing + np.deg2rad(8.0))
     assert np.all(closed < found.last)
@@ -111,7 +111,7 @@ def test_attempt_that_says_where_its_fingers_start_is_never_screened(cube, confi
     record = run_attempt(scene, standing(cube), attempt, config)
     assert record.outcome is Outcome.MISSING_FINGERTIP
     assert np.array_equal(
-        record.q_closed, run_attempt(scene, standing(cube), attempt, OFF).q_closed
+        record.closed.q, run_attempt(scene, standing(cube), attempt, OFF).closed.q
     )
 
 
@@ -136,8 +136,8 @@ def test_given_prediction_changes_no_bit(cube, hand, config, scene):
     attempt = from_above(cube, STANDOFF)
     alone = run_attempt(scene, standing(cube), attempt, config)
     given = run_attempt(scene, standing(cube), attempt, config, ask(cube, hand, attempt))
-    assert np.array_equal(alone.q_lifted, given.q_lifted)
-    assert np.array_equal(alone.closed.f_Q_O, given.closed.f_Q_O)
+    assert np.array_equal(alone.lift.q, given.lift.q)
+    assert np.array_equal(alone.closed.contacts.f_Q_O, given.closed.contacts.f_Q_O)
 
 
 @pytest.mark.sim

@@ -64,8 +64,8 @@ def test_closed_hand_with_a_smaller_chance_is_not_lifted(scene, cube, held):
     at, below = records
     assert pickle.dumps(at) == pickle.dumps(held)
     assert below.outcome is Outcome.NOT_LIFTED
-    assert pickle.dumps(below.closed) == pickle.dumps(held.closed)
-    assert below.lifted is None
+    assert pickle.dumps(below.closed.contacts) == pickle.dumps(held.closed.contacts)
+    assert below.lift is None
     assert below.chance == held.chance
 
 
@@ -100,21 +100,21 @@ def test_dropped_plank_falls_flat_from_its_edge(tmp_path, config):
 def test_cube_grasped_across_its_faces_is_lifted(held):
     assert held.outcome is Outcome.SUCCESS
     assert held.closed is not None
-    assert held.lifted is not None
-    assert held.closed.touching.all()
-    assert not held.lifted.object_on_table
-    assert held.closed.point_contacts == held.lifted.point_contacts == 0
+    assert held.lift is not None
+    assert held.closed.contacts.touching.all()
+    assert not held.lift.contacts.object_on_table
+    assert held.closed.contacts.point_contacts == held.lift.contacts.point_contacts == 0
 
 
 def test_contacts_lie_on_the_cubes_faces_with_outward_normals(held):
-    p, n = held.closed.p_OQ, held.closed.nhat_Q_O
+    p, n = held.closed.contacts.p_OQ, held.closed.contacts.nhat_Q_O
     assert np.allclose(np.abs(p[:, 1]), CUBE / 2.0, atol=1e-5)
     assert np.allclose(n, np.sign(p[:, 1])[:, None] * [0.0, 1.0, 0.0], atol=1e-3)
     assert np.allclose(np.linalg.norm(n, axis=1), 1.0)
 
 
 def test_fingertips_push_into_the_object_within_the_friction_cone(held, config):
-    for contacts in (held.closed, held.lifted):
+    for contacts in (held.closed.contacts, held.lift.contacts):
         push = -np.einsum("ij,ij->i", contacts.f_Q_O, contacts.nhat_Q_O)
         tangential = np.linalg.norm(contacts.f_Q_O + push[:, None] * contacts.nhat_Q_O, axis=1)
         assert np.all(push > 0.0)
@@ -123,14 +123,16 @@ def test_fingertips_push_into_the_object_within_the_friction_cone(held, config):
 
 def test_held_cube_is_carried_by_its_fingertips_alone(held, cube):
     """During the hold the sum of the fingertip forces is m g, whatever way the cube tilted."""
-    assert held.lifted.other_links == 0
-    total = np.linalg.norm(held.lifted.f_Q_O.sum(axis=0))
+    assert held.lift.contacts.other_links == 0
+    total = np.linalg.norm(held.lift.contacts.f_Q_O.sum(axis=0))
     assert total == pytest.approx(cube.mass * GRAVITY, rel=0.02)
 
 
 def test_fingertips_sink_in_by_little(held):
     """A pad is 20 mm thick; the contact is stiff enough to stay near its surface."""
-    assert np.all((held.closed.penetration > 0.0) & (held.closed.penetration < 3e-3))
+    assert np.all(
+        (held.closed.contacts.penetration > 0.0) & (held.closed.contacts.penetration < 3e-3)
+    )
 
 
 def test_object_rises_with_the_palm_to_the_target(held, config):
@@ -138,8 +140,8 @@ def test_object_rises_with_the_palm_to_the_target(held, config):
     whole += config.lift.release_time + config.lift.hold_time
     # The wrist starts where a coarse step begins.
     coarse = config.physics.coarse_steps * config.physics.time_step
-    assert whole - 1e-6 < held.time_lift < whole + coarse
-    risen = held.X_TO_lifted[2, 3] - held.X_TO[2, 3]
+    assert whole - 1e-6 < held.lift.duration < whole + coarse
+    risen = held.lift.X_TO[2, 3] - held.X_TO[2, 3]
     assert risen == pytest.approx(0.60 - CUBE - STANDOFF, abs=1e-3)
 
 
@@ -148,16 +150,16 @@ def test_slippery_cube_is_lost(cube, hand):
     scene = build_scene(cube, slippery.physics, hand)
     record = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), slippery)
     assert record.outcome in (Outcome.SLIPPED, Outcome.DROPPED)
-    assert record.closed.touching.all()
+    assert record.closed.contacts.touching.all()
 
 
 def test_attempt_in_the_air_misses(scene, cube, config):
     everything = override_config(config, ["screen.mode=off"])
     record = run_attempt(scene, standing(cube), from_above(cube, 0.25), everything)
     assert record.outcome is Outcome.MISSING_FINGERTIP
-    assert not record.closed.touching.any()
-    assert np.isnan(record.closed.p_OQ).all()
-    assert record.lifted is None
+    assert not record.closed.contacts.touching.any()
+    assert np.isnan(record.closed.contacts.p_OQ).all()
+    assert record.lift is None
 
 
 def test_open_hand_that_meets_the_object_collides(scene, cube, config):
@@ -256,16 +258,16 @@ def test_same_attempt_gives_the_same_bits_whatever_ran_before(scene, cube, confi
     )
     for record in (again, fresh):
         assert record.outcome is held.outcome
-        assert np.array_equal(record.q_lifted, held.q_lifted)
-        assert np.array_equal(record.closed.f_Q_O, held.closed.f_Q_O)
-        assert np.array_equal(record.lifted.p_OQ, held.lifted.p_OQ)
-        assert np.array_equal(record.X_TO_lifted, held.X_TO_lifted)
+        assert np.array_equal(record.lift.q, held.lift.q)
+        assert np.array_equal(record.closed.contacts.f_Q_O, held.closed.contacts.f_Q_O)
+        assert np.array_equal(record.lift.contacts.p_OQ, held.lift.contacts.p_OQ)
+        assert np.array_equal(record.lift.X_TO, held.lift.X_TO)
 
 
 def test_closing_torque_limits_the_pinch(held, hand):
     """The closing joint's torque is the moment of the tip force about it and the coupled joint."""
     lever = 0.15  # no fingertip point is farther from its closing joint [m]
-    for finger, force in zip(hand.fingers, held.closed.f_Q_O, strict=True):
+    for finger, force in zip(hand.fingers, held.closed.contacts.f_Q_O, strict=True):
         assert np.linalg.norm(force) * lever > finger.torque_limit
         assert np.linalg.norm(force) < finger.torque_limit / 0.04
 
@@ -380,10 +382,10 @@ def test_hand_that_presses_beside_a_pad_does_not_lift(scene, cube, config, held)
         X_WT @ standing(cube),
         X_WT @ standing(cube) @ from_above(cube, STANDOFF).X_OG,
         spread=0.0,
-        closing=held.q_closed[[1, 4, 6]],
+        closing=held.closed.q[[1, 4, 6]],
     )
     X_FO = invert_pose(scene.pose(tip)) @ scene.pose(scene.object)
-    x = float((X_FO[:3, :3] @ held.closed.p_OQ[0] + X_FO[:3, 3])[0])
+    x = float((X_FO[:3, :3] @ held.closed.contacts.p_OQ[0] + X_FO[:3, 3])[0])
     begin = x + PAD_BAND + 1e-3
     beyond = {"pad_region": ((1.0, 0.0, 0.0, begin),), "pad_point": (x + 0.01, 0.01, 0.0)}
     first, *others = scene.handles.hand.fingers
@@ -392,28 +394,28 @@ def test_hand_that_presses_beside_a_pad_does_not_lift(scene, cube, config, held)
     everything = override_config(config, ["screen.mode=off"])
     attempt = from_above(cube, STANDOFF)
     record = run_attempt(replace(scene, handles=handles), standing(cube), attempt, everything)
-    assert record.closed.touching.all()
-    assert record.closed.other_links == 1
+    assert record.closed.contacts.touching.all()
+    assert record.closed.contacts.other_links == 1
     assert record.outcome is Outcome.HAND_CONTACT
-    assert record.lifted is None
+    assert record.lift is None
 
 
 def test_hand_that_closes_on_the_table_does_not_lift(scene, cube, config):
     """Its fingertips are as long as the cube is high."""
     record = run_attempt(scene, standing(cube), from_above(cube, 0.041), config)
-    assert record.closed.touching.all()
-    assert record.closed.other_links == 0
-    assert record.closed.hand_on_table
+    assert record.closed.contacts.touching.all()
+    assert record.closed.contacts.other_links == 0
+    assert record.closed.contacts.hand_on_table
     assert record.outcome is Outcome.TABLE_CONTACT
-    assert record.lifted is None
+    assert record.lift is None
 
 
 def test_object_that_still_stands_on_the_table_was_not_lifted(scene, cube, config):
     """The palm's target is where it is already."""
     still = override_config(config, ["lift.p_TG=[0, 0, 0.13]"])
     record = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), still)
-    assert record.lifted.touching.all()
-    assert record.lifted.object_on_table
+    assert record.lift.contacts.touching.all()
+    assert record.lift.contacts.object_on_table
     assert record.outcome is Outcome.TABLE_CONTACT
 
 
@@ -423,7 +425,7 @@ def test_limit_of_contacts_decides_what_touches(scene, cube, config):
     weak = replace(scene, physics=strict.physics)
     record = run_attempt(weak, standing(cube), from_above(cube, STANDOFF), strict)
     assert record.outcome is Outcome.MISSING_FINGERTIP
-    assert record.closed.other_links == 0
+    assert record.closed.contacts.other_links == 0
 
 
 def test_slip_and_turn_are_how_the_object_lags_behind_the_palm(cube, config, hand):
@@ -433,14 +435,12 @@ def test_slip_and_turn_are_how_the_object_lags_behind_the_palm(cube, config, han
     record = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), torque)
     p_TG = (standing(cube) @ from_above(cube, STANDOFF).X_OG)[:3, 3]
     carried = standing(cube)[:3, 3] + np.array(config.lift.p_TG) - p_TG
-    slip = np.linalg.norm(record.X_TO_lifted[:3, 3] - carried)
-    turn = np.arccos((np.trace(record.X_TO_lifted[:3, :3]) - 1.0) / 2.0)
+    slip = np.linalg.norm(record.lift.X_TO[:3, 3] - carried)
+    turn = np.arccos((np.trace(record.lift.X_TO[:3, :3]) - 1.0) / 2.0)
     assert slip > 1e-3 and turn > 1e-3
-    assert record.slip == pytest.approx(slip, abs=1e-4)
-    assert record.turn == pytest.approx(turn, abs=1e-3)
-    assert np.allclose(
-        (record.X_TO_lifted @ record.X_OG_lifted)[:3, 3], config.lift.p_TG, atol=1e-4
-    )
+    assert record.lift.slip == pytest.approx(slip, abs=1e-4)
+    assert record.lift.turn == pytest.approx(turn, abs=1e-3)
+    assert np.allclose((record.lift.X_TO @ record.lift.X_OG)[:3, 3], config.lift.p_TG, atol=1e-4)
 
 
 def test_released_object_stands_on_the_table(scene, cube, config):
@@ -500,7 +500,7 @@ def test_closing_ends_where_a_fingertip_has_passed_the_object(scene, cube, confi
     assert record.outcome is Outcome.MISSING_FINGERTIP
     end = last + np.deg2rad(2.0)
     look = config.close.check_period * max(hand.closing_speed)
-    closed = record.q_closed[[1, 4, 6]]
+    closed = record.closed.q[[1, 4, 6]]
     assert end < closed.max() < end + 1.1 * look
 
 
@@ -511,7 +511,7 @@ def test_time_of_closing_that_was_skipped_counts(scene, cube, config, hand):
         known = replace(prediction(None, clear=True), closing=np.full(3, start))
         record = run_attempt(scene, standing(cube), from_above(cube, 0.3), short, known)
         step = config.physics.time_step
-        assert record.time_close == pytest.approx(rest, abs=step)
+        assert record.closed.duration == pytest.approx(rest, abs=step)
 
 
 @pytest.mark.parametrize(("speed", "looks"), [(2.0, 1), (0.5, 5)])
@@ -522,4 +522,4 @@ def test_closing_ends_at_the_first_look_at_which_the_fingers_stand(
     patient = override_config(config, [f"close.stop_speed={speed}", "close.max_time=0.5"])
     known = prediction(None, clear=True)
     record = run_attempt(scene, standing(cube), from_above(cube, 0.3), patient, known)
-    assert record.time_close == pytest.approx(looks * config.close.check_period, abs=8e-3)
+    assert record.closed.duration == pytest.approx(looks * config.close.check_period, abs=8e-3)

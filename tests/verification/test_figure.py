@@ -132,19 +132,19 @@ def test_dots_are_on_the_object_and_its_hand_is_shown(
 ) -> None:
     assert held.outcome is Outcome.SUCCESS
     assert held.closed is not None
-    assert held.lifted is not None
+    assert held.lift is not None
     result = verified(
         outcome=Outcome.SUCCESS,
         trial=held,
-        p_OQ=held.closed.p_OQ,
-        nhat_Q_O=held.closed.nhat_Q_O,
+        p_OQ=held.closed.contacts.p_OQ,
+        nhat_Q_O=held.closed.contacts.nhat_Q_O,
     )
     figure = verification_figure(result)
     assert texts_of(figure)[0] == f"1_box_a  {result.words}"
     assert result.words.startswith("held")
     line = texts_of(figure)[1].splitlines()[1]
-    assert f"slip {1e3 * held.slip:.1f} mm, turn {np.rad2deg(held.turn):.1f}°" in line
-    assert line.endswith(f"other links at the end: {held.lifted.other_links}")
+    assert f"slip {1e3 * held.lift.slip:.1f} mm, turn {np.rad2deg(held.lift.turn):.1f}°" in line
+    assert line.endswith(f"other links at the end: {held.lift.contacts.other_links}")
     assert [axes.get_title(loc="left") for axes in figure.axes][2] == "end of the lift, with forces"
     # Predicted where they were reached: dots lie on each other.
     for panel in (0, 1):
@@ -159,8 +159,7 @@ def test_dots_are_on_the_object_and_its_hand_is_shown(
     assert np.mean(np.ptp(alone, axis=2) < 8) < 0.05
     largest = max(
         np.linalg.norm(contacts.f_Q_O, axis=1).max()
-        for contacts in (held.closed, held.lifted)
-        if contacts is not None
+        for contacts in (held.closed.contacts, held.lift.contacts)
     )
     legend = [text.get_text() for text in figure.legends[0].get_texts()]
     assert any(f"{largest:.1f} N" in text for text in legend)
@@ -170,7 +169,7 @@ def test_dots_are_on_the_object_and_its_hand_is_shown(
 def test_last_panel_shows_the_last_instant(
     verified: Callable[..., Verification], held: TrialRecord, cube: ObjectModel, config: Config
 ) -> None:
-    closed = replace(held, lifted=None, q_lifted=None, X_TO_lifted=None)
+    closed = replace(held, lift=None)
     fit = SimpleNamespace(X_OG=held.X_OG, spread=0.0, closing=np.full(3, 1.0))
     X_TO_lifted = make_pose(np.eye(3), [0.0, 0.0, 0.6])
     lift = ForceLift(
@@ -194,14 +193,12 @@ def test_palm_is_where_the_lift_ended(cube: ObjectModel, config: Config, frictio
     slick = config.model_copy(update={"physics": physics})
     scene = build_scene(cube, physics, load_hand(config.hand))
     record = run_attempt(scene, standing(cube), from_above(cube, 0.06), slick)
-    assert record.lifted is not None
-    assert record.X_TO_lifted is not None
-    assert record.X_OG_lifted is not None
-    assert record.lifted.touching.any() == (friction > 0.5)
+    assert record.lift is not None
+    assert record.lift.contacts.touching.any() == (friction > 0.5)
     # The coarse steps of a lift have a scene of their own.
     assert scene.coarse_scene is not None
     X_WG = palm_pose(max(scene, scene.coarse_scene(), key=lambda stage: stage.time))
-    X_WO = X_WT @ record.X_TO_lifted
-    np.testing.assert_allclose(X_WO @ record.X_OG_lifted, X_WG, atol=1e-9)
+    X_WO = X_WT @ record.lift.X_TO
+    np.testing.assert_allclose(X_WO @ record.lift.X_OG, X_WG, atol=1e-9)
     if friction < 0.5:
         assert X_WG[2, 3] < 0.65 + config.lift.p_TG[2] - 0.1

@@ -14,8 +14,9 @@ from drakegrasp.frames import make_pose
 from drakegrasp.objects.model import make_object
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.contacts import Contacts
+from drakegrasp.simulation.lift import Lift
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.simulation.trial import TrialRecord
+from drakegrasp.simulation.trial import Closed, TrialRecord
 from drakegrasp.verification.forces.lift import ForceLift, LiftEnd
 from drakegrasp.verification.result import Verification
 
@@ -47,10 +48,19 @@ def lifted(
         outcome=outcome,
         X_TO=standing(model),
         X_OG=np.eye(4),
-        closed=contacts,
-        lifted=contacts,
-        slip=1e-3 * slip_mm,
-        turn=np.deg2rad(turn_deg),
+        closed=Closed(contacts=contacts, q=np.zeros(8), duration=1.0),
+        lift=Lift(
+            contacts=contacts,
+            q=np.zeros(8),
+            duration=1.0,
+            X_TO=standing(model),
+            X_OG=np.eye(4),
+            slip=1e-3 * slip_mm,
+            turn=np.deg2rad(turn_deg),
+            slip_released=0.0,
+            turn_released=0.0,
+            moved=False,
+        ),
     )
     return Verification(
         method="hand",

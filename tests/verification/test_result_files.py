@@ -23,8 +23,9 @@ from drakegrasp.objects.model import make_object
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import Contacts
+from drakegrasp.simulation.lift import Lift
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.simulation.trial import TrialRecord
+from drakegrasp.simulation.trial import Closed, TrialRecord
 from drakegrasp.verification.forces.lift import ForceLift, LiftEnd
 from drakegrasp.verification.result import Verification
 from drakegrasp.verification.result_files import (
@@ -95,15 +96,19 @@ def results() -> list[Verification]:
         outcome=Outcome.SUCCESS,
         X_TO=placed.X_TO,
         X_OG=X_OG,
-        closed=contacts(),
-        lifted=contacts(),
-        q_closed=RNG.random(8),
-        q_lifted=RNG.random(8),
-        time_close=1.5,
-        time_lift=2.5,
-        X_TO_lifted=make_pose(np.eye(3), [0.0, 0.0, 0.5]),
-        slip=0.002,
-        turn=0.01,
+        closed=Closed(contacts=contacts(), q=RNG.random(8), duration=1.5),
+        lift=Lift(
+            contacts=contacts(),
+            q=RNG.random(8),
+            duration=2.5,
+            X_TO=make_pose(np.eye(3), [0.0, 0.0, 0.5]),
+            X_OG=X_OG,
+            slip=0.002,
+            turn=0.01,
+            slip_released=0.001,
+            turn_released=0.005,
+            moved=False,
+        ),
     )
     lift = ForceLift(
         end=LiftEnd.HELD,
@@ -204,7 +209,7 @@ def test_every_field_is_written_and_reads_back(found: list[Verification], tmp_pa
     for name in ("p_OQ", "nhat_Q_O", "surface_distance", "epsilon", "smallest_friction", "tries"):
         assert np.array_equal(columns[name], [getattr(v, name) for v in found], equal_nan=True)
     assert np.array_equal(columns["X_OG"][0], pack_pose(X_OG))
-    assert np.array_equal(columns["closed_q"][0], held.q_closed)
+    assert np.array_equal(columns["closed_q"][0], held.trial.closed.q)
     assert held.closed is not None
     assert np.array_equal(columns["closed_p_OQ"][0], held.closed.p_OQ, equal_nan=True)
     assert np.array_equal(columns["closing_start"][0], [0.1, 0.2, 0.3])

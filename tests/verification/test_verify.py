@@ -44,7 +44,7 @@ def grasp(cube: PlacedObject) -> tuple[np.ndarray, np.ndarray]:
     pregrasp = Pregrasp(X_OG=make_pose(R_OG0, [0.0, 0.0, CUBE / 2.0 + 0.06]), spread=0.0)
     record = run_attempt(scene, cube.X_TO, pregrasp, CONFIG)
     assert record.outcome is Outcome.SUCCESS and record.closed is not None
-    return record.closed.p_OQ, record.closed.nhat_Q_O
+    return record.closed.contacts.p_OQ, record.closed.contacts.nhat_Q_O
 
 
 def verify(
@@ -88,7 +88,7 @@ def test_the_same_grasp_gives_the_same_bits(
     assert again.closed is not None and held.closed is not None
     np.testing.assert_array_equal(again.X_OG, held.X_OG)
     np.testing.assert_array_equal(again.closed.p_OQ, held.closed.p_OQ)
-    np.testing.assert_array_equal(again.trial.X_TO_lifted, held.trial.X_TO_lifted)
+    np.testing.assert_array_equal(again.trial.lift.X_TO, held.trial.lift.X_TO)
 
 
 @pytest.mark.parametrize("yaw", [0.7, -2.9])
@@ -172,10 +172,11 @@ def test_the_others_count_where_a_fingertip_that_is_not_required_misses(
 ) -> None:
     """The first finger closes 2 cm from its point, the last on nothing."""
     assert held.trial is not None and held.trial.closed is not None
-    closed = held.trial.closed
-    p_OQ, touching = closed.p_OQ.copy(), closed.touching.copy()
+    closed, contacts = held.trial.closed, held.trial.closed.contacts
+    p_OQ, touching = contacts.p_OQ.copy(), contacts.touching.copy()
     p_OQ[2], touching[2] = np.nan, False
-    trial = replace(held.trial, closed=replace(closed, p_OQ=p_OQ, touching=touching))
+    contacts = replace(contacts, p_OQ=p_OQ, touching=touching)
+    trial = replace(held.trial, closed=replace(closed, contacts=contacts))
     config = load_config(hand=str(write_with_optional_fingers(tmp_path, 2)))
     near = verifying._judge(replace(held, trial=trial), config)
     assert near.success and near.contact_error is not None
@@ -236,7 +237,7 @@ def test_palm_poses_that_collide_at_the_start_do_not_count(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     assert held.trial is not None
-    hits = replace(held.trial, outcome=Outcome.START_COLLISION, closed=None, lifted=None)
+    hits = replace(held.trial, outcome=Outcome.START_COLLISION, closed=None, lift=None)
     trials = [hits] * (CONFIG.verify.max_tries + 1) + [held.trial]
     monkeypatch.setattr(verifying, "fit_wrist", lambda *_, **__: [held.fit] * len(trials))
     remaining = iter(trials)
@@ -292,7 +293,7 @@ def test_results_know_what_they_were_asked(held: dg.Verification, cube: PlacedOb
     assert np.isnan(replace(held, fit=None).spread)
     assert repr(held).startswith("Verification(hand, held, precision, stable: ")
     assert held.pregrasp is not None and held.pregrasp.closing is not None
-    assert held.closing is not None
+    assert held.closed is not None
     # The fingers were opened before they closed.
     assert np.all(held.pregrasp.closing < held.closing)
     assert (X_WT @ cube.X_TO @ held.pregrasp.X_OG)[2, 3] > 0.65
@@ -354,7 +355,7 @@ def test_as_many_palm_poses_are_tried_as_may_be(
     """And of different failures the one that got furthest is told."""
     assert held.trial is not None
     ends = [Outcome.SLIPPED, Outcome.MISSING_FINGERTIP, Outcome.DROPPED, Outcome.SUCCESS]
-    trials = [replace(held.trial, outcome=end, closed=None, lifted=None) for end in ends]
+    trials = [replace(held.trial, outcome=end, closed=None, lift=None) for end in ends]
     monkeypatch.setattr(verifying, "fit_wrist", lambda *_, **__: [held.fit] * len(trials))
     for most, outcome in ((3, Outcome.SLIPPED), (4, Outcome.SUCCESS)):
         remaining = iter(trials)
@@ -373,7 +374,7 @@ def test_verdict_is_that_of_a_whole_lift(
     found = verify_contacts(cube, *grasp, method="hand", config=config)
     assert found.outcome is Outcome.SUCCESS
     assert found.trial is not None and held.trial is not None
-    assert found.trial.time_lift == held.trial.time_lift
+    assert found.trial.lift.duration == held.trial.lift.duration
     assert found.config.lift.stop_when == "never"
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import base64
 import os
+import pickle
 import re
 import socket
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from urllib.parse import urlsplit
@@ -82,12 +83,7 @@ def test_recording_a_trial_changes_no_bit_of_it(
         cube, standing(cube), attempt, config, path, p_OQ=P_OQ, nhat_Q_O=NHAT_Q_O
     )
     assert plain.outcome is recorded.outcome is Outcome.SUCCESS
-    for name in ("q_closed", "q_lifted", "X_TO_lifted", "slip", "turn", "time_close"):
-        assert np.array_equal(getattr(plain, name), getattr(recorded, name)), name
-    for one, other in ((plain.closed, recorded.closed), (plain.lifted, recorded.lifted)):
-        assert one is not None
-        for field in fields(one):
-            assert np.array_equal(getattr(one, field.name), getattr(other, field.name)), field.name
+    assert pickle.dumps(recorded) == pickle.dumps(plain)
     everything = b"".join(commands_of(path))
     assert all(part in everything for part in (OBJECT, HAND, b"predicted/3/shaft"))
     # Object and fingers move; contacts go with the object.
@@ -98,7 +94,7 @@ def test_recording_a_trial_changes_no_bit_of_it(
         for part in msgpack.unpackb(keys, strict_map_key=False)["animations"]
     }
     times = [key["time"] for key in clips["/drake/visualizer/object/object"]["tracks"][0]["keys"]]
-    end = plain.time_close + plain.time_lift
+    end = plain.closed.duration + plain.lift.duration
     assert times == list(range(len(times)))
     assert len(times) / MESHCAT_RATE == pytest.approx(end, abs=2.0 / MESHCAT_RATE)
     assert OBJECT in keys
