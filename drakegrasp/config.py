@@ -529,7 +529,7 @@ def load_config(
     try:
         return parse_config(_with_absolute_hand(tree))
     except ConfigError:
-        # A mistake of the file by itself is told with its name.
+        # If the file alone is invalid, name it in the error.
         if source is not None:
             _refuse_mistakes(own, str(source))
         raise

@@ -95,7 +95,7 @@ class Counts:
         self.show()
 
     def unexplained(self) -> list[str]:
-        """Return a line for each object of whose attempts no physics explains so many ends."""
+        """Return a warning for each object with too many crashes or timeouts."""
         lines = []
         for name, ended in self._ended.items():
             attempts = self._attempts[name]

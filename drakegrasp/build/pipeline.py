@@ -311,7 +311,7 @@ def _prepare_all(
         job.events.mesh_done(entry)
         report(len(entries), len(sources), found=known)
 
-    # Licence and group are no matter of the mesh file, and change nothing that was simulated.
+    # Licence and group do not affect results; take them from the sources.
     said = {source.name: (source.licence, source.group) for source in sources}
     ordered = [entries[source.name] for source in sources]
 

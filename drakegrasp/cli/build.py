@@ -97,8 +97,8 @@ def build(
 def assemble(out: Path, reject: Path | None, overrides: tuple[str, ...], workers: int) -> None:
     """Filter and split again, without simulating.
 
-    The command writes trials.hdf5 and both data files again from the shards in OUT. What a
-    reject.json names and is no success of the dataset is skipped, and named.
+    The command writes trials.hdf5 and both data files again from the shards in OUT.
+    Entries of reject.json that are not successes are skipped and listed.
     """
     from drakegrasp.dataset.assemble import assemble as assemble_files
     from drakegrasp.dataset.manifest import read_manifest

@@ -22,7 +22,7 @@ class PathType(click.Path):
     """A path that a file can have."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Refuse what no file is called, as the text of a variable that is not set."""
+        """Refuse an empty path, e.g. of an unset shell variable, and impossible names."""
         text = os.fspath(value)
         if not text.strip():
             self.fail(f"must be a path, got {text!r}", param, ctx)

@@ -181,7 +181,7 @@ def check_meeting(hand: Hand) -> Finding:
 def check_overlaps(hand: Hand) -> Finding:
     """Return whether only fingertips of different fingers meet, until the hand is closed.
 
-    In the simulation other links pass through each other, so they must not come to that.
+    In the simulation other links pass through each other, so they must not touch.
     """
     # The hand alone, with its shapes.
     builder = DiagramBuilder()

@@ -34,7 +34,8 @@ COLUMN_CHUNK = 2048
 def open_hdf5(path: Path, *, again: bool = False) -> h5py.File:
     """Open a file of a dataset to read it; close it after use.
 
-    A stranger's file can name any other file as the place of its values. Ours hold all of theirs.
+    An untrusted file may use links or external storage; our files never do, so such a file is
+    refused.
 
     Args:
         path: Of the file.
@@ -63,7 +64,7 @@ def open_hdf5(path: Path, *, again: bool = False) -> h5py.File:
 
 
 def _found_elsewhere(file: h5py.File) -> str | None:
-    """Return in words what in a file leads elsewhere, or None."""
+    """Describe the first link or external dataset of a file, or return None."""
     groups, seen = [(file.id, "")], set()
     while groups:
         group, place = groups.pop()

@@ -122,7 +122,7 @@ def tidy(out: Path) -> None:
 
 
 def _refuse_linked_folders(out: Path) -> None:
-    """Refuse a directory some of whose folders lie elsewhere: nobody's files are written there.
+    """Refuse a dataset whose subfolders are symbolic links: nothing is written outside of it.
 
     Raises:
         DataError: If one is a link.

@@ -117,7 +117,7 @@ class GraspDataset:
         """Return the row of an index, which counts from the end if it is negative.
 
         Raises:
-            IndexError: If there is no such sample, as a list says it.
+            IndexError: If the index is out of range.
         """
         index = operator.index(index)
         if not -self._length <= index < self._length:

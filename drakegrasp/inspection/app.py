@@ -263,7 +263,7 @@ def _plot(inspection: Inspection, request: Request) -> Response:
     svg = plot_svg(inspection.catalog.current(), request.path_params["name"])
     if svg is None:
         raise HTTPException(404, "there is no such plot")
-    # A picture of its own: what it may do is nothing but show its own styles.
+    # A standalone SVG: inline styles only.
     policy = "default-src 'none'; style-src 'unsafe-inline'"
     return Response(svg, media_type="image/svg+xml", headers={"content-security-policy": policy})
 

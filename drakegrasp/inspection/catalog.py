@@ -141,7 +141,7 @@ class Snapshot:
         return int(self.table.row[i]) if self.assembled else None
 
     def refuse_replaced(self) -> None:
-        """Refuse what was just read if a file may have been another than that of this state.
+        """Refuse what was just read if a file was replaced while it was being read.
 
         Raises:
             DataError: If a file was replaced.

@@ -42,7 +42,7 @@ class Quantity:
     def text(self, value: float) -> str:
         """Return a value in SI as text with its unit; a dash if there is none.
 
-        Infinite stands for what a contact without a normal has no value of.
+        Infinity means undefined: the contact has no normal.
         """
         if np.isposinf(value):
             return "none"

@@ -323,7 +323,7 @@ def load_object(path: str | Path) -> ObjectModel:
             f"{path.name}: must be an object file of drakegrasp, got: {one_line(error)}"
         ) from error
 
-    # Their types in an object, and whether one can be like that.
+    # Convert types, then validate.
     try:
         for key in ("name", "class_name", "mesh_sha256", "mass", "collision_error", "scale", "up"):
             values[key] = values[key].item()
@@ -339,7 +339,7 @@ def load_object(path: str | Path) -> ObjectModel:
 
 
 def _mistake(values: dict[str, Any]) -> str | None:
-    """Return what no object has of the values in a file, in words; None if all are possible."""
+    """Describe the first invalid value of an object file, or return None."""
     # Texts.
     for key in ("name", "class_name"):
         if not (isinstance(values[key], str) and is_name(values[key])):

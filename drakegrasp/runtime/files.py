@@ -141,8 +141,8 @@ class _PatientFile(FileIO):
     """A new file whose writes never fail for HDF5, although the disk may be full.
 
     HDF5 (1.14) repeats a write that failed when it frees a handle, and closing the file then ends
-    in a segmentation fault. Here the first error is kept, every later write is dropped, and HDF5
-    closes the file, which is of no use then, in peace.
+    in a segmentation fault. Here the first error is kept, every later write is dropped, so that
+    HDF5 can close the broken file without crashing.
     """
 
     def __init__(self, path: Path) -> None:

@@ -86,7 +86,7 @@ def disengage(scene: Scene) -> None:
 
 
 def hand_over(scene: Scene, before: Scene) -> None:
-    """Let the drive go on in the scene that continues a lift, and no more in the one before.
+    """Move the drive's state to the scene that continues the lift.
 
     Args:
         scene: The scene that continues, with the state of the other one.

@@ -221,7 +221,8 @@ class _Monitor:
             self._held = False
             return False
 
-        # One that stays has slipped where a fingertip has lost it; on the table that may change.
+        # If nothing moves and a fingertip is clear of the object, the grasp has slipped for good,
+        # unless the table still supports the object.
         if self._held:
             return False
         touching = bodies_on_object(scene)

@@ -297,8 +297,8 @@ def _as_tried(
         rules: What was drawn for the dataset.
         overridden: Paths of keys that the caller sets, e.g. "physics.friction_hand".
     """
-    # The values in use by row; where one coefficient was drawn, both count. What the caller sets
-    # stays.
+    # Use each row's drawn friction and mass; what the caller sets wins. Where one coefficient was
+    # drawn, both are taken from the row.
     drawn_friction = rules.friction_hand is not None or rules.friction_table is not None
     frictions = {
         name: dataset.column(f"conditions/{name}")[rows].astype(float)

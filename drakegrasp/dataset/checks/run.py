@@ -166,7 +166,7 @@ def _check_objects(out: Path, manifest: Manifest, context: Context) -> str | Non
 
 
 def _check_card(out: Path, findings: Findings) -> None:
-    """The data card counts what the files hold; a dataset of before there were cards has none."""
+    """The data card counts what the files hold; older datasets have no card."""
     path = out / CARD_FILES[0]
     try:
         counts = card_content(out)["counts"]

@@ -57,7 +57,7 @@ def open_trials(path: Path) -> Iterator[h5py.File]:
 
 @contextmanager
 def opened(path: Path, what: str, *, again: bool = False) -> Iterator[h5py.File]:
-    """Open an HDF5 file while the block runs; what HDF5 cannot read in the block is told.
+    """Open an HDF5 file while the block runs; HDF5 errors in the block become a DataError.
 
     Args:
         path: Of the file.

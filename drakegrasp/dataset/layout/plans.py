@@ -40,7 +40,7 @@ def refuse_other_plan(path: Path, file: h5py.File) -> None:
 
 
 def _other_arrays(file: h5py.File) -> Iterator[str]:
-    """Yield what the arrays of a plan have otherwise than `ARRAYS`, in words."""
+    """Yield how the arrays of a plan differ from `ARRAYS`."""
     lengths: dict[str, int] = {}
     for name, (dtype, axes) in ARRAYS.items():
         dataset = file.get(name)

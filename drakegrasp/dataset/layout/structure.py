@@ -35,7 +35,7 @@ TRIAL_TABLES: Tables = {
 
 @dataclass(frozen=True, kw_only=True)
 class Difference:
-    """What a file has otherwise than the schema.
+    """How a file differs from the schema.
 
     Attributes:
         place: Path of the group or the dataset; empty for the whole file.
@@ -56,14 +56,14 @@ class Difference:
 def differences(
     file: h5py.File, tables: Tables, *, image: int | None = None, thorough: bool = False
 ) -> Iterator[Difference]:
-    """Yield what the groups and datasets of a file have otherwise than the schema.
+    """Yield how the groups and datasets of a file differ from the schema.
 
     Args:
         file: The file.
         tables: Fields of each group.
         image: Size of the images [px]; what most datasets say if None.
-        thorough: Whether what hinders nobody from reading is a difference, too: more than the
-            fields, and other attributes of them.
+        thorough: Whether to report harmless differences as well: additional fields, and other
+            attributes of fields.
     """
     # Older files have fewer fields.
     version = file.attrs.get("schema_version")
@@ -163,7 +163,7 @@ def _of_field(
     rows: int,
     lengths: Mapping[str, int],
 ) -> Iterator[Difference]:
-    """Yield what type and shape a dataset has otherwise than its field.
+    """Yield how the type and shape of a dataset differ from its field.
 
     Args:
         place: Path of the dataset.
@@ -190,7 +190,7 @@ def _of_field(
 
 
 def _of_attributes(place: str, dataset: h5py.Dataset, field: Field) -> Iterator[Difference]:
-    """Yield what attributes a dataset has otherwise than its field."""
+    """Yield how the attributes of a dataset differ from its field."""
     attrs = dict(dataset.attrs)
     for key, value in (("unit", field.unit), ("frame", field.frame)):
         if not (isinstance(attrs.get(key), str) and attrs[key] == value):

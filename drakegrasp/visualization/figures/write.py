@@ -135,7 +135,7 @@ def write_figures(
             written.left_out[name] = str(error)
         progress(i + 1, len(drawings))
 
-    # Older files of what is not there now would be of another state; a sheet of classes has pages.
+    # Delete figures of an earlier run that this run did not draw; a sheet of classes has pages.
     names = {*drawings, *(path.stem for path in folder.glob("classes_[0-9]*.*"))}
     for name in names.difference(written.names):
         for suffix in (".png", ".svg"):
