@@ -1,17 +1,17 @@
 """Rules of the conditions of attempts: friction, mass, looks, cameras and noise are those drawn.
 
-In: a `Batch` of rows of `/trials` or of samples. Out: a `Violation` for every row that is wrong. No
+In: a `Batch` of rows of `/trials`. Out: a `Violation` for every row that is wrong. No
 file is read.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
 from drakegrasp.config import Config, RandomizeConfig
-from drakegrasp.dataset.checks.findings import AnyArray, Batch, Violation, all_per_row
+from drakegrasp.dataset.checks.findings import Batch, Violation, all_per_row
 from drakegrasp.dataset.schema import CONDITION_FIELDS
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.randomization.draws import draw_conditions
@@ -52,17 +52,4 @@ def as_drawn(
             f"{name} must be what the seed gives the attempt",
             ~all_per_row(batch[name] == values),
             lambda i, name=name: str(batch[name][i]),  # type: ignore[misc]
-        )
-
-
-def same_as_trial(batch: Batch, trials: Mapping[str, AnyArray]) -> Iterator[Violation]:
-    """The conditions of a sample are its trial's, given the columns of the trials by row."""
-    for field in CONDITION_FIELDS:
-        own = "object_props/work2mass" if field.name == "mass" else f"conditions/{field.name}"
-        values = batch[own]
-        due = trials[field.name].astype(values.dtype).reshape(values.shape)
-        yield from batch.broken(
-            f"{own.split('/')[1]} must be that of its trial",
-            ~all_per_row(values == due),
-            lambda i, values=values: str(values[i]),  # type: ignore[misc]
         )

@@ -11,7 +11,6 @@ from functools import partial
 
 import numpy as np
 
-from drakegrasp.dataset.checks import conditions as condition_rules
 from drakegrasp.dataset.checks import consistency
 from drakegrasp.dataset.checks import hold as hold_rules
 from drakegrasp.dataset.checks import images as image_rules
@@ -28,7 +27,7 @@ from drakegrasp.dataset.checks.findings import AnyArray, Batch, Findings, Violat
 from drakegrasp.dataset.checks.images import Lens
 from drakegrasp.dataset.checks.open_file import FilePlace, OpenFile
 from drakegrasp.dataset.paths import TRIALS_FILE
-from drakegrasp.dataset.schema import CONDITION_FIELDS, SHARED_FIELDS, SPLITS
+from drakegrasp.dataset.schema import CONDITION_FIELDS, LINEAGE_NAMES, SHARED_FIELDS, SPLITS
 from drakegrasp.outcomes import Outcome
 
 #: Samples in a batch: some 20 MB of images.
@@ -37,12 +36,13 @@ SAMPLE_ROWS = 64
 TASK_ROWS = 4 * SAMPLE_ROWS
 #: Samples in a batch without images.
 PAIR_ROWS = 8192
-#: Fields of a trial with which a sample is compared.
+_CONTACTS = ("p_OQ", "nhat_Q_O", "f_Q_O")
+#: Fields of a trial from which a sample follows, or that say whether it may be one.
 COMPARED = (
     *("object", "outcome", "X_TO", "X_OG", "X_OG_lifted", "surface_distance", "normal_angle"),
-    *(f"{when}_{name}" for when in ("closed", "lifted") for name in ("p_OQ", "nhat_Q_O", "f_Q_O")),
-    *hold_rules.COPIES.values(),
-    *(field.name for field in CONDITION_FIELDS),
+    *(f"{when}_{name}" for when in ("closed", "lifted") for name in ("q", "area", *_CONTACTS)),
+    *("precision", "stable", "slip", "turn", "slip_released", "turn_released"),
+    *("lifted_other_links", *LINEAGE_NAMES, *(field.name for field in CONDITION_FIELDS)),
 )
 
 
@@ -145,7 +145,7 @@ def _judge_samples(rows: Rows, findings: Findings, *, camera: str) -> AnyArray:
             partial(image_rules.image_frames, lens=lens),
         )
         if dataset is not None:
-            batch = _judge_by_trial(data, batch, camera, dataset, findings)
+            batch = _judge_by_trial(data, batch, camera, dataset, rows.model, findings)
 
         # What the images show, which needs right frames.
         batch = image_rules.without_noise(batch, lens, data.config.camera)
@@ -161,7 +161,12 @@ def _judge_samples(rows: Rows, findings: Findings, *, camera: str) -> AnyArray:
 
 
 def _judge_by_trial(
-    data: OpenFile, batch: Batch, camera: str, dataset: Dataset, findings: Findings
+    data: OpenFile,
+    batch: Batch,
+    camera: str,
+    dataset: Dataset,
+    load: LoadModel,
+    findings: Findings,
 ) -> Batch:
     """Compare samples with their trials; return those that agree, or have no sound trial."""
     trials = dataset.trials
@@ -187,16 +192,30 @@ def _judge_by_trial(
     agreeing = data.judge(
         judged, findings, partial(_is_success_of, outcomes=columns["outcome"], names=names)
     )
-    still = np.isin(judged.rows, agreeing.rows)
-    own = _select(columns, still)
+    own = _select(columns, np.isin(judged.rows, agreeing.rows))
     agreeing = data.judge(
         agreeing,
         findings,
-        partial(sample_rules.same_as_trial, trials=own, camera=camera, config=data.config.camera),
-        partial(hold_rules.same_as_trial, trials=own, camera=camera),
-        partial(condition_rules.same_as_trial, trials=own),
         partial(hold_rules.surface_limits, trials=own, filters=data.config.filters),
     )
+
+    # An object whose file is broken is a finding already.
+    names = agreeing["object_props/object_name"]
+    models = {name: load(name) for name in dict.fromkeys(names.tolist())}
+    sound = {name: model for name, model in models.items() if model is not None}
+    known = agreeing.without(set(agreeing.rows[~np.isin(names, list(sound))].tolist()))
+    derived = data.judge(
+        known,
+        findings,
+        partial(
+            sample_rules.follows_from_trial,
+            trials=_select(columns, np.isin(judged.rows, known.rows)),
+            models=sound,
+            camera=camera,
+            config=data.config.camera,
+        ),
+    )
+    agreeing = agreeing.without(set(known.rows.tolist()) - set(derived.rows.tolist()))
     return batch.without(set(judged.rows.tolist()) - set(agreeing.rows.tolist()))
 
 
@@ -238,7 +257,7 @@ def _judge_by_mesh(
         data.judge(
             batch.without(set(batch.rows[names != name].tolist())),
             findings,
-            partial(sample_rules.object_values, model=model),
+            partial(sample_rules.class_of_object, model=model),
             partial(image_rules.object_pixels, lens=lens, model=model),
             partial(
                 sample_rules.contacts_on_mesh, camera=lens.camera, model=model, max_distance=limit

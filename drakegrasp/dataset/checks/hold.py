@@ -1,4 +1,4 @@
-"""Rules of how a sample holds: its words and limits, and the grasp at the end of the lift.
+"""Rules of how a sample holds: its labels and limits, and the palm at the end of the lift.
 
 In: a `Batch` of samples of one data file, and the trials to compare with. Out: a `Violation` for
 every row that is wrong. A rule relies on those that `data_file` applies before it. No file is read.
@@ -12,39 +12,18 @@ import numpy as np
 
 from drakegrasp.config import FilterConfig
 from drakegrasp.dataset.checks.findings import (
-    POSITION_TOLERANCE,
     AnyArray,
     Batch,
     Violation,
     rotation,
     unit_length,
 )
-from drakegrasp.dataset.checks.samples import move_each, rotate_each
 from drakegrasp.dataset.filters import breaks_hold, breaks_surface
-from drakegrasp.dataset.schema import LINEAGE_NAMES
-from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.verdict import is_precision, is_stable
 
 #: float32 rounds slip [m] and turn [rad] by 2e-7 at most.
 MOTION_TOLERANCE = 1e-6
-#: float32 rounds forces [N] and joint positions [rad or m] by this share of them.
-RELATIVE_TOLERANCE = 1e-5
-#: Fields of `grasp_props` that are a trial's values as they are, and their names there.
-COPIES = {
-    "precision": "precision",
-    "stable": "stable",
-    "slip": "slip",
-    "turn": "turn",
-    "slip_released": "slip_released",
-    "turn_released": "turn_released",
-    "other_links_held": "lifted_other_links",
-    "q": "closed_q",
-    "q_held": "lifted_q",
-    "area": "closed_area",
-    "area_held": "lifted_area",
-    **{name: name for name in LINEAGE_NAMES},
-}
 
 
 def poses(batch: Batch) -> Iterator[Violation]:
@@ -101,51 +80,3 @@ def surface_limits(
             bad,
             lambda i: "a trial that does not",
         )
-
-
-def same_as_trial(batch: Batch, trials: Mapping[str, AnyArray], camera: str) -> Iterator[Violation]:
-    """What is held follows from the trial, through the object's resting pose.
-
-    Args:
-        batch: The samples.
-        trials: Columns of their trials, a row per sample.
-        camera: `oto` or `otm`, the camera of their grasps.
-    """
-    # Contacts and palm in the camera's frame.
-    X_CO = batch.frame(f"cam2work_{camera}") @ unpack_pose(trials["X_TO"])
-    points, normals = batch.contacts("grasps_held")
-    p_CQ = move_each(X_CO, trials["lifted_p_OQ"])
-    n_C = rotate_each(X_CO, trials["lifted_nhat_Q_O"])
-    expected = {
-        "grasps_held": (np.stack([points, normals]), np.stack([p_CQ, n_C])),
-        "X_CG": (batch.pose("grasp_props/X_CG"), X_CO @ unpack_pose(trials["X_OG"])),
-        "X_CG_held": (
-            batch.pose("grasp_props/X_CG_held"),
-            X_CO @ unpack_pose(trials["X_OG_lifted"]),
-        ),
-    }
-    for name, (values, due) in expected.items():
-        axes = tuple(a for a in range(values.ndim) if a != (1 if name == "grasps_held" else 0))
-        yield from _differs(batch, name, np.abs(values - due).max(axis=axes), POSITION_TOLERANCE)
-
-    # Forces.
-    for name, column in (("f_Q_C", "closed_f_Q_O"), ("f_Q_C_held", "lifted_f_Q_O")):
-        due = rotate_each(X_CO, trials[column])
-        off = np.abs(batch[f"grasp_props/{name}"] - due).max(axis=(1, 2))
-        scale = np.linalg.norm(due, axis=2).max(axis=1)
-        yield from _differs(batch, name, off, RELATIVE_TOLERANCE * (1.0 + scale))
-
-    # Copies.
-    for name, column in COPIES.items():
-        values = batch[f"grasp_props/{name}"].astype(float).reshape(len(batch), -1)
-        due = trials[column].astype(float).reshape(len(batch), -1)
-        off = np.abs(values - due).max(axis=1)
-        yield from _differs(batch, name, off, RELATIVE_TOLERANCE * np.abs(due).max(axis=1))
-
-
-def _differs(batch: Batch, name: str, off: Array, tolerance: Array | float) -> Iterator[Violation]:
-    yield from batch.broken(
-        f"{name} must follow from its trial",
-        ~(off <= tolerance),
-        lambda i: f"a difference of {off[i]:.4g}",
-    )

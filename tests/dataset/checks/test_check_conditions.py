@@ -81,7 +81,7 @@ def test_a_condition_of_a_sample_that_is_not_its_trials_is_found(spoilt: Path, n
     edit = set_at(3, to=0.5) if name == "X_C0C" else lambda v: v + v.dtype.type(1)
     change(spoilt, OTM, f"train/conditions/{name}", 1, edit)
     hits = found(spoilt)
-    assert (OTM, "/train", 1, f"{name} must be that of its trial") in hits
+    assert (OTM, "/train", 1, f"conditions/{name} must follow from its trial") in hits
     assert {h[:3] for h in hits} == {(OTM, "/train", 1)}
 
 
