@@ -282,7 +282,7 @@ def _prepare_all(
     sources: Sequence[MeshSource], manifest: Manifest, job: _Job, report: Report
 ) -> Manifest:
     """Return the manifest with every object prepared or refused, in the order of the sources."""
-    out, config = job.out, manifest.config.to_dict()
+    out, config = job.out, manifest.config
     entries: dict[str, ObjectEntry | RefusedMesh] = {}
     tasks = []
 
@@ -295,7 +295,7 @@ def _prepare_all(
                 PrepareTask(
                     source=source,
                     mesh_sha256=digest,
-                    out=str(out),
+                    out=out,
                     config=config,
                     restartable=job.pool is not None,
                 )
@@ -411,11 +411,11 @@ def _run_units(
     target: Target | None,
 ) -> None:
     """Run work units, and count what they found."""
-    config, restartable = manifest.config.to_dict(), job.pool is not None
+    config, restartable = manifest.config, job.pool is not None
     spared = _spared(manifest)
     units = (
         WorkUnit(
-            out=str(job.out),
+            out=job.out,
             header=header,
             config=config,
             refined=header.object_name not in spared,

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from drakegrasp.config import Config, parse_config
+from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import ObjectEntry, RefusedMesh
 from drakegrasp.dataset.paths import model_path
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared, save_prepared
@@ -39,15 +38,15 @@ class PrepareTask:
         source: The mesh.
         mesh_sha256: Its digest, `source_sha256`.
         out: Directory of the dataset, visible to every worker.
-        config: `Config.to_dict()`.
+        config: All the rules.
         restartable: Whether the process that runs it is started again when it dies. If so, a
             crash or a hang costs only the mesh; if not, it propagates to the caller.
     """
 
     source: MeshSource
     mesh_sha256: str
-    out: str
-    config: dict[str, Any]
+    out: Path
+    config: Config
     restartable: bool
 
 
@@ -61,7 +60,7 @@ def prepare_one(task: PrepareTask) -> tuple[str, ObjectEntry | RefusedMesh]:
         DiskFullError: If there is no room for the object's files.
         MachineError: If something other than the mesh kills the process again and again.
     """
-    out, source, config = Path(task.out), task.source, parse_config(task.config)
+    out, source, config = task.out, task.source, task.config
     with disk_full_named(out):
         # The worker or the client may have died before the manifest named the object.
         entry = _entry_there(task, config)
@@ -86,7 +85,7 @@ def prepare_one(task: PrepareTask) -> tuple[str, ObjectEntry | RefusedMesh]:
 def _entry_there(task: PrepareTask, config: Config) -> ObjectEntry | None:
     """Return the entry of an object whose files are complete, or None."""
     try:
-        prepared = load_prepared(Path(task.out), task.source.name, config)
+        prepared = load_prepared(task.out, task.source.name, config)
     except DrakegraspError:
         return None
     model = prepared.model
@@ -112,9 +111,8 @@ def _prepared_or_refused(task: PrepareTask, journal: Journal) -> ObjectEntry | R
 
 
 def _prepared_entry(task: PrepareTask) -> ObjectEntry | RefusedMesh:
-    config = parse_config(task.config)
     try:
-        prepared = prepare(task.source, config)
+        prepared = prepare(task.source, task.config)
     except MeshError as error:
         # The entry has the name already.
         return _refused(task, str(error).removeprefix(f"{task.source.path.name}: "))
@@ -122,7 +120,7 @@ def _prepared_entry(task: PrepareTask) -> ObjectEntry | RefusedMesh:
     # The digest was taken from another read of the file.
     if prepared.model.mesh_sha256 != task.mesh_sha256:
         return _refused(task, "the mesh file changed during the build")
-    save_prepared(prepared, Path(task.out), config)
+    save_prepared(prepared, task.out, task.config)
     return prepared.entry()
 
 

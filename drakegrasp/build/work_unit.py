@@ -16,7 +16,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -32,7 +31,7 @@ from drakegrasp.build.attempts import (
 )
 from drakegrasp.build.columns import empty_looks, fill_look, trial_rows
 from drakegrasp.build.target import has_target
-from drakegrasp.config import Config, FilterConfig, parse_config
+from drakegrasp.config import Config, FilterConfig
 from drakegrasp.dataset.assembly.survey import count_samples, successes_of
 from drakegrasp.dataset.filters import Removal, judge_successes
 from drakegrasp.dataset.hdf5 import AnyArray
@@ -85,15 +84,15 @@ class WorkUnit:
     Attributes:
         out: Directory of the dataset, visible to every worker.
         header: Object and range of candidates.
-        config: `Config.to_dict()`.
+        config: All the rules.
         refined: Whether palm poses about those of samples are tried, if the configuration has any.
         restartable: Whether the process that runs it is started again when it dies. If so, a
             crash or a hang costs only the attempt; if not, it propagates to the caller.
     """
 
-    out: str
+    out: Path
     header: ShardHeader
-    config: dict[str, Any]
+    config: Config
     refined: bool = True
     restartable: bool = False
 
@@ -134,7 +133,7 @@ def run_unit(unit: WorkUnit) -> UnitSummary:
         DiskFullError: If there is no room for the shard.
         MachineError: If something other than an attempt kills the process again and again.
     """
-    out, header = Path(unit.out), unit.header
+    out, header = unit.out, unit.header
     with _one_unit, disk_full_named(out):
         outcomes = _outcomes_there(out, header)
         if outcomes is not None:
@@ -147,15 +146,14 @@ def run_unit(unit: WorkUnit) -> UnitSummary:
             summary = _run_experiment(unit, NO_JOURNAL)
         header.journal_path(out).unlink(missing_ok=True)
         trim_memory()
-        config = parse_config(unit.config)
-        if not has_target(config):
+        if not has_target(unit.config):
             return summary
-        return replace(summary, samples=count_samples(out, header, config))
+        return replace(summary, samples=count_samples(out, header, unit.config))
 
 
 def _run_experiment(unit: WorkUnit, journal: Journal) -> UnitSummary:
     """Tell the whole experiment: set up, run round after round, write."""
-    config, out, header = parse_config(unit.config), Path(unit.out), unit.header
+    config, out, header = unit.config, unit.out, unit.header
     seconds: dict[str, float] = {}
     _refuse_crash_loop(journal, header)
 

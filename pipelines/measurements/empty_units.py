@@ -60,9 +60,8 @@ def units(count: int) -> Iterator[WorkUnit]:
         for i in range(-(-count // per_object))
     )
     manifest = Manifest(config=config, objects=objects, versions={})
-    values = config.to_dict()
     for _, header in zip(range(count), manifest.headers(), strict=False):
-        yield WorkUnit(out="/nowhere", header=header, config=values, restartable=True)
+        yield WorkUnit(out=Path("/nowhere"), header=header, config=config, restartable=True)
 
 
 def memory() -> float:

@@ -264,9 +264,9 @@ def test_every_step_of_a_unit_is_in_its_journal(
     monkeypatch.setattr(
         Journal, "verdict", lambda self, name: Verdict.HUNG if name == step else None
     )
-    config = read_manifest(out).config.to_dict()
+    config = read_manifest(out).config
     with pytest.raises(MachineError, match=r"1_box_a: .*passed its time limit"):
-        run_unit(WorkUnit(out=str(out), header=header, config=config, restartable=True))
+        run_unit(WorkUnit(out=out, header=header, config=config, restartable=True))
 
 
 # Faults found on start

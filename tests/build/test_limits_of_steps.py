@@ -73,8 +73,8 @@ def prepare_tasks(sources: list[MeshSource], out: Path, config: Config) -> list[
         PrepareTask(
             source=source,
             mesh_sha256=source_sha256(source),
-            out=str(out),
-            config=config.to_dict(),
+            out=out,
+            config=config,
             restartable=True,
         )
         for source in sources
@@ -117,8 +117,7 @@ def test_screen_that_hangs_ends_and_is_named(
     manifest = read_manifest(out)
     (header,) = manifest.headers()
     header.path(out).unlink()
-    settings = manifest.config.to_dict()
-    unit = WorkUnit(out=str(out), header=header, config=settings, restartable=True)
+    unit = WorkUnit(out=out, header=header, config=manifest.config, restartable=True)
     # Building the scene has the same limit, and takes a second of computing.
     die(run_unit, unit, "spin:1_box_a:predict", HUNG_DEATHS, seconds=2.0)
     with pytest.raises(MachineError, match=r"predicting its attempts passed its time limit"):

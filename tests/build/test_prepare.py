@@ -26,8 +26,8 @@ def task(tmp_path: Path) -> PrepareTask:
     return PrepareTask(
         source=source,
         mesh_sha256=source_sha256(source),
-        out=str(tmp_path / "out"),
-        config=load_config(overrides=["candidates.max=5"]).to_dict(),
+        out=tmp_path / "out",
+        config=load_config(overrides=["candidates.max=5"]),
         restartable=False,
     )
 

@@ -247,8 +247,7 @@ def test_unit_that_is_not_refined_has_the_first_round_alone(refined: Path, tmp_p
     manifest = read_manifest(tmp_path)
     header = next(manifest.headers())
     header.path(tmp_path).unlink()
-    values = manifest.config.to_dict()
-    run_unit(WorkUnit(out=str(tmp_path), header=header, config=values, refined=False))
+    run_unit(WorkUnit(out=tmp_path, header=header, config=manifest.config, refined=False))
     with h5py.File(header.path(tmp_path)) as shard, h5py.File(header.path(refined)) as whole:
         generation = shard["trials/generation"][:]
         assert len(generation) < len(whole["trials/generation"])
