@@ -257,6 +257,8 @@ class LiftConfig(_Section):
     stop_turn_deg: Positive = 10.0  # of the object in the hand since it is free
     # Closed hands with a smaller chance of a sample are not lifted, but for a tenth; 0: all are.
     least_chance: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
+    # Nor are those whose otm depth image is flatter than this [m^2], but for the same tenth.
+    least_depth_variance: NonNegative = 0.0
 
 
 class CertifyConfig(_Section):
@@ -431,7 +433,15 @@ class Config(_Section):
 
     @model_validator(mode="after")
     def _filters_within_stop(self) -> Config:
-        # A grasp that a looser filter would keep may be among the lifts that were ended.
+        # A grasp that a looser filter would keep may be among the hands that were not lifted.
+        if self.filters.min_depth_variance < self.lift.least_depth_variance:
+            raise ValueError(
+                f"filters.min_depth_variance must be at least {self.lift.least_depth_variance}, "
+                "where lift.least_depth_variance left out what is flatter, "
+                f"got {self.filters.min_depth_variance}"
+            )
+
+        # Or among the lifts that were ended.
         if self.lift.stop_when == "never":
             return self
         if self.filters.require == "held":
@@ -561,7 +571,9 @@ def override_config(config: Config, overrides: Sequence[str]) -> Config:
 
 def with_whole_lifts(config: Config) -> Config:
     """Return a configuration that lifts each closed hand until it is certain whether it holds."""
-    lift = config.lift.model_copy(update={"stop_when": "never", "least_chance": 0.0})
+    lift = config.lift.model_copy(
+        update={"stop_when": "never", "least_chance": 0.0, "least_depth_variance": 0.0}
+    )
     return config.model_copy(update={"lift": lift})
 
 

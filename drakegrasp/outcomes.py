@@ -34,8 +34,8 @@ class Outcome(IntEnum):
     # The lift was ended early because the object moved more in the hand than a sample may: it is
     # no sample, but whether the hand would have held it is unknown.
     MOVED = 15
-    # The closed hand might lift, but its chance of a sample was below `lift.least_chance`: whether
-    # it would have held the object is unknown.
+    # The closed hand might lift, but its chance of a sample was below `lift.least_chance`, or its
+    # image is too flat for one: whether it would have held the object is unknown.
     NOT_LIFTED = 16
 
     @property

@@ -101,6 +101,7 @@ lift:
   stop_slip: 0.03
   stop_turn_deg: 30.0
   least_chance: 0.3
+  least_depth_variance: 0.0005
 certify:
   repeats: 5
   palm_noise: 0.001
@@ -545,6 +546,14 @@ def test_whole_lifts_differ_in_when_they_end_alone() -> None:
     assert with_whole_lifts(stopped) == override_config(stopped, ["lift.stop_when=never"])
     chosen = load_config(overrides=["lift.least_chance=0.2", "lift.drive=torque", "seed=3"])
     assert with_whole_lifts(chosen) == override_config(chosen, ["lift.least_chance=0"])
+    seen = load_config(overrides=["lift.least_depth_variance=1e-3", "seed=3"])
+    assert with_whole_lifts(seen) == override_config(seen, ["lift.least_depth_variance=0"])
+
+
+def test_the_filter_of_flat_images_keeps_none_that_was_not_lifted() -> None:
+    load_config(overrides=["lift.least_depth_variance=1e-3", "filters.min_depth_variance=1e-3"])
+    with pytest.raises(ConfigError, match=r"filters.min_depth_variance must be at least 0.001"):
+        load_config(overrides=["lift.least_depth_variance=1e-3", "filters.min_depth_variance=9e-4"])
 
 
 def test_simulation_hash_does_not_depend_on_the_order_of_keys(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ import numpy.typing as npt
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
+from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array
@@ -163,11 +164,23 @@ def try_attempt(
 ) -> TrialRecord:
     """Run the trial of one attempt; replace the scene if Drake failed in it."""
     X_TO = setup.prepared.resting_poses[attempt.resting]
-    record = run_attempt(setup.scene, X_TO, attempt, setup.config, prediction)
+    is_visible = partial(_is_visible, setup, attempt, X_TO)
+    record = run_attempt(
+        setup.scene, X_TO, attempt, setup.config, prediction, is_visible=is_visible
+    )
     if record.outcome is Outcome.SOLVER_ERROR:
         forget_scenes()
         setup.scene = cached_scene(setup.prepared.model, setup.config.physics, setup.config.hand)
     return record
+
+
+def _is_visible(setup: TrialSetup, attempt: Attempt, X_TO: Array) -> bool:
+    """Return whether the otm depth image of an attempt is not too flat for a lift."""
+    least = setup.config.lift.least_depth_variance
+    if least == 0.0:
+        return True
+    view = _render_view(setup, attempt, X_TO, "otm")
+    return bool(view.image[3].astype(float).var() >= least)
 
 
 def measure_contacts(setup: TrialSetup, record: TrialRecord) -> ContactFit | None:
@@ -188,23 +201,23 @@ def render_views(setup: TrialSetup, attempt: Attempt, record: TrialRecord) -> di
     Raises:
         BlankImageError: If an image is blank, because OpenGL failed.
     """
-    # The cameras, and how the scene looks.
+    return {name: _render_view(setup, attempt, record.X_TO, name) for name in CAMERAS}
+
+
+def _render_view(setup: TrialSetup, attempt: Attempt, X_TO: Array, name: str) -> View:
+    """Return what the camera of a name sees of the object at rest, before the attempt."""
+    # The camera, and how the scene looks.
     camera, model = setup.config.camera, setup.prepared.model
     conditions = attempt.conditions or usual_conditions(model, setup.config.physics)
-    X_TG, X_C0C = multiply(record.X_TO, record.X_OG), conditions.X_C0C
-    poses = {
-        "oto": camera_pose_oto(X_TG, camera, X_C0C),
-        "otm": camera_pose_otm(X_TG, camera, X_C0C),
-    }
+    pose = {"oto": camera_pose_oto, "otm": camera_pose_otm}[name]
+    X_TC = pose(multiply(X_TO, attempt.X_OG), camera, conditions.X_C0C)
     paint(setup.renderer, conditions.appearance)
+    seen = render(setup.renderer, X_TO, X_TC)
 
     # The object's frame comes from the clean image; the sensor's errors come last.
-    K, views = intrinsics(camera), dict[str, View]()
-    for number, (name, X_TC) in enumerate(poses.items()):
-        seen = render(setup.renderer, record.X_TO, X_TC)
-        estimated = name == "otm" and seen.mask.any()
-        X_CI = image_frame(K, seen.mask, seen.image[3]) if estimated else None
-        image = seen.image
-        image[3] = spoil_depth(image[3], K, conditions.sensor, number, camera)
-        views[name] = View(image=image, mask=seen.mask, X_TC=X_TC, X_CI=X_CI)
-    return views
+    K = intrinsics(camera)
+    estimated = name == "otm" and seen.mask.any()
+    X_CI = image_frame(K, seen.mask, seen.image[3]) if estimated else None
+    image, number = seen.image, CAMERAS.index(name)
+    image[3] = spoil_depth(image[3], K, conditions.sensor, number, camera)
+    return View(image=image, mask=seen.mask, X_TC=X_TC, X_CI=X_CI)

@@ -317,7 +317,8 @@ def held_note(funnel: Funnel) -> str:
         found = [f"{held:,} are held", f"{stable:,} stable"]
         found += [f"{samples:,} samples"] if funnel.removals.any() else []
         reasons.append(
-            f"closed hands that were not lifted, as their chance of a sample is small: {left:,}; "
+            f"closed hands that were not lifted, as their chance of a sample is small or their "
+            f"image too flat: {left:,}; "
             f"of {lifts:,} that were lifted whatever their chance {', '.join(found)}"
         )
     return f"the number of held grasps is a lower bound: {'; '.join(reasons)}" if reasons else ""

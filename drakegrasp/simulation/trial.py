@@ -7,6 +7,7 @@ A failure of the physics is an outcome, not an exception, and so is an error wit
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
-from drakegrasp.errors import first_line
+from drakegrasp.errors import MachineError, first_line
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.lift_chance import GRASP_CONTACTS, ClosedGrasp
 from drakegrasp.outcomes import Outcome
@@ -85,6 +86,8 @@ def run_attempt(
     attempt: Pregrasp,
     config: Config,
     prediction: Prediction | None = None,
+    *,
+    is_visible: Callable[[], bool] = lambda: True,
 ) -> TrialRecord:
     """Simulate one attempt to grasp and lift the object, and return its record.
 
@@ -97,6 +100,8 @@ def run_attempt(
         config: The rules.
         prediction: What `predict` returns for the attempt, where the caller has it already; the
             record is the same without.
+        is_visible: Whether the images of a grasp would make a sample; asked of hands that may
+            lift, unless they are audited.
 
     Raises:
         ConfigError: If the hand cannot have the drive that the configuration asks for.
@@ -151,7 +156,7 @@ def run_attempt(
 
         # Choose what is worth a lift, by what is known now; some are lifted all the same.
         record = replace(record, chance=_chance(scene, X_TO, attempt, contacts))
-        if not attempt.audited and record.chance < config.lift.least_chance:
+        if not attempt.audited and (record.chance < config.lift.least_chance or not is_visible()):
             return replace(record, outcome=Outcome.NOT_LIFTED)
 
         # Lift: object and wrist are free, and the wrist moves to its target.
@@ -169,7 +174,7 @@ def run_attempt(
         return replace(record, outcome=Outcome(int(verdict)))
     except TrialTimeout:
         return replace(start, outcome=Outcome.TIMEOUT)
-    except (MemoryError, OSError):
+    except (MachineError, MemoryError, OSError):
         raise  # the machine's failure, not the attempt's
     # A failed assertion within Drake arrives as SystemExit, everything else as RuntimeError.
     except (Exception, SystemExit) as error:

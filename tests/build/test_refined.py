@@ -84,6 +84,26 @@ def test_check_finds_nothing(refined: Path) -> None:
     assert [str(v) for v in check_dataset(refined)] == []
 
 
+def test_hands_whose_image_is_flat_are_not_lifted_and_no_sample_is_lost(
+    refined: Path, sources: list[MeshSource], config: Config, tmp_path: Path
+) -> None:
+    seeing = override_config(config, ["lift.least_depth_variance=0.001"])
+    out = tmp_path / "out"
+    build(sources, out, seeing, run_here, show=False)
+    assert [str(v) for v in check_dataset(out)] == []
+
+    # The same attempts; of those that were lifted, the same bits.
+    whole, now = trials(refined), trials(out)
+    left = now["outcome"] == Outcome.NOT_LIFTED
+    assert left.any()
+    assert not now["audited"][left].any()
+    for name in ("candidate", "child", "closed_p_OQ", "X_OG"):
+        assert np.array_equal(whole[name], now[name], equal_nan=True)
+    assert np.array_equal(whole["lifted_p_OQ"][~left], now["lifted_p_OQ"][~left], equal_nan=True)
+    samples = [GraspDataset(one / "grasping_otm.hdf5") for one in (refined, out)]
+    assert len(samples[0]) == len(samples[1]) > 5
+
+
 def test_samplers_and_resting_poses_take_turns(refined: Path) -> None:
     columns = trials(refined)
     first = (columns["generation"] == 0) & (columns["standoff_index"] == 0)

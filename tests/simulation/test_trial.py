@@ -69,6 +69,26 @@ def test_closed_hand_with_a_smaller_chance_is_not_lifted(scene, cube, held):
     assert below.chance == held.chance
 
 
+def test_closed_hand_whose_image_is_of_no_use_is_not_lifted(scene, cube, config, held):
+    def no() -> bool:
+        asked.append(True)
+        return False
+
+    asked: list[bool] = []
+    attempt = from_above(cube, STANDOFF)
+    record = run_attempt(scene, standing(cube), attempt, config, is_visible=no)
+    assert record.outcome is Outcome.NOT_LIFTED
+    assert pickle.dumps(record.closed) == pickle.dumps(held.closed)
+    assert record.lift is None
+    assert asked == [True]
+    # An audited hand is lifted, and of one that may not lift no image is needed.
+    audited = replace(attempt, audited=True)
+    lifted = run_attempt(scene, standing(cube), audited, config, is_visible=no)
+    assert pickle.dumps(lifted) == pickle.dumps(held)
+    run_attempt(scene, standing(cube), from_above(cube, 0.25), config, is_visible=no)
+    assert asked == [True]
+
+
 def test_hand_without_weights_lifts_all_that_it_may(scene, cube, held):
     hand = replace(scene.handles.hand, lift_chance=None)
     bare = replace(scene, handles=replace(scene.handles, hand=hand))

@@ -179,11 +179,20 @@ def verdicts(
     judged, left = _stages(batch) >= Stage.CLOSED, batch["outcome"] == Outcome.NOT_LIFTED
     lifted = np.where(left, Outcome.NOT_LIFTED.value, lifted)
     if rules is not None:
-        unlikely = (batch["chance"] < rules.least_chance) & ~batch["audited"]
+        may_lift, audited = judged & (closed == Outcome.SUCCESS), batch["audited"]
+        unlikely = (batch["chance"] < rules.least_chance) & ~audited
         yield from batch.broken(
-            "outcome must be not_lifted exactly where the hand may lift, the chance is below "
+            "outcome must be not_lifted where the hand may lift, the chance is below "
             "lift.least_chance and the trial is not audited",
-            judged & (closed == Outcome.SUCCESS) & (left != unlikely),
+            may_lift & unlikely & ~left,
+            batch["chance"],
+        )
+        # Of a flat image the trial knows nothing; it has none.
+        flat = (rules.least_depth_variance > 0.0) & ~audited
+        yield from batch.broken(
+            "outcome must be not_lifted only where the chance is below lift.least_chance, or the "
+            "image may be flat, and the trial is not audited",
+            may_lift & left & ~unlikely & ~flat,
             batch["chance"],
         )
 

@@ -127,7 +127,7 @@ def test_lift_is_ended_only_where_the_configuration_says_so(
         (0.999, False, False, False),
     ],
 )
-def test_hand_is_not_lifted_exactly_where_its_chance_says_so(
+def test_hand_is_not_lifted_where_its_chance_says_so_and_nowhere_else(
     tmp_path: Path, least: float, audited: bool, left: bool, sound: bool
 ) -> None:
     out = make_dataset(tmp_path / "out", tmp_path / "meshes", f"lift.least_chance={least}")
@@ -137,8 +137,20 @@ def test_hand_is_not_lifted_exactly_where_its_chance_says_so(
     change(out, TRIALS, "trials/audited", SLIPPED, lambda _: audited)
     if left:
         leave_closed(out, SLIPPED)
-    what = (TRIALS, "/trials", SLIPPED, "outcome must be not_lifted exactly where")
-    must_find(out / TRIALS, *([] if sound else [what]))
+    what = f"outcome must be not_lifted {'only ' if left else ''}where the"
+    must_find(out / TRIALS, *([] if sound else [(TRIALS, "/trials", SLIPPED, what)]))
+
+
+@pytest.mark.parametrize("audited", [False, True])
+def test_hand_that_is_likely_to_hold_is_not_lifted_only_for_its_image(
+    tmp_path: Path, audited: bool
+) -> None:
+    settings = ("lift.least_depth_variance=1e-9", "filters.min_depth_variance=1e-9")
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes", *settings)
+    change(out, TRIALS, "trials/audited", SLIPPED, lambda _: audited)
+    leave_closed(out, SLIPPED)
+    what = (TRIALS, "/trials", SLIPPED, "outcome must be not_lifted only where the")
+    must_find(out / TRIALS, *([what] if audited else []))
 
 
 def test_hand_that_may_not_lift_ends_no_lift(tmp_path: Path) -> None:
