@@ -501,8 +501,9 @@ class Config(_Section):
         if self.lift.stop_when == "never":
             for key in ("stop_when", "stop_slip", "stop_turn_deg"):
                 del values["lift"][key]  # as before there was a choice
-        if not self.lift.least_chance:
-            del values["lift"]["least_chance"]
+        for key in ("least_chance", "least_depth_variance"):
+            if not values["lift"][key]:
+                del values["lift"][key]  # all are lifted
         canonical = json.dumps(values, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 

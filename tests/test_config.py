@@ -484,6 +484,11 @@ def test_simulation_hash_changes_with_what_is_simulated_and_nothing_else(key: st
     assert same is (key.split(".")[0] in NOT_SIMULATED or key == "candidates.max")
 
 
+def test_datasets_that_were_begun_with_the_defaults_go_on() -> None:
+    """A new setting whose default changes nothing must not change this."""
+    assert Config().simulation_hash() == "0ac5a08314cdf99a"
+
+
 def test_poses_that_nobody_refines_are_not_simulated() -> None:
     wide = load_config(overrides=["refine.shift=0.1"])
     assert wide.simulation_hash() == Config().simulation_hash()
