@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +25,8 @@ READABLE = (3, 4)
 OTHER_SCHEMA = "build the dataset again with this version of drakegrasp, in another directory"
 
 SPLITS = ("train", "valid", "test")
+#: Units in which people read numbers, and factors to them from SI.
+SHOWN_UNITS = {"": 1.0, "s": 1.0, "N": 1.0, "kg": 1.0, "mm": 1e3, "°": float(np.rad2deg(1.0))}
 CAMERAS = ("oto", "otm")
 
 #: The conventions in words, stored as attributes in every file.
@@ -70,6 +73,13 @@ class Field:
         sample: Whether it is an image, stored in one chunk per row.
         some: Whether rows that reached the stage may lack a value.
         since: First version of the schema that has it.
+        of: Where its value is measured, as a path of attributes: from the row of `build.columns`
+            for a trial, from a `Verification` for a verdict. For a number of a sample, the column
+            of its trial that it copies. Empty if it is computed otherwise.
+        title: What people call it where it is shown; empty if it is shown nowhere.
+        shown: Unit in which it is shown, one of SHOWN_UNITS; that of several fingers is shown by
+            its largest value.
+        digits: After the decimal point where it is shown.
     """
 
     name: str
@@ -83,6 +93,10 @@ class Field:
     sample: bool = False
     some: bool = False
     since: int = 3
+    of: str = ""
+    title: str = ""
+    shown: str = ""
+    digits: int = 1
 
     @property
     def axes(self) -> tuple[int | str, ...]:
@@ -96,6 +110,14 @@ class Field:
             KeyError: If a letter is missing.
         """
         return tuple(sizes[axis] if isinstance(axis, str) else axis for axis in self.axes)
+
+    def value_of(self, source: object) -> Any:
+        """Return the field's value of what a row is made of, or None where a stage is missing."""
+        for name in self.of.split("."):
+            if source is None:
+                return None
+            source = getattr(source, name)
+        return source
 
     def empty(self, count: int, sizes: Mapping[str, int]) -> npt.NDArray[np.generic]:
         """Return an array of `count` rows without a value: NaN, 0 or False."""
@@ -140,23 +162,46 @@ def _new(*fields: Field) -> tuple[Field, ...]:
     return tuple(replace(field, since=4) for field in fields)
 
 
-def _contacts(prefix: str, when: str) -> tuple[Field, ...]:
+def _contacts(prefix: str, of: str, when: str) -> tuple[Field, ...]:
     """Return the joint positions and contacts of one instant, e.g. `closed_q`, `closed_p_OQ`."""
     return tuple(
-        replace(field, name=f"{prefix}_{field.name}", meaning=f"{field.meaning} {when}")
-        for field in (_JOINTS, *_CONTACTS)
+        replace(
+            field,
+            name=f"{prefix}_{field.name}",
+            meaning=f"{field.meaning} {when}",
+            of=f"{of}.{field.of}",
+        )
+        for field in (_JOINTS, *_OF_CONTACTS)
     )
 
 
-def _verdict(outcomes: list[Outcome]) -> Field:
+def _measured(of: str, *fields: Field) -> tuple[Field, ...]:
+    """Return fields whose values are attributes of the same names of one thing."""
+    return tuple(replace(field, of=f"{of}.{field.name}") for field in fields)
+
+
+def _copied(group: str, *fields: Field) -> tuple[Field, ...]:
+    """Return fields of a sample that copy columns of its trial, in single precision."""
+    return tuple(
+        replace(
+            field,
+            name=f"{group}/{field.name}",
+            dtype="float32" if field.dtype == "float64" else field.dtype,
+            of=field.name,
+        )
+        for field in fields
+    )
+
+
+def _verdict(of: str, outcomes: list[Outcome]) -> Field:
     labels = ", ".join(f"{outcome.value} {outcome.label}" for outcome in outcomes)
-    return Field("outcome", "", "uint8", "-", "-", f"verdict: {labels}")
+    return Field("outcome", "", "uint8", "-", "-", f"verdict: {labels}", of=of)
 
 
 # A row per field on at most two lines is what makes this a table.
 # fmt: off
 
-_JOINTS = Field("q", "j", "float64", "rad or m", "-", "positions of the hand's joints")
+_JOINTS = Field("q", "j", "float64", "rad or m", "-", "positions of the hand's joints", of="q")
 
 #: What `simulation.contacts.Contacts` says of one instant, by its names.
 _CONTACTS: tuple[Field, ...] = (
@@ -176,15 +221,14 @@ _CONTACTS: tuple[Field, ...] = (
           "number of contacts of the object that were not hydroelastic"),
 )
 
-#: The contact fields by the names of `simulation.contacts.Contacts`, without their prefix.
-CONTACT_NAMES = tuple(field.name for field in _CONTACTS)
+_OF_CONTACTS = _measured("contacts", *_CONTACTS)
 
 # While the hand closes the object is fixed in its place, so nothing shows whether it stands on the
 # table.
-_CLOSED = tuple(field for field in _contacts("closed", "when closing ended")
+_CLOSED = tuple(field for field in _contacts("closed", "trial.closed", "when closing ended")
                 if field.name != "closed_object_on_table")
 # Of a lift that ends early: when it ends.
-_LIFTED = _contacts("lifted", "after the lift")
+_LIFTED = _contacts("lifted", "trial.lift", "after the lift")
 
 # Where a palm pose comes from; an attempt's identity is object, candidate, stand-off and child.
 _LINEAGE = _new(
@@ -202,27 +246,31 @@ _LINEAGE = _new(
           "logarithm of the density of the palm pose's draw: among the different rotations; per "
           "m^2 of surface and rad of roll; per m^3 rad^3 about the parent's"),
 )
-#: The lineage fields by the names of `simulation.candidates.Attempt`.
-LINEAGE_NAMES = tuple(field.name for field in _LINEAGE)
 # Fields of several tables.
 _SPREAD = Field("spread", "", "float64", "rad", "-", "angle of the spread joints")
 _X_TO = Field("X_TO", "12", "float64", "m, -", "T", "resting pose of the object")
 _TIME_CLOSE = Field("time_close", "", "float64", "s", "-",
-                    "simulated time at which closing ended")
+                    "simulated time at which closing ended", of="trial.closed.duration",
+                    title="time of closing", shown="s", digits=2)
 _TIME_LIFT = Field(
     "time_lift", "", "float64", "s", "-",
-    "simulated time of the lift with its hold; shorter where it ended early")
-_SLIP = (
+    "simulated time of the lift with its hold; shorter where it ended early",
+    of="trial.lift.duration", title="time of the lift", shown="s", digits=2)
+_SLIP = _measured(
+    "trial.lift",
     Field("slip", "", "float64", "m", "G",
-          "distance that the object moved in the hand during the lift"),
+          "distance that the object moved in the hand during the lift", title="slip", shown="mm"),
     Field("turn", "", "float64", "rad", "G",
-          "angle that the object turned in the hand during the lift"),
+          "angle that the object turned in the hand during the lift", title="turn", shown="°"),
 )
-_RELEASED = (
+_RELEASED = _measured(
+    "trial.lift",
     Field("slip_released", "", "float64", "m", "G",
-          "distance that the object moved in the hand before the wrist moved"),
+          "distance that the object moved in the hand before the wrist moved",
+          title="slip before the wrist moves", shown="mm"),
     Field("turn_released", "", "float64", "rad", "G",
-          "angle that the object turned in the hand before the wrist moved"),
+          "angle that the object turned in the hand before the wrist moved",
+          title="turn before the wrist moves", shown="°"),
 )
 _WORDS = (
     Field("precision", "", "bool", "-", "-",
@@ -233,22 +281,33 @@ _WORDS = (
 
 #: The conditions of an attempt, drawn or not: what `simulation.randomization` may change.
 CONDITION_FIELDS: tuple[Field, ...] = (
-    Field("friction_hand", "", "float64", "-", "-",
-          "effective coefficient of friction between hand and object"),
-    Field("friction_table", "", "float64", "-", "-",
-          "effective coefficient of friction between table and object"),
-    Field("mass", "", "float64", "kg", "-", "mass of the object; its inertia is in proportion"),
-    Field("object_colour", "3", "float64", "-", "-", "R, G, B of the object in 0..1"),
-    Field("table_colour", "3", "float64", "-", "-", "R, G, B of the table in 0..1"),
-    Field("light_direction", "3", "float64", "-", "W",
-          "unit vector along which the light from above shines"),
-    Field("light_strength", "", "float64", "-", "-", "intensity of the light from above"),
+    *_measured(
+        "conditions.materials",
+        Field("friction_hand", "", "float64", "-", "-",
+              "effective coefficient of friction between hand and object",
+              title="friction of the object with the hand", digits=3),
+        Field("friction_table", "", "float64", "-", "-",
+              "effective coefficient of friction between table and object",
+              title="friction of the object with the table", digits=3),
+        Field("mass", "", "float64", "kg", "-", "mass of the object; its inertia is in proportion",
+              title="mass", shown="kg", digits=3),
+    ),
+    *_measured(
+        "conditions.appearance",
+        Field("object_colour", "3", "float64", "-", "-", "R, G, B of the object in 0..1"),
+        Field("table_colour", "3", "float64", "-", "-", "R, G, B of the table in 0..1"),
+        Field("light_direction", "3", "float64", "-", "W",
+              "unit vector along which the light from above shines"),
+        Field("light_strength", "", "float64", "-", "-", "intensity of the light from above"),
+    ),
     Field("X_C0C", "12", "float64", "m, -", "C0",
-          "pose of the oto camera in its usual pose behind the palm"),
+          "pose of the oto camera in its usual pose behind the palm", of="conditions.X_C0C"),
     Field("depth_noise", "", "float64", "1/m", "-",
-          "standard deviation of the depths over their square; 0 for images without noise"),
+          "standard deviation of the depths over their square; 0 for images without noise",
+          of="conditions.sensor.noise"),
     Field("depth_seed", "", "uint64", "-", "-",
-          "seed of the noise of the depth images; 0 for images without noise"),
+          "seed of the noise of the depth images; 0 for images without noise",
+          of="conditions.sensor.seed"),
 )
 
 #: A row per grasp, in `/train`, `/valid` and `/test` of both data files.
@@ -262,38 +321,33 @@ DATA_FIELDS: tuple[Field, ...] = (
     Field("grasps_held", "6k", "float32", "m, -", "C",
           "the same where the fingertips hold the object after the lift, on the resting object"),
     Field("trial_id", "", "int64", "-", "-", "row of trials.hdf5"),
-    *(replace(field, name=f"grasp_props/{field.name}") for field in _WORDS),
-    *(replace(field, name=f"grasp_props/{field.name}",
-              dtype="float32" if field.dtype == "float64" else field.dtype)
-      for field in _LINEAGE),
+    *_copied("grasp_props", *_WORDS, *_LINEAGE),
     *_new(Field("grasp_props/weight", "", "float32", "-", "-",
                 "1 / number of samples, itself included, of the same object and resting pose whose "
                 "palm is within 10 mm and 15 deg")),
-    *(replace(field, name=f"grasp_props/{field.name}", dtype="float32")
-      for field in (*_SLIP, *_RELEASED)),
+    *_copied("grasp_props", *_SLIP, *_RELEASED),
     Field("grasp_props/other_links_held", "", "uint8", "-", "-",
-          "number of other links of the hand that touch the object after the lift"),
+          "number of other links of the hand that touch the object after the lift",
+          of="lifted_other_links"),
     Field("grasp_props/X_CG", "12", "float32", "m, -", "C",
           "pose of the palm at the start and while closing, in this file's camera"),
     Field("grasp_props/X_CG_held", "12", "float32", "m, -", "C",
           "pose of the palm after the lift, relative to the resting object"),
     Field("grasp_props/q", "j", "float32", "rad or m", "-",
-          "positions of the hand's joints after closing"),
+          "positions of the hand's joints after closing", of="closed_q"),
     Field("grasp_props/q_held", "j", "float32", "rad or m", "-",
-          "positions of the hand's joints after the lift"),
+          "positions of the hand's joints after the lift", of="lifted_q"),
     Field("grasp_props/f_Q_C", "k 3", "float32", "N", "C",
           "forces of the fingertips on the object after closing"),
     Field("grasp_props/f_Q_C_held", "k 3", "float32", "N", "C",
           "forces of the fingertips on the object after the lift, turned with it to its resting "
           "pose"),
     Field("grasp_props/area", "k", "float32", "m^2", "-",
-          "areas of the contact patches after closing"),
+          "areas of the contact patches after closing", of="closed_area"),
     Field("grasp_props/area_held", "k", "float32", "m^2", "-",
-          "areas of the contact patches after the lift"),
+          "areas of the contact patches after the lift", of="lifted_area"),
     # The mass is in object_props.
-    *(replace(field, name=f"conditions/{field.name}",
-              dtype="float32" if field.dtype == "float64" else field.dtype)
-      for field in CONDITION_FIELDS if field.name != "mass"),
+    *_copied("conditions", *(field for field in CONDITION_FIELDS if field.name != "mass")),
     Field("object_props/object_name", "", "str", "-", "-", "name of the object"),
     Field("object_props/class_name", "", "str", "-", "-", "name of the object's class"),
     Field("object_props/work2com", "3", "float32", "m", "T",
@@ -301,7 +355,7 @@ DATA_FIELDS: tuple[Field, ...] = (
     Field("object_props/work2inertia", "9", "float32", "kg m^2", "T",
           "rotational inertia of the resting object about Ocm, 3x3 row-major"),
     Field("object_props/work2mass", "1", "float32", "kg", "-",
-          "mass of the object, as in the trial"),
+          "mass of the object, as in the trial", of="mass"),
     Field("object_props/frame_cam2img_otm", "12", "float32", "m, -", "C (otm)",
           "X_CI, image frame estimated from the otm mask"),
     Field("object_props/frame_cam2work_otm", "12", "float32", "m, -", "C (otm)",
@@ -325,46 +379,56 @@ SHARED_FIELDS: tuple[Field, ...] = tuple(
 TRIAL_FIELDS: tuple[Field, ...] = (
     Field("trial_id", "", "int64", "-", "-", "the row's own number"),
     Field("object", "", "int32", "-", "-", "row of /objects"),
-    Field("candidate", "", "int32", "-", "-",
-          "index of the palm pose among its object's candidates; of a family's first attempt"),
-    Field("standoff_index", "", "uint8", "-", "-",
-          "index into the configuration's candidates.standoffs"),
-    *_LINEAGE,
-    _SPREAD,
-    Field("seed", "", "uint64", "-", "-",
-          "state of the candidate's random stream, from which the spread was drawn, or of the "
-          "refined palm pose's"),
-    _verdict([outcome for outcome in Outcome if not outcome.verification_only]),
-    _X_TO,
-    Field("X_OG", "12", "float64", "m, -", "O",
-          "pose of the palm at the start; the candidate's where the palm ray misses"),
+    *_measured(
+        "attempt",
+        Field("candidate", "", "int32", "-", "-",
+              "index of the palm pose among its object's candidates; of a family's first attempt"),
+        Field("standoff_index", "", "uint8", "-", "-",
+              "index into the configuration's candidates.standoffs"),
+        *_LINEAGE,
+        _SPREAD,
+        Field("seed", "", "uint64", "-", "-",
+              "state of the candidate's random stream, from which the spread was drawn, or of the "
+              "refined palm pose's"),
+    ),
+    _verdict("trial.outcome", [outcome for outcome in Outcome if not outcome.verification_only]),
+    *_measured(
+        "trial",
+        _X_TO,
+        Field("X_OG", "12", "float64", "m, -", "O",
+              "pose of the palm at the start; the candidate's where the palm ray misses"),
+    ),
     *CONDITION_FIELDS,
     *_new(
         Field("audited", "", "bool", "-", "-",
-              "whether a closed hand that may lift is lifted whatever its chance: one in ten"),
+              "whether a closed hand that may lift is lifted whatever its chance: one in ten",
+              of="attempt.audited"),
     ),
     *_since(Stage.CLOSED, _TIME_CLOSE, *_CLOSED),
     *_since(
         Stage.CLOSED,
         *_new(Field("chance", "", "float64", "-", "-",
                     "chance of a sample, of a closed hand that may lift; NaN for hands without "
-                    "weights of it", some=True)),
+                    "weights of it", some=True, of="trial.chance")),
     ),
     *_since(
         Stage.LIFTED,
         Field("surface_distance", "k", "float64", "m", "-",
               "distance of the contact points after closing from the full mesh's surface",
-              per_finger=True),
+              per_finger=True, of="fit.distance", title="off surface", shown="mm", digits=2),
         Field("normal_angle", "k", "float64", "rad", "-",
               "angle of the normals after closing from the full mesh's nearest face, or from that "
-              "ahead if it agrees better", per_finger=True),
+              "ahead if it agrees better", per_finger=True, of="fit.normal_angle",
+              title="normal angle", shown="°"),
         _TIME_LIFT,
         *_LIFTED,
-        Field("X_TO_lifted", "12", "float64", "m, -", "T", "pose of the object after the lift"),
-        Field("X_OG_lifted", "12", "float64", "m, -", "O", "pose of the palm after the lift"),
+        Field("X_TO_lifted", "12", "float64", "m, -", "T", "pose of the object after the lift",
+              of="trial.lift.X_TO"),
+        Field("X_OG_lifted", "12", "float64", "m, -", "O", "pose of the palm after the lift",
+              of="trial.lift.X_OG"),
         *_SLIP,
         *_RELEASED,
-        *_WORDS,
+        *_measured("trial", *_WORDS),
     ),
 )
 
@@ -432,66 +496,80 @@ OBJECT_FIELDS: tuple[Field, ...] = (
 #: A row per predicted grasp, in the order of the input, in `/grasps` of the results of
 #: `drakegrasp verify`. What a method or a stage did not reach is NaN, 0, false or empty.
 VERIFICATION_FIELDS: tuple[Field, ...] = (
-    Field("object", "", "str", "-", "-", "name of the object"),
-    Field("method", "", "str", "-", "-", "how it was verified: hand, or forces alone"),
-    _verdict([outcome for outcome in Outcome if not outcome.dataset_only]),
-    *_WORDS,
-    Field("reason", "", "str", "-", "-", "why, in words"),
-    _X_TO,
-    Field("X_TO_simulated", "12", "float64", "m, -", "T",
-          "pose at which it is simulated: moved on the table and turned about its normal"),
-    Field("p_OQ", "k 3", "float64", "m", "O", "predicted contact points"),
-    Field("nhat_Q_O", "k 3", "float64", "-", "O", "predicted unit normals out of the object"),
+    Field("object", "", "str", "-", "-", "name of the object", of="placed.model.name"),
+    Field("method", "", "str", "-", "-", "how it was verified: hand, or forces alone",
+          of="method"),
+    _verdict("outcome", [outcome for outcome in Outcome if not outcome.dataset_only]),
+    *(replace(field, of=field.name) for field in _WORDS),
+    Field("reason", "", "str", "-", "-", "why, in words", of="reason"),
+    *_measured(
+        "placed",
+        _X_TO,
+        Field("X_TO_simulated", "12", "float64", "m, -", "T",
+              "pose at which it is simulated: moved on the table and turned about its normal"),
+    ),
+    Field("p_OQ", "k 3", "float64", "m", "O", "predicted contact points", of="p_OQ"),
+    Field("nhat_Q_O", "k 3", "float64", "-", "O", "predicted unit normals out of the object",
+          of="nhat_Q_O"),
     Field("surface_distance", "k", "float64", "m", "-",
-          "distance of the predicted points from the object's surface"),
+          "distance of the predicted points from the object's surface", of="surface_distance"),
     Field("epsilon", "", "float64", "-", "-",
-          "Ferrari-Canny measure of the predicted contacts, 0 without force closure"),
+          "Ferrari-Canny measure of the predicted contacts, 0 without force closure",
+          of="epsilon"),
     Field("smallest_friction", "", "float64", "-", "-",
           "least friction coefficient at which forces within the hand's limit at the predicted "
-          "contacts hold the object; inf if none does"),
-    Field("X_OG", "12", "float64", "m, -", "O", "pose of the palm that was found"),
-    _SPREAD,
-    Field("closing", "k", "float64", "rad or m", "-",
-          "closing positions at which the fingertips meet the predicted points"),
-    Field("residual", "k", "float64", "m", "-",
-          "distance of the predicted points from the fingertips then"),
-    Field("normal_error", "k", "float64", "rad", "-",
-          "angle between the fingertips' and the predicted normals then"),
+          "contacts hold the object; inf if none does", of="smallest_friction"),
+    *_measured(
+        "fit",
+        Field("X_OG", "12", "float64", "m, -", "O", "pose of the palm that was found"),
+        _SPREAD,
+        Field("closing", "k", "float64", "rad or m", "-",
+              "closing positions at which the fingertips meet the predicted points"),
+        Field("residual", "k", "float64", "m", "-",
+              "distance of the predicted points from the fingertips then"),
+        Field("normal_error", "k", "float64", "rad", "-",
+              "angle between the fingertips' and the predicted normals then"),
+    ),
     Field("solver_status", "", "int16", "-", "-",
-          "exit mode of SLSQP, 0 for success; -1 where it was not asked"),
-    Field("solver_iterations", "", "uint16", "-", "-", "iterations of SLSQP"),
-    Field("tries", "", "uint16", "-", "-", "number of palm poses that were tried"),
+          "exit mode of SLSQP, 0 for success; -1 where it was not asked", of="solver_status"),
+    Field("solver_iterations", "", "uint16", "-", "-", "iterations of SLSQP", of="fit.iterations"),
+    Field("tries", "", "uint16", "-", "-", "number of palm poses that were tried", of="tries"),
     Field("closing_start", "k", "float64", "rad or m", "-",
-          "closing positions from which the simulated fingers close"),
+          "closing positions from which the simulated fingers close", of="pregrasp.closing"),
     *_since(
         Stage.CLOSED,
         _TIME_CLOSE,
         *_CLOSED,
         Field("contact_error", "k", "float64", "m", "-",
-              "distance of the contact points after closing from the predicted ones"),
+              "distance of the contact points after closing from the predicted ones",
+              of="contact_error"),
     ),
     *_since(
         Stage.LIFTED,
         _TIME_LIFT,
         *_LIFTED,
         Field("X_TO_lifted", "12", "float64", "m, -", "T",
-              "pose of the object after the lift, which began at X_TO_simulated"),
+              "pose of the object after the lift, which began at X_TO_simulated",
+              of="X_TO_lifted"),
         *_SLIP,
     ),
-    Field("planned_force", "", "float64", "N", "-",
-          "method forces: normal force of the finger that is loaded hardest for its strength; inf "
-          "if no forces carry the object"),
-    Field("planned_share", "", "float64", "-", "-",
-          "method forces: share of that finger's strength, as small as the lift allows; above 1 it "
-          "fails"),
-    *_since(
-        Stage.LIFTED,
-        Field("applied_force", "", "float64", "N", "-",
-              "method forces: largest normal force that was applied"),
-        Field("position_error", "", "float64", "m", "-",
-              "method forces: distance of the object from its path at the end"),
-        Field("angle_error", "", "float64", "rad", "-",
-              "method forces: angle of the object from its path at the end"),
+    *_measured(
+        "lift",
+        Field("planned_force", "", "float64", "N", "-",
+              "method forces: normal force of the finger that is loaded hardest for its strength; "
+              "inf if no forces carry the object"),
+        Field("planned_share", "", "float64", "-", "-",
+              "method forces: share of that finger's strength, as small as the lift allows; above "
+              "1 it fails"),
+        *_since(
+            Stage.LIFTED,
+            Field("applied_force", "", "float64", "N", "-",
+                  "method forces: largest normal force that was applied"),
+            Field("position_error", "", "float64", "m", "-",
+                  "method forces: distance of the object from its path at the end"),
+            Field("angle_error", "", "float64", "rad", "-",
+                  "method forces: angle of the object from its path at the end"),
+        ),
     ),
 )
 # fmt: on

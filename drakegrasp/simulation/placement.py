@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -55,6 +56,11 @@ class PlacedObject:
     model: ObjectModel
     X_TO: Array
     config: Config = field(default_factory=load_config)
+
+    @cached_property
+    def X_TO_simulated(self) -> Array:
+        """Pose (4, 4) moved to the table's centre, without yaw: verdicts depend on neither."""
+        return canonical_pose(self.X_TO)
 
     def __repr__(self) -> str:
         model, z = self.model, self.X_TO[2, 3]

@@ -34,7 +34,7 @@ from drakegrasp.simulation.scene import (
 )
 from drakegrasp.simulation.screen import Prediction, predict
 from drakegrasp.simulation.stepping import TrialLimits, TrialTimeout, start_limits
-from drakegrasp.simulation.verdict import judge_closed, judge_lifted
+from drakegrasp.simulation.verdict import is_precision, is_stable, judge_closed, judge_lifted
 
 #: Far below a time step, far above the rounding of a sum of them [s].
 ROUNDING = 1e-9
@@ -78,6 +78,20 @@ class TrialRecord:
     lift: Lift | None = None
     chance: float = np.nan
     message: str = field(default="")
+
+    @property
+    def precision(self) -> bool:
+        """Whether the grasp is held, and by the fingertips alone."""
+        lift = self.lift
+        return lift is not None and bool(is_precision(self.outcome, lift.contacts.other_links))
+
+    @property
+    def stable(self) -> bool:
+        """Whether it is a precision grasp that moved less than 5 mm and 5 degrees in the hand."""
+        lift = self.lift
+        return lift is not None and bool(
+            is_stable(self.outcome, lift.contacts.other_links, lift.slip, lift.turn)
+        )
 
 
 def run_attempt(

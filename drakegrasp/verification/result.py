@@ -154,6 +154,16 @@ class Verification:
         return None if self._lift is None else self._lift.contacts
 
     @property
+    def X_TO_lifted(self) -> Array | None:
+        """Pose (4, 4) of the object after the lift, by the hand or by forces alone."""
+        return self._lift.X_TO if self._lift else self.lift.X_TO_lifted if self.lift else None
+
+    @property
+    def solver_status(self) -> int:
+        """Exit mode of SLSQP, 0 for success; -1 where it was not asked."""
+        return -1 if self.fit is None else self.fit.status
+
+    @property
     def _lift(self) -> Lift | None:
         return None if self.trial is None else self.trial.lift
 

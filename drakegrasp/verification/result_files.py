@@ -20,14 +20,12 @@ import numpy as np
 from drakegrasp.config import Config
 from drakegrasp.dataset.hdf5 import AnyArray, write_field
 from drakegrasp.dataset.manifest import finger_names, installed_versions, write_origin
-from drakegrasp.dataset.schema import CONTACT_NAMES, VERIFICATION_FIELDS, Field, sizes
+from drakegrasp.dataset.schema import VERIFICATION_FIELDS, Field, sizes
 from drakegrasp.errors import DataError
 from drakegrasp.frames import pack_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.runtime.files import atomic_hdf5, probe_folder, sync_and_rename
-from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.lift import Lift
-from drakegrasp.simulation.placement import canonical_pose
 from drakegrasp.simulation.trial import Closed
 from drakegrasp.verification.result import Verification
 
@@ -231,73 +229,20 @@ def write_results(results: Sequence[Verification], path: Path, config: Config) -
     """
     hand = load_hand(config.hand)
     shape = sizes(fingers=hand.num_fingers, joints=len(hand.joint_names), image=0)
-    rows = [_row(result) for result in results]
     with atomic_hdf5(path) as file:
         write_origin(file, config, installed_versions(config), finger_names(config))
         group = file.create_group(GROUP)
         for field in VERIFICATION_FIELDS:
-            write_field(group, field, _column(field, rows, shape))
+            write_field(group, field, _column(field, results, shape))
 
 
-def _column(field: Field, rows: Sequence[dict[str, Any]], shape: dict[str, int]) -> AnyArray:
-    """Return the values of a field for all rows; missing ones have the field's empty value."""
+def _column(field: Field, results: Sequence[Verification], shape: dict[str, int]) -> AnyArray:
+    """Return the values of a field for all results; what was not reached has its empty value."""
     if field.dtype == "str":
-        return np.array([row[field.name] for row in rows], dtype=object)
-    column = field.empty(len(rows), shape)
-    for i, row in enumerate(rows):
-        if row.get(field.name) is not None:
-            column[i] = row[field.name]
+        return np.array([field.value_of(result) for result in results], dtype=object)
+    column = field.empty(len(results), shape)
+    for i, result in enumerate(results):
+        value = field.value_of(result)
+        if value is not None:
+            column[i] = pack_pose(value) if field.shape == "12" else value
     return column
-
-
-def _row(result: Verification) -> dict[str, Any]:
-    """Return the values of a result by field; those of stages not reached are missing or None."""
-    # What every result has.
-    fit, trial, lift = result.fit, result.trial, result.lift
-    row: dict[str, Any] = {
-        "object": result.placed.model.name,
-        "method": result.method,
-        "outcome": result.outcome,
-        "precision": result.precision,
-        "stable": result.stable,
-        "reason": result.reason,
-        "X_TO": pack_pose(result.placed.X_TO),
-        "X_TO_simulated": pack_pose(canonical_pose(result.placed.X_TO)),
-        "p_OQ": result.p_OQ,
-        "nhat_Q_O": result.nhat_Q_O,
-        "surface_distance": result.surface_distance,
-        "epsilon": result.epsilon,
-        "smallest_friction": result.smallest_friction,
-        "solver_status": -1,
-        "tries": result.tries,
-        "contact_error": result.contact_error,
-    }
-
-    # The palm pose and its trial.
-    if fit is not None:
-        row |= {name: getattr(fit, name) for name in ("spread", "closing", "residual")}
-        row |= {"X_OG": pack_pose(fit.X_OG), "normal_error": fit.normal_error}
-        row |= {"solver_status": fit.status, "solver_iterations": fit.iterations}
-    if result.pregrasp is not None:
-        row["closing_start"] = result.pregrasp.closing
-    if trial is not None and trial.closed is not None:
-        row |= {"time_close": trial.closed.duration, "closed_q": trial.closed.q}
-        row |= _contact_values("closed", trial.closed.contacts)
-    if trial is not None and trial.lift is not None:
-        row |= {"time_lift": trial.lift.duration, "lifted_q": trial.lift.q}
-        row |= _contact_values("lifted", trial.lift.contacts)
-        row |= {"slip": trial.lift.slip, "turn": trial.lift.turn}
-        row["X_TO_lifted"] = pack_pose(trial.lift.X_TO)
-
-    # The lift by forces.
-    if lift is not None:
-        names = ("planned_force", "planned_share", "applied_force", "position_error", "angle_error")
-        row |= {name: getattr(lift, name) for name in names}
-        if lift.X_TO_lifted is not None:
-            row["X_TO_lifted"] = pack_pose(lift.X_TO_lifted)
-    return row
-
-
-def _contact_values(prefix: str, contacts: Contacts) -> dict[str, Any]:
-    """Return the values of the contact fields with a prefix, "closed" or "lifted"."""
-    return {f"{prefix}_{name}": getattr(contacts, name) for name in CONTACT_NAMES}

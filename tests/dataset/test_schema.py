@@ -5,13 +5,16 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
+from types import NoneType
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
 from helpers.datasets import OTM, OTO, TRIALS, edit_file, make_dataset
 
+from drakegrasp.build.columns import TrialRow
 from drakegrasp.build.replay import replay_trial
 from drakegrasp.config import Config
 from drakegrasp.dataset.assemble import assemble
@@ -21,7 +24,7 @@ from drakegrasp.dataset.manifest import claim_directory
 from drakegrasp.dataset.paths import FILE_NAME
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import (
-    CONTACT_NAMES,
+    DATA_FIELDS,
     SCHEMA_VERSION,
     SUCCESS_FIELDS,
     TRIAL_FIELDS,
@@ -29,10 +32,12 @@ from drakegrasp.dataset.schema import (
     Field,
     sizes,
 )
+from drakegrasp.dataset.shards import ASSEMBLED_FIELDS
 from drakegrasp.dataset.statistics import count_funnel, count_splits, count_unfinished
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Stage
 from drakegrasp.simulation.contacts import Contacts
+from drakegrasp.verification.result import Verification
 
 SIZES = sizes(fingers=3, joints=4, image=8)
 
@@ -67,17 +72,57 @@ def test_letter_without_a_length_is_an_error() -> None:
 def test_contact_fields_are_those_that_the_simulation_reads() -> None:
     """All but the force of the table, which no file keeps."""
     names = {field.name for field in dataclasses.fields(Contacts)}
-    assert set(CONTACT_NAMES) == names - {"table_force"}
+    path = "trial.lift.contacts."
+    read = {f.of.removeprefix(path) for f in TRIAL_FIELDS if f.of.startswith(path)}
+    assert read == names - {"table_force"}
 
 
 @pytest.mark.parametrize("table", [TRIAL_FIELDS, VERIFICATION_FIELDS])
-def test_contacts_have_values_from_their_stage_on(table: tuple[Field, ...]) -> None:
-    stages = {field.name: field.stage for field in table}
-    for prefix, stage in (("closed", Stage.CLOSED), ("lifted", Stage.LIFTED)):
-        # A hand that closes on a fixed object takes nothing off the table.
-        names = {f"{prefix}_{name}" for name in ("q", *CONTACT_NAMES)} - {"closed_object_on_table"}
-        assert {stages[name] for name in names} == {stage}
-    assert "closed_object_on_table" not in stages
+def test_stage_of_a_field_is_that_of_its_measurement(table: tuple[Field, ...]) -> None:
+    for path, stage in (("trial.closed.", Stage.CLOSED), ("trial.lift.", Stage.LIFTED)):
+        stages = {field.stage for field in table if field.of.startswith(path)}
+        assert stages == {stage}
+    # A hand that closes on a fixed object takes nothing off the table.
+    assert "closed_object_on_table" not in {field.name for field in table}
+
+
+def _leads_to_something(root: type, path: str) -> bool:
+    """Return whether a path of attributes is one of a class, by its annotations."""
+    for name in path.split("."):
+        kinds = [k for k in (*get_args(root), root) if k is not NoneType and isinstance(k, type)]
+        hints = [get_type_hints(kind).get(name, getattr(kind, name, None)) for kind in kinds]
+        # A property has the type that it returns.
+        hints = [
+            get_type_hints(getattr(hint, "fget", None) or hint.func)["return"]
+            if isinstance(hint, property | cached_property)
+            else hint
+            for hint in hints
+            if hint is not None
+        ]
+        if not hints:
+            return False
+        (root,) = hints
+    return True
+
+
+@pytest.mark.parametrize(
+    ("root", "field"),
+    [
+        *((TrialRow, f) for f in TRIAL_FIELDS if f.name not in ASSEMBLED_FIELDS),
+        *((Verification, f) for f in VERIFICATION_FIELDS),
+    ],
+)
+def test_field_says_where_its_value_is_measured(root: type, field: Field) -> None:
+    assert _leads_to_something(root, field.of)
+
+
+def test_number_of_a_sample_is_a_column_of_its_trial_in_single_precision() -> None:
+    columns = {field.name: field for field in TRIAL_FIELDS}
+    for field in DATA_FIELDS:
+        if field.of:
+            of = columns[field.of]
+            assert np.dtype(field.dtype) == (np.float32 if of.dtype == "float64" else of.dtype)
+            assert field.unit == of.unit
 
 
 def test_reasons_of_removal_are_those_of_the_filters() -> None:

@@ -15,10 +15,9 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.hdf5 import COLUMN_CHUNK, AnyArray, create_field
-from drakegrasp.dataset.schema import CAMERAS, CONDITION_FIELDS, DATA_FIELDS, LINEAGE_NAMES
+from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS
 from drakegrasp.frames import (
     X_WT,
-    Array,
     invert_pose,
     pack_pose,
     rotate_vectors,
@@ -114,14 +113,23 @@ def sample_values(
     X_TC = {c: unpack_pose(look[f"X_TC_{c}"]) for c in CAMERAS}
     X_CO = multiply(invert_pose(X_TC[camera]), X_TO)
 
-    # What does not depend on the camera of the file.
-    R_TO, mass = X_TO[:3, :3], trial["mass"]
+    # Grasp, palm and forces in the frame of the file's camera. What is held is put in place with
+    # the object: both go through its resting pose.
+    values: dict[str, Any] = {}
+    for suffix, when, X_OG in (("", "closed", "X_OG"), ("_held", "lifted", "X_OG_lifted")):
+        grasp = pack_grasp(trial[f"{when}_p_OQ"], trial[f"{when}_nhat_Q_O"])
+        values[f"grasps{suffix}"] = transform_grasp(X_CO, grasp)
+        X_CG = multiply(X_CO, unpack_pose(trial[X_OG]))
+        values[f"grasp_props/X_CG{suffix}"] = pack_pose(X_CG)
+        f_Q_C = rotate_vectors(X_CO, trial[f"{when}_f_Q_O"])
+        values[f"grasp_props/f_Q_C{suffix}"] = f_Q_C
+
+    # Frames and mass properties, which do not depend on the camera of the file.
+    R_TO = X_TO[:3, :3]
+    I_OOcm_T = multiply(multiply(R_TO, model.I_OOcm_O), R_TO.T).ravel()
     properties = {
         "work2com": transform_points(X_TO, model.p_OOcm[None])[0],
-        "work2inertia": mass
-        / model.mass
-        * multiply(multiply(R_TO, model.I_OOcm_O), R_TO.T).ravel(),
-        "work2mass": [mass],
+        "work2inertia": trial["mass"] / model.mass * I_OOcm_T,
         "frame_cam2img_otm": look["X_CI_otm"],
         "frame_cam2work_otm": pack_pose(invert_pose(X_TC["otm"])),
         "frame_cam2work_oto": pack_pose(invert_pose(X_TC["oto"])),
@@ -130,37 +138,7 @@ def sample_values(
         "frame_world2obj": pack_pose(multiply(X_WT, X_TO)),
         "frame_world2work": pack_pose(X_WT),
     }
+    values |= {f"object_props/{name}": value for name, value in properties.items()}
 
-    # The grasps in the frame of the file's camera.
-    return {
-        "grasps": _grasp(X_CO, trial, "closed"),
-        "grasps_held": _grasp(X_CO, trial, "lifted"),
-        **{f"grasp_props/{name}": value for name, value in _grasp_props(X_CO, trial).items()},
-        **{f"object_props/{name}": value for name, value in properties.items()},
-        **{f"conditions/{f.name}": trial[f.name] for f in CONDITION_FIELDS if f.name != "mass"},
-    }
-
-
-def _grasp(X_CO: Array, trial: Mapping[str, Any], when: str) -> Array:
-    """Return a trial's grasp (6k,) in a camera's frame, when `closed` or `lifted`."""
-    return transform_grasp(X_CO, pack_grasp(trial[f"{when}_p_OQ"], trial[f"{when}_nhat_Q_O"]))
-
-
-def _grasp_props(X_CO: Array, trial: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of `grasp_props` of a trial, in the frame of a camera.
-
-    What is held is put in place with the object: both go through its resting pose.
-    """
-    names = ("precision", "stable", "slip", "turn", "slip_released", "turn_released")
-    return {
-        **{name: trial[name] for name in (*names, *LINEAGE_NAMES)},
-        "other_links_held": trial["lifted_other_links"],
-        "X_CG": pack_pose(multiply(X_CO, unpack_pose(trial["X_OG"]))),
-        "X_CG_held": pack_pose(multiply(X_CO, unpack_pose(trial["X_OG_lifted"]))),
-        "q": trial["closed_q"],
-        "q_held": trial["lifted_q"],
-        "f_Q_C": rotate_vectors(X_CO, trial["closed_f_Q_O"]),
-        "f_Q_C_held": rotate_vectors(X_CO, trial["lifted_f_Q_O"]),
-        "area": trial["closed_area"],
-        "area_held": trial["lifted_area"],
-    }
+    # All others are columns of the trial.
+    return values | {field.name: trial[field.of] for field in DATA_FIELDS if field.of}

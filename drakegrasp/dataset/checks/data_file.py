@@ -27,7 +27,7 @@ from drakegrasp.dataset.checks.findings import AnyArray, Batch, Findings, Violat
 from drakegrasp.dataset.checks.images import Lens
 from drakegrasp.dataset.checks.open_file import FilePlace, OpenFile
 from drakegrasp.dataset.paths import TRIALS_FILE
-from drakegrasp.dataset.schema import CONDITION_FIELDS, LINEAGE_NAMES, SHARED_FIELDS, SPLITS
+from drakegrasp.dataset.schema import DATA_FIELDS, SHARED_FIELDS, SPLITS
 from drakegrasp.outcomes import Outcome
 
 #: Samples in a batch: some 20 MB of images.
@@ -40,9 +40,8 @@ _CONTACTS = ("p_OQ", "nhat_Q_O", "f_Q_O")
 #: Fields of a trial from which a sample follows, or that say whether it may be one.
 COMPARED = (
     *("object", "outcome", "X_TO", "X_OG", "X_OG_lifted", "surface_distance", "normal_angle"),
-    *(f"{when}_{name}" for when in ("closed", "lifted") for name in ("q", "area", *_CONTACTS)),
-    *("precision", "stable", "slip", "turn", "slip_released", "turn_released"),
-    *("lifted_other_links", *LINEAGE_NAMES, *(field.name for field in CONDITION_FIELDS)),
+    *(f"{when}_{name}" for when in ("closed", "lifted") for name in _CONTACTS),
+    *(field.of for field in DATA_FIELDS if field.of),
 )
 
 
