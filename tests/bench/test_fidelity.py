@@ -65,7 +65,7 @@ def test_label_depends_on_the_drive_if_any_other_drive_changes_it(monkeypatch):
     """Three lifts: one that all drives hold, one that two drives lose, one that one loses."""
 
     class Record:
-        outcome, lifted = Outcome.SUCCESS, object()
+        outcome, lift = Outcome.SUCCESS, object()
 
     outcomes = {
         "lift.drive=torque": [Outcome.SUCCESS, Outcome.SLIPPED, Outcome.SUCCESS],
@@ -91,7 +91,7 @@ def test_lift_that_was_ended_is_compared_by_its_whole(monkeypatch):
     def lift_again(bench, attempt, prediction):
         tried.append(attempt)
         configs.append(bench.config)
-        return SimpleNamespace(outcome=Outcome.SUCCESS, lifted=object())
+        return SimpleNamespace(outcome=Outcome.SUCCESS, lift=object())
 
     def simulate(bench, attempts, variant, count):
         configs.append(bench.config)
@@ -100,7 +100,7 @@ def test_lift_that_was_ended_is_compared_by_its_whole(monkeypatch):
     monkeypatch.setattr(fidelity, "try_attempt", lift_again)
     monkeypatch.setattr(fidelity, "_simulate", simulate)
     records = [
-        SimpleNamespace(outcome=outcome, lifted=object())
+        SimpleNamespace(outcome=outcome, lift=object())
         for outcome in (Outcome.SUCCESS, Outcome.MOVED, Outcome.NOT_LIFTED)
     ]
     lifts = [fidelity.Simulated(i, record, None) for i, record in enumerate(records)]

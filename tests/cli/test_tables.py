@@ -72,7 +72,7 @@ def test_share_of_stable_ones_is_that_of_audited_lifts_where_lifts_were_chosen()
     assert ["1_mug", "120", "20", "12", "9", "80%", "0"] in map(
         str.split, text.getvalue().split("\n")
     )
-    assert "small: 100; of 11" in " ".join(text.getvalue().split())
+    assert "flat: 100; of 11" in " ".join(text.getvalue().split())
 
 
 @pytest.mark.parametrize("compact", [False, True])
