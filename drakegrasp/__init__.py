@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from drakegrasp.dataset.checks.findings import Violation
     from drakegrasp.dataset.checks.run import check_dataset
     from drakegrasp.dataset.reader import GraspDataset, Sample
+    from drakegrasp.dataset.trials import Trials
     from drakegrasp.errors import DrakegraspError
     from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp
     from drakegrasp.hand.description import Hand, load_hand
@@ -37,6 +38,7 @@ _HOMES = {
     "PlacedObject": "simulation.placement",
     "Replay": "build.replay",
     "Sample": "dataset.reader",
+    "Trials": "dataset.trials",
     "Verification": "verification.result",
     "Violation": "dataset.checks.findings",
     "build_dataset": "api",
@@ -62,6 +64,7 @@ __all__ = [
     "PlacedObject",
     "Replay",
     "Sample",
+    "Trials",
     "Verification",
     "Violation",
     "build_dataset",

@@ -68,7 +68,7 @@ HEAVY = (
     *("pydrake", "dask", "distributed", "trimesh", "scipy", "matplotlib", "rich", "pydantic"),
     *("yaml", "click", "torch"),
 )
-READERS = ("grasp", "dataset.schema", "dataset.shards", "dataset.reader")
+READERS = ("grasp", "dataset.schema", "dataset.shards", "dataset.reader", "dataset.trials")
 CHECKERS = ("dataset.checks.run", "dataset.assemble")
 
 

@@ -21,11 +21,9 @@ import numpy as np
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.filters import Removal
-from drakegrasp.dataset.hdf5 import read_names
-from drakegrasp.dataset.layout.opening import open_trials, read_codes
 from drakegrasp.dataset.manifest import installed_versions, read_manifest, refuse_older
-from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
 from drakegrasp.frames import unpack_pose
 from drakegrasp.hand.description import load_hand
@@ -192,32 +190,27 @@ def wilson_interval(hits: int, count: int, confidence: float = CONFIDENCE) -> tu
 
 def _read_lifts(out: Path) -> list[StoredLift]:
     """Return all lifts of a dataset, in the order of its rows: objects are together."""
-    path = out / TRIALS_FILE
-    with open_trials(path) as file:
-        trials, successes = file["trials"], file["successes"]
-        names = read_names(file["objects/name"])
-        objects = read_codes(trials["object"], len(names))
-        outcomes = read_codes(trials["outcome"], list(Outcome))
-        X_OG, spreads, resting = (trials[name][:] for name in ("X_OG", "spread", "resting"))
-        materials = {f.name: trials[f.name][:] for f in fields(Materials)}
-        # Only what was lifted has the time of a lift.
-        lifted = np.isfinite(trials["time_lift"][:])
-        kept = successes["trial_id"][:][successes["removal"][:] == Removal.KEPT]
-
-    samples = set(kept.tolist())
+    # Only what was lifted has the time of a lift.
+    trials = Trials(out).where(outcome=[Outcome.SUCCESS, *LOST])
+    trials = trials[np.isfinite(trials["time_lift"])]
+    names = [field.name for field in fields(Materials)]
+    columns = ("outcome", "object_name", "removal", "X_OG", "spread", "resting", *names)
     lifts = []
-    for row in np.flatnonzero(lifted & np.isin(outcomes, [Outcome.SUCCESS, *LOST])):
-        outcome = Outcome(int(outcomes[row]))
-        held: Group = "sample" if int(row) in samples else "removed"
+    for trial_id, *values in zip(
+        trials.trial_ids.tolist(), *trials.columns(columns).values(), strict=True
+    ):
+        row = dict(zip(columns, values, strict=True))
+        outcome = Outcome(int(row["outcome"]))
+        held: Group = "sample" if row["removal"] == Removal.KEPT else "removed"
         lifts.append(
             StoredLift(
-                trial_id=int(row),
-                object_name=names[objects[row]],
+                trial_id=trial_id,
+                object_name=row["object_name"],
                 group=held if outcome is Outcome.SUCCESS else "lost",
                 outcome=outcome,
-                resting=int(resting[row]),
-                pregrasp=Pregrasp(X_OG=unpack_pose(X_OG[row]), spread=float(spreads[row])),
-                materials=Materials(**{k: float(v[row]) for k, v in materials.items()}),
+                resting=int(row["resting"]),
+                pregrasp=Pregrasp(X_OG=unpack_pose(row["X_OG"]), spread=float(row["spread"])),
+                materials=Materials(**{name: float(row[name]) for name in names}),
             )
         )
     return lifts

@@ -22,6 +22,7 @@ from drakegrasp.build.target import Target, refuse_two_ends, target_of
 from drakegrasp.build.work_unit import WorkUnit, run_unit
 from drakegrasp.config import Config, SplitConfig
 from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
+from drakegrasp.dataset.assembly.split import may_train, rank_in_split, split_rule
 from drakegrasp.dataset.assembly.survey import headers_by_object
 from drakegrasp.dataset.card.files import write_card
 from drakegrasp.dataset.lock import Holder, build_lock
@@ -37,7 +38,6 @@ from drakegrasp.dataset.manifest import (
 )
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.shards import ShardHeader
-from drakegrasp.dataset.split import may_train, rank_in_split, split_rule
 from drakegrasp.dataset.statistics import is_assembled
 from drakegrasp.errors import DataError, DrakegraspError
 from drakegrasp.hand.description import load_hand

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from drakegrasp.build.attempts import TrialSetup, find_attempt, measure_contacts, try_attempt
 from drakegrasp.build.columns import trial_rows
 from drakegrasp.config import Config
-from drakegrasp.dataset.layout.opening import object_name, open_trials, read_trial
 from drakegrasp.dataset.manifest import installed_versions, read_manifest
-from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
 from drakegrasp.dataset.shards import trial_columns
+from drakegrasp.dataset.trials import Trials
 from drakegrasp.hand.description import load_hand
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.blas import one_thread
@@ -72,7 +72,7 @@ def replay_trial(out: str | Path, trial_id: int) -> Replay:
     now = installed_versions(config)
     return Replay(
         trial_id=trial_id,
-        object_name=stored.name,
+        object_name=stored.row["object_name"],
         recorded=Outcome(int(stored.row["outcome"])),
         found=Outcome(int(row["outcome"][0])),
         differences={
@@ -106,10 +106,9 @@ def record_trial(out: str | Path, trial_id: int, path: str | Path) -> Outcome:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _StoredTrial:
-    """A row of trials.hdf5 with the name of its object, and what to run it again with."""
+    """A row of trials.hdf5, and what to run it again with."""
 
-    row: dict[str, np.ndarray]
-    name: str
+    row: dict[str, Any]
     prepared: PreparedObject
     attempt: Attempt
     config: Config
@@ -118,26 +117,18 @@ class _StoredTrial:
 
 def _stored_trial(out: Path, trial_id: int) -> _StoredTrial:
     manifest = read_manifest(out)
-    row, name = _stored_row(out, trial_id)
+    row = Trials(out).trial(trial_id)
+    name = row["object_name"]
     config = manifest.config_of(name)
     prepared = load_prepared(out, name, config)
     candidate, standoff, child = (int(row[key]) for key in ("candidate", "standoff_index", "child"))
-    attempt = find_attempt(prepared, candidate, standoff, child, config)
     return _StoredTrial(
         row=row,
-        name=name,
         prepared=prepared,
-        attempt=attempt,
+        attempt=find_attempt(prepared, candidate, standoff, child, config),
         config=config,
         versions=manifest.versions,
     )
-
-
-def _stored_row(out: Path, trial_id: int) -> tuple[dict[str, np.ndarray], str]:
-    path = out / TRIALS_FILE
-    with open_trials(path) as file:
-        row = read_trial(file, trial_id)
-        return {f.name: row[f.name] for f in trial_columns()}, object_name(file, row)
 
 
 def _difference(a: np.ndarray, b: np.ndarray) -> float:

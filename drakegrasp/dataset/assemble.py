@@ -29,6 +29,7 @@ from drakegrasp.dataset.assembly.pack import (
     unpack_rows,
 )
 from drakegrasp.dataset.assembly.samples import TEXTS, SampleRows
+from drakegrasp.dataset.assembly.split import split_samples
 from drakegrasp.dataset.assembly.survey import (
     Survey,
     headers_by_object,
@@ -55,7 +56,6 @@ from drakegrasp.dataset.manifest import (
 from drakegrasp.dataset.paths import DATA_FILES, FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.rejections import AttemptKey, find_keys
 from drakegrasp.dataset.schema import OBJECT_FIELDS, SPLITS, SUCCESS_FIELDS, TRIAL_FIELDS
-from drakegrasp.dataset.split import split_samples
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array
 from drakegrasp.runtime.executor import Executor, in_order, run_here

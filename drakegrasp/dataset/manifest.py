@@ -34,6 +34,7 @@ from drakegrasp.config import (
     parse_stored,
 )
 from drakegrasp.dataset import log as build_log
+from drakegrasp.dataset.assembly.split import Rule, split_rule
 from drakegrasp.dataset.assembly.weights import number_poses
 from drakegrasp.dataset.layout.json_files import Name, read_mapping, validated
 from drakegrasp.dataset.paths import FILE_NAME, OWN_FILES, OWN_FOLDERS
@@ -45,7 +46,6 @@ from drakegrasp.dataset.schema import (
     refuse_other_schema,
 )
 from drakegrasp.dataset.shards import ShardHeader
-from drakegrasp.dataset.split import Rule, split_rule
 from drakegrasp.errors import ConfigError, DataError, GraspError
 from drakegrasp.frames import read_pose, unpack_pose
 from drakegrasp.hand.file_format import read_hand_file

@@ -6,8 +6,10 @@ While a build runs, or after it was stopped, the funnel is counted from the shar
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -16,20 +18,21 @@ import numpy.typing as npt
 from drakegrasp.dataset.assembly.survey import shards_sha256
 from drakegrasp.dataset.assembly.weights import effective_number
 from drakegrasp.dataset.filters import Removal
-from drakegrasp.dataset.hdf5 import open_hdf5, read_names, read_texts
-from drakegrasp.dataset.layout.opening import open_samples, open_trials, read_codes
+from drakegrasp.dataset.hdf5 import open_hdf5, read_names
+from drakegrasp.dataset.layout.opening import open_samples, open_trials
 from drakegrasp.dataset.manifest import read_manifest, refuse_older
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.schema import SCHEMA_VERSION, SPLITS
-from drakegrasp.dataset.shards import read_trials
+from drakegrasp.dataset.trials import NONE, Trials, shard_part
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.runtime.executor import Executor, run_here
 
-#: Rows that are read at a time.
-BLOCK = 1 << 20
-#: The columns that say how well a success holds.
-WORDS = ("precision", "stable")
+#: Columns of attempts that a funnel counts.
+_COUNTED = (
+    *("object", "outcome", "removal", "generation", "standoff_index", "audited", "slip"),
+    *("precision", "stable"),
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -157,46 +160,25 @@ def count_unfinished(out: Path) -> Unfinished | None:
     if is_assembled(out):
         return None
 
-    # Add up the outcomes and words of the shards that exist.
+    # Count the attempts of the shards that are whole.
     manifest = read_manifest(out)
     refuse_older(manifest, out)
-    names = [entry.name for entry in manifest.objects]
-    rows = {name: i for i, name in enumerate(names)}
-    outcomes, done = np.zeros((len(names), 1 + max(Outcome)), dtype=np.int64), 0
-    words = {word: np.zeros(len(names), dtype=np.int64) for word in WORDS}
-    refined = np.zeros((len(names), 3), dtype=np.int64)
-    audited = np.zeros((len(names), 4), dtype=np.int64)
+    entries = manifest.objects
+    numbers = {entry.name: number for number, entry in enumerate(entries)}
+    parts = []
     for header in manifest.headers():
-        try:
-            columns = ("outcome", "generation", "audited", "slip", *WORDS)
-            unit = read_trials(header.path(out), header, columns, verify_seal=False)
-        except DataError:
-            continue
-        row, first = rows[header.object_name], unit["generation"] == 0
-        outcomes[row] += np.bincount(unit["outcome"][first], minlength=1 + max(Outcome))
-        for word in WORDS:
-            words[word][row] += np.count_nonzero(unit[word][first])
-        held = unit["outcome"][~first] == Outcome.SUCCESS
-        refined[row] += (len(held), np.count_nonzero(held), 0)
-        chosen = unit["audited"] & first
-        ends = _audited_ends(unit["outcome"], unit["slip"], unit["stable"])
-        audited[row, :3] += [np.count_nonzero(end & chosen) for end in ends]
-        done += 1
+        with suppress(DataError):
+            parts.append(shard_part(out, header, numbers[header.object_name]))
+    objects = {
+        key: np.array([getattr(entry, key) for entry in entries])
+        for key in ("name", "class_name", "distinct", "valid")
+    }
+    funnel = funnel_of(Trials.of_parts(out, objects, parts))
 
-    funnel = Funnel(
-        names=tuple(names),
-        classes=tuple(entry.class_name for entry in manifest.objects),
-        candidates=np.array([entry.candidates for entry in manifest.objects], dtype=np.int64),
-        distinct=np.array([entry.distinct for entry in manifest.objects], dtype=np.int64),
-        valid=np.array([entry.valid for entry in manifest.objects], dtype=np.int64),
-        outcomes=outcomes,
-        precision=words["precision"],
-        stable=words["stable"],
-        removals=np.zeros((len(names), 1 + max(Removal)), dtype=np.int64),
-        refined=refined,
-        audited=audited,
-    )
-    return Unfinished(funnel=funnel, done=done, total=manifest.units)
+    # Palm poses that are still to be tried count, too.
+    planned = np.array([entry.candidates for entry in entries], dtype=np.int64)
+    funnel = replace(funnel, candidates=planned)
+    return Unfinished(funnel=funnel, done=len(parts), total=manifest.units)
 
 
 def count_funnel(out: Path) -> Funnel:
@@ -205,76 +187,57 @@ def count_funnel(out: Path) -> Funnel:
     Raises:
         DataError: If trials.hdf5 is missing or damaged.
     """
-    return funnel_of(out / TRIALS_FILE)
+    return funnel_of(Trials(out, any_name=True))
 
 
-def funnel_of(path: Path) -> Funnel:
-    """Return the funnel that a file of trials tells, as `count_funnel`."""
-    # The columns that are counted, a block of rows after the other.
-    with open_trials(path) as file:
-        objects, trials, successes = (file[name] for name in ("objects", "trials", "successes"))
-        names, classes = (read_texts(objects[key]) for key in ("name", "class_name"))
-        counts = {key: objects[key][:] for key in ("distinct", "valid")}
-        count, rows = len(names), len(trials["outcome"])
-        success = read_codes(successes["trial_id"], rows)
-        removal = read_codes(successes["removal"], list(Removal))
-        outcomes = np.zeros((count, 1 + max(Outcome)), dtype=np.int64)
-        held = {word: np.zeros(count, dtype=np.int64) for word in WORDS}
-        owner = np.zeros(len(success), dtype=np.int32)
-        born = np.zeros(len(success), dtype=np.bool_)
-        fair, audited = np.zeros(len(success), np.bool_), np.zeros((count, 4), np.int64)
-        candidates, refined = np.zeros(count, np.int64), np.zeros((count, 3), np.int64)
-        for start in range(0, rows, BLOCK):
-            block = slice(start, start + BLOCK)
-            index = read_codes(trials["object"], count, block)
-            outcome = read_codes(trials["outcome"], list(Outcome), block)
-            # In files of an older schema all are of the first round.
-            later = np.zeros(len(index), dtype=np.bool_)
-            if "generation" in trials:
-                later = trials["generation"][block] > 0
+def funnel_of(trials: Trials) -> Funnel:
+    """Return the funnel of attempts, as `count_funnel`."""
+    names = trials.objects["name"]
+    count = len(names)
+    outcomes = np.zeros((count, 1 + max(Outcome)), dtype=np.int64)
+    removals = np.zeros((count, 1 + max(Removal)), dtype=np.int64)
+    candidates, precision, stable = np.zeros((3, count), dtype=np.int64)
+    refined, audited = np.zeros((count, 3), np.int64), np.zeros((count, 4), np.int64)
+    for block in trials.blocks(_COUNTED):
+        number, outcome, removal = (block[name] for name in ("object", "outcome", "removal"))
+        if not np.isin(removal, [*Removal, NONE]).all():
+            raise DataError(f"{trials.path}: /successes/removal must be 0 to {max(Removal)}")
+        held, sample = outcome == Outcome.SUCCESS, removal == Removal.KEPT
 
-            # Palm poses, outcomes and words of the first round; what was refined from it.
-            first = index[~later]
-            begun = first[trials["standoff_index"][block][~later] == 0]
-            candidates += np.bincount(begun, minlength=count)
-            outcomes += _count_pairs(first, outcome[~later], count, 1 + max(Outcome))
-            for word, numbers in held.items():
-                numbers += np.bincount(index[trials[word][block] & ~later], minlength=count)
-            refined[:, 0] += np.bincount(index[later], minlength=count)
+        # Palm poses, outcomes, how well they hold and removals of the first round.
+        first = block["generation"] == 0
+        _count(candidates, number[first & (block["standoff_index"] == 0)])
+        _count(outcomes, (number[first], outcome[first]))
+        _count(precision, number[first & block["precision"]])
+        _count(stable, number[first & block["stable"]])
+        decided = first & (removal != NONE)
+        _count(removals, (number[decided], removal[decided]))
 
-            # The audited of the first round, and whose the successes are.
-            chosen = np.zeros(len(index), dtype=np.bool_)
-            if "audited" in trials:
-                chosen = trials["audited"][block] & ~later
-            ends = _audited_ends(outcome, trials["slip"][block], trials["stable"][block])
-            for k, end in enumerate(ends):
-                audited[:, k] += np.bincount(index[end & chosen], minlength=count)
-            here = (success >= start) & (success < start + BLOCK)
-            own = success[here] - start
-            owner[here], born[here], fair[here] = index[own], later[own], chosen[own]
+        # What was refined from it, and what became of those that were lifted in any case.
+        for column, counted in zip(refined.T, (True, held, sample), strict=True):
+            _count(column, number[~first & counted])
+        fair, lifted = first & block["audited"], np.isfinite(block["slip"])
+        for column, counted in zip(audited.T, (lifted, held, block["stable"], sample), strict=True):
+            _count(column, number[fair & counted])
 
-    audited[:, 3] = np.bincount(owner[fair & (removal == Removal.KEPT)], minlength=count)
-    refined[:, 1] = np.bincount(owner[born], minlength=count)
-    refined[:, 2] = np.bincount(owner[born & (removal == Removal.KEPT)], minlength=count)
     return Funnel(
-        names=names,
-        classes=classes,
+        names=tuple(names.tolist()),
+        classes=tuple(trials.objects["class_name"].tolist()),
         candidates=candidates,
-        **counts,
+        distinct=trials.objects["distinct"],
+        valid=trials.objects["valid"],
         outcomes=outcomes,
-        precision=held["precision"],
-        stable=held["stable"],
-        removals=_count_pairs(owner[~born], removal[~born], count, 1 + max(Removal)),
+        precision=precision,
+        stable=stable,
+        removals=removals,
         refined=refined,
         audited=audited,
     )
 
 
-def _audited_ends(
-    outcome: npt.NDArray[np.generic], slip: npt.NDArray[np.generic], stable: npt.NDArray[np.generic]
-) -> tuple[npt.NDArray[np.bool_], ...]:
-    """Return which attempts (n,) were lifted, which are held and which are stable."""
-    return np.isfinite(slip), outcome == Outcome.SUCCESS, stable.astype(bool)
+def _count(counts: npt.NDArray[np.int64], cells: Any) -> None:
+    """Add to an array of counts how often each of its cells occurs."""
+    np.add.at(counts, cells, 1)
 
 
 def why_no_samples(funnel: Funnel) -> dict[str, str]:
@@ -361,12 +324,3 @@ def splits_of(path: Path) -> list[SplitCount]:
 def _effective(group: h5py.Group) -> float:
     weights = group.get("grasp_props/weight")
     return np.nan if weights is None else effective_number(weights[:])
-
-
-def _count_pairs(
-    rows: npt.NDArray[np.int32], columns: npt.NDArray[np.uint8], height: int, width: int
-) -> npt.NDArray[np.int64]:
-    """Return how often each pair of a row and a column occurs, (height, width)."""
-    counts = np.zeros((height, width), dtype=np.int64)
-    np.add.at(counts, (rows, columns), 1)
-    return counts

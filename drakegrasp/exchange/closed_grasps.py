@@ -11,11 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from drakegrasp.dataset.hdf5 import read_names
-from drakegrasp.dataset.layout.opening import open_trials, read_codes, refuse_other_codes
-from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
-from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.schema import SPLITS
+from drakegrasp.dataset.layout.opening import refuse_other_codes
+from drakegrasp.dataset.paths import DATA_FILES
+from drakegrasp.dataset.trials import Trials, sample_ids
 from drakegrasp.frames import Array, unpack_pose
 
 
@@ -48,31 +46,22 @@ def read_closed_grasps(out: Path) -> Iterator[ClosedGrasp]:
         DataError: If a file of the dataset is missing or not of the dataset.
     """
     # Which trials are samples, and of which split.
-    split_of: dict[int, str] = {}
-    for split in SPLITS:
-        data = GraspDataset(out / DATA_FILES["oto"], split=split)
-        split_of |= dict.fromkeys(data.column("trial_id").tolist(), split)
+    trials = Trials(out)
+    ids = sample_ids(out)
+    split_of = {row: split for split, rows in ids.items() for row in rows.tolist()}
     rows = np.array(sorted(split_of), dtype=np.int64)
+    refuse_other_codes(out / DATA_FILES["oto"], "trial_id", rows, len(trials))
 
-    # Their postures, from the file of all trials.
-    path = out / TRIALS_FILE
-    with open_trials(path) as file:
-        trials = file["trials"]
-        names = read_names(file["objects/name"])
-        refuse_other_codes(out / DATA_FILES["oto"], "trial_id", rows, len(trials["object"]))
-        objects = read_codes(trials["object"], len(names))[rows]
-        X_TO, X_OG, q, spread = (
-            trials[key][rows] for key in ("X_TO", "X_OG", "closed_q", "spread")
-        )
-
+    # Their postures.
+    samples = trials[rows].columns(("object_name", "X_TO", "X_OG", "closed_q", "spread"))
+    X_TO, X_OG = (unpack_pose(samples[name]) for name in ("X_TO", "X_OG"))
     for i, row in enumerate(rows.tolist()):
-        pose = unpack_pose(X_TO[i])
         yield ClosedGrasp(
             trial_id=row,
             split=split_of[row],
-            object_name=str(names[objects[i]]),
-            X_TO=pose,
-            X_TG=pose @ unpack_pose(X_OG[i]),
-            q=q[i],
-            spread=float(spread[i]),
+            object_name=samples["object_name"][i],
+            X_TO=X_TO[i],
+            X_TG=X_TO[i] @ X_OG[i],
+            q=samples["closed_q"][i],
+            spread=float(samples["spread"][i]),
         )

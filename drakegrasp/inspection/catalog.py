@@ -20,8 +20,6 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import Config, parse_stored
-from drakegrasp.dataset.hdf5 import read_texts
-from drakegrasp.dataset.layout.opening import open_trials
 from drakegrasp.dataset.manifest import Manifest, read_manifest
 from drakegrasp.dataset.paths import (
     ASSEMBLED_FILES,
@@ -33,16 +31,9 @@ from drakegrasp.dataset.paths import (
 from drakegrasp.dataset.rejections import AttemptKey
 from drakegrasp.dataset.schema import SCHEMA_VERSION
 from drakegrasp.dataset.shards import ShardHeader
+from drakegrasp.dataset.trials import Stamp, TrialPart, Trials, sample_ids, shard_part, stamp
 from drakegrasp.errors import DataError
-from drakegrasp.inspection.table import (
-    AttemptTable,
-    empty_table,
-    join,
-    read_sample_ids,
-    read_shard_part,
-    read_trials_table,
-    rows_within,
-)
+from drakegrasp.inspection.table import AttemptTable, first_rows, join, read_table
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.json_text import parse_json
 from drakegrasp.runtime.names import is_name
@@ -51,8 +42,6 @@ from drakegrasp.runtime.names import is_name
 LISTING_PERIOD = 5.0
 #: Damaged shards that are named.
 NAMED = 3
-#: What changes when a file is replaced; None if it is not there.
-Stamp = tuple[int, ...] | None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -66,8 +55,8 @@ class Snapshot:
         own_hashes: That of each object with a seed of its own, by its name.
         names, classes: Of the objects, by their number.
         meshes: Hashes of the objects' meshes, hexadecimal.
-        table: The attempts.
-        sources: Files that hold the attempts; `AttemptTable.source` counts them.
+        trials: The attempts, in their files.
+        table: What is kept of them in memory.
         sample_ids: Trial ids of the samples by split, in rising order.
         assembled: Whether the attempts are rows of trials.hdf5; else they are of shards.
         stamps: Of the assembled files; shards never change.
@@ -80,8 +69,8 @@ class Snapshot:
     names: tuple[str, ...]
     classes: tuple[str, ...]
     meshes: tuple[str, ...]
+    trials: Trials
     table: AttemptTable
-    sources: tuple[Path, ...]
     sample_ids: dict[str, npt.NDArray[np.int64]]
     assembled: bool
     own_hashes: Mapping[str, str] = field(default_factory=dict)
@@ -138,7 +127,7 @@ class Snapshot:
 
     def trial_id(self, i: int) -> int | None:
         """Return the row of an attempt in trials.hdf5, or None before there is one."""
-        return int(self.table.row[i]) if self.assembled else None
+        return i if self.assembled else None
 
     def refuse_replaced(self) -> None:
         """Refuse what was just read if a file was replaced while it was being read.
@@ -146,8 +135,8 @@ class Snapshot:
         Raises:
             DataError: If a file was replaced.
         """
-        for path, stamp in self.stamps.items():
-            if _stamp(path) != stamp:
+        for path, before in self.stamps.items():
+            if stamp(path) != before:
                 raise DataError(f"{path}: must stay while it is read, got another; load it again")
 
 
@@ -164,7 +153,7 @@ class Catalog:
     def __init__(self, out: Path) -> None:
         self.out = out
         self._lock = threading.Lock()
-        self._parts: dict[ShardHeader, AttemptTable] = {}
+        self._parts: dict[ShardHeader, tuple[TrialPart, AttemptTable]] = {}
         self._stamps: dict[Path, Stamp] = {}
         self._listed = -LISTING_PERIOD
         # The assembled files, if there are any, and the manifest of a build that is not in them.
@@ -180,7 +169,7 @@ class Catalog:
             DataError: If they cannot be read.
         """
         with self._lock:
-            stamps = {self.out / n: _stamp(self.out / n) for n in (*ASSEMBLED_FILES, FILE_NAME)}
+            stamps = {self.out / n: stamp(self.out / n) for n in (*ASSEMBLED_FILES, FILE_NAME)}
             changed = self._snapshot is None or stamps != self._stamps
             if changed:
                 self._read_files(stamps)
@@ -219,26 +208,33 @@ class Catalog:
     def _read_shards(self, manifest: Manifest) -> Snapshot:
         """Return the state of a build that runs or was stopped."""
         # Shards never change: only new ones are read. Those of objects that are gone are dropped.
-        numbers = {entry.name: i for i, entry in enumerate(manifest.objects)}
+        entries = manifest.objects
+        numbers = {entry.name: i for i, entry in enumerate(entries)}
+        objects = {
+            key: np.array([getattr(entry, key) for entry in entries], dtype=object)
+            for key in ("name", "class_name")
+        }
         parts, damaged = {}, []
         for header in _done_headers(self.out, manifest):
             try:
-                if (part := self._parts.get(header)) is None:
-                    part = read_shard_part(self.out, header, 0, numbers[header.object_name])
-                parts[header] = part
+                if (read := self._parts.get(header)) is None:
+                    part = shard_part(self.out, header, numbers[header.object_name])
+                    read = part, read_table(Trials.of_parts(self.out, objects, [part]))
+                parts[header] = read
             except DataError:
                 damaged.append(header.path(self.out).relative_to(self.out))
         self._parts = parts
 
-        # The number of a shard is its place among those that are there, and that of its object
-        # the place in this manifest, which may have grown.
+        # The number of an object is its place in this manifest, which may have grown.
         wanted: dict[str, int | None] = dict.fromkeys(numbers, manifest.config.max_grasps)
-        cut = []
-        for number, (header, part) in enumerate(parts.items()):
+        cut, tables = [], []
+        for header, (part, table) in parts.items():
             name = header.object_name
-            part.source[:], part.object[:] = number, numbers[name]
-            rows, wanted[name] = rows_within(part, wanted[name])
-            cut.append(rows)
+            table.object[:] = numbers[name]
+            rows, wanted[name] = first_rows(table, wanted[name])
+            cut.append(replace(part, count=len(rows), object=numbers[name]))
+            tables.append(rows)
+        trials = Trials.of_parts(self.out, objects, cut)
 
         missing = [
             f"{TRIALS_FILE} and the data files are not there yet: {len(parts):,} of "
@@ -252,11 +248,11 @@ class Catalog:
             out=self.out,
             config=manifest.config,
             config_hash=manifest.config.simulation_hash(),
-            names=tuple(entry.name for entry in manifest.objects),
-            classes=tuple(entry.class_name for entry in manifest.objects),
-            meshes=tuple(entry.mesh_sha256 for entry in manifest.objects),
-            table=join(cut) if cut else empty_table(),
-            sources=tuple(header.path(self.out) for header in parts),
+            names=tuple(entry.name for entry in entries),
+            classes=tuple(entry.class_name for entry in entries),
+            meshes=tuple(entry.mesh_sha256 for entry in entries),
+            trials=trials,
+            table=join(tables) if tables else read_table(trials),
             sample_ids={},
             assembled=False,
             own_hashes=_own_hashes(self.out),
@@ -279,17 +275,15 @@ def _read_assembled(out: Path, stamps: Mapping[Path, Stamp]) -> tuple[Snapshot, 
     Nothing but that file has to be there.
     """
     # Objects and configuration.
-    path = out / TRIALS_FILE
-    with open_trials(path) as file:
-        try:
-            config = parse_stored(parse_json(file.attrs["config"]))
-        except ValueError as error:
-            raise DataError(f"{path}: attribute config must be one, got {error}") from None
-        names, classes, meshes = (
-            read_texts(file["objects"][key]) for key in ("name", "class_name", "mesh_sha256")
-        )
-        config_hash = str(file.attrs.get("config_hash", ""))
-        signature = str(file.attrs.get("signature", ""))
+    trials = Trials(out, any_name=True)
+    try:
+        config = parse_stored(parse_json(trials.attributes["config"]))
+    except ValueError as error:
+        path = out / TRIALS_FILE
+        raise DataError(f"{path}: attribute config must be one, got {error}") from None
+    names, classes, meshes = (
+        tuple(trials.objects[key].tolist()) for key in ("name", "class_name", "mesh_sha256")
+    )
 
     # What else there is.
     missing = [
@@ -304,19 +298,19 @@ def _read_assembled(out: Path, stamps: Mapping[Path, Stamp]) -> tuple[Snapshot, 
     state = Snapshot(
         out=out,
         config=config,
-        config_hash=config_hash,
+        config_hash=str(trials.attributes.get("config_hash", "")),
         names=names,
         classes=classes,
         meshes=meshes,
-        table=read_trials_table(path),
-        sources=(path,),
-        sample_ids=read_sample_ids(out),
+        trials=trials,
+        table=read_table(trials),
+        sample_ids=sample_ids(out),
         assembled=True,
         own_hashes=_own_hashes(out),
-        stamps={path: stamp for path, stamp in stamps.items() if path.name in ASSEMBLED_FILES},
+        stamps={path: then for path, then in stamps.items() if path.name in ASSEMBLED_FILES},
         missing=tuple(missing),
     )
-    return state, signature
+    return state, str(trials.attributes.get("signature", ""))
 
 
 def _own_hashes(out: Path) -> dict[str, str]:
@@ -378,11 +372,3 @@ def _names_in(folder: Path) -> frozenset[str]:
         return frozenset(os.listdir(folder))
     except OSError:
         return frozenset()
-
-
-def _stamp(path: Path) -> Stamp:
-    try:
-        status = path.stat()
-    except OSError:
-        return None
-    return status.st_ino, status.st_size, status.st_mtime_ns

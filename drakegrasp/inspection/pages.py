@@ -18,6 +18,7 @@ from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.rejections import FILE_NAME, Decisions
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.dataset.suspicion import PARTS
+from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import printable
 from drakegrasp.inspection.catalog import Snapshot
 from drakegrasp.inspection.links import Links
@@ -33,7 +34,6 @@ from drakegrasp.inspection.query import (
     count_decisions,
 )
 from drakegrasp.inspection.rows import THUMBNAIL, contact_dots, read_rows
-from drakegrasp.inspection.table import NONE
 from drakegrasp.outcomes import Outcome
 from drakegrasp.visualization.style import FINGER_COLOURS
 

@@ -10,10 +10,10 @@ import numpy as np
 
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.statistics import count_splits
+from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DataError
 from drakegrasp.inspection.catalog import Snapshot
 from drakegrasp.inspection.query import QUANTITIES
-from drakegrasp.inspection.table import NONE
 from drakegrasp.outcomes import Outcome
 from drakegrasp.visualization.distributions import (
     draw_counts,

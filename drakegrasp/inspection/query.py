@@ -15,9 +15,9 @@ import numpy.typing as npt
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.rejections import Decisions
 from drakegrasp.dataset.schema import SPLITS
+from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DataError
 from drakegrasp.inspection.catalog import Snapshot
-from drakegrasp.inspection.table import NONE
 from drakegrasp.outcomes import Outcome
 
 

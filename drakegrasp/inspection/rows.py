@@ -13,14 +13,12 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.hdf5 import open_hdf5
-from drakegrasp.dataset.layout.opening import read_cell
 from drakegrasp.dataset.paths import DATA_FILES, shards_folder
-from drakegrasp.dataset.schema import CERTIFICATE_FIELDS, SPLITS, TRIAL_FIELDS
-from drakegrasp.dataset.shards import ASSEMBLED_FIELDS
-from drakegrasp.errors import DataError
+from drakegrasp.dataset.schema import CERTIFICATE_FIELDS, SPLITS
+from drakegrasp.dataset.shards import trial_columns
+from drakegrasp.dataset.trials import NONE
 from drakegrasp.frames import invert_pose, rotate_vectors, transform_points, unpack_pose
 from drakegrasp.inspection.catalog import Snapshot
-from drakegrasp.inspection.table import NONE
 from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, intrinsics, project
 from drakegrasp.visualization.style import HIDDEN
 
@@ -28,7 +26,6 @@ from drakegrasp.visualization.style import HIDDEN
 THUMBNAIL = ("X_TO", "X_OG", "X_C0C", "closed_p_OQ", "closed_nhat_Q_O")
 #: Length of the arrows along the normals [m].
 ARROW = 0.03
-_FIELDS = {field.name: field for field in TRIAL_FIELDS}
 _CAMERA_POSES = {"oto": camera_pose_oto, "otm": camera_pose_otm}
 
 
@@ -77,26 +74,10 @@ def read_rows(
     Raises:
         DataError: If a file was replaced meanwhile.
     """
-    columns = names or [f.name for f in TRIAL_FIELDS if f.name not in ASSEMBLED_FIELDS]
-    table, rows = snapshot.table, []
-    files: dict[int, h5py.File] = {}
-    try:
-        for i in places:
-            number = int(table.source[i])
-            if number not in files:
-                files[number] = open_hdf5(snapshot.sources[number])
-                if not snapshot.assembled and not _is_shard_of(snapshot, i, files[number]):
-                    raise ValueError(f"{snapshot.sources[number]} is of another mesh")
-            trials = files[number]["trials"]
-            rows.append({name: read_cell(trials, _FIELDS[name], table.row[i]) for name in columns})
-    except (OSError, KeyError, ValueError, IndexError) as error:
-        raise DataError(f"{snapshot.out}: files have changed meanwhile ({error})") from None
-    finally:
-        for file in files.values():
-            file.close()
-    # A file is opened by its name: it may have been another one.
-    snapshot.refuse_replaced()
-    return rows
+    columns = snapshot.trials[places].columns(names or [f.name for f in trial_columns()])
+    return [
+        dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)
+    ]
 
 
 def read_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
@@ -120,7 +101,7 @@ def read_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
 
 def _sample_look(snapshot: Snapshot, i: int, camera: str) -> Look | None:
     split = SPLITS[snapshot.table.split[i]]
-    row = int(np.searchsorted(snapshot.sample_ids[split], snapshot.table.row[i]))
+    row = int(np.searchsorted(snapshot.sample_ids[split], i))
     path = snapshot.out / DATA_FILES[camera]
     if not path.is_file():
         return _shard_look(snapshot, i, camera)
@@ -203,11 +184,11 @@ def read_certificate(snapshot: Snapshot, i: int) -> dict[str, float]:
     Raises:
         DataError: If a file was replaced meanwhile.
     """
-    table = snapshot.table
     group, key = ("successes", "trial_id") if snapshot.assembled else ("looks", "row")
+    part, row = snapshot.trials.part_of(i)
     try:
-        with open_hdf5(snapshot.sources[table.source[i]]) as file:
-            (found,) = np.nonzero(file[group][key][:] == table.row[i])
+        with open_hdf5(part.path) as file:
+            (found,) = np.nonzero(file[group][key][:] == row)
             certificate = {f.name: float(file[group][f.name][found[0]]) for f in CERTIFICATE_FIELDS}
     except (OSError, KeyError, ValueError, IndexError):
         certificate = {f.name: float("nan") for f in CERTIFICATE_FIELDS}

@@ -19,6 +19,7 @@ from drakegrasp.build.replay import replay_trial
 from drakegrasp.build.work_unit import WorkUnit, run_unit
 from drakegrasp.config import Config, load_config, override_config
 from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.assembly.split import rank_in_split, split_samples
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.manifest import read_manifest
@@ -29,7 +30,6 @@ from drakegrasp.dataset.rejections import (
     read_decisions,
     write_decisions,
 )
-from drakegrasp.dataset.split import rank_in_split, split_samples
 from drakegrasp.dataset.statistics import count_funnel, count_splits
 from drakegrasp.frames import unpack_pose
 from drakegrasp.inspection.catalog import Catalog
@@ -198,7 +198,7 @@ def test_pictures_are_of_the_first_round_in_one_resting_pose(refined: Path) -> N
     first = columns["generation"] == 0
     counts = np.bincount(columns["resting"][own & first])
     assert (own & ~first).any() and 0 < counts.max() < counts.sum()
-    shown = read_approaches(refined, 0, name, read_manifest(refined).config_of(name))
+    shown = read_approaches(refined, name, read_manifest(refined).config_of(name))
     assert len(shown.successes) == counts.max()
     pose = (columns["object"] == 0) & first & (columns["resting"] == counts.argmax())
     assert shown.attempts == np.count_nonzero(pose)

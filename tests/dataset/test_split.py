@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drakegrasp.config import SplitConfig
-from drakegrasp.dataset.split import may_train, split_rule, split_samples
+from drakegrasp.dataset.assembly.split import may_train, split_rule, split_samples
 
 NAMES = ["a1", "a2", "a3", "b1", "c1", "c2"]
 CLASSES = ["a", "a", "a", "b", "c", "c"]

@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_info
 
 from drakegrasp.build.prepare import prepare
 from drakegrasp.config import BuiltinConfig, SplitConfig, load_config
-from drakegrasp.dataset.split import split_samples
+from drakegrasp.dataset.assembly.split import split_samples
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.builtin.catalog import export_builtin

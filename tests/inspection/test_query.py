@@ -11,10 +11,11 @@ import pytest
 from helpers.pages import numbered
 
 from drakegrasp.dataset.rejections import AttemptKey, Decisions
+from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DataError
 from drakegrasp.inspection.catalog import Catalog, Snapshot
 from drakegrasp.inspection.query import QUANTITIES, Query, parse_query, select
-from drakegrasp.inspection.table import FEATURES, NONE
+from drakegrasp.inspection.table import FEATURES
 
 NOTHING = Decisions()
 

@@ -27,6 +27,7 @@ from drakegrasp.dataset.statistics import (
     split_rule_of,
     splits_of,
 )
+from drakegrasp.dataset.trials import Trials
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file, hand_names
 from drakegrasp.outcomes import Outcome
@@ -97,7 +98,7 @@ def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
         DataError: If one of the files is missing or damaged.
     """
     # The manifest has more objects than the files while a build goes on that adds some.
-    funnel = funnel_of(trials)
+    funnel = funnel_of(Trials(trials, any_name=True))
     entries = [entry for entry in manifest.objects if entry.name in funnel.names]
 
     # The known limits, and one that follows from the counts.

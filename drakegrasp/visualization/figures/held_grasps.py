@@ -1,7 +1,6 @@
 """Held grasps as arrays: numbers of all of them, and approaches by object.
 
-In: trials.hdf5. Out: arrays. It is read in blocks and by object: all of a large file would fill the
-memory.
+In: the attempts of a dataset. Out: arrays.
 """
 
 from __future__ import annotations
@@ -15,9 +14,8 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import norm
 from drakegrasp.config import Config
-from drakegrasp.dataset.layout.opening import open_trials
-from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.dataset.trials import Trials
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.outcomes import Outcome
 from drakegrasp.visualization.figures.approach_map import ObjectApproaches
@@ -28,8 +26,6 @@ COLUMNS = (
     *("slip", "turn", "closed_f_Q_O", "lifted_f_Q_O", "lifted_penetration", "normal_angle"),
     *("precision", "stable"),
 )
-#: Rows that are read at once: 8 chunks of a column.
-BLOCK = 16_384
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -53,33 +49,18 @@ def read_held(out: Path) -> HeldGrasps:
     Raises:
         DataError: If trials.hdf5 is missing or damaged.
     """
-    # Block by block; most rows are failures.
-    ids: list[npt.NDArray[np.int64]] = []
-    parts: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in COLUMNS}
-    path = out / TRIALS_FILE
-    with open_trials(path) as file:
-        trials = file["trials"]
-        held = trials["outcome"][:] == Outcome.SUCCESS
-        if "generation" in trials:
-            held &= trials["generation"][:] == 0
-        (rows,) = np.nonzero(held)
-        for start in range(0, len(trials["outcome"]), BLOCK):
-            picked = rows[(rows >= start) & (rows < start + BLOCK)] - start
-            ids.append(picked + start)
-            for name in COLUMNS:
-                if len(picked) or not start:
-                    parts[name].append(trials[name][start : start + BLOCK][picked])
-    columns = {name: np.concatenate(values) for name, values in parts.items()}
+    held = Trials(out).where(outcome=Outcome.SUCCESS, refined=False)
+    columns = held.columns(COLUMNS)
 
     degrees = np.rad2deg(1.0)
     closed, lifted = (norm(columns[f"{when}_f_Q_O"]) for when in ("closed", "lifted"))
     angles = np.nan_to_num(columns["normal_angle"])
     return HeldGrasps(
-        trial_ids=np.concatenate([np.zeros(0, np.int64), *ids]),
+        trial_ids=held.trial_ids,
         groups={
-            "held": np.ones(len(rows), dtype=np.bool_),
-            "precision": columns["precision"].astype(np.bool_),
-            "stable": columns["stable"].astype(np.bool_),
+            "held": np.ones(len(held), dtype=np.bool_),
+            "precision": columns["precision"],
+            "stable": columns["stable"],
         },
         quantities={
             "slip in the hand [mm]": 1e3 * columns["slip"],
@@ -98,34 +79,27 @@ def _largest(values: npt.NDArray[Any]) -> Array:
     return np.asarray(values.max(axis=1, initial=0.0))
 
 
-def read_approaches(out: Path, number: int, name: str, config: Config) -> ObjectApproaches:
+def read_approaches(out: Path, name: str, config: Config) -> ObjectApproaches:
     """Return from where an object was approached first, in the resting pose that held most.
 
     Args:
         out: Directory of the dataset.
-        number: Of the object, row of `/objects`.
         name: Of the object.
         config: Of the object, see `Manifest.config_of`.
 
     Raises:
         DataError: If a file is missing or damaged.
     """
-    # The attempts of the object, which are beside each other. A picture shows one pose.
+    # The attempts of the object at the pose in which most are held: a picture shows one pose.
     prepared = load_prepared(out, name, config)
-    with open_trials(out / TRIALS_FILE) as file:
-        trials = file["trials"]
-        own_round = (trials["object"][:] == number) & (trials["generation"][:] == 0)
-        resting = trials["resting"][:]
-        won = own_round & (trials["outcome"][:] == Outcome.SUCCESS)
-        pose = int(np.bincount(resting[won], minlength=1).argmax())
-        (rows,) = np.nonzero(own_round & (resting == pose))
-        part = slice(int(rows[0]), int(rows[-1]) + 1) if len(rows) else slice(0, 0)
-        own = rows - part.start
-        outcome, packed, standoff, precision, stable = (
-            trials[key][part][own]
-            for key in ("outcome", "X_OG", "standoff_index", "precision", "stable")
-        )
-    X_OG = np.array([unpack_pose(pose) for pose in packed]).reshape(-1, 4, 4)
+    first = Trials(out).where(object_name=name, refined=False)
+    resting, held = first["resting"], first["outcome"] == Outcome.SUCCESS
+    pose = int(np.bincount(resting[held], minlength=1).argmax())
+    own = first[resting == pose].columns(
+        ("outcome", "X_OG", "standoff_index", "precision", "stable")
+    )
+    outcome, packed, standoff, precision, stable = own.values()
+    X_OG = unpack_pose(packed)
 
     # Attempts whose palm ray misses do not approach the object.
     won, approached = outcome == Outcome.SUCCESS, outcome != Outcome.RAY_MISS
@@ -138,7 +112,7 @@ def read_approaches(out: Path, number: int, name: str, config: Config) -> Object
         vertices=prepared.model.visual_vertices,
         faces=prepared.model.visual_faces,
         R_TO=X_TO[:3, :3],
-        attempts=len(rows),
+        attempts=len(outcome),
         directions=directions[approached & ~won],
         rays=np.stack([p_OG, p_OG + reach[:, None] * z_O], axis=1),
         successes=directions[won],

@@ -15,10 +15,9 @@ import numpy as np
 from pydrake.geometry import LightParameter
 
 from drakegrasp.config import Config
-from drakegrasp.dataset.layout.opening import object_name, open_trials, read_trial
 from drakegrasp.dataset.manifest import read_manifest
-from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
 from drakegrasp.frames import X_WT, Array, transform_points, unpack_pose
 from drakegrasp.hand.description import load_hand
@@ -78,14 +77,12 @@ def load_trial(out: Path, trial_id: int, *, table_size: float = TABLE_SIZE) -> T
         DataError: If the trial does not exist, or ended before the lift.
     """
     # Read the trial.
-    path = out / TRIALS_FILE
-    with open_trials(path) as file:
-        row = read_trial(file, trial_id)
-        name = object_name(file, row)
+    row = Trials(out).trial(trial_id)
+    name = row["object_name"]
     config = read_manifest(out).config_of(name)
     outcome = Outcome(int(row["outcome"]))
     if outcome.stage is not Stage.LIFTED:
-        raise DataError(f"{path}: trial {trial_id} must have been lifted, got {outcome.label}")
+        raise DataError(f"{out}: trial {trial_id} must have been lifted, got {outcome.label}")
 
     # Poses of palm and object at the start, and after the lift.
     X_WO = X_WT @ unpack_pose(row["X_TO"])

@@ -257,7 +257,7 @@ def _approaches(data: _Dataset) -> _Drawn:
     if not shown:
         raise DataError("no attempt succeeded")
     names, config_of = data.funnel.names, data.manifest.config_of
-    items = [read_approaches(data.out, i, names[i], config_of(names[i])) for i in shown]
+    items = [read_approaches(data.out, names[i], config_of(names[i])) for i in shown]
     figure = approaches_figure(items, left_out=int(np.count_nonzero(held)) - len(shown))
     numbers = {
         item.name: {

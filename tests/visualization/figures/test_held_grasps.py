@@ -1,4 +1,4 @@
-"""Held grasps as arrays: block by block as at once, and the approaches of one object."""
+"""Held grasps as arrays, and the approaches of one object."""
 
 from __future__ import annotations
 
@@ -12,15 +12,10 @@ from helpers.datasets import SLIP, TRIALS, edit_file
 
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.errors import DataError
-from drakegrasp.visualization.figures import held_grasps
 from drakegrasp.visualization.figures.held_grasps import read_approaches, read_held
 
 
-@pytest.mark.parametrize("block", [1, 5, 36, 1000])
-def test_every_success_is_read_once(
-    boxes: Path, block: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(held_grasps, "BLOCK", block)
+def test_every_success_is_read_once(boxes: Path) -> None:
     held = read_held(boxes)
     assert held.trial_ids.tolist() == [0, 3, 11, 12, 15, 23, 24, 27, 35]
     assert [int(group.sum()) for group in held.groups.values()] == [9, 9, 9]
@@ -45,7 +40,7 @@ def test_what_is_no_dataset_is_refused(tmp_path: Path) -> None:
 
 def test_approaches_are_of_one_object(boxes: Path, tmp_path: Path) -> None:
     config = read_manifest(boxes).config
-    found = read_approaches(boxes, 1, "2_box_b", config)
+    found = read_approaches(boxes, "2_box_b", config)
     assert found.attempts == 12
     assert found.groups.tolist() == [2, 2, 2]  # stable
     # All palms are tilted by 0.25 rad; the one attempt whose ray misses, row 7, approached nothing.

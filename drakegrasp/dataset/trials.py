@@ -1,0 +1,555 @@
+"""Reading the attempts of a dataset, whatever their outcome. Imports h5py and NumPy only.
+
+>>> held = Trials("OUT").where(outcome="success", object_name="mug")   # doctest: +SKIP
+>>> held["slip"].max(), held.contacts(frame="T").points.shape          # doctest: +SKIP
+(0.0093, (27, 3, 3))
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, overload
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.arithmetic import multiply
+from drakegrasp.dataset.hdf5 import read_names, read_texts
+from drakegrasp.dataset.layout.opening import (
+    open_samples,
+    open_trials,
+    opened,
+    read_codes,
+    refuse_other_codes,
+)
+from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
+from drakegrasp.dataset.schema import CAMERAS, OBJECT_FIELDS, READABLE, SPLITS, TRIAL_FIELDS
+from drakegrasp.dataset.shards import ShardHeader, open_shard
+from drakegrasp.errors import DataError, MachineError
+from drakegrasp.frames import X_WT, Array, invert_pose, unpack_pose
+from drakegrasp.outcomes import Outcome
+
+if TYPE_CHECKING:
+    import pandas
+
+AnyArray = npt.NDArray[Any]
+#: Number of a removal or a split that an attempt does not have.
+NONE = 255
+#: Rows that are read at once: 8 chunks of a column.
+BLOCK = 16_384
+#: Columns besides those of `/trials`: names of the row's object, why a success is no sample
+#: (`removal` in the schema), and the split of a sample (index into SPLITS); NONE for all others.
+DERIVED = ("object_name", "class_name", "removal", "split")
+#: What changes when a file is replaced; None if it is not there.
+Stamp = tuple[int, ...] | None
+#: Frames in which contacts can be given: object, table top, palm, world.
+Frame = Literal["O", "T", "G", "W"]
+_FIELDS = {field.name: field for field in TRIAL_FIELDS}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrialContacts:
+    """The contacts of n attempts with k fingers, in one frame.
+
+    Attributes:
+        touching: (n, k) bool, whether the fingertip touches the object.
+        points: (n, k, 3), contact points [m]; NaN for a finger that does not touch.
+        normals: (n, k, 3), unit normals out of the object; NaN likewise.
+        forces: (n, k, 3), of the fingertips on the object [N].
+    """
+
+    touching: npt.NDArray[np.bool_]
+    points: Array
+    normals: Array
+    forces: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrialPart:
+    """The rows of one file: all of trials.hdf5, or the first of a shard while a build runs.
+
+    Attributes:
+        path: Of the file.
+        count: Number of rows.
+        header: Identity of the shard; None for trials.hdf5.
+        object: Row of the shard's object among the objects.
+    """
+
+    path: Path
+    count: int
+    header: ShardHeader | None = None
+    object: int = 0
+
+
+class Trials:
+    """Attempts of a dataset as columns and rows; a choice of them is `Trials` again.
+
+    Columns are read when they are asked for, so a large dataset needs memory for those alone. A
+    file that was written anew in the meantime is refused, because its rows may be others.
+
+    Args:
+        out: Directory of an assembled dataset, or its trials.hdf5.
+        any_name: Whether objects may have names that no file can have: enough to show them.
+
+    Raises:
+        DataError: If the file is missing, damaged or differs from the schema.
+    """
+
+    def __init__(self, out: str | Path, *, any_name: bool = False) -> None:
+        self._files = _whole_file(Path(out), any_name)
+        self._rows: npt.NDArray[np.int64] | None = None
+
+    @classmethod
+    def of_parts(
+        cls, out: Path, objects: Mapping[str, AnyArray], parts: Sequence[TrialPart]
+    ) -> Trials:
+        """Return the attempts in some shards of a build that has not been assembled.
+
+        Args:
+            out: Directory of the dataset.
+            objects: Columns of its objects, `name` and `class_name` at least.
+            parts: In the order of the rows.
+        """
+        return cls._of(_Files(out=out, objects=objects, parts=tuple(parts)), None)
+
+    @classmethod
+    def _of(cls, files: _Files, rows: npt.NDArray[np.int64] | None) -> Trials:
+        trials = cls.__new__(cls)
+        trials._files, trials._rows = files, rows
+        return trials
+
+    @property
+    def path(self) -> Path:
+        """The directory of the dataset, or its trials.hdf5, as it was given."""
+        return self._files.out
+
+    @property
+    def objects(self) -> Mapping[str, AnyArray]:
+        """Columns of `/objects` by the names of the schema; texts are str."""
+        return self._files.objects
+
+    @property
+    def attributes(self) -> Mapping[str, Any]:
+        """What trials.hdf5 says of its dataset, e.g. `config` as JSON; nothing without the file."""
+        return self._files.attributes
+
+    def part_of(self, trial_id: int) -> tuple[TrialPart, int]:
+        """Return the file that holds an attempt, and its row there.
+
+        Raises:
+            IndexError: If there is no such attempt.
+        """
+        for part, start in self._files.starts():
+            if trial_id < start + part.count:
+                return part, trial_id - start
+        raise IndexError(f"trial must be below {self._files.count}, got {trial_id}")
+
+    def __len__(self) -> int:
+        return self._files.count if self._rows is None else len(self._rows)
+
+    def __repr__(self) -> str:
+        return f"Trials({str(self.path)!r}): {len(self):,} attempts"
+
+    @property
+    def trial_ids(self) -> npt.NDArray[np.int64]:
+        """Rows (n,) of the attempts in trials.hdf5."""
+        return np.arange(self._files.count) if self._rows is None else self._rows
+
+    @overload
+    def __getitem__(self, key: str) -> AnyArray: ...
+
+    @overload
+    def __getitem__(self, key: int) -> dict[str, Any]: ...
+
+    @overload
+    def __getitem__(self, key: slice | npt.NDArray[Any] | Sequence[int]) -> Trials: ...
+
+    def __getitem__(self, key: Any) -> AnyArray | dict[str, Any] | Trials:
+        """Return a column by its name, one attempt by its place, or a choice of them.
+
+        Args:
+            key: Name of a column, see `columns`; a place, which counts from the end if it is
+                negative; or a slice, places, or a mask (n,), as NumPy takes them.
+
+        Raises:
+            DataError: If there is no such column, or a file was replaced.
+            IndexError: If there is no such place.
+        """
+        if isinstance(key, str):
+            return self.columns([key])[key]
+        if isinstance(key, slice | np.ndarray | list | tuple | range):
+            if not isinstance(key, slice):
+                key = np.asarray(key) if len(key) else np.zeros(0, dtype=np.int64)
+            return self._of(self._files, self.trial_ids[key])
+        place = operator.index(key)
+        if not -len(self) <= place < len(self):
+            raise IndexError(f"place must be below {len(self)}, got {place}")
+        return {name: values[0] for name, values in self[[place]].columns().items()}
+
+    def trial(self, trial_id: int) -> dict[str, Any]:
+        """Return an attempt by its row in trials.hdf5, as `trials[place]` does.
+
+        Raises:
+            DataError: If there is no such row.
+        """
+        if not 0 <= trial_id < self._files.count:
+            file, last = self._files.parts[0].path, self._files.count - 1
+            raise DataError(f"{file}: trial must be 0 to {last}, got {trial_id}")
+        return self._of(self._files, np.array([trial_id]))[0]
+
+    def where(
+        self,
+        *,
+        outcome: Outcome | str | Sequence[Outcome | str] | None = None,
+        object_name: str | None = None,
+        class_name: str | None = None,
+        refined: bool | None = None,
+        sample: bool | None = None,
+    ) -> Trials:
+        """Return the attempts for which all that is given holds.
+
+        Args:
+            outcome: One or several outcomes, as `Outcome` or by their labels, e.g. "success".
+            object_name: Name of the object.
+            class_name: Name of the object's class.
+            refined: Whether the palm pose is a refined one, about that of a grasp that holds.
+            sample: Whether the attempt is a sample of the dataset.
+
+        Raises:
+            DataError: If there is no such outcome, object or class.
+        """
+        mask = np.ones(len(self), dtype=np.bool_)
+        if outcome is not None:
+            wanted = [outcome] if isinstance(outcome, str | Outcome) else outcome
+            mask &= np.isin(self["outcome"], [_outcome(each) for each in wanted])
+        for key, name in (("name", object_name), ("class_name", class_name)):
+            if name is not None:
+                own = self.objects[key] == name
+                if not own.any():
+                    raise DataError(f"{key} must be one of the dataset's, got {name!r}")
+                mask &= own[self["object"]]
+        if refined is not None:
+            mask &= (self["generation"] > 0) == refined
+        if sample is not None:
+            mask &= (self["removal"] == 0) == sample
+        return self[mask]
+
+    def columns(self, names: Sequence[str] | None = None) -> dict[str, AnyArray]:
+        """Return columns (n, ...) of the attempts by their names.
+
+        Args:
+            names: Fields of `/trials`, or DERIVED ones; all but `split` if None, which is read
+                from the data files. A field that an older file lacks, or that an attempt did not
+                reach, is NaN, 0 or False.
+
+        Raises:
+            DataError: If there is no such column, or a file was replaced.
+        """
+        names = [*_FIELDS, *DERIVED[:-1]] if names is None else names
+        rows, back = np.unique(self.trial_ids, return_inverse=True)
+        parts = list(self._of(self._files, rows).blocks(names))
+        whole = {name: np.concatenate([part[name] for part in parts]) for name in names}
+        return {name: values[back] for name, values in whole.items()}
+
+    def blocks(self, names: Sequence[str]) -> Iterator[dict[str, AnyArray]]:
+        """Yield columns of some thousand attempts after the other, which must be in rising order.
+
+        There is one block at least, so that columns of no attempts have a type and a shape.
+
+        Args:
+            names: See `columns`.
+
+        Raises:
+            DataError: See `columns`.
+        """
+        for name in names:
+            if name not in _FIELDS and name not in DERIVED:
+                known = ", ".join([*_FIELDS, *DERIVED])
+                raise DataError(f"column must be one of {known}, got {name!r}")
+        empty = True
+        for part, start in self._files.starts():
+            own = np.arange(part.count)
+            if self._rows is not None:
+                first, last = np.searchsorted(self._rows, [start, start + part.count])
+                own = self._rows[first:last] - start
+            if len(own):
+                empty = False
+                yield from self._files.read(part, start, own, names)
+        if empty:
+            yield self._files.nothing(names)
+
+    def contacts(
+        self, when: Literal["closed", "lifted"] = "closed", *, frame: Frame = "O"
+    ) -> TrialContacts:
+        """Return the contacts of the attempts.
+
+        Args:
+            when: After closing, or after the lift.
+            frame: Frame of the result: `O` the object's, `T` the table top's, `G` the palm's, `W`
+                the world's; after the lift object and palm are where they are then.
+
+        Raises:
+            DataError: If there is no such moment or frame.
+        """
+        if when not in ("closed", "lifted"):
+            raise DataError(f"when must be closed or lifted, got {when!r}")
+        if frame not in ("O", "T", "G", "W"):
+            raise DataError(f"frame must be O, T, G or W, got {frame!r}")
+        lifted = "_lifted" if when == "lifted" else ""
+        keys = [f"{when}_{name}" for name in ("touching", "p_OQ", "nhat_Q_O", "f_Q_O")]
+        poses = [f"X_TO{lifted}", f"X_OG{lifted}"]
+        columns = self.columns([*keys, *poses])
+        X_TO, X_OG = (unpack_pose(columns[name]) for name in poses)
+        touching, points, normals, forces = (columns[key] for key in keys)
+        if frame == "O":
+            return TrialContacts(touching=touching, points=points, normals=normals, forces=forces)
+        X_FO = {"T": X_TO, "G": invert_pose(X_OG), "W": multiply(X_WT, X_TO)}[frame]
+        R_OF = np.swapaxes(X_FO[:, :3, :3], -1, -2)
+        return TrialContacts(
+            touching=touching,
+            points=multiply(points, R_OF) + X_FO[:, None, :3, 3],
+            normals=multiply(normals, R_OF),
+            forces=multiply(forces, R_OF),
+        )
+
+    def to_pandas(self, names: Sequence[str] | None = None) -> pandas.DataFrame:
+        """Return a pandas data frame with a row per attempt, by trial id.
+
+        Args:
+            names: See `columns`. Of all columns those with one value per attempt if None.
+                Several values of an attempt are columns of their own: `slip`, `closed_q.0`, ...;
+                outcomes and names are categories.
+
+        Raises:
+            DataError: If there is no such column.
+            MachineError: If pandas is not installed.
+        """
+        try:
+            import pandas
+        except ModuleNotFoundError:
+            raise MachineError("to_pandas needs pandas, got none: pip install pandas") from None
+        if names is None:
+            names = [name for name, field in _FIELDS.items() if not field.shape] + [*DERIVED]
+        series: dict[str, Any] = {}
+        for name, values in self.columns(names).items():
+            if values.ndim > 1:
+                flat = values.reshape(len(values), -1)
+                series |= {f"{name}.{i}": flat[:, i] for i in range(flat.shape[1])}
+            else:
+                series[name] = values
+        if "outcome" in series:
+            labels = {outcome.value: outcome.label for outcome in Outcome}
+            series["outcome"] = [labels[int(value)] for value in series["outcome"]]
+        if "split" in series:
+            series["split"] = [_split_name(int(value)) for value in series["split"]]
+        frame = pandas.DataFrame(series, index=pandas.Index(self.trial_ids, name="trial_id"))
+        frame = frame.drop(columns="trial_id", errors="ignore")
+        words = [
+            name for name in ("outcome", "split", "object_name", "class_name") if name in frame
+        ]
+        return frame.astype(dict.fromkeys(words, "category"))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Files:
+    """The files of all attempts, in the order of the rows.
+
+    Attributes:
+        out: Directory of the dataset, or its trials.hdf5.
+        objects: See `Trials.objects`.
+        parts: The files.
+        attributes: Of trials.hdf5.
+        stamp: Of trials.hdf5 when it was first opened; None for shards, which never change.
+    """
+
+    out: Path
+    objects: Mapping[str, AnyArray]
+    parts: tuple[TrialPart, ...]
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+    stamp: Stamp = None
+
+    @property
+    def count(self) -> int:
+        return sum(part.count for part in self.parts)
+
+    def starts(self) -> Iterator[tuple[TrialPart, int]]:
+        """Yield each part with the number of rows before it."""
+        start = 0
+        for part in self.parts:
+            yield part, start
+            start += part.count
+
+    @contextmanager
+    def open(self, part: TrialPart) -> Iterator[h5py.File]:
+        """Open a part: the file that was looked at first, or none."""
+        if part.header is not None:
+            with open_shard(part.path, part.header, verify_seal=False, again=True) as (file, _):
+                yield file
+            return
+        with opened(part.path, "the trials of a dataset", again=True) as file:
+            if stamp(part.path) != self.stamp:
+                raise DataError(f"{part.path}: must stay while it is read, got another; read again")
+            yield file
+
+    def read(
+        self, part: TrialPart, start: int, rows: npt.NDArray[np.int64], names: Sequence[str]
+    ) -> Iterator[dict[str, AnyArray]]:
+        """Yield columns of some rows of a part, which begins with row `start` of all."""
+        stored = [name for name in dict.fromkeys((*names, "object")) if name in _FIELDS]
+        with self.open(part) as file:
+            for block in np.split(rows, np.flatnonzero(np.diff(rows // BLOCK)) + 1):
+                columns = self._stored(file["trials"], part, block, stored)
+                columns |= self._derived(columns, start + block, names)
+                yield {name: columns[name] for name in names}
+
+    def _stored(
+        self,
+        trials: h5py.Group,
+        part: TrialPart,
+        rows: npt.NDArray[np.int64],
+        names: Sequence[str],
+    ) -> dict[str, AnyArray]:
+        """Return columns of rows that lie close together, as they are stored."""
+        columns: dict[str, AnyArray] = {}
+        near = slice(int(rows[0]), int(rows[-1]) + 1)
+        for name in names:
+            if name in trials:
+                columns[name] = trials[name][near][rows - near.start]
+            elif _FIELDS[name].since > min(READABLE):
+                columns[name] = _FIELDS[name].empty(len(rows), {})
+            elif part.header is None:
+                raise DataError(f"{part.path}: /trials/{name} must be there, got none")
+        if part.header is not None:
+            columns["object"] = np.full(len(rows), part.object, dtype=np.int32)
+
+        # Numbers that stand for something must.
+        for name, codes in (("outcome", list(Outcome)), ("object", len(self.objects["name"]))):
+            if name in columns:
+                refuse_other_codes(part.path, f"/trials/{name}", columns[name], codes, near.start)
+        return columns
+
+    def _derived(
+        self, columns: Mapping[str, AnyArray], ids: npt.NDArray[np.int64], names: Sequence[str]
+    ) -> dict[str, AnyArray]:
+        """Return what the columns of some attempts are besides what is stored of each."""
+        values: dict[str, AnyArray] = {"trial_id": ids}
+        values["object_name"] = self.objects["name"][columns["object"]]
+        values["class_name"] = self.objects["class_name"][columns["object"]]
+        if "removal" in names:
+            values["removal"] = self.removal[ids]
+        if "split" in names:
+            values["split"] = self.split[ids]
+        return values
+
+    def nothing(self, names: Sequence[str]) -> dict[str, AnyArray]:
+        """Return columns of no attempts."""
+        sizes = {"k": 0, "j": 0}
+        if self.parts:
+            with self.open(self.parts[0]) as file:
+                touching, q = file["trials/closed_touching"], file["trials/closed_q"]
+                sizes = {"k": touching.shape[1], "j": q.shape[1]}
+        derived = {"removal": np.uint8, "split": np.uint8}
+        return {
+            name: _FIELDS[name].empty(0, sizes)
+            if name in _FIELDS
+            else np.zeros(0, dtype=derived.get(name, object))
+            for name in names
+        }
+
+    @cached_property
+    def removal(self) -> npt.NDArray[np.uint8]:
+        """Why each attempt is no sample, NONE where it is no success or nothing is decided."""
+        removal = np.full(self.count, NONE, dtype=np.uint8)
+        for part in self.parts:
+            if part.header is None:
+                with self.open(part) as file:
+                    success = read_codes(file["successes/trial_id"], self.count)
+                    removal[success] = file["successes/removal"][:]
+        return removal
+
+    @cached_property
+    def split(self) -> npt.NDArray[np.uint8]:
+        """Split of each attempt as an index into SPLITS, NONE if it is no sample."""
+        split = np.full(self.count, NONE, dtype=np.uint8)
+        if all(part.header is None for part in self.parts):
+            for number, ids in enumerate(sample_ids(self.out).values()):
+                split[ids[ids < len(split)]] = number
+        return split
+
+
+def _whole_file(out: Path, any_name: bool) -> _Files:
+    """Return the attempts of an assembled dataset, see `Trials`."""
+    path = out if out.is_file() else out / TRIALS_FILE
+    with open_trials(path) as file:
+        group = file["objects"]
+        if not any_name:
+            read_names(group["name"])
+        objects = {
+            f.name: np.array(read_texts(group[f.name]), dtype=object)
+            if f.dtype == "str"
+            else group[f.name][:]
+            for f in OBJECT_FIELDS
+        }
+        part = TrialPart(path=path, count=len(file["trials/outcome"]))
+        attributes = dict(file.attrs)
+    return _Files(out=out, objects=objects, parts=(part,), attributes=attributes, stamp=stamp(path))
+
+
+def shard_part(out: Path, header: ShardHeader, object_: int) -> TrialPart:
+    """Return the attempts in a shard; its seal, which takes reading all of it, is not verified.
+
+    Args:
+        out: Directory of the dataset.
+        header: Of the shard.
+        object_: Row of its object among the objects.
+
+    Raises:
+        DataError: If it is missing, damaged, or another shard.
+    """
+    path = header.path(out)
+    with open_shard(path, header, verify_seal=False) as (file, _):
+        count = len(file["trials/outcome"])
+    return TrialPart(path=path, count=count, header=header, object=object_)
+
+
+def sample_ids(out: Path) -> dict[str, npt.NDArray[np.int64]]:
+    """Return the trial ids of the samples by split, in rising order; none without data files.
+
+    Args:
+        out: Directory of the dataset, or its trials.hdf5.
+
+    Raises:
+        DataError: If a data file is damaged.
+    """
+    folder = out if out.is_dir() else out.parent
+    for camera in CAMERAS:
+        if (folder / DATA_FILES[camera]).is_file():
+            with open_samples(folder / DATA_FILES[camera]) as file:
+                return {split: file[split]["trial_id"][:] for split in SPLITS}
+    return {split: np.zeros(0, dtype=np.int64) for split in SPLITS}
+
+
+def stamp(path: Path) -> Stamp:
+    """Return what changes when a file is replaced; None if it is not there."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_size, status.st_mtime_ns
+
+
+def _outcome(outcome: Outcome | str) -> Outcome:
+    labels = {each.label: each for each in Outcome}
+    if isinstance(outcome, str) and outcome not in labels:
+        raise DataError(f"outcome must be one of {', '.join(labels)}, got {outcome!r}")
+    return labels[outcome] if isinstance(outcome, str) else outcome
+
+
+def _split_name(number: int) -> str | None:
+    return None if number == NONE else SPLITS[number]

@@ -1,0 +1,234 @@
+"""`Trials`: columns, rows, choices and contacts are those of the files."""
+
+from __future__ import annotations
+
+import pickle
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from helpers.datasets import OTO, SUCCESS, TRIALS, edit_file
+
+from drakegrasp.dataset import trials as trials_module
+from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.schema import SPLITS, TRIAL_FIELDS
+from drakegrasp.dataset.trials import NONE, Trials, shard_part
+from drakegrasp.errors import DataError, MachineError
+from drakegrasp.frames import X_WT, invert_pose, rotate_vectors, transform_points, unpack_pose
+from drakegrasp.outcomes import Outcome
+
+
+def stored(out: Path, name: str) -> Any:
+    with h5py.File(out / TRIALS) as file:
+        return file["trials"][name][:]
+
+
+@pytest.mark.parametrize("block", [1, 5, 36, 1000])
+@pytest.mark.parametrize("rows", [None, [7], [20, 3, 3, 35, 0], []], ids=str)
+def test_columns_are_those_of_the_file(
+    sound: Path, block: int, rows: list[int] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trials_module, "BLOCK", block)
+    trials = Trials(sound) if rows is None else Trials(sound)[rows]
+    columns = trials.columns([field.name for field in TRIAL_FIELDS])
+    picked = slice(None) if rows is None else np.array(rows, dtype=int)
+    assert len(trials) == (36 if rows is None else len(rows))
+    for field in TRIAL_FIELDS:
+        expected = stored(sound, field.name)[picked]
+        np.testing.assert_array_equal(columns[field.name], expected)
+        assert columns[field.name].dtype == expected.dtype
+
+
+def test_blocks_are_the_columns_in_parts(sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trials_module, "BLOCK", 5)
+    blocks = list(Trials(sound).blocks(["slip", "object_name"]))
+    assert [len(block["slip"]) for block in blocks] == [5] * 7 + [1]
+    np.testing.assert_array_equal(
+        np.concatenate([block["slip"] for block in blocks]), stored(sound, "slip")
+    )
+
+
+def test_what_is_derived_is_that_of_the_other_groups_and_files(sound: Path) -> None:
+    trials = Trials(sound)
+    with h5py.File(sound / TRIALS) as file, h5py.File(sound / OTO) as data:
+        hits, removal = file["successes/trial_id"][:], file["successes/removal"][:]
+        names = file["objects/name"].asstr()[:][file["trials/object"][:]]
+        ids = {split: data[split]["trial_id"][:] for split in SPLITS}
+    assert trials["object_name"].tolist() == names.tolist()
+    assert set(trials["class_name"]) == {"box", "brick"}
+    np.testing.assert_array_equal(trials["removal"][hits], removal)
+    assert (trials["removal"] != NONE).sum() == len(hits)
+    for number, split in enumerate(SPLITS):
+        np.testing.assert_array_equal(np.flatnonzero(trials["split"] == number), ids[split])
+
+
+@pytest.mark.parametrize(
+    ("filters", "name", "wanted"),
+    [
+        ({"outcome": "success"}, "outcome", [Outcome.SUCCESS]),
+        ({"outcome": Outcome.DROPPED}, "outcome", [Outcome.DROPPED]),
+        (
+            {"outcome": ["dropped", Outcome.SLIPPED]},
+            "outcome",
+            [Outcome.SLIPPED, Outcome.DROPPED],
+        ),
+        ({"object_name": "2_box_b"}, "object", [1]),
+        ({"class_name": "box"}, "object", [0, 1]),
+        ({"refined": False}, "generation", [0]),
+        ({"refined": True}, "generation", []),
+    ],
+    ids=str,
+)
+def test_choice_is_of_what_was_asked_for(
+    sound: Path, filters: dict[str, Any], name: str, wanted: list[int]
+) -> None:
+    (rows,) = np.nonzero(np.isin(stored(sound, name), wanted))
+    assert Trials(sound).where(**filters).trial_ids.tolist() == rows.tolist()
+
+
+def test_choices_of_choices_are_narrower(sound: Path) -> None:
+    held = Trials(sound).where(outcome="success")
+    own = held.where(object_name="3_brick", sample=True)
+    assert own.trial_ids.tolist() == [24, 27, 35]
+    assert held.where(object_name="3_brick", sample=False).trial_ids.tolist() == []
+    assert own[1:].trial_ids.tolist() == [27, 35]
+    assert own[[2, 0]]["trial_id"].tolist() == [35, 24]
+    assert own[own["trial_id"] > 30].trial_ids.tolist() == [35]
+    assert own[-1]["trial_id"] == own[2]["trial_id"] == 35
+
+
+def test_removed_success_is_no_sample(out: Path) -> None:
+    assemble(out, rejected=[27])
+    own = Trials(out).where(outcome="success", object_name="3_brick")
+    assert own.where(sample=True).trial_ids.tolist() == [24, 35]
+    assert own.where(sample=False).trial_ids.tolist() == [27]
+
+
+@pytest.mark.parametrize(
+    ("filters", "got"),
+    [
+        ({"outcome": "won"}, "outcome must be one of success, .*, got 'won'"),
+        ({"object_name": "mug"}, "name must be one of the dataset's, got 'mug'"),
+        ({"class_name": "mug"}, "class_name must be one of the dataset's, got 'mug'"),
+    ],
+)
+def test_choice_of_what_there_is_not_is_refused(
+    sound: Path, filters: dict[str, Any], got: str
+) -> None:
+    with pytest.raises(DataError, match=got):
+        Trials(sound).where(**filters)
+
+
+def test_row_has_every_value_of_an_attempt(sound: Path) -> None:
+    row = Trials(sound).trial(15)
+    assert row.keys() == {f.name for f in TRIAL_FIELDS} | {"object_name", "class_name", "removal"}
+    assert (row["object_name"], row["class_name"]) == ("2_box_b", "box")
+    np.testing.assert_array_equal(row["X_OG"], stored(sound, "X_OG")[15])
+
+
+def test_row_or_column_that_is_not_there_is_refused(sound: Path) -> None:
+    trials = Trials(sound)
+    with pytest.raises(DataError, match=r"trials\.hdf5: trial must be 0 to 35, got 36"):
+        trials.trial(36)
+    with pytest.raises(IndexError, match="place must be below 36, got -37"):
+        trials[-37]
+    with pytest.raises(DataError, match=r"column must be one of trial_id, .*, got 'mug'"):
+        trials["mug"]
+
+
+@pytest.mark.parametrize("frame", ["O", "T", "G", "W"])
+@pytest.mark.parametrize("when", ["closed", "lifted"])
+def test_contacts_are_those_of_the_file_in_any_frame(sound: Path, when: Any, frame: Any) -> None:
+    trials = Trials(sound).where(outcome="success")
+    contacts = trials.contacts(when, frame=frame)
+    assert contacts.touching.all()
+    for k, row in enumerate(trials.trial_ids):
+        suffix = "_lifted" if when == "lifted" else ""
+        X_TO, X_OG = (unpack_pose(stored(sound, f"{n}{suffix}")[row]) for n in ("X_TO", "X_OG"))
+        X_FO = {"O": np.eye(4), "T": X_TO, "G": invert_pose(X_OG), "W": X_WT @ X_TO}[frame]
+        p_OQ, nhat_Q_O, f_Q_O = (
+            stored(sound, f"{when}_{name}")[row] for name in ("p_OQ", "nhat_Q_O", "f_Q_O")
+        )
+        np.testing.assert_allclose(contacts.points[k], transform_points(X_FO, p_OQ), atol=1e-12)
+        np.testing.assert_allclose(contacts.normals[k], rotate_vectors(X_FO, nhat_Q_O), atol=1e-12)
+        np.testing.assert_allclose(contacts.forces[k], rotate_vectors(X_FO, f_Q_O), atol=1e-12)
+
+
+def test_contacts_of_another_moment_or_frame_are_refused(sound: Path) -> None:
+    with pytest.raises(DataError, match="when must be closed or lifted, got 'open'"):
+        Trials(sound).contacts("open")  # type: ignore[arg-type]
+    with pytest.raises(DataError, match="frame must be O, T, G or W, got 'C'"):
+        Trials(sound).contacts(frame="C")  # type: ignore[arg-type]
+
+
+def test_data_frame_has_a_row_per_attempt(sound: Path) -> None:
+    pytest.importorskip("pandas")
+    trials = Trials(sound).where(object_name="2_box_b")
+    frame = trials.to_pandas()
+    assert frame.index.tolist() == list(range(12, 24))
+    assert frame.loc[12, "outcome"] == "success"
+    assert frame["slip"].tolist()[:1] == trials["slip"].tolist()[:1]
+    assert frame["object_name"].cat.categories.tolist() == ["2_box_b"]
+    wide = trials.to_pandas(["closed_p_OQ"])
+    assert [*wide] == [f"closed_p_OQ.{i}" for i in range(9)]
+    np.testing.assert_array_equal(wide.to_numpy(), trials["closed_p_OQ"].reshape(12, 9))
+
+
+def test_data_frame_without_pandas_is_one_line(
+    sound: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(MachineError, match="to_pandas needs pandas, got none: pip install pandas"):
+        Trials(sound).to_pandas()
+
+
+def test_file_that_was_replaced_is_refused(out: Path) -> None:
+    trials = Trials(out)
+    shutil.copy(out / TRIALS, out / "other")
+    (out / "other").replace(out / TRIALS)
+    with pytest.raises(DataError, match="must stay while it is read, got another"):
+        trials["slip"]
+
+
+def test_numbers_that_stand_for_nothing_are_refused(out: Path) -> None:
+    edit_file(out / TRIALS, lambda f: f["trials/outcome"].write_direct(np.full(36, 99, "u1")))
+    with pytest.raises(DataError, match="/trials/outcome must be 0 to 16, got 99 in row 0"):
+        Trials(out)["outcome"]
+    edit_file(out / TRIALS, lambda f: f["trials/object"].write_direct(np.full(36, 3, "i4")))
+    with pytest.raises(DataError, match="/trials/object must be 0 to 2, got 3 in row 0"):
+        Trials(out)["object_name"]
+
+
+def test_name_that_no_file_can_have_is_only_shown(out: Path) -> None:
+    def rename(file: h5py.File) -> None:
+        file["objects/name"][0] = "../mug"
+
+    edit_file(out / TRIALS, rename)
+    with pytest.raises(DataError, match=r"a name must be .*, got '\.\./mug'"):
+        Trials(out)
+    assert Trials(out, any_name=True)[0]["object_name"] == "../mug"
+
+
+def test_trials_may_be_sent_to_another_process(sound: Path) -> None:
+    held = Trials(sound / TRIALS).where(outcome="success")
+    again = pickle.loads(pickle.dumps(held))
+    assert again.trial_ids.tolist() == held.trial_ids.tolist()
+    assert again[0]["trial_id"] == SUCCESS
+
+
+def test_attempts_in_shards_are_those_of_the_file(sound: Path) -> None:
+    manifest, whole = read_manifest(sound), Trials(sound)
+    names = [entry.name for entry in manifest.objects]
+    parts = [shard_part(sound, h, names.index(h.object_name)) for h in manifest.headers()]
+    building = Trials.of_parts(sound, whole.objects, parts)
+    for name in (*(field.name for field in TRIAL_FIELDS), "object_name", "class_name"):
+        np.testing.assert_array_equal(building[name], whole[name])
+    assert (building["removal"] == NONE).all()
+    assert (building["split"] == NONE).all()
+    part, row = building.part_of(15)
+    assert (part.header, row) == (parts[2].header, 3)
