@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.hdf5 import open_hdf5, read_names
+from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.layout.attributes import (
     OF_CAMERA,
     ORIGIN,
@@ -24,9 +24,8 @@ from drakegrasp.dataset.layout.attributes import (
     attribute_mistakes,
 )
 from drakegrasp.dataset.layout.structure import DATA_TABLES, TRIAL_TABLES, Tables, differences
-from drakegrasp.dataset.schema import READABLE, TRIAL_FIELDS, Field, refuse_other_schema
+from drakegrasp.dataset.schema import refuse_other_schema
 from drakegrasp.errors import DataError, first_line, printable
-from drakegrasp.outcomes import Outcome
 
 
 @contextmanager
@@ -154,45 +153,3 @@ def refuse_other_codes(
     if bad.any():
         row = int(np.argmax(bad))
         raise DataError(f"{path}: {place} must be {must}, got {values[row]} in row {first + row}")
-
-
-def read_trial(file: h5py.File, trial_id: int) -> dict[str, npt.NDArray[Any]]:
-    """Return a row of /trials by the fields' names.
-
-    Args:
-        file: What `open_trials` opened.
-        trial_id: Number of the row.
-
-    Raises:
-        DataError: If there is no such row.
-    """
-    trials = file["trials"]
-    count = len(trials["outcome"])
-    if not 0 <= trial_id < count:
-        raise DataError(f"{file.filename}: trial must be 0 to {count - 1}, got {trial_id}")
-    row = {f.name: read_cell(trials, f, trial_id) for f in TRIAL_FIELDS}
-    refuse_other_codes(Path(file.filename), "/trials/outcome", row["outcome"][None], list(Outcome))
-    return row
-
-
-def read_cell(trials: h5py.Group, field: Field, row: int) -> npt.NDArray[Any]:
-    """Return a value of a row of /trials: NaN or 0 if it is newer than the file.
-
-    Raises:
-        KeyError: If a field is missing that every file has.
-    """
-    # Fields that older files lack are scalars.
-    if field.since > min(READABLE) and field.name not in trials:
-        return np.asarray(field.empty(1, {})[0])
-    return np.asarray(trials[field.name][row])
-
-
-def object_name(file: h5py.File, row: Mapping[str, npt.NDArray[Any]]) -> str:
-    """Return the name of the object of a row of /trials.
-
-    Raises:
-        DataError: If there is no such object, or its name is none.
-    """
-    names = read_names(file["objects/name"])
-    refuse_other_codes(Path(file.filename), "/trials/object", row["object"][None], len(names))
-    return names[int(row["object"])]
