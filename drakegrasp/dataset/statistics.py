@@ -168,7 +168,7 @@ def count_unfinished(out: Path) -> Unfinished | None:
     parts = []
     for header in manifest.headers():
         with suppress(DataError):
-            parts.append(shard_part(out, header, numbers[header.object_name]))
+            parts.append(shard_part(out, header, numbers[header.object_name], _COUNTED))
     objects = {
         key: np.array([getattr(entry, key) for entry in entries])
         for key in ("name", "class_name", "distinct", "valid")
@@ -237,7 +237,8 @@ def funnel_of(trials: Trials) -> Funnel:
 
 def _count(counts: npt.NDArray[np.int64], cells: Any) -> None:
     """Add to an array of counts how often each of its cells occurs."""
-    np.add.at(counts, cells, 1)
+    flat = np.ravel_multi_index(cells, counts.shape) if counts.ndim > 1 else cells
+    counts += np.bincount(flat, minlength=counts.size).reshape(counts.shape)
 
 
 def why_no_samples(funnel: Funnel) -> dict[str, str]:

@@ -30,7 +30,7 @@ from drakegrasp.dataset.layout.opening import (
 )
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.schema import CAMERAS, OBJECT_FIELDS, READABLE, SPLITS, TRIAL_FIELDS
-from drakegrasp.dataset.shards import ShardHeader, open_shard
+from drakegrasp.dataset.shards import ShardHeader, open_shard, trial_columns
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.frames import X_WT, Array, invert_pose, unpack_pose
 from drakegrasp.outcomes import Outcome
@@ -501,19 +501,24 @@ def _whole_file(out: Path, any_name: bool) -> _Files:
     return _Files(out=out, objects=objects, parts=(part,), attributes=attributes, stamp=stamp(path))
 
 
-def shard_part(out: Path, header: ShardHeader, object_: int) -> TrialPart:
+def shard_part(
+    out: Path, header: ShardHeader, object_: int, names: Sequence[str] | None = None
+) -> TrialPart:
     """Return the attempts in a shard; its seal, which takes reading all of it, is not verified.
 
     Args:
         out: Directory of the dataset.
         header: Of the shard.
         object_: Row of its object among the objects.
+        names: Columns that must be there; all that a shard has, and its images, if None.
 
     Raises:
         DataError: If it is missing, damaged, or another shard.
     """
     path = header.path(out)
-    with open_shard(path, header, verify_seal=False) as (file, _):
+    stored = tuple(f for f in trial_columns() if f.name in (*(names or ()), "outcome"))
+    tables = None if names is None else {"trials": stored}
+    with open_shard(path, header, tables, verify_seal=False) as (file, _):
         count = len(file["trials/outcome"])
     return TrialPart(path=path, count=count, header=header, object=object_)
 
