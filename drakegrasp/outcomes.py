@@ -27,7 +27,7 @@ class Outcome(IntEnum):
     SLIPPED = 8  # a fingertip lost contact during the lift, but the object was held
     DROPPED = 9  # the object fell during the lift
     SOLVER_ERROR = 10  # Drake failed or the state diverged; says nothing about the grasp
-    TIMEOUT = 11  # the attempt's wall-clock limit passed; says nothing about the grasp
+    TIMEOUT = 11  # the attempt's limit of computing time passed; says nothing about the grasp
     CRASHED = 12  # the attempt killed its process; says nothing about the grasp
     UNREACHABLE = 13  # verification only: no wrist pose brings the fingertips to the contacts
     OFF_SURFACE = 14  # verification only: a predicted contact is not on the object's surface

@@ -3,11 +3,11 @@
     python pipelines/fit_lift_chance.py TRAIN --test TEST --write FILE
 
 Both are datasets of one hand and of different objects, in which all closed hands were lifted, e.g.
-`build --config fast --set lift.least_chance=0 --candidates 240`. Without `--write` nothing is
-fitted: the hand's own weights are tried. Prints JSON: of both datasets the area under the curve
-(AUC) of the chance and of the length of the mean normal alone, the share of samples in the better
-half of the lifts, and for some least chances which shares of samples and of lifts have less. The
-chances in TRAIN are those of models of its other objects.
+`build --config fast --set lift.least_chance=0 --set lift.least_depth_variance=0 --candidates 240`.
+Without `--write` nothing is fitted: the hand's own weights are tried. Prints JSON: of both datasets
+the area under the curve (AUC) of the chance and of the length of the mean normal alone, the share
+of samples in the better half of the lifts, and for some least chances which shares of samples and
+of lifts have less. The chances in TRAIN are those of models of its other objects.
 """
 
 from __future__ import annotations
@@ -82,12 +82,13 @@ def read_lifts(out: Path) -> Lifts:
     """Return the lifts of a dataset.
 
     Raises:
-        DataError: If a chance chose which hands were lifted: what was lost would be missing.
+        DataError: If it was chosen which hands were lifted: what was lost would be missing.
     """
     manifest = read_manifest(out)
-    if manifest.config.lift.least_chance > 0.0:
-        got = manifest.config.lift.least_chance
-        raise DataError(f"{out}: must be built with lift.least_chance=0, got {got:g}")
+    rules = manifest.config.lift
+    for name in ("least_chance", "least_depth_variance"):
+        if (got := getattr(rules, name)) > 0.0:
+            raise DataError(f"{out}: must be built with lift.{name}=0, got {got:g}")
     names = (*(f"closed_{name}" for name in GRASP_CONTACTS), "X_TO", "friction_hand")
     judged = ("outcome", "lifted_other_links", "slip", "turn", "generation", "object")
     with h5py.File(out / TRIALS_FILE) as file:

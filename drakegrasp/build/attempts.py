@@ -1,7 +1,7 @@
 """One object's trial setup in this process, and the steps of a trial on it.
 
 In: a prepared object of a dataset, and attempts. Out: what geometry predicts of them, the records
-of their trials, how contacts lie on the surface, and the views of a success. Nothing is written
+of their trials, how contacts lie on the surface, and the views of a grasp. Nothing is written
 here, see `drakegrasp.build.columns`.
 """
 
@@ -20,7 +20,7 @@ from drakegrasp.config import Config
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.dataset.shards import ShardHeader
-from drakegrasp.errors import DataError
+from drakegrasp.errors import DataError, MachineError
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import with_hand_defaults
@@ -175,11 +175,20 @@ def try_attempt(
 
 
 def _is_visible(setup: TrialSetup, attempt: Attempt, X_TO: Array) -> bool:
-    """Return whether the otm depth image of an attempt is not too flat for a lift."""
+    """Return whether the otm depth image of an attempt is not too flat for a lift.
+
+    Raises:
+        MachineError: If the renderer fails: that is no failure of the grasp.
+    """
     least = setup.config.lift.least_depth_variance
     if least == 0.0:
         return True
-    view = _render_view(setup, attempt, X_TO, "otm")
+    try:
+        view = _render_view(setup, attempt, X_TO, "otm")
+    except MachineError:
+        raise
+    except (RuntimeError, SystemExit) as error:
+        raise MachineError(f"{setup.prepared.model.name}: cannot render: {error}") from None
     return bool(view.image[3].astype(float).var() >= least)
 
 

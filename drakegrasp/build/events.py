@@ -1,4 +1,4 @@
-"""What a build says in its log, and what it learns from the log of an earlier build.
+"""What a build says in its log.
 
 In: what happens. Out: lines of `log.jsonl`, see `drakegrasp.dataset.log`.
 """

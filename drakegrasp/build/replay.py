@@ -101,7 +101,10 @@ def record_trial(out: str | Path, trial_id: int, path: str | Path) -> Outcome:
     stored = _stored_trial(Path(out), trial_id)
     X_TO = stored.prepared.resting_poses[stored.attempt.resting]
     model, config = stored.prepared.model, stored.config
-    return record_attempt(model, X_TO, stored.attempt, config, Path(path)).outcome
+    # A hand that was not lifted for its image is not lifted here, and nothing is rendered.
+    lifted = stored.row["outcome"] != Outcome.NOT_LIFTED
+    attempt = stored.attempt
+    return record_attempt(model, X_TO, attempt, config, Path(path), is_visible=lifted).outcome
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -58,7 +58,7 @@ from drakegrasp.simulation.screen import Prediction
 from drakegrasp.simulation.trial import TrialRecord
 from drakegrasp.vision.camera import intrinsics
 
-#: An attempt that takes this many times its wall-clock limit hangs: it never checks the clock.
+#: An attempt that takes this many times its limit of computing time hangs: it never looks at it.
 HANG_FACTOR = 1.5
 #: Computing time after which any other step of a unit hangs [s].
 STAGE_SECONDS = 600.0

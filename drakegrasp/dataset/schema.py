@@ -401,7 +401,7 @@ TRIAL_FIELDS: tuple[Field, ...] = (
     *CONDITION_FIELDS,
     *_new(
         Field("audited", "", "bool", "-", "-",
-              "whether a closed hand that may lift is lifted whatever its chance: one in ten",
+              "whether a closed hand that may lift is lifted in any case, as one in ten is",
               of="attempt.audited"),
     ),
     *_since(Stage.CLOSED, _TIME_CLOSE, *_CLOSED),

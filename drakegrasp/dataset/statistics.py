@@ -258,7 +258,8 @@ def _furthest(funnel: Funnel, i: int) -> str:
     if lifted:
         return f"always lost: {lifted:,} lifts, none held"
     if by[Outcome.NOT_LIFTED]:
-        return f"never lifted: {by[Outcome.NOT_LIFTED]:,} hands that closed with a small chance"
+        count = by[Outcome.NOT_LIFTED]
+        return f"never lifted: {count:,} hands that closed with a small chance or a flat image"
     if closed:
         return f"never gripped: the hand closed {closed:,} times, never with fingertips alone"
     if by[Outcome.START_COLLISION] > by[Outcome.SCREENED]:
@@ -283,7 +284,7 @@ def held_note(funnel: Funnel) -> str:
         reasons.append(
             f"closed hands that were not lifted, as their chance of a sample is small or their "
             f"image too flat: {left:,}; "
-            f"of {lifts:,} that were lifted whatever their chance {', '.join(found)}"
+            f"of {lifts:,} that were lifted in any case {', '.join(found)}"
         )
     return f"the number of held grasps is a lower bound: {'; '.join(reasons)}" if reasons else ""
 

@@ -63,11 +63,18 @@ def in_order(execute: Executor) -> Executor:
     def run(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
         early: dict[int, R] = {}
         due = 0
-        for number, result in execute(partial(_numbered, function), enumerate(items)):
-            early[number] = result
-            while due in early:
-                yield early.pop(due)
-                due += 1
+        results = execute(partial(_numbered, function), enumerate(items))
+        try:
+            for number, result in results:
+                early[number] = result
+                while due in early:
+                    yield early.pop(due)
+                    due += 1
+        finally:
+            # Who closes this iterator ends the work, too.
+            close = getattr(results, "close", None)
+            if close is not None:
+                close()
 
     return run
 

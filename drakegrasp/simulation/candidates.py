@@ -42,7 +42,7 @@ _DENSITY_GRID = 2.0**-32
 #: Last numbers of the places of streams: of a sampler at a resting pose, of a child, and of the
 #: draw of whom to audit.
 _SAMPLER, _CHILD, _AUDIT = 2, 1, 3
-#: One of so many attempts is lifted whatever its chance of a sample.
+#: One of so many attempts is lifted in any case, whatever its chance of a sample and its image.
 AUDIT = 10
 
 
@@ -94,7 +94,7 @@ class Pregrasp:
             hand.
         ray_hits: Whether the palm ray meets the object; true if no ray places the palm.
         conditions: Friction, mass, looks and cameras; None are the usual ones.
-        audited: Whether the closed hand is lifted whatever its chance of a sample.
+        audited: Whether the closed hand is lifted in any case, whatever its chance and its image.
     """
 
     X_OG: Array

@@ -119,6 +119,7 @@ def run_attempt(
 
     Raises:
         ConfigError: If the hand cannot have the drive that the configuration asks for.
+        MachineError: If `is_visible` cannot render.
         MemoryError: If the machine runs out of memory.
         OSError: If a file of the hand cannot be read.
     """
@@ -228,7 +229,7 @@ def _close(
     scene: Scene, limits: TrialLimits, config: Config, prediction: Prediction | None
 ) -> None:
     """Close the fingers on the static object until they stop, or one has missed it."""
-    # Closed that geometry skipped counts as time, and an angle beyond its last contact as a miss.
+    # Closing that geometry skipped counts as time, and an angle beyond its last contact as a miss.
     end, last = config.close.max_time, np.array(np.inf)
     if prediction is not None:
         assert scene.handles is not None

@@ -129,7 +129,7 @@ class Verification:
 
     @property
     def closing(self) -> Array | None:
-        """Closed positions (k,) at which the fingertips meet the predicted points [rad or m]."""
+        """Closing positions (k,) at which the fingertips meet the predicted points [rad or m]."""
         return None if self.fit is None else self.fit.closing
 
     @property

@@ -54,7 +54,7 @@ _REASONS = {
     Outcome.DROPPED: "the hand loses the object during the lift",
     Outcome.SLIPPED: "a fingertip loses contact during the lift",
     Outcome.SOLVER_ERROR: "the simulation failed, which says nothing about the grasp",
-    Outcome.TIMEOUT: "the wall-clock limit passed, which says nothing about the grasp",
+    Outcome.TIMEOUT: "the limit of computing time passed, which says nothing about the grasp",
 }
 #: The verdict by the end of a lift by forces.
 _ENDS = {
@@ -92,8 +92,9 @@ def verify_contacts(
         p_OQ: (k, 3), contact points [m]; they are rounded to 0.1 mm.
         nhat_Q_O: (k, 3), outward unit normals.
         method: "hand" or "forces".
-        config: Hand, physics, lift and limits. `lift.stop_when` and `lift.least_chance` are without
-            effect: the verdict is that of a whole lift.
+        config: Hand, physics, lift and limits. What ends or avoids lifts (`lift.stop_when`,
+            `lift.least_chance`, `lift.least_depth_variance`) is without effect: the verdict is that
+            of a whole lift.
     """
     # Round the contacts; adding zero turns -0.0 into 0.0.
     config = with_whole_lifts(config)

@@ -54,6 +54,7 @@ def record_attempt(
     *,
     p_OQ: Array | None = None,
     nhat_Q_O: Array | None = None,
+    is_visible: bool = True,
 ) -> TrialRecord:
     """Return the result of `trial.run_attempt`, and write a recording of it.
 
@@ -65,6 +66,7 @@ def record_attempt(
         path: The HTML file.
         p_OQ: (k, 3), predicted contacts to draw on the object, in {O} [m].
         nhat_Q_O: (k, 3), their outward unit normals in {O}.
+        is_visible: Whether the images of the grasp would make a sample.
 
     Raises:
         OSError: If the file cannot be written.
@@ -74,7 +76,7 @@ def record_attempt(
         scene = build_scene(model, config.physics, load_hand(config.hand), meshcat=meshcat)
         # An attempt that fails before it is simulated is shown at its start.
         show_start(meshcat, scene, X_TO, config, attempt.X_OG, attempt.spread, attempt.closing)
-        record = run_attempt(scene, X_TO, attempt, config)
+        record = run_attempt(scene, X_TO, attempt, config, is_visible=lambda: is_visible)
         draw_predicted(meshcat, p_OQ, nhat_Q_O)
         return record
 

@@ -14,8 +14,9 @@ from helpers.assertions import assert_same_dataset
 from helpers.meshes import write_fixed
 
 from drakegrasp.bench.cross_check import cross_check
+from drakegrasp.build import attempts
 from drakegrasp.build.pipeline import build
-from drakegrasp.build.replay import replay_trial
+from drakegrasp.build.replay import record_trial, replay_trial
 from drakegrasp.build.work_unit import WorkUnit, run_unit
 from drakegrasp.config import Config, load_config, override_config
 from drakegrasp.dataset.assemble import assemble
@@ -31,6 +32,7 @@ from drakegrasp.dataset.rejections import (
     write_decisions,
 )
 from drakegrasp.dataset.statistics import count_funnel, count_splits
+from drakegrasp.errors import MachineError
 from drakegrasp.frames import unpack_pose
 from drakegrasp.inspection.catalog import Catalog
 from drakegrasp.inspection.query import Query, select
@@ -85,8 +87,15 @@ def test_check_finds_nothing(refined: Path) -> None:
 
 
 def test_hands_whose_image_is_flat_are_not_lifted_and_no_sample_is_lost(
-    refined: Path, sources: list[MeshSource], config: Config, tmp_path: Path
+    refined: Path,
+    sources: list[MeshSource],
+    config: Config,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("no OpenGL")
+
     seeing = override_config(config, ["lift.least_depth_variance=0.001"])
     out = tmp_path / "out"
     build(sources, out, seeing, run_here, show=False)
@@ -101,7 +110,15 @@ def test_hands_whose_image_is_flat_are_not_lifted_and_no_sample_is_lost(
         assert np.array_equal(whole[name], now[name], equal_nan=True)
     assert np.array_equal(whole["lifted_p_OQ"][~left], now["lifted_p_OQ"][~left], equal_nan=True)
     samples = [GraspDataset(one / "grasping_otm.hdf5") for one in (refined, out)]
-    assert len(samples[0]) == len(samples[1]) > 5
+    assert len(samples[0]) > 5
+    assert np.array_equal(*(each.column("trial_id") for each in samples))
+
+    # A recording of such a hand shows no lift; a renderer that fails is the machine's failure.
+    (flat, *_) = np.flatnonzero(left & (whole["outcome"] == Outcome.SUCCESS)).tolist()
+    assert record_trial(out, flat, tmp_path / "trial.html") is Outcome.NOT_LIFTED
+    monkeypatch.setattr(attempts, "render", fail)
+    with pytest.raises(MachineError, match="cannot render: no OpenGL"):
+        replay_trial(out, flat)
 
 
 def test_samplers_and_resting_poses_take_turns(refined: Path) -> None:

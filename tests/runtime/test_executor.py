@@ -41,20 +41,30 @@ def test_what_is_begun_ends_before_the_executor_does(tmp_path: Path) -> None:
 
 
 def test_results_come_in_the_order_of_the_items() -> None:
-    taken = []
+    taken: list[object] = []
 
     def backwards(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
         """Return results in threes, the last one first."""
         remaining = iter(items)
-        while some := list(islice(remaining, 3)):
-            for item in reversed(some):
-                taken.append(item)
-                yield function(item)
+        try:
+            while some := list(islice(remaining, 3)):
+                for item in reversed(some):
+                    taken.append(item)
+                    yield function(item)
+        finally:
+            taken.append("closed")
 
     results = in_order(backwards)(abs, iter([-5, 1, -4, 3, -2]))
     assert next(results) == 5
     assert len(taken) == 3  # and not all of them
     assert list(results) == [1, 4, 3, 2]
+
+    # Who closes it ends the work.
+    taken.clear()
+    results = in_order(backwards)(abs, iter([-5, 1, -4, 3, -2]))
+    next(results)
+    results.close()  # type: ignore[attr-defined]
+    assert taken[-1] == "closed"
 
 
 def test_process_that_dies_is_one_error() -> None:

@@ -19,6 +19,7 @@ from helpers.objects import (
 )
 
 from drakegrasp.config import load_config, override_config
+from drakegrasp.errors import BlankImageError
 from drakegrasp.frames import X_WT, invert_pose, make_pose
 from drakegrasp.hand.file_format import PAD_BAND
 from drakegrasp.objects.model import prepare_object
@@ -85,8 +86,21 @@ def test_closed_hand_whose_image_is_of_no_use_is_not_lifted(scene, cube, config,
     audited = replace(attempt, audited=True)
     lifted = run_attempt(scene, standing(cube), audited, config, is_visible=no)
     assert pickle.dumps(lifted) == pickle.dumps(held)
-    run_attempt(scene, standing(cube), from_above(cube, 0.25), config, is_visible=no)
+    closed = run_attempt(scene, standing(cube), from_above(cube, 0.041), config, is_visible=no)
+    assert closed.outcome is Outcome.TABLE_CONTACT
     assert asked == [True]
+    # Nor of one whose chance is too small.
+    unlikely = load_config(overrides=["lift.least_chance=0.99"])
+    run_attempt(scene, standing(cube), attempt, unlikely, is_visible=no)
+    assert asked == [True]
+
+
+def test_image_that_cannot_be_rendered_is_no_outcome(scene, cube, config):
+    def fail():
+        raise BlankImageError("nothing")
+
+    with pytest.raises(BlankImageError):
+        run_attempt(scene, standing(cube), from_above(cube, STANDOFF), config, is_visible=fail)
 
 
 def test_hand_without_weights_lifts_all_that_it_may(scene, cube, held):

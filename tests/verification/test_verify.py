@@ -293,7 +293,7 @@ def test_results_know_what_they_were_asked(held: dg.Verification, cube: PlacedOb
     assert np.isnan(replace(held, fit=None).spread)
     assert repr(held).startswith("Verification(hand, held, precision, stable: ")
     assert held.pregrasp is not None and held.pregrasp.closing is not None
-    assert held.closed is not None
+    assert held.closing is not None
     # The fingers were opened before they closed.
     assert np.all(held.pregrasp.closing < held.closing)
     assert (X_WT @ cube.X_TO @ held.pregrasp.X_OG)[2, 3] > 0.65
