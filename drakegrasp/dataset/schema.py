@@ -55,6 +55,43 @@ CONVENTIONS = {
 
 
 @dataclass(frozen=True)
+class Shown:
+    """A number as people read it, on pages and in figures.
+
+    Attributes:
+        title: In words.
+        unit: One of SHOWN_UNITS; empty for a plain number.
+        digits: After the decimal point.
+    """
+
+    title: str
+    unit: str = ""
+    digits: int = 1
+
+    @property
+    def factor(self) -> float:
+        """From SI to the unit."""
+        return SHOWN_UNITS[self.unit]
+
+    @property
+    def label(self) -> str:
+        """The title with the unit, for an axis."""
+        return f"{self.title} [{self.unit}]" if self.unit else self.title
+
+    def text(self, value: float) -> str:
+        """Return a value in SI as text with its unit; a dash if there is none.
+
+        Infinity means undefined: the contact has no normal.
+        """
+        if np.isposinf(value):
+            return "none"
+        if not np.isfinite(value):
+            return "–"
+        space = "" if self.unit in ("", "°") else " "
+        return f"{value * self.factor:.{self.digits}f}{space}{self.unit}"
+
+
+@dataclass(frozen=True)
 class Field:
     """One field of a file.
 
@@ -76,10 +113,7 @@ class Field:
         of: Where its value is measured, as a path of attributes: from the row of `build.columns`
             for a trial, from a `Verification` for a verdict. For a number of a sample, the column
             of its trial that it copies. Empty if it is computed otherwise.
-        title: What people call it where it is shown; empty if it is shown nowhere.
-        shown: Unit in which it is shown, one of SHOWN_UNITS; that of several fingers is shown by
-            its largest value.
-        digits: After the decimal point where it is shown.
+        shown: How people read it; None if it is not shown by itself.
     """
 
     name: str
@@ -94,9 +128,7 @@ class Field:
     some: bool = False
     since: int = 3
     of: str = ""
-    title: str = ""
-    shown: str = ""
-    digits: int = 1
+    shown: Shown | None = None
 
     @property
     def axes(self) -> tuple[int | str, ...]:
@@ -247,30 +279,31 @@ _LINEAGE = _new(
           "m^2 of surface and rad of roll; per m^3 rad^3 about the parent's"),
 )
 # Fields of several tables.
-_SPREAD = Field("spread", "", "float64", "rad", "-", "angle of the spread joints")
+_SPREAD = Field("spread", "", "float64", "rad", "-", "angle of the spread joints",
+                shown=Shown("spread", "°"))
 _X_TO = Field("X_TO", "12", "float64", "m, -", "T", "resting pose of the object")
 _TIME_CLOSE = Field("time_close", "", "float64", "s", "-",
                     "simulated time at which closing ended", of="trial.closed.duration",
-                    title="time of closing", shown="s", digits=2)
+                    shown=Shown("time of closing", "s", 2))
 _TIME_LIFT = Field(
     "time_lift", "", "float64", "s", "-",
     "simulated time of the lift with its hold; shorter where it ended early",
-    of="trial.lift.duration", title="time of the lift", shown="s", digits=2)
+    of="trial.lift.duration", shown=Shown("time of the lift", "s", 2))
 _SLIP = _measured(
     "trial.lift",
     Field("slip", "", "float64", "m", "G",
-          "distance that the object moved in the hand during the lift", title="slip", shown="mm"),
+          "distance that the object moved in the hand during the lift", shown=Shown("slip", "mm")),
     Field("turn", "", "float64", "rad", "G",
-          "angle that the object turned in the hand during the lift", title="turn", shown="°"),
+          "angle that the object turned in the hand during the lift", shown=Shown("turn", "°")),
 )
 _RELEASED = _measured(
     "trial.lift",
     Field("slip_released", "", "float64", "m", "G",
           "distance that the object moved in the hand before the wrist moved",
-          title="slip before the wrist moves", shown="mm"),
+          shown=Shown("slip before the wrist moves", "mm")),
     Field("turn_released", "", "float64", "rad", "G",
           "angle that the object turned in the hand before the wrist moved",
-          title="turn before the wrist moves", shown="°"),
+          shown=Shown("turn before the wrist moves", "°")),
 )
 _WORDS = (
     Field("precision", "", "bool", "-", "-",
@@ -285,12 +318,12 @@ CONDITION_FIELDS: tuple[Field, ...] = (
         "conditions.materials",
         Field("friction_hand", "", "float64", "-", "-",
               "effective coefficient of friction between hand and object",
-              title="friction of the object with the hand", digits=3),
+              shown=Shown("friction of the object with the hand", digits=3)),
         Field("friction_table", "", "float64", "-", "-",
               "effective coefficient of friction between table and object",
-              title="friction of the object with the table", digits=3),
+              shown=Shown("friction of the object with the table", digits=3)),
         Field("mass", "", "float64", "kg", "-", "mass of the object; its inertia is in proportion",
-              title="mass", shown="kg", digits=3),
+              shown=Shown("mass", "kg", 3)),
     ),
     *_measured(
         "conditions.appearance",
@@ -415,11 +448,11 @@ TRIAL_FIELDS: tuple[Field, ...] = (
         Stage.LIFTED,
         Field("surface_distance", "k", "float64", "m", "-",
               "distance of the contact points after closing from the full mesh's surface",
-              per_finger=True, of="fit.distance", title="off surface", shown="mm", digits=2),
+              per_finger=True, of="fit.distance", shown=Shown("off surface", "mm", 2)),
         Field("normal_angle", "k", "float64", "rad", "-",
               "angle of the normals after closing from the full mesh's nearest face, or from that "
               "ahead if it agrees better", per_finger=True, of="fit.normal_angle",
-              title="normal angle", shown="°"),
+              shown=Shown("normal angle", "°")),
         _TIME_LIFT,
         *_LIFTED,
         Field("X_TO_lifted", "12", "float64", "m, -", "T", "pose of the object after the lift",

@@ -28,6 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array, multiply, norm
+from drakegrasp.dataset.schema import TRIAL_FIELDS, Shown
 from drakegrasp.frames import unpack_pose
 from drakegrasp.outcomes import Outcome, Stage
 
@@ -44,57 +45,71 @@ class Part:
     Attributes:
         name: Of the part.
         scale: Value from which on it alone is reason enough to look; own choices, see below.
-        unit: SI unit, or "-".
+        shown: How people read it.
         meaning: What it is, in words.
         stage: First stage at which it has a value.
     """
 
     name: str
     scale: float
-    unit: str
+    shown: Shown
     meaning: str
-    stage: Stage
+    stage: Stage = Stage.LIFTED
+
+
+def _shown(name: str) -> Shown:
+    """Return how people read a field of `/trials`."""
+    (shown,) = (field.shown for field in TRIAL_FIELDS if field.name == name)
+    assert shown is not None
+    return shown
 
 
 #: The scales are the limits of `filters` in the preset `paper` where there is one. The others are
 #: values that 5 % of the stable grasps on 29 objects exceed (penetration, sum of normals: for
 #: three fingers 1.6), or none of them does (imbalance).
 PARTS = (
-    Part("penetration", 4e-3, "m", "largest depth of the object in a fingertip", Stage.CLOSED),
+    Part(
+        "penetration",
+        4e-3,
+        Shown("penetration", "mm"),
+        "largest depth of the object in a fingertip",
+        Stage.CLOSED,
+    ),
+    Part("slip", 0.010, _shown("slip"), "motion of the object in the hand during the lift"),
+    Part(
+        "turn",
+        float(np.deg2rad(10.0)),
+        _shown("turn"),
+        "rotation of the object in the hand during the lift",
+    ),
     Part(
         "normal_angle",
         float(np.deg2rad(30.0)),
-        "rad",
+        _shown("normal_angle"),
         "largest angle of a contact's normal from the mesh's",
-        Stage.LIFTED,
     ),
     Part(
         "surface_distance",
         2e-3,
-        "m",
+        _shown("surface_distance"),
         "largest distance of a contact's centre from the mesh: contact on an edge",
-        Stage.LIFTED,
     ),
-    Part("slip", 0.010, "m", "motion of the object in the hand during the lift", Stage.LIFTED),
     Part(
-        "turn",
-        float(np.deg2rad(10.0)),
-        "rad",
-        "rotation of the object in the hand during the lift",
-        Stage.LIFTED,
+        "other_links",
+        1.0,
+        Shown("other links", digits=0),
+        "other links that touch the object after the lift",
     ),
-    Part("other_links", 1.0, "-", "other links that touch the object after the lift", Stage.LIFTED),
     Part(
         "imbalance",
         0.05,
-        "-",
+        Shown("force imbalance", digits=3),
         "fingertips' forces and weight after the lift, as a share of the weight",
-        Stage.LIFTED,
     ),
     Part(
         "normal_sum",
         0.54,
-        "-",
+        Shown("sum of normals", digits=2),
         "length of the sum of the contact normals after closing, per finger",
         Stage.CLOSED,
     ),

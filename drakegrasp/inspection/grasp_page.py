@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from drakegrasp.dataset.rejections import Decisions
-from drakegrasp.dataset.schema import CAMERAS
+from drakegrasp.dataset.schema import CAMERAS, TRIAL_FIELDS
 from drakegrasp.dataset.suspicion import PARTS, suspicion
 from drakegrasp.frames import unpack_pose
 from drakegrasp.inspection.catalog import Snapshot
 from drakegrasp.inspection.links import Links
 from drakegrasp.inspection.pages import Places, decision_values, number_text, render, words_of
-from drakegrasp.inspection.query import DEGREES, QUANTITIES, Query
+from drakegrasp.inspection.query import QUANTITIES, Query
 from drakegrasp.inspection.rows import contact_dots, read_certificate, read_look, read_rows
 from drakegrasp.outcomes import Outcome
 
@@ -125,29 +125,23 @@ def _parts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[dict[str, An
 def _facts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[tuple[str, str]]:
     """Return further numbers of an attempt as names and texts."""
     key = snapshot.key(i)
-
-    def number(name: str, factor: float, unit: str, digits: int = 1) -> str:
-        value = float(row[name]) * factor
-        space = "" if unit == "°" else " "
-        return f"{value:.{digits}f}{space}{unit}" if np.isfinite(value) else "–"
-
     standoffs = snapshot.config.candidates.drawn_standoffs
     s = key.standoff_index
     standoff = f"{1e3 * standoffs[s]:.0f} mm" if s < len(standoffs) else str(s)
+    in_parts = {part.name for part in PARTS}
     return [
         ("palm pose, stand-off", f"{key.candidate}, {standoff}"),
-        ("spread", number("spread", DEGREES, "°")),
-        ("time of closing, of the lift",
-         f"{number('time_close', 1.0, 's', 2)}, {number('time_lift', 1.0, 's', 2)}"),
-        ("slip before the wrist moves", number("slip_released", 1e3, "mm")),
-        ("turn before the wrist moves", number("turn_released", DEGREES, "°")),
-        ("other links after closing",
-         str(int(row["closed_other_links"])) if np.isfinite(row["time_close"]) else "–"),
-        ("mass", f"{float(row['mass']):.4g} kg"),
-        ("friction of the object with hand, table",
-         f"{float(row['friction_hand']):.3g}, {float(row['friction_table']):.3g}"),
+        *(
+            (field.shown.title, field.shown.text(float(row[field.name])))
+            for field in TRIAL_FIELDS
+            if field.shown is not None and field.name not in in_parts
+        ),
+        (
+            "other links after closing",
+            str(int(row["closed_other_links"])) if np.isfinite(row["time_close"]) else "–",
+        ),
         *_certificate(snapshot, i),
-    ]  # fmt: skip
+    ]
 
 
 def _certificate(snapshot: Snapshot, i: int) -> list[tuple[str, str]]:
@@ -191,7 +185,7 @@ def _fingers(row: dict[str, Any]) -> list[dict[str, Any]]:
             area = float(row[f"{when}_area"][k]) if touching else np.nan
             instants.append([text(force, 1), text(1e3 * depth, 2), text(1e6 * area, 0)])
         fit = [
-            text(float(row["normal_angle"][k]) * DEGREES, 1),
+            text(np.rad2deg(float(row["normal_angle"][k])), 1),
             text(1e3 * float(row["surface_distance"][k]), 2),
         ]
         fingers.append({"closed": instants[0], "lifted": instants[1], "fit": fit})

@@ -109,9 +109,8 @@ def _distributions(snapshot: Snapshot) -> Any:
     held = table.outcome == Outcome.SUCCESS
     quantities = []
     for name, quantity in QUANTITIES.items():
-        unit = f" [{quantity.unit}]" if quantity.unit else ""
         values = table.feature(name)[held].astype(float) * quantity.factor
-        quantities.append((quantity.title + unit, values))
+        quantities.append((quantity.label, values))
     groups = {
         "held": np.ones(int(held.sum()), dtype=bool),
         "precision": table.precision[held],

@@ -14,59 +14,18 @@ import numpy.typing as npt
 
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.rejections import Decisions
-from drakegrasp.dataset.schema import SPLITS
+from drakegrasp.dataset.schema import SPLITS, Shown
+from drakegrasp.dataset.suspicion import PARTS
 from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DataError
 from drakegrasp.inspection.catalog import Snapshot
 from drakegrasp.outcomes import Outcome
 
-
-@dataclass(frozen=True)
-class Quantity:
-    """A feature of an attempt as people read it.
-
-    Attributes:
-        name: Of the feature in the table.
-        title: In words.
-        unit: Of what is shown, e.g. "mm"; empty for a plain number.
-        factor: From SI to that unit.
-        digits: After the decimal point.
-    """
-
-    name: str
-    title: str
-    unit: str
-    factor: float
-    digits: int
-
-    def text(self, value: float) -> str:
-        """Return a value in SI as text with its unit; a dash if there is none.
-
-        Infinity means undefined: the contact has no normal.
-        """
-        if np.isposinf(value):
-            return "none"
-        if not np.isfinite(value):
-            return "–"
-        space = "" if self.unit in ("", "°") else " "
-        return f"{value * self.factor:.{self.digits}f}{space}{self.unit}"
-
-
-DEGREES = float(np.rad2deg(1.0))
+#: Features of an attempt that can be filtered and sorted by, as people read them.
 QUANTITIES = {
-    q.name: q
-    for q in (
-        Quantity("suspicion", "suspicion", "", 1.0, 2),
-        Quantity("penetration", "penetration", "mm", 1e3, 1),
-        Quantity("slip", "slip", "mm", 1e3, 1),
-        Quantity("turn", "turn", "°", DEGREES, 1),
-        Quantity("force", "largest force", "N", 1.0, 1),
-        Quantity("normal_angle", "normal angle", "°", DEGREES, 1),
-        Quantity("surface_distance", "off surface", "mm", 1e3, 2),
-        Quantity("other_links", "other links", "", 1.0, 0),
-        Quantity("imbalance", "force imbalance", "", 1.0, 3),
-        Quantity("normal_sum", "sum of normals", "", 1.0, 2),
-    )
+    "suspicion": Shown("suspicion", digits=2),
+    "force": Shown("largest force", "N"),
+    **{part.name: part.shown for part in PARTS},
 }
 #: Quantities with a range among the filters.
 RANGES = ("suspicion", "penetration", "slip", "turn", "force", "normal_angle")

@@ -392,7 +392,7 @@ def test_page_of_a_grasp_has_friction_certificate_and_text_to_copy(
         q = file["trials/closed_q"][0].tolist()
         X_OG = unpack_pose(file["trials/X_OG"][0])
     for name, value in (
-        ("friction of the object with hand, table", f"{friction:.3g}, {friction:.3g}"),
+        ("friction of the object with the hand", f"{friction:.3f}"),
         ("repeats with noise that hold", "75 %"),
         ("least friction with the hand that holds", "0.4"),
     ):
