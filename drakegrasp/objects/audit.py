@@ -9,7 +9,6 @@ from typing import Any, Literal
 import numpy as np
 import trimesh
 
-from drakegrasp.arithmetic import norm
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
 from drakegrasp.mesh.components import face_components, pair_half_edges
@@ -22,6 +21,7 @@ from drakegrasp.mesh.surfaces import (
     is_solid_surface,
     on_faces,
     signed_volume,
+    unit_normals,
 )
 from drakegrasp.objects.contact_fit import AHEAD
 from drakegrasp.objects.memory import forecast_memory
@@ -205,9 +205,7 @@ def wall_thickness(vertices: Array, faces: Faces) -> float:
         faces: (m, 3).
     """
     points, picked = on_faces(vertices, faces, even_points(WALL_POINTS))
-    a, b, c = np.moveaxis(vertices[faces[picked]], 1, 0)
-    normal = np.cross(b - a, c - a)
-    inward = -normal / np.maximum(norm(normal), 1e-300)[:, None]
+    inward = -unit_normals(vertices[faces[picked]])
     through = first_hits(vertices[faces], points + BELOW * inward, inward)
     return float(np.quantile(through[np.isfinite(through)], WALL_SHARE))
 
