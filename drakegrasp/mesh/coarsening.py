@@ -95,7 +95,8 @@ def _merge(vertices: Array, faces: Faces, key: Faces) -> tuple[Array, Faces]:
         a, b = faces[:, corner], faces[:, (corner + 1) % 3]
         within = key[a] == key[b]
         pairs.append(np.stack((a[within], b[within])).astype(np.int32))
-    count, cluster = connect(*np.concatenate(pairs, axis=1), len(vertices))
+    first, second = np.concatenate(pairs, axis=1)
+    count, cluster = connect(first, second, len(vertices))
 
     sizes = np.bincount(cluster, minlength=count)
     means = [np.bincount(cluster, vertices[:, axis], count) / sizes for axis in range(3)]

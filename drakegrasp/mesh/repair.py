@@ -212,7 +212,7 @@ def _stitch(vertices: Array, faces: Faces, notes: list[str]) -> tuple[Array, Fac
 
     # Merge rim vertices that are close to each other, directly or by others between them.
     pairs = cKDTree(vertices[rim]).query_pairs(STITCH * diagonal(vertices), output_type="ndarray")
-    _, labels = connect(*pairs.T, len(rim))
+    _, labels = connect(pairs[:, 0], pairs[:, 1], len(rim))
     _, first = np.unique(labels, return_index=True)
     merged = np.arange(len(vertices))
     merged[rim] = rim[first[labels]]

@@ -113,9 +113,7 @@ class AuditRow:
 
     def to_json(self) -> dict[str, Any]:
         """Return the row as JSON types, without the model."""
-        content = asdict(replace(self, model=None))
-        del content["model"]
-        return content
+        return {k: v for k, v in asdict(replace(self, model=None)).items() if k != "model"}
 
 
 def audit(
@@ -238,19 +236,19 @@ def _measures(model: ObjectModel, vertices: Array, faces: Faces) -> dict[str, An
 
 def _warnings(row: AuditRow) -> list[str]:
     """Return what may be wrong with an object that a build would take."""
-    found = []
+    warnings = []
     if row.units_guess is not None:
-        found.append(f"its lengths may be in {row.units_guess}")
+        warnings.append(f"its lengths may be in {row.units_guess}")
     if row.wall is not None and row.wall < THIN_WALL:
-        found.append(
+        warnings.append(
             f"walls of {row.wall * 1e3:.1f} mm, thin for a fingertip (below {THIN_WALL * 1e3:g} mm)"
         )
     if row.density is not None and not DENSITIES[0] <= row.density <= DENSITIES[1]:
-        found.append(f"{row.mass:g} kg make {row.density:,.0f} kg/m^3: give its mass or density")
+        warnings.append(f"{row.mass:g} kg make {row.density:,.0f} kg/m^3: give its mass or density")
     if row.gyration is not None and not GYRATION[0] <= row.gyration <= GYRATION[1]:
-        found.append(f"its inertia is {row.gyration**2:.2g} times that of its hull")
+        warnings.append(f"its inertia is {row.gyration**2:.2g} times that of its hull")
     if row.crossing:
-        found.append(f"{row.crossing} faces pass through others")
+        warnings.append(f"{row.crossing} faces pass through others")
     if row.volume_change is not None and abs(row.volume_change) > NOTED_CHANGE:
-        found.append(f"repair changed the volume by {row.volume_change:+.0%}")
-    return found
+        warnings.append(f"repair changed the volume by {row.volume_change:+.0%}")
+    return warnings
