@@ -54,6 +54,8 @@ NonNegativeCount = Annotated[int, Field(ge=0, le=MOST)]
 Seed = Annotated[int, Field(ge=0, le=MOST_SEED)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Angles = Annotated[tuple[Number, ...], Field(min_length=1)]
+#: Identifier of a licence: a line of printable ASCII.
+Licence = Annotated[str, Field(pattern=r"^[ -~]*[!-~][ -~]*$", max_length=200)]
 
 
 #: Characters that are shown of a wrong value.

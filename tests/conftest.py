@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import trimesh
-from helpers.meshes import SMALL, write_fixed
+from helpers.meshes import G3DB, SMALL, write_fixed
 from hypothesis import settings
 
 from drakegrasp.build.pipeline import build
@@ -27,10 +27,9 @@ settings.load_profile("drakegrasp")
 @pytest.fixture(scope="session")
 def g3db() -> Path:
     """The thirty real meshes beside the project; tests that need them skip without."""
-    folder = Path(__file__).resolve().parents[2] / "shared" / "meshes" / "g3db"
-    if not folder.is_dir():
+    if not G3DB.is_dir():
         pytest.skip("the real meshes are not beside the project")
-    return folder
+    return G3DB
 
 
 @pytest.fixture(scope="session")

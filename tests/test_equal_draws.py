@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from helpers import draws
+from helpers.meshes import G3DB
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
@@ -34,8 +35,7 @@ def drawn_with(**settings: str) -> dict[str, object]:
     """Return what a process with other settings in its environment draws, and its kernels."""
     ours = ("OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES", "GLIBC_TUNABLES")
     env = {k: v for k, v in os.environ.items() if k not in ours} | settings
-    meshes = Path(__file__).resolve().parents[2] / "shared" / "meshes" / "g3db"
-    command = [sys.executable, draws.__file__, *([str(meshes)] if meshes.is_dir() else [])]
+    command = [sys.executable, draws.__file__, *([str(G3DB)] if G3DB.is_dir() else [])]
     result = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
     found: dict[str, object] = json.loads(result.stdout)

@@ -36,7 +36,7 @@ from drakegrasp.dataset.assembly.survey import count_samples, successes_of
 from drakegrasp.dataset.filters import Removal, judge_successes
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.prepared_objects import PreparedObject
-from drakegrasp.dataset.shards import Shard, ShardHeader, read_outcomes, write_shard
+from drakegrasp.dataset.shards import Shard, ShardHeader, read_trials, write_shard
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.blas import one_thread
@@ -252,7 +252,9 @@ def find_outcomes(out: Path, header: ShardHeader) -> dict[Outcome, int] | None:
         DataError: If its shard is damaged or of something else.
     """
     path = header.path(out)
-    return count_outcomes(read_outcomes(path, header)) if path.exists() else None
+    if not path.exists():
+        return None
+    return count_outcomes(read_trials(path, header, ("outcome",))["outcome"])
 
 
 def unit_attempts(

@@ -9,11 +9,10 @@ number of attempts. Imports no Drake.
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import partial
-from itertools import islice, takewhile
 from pathlib import Path
 
 import h5py
@@ -136,7 +135,7 @@ def assemble_locked(
     with disk_full_named(out), replaced_together(out) as new:
         # Survey the shards: how many rows, and of each success what the filters need.
         surveys = _survey_all(out, manifest, execute, progress)
-        slices, successes = _placed_rows(surveys, manifest)
+        slices, successes = _number_rows(surveys, manifest)
 
         # Decide which successes are samples, and in which split.
         known = _keys(manifest, successes)
@@ -157,7 +156,8 @@ def assemble_locked(
         with ExitStack() as stack:
             trials = stack.enter_context(new_hdf5(paths[TRIALS_FILE]))
             _write_objects(trials, manifest)
-            columns = _create_trials(trials, slices[-1].first + slices[-1].rows, sizes)
+            group, count = trials.create_group("trials"), slices[-1].first + slices[-1].rows
+            columns = [create_field(group, f, f.row_shape(sizes), count) for f in TRIAL_FIELDS]
             _write_removal(trials, successes, removal)
             _write_attributes(trials, manifest, origin)
             rows = {}
@@ -203,10 +203,10 @@ def _survey_all(out: Path, manifest: Manifest, execute: Executor, progress: Repo
     return surveys
 
 
-def _placed_rows(
+def _number_rows(
     surveys: Sequence[Survey], manifest: Manifest
 ) -> tuple[list[ShardSlice], Successes]:
-    """Return the place of each shard, and all successes with their trials' ids."""
+    """Return the rows of each shard, and all successes with their trials' ids."""
     headers = headers_by_object(manifest)
     first, slices, parts = 0, list[ShardSlice](), []
     for survey in surveys:
@@ -226,28 +226,22 @@ def _pack_tasks(
     sizes: Mapping[str, int],
 ) -> Iterator[PackTask]:
     """Yield the tasks that pack the rows, from the first to the last."""
-    count, place = slices[-1].first + slices[-1].rows, 0
+    count, firsts = slices[-1].first + slices[-1].rows, [piece.first for piece in slices]
     for start in range(0, count, TASK_ROWS):
         stop = min(start + TASK_ROWS, count)
-        # The shard in which the last range ended may have more rows.
-        while slices[place].first + slices[place].rows <= start:
-            place += 1
-        within = islice(slices, place, None)
+        # From the shard in which the range begins to that in which it ends.
+        within = slices[bisect_right(firsts, start) - 1 : bisect_left(firsts, stop)]
         bounds = {split: np.searchsorted(rows, (start, stop)) for split, rows in ids.items()}
         yield PackTask(
             out=str(out),
             part=str(temporary_name(out / f"rows-{start}")),
             start=start,
             stop=stop,
-            slices=tuple(takewhile(partial(_begins_before, stop=stop), within)),
+            slices=tuple(within),
             ids={split: ids[split][a:b] for split, (a, b) in bounds.items()},
             weights={split: weights[split][a:b] for split, (a, b) in bounds.items()},
             sizes=sizes,
         )
-
-
-def _begins_before(piece: ShardSlice, stop: int) -> bool:
-    return piece.first < stop
 
 
 def _packed(execute: Executor, tasks: Sequence[PackTask]) -> Iterator[Part]:
@@ -258,16 +252,6 @@ def _packed(execute: Executor, tasks: Sequence[PackTask]) -> Iterator[Part]:
     finally:
         for task in tasks:
             Path(task.part).unlink(missing_ok=True)
-
-
-def _create_trials(file: h5py.File, count: int, sizes: Mapping[str, int]) -> list[h5py.Dataset]:
-    """Create the columns of /trials, with room for a number of rows, and return them."""
-    group, columns = file.create_group("trials"), []
-    for field in TRIAL_FIELDS:
-        column = create_field(group, field, field.row_shape(sizes))
-        column.resize(count, axis=0)
-        columns.append(column)
-    return columns
 
 
 def _texts(manifest: Manifest) -> dict[str, list[str]]:

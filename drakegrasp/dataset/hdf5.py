@@ -51,7 +51,7 @@ def open_hdf5(path: Path, *, again: bool = False) -> h5py.File:
     if again:
         return file
     try:
-        elsewhere = _found_elsewhere(file)
+        elsewhere = _find_elsewhere(file)
     except BaseException as error:
         file.close()
         if isinstance(error, RuntimeError):
@@ -63,13 +63,13 @@ def open_hdf5(path: Path, *, again: bool = False) -> h5py.File:
     return file
 
 
-def _found_elsewhere(file: h5py.File) -> str | None:
+def _find_elsewhere(file: h5py.File) -> str | None:
     """Describe the first link or external dataset of a file, or return None."""
     groups, seen = [(file.id, "")], set()
     while groups:
-        group, place = groups.pop()
+        group, path = groups.pop()
         for key in group:
-            name = f"{place}/{key.decode(errors='replace')}"
+            name = f"{path}/{key.decode(errors='replace')}"
             if group.links.get_info(key).type != h5py.h5l.TYPE_HARD:
                 return f"a link at {name}"
 
@@ -139,8 +139,10 @@ def read_column(group: h5py.Group, name: str) -> AnyArray:
     return values
 
 
-def create_field(group: h5py.Group, field: Field, shape: tuple[int, ...]) -> h5py.Dataset:
-    """Create the dataset of a field, without rows; it can be resized.
+def create_field(
+    group: h5py.Group, field: Field, shape: tuple[int, ...], rows: int = 0
+) -> h5py.Dataset:
+    """Create the dataset of a field, with room for some rows; it can be resized.
 
     Unit, frame and meaning become attributes. An image is one chunk, because loaders read single
     samples in random order.
@@ -149,6 +151,7 @@ def create_field(group: h5py.Group, field: Field, shape: tuple[int, ...]) -> h5p
         group: Where to create it.
         field: The field.
         shape: Shape of one row.
+        rows: Number of rows.
     """
     text = field.dtype == "str"
     dataset = group.create_dataset(
@@ -162,13 +165,13 @@ def create_field(group: h5py.Group, field: Field, shape: tuple[int, ...]) -> h5p
         shuffle=not text,
     )
     dataset.attrs.update({"unit": field.unit, "frame": field.frame, "meaning": field.meaning})
+    dataset.resize(rows, axis=0)
     return dataset
 
 
 def write_field(group: h5py.Group, field: Field, values: AnyArray) -> h5py.Dataset:
     """Create the dataset of a field from all of its rows (n, ...), see `create_field`."""
-    dataset = create_field(group, field, values.shape[1:])
-    dataset.resize(len(values), axis=0)
+    dataset = create_field(group, field, values.shape[1:], len(values))
     if len(values):
         dataset[...] = values
     return dataset

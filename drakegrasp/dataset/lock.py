@@ -71,7 +71,14 @@ def build_lock(out: Path) -> Iterator[Holder | None]:
     Raises:
         DataError: If another process builds in the directory, or it cannot be written.
     """
-    made = _make_directory(out)
+    # A directory that is made here goes again if it stays empty.
+    try:
+        made = not out.exists()
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _unwritable(out, error) from None
+
+    # First among the threads of this process, then among all processes.
     key = _claim(out)
     try:
         file, before = _take(out / FILE_NAME)
@@ -135,16 +142,6 @@ def _refuse_linked_folders(out: Path) -> None:
     for folder in folders:
         if folder.is_symlink():
             raise DataError(f"{folder}: must be a folder in the dataset, got a link")
-
-
-def _make_directory(out: Path) -> bool:
-    """Make a directory; return whether it was missing."""
-    try:
-        made = not out.exists()
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise _unwritable(out, error) from None
-    return made
 
 
 def _unwritable(out: Path, error: OSError) -> DataError:

@@ -25,6 +25,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, with_config
 from drakegrasp.config import (
     POSTPROCESSING_KEYS,
     Config,
+    Licence,
     NonNegative,
     Number,
     Positive,
@@ -33,11 +34,11 @@ from drakegrasp.config import (
     override_config,
     parse_stored,
 )
-from drakegrasp.dataset import log as build_log
+from drakegrasp.dataset import lock, log
 from drakegrasp.dataset.assembly.split import Rule, split_rule
 from drakegrasp.dataset.assembly.weights import number_poses
 from drakegrasp.dataset.layout.json_files import Name, read_mapping, validated
-from drakegrasp.dataset.paths import FILE_NAME, OWN_FILES, OWN_FOLDERS
+from drakegrasp.dataset.paths import FILE_NAME
 from drakegrasp.dataset.rejections import AttemptKey, key_to_json
 from drakegrasp.dataset.schema import (
     CONVENTIONS,
@@ -71,7 +72,6 @@ def _refuse_no_pose(packed: tuple[float, ...]) -> tuple[float, ...]:
 #: Types of what a manifest holds; they are checked when one is read.
 Axis = Annotated[str, Field(pattern=r"^[+-][xyz]$")]
 Hex = Annotated[str, Field(pattern="^[0-9a-f]+$")]
-Licence = Annotated[str, Field(pattern=r"^[ -~]*[!-~][ -~]*$", max_length=200)]
 Whole = Annotated[int, Field(ge=0, le=2**63 - 1)]
 Pose = Annotated[
     tuple[Number, ...], Field(min_length=12, max_length=12), AfterValidator(_refuse_no_pose)
@@ -476,7 +476,7 @@ def _refuse_other_files(out: Path) -> None:
     Raises:
         DataError: If there is one.
     """
-    own = (*OWN_FOLDERS, *OWN_FILES)
+    own = (*lock.FOLDERS, lock.FILE_NAME, log.FILE_NAME)
     names = (path.name for path in out.iterdir())
     others = sorted(name for name in names if not name.startswith(".") and name not in own)
     if others:
@@ -488,10 +488,10 @@ def _refuse_other_files(out: Path) -> None:
 
 def release_directory(out: Path) -> None:
     """Remove the files of a build that made nothing, and the directory if it is then empty."""
-    for name in (FILE_NAME, build_log.FILE_NAME):
+    for name in (FILE_NAME, log.FILE_NAME):
         (out / name).unlink(missing_ok=True)
     # A directory with anything else in it was there before.
-    for folder in (*(out / name for name in OWN_FOLDERS), out):
+    for folder in (*(out / name for name in lock.FOLDERS), out):
         with suppress(OSError):
             folder.rmdir()
 

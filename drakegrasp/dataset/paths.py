@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-from drakegrasp.dataset import lock as build_lock
-from drakegrasp.dataset import log as build_log
 from drakegrasp.dataset.layout.opening import opened
 from drakegrasp.dataset.layout.plans import refuse_other_plan
 from drakegrasp.dataset.schema import CAMERAS
@@ -24,10 +22,6 @@ ASSEMBLED_FILES = (TRIALS_FILE, *DATA_FILES.values())
 CARD_FILES = ("DATACARD.json", "DATACARD.md")
 #: Folder of the meshes of the built-in objects, in a dataset that is built from them.
 BUILTIN_FOLDER = "builtin"
-#: Folders that a build makes.
-OWN_FOLDERS = build_lock.FOLDERS
-#: Files that a build writes besides the manifest.
-OWN_FILES = (build_lock.FILE_NAME, build_log.FILE_NAME)
 
 
 def model_path(out: Path, name: str) -> Path:
@@ -61,19 +55,10 @@ def model_file_sha256(out: Path, name: str) -> str:
     return hashlib.sha256(model_path(out, name).read_bytes()).hexdigest()
 
 
-def refuse_changed_object(out: Path, name: str) -> None:
-    """Refuse an object if one of its two files is missing or has changed.
-
-    The plan is sealed, and holds the hash of the other file.
-
-    Raises:
-        DataError: If a file is missing or has changed, or the plan is none.
-    """
-    refuse_changed_model(out, name, recorded_model(out, name))
-
-
 def recorded_model(out: Path, name: str) -> str:
     """Return the hash of the file of an object's meshes that its plan holds, hexadecimal.
+
+    The plan is sealed.
 
     Raises:
         DataError: If the plan is missing or has changed.

@@ -22,7 +22,8 @@ from drakegrasp.dataset.paths import (
     model_file_sha256,
     model_path,
     plan_path,
-    refuse_changed_object,
+    recorded_model,
+    refuse_changed_model,
 )
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array
@@ -119,7 +120,7 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
 
     # Both files must be as they were written, and of this configuration. Plans have no version.
     try:
-        refuse_changed_object(out, name)
+        refuse_changed_model(out, name, recorded_model(out, name))
         with opened(path, "the plan of an object") as file:
             attributes = dict(file.attrs)
             arrays = {key: file[key][:] for key in ARRAYS}

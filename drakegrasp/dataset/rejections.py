@@ -168,13 +168,13 @@ def find_keys(
         DataError: If an id is that of no success.
     """
     keys = {number: key for key, number in ids.items()}
-    found = {entry for entry in rejected if isinstance(entry, AttemptKey) and entry in ids}
+    used = {entry for entry in rejected if isinstance(entry, AttemptKey) and entry in ids}
     for entry in rejected:
         if not isinstance(entry, AttemptKey):
             if entry not in keys:
                 raise DataError(f"{out}: rejected trials must be successes, got trial {entry}")
-            found.add(keys[entry])
-    return tuple(sorted(found))
+            used.add(keys[entry])
+    return tuple(sorted(used))
 
 
 def unused_rejections(

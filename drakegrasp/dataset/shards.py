@@ -13,7 +13,6 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-import numpy.typing as npt
 
 from drakegrasp.dataset.hdf5 import AnyArray, read_column, write_fixed
 from drakegrasp.dataset.layout.attributes import COUNT, TEXT
@@ -25,12 +24,7 @@ from drakegrasp.dataset.layout.opening import (
 )
 from drakegrasp.dataset.layout.structure import Tables
 from drakegrasp.dataset.paths import shards_folder
-from drakegrasp.dataset.schema import (
-    LOOK_FIELDS,
-    SCHEMA_VERSION,
-    TRIAL_FIELDS,
-    Field,
-)
+from drakegrasp.dataset.schema import LOOK_FIELDS, SCHEMA_VERSION, TRIAL_FIELDS, Field
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.files import atomic_hdf5, refuse_broken_seal
@@ -142,17 +136,6 @@ def read_shard(path: Path, header: ShardHeader | None = None, *, verify_seal: bo
             trials={f.name: read_column(file["trials"], f.name) for f in trial_columns()},
             looks={f.name: read_column(file["looks"], f.name) for f in LOOK_FIELDS},
         )
-
-
-def read_outcomes(
-    path: Path, header: ShardHeader, *, verify_seal: bool = True
-) -> npt.NDArray[np.uint8]:
-    """Return the `Outcome` (n,) of each attempt of a shard, see `read_trials`.
-
-    Raises:
-        DataError: See `read_shard`.
-    """
-    return read_trials(path, header, ("outcome",), verify_seal=verify_seal)["outcome"]
 
 
 def read_trials(

@@ -2,13 +2,10 @@
 
 The score says which grasps a person should look at first. By itself it removes nothing; a limit
 in the configuration (`filters.max_suspicion`) can. Each part is a quantity that a firm grasp keeps
-small, divided by the value from which on the part alone is reason enough to look:
+small, divided by the value from which on the part alone is reason enough to look, see `PARTS`:
 
-* `penetration`: depth of the object in the fingertips. Compliant contact needs some.
-* `normal_angle`, `surface_distance`: the contact's mean normal and centre against the full mesh.
-  Patches on both sides of an edge give a normal and a point that no surface has.
-* `slip`, `turn`: motion of the object in the hand during the lift.
-* `other_links`: links besides the fingertips that touch the object after the lift.
+* `normal_angle`, `surface_distance`: patches on both sides of an edge give a mean normal and a
+  centre that no surface has.
 * `imbalance`: after the lift the fingertips' forces and the weight should cancel. What is left is
   carried by something else, or accelerates the object.
 * `normal_sum`: length of the sum of the unit normals after closing. Opposed fingers cancel; where

@@ -10,13 +10,11 @@ from __future__ import annotations
 
 import numpy as np
 import trimesh
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from drakegrasp.frames import Array
-from drakegrasp.mesh.decimation import DECIMATION_STEPS, reduce_and_part
+from drakegrasp.mesh.decimation import DECIMATION_STEPS, reduce_and_part, some_vertices
 from drakegrasp.mesh.repair import weld
-from drakegrasp.mesh.surfaces import Faces, Solid, diagonal
+from drakegrasp.mesh.surfaces import Faces, Solid, connect, diagonal
 from drakegrasp.runtime.environment import release_memory
 
 #: Faces above which a surface is reduced, to about as many: edges of 0.9 mm on a ball of 10 cm.
@@ -26,8 +24,6 @@ MOST_DECIMATED = 300_000
 #: Cells in which vertices are merged: the first edge, as a fraction of the diagonal, and the factor
 #: from one try to the next. Products, so that every machine has the same.
 FIRST_CELL, CELL_FACTOR = 1.0 / 8192.0, 1.25
-#: Vertices at which the deviation is measured.
-DEVIATION_POINTS = 3000
 
 
 def coarsen(vertices: Array, faces: Faces) -> tuple[Array, Faces, tuple[str, ...]]:
@@ -99,11 +95,8 @@ def _merge(vertices: Array, faces: Faces, key: Faces) -> tuple[Array, Faces]:
         a, b = faces[:, corner], faces[:, (corner + 1) % 3]
         within = key[a] == key[b]
         pairs.append(np.stack((a[within], b[within])).astype(np.int32))
-    rows, columns = np.concatenate(pairs, axis=1)
-    graph = coo_matrix(
-        (np.ones(len(rows), dtype=bool), (rows, columns)), shape=(len(vertices), len(vertices))
-    )
-    count, cluster = connected_components(graph, directed=False)
+    first, second = np.concatenate(pairs, axis=1)
+    count, cluster = connect(first, second, len(vertices))
 
     sizes = np.bincount(cluster, minlength=count)
     means = [np.bincount(cluster, vertices[:, axis], count) / sizes for axis in range(3)]
@@ -113,8 +106,7 @@ def _merge(vertices: Array, faces: Faces, key: Faces) -> tuple[Array, Faces]:
 
 def _deviation(vertices: Array, solid: Solid) -> float:
     """Return how far some vertices of the full surface are at most from the reduced one [m]."""
-    count = min(DEVIATION_POINTS, len(vertices))
-    points = vertices[np.linspace(0, len(vertices) - 1, count).astype(int)]
     # In millimetres: trimesh (5) takes triangles with edges below a millimetre for degenerate.
     surface = trimesh.Trimesh(1e3 * solid.vertices, solid.faces, process=False)
-    return float(trimesh.proximity.closest_point(surface, 1e3 * points)[1].max()) / 1e3
+    points = 1e3 * some_vertices(vertices)
+    return float(trimesh.proximity.closest_point(surface, points)[1].max()) / 1e3

@@ -10,14 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
 from drakegrasp.mesh.surfaces import (
     Faces,
     compact,
+    connect,
     face_areas,
     half_edges,
     signed_volume,
@@ -72,8 +71,7 @@ def find_components(vertices: Array, faces: Faces, notes: list[str]) -> list[Com
     same = ends[halves, 0] == ends[other, 0]
     rows = np.concatenate((start, end))
     columns = np.concatenate((np.where(same, other, other_end), np.where(same, other_end, other)))
-    graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(len(ends), len(ends)))
-    _, corner_vertex = connected_components(graph, directed=False)
+    _, corner_vertex = connect(rows, columns, len(ends))
     _, first = np.unique(corner_vertex, return_index=True)
     vertices = vertices[faces.ravel()[first]]
     faces = corner_vertex.reshape(-1, 3).astype(np.int64)
@@ -110,8 +108,7 @@ def _orient(vertices: Array, faces: Faces, twins: Faces) -> tuple[Faces, int]:
     clash = (ends[halves, 0] == ends[twins[halves], 0]).astype(np.int64)
     f, g = halves // 3, twins[halves] // 3
     rows, columns = np.concatenate((f, f + m)), np.concatenate((g + m * clash, g + m * (1 - clash)))
-    graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(2 * m, 2 * m))
-    _, labels = connected_components(graph, directed=False)
+    _, labels = connect(rows, columns, 2 * m)
     if (labels[:m] == labels[m:]).any():
         raise MeshError("the surface must have two sides, got one like a Möbius strip")
 
@@ -236,8 +233,4 @@ def _pair_radially(vertices: Array, faces: Faces, halves: Faces, twins: Faces) -
 def face_components(twins: Faces, face_count: int) -> tuple[int, Faces]:
     """Return the number of connected components, and the component of every face (m,)."""
     halves = np.flatnonzero(twins >= 0)
-    graph = coo_matrix(
-        (np.ones(len(halves)), (halves // 3, twins[halves] // 3)), shape=(face_count, face_count)
-    )
-    count, labels = connected_components(graph, directed=False)
-    return int(count), labels
+    return connect(halves // 3, twins[halves] // 3, face_count)

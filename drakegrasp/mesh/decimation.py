@@ -9,10 +9,12 @@ import numpy as np
 import trimesh
 
 from drakegrasp.errors import MeshError
+from drakegrasp.frames import Array
 from drakegrasp.mesh.components import find_components, part_touching_edges
 from drakegrasp.mesh.repair import weld
 from drakegrasp.mesh.surfaces import (
     MAX_OVERLAP,
+    Faces,
     Solid,
     diagonal,
     even_points,
@@ -87,11 +89,15 @@ def surface_deviation(first: Solid, second: Solid) -> float:
     for mesh, other in (meshes, meshes[::-1]):
         # Points evenly spread over the faces, and vertices, where the deviation is largest.
         points = on_faces(mesh.vertices, mesh.faces, even_points(DEVIATION_POINTS))[0]
-        count = min(DEVIATION_POINTS, len(mesh.vertices))
-        corners = np.linspace(0, len(mesh.vertices) - 1, count).astype(int)
-        points = np.vstack((points, mesh.vertices[corners]))
+        points = np.vstack((points, some_vertices(mesh.vertices)))
         worst = max(worst, float(trimesh.proximity.closest_point(other, points)[1].max()))
     return worst
+
+
+def some_vertices(vertices: Array) -> Array:
+    """Return at most `DEVIATION_POINTS` of the vertices (n, 3), spread over their order."""
+    count = min(DEVIATION_POINTS, len(vertices))
+    return vertices[np.linspace(0, len(vertices) - 1, count).astype(int)]
 
 
 def _is_sound(reduced: Solid, solid: Solid) -> bool:
@@ -108,19 +114,11 @@ def _is_sound(reduced: Solid, solid: Solid) -> bool:
 def _decimate_quadric(solid: Solid, max_faces: int) -> Solid | None:
     """Return the result of the least aggressive decimation that gives few enough faces."""
     for aggressiveness in DECIMATION_STEPS:
-        vertices, faces = fast_simplification.simplify(
-            np.ascontiguousarray(solid.vertices),
-            np.ascontiguousarray(solid.faces),
-            target_count=max_faces,
-            agg=aggressiveness,
-        )
-        if not 0 < len(faces) <= max_faces:
-            continue
-        # Walls that have come to touch now share edges; separating them closes both again.
-        components = find_components(
-            np.asarray(vertices, dtype=np.float64), np.asarray(faces, np.int64), []
-        )
-        return stack([(part.vertices, part.faces) for part in components])
+        vertices, faces = _simplify(solid, max_faces, aggressiveness)
+        if 0 < len(faces) <= max_faces:
+            # Walls that have come to touch now share edges; separating them closes both again.
+            components = find_components(vertices, faces, [])
+            return stack([(part.vertices, part.faces) for part in components])
     return None
 
 
@@ -150,15 +148,19 @@ def reduce_and_part(solid: Solid, target: int, aggressiveness: float) -> Solid:
         target: Number of faces to aim at.
         aggressiveness: How fast the error may grow from round to round, see `DECIMATION_STEPS`.
     """
+    vertices, faces = part_touching_edges(*weld(*_simplify(solid, target, aggressiveness)))
+    return Solid(vertices=vertices, faces=faces)
+
+
+def _simplify(solid: Solid, target: int, aggressiveness: float) -> tuple[Array, Faces]:
+    """Return vertices and faces of a quadric decimation, see `reduce_and_part`."""
     vertices, faces = fast_simplification.simplify(
         np.ascontiguousarray(solid.vertices),
         np.ascontiguousarray(solid.faces),
         target_count=target,
         agg=aggressiveness,
     )
-    welded = weld(np.asarray(vertices, dtype=np.float64), np.asarray(faces, np.int64))
-    vertices, faces = part_touching_edges(*welded)
-    return Solid(vertices=vertices, faces=faces)
+    return np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
 
 
 def _simplify_manifold(solid: Solid, max_faces: int) -> Solid | None:

@@ -16,7 +16,7 @@ from scipy.ndimage import distance_transform_edt
 
 from drakegrasp.arithmetic import norm
 from drakegrasp.frames import Array
-from drakegrasp.mesh.surfaces import cover_triangles
+from drakegrasp.mesh.surfaces import cover_triangles, enumerate_pairs
 
 Distances = npt.NDArray[np.float32]
 
@@ -92,13 +92,12 @@ class DistanceField:
             np.maximum(beside, value - upper, out=beside)
 
             # Flat index of the nearest grid point.
-            place = (value - np.float32(self.origin[axis])) * scale
-            place += np.float32(0.5)
+            cell = (value - np.float32(self.origin[axis])) * scale
+            cell += np.float32(0.5)
             count = self.values.shape[axis]
-            np.maximum(place, np.float32(0.0), out=place)
-            np.minimum(place, np.float32(count - 1), out=place)
+            np.clip(cell, np.float32(0.0), np.float32(count - 1), out=cell)
             index *= np.int32(count)
-            index += place.astype(np.int32)
+            index += cell.astype(np.int32)
         return np.asarray(np.maximum(self.values.ravel().take(index), beside))
 
     def interpolate(self, x: Distances, y: Distances, z: Distances) -> Distances:
@@ -116,11 +115,11 @@ class DistanceField:
         index = np.zeros(np.shape(x), dtype=np.int32)
         parts = []
         for value, start, count in zip((x, y, z), self.origin, self.values.shape, strict=True):
-            place = np.clip((value - np.float32(start)) * scale, 0, np.float32(count) - 1.001)
-            cell = place.astype(np.int32)
+            cells = np.clip((value - np.float32(start)) * scale, 0, np.float32(count) - 1.001)
+            cell = cells.astype(np.int32)
             index *= np.int32(count)
             index += cell
-            parts.append(place - cell)
+            parts.append(cells - cell)
 
         # Interpolate along z, then y, then x.
         flat = self.values.ravel()
@@ -193,8 +192,8 @@ def _unsigned(triangles: Array, origin: Array, spacing: float, shape: tuple[int,
     squared = np.zeros(shape, dtype=np.float32)
     sample = points[first].astype(np.float32)
     for axis in range(3):
-        place = grid[axis] * np.float32(spacing) + np.float32(origin[axis])
-        squared += (place - sample[seed, axis]) ** 2
+        coordinate = grid[axis] * np.float32(spacing) + np.float32(origin[axis])
+        squared += (coordinate - sample[seed, axis]) ** 2
     distance = np.sqrt(squared)
 
     # Near the surface, the distance from its triangle.
@@ -222,8 +221,7 @@ def _inside(
     size = np.floor(flat[:, :, :2].max(axis=1)).astype(int) - low + 1
     size = np.maximum(size, 0)
     count = size[:, 0] * size[:, 1]
-    t = np.repeat(np.arange(len(flat)), count)
-    k = np.arange(len(t)) - np.repeat(np.cumsum(count) - count, count)
+    t, k = enumerate_pairs(count)
     x, y = low[t, 0] + k // size[t, 1], low[t, 1] + k % size[t, 1]
 
     # Twice the signed areas of the three triangles that the column makes with the projected edges:

@@ -11,7 +11,7 @@ import trimesh
 from drakegrasp.errors import MeshError, one_line
 from drakegrasp.frames import Array
 from drakegrasp.mesh.repair import weld
-from drakegrasp.mesh.surfaces import Faces
+from drakegrasp.mesh.surfaces import Faces, stack
 
 #: Mesh files that can be read; other files are ignored.
 SUFFIXES = (".obj", ".stl", ".ply", ".glb")
@@ -117,10 +117,9 @@ def _concatenate(parts: list[trimesh.Trimesh]) -> tuple[Array, Faces]:
     """Return the vertices and faces of several meshes as one; of none, empty arrays."""
     if not parts:
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
-    if len(parts) == 1:  # no copies of what may be large
-        vertices, faces = parts[0].vertices.view(np.ndarray), parts[0].faces.view(np.ndarray)
-        return vertices.astype(np.float64, copy=False), faces.astype(np.int64, copy=False)
-    offsets = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
-    every = [part.faces + offset for part, offset in zip(parts, offsets, strict=True)]
-    vertices = np.vstack([part.vertices for part in parts])
-    return np.array(vertices, dtype=np.float64), np.vstack(every).astype(np.int64)
+    arrays = [(part.vertices.view(np.ndarray), part.faces.view(np.ndarray)) for part in parts]
+    if len(arrays) > 1:
+        solid = stack(arrays)
+        arrays = [(solid.vertices, solid.faces)]
+    ((vertices, faces),) = arrays  # no copies of one that may be large
+    return vertices.astype(np.float64, copy=False), faces.astype(np.int64, copy=False)

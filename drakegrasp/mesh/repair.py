@@ -15,8 +15,6 @@ before.
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from drakegrasp.arithmetic import norm
@@ -34,6 +32,7 @@ from drakegrasp.mesh.surfaces import (
     Faces,
     Solid,
     compact,
+    connect,
     diagonal,
     face_areas,
     half_edges,
@@ -98,21 +97,21 @@ def _first_equal(vertices: Array, spacing: float) -> Faces:
     Sorting all vertices at once would take several times their memory: an STL file has each of
     them six times. So each part of them is sorted first, and then what is left of the parts.
     """
-    firsts, places, total = [], [], 0
+    firsts, indices, total = [], [], 0
     for start in range(0, len(vertices), WELD_PART):
         part = np.round(vertices[start : start + WELD_PART] / spacing)
         _, first, inverse = np.unique(part, axis=0, return_index=True, return_inverse=True)
         firsts.append(start + first)
-        places.append((total + inverse.reshape(-1)).astype(np.int32))
+        indices.append((total + inverse.reshape(-1)).astype(np.int32))
         total += len(first)
-    kept, place = np.concatenate(firsts), np.concatenate(places)
+    kept, index = np.concatenate(firsts), np.concatenate(indices)
     if len(firsts) == 1:
-        return kept[place].astype(np.int64)
+        return kept[index].astype(np.int64)
 
     # Equal ones of two parts: the earlier part is the first.
     grid = np.round(vertices[kept] / spacing)
     _, first, inverse = np.unique(grid, axis=0, return_index=True, return_inverse=True)
-    return kept[first[inverse.reshape(-1)]][place].astype(np.int64)
+    return kept[first[inverse.reshape(-1)]][index].astype(np.int64)
 
 
 def _unique_faces(faces: Faces) -> tuple[Faces, Faces, Faces]:
@@ -213,8 +212,7 @@ def _stitch(vertices: Array, faces: Faces, notes: list[str]) -> tuple[Array, Fac
 
     # Merge rim vertices that are close to each other, directly or by others between them.
     pairs = cKDTree(vertices[rim]).query_pairs(STITCH * diagonal(vertices), output_type="ndarray")
-    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(rim), len(rim)))
-    _, labels = connected_components(graph, directed=False)
+    _, labels = connect(pairs[:, 0], pairs[:, 1], len(rim))
     _, first = np.unique(labels, return_index=True)
     merged = np.arange(len(vertices))
     merged[rim] = rim[first[labels]]

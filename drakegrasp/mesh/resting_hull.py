@@ -13,7 +13,14 @@ import trimesh
 
 from drakegrasp.arithmetic import dot, norm
 from drakegrasp.frames import Array
-from drakegrasp.mesh.surfaces import Faces, Solid, compact, face_areas, half_edges
+from drakegrasp.mesh.surfaces import (
+    Faces,
+    Solid,
+    compact,
+    face_areas,
+    half_edges,
+    unit_normals,
+)
 
 #: Triangles of the hull are one facet where their corners are this near to the plane of its largest
 #: one [m], and their normals agree with its normal to this cosine.
@@ -63,15 +70,14 @@ def resting_hull(points: Array) -> Solid:
 
 def _facets(vertices: Array, faces: Faces) -> list[Faces]:
     """Return the facets of a convex surface, each as its triangles (m, 3), largest first."""
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    areas = face_areas(vertices, faces)
-    normals = np.cross(b - a, c - a) / np.maximum(2.0 * areas, 1e-300)[:, None]
+    areas, normals = face_areas(vertices, faces), unit_normals(vertices[faces])
 
     # The largest triangle that is left takes those in its plane.
     facets, free = [], np.ones(len(faces), dtype=bool)
     for largest in np.argsort(-areas, kind="stable"):
         if free[largest]:
-            near = np.abs(dot(vertices - a[largest], normals[largest])) <= FLATNESS
+            corner = vertices[faces[largest, 0]]
+            near = np.abs(dot(vertices - corner, normals[largest])) <= FLATNESS
             alike = dot(normals, normals[largest]) >= ALIKE
             members = free & alike & near[faces].all(axis=1)
             members[largest] = True

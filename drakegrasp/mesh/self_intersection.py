@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import dot, norm
 from drakegrasp.frames import Array
-from drakegrasp.mesh.surfaces import Faces, diagonal
+from drakegrasp.mesh.surfaces import Faces, diagonal, pair_blocks, unit_normals
 
 #: An edge passes through a face if its ends are farther than this on both sides, and it farther
 #: than this from the face's edges, as a fraction of the diagonal. Surfaces that only touch do
@@ -42,20 +42,15 @@ def crossing_faces(vertices: Array, faces: Faces) -> Faces:
     counts = ends - np.arange(len(faces)) - 1
 
     # Test the pairs of many runs at a time.
-    found = np.zeros(len(faces), dtype=bool)
+    crosses = np.zeros(len(faces), dtype=bool)
     depth = DEPTH * diagonal(vertices)
-    blocks = np.flatnonzero(np.diff(np.cumsum(counts) // PAIRS, prepend=0))
-    for run in np.split(np.arange(len(faces)), blocks):
-        repeated = np.repeat(run, counts[run])
-        offset = np.arange(len(repeated)) - np.repeat(
-            np.cumsum(counts[run]) - counts[run], counts[run]
-        )
-        first, second = order[repeated], order[repeated + 1 + offset]
+    for i, j in pair_blocks(counts, PAIRS):
+        first, second = order[i], order[i + 1 + j]
         overlap = ((low[first] <= high[second]) & (low[second] <= high[first])).all(axis=1)
         first, second = first[overlap], second[overlap]
         crossing = _cross(vertices, faces[first], faces[second], depth)
-        found[first[crossing]] = found[second[crossing]] = True
-    return np.flatnonzero(found)
+        crosses[first[crossing]] = crosses[second[crossing]] = True
+    return np.flatnonzero(crosses)
 
 
 def _cross(vertices: Array, first: Faces, second: Faces, depth: float) -> Mask:
@@ -78,8 +73,7 @@ def _pass(p: Array, q: Array, triangles: Array, depth: float) -> Mask:
     """Return which segments p (k, 3) to q (k, 3) pass through their triangle (k, 3, 3)."""
     # The ends lie on different sides of its plane ...
     a, b, c = np.moveaxis(triangles, 1, 0)
-    normal = np.cross(b - a, c - a)
-    normal = normal / np.maximum(norm(normal), 1e-300)[:, None]
+    normal = unit_normals(triangles)
     above, below = dot(p - a, normal), dot(q - a, normal)
     sides = (np.minimum(above, below) < -depth) & (np.maximum(above, below) > depth)
 

@@ -6,11 +6,14 @@ changes a shape.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import manifold3d
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from drakegrasp.arithmetic import dot, multiply, norm
 from drakegrasp.errors import MeshError
@@ -64,6 +67,13 @@ def face_areas(vertices: Array, faces: Faces) -> Array:
     return norm(np.cross(b - a, c - a)) / 2.0
 
 
+def unit_normals(triangles: Array) -> Array:
+    """Return the outward unit normal (m, 3) of triangles (m, 3, 3); 0 for one without an area."""
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    normals = np.cross(b - a, c - a)
+    return np.asarray(normals / np.maximum(norm(normals), 1e-300)[:, None])
+
+
 def diagonal(vertices: Array) -> float:
     """Return the diagonal of the bounding box [m]."""
     return float(norm(np.ptp(vertices, axis=0)))
@@ -81,6 +91,36 @@ def is_solid_surface(faces: Faces) -> bool:
 def half_edges(faces: Faces) -> Faces:
     """Return the half-edges (3m, 2): start and end; 3f + i leaves corner i of face f."""
     return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+
+
+# Connections and pairs
+
+
+def connect(first: Faces, second: Faces, count: int) -> tuple[int, Faces]:
+    """Return the number of connected sets of nodes, and the set (count,) of each node.
+
+    Args:
+        first: (e,), one node of each edge.
+        second: (e,), the other one.
+        count: Number of nodes.
+    """
+    edges = np.ones(len(first), dtype=bool), (first, second)
+    number, sets = connected_components(coo_matrix(edges, shape=(count, count)), directed=False)
+    return int(number), sets
+
+
+def enumerate_pairs(counts: Faces) -> tuple[Faces, Faces]:
+    """Return all pairs (i, j) with i < len(counts) and j < counts[i], as two arrays (n,)."""
+    i = np.repeat(np.arange(len(counts)), counts)
+    return i, np.arange(len(i)) - np.repeat(np.cumsum(counts) - counts, counts)
+
+
+def pair_blocks(counts: Faces, most: int) -> Iterator[tuple[Faces, Faces]]:
+    """Yield the pairs of `enumerate_pairs` in blocks of about `most` at a time."""
+    blocks = np.flatnonzero(np.diff(np.cumsum(counts) // most, prepend=0))
+    for run in np.split(np.arange(len(counts)), blocks):
+        i, j = enumerate_pairs(counts[run])
+        yield run[i], j
 
 
 # Inside and outside
@@ -124,12 +164,9 @@ def whole_windings(p_OQ: Array, vertices: Array, faces: Faces) -> Array:
     area, volume = ROUNDING * diagonal(vertices) ** 2, ROUNDING * diagonal(vertices) ** 3
 
     winding, doubtful = np.zeros(len(p_OQ)), np.zeros(len(p_OQ), dtype=bool)
-    blocks = np.flatnonzero(np.diff(np.cumsum(counts) // CHUNK_PAIRS, prepend=0))
-    for run in np.split(np.arange(len(faces)), blocks):
+    for t, j in pair_blocks(counts, CHUNK_PAIRS):
         # Of these pairs, those where some of the triangle may be above the point.
-        t = np.repeat(run, counts[run])
-        ends = np.cumsum(counts[run])
-        q = order[begins[t] + np.arange(len(t)) - np.repeat(ends - counts[run], counts[run])]
+        q = order[begins[t] + j]
         y, z = p_OQ[q, 1], p_OQ[q, 2]
         near = (low[t, 1] <= y) & (y <= high[t, 1]) & (z <= high[t, 2])
         t, q = t[near], q[near]
@@ -174,10 +211,7 @@ def overlap_share(vertices: Array, faces: Faces, *, points: int = CHECK_POINTS) 
     # Near the faces, if too few of those points are inside.
     if inside < count // 20:
         on_face, picked = on_faces(vertices, faces, spread[: count // 2])
-        a, b, c = np.moveaxis(vertices[faces[picked]], 1, 0)
-        normals = np.cross(b - a, c - a)
-        normals /= np.maximum(norm(normals), 1e-300)[:, None]
-        offsets = NEAR * float(norm(size)) * normals
+        offsets = NEAR * float(norm(size)) * unit_normals(vertices[faces[picked]])
         both_sides = np.vstack((on_face - offsets, on_face + offsets))
         inside, wrong = _count_wrong(both_sides, vertices, faces)
     return wrong / max(1, inside)

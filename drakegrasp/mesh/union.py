@@ -1,4 +1,4 @@
-"""Union: closed components come in, one surface that encloses every place once goes out.
+"""Union: closed components come in, one surface that encloses each point once at most goes out.
 
 Components may overlap, lie inside each other, be inside out, and pass through themselves.
 """
@@ -144,7 +144,7 @@ def _tidy(solid: manifold3d.Manifold, size: float, *, chip: float = CHIP) -> tup
 
 
 def separate(vertices: Array, faces: Faces, notes: list[str]) -> tuple[Array, Faces]:
-    """Return a surface that does not pass through itself and encloses every place once.
+    """Return a surface that does not pass through itself and encloses no point twice.
 
     Args:
         vertices: (n, 3) [m].
@@ -186,7 +186,7 @@ def _untangle(solid: manifold3d.Manifold, depth: int) -> list[manifold3d.Manifol
     A surface that passes through itself falls apart into separate pieces when it is
     cut small enough, and separate pieces can be united. Only what is still tangled is
     cut again, so that the rest keeps its large triangles. Where the surface lies
-    inside out there is no material: such places are dents deeper than the wall is thick.
+    inside out there is no material: these are dents deeper than the wall is thick.
     """
     # Drop dents.
     pieces = [piece for piece in solid.decompose() if abs(piece.volume()) > NOTHING]

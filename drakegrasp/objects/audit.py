@@ -9,7 +9,6 @@ from typing import Any, Literal
 import numpy as np
 import trimesh
 
-from drakegrasp.arithmetic import norm
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import Array
 from drakegrasp.mesh.components import face_components, pair_half_edges
@@ -22,6 +21,7 @@ from drakegrasp.mesh.surfaces import (
     is_solid_surface,
     on_faces,
     signed_volume,
+    unit_normals,
 )
 from drakegrasp.objects.contact_fit import AHEAD
 from drakegrasp.objects.memory import forecast_memory
@@ -113,9 +113,7 @@ class AuditRow:
 
     def to_json(self) -> dict[str, Any]:
         """Return the row as JSON types, without the model."""
-        content = asdict(replace(self, model=None))
-        del content["model"]
-        return content
+        return {k: v for k, v in asdict(replace(self, model=None)).items() if k != "model"}
 
 
 def audit(
@@ -205,9 +203,7 @@ def wall_thickness(vertices: Array, faces: Faces) -> float:
         faces: (m, 3).
     """
     points, picked = on_faces(vertices, faces, even_points(WALL_POINTS))
-    a, b, c = np.moveaxis(vertices[faces[picked]], 1, 0)
-    normal = np.cross(b - a, c - a)
-    inward = -normal / np.maximum(norm(normal), 1e-300)[:, None]
+    inward = -unit_normals(vertices[faces[picked]])
     through = first_hits(vertices[faces], points + BELOW * inward, inward)
     return float(np.quantile(through[np.isfinite(through)], WALL_SHARE))
 
@@ -240,19 +236,19 @@ def _measures(model: ObjectModel, vertices: Array, faces: Faces) -> dict[str, An
 
 def _warnings(row: AuditRow) -> list[str]:
     """Return what may be wrong with an object that a build would take."""
-    found = []
+    warnings = []
     if row.units_guess is not None:
-        found.append(f"its lengths may be in {row.units_guess}")
+        warnings.append(f"its lengths may be in {row.units_guess}")
     if row.wall is not None and row.wall < THIN_WALL:
-        found.append(
+        warnings.append(
             f"walls of {row.wall * 1e3:.1f} mm, thin for a fingertip (below {THIN_WALL * 1e3:g} mm)"
         )
     if row.density is not None and not DENSITIES[0] <= row.density <= DENSITIES[1]:
-        found.append(f"{row.mass:g} kg make {row.density:,.0f} kg/m^3: give its mass or density")
+        warnings.append(f"{row.mass:g} kg make {row.density:,.0f} kg/m^3: give its mass or density")
     if row.gyration is not None and not GYRATION[0] <= row.gyration <= GYRATION[1]:
-        found.append(f"its inertia is {row.gyration**2:.2g} times that of its hull")
+        warnings.append(f"its inertia is {row.gyration**2:.2g} times that of its hull")
     if row.crossing:
-        found.append(f"{row.crossing} faces pass through others")
+        warnings.append(f"{row.crossing} faces pass through others")
     if row.volume_change is not None and abs(row.volume_change) > NOTED_CHANGE:
-        found.append(f"repair changed the volume by {row.volume_change:+.0%}")
-    return found
+        warnings.append(f"repair changed the volume by {row.volume_change:+.0%}")
+    return warnings

@@ -350,17 +350,13 @@ def _mistake(values: dict[str, Any]) -> str | None:
         return "notes that are no texts"
 
     # Numbers.
-    friction = 1.0 if values["friction"] is None else values["friction"]
-    for key, number in (
-        ("mass", values["mass"]),
-        ("scale", values["scale"]),
-        ("friction", friction),
-    ):
-        if not (isinstance(number, float) and np.isfinite(number) and number > 0.0):
+    for key in ("mass", "scale", "friction", "collision_error"):
+        number = values[key]
+        if key == "friction" and number is None:
+            continue
+        valid = isinstance(number, float) and np.isfinite(number) and number >= 0.0
+        if not valid or (number == 0.0 and key != "collision_error"):
             return f"{key} {number!r}"
-    error = values["collision_error"]
-    if not (isinstance(error, float) and np.isfinite(error) and error >= 0.0):
-        return f"collision_error {error!r}"
 
     # Arrays; a face names three vertices.
     for key in ("visual_vertices", "collision_vertices", "p_OOcm", "I_OOcm_O"):

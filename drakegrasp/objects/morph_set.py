@@ -7,7 +7,6 @@ group: in a split by object all morphs of a mesh, and the mesh itself, stay toge
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from drakegrasp.errors import MeshError
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.morph import Original, load_original, morph_object
 from drakegrasp.objects.sources import MANIFEST_NAME, MeshSource, find_meshes
-from drakegrasp.runtime.files import temporary_name
+from drakegrasp.runtime.files import atomic_folder
 from drakegrasp.runtime.progress import Report, silent
 
 
@@ -77,7 +76,7 @@ def morph_meshes(
         for source in sources:
             try:
                 original = load_original(source)
-                morphs = list(_morphs_of(source, original, per_mesh, seed))
+                morphs = _morphs_of(source, original, per_mesh, seed)
                 _refuse_known(source, {name for name, _, _ in morphs} & entries.keys())
                 for name, text, count in morphs:
                     (folder / f"{name}.obj").write_text(text, encoding="ascii")
@@ -107,11 +106,8 @@ def morph_meshes(
 
 def _morphs_of(
     source: MeshSource, original: Original, per_mesh: int, seed: int
-) -> Iterator[tuple[str, str, int]]:
-    """Yield name, Wavefront text and number of draws of each morph of a mesh.
-
-    All are made before the first is given: a mesh has all of its morphs or none.
-    """
+) -> list[tuple[str, str, int]]:
+    """Return name, Wavefront text and number of draws of each morph of a mesh."""
     made = []
     for number in range(1, per_mesh + 1):
         # Also checks the name, which is that of a file.
@@ -119,15 +115,11 @@ def _morphs_of(
         MeshSource(name=name, class_name=source.class_name, path=source.path)
         morphed = morph_object(original, source.name, number, seed)
         made.append((name, obj_text(morphed.vertices, morphed.faces, normals=False), morphed.draws))
-    yield from made
+    return made
 
 
 def _refuse_known(source: MeshSource, names: set[str]) -> None:
-    """Refuse a mesh whose morphs would have names of another's.
-
-    Raises:
-        MeshError: If there are such names.
-    """
+    """Refuse a mesh if any morphs of another one have these names."""
     if names:
         raise MeshError(
             f"{source.name} of class {source.class_name}: its morphs must have names of their own, "
@@ -149,20 +141,12 @@ def _whole_directory(out: Path) -> Iterator[Path]:
     Raises:
         MeshError: If `out` holds anything, or cannot be written.
     """
-    # What is there already stays as it is.
     try:
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise MeshError(f"{out}: must be new or an empty directory, got one that holds others")
-        out.parent.mkdir(parents=True, exist_ok=True)
-        folder = temporary_name(out)
-        folder.mkdir()
+        with atomic_folder(out) as folder:
+            yield folder
     except OSError as error:
         raise MeshError(
             f"{out}: must be a directory that can be written, got: {error.strerror}"
         ) from error
-
-    try:
-        yield folder
-        folder.replace(out)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)

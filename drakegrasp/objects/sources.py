@@ -28,7 +28,7 @@ import unicodedata
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 import pydantic
@@ -36,7 +36,7 @@ import trimesh
 import yaml
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.config import Positive, describe_mistake
+from drakegrasp.config import Licence, Positive, describe_mistake
 from drakegrasp.errors import MeshError, one_line
 from drakegrasp.frames import Array
 from drakegrasp.mesh.loading import MANY_FACES, SUFFIXES, clean_triangles, parse_mesh, read_bytes
@@ -55,8 +55,6 @@ UPRIGHT = {
     "+z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     "-z": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
 }
-#: Keys of an object in the manifest.
-_KEYS = "units, scale, up, class, name, mass, density, friction, licence, group"
 MANIFEST_NAME = "objects.yaml"
 
 
@@ -111,24 +109,18 @@ class MeshSource:
 # Finding meshes
 
 
-_Factor = Positive
-
-
-_Line = Annotated[str, pydantic.Field(pattern=r"^[ -~]*[!-~][ -~]*$", max_length=200)]
-
-
 class _Entry(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(extra="forbid", coerce_numbers_to_str=True)
 
     units: Literal["m", "cm", "mm"] | None = None
+    scale: Positive = 1.0
+    up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] = "+z"
     class_name: str | None = pydantic.Field(default=None, alias="class")
     name: str | None = None
-    scale: _Factor = 1.0
-    up: Literal["+x", "-x", "+y", "-y", "+z", "-z"] = "+z"
-    mass: _Factor | None = None
-    density: _Factor | None = None
-    friction: _Factor | None = None
-    licence: _Line | None = None
+    mass: Positive | None = None
+    density: Positive | None = None
+    friction: Positive | None = None
+    licence: Licence | None = None
     group: str | None = None
 
     @pydantic.field_validator("scale", "mass", "density", "friction", mode="before")
@@ -142,7 +134,7 @@ class _Manifest(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(extra="forbid", coerce_numbers_to_str=True)
 
     units: Literal["m", "cm", "mm"] | None = None
-    licence: _Line | None = None
+    licence: Licence | None = None
     objects: dict[str, _Entry] = pydantic.Field(default_factory=dict)
 
     @pydantic.field_validator("objects", mode="before")
@@ -162,7 +154,8 @@ def _read_manifest(path: Path) -> _Manifest:
         return _Manifest.model_validate({} if content is None else content)
     except pydantic.ValidationError as error:
         mistake = error.errors()[0]
-        keys = _KEYS if mistake["loc"][:1] == ("objects",) else "units, licence, objects"
+        model = _Entry if mistake["loc"][:1] == ("objects",) else _Manifest
+        keys = ", ".join(field.alias or name for name, field in model.model_fields.items())
         line = describe_mistake(mistake, whole="the file", legal=f"a known key ({keys})")
         raise MeshError(f"{path}: {line}") from error
 
@@ -251,18 +244,10 @@ def _entries(table: _Manifest) -> dict[str, _Entry]:
 
 def _source(path: Path, stem: str, table: _Manifest, units: str) -> MeshSource:
     entry = _entries(table).get(stem, _Entry())
-    return MeshSource(
-        name=stem if entry.name is None else entry.name,
-        class_name=_class_of(stem) if entry.class_name is None else entry.class_name,
-        path=path,
-        scale=UNITS[entry.units or table.units or units] * entry.scale,
-        up=entry.up,
-        mass=entry.mass,
-        density=entry.density,
-        friction=entry.friction,
-        licence=entry.licence or table.licence,
-        group=entry.group,
-    )
+    said = entry.model_dump(exclude={"units", "scale"}, exclude_none=True)
+    usual = {"name": stem, "class_name": _class_of(stem), "licence": table.licence}
+    scale = UNITS[entry.units or table.units or units] * entry.scale
+    return MeshSource(path=path, scale=scale, **(usual | said))
 
 
 def _refuse_units(units: str) -> None:

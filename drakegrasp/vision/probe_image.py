@@ -67,28 +67,15 @@ def render_box() -> tuple[int, int]:
     import numpy as np
     import trimesh
 
-    from drakegrasp.config import CameraConfig
+    from drakegrasp.config import CameraConfig, ObjectConfig
     from drakegrasp.frames import make_pose
-    from drakegrasp.objects.model import ObjectModel
+    from drakegrasp.objects.model import make_object
     from drakegrasp.vision.camera import intrinsics
     from drakegrasp.vision.rendering import build_renderer, render
 
-    # A cube of 1 kg.
-    config = CameraConfig()
-    box = trimesh.creation.box((BOX_EDGE,) * 3)
-    model = ObjectModel(
-        name="box",
-        class_name="box",
-        mesh_sha256="",
-        visual_vertices=box.vertices,
-        visual_faces=box.faces,
-        collision_vertices=box.vertices,
-        collision_faces=box.faces,
-        mass=1.0,
-        p_OOcm=np.zeros(3),
-        I_OOcm_O=np.eye(3) * BOX_EDGE**2 / 6.0,
-        collision_error=0.0,
-    )
+    config, box = CameraConfig(), trimesh.creation.box((BOX_EDGE,) * 3)
+    name = {"name": "box", "class_name": "box", "mesh_sha256": ""}
+    model = make_object(box.vertices, box.faces, ObjectConfig(), **name)
 
     # It stands on the table, and the camera looks straight down on it.
     X_TO = make_pose(np.eye(3), [0.0, 0.0, BOX_EDGE / 2.0])

@@ -127,7 +127,8 @@ def paint(renderer: Renderer, appearance: Appearance) -> None:
     The lights of a render engine are fixed, so this makes a new engine. That takes as long as some
     ten images.
     """
-    if _equal(renderer.appearance, appearance):
+    now = vars(renderer.appearance).items()
+    if all(np.array_equal(value, getattr(appearance, name)) for name, value in now):
         return
 
     # An engine takes the colours over when it is added.
@@ -138,10 +139,6 @@ def paint(renderer: Renderer, appearance: Appearance) -> None:
     _set_colour(renderer, renderer.table, appearance.table_colour)
     graph.AddRenderer(context, ENGINE, MakeRenderEngineVtk(_engine_parameters(appearance)))
     renderer.appearance = appearance
-
-
-def _equal(one: Appearance, other: Appearance) -> bool:
-    return all(np.array_equal(value, getattr(other, name)) for name, value in vars(one).items())
 
 
 def _engine_parameters(appearance: Appearance) -> RenderEngineVtkParams:

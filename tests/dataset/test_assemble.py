@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
 from collections import Counter
@@ -13,6 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from helpers.assertions import arrays_of
 from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
 
 from drakegrasp.dataset import assemble as assemble_module
@@ -158,10 +158,9 @@ def lost_finger(when: str) -> Any:
     ],
 )
 def test_a_success_that_is_spoiled_is_removed_for_that_reason(
-    sound: Path, tmp_path: Path, edit: Any, reason: Removal | None
+    out: Path, edit: Any, reason: Removal | None
 ) -> None:
     """By one number of one finger or camera; the other grasps of the dataset stay."""
-    out = Path(shutil.copytree(sound, tmp_path / "out"))
     spoil(out, edit)
     found = assemble(out, overrides=["filters.min_depth_variance=1e-6"]).removed
     assert found == ({Removal.KEPT: 9} if reason is None else {Removal.KEPT: 8, reason: 1})
@@ -170,26 +169,17 @@ def test_a_success_that_is_spoiled_is_removed_for_that_reason(
 
 
 @pytest.mark.parametrize(
-    ("limit", "reason"),
-    [
-        ("max_suspicion", Removal.SUSPICIOUS),
-        ("max_penetration", Removal.SUSPICIOUS),
-        ("max_imbalance", Removal.SUSPICIOUS),
-        ("max_normal_sum", Removal.SUSPICIOUS),
-    ],
+    "limit", ["max_suspicion", "max_penetration", "max_imbalance", "max_normal_sum"]
 )
-def test_each_part_of_the_suspicion_reaches_its_filter(
-    sound: Path, tmp_path: Path, limit: str, reason: Removal
-) -> None:
+def test_each_part_of_the_suspicion_reaches_its_filter(out: Path, limit: str) -> None:
     """The score of a made-up grasp is 1.2, its depth 0.1 mm, its forces do not carry the weight."""
-    out = Path(shutil.copytree(sound, tmp_path / "out"))
+    reason = Removal.SUSPICIOUS
     assert assemble(out, overrides=[f"filters.{limit}=1e9"]).removed == {Removal.KEPT: 9}
     assert assemble(out, overrides=[f"filters.{limit}=1e-5"]).removed == {reason: 9}
 
 
-def test_camera_height_is_above_the_table(sound: Path, tmp_path: Path) -> None:
+def test_camera_height_is_above_the_table(out: Path) -> None:
     """A limit a millimetre above the lowest camera removes its grasps, one below keeps all."""
-    out = Path(shutil.copytree(sound, tmp_path / "out"))
     with h5py.File(out / OTM) as file:
         heights = [
             X[11] for split in file for X in file[f"{split}/object_props/frame_work2cam_otm"]
@@ -363,21 +353,6 @@ def backwards(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[
     return iter([function(item) for item in reversed(list(items))])
 
 
-def arrays(out: Path) -> dict[str, Any]:
-    """Return every value of the three files."""
-    found = {}
-    for name in FILES:
-        with h5py.File(out / name) as file:
-            places: list[str] = []
-            file.visit(places.append)
-            found |= {
-                f"{name}/{place}": file[place][:].tolist()
-                for place in places
-                if isinstance(file[place], h5py.Dataset)
-            }
-    return found
-
-
 @pytest.fixture
 def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Chunks of five rows, in tasks of ten: a task begins and ends within a shard."""
@@ -389,7 +364,7 @@ def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("small_chunks")
 def test_files_do_not_depend_on_the_order_of_the_tasks(out: Path) -> None:
-    before = arrays(out)
+    before = {name: arrays_of(out / name) for name in FILES}
     assemble(out)
     in_order = [(out / name).read_bytes() for name in FILES]
     with h5py.File(out / TRIALS) as file:
@@ -397,7 +372,7 @@ def test_files_do_not_depend_on_the_order_of_the_tasks(out: Path) -> None:
         assert len(file["trials/X_TO"]) == 36
     assemble(out, execute=backwards)
     assert [(out / name).read_bytes() for name in FILES] == in_order
-    assert repr(arrays(out)) == repr(before)
+    np.testing.assert_equal({name: arrays_of(out / name) for name in FILES}, before)
 
 
 def test_files_do_not_depend_on_the_number_of_processes(out: Path) -> None:

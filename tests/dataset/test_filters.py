@@ -50,10 +50,6 @@ def good(count: int) -> Successes:
     )
 
 
-def test_good_ones_are_kept() -> None:
-    assert np.all(judge_successes(good(10), FilterConfig()) == Removal.KEPT)
-
-
 @pytest.mark.parametrize(
     ("field", "value", "reason"),
     [
@@ -182,12 +178,6 @@ def test_held_asks_nothing_of_the_hold_and_the_same_of_the_contacts() -> None:
     assert np.all(judge_successes(bad, held) == Removal.KEPT)
     off = replace(bad, normal_angle=np.ones(3))
     assert np.all(judge_successes(off, held) == Removal.NORMAL_OFF)
-
-
-def test_other_links_may_be_allowed_up_to_a_number() -> None:
-    successes = replace(good(3), other_links=np.array([0, 1, 2], np.uint8))
-    removal = judge_successes(successes, FilterConfig(other_links=1))
-    assert removal.tolist() == [Removal.KEPT, Removal.KEPT, Removal.OTHER_LINKS]
 
 
 def test_motion_that_is_unknown_is_no_sample() -> None:

@@ -44,25 +44,29 @@ def holder(out: Path) -> Iterator[subprocess.Popen[bytes]]:
         process.communicate()
 
 
-@pytest.fixture
-def no_flock(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A file system that knows no locks."""
+@pytest.fixture(params=[True, False], ids=["locks", "no locks"])
+def advice(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """On a file system with locks and on one without: what a refused build is told to do."""
+    if request.param:
+        return "wait for it or choose another --out"
+    monkeypatch.setattr(fcntl, "flock", refuse_lock)
+    return "wait for it, or remove build.lock there if it is dead"
 
-    def refuse(file: object, operation: int) -> None:
-        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
-    monkeypatch.setattr(fcntl, "flock", refuse)
+def refuse_lock(file: object, operation: int) -> None:
+    raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
 
-def test_second_build_is_refused_and_names_the_first(tmp_path: Path) -> None:
+def test_second_build_is_refused_and_names_the_first(tmp_path: Path, advice: str) -> None:
     with holder(tmp_path) as process:
-        message = rf"one process at a time, got process {process.pid} on \S+, since \d{{4}}-"
+        message = rf"one process at a time, got process {process.pid} on \S+, since .*; {advice}"
         with pytest.raises(DataError, match=message), build_lock(tmp_path):
             raise AssertionError
     with build_lock(tmp_path) as dead:
         assert dead is None
 
 
+@pytest.mark.usefixtures("advice")
 def test_dead_build_is_taken_over_and_named(tmp_path: Path) -> None:
     with holder(tmp_path) as process:
         process.kill()
@@ -109,32 +113,15 @@ def test_directory_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
         raise AssertionError
 
 
-@pytest.mark.usefixtures("no_flock")
-def test_without_locks_a_living_process_is_believed(tmp_path: Path) -> None:
-    with holder(tmp_path) as process:
-        message = f"got process {process.pid} .*remove build.lock there if it is dead"
-        with pytest.raises(DataError, match=message), build_lock(tmp_path):
-            raise AssertionError
-
-
-@pytest.mark.usefixtures("no_flock")
-def test_without_locks_a_dead_process_is_taken_over(tmp_path: Path) -> None:
-    with holder(tmp_path) as process:
-        process.kill()
-        process.wait()
-        with build_lock(tmp_path) as dead:
-            assert dead is not None
-
-
-@pytest.mark.usefixtures("no_flock")
 @pytest.mark.parametrize(
     ("change", "taken"),
     [({"host": "elsewhere"}, False), ({"began": 1}, True), ({"boot": "before"}, True), ({}, False)],
 )
 def test_without_locks_a_number_alone_is_no_process(
-    tmp_path: Path, change: dict[str, object], taken: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, object], taken: bool
 ) -> None:
     """The same number after a restart is another process; another machine's may be alive."""
+    monkeypatch.setattr(fcntl, "flock", refuse_lock)
     process = {**vars(this_process()), **change}
     content = {"process": process, "since": "2026-01-01T00:00:00", "command": []}
     (tmp_path / FILE_NAME).write_text(json.dumps(content))

@@ -102,15 +102,6 @@ def test_other_things_are_refused(data_file: Path, tmp_path: Path) -> None:
         GraspDataset(tmp_path / "text.hdf5")
 
 
-def test_newer_schema_is_refused(data_file: Path, tmp_path: Path) -> None:
-    path = tmp_path / "newer.hdf5"
-    path.write_bytes(data_file.read_bytes())
-    with h5py.File(path, "r+") as file:
-        file.attrs["schema_version"] = SCHEMA_VERSION + 1
-    with pytest.raises(DataError, match=f"schema must be 3 or {SCHEMA_VERSION}, got"):
-        GraspDataset(path)
-
-
 def _trial_id(task: tuple[GraspDataset, int]) -> int:
     data, index = task
     return data[index].trial_id

@@ -43,25 +43,6 @@ def test_a_decision_replaces_the_one_before() -> None:
         rejected.with_decision(A, "no")
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        "",
-        "[]",
-        "3",
-        '{"version": 2, "rejected": [], "kept": []}',
-        '{"version": 1, "rejected": [{"object": "a"}], "kept": []}',
-        '{"version": 1, "rejected": [{"object": "a", "candidate": true, "standoff_index": 0}], '
-        '"kept": []}',
-    ],
-)
-def test_another_file_is_refused(content: str, tmp_path: Path) -> None:
-    path = tmp_path / "reject.json"
-    path.write_text(content, encoding="utf-8")
-    with pytest.raises(DataError, match="must be"):
-        read_rejected(path)
-
-
 def test_text_has_an_id_per_line(tmp_path: Path) -> None:
     path = tmp_path / "list.txt"
     path.write_text("# bad ones\n3\n\n12 # slides\n", encoding="utf-8")
@@ -72,22 +53,6 @@ def test_text_has_an_id_per_line(tmp_path: Path) -> None:
     path.write_bytes(b"\xff\xfe")
     with pytest.raises(DataError, match="must be a text file"):
         read_rejected(path)
-
-
-def test_assembly_drops_exactly_what_is_rejected(tmp_path: Path) -> None:
-    out = make_dataset(tmp_path / "out", tmp_path)
-    path = out / "reject.json"
-    write_decisions(path, Decisions(rejected=frozenset([A, B]), kept=frozenset([A])))
-    assembly = assemble(out, rejected=read_rejected(path))
-    assert assembly.removed == {Removal.KEPT: 7, Removal.REJECTED: 2}
-
-
-def test_an_id_that_is_no_success_changes_nothing(tmp_path: Path) -> None:
-    out = make_dataset(tmp_path / "out", tmp_path)
-    before = (out / "trials.hdf5").read_bytes()
-    with pytest.raises(DataError, match="must be successes, got trial 1"):
-        assemble(out, rejected=[0, 1])
-    assert (out / "trials.hdf5").read_bytes() == before
 
 
 def test_keys_that_are_no_success_are_left_out(tmp_path: Path) -> None:

@@ -296,11 +296,11 @@ def leave_closed(out: Path, row: int) -> None:
 Edit = Callable[[np.ndarray], Any]
 
 
-def change(out: Path, name: str, place: str, row: int, edit: Edit) -> None:
+def change(out: Path, name: str, dataset: str, row: int, edit: Edit) -> None:
     """Replace a row of a dataset by what `edit` makes of it; no edit in place."""
     with h5py.File(out / name, "r+") as file:
-        values = file[place][row]
-        file[place][row] = edit(np.array(values) if not isinstance(values, bytes) else values)
+        values = file[dataset][row]
+        file[dataset][row] = edit(np.array(values) if not isinstance(values, bytes) else values)
 
 
 def set_at(*index: int | slice, to: Any) -> Edit:

@@ -9,6 +9,7 @@ import pytest
 import trimesh
 
 from drakegrasp.config import ObjectConfig
+from drakegrasp.mesh.surfaces import Solid
 from drakegrasp.objects.builtin.catalog import wavefront
 from drakegrasp.objects.builtin.shapes import packaging, vessels
 from drakegrasp.objects.model import ObjectModel, prepare_object
@@ -63,6 +64,17 @@ def prepare(path: Path, scale: float = 1.0, **options: float) -> ObjectModel:
 def box(extents=BOX, at=(0.0, 0.0, 0.0)) -> trimesh.Trimesh:
     mesh = trimesh.creation.box(extents)
     return trimesh.Trimesh(mesh.vertices + np.asarray(at), mesh.faces, process=False)
+
+
+def solid_of(mesh: trimesh.Trimesh) -> Solid:
+    return Solid(vertices=np.array(mesh.vertices), faces=np.array(mesh.faces, dtype=np.int64))
+
+
+def box_distance(p: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Return the signed distance (n,) of points (n, 3) from a box about the origin [m]."""
+    beyond = np.abs(p) - half
+    outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
+    return outside + np.minimum(beyond.max(axis=1), 0.0)
 
 
 def without_faces(mesh: trimesh.Trimesh, keep: np.ndarray) -> trimesh.Trimesh:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from helpers.meshes import assert_sound, prepare, write
+from helpers.meshes import assert_sound, prepare, solid_of, write
 from helpers.scripts import load_script
 
 from drakegrasp.errors import MeshError
 from drakegrasp.mesh.decimation import decimate
-from drakegrasp.mesh.surfaces import Solid, is_solid_surface
+from drakegrasp.mesh.surfaces import is_solid_surface
 
 
 def test_decimation_keeps_the_solid(tmp_path):
@@ -27,8 +27,7 @@ def test_decimation_keeps_the_solid(tmp_path):
 
 
 def test_decimation_falls_back(tmp_path, monkeypatch):
-    ball = trimesh.creation.icosphere(4, radius=0.05)
-    solid = Solid(vertices=np.array(ball.vertices), faces=np.array(ball.faces, dtype=np.int64))
+    solid = solid_of(trimesh.creation.icosphere(4, radius=0.05))
     monkeypatch.setattr("drakegrasp.mesh.decimation._decimate_quadric", lambda *_: None)
     reduced, error = decimate(solid, 1000)
     assert is_solid_surface(reduced.faces) and len(reduced.faces) <= 1000 and 0.0 < error < 1e-3
@@ -43,8 +42,7 @@ def test_decimation_falls_back(tmp_path, monkeypatch):
 
 def test_mesh_with_few_faces_too_many_is_not_decimated_twice(monkeypatch):
     """The first of two decimations aims at more faces than are allowed, or than there are."""
-    ball = trimesh.creation.icosphere(4, radius=0.05)
-    solid = Solid(vertices=np.array(ball.vertices), faces=np.array(ball.faces, dtype=np.int64))
+    solid = solid_of(trimesh.creation.icosphere(4, radius=0.05))
     for way in ("decimate_quadric", "simplify_manifold", "decimate_parted"):
         monkeypatch.setattr(f"drakegrasp.mesh.decimation._{way}", lambda *_: None)
     with pytest.raises(MeshError, match="at most 4000 faces, got a broken one from 5120"):

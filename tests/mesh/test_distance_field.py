@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from helpers.meshes import box_distance
 
 from drakegrasp.mesh.distance_field import CELLS, DistanceField, make_distance_field
 
@@ -15,13 +16,6 @@ def field_of(mesh: trimesh.Trimesh) -> DistanceField:
 
 def columns(points: np.ndarray) -> tuple[np.ndarray, ...]:
     return tuple(np.ascontiguousarray(column, dtype=np.float32) for column in points.T)
-
-
-def box_distance(p: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Return the signed distance (n,) of points (n, 3) from a box about the origin."""
-    beyond = np.abs(p) - half
-    outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
-    return outside + np.minimum(beyond.max(axis=1), 0.0)
 
 
 def test_box_has_its_distances():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from helpers.meshes import solid_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -19,10 +20,6 @@ from drakegrasp.mesh.surfaces import (
 
 #: More faces than any solid here can need.
 PLENTY = 10**6
-
-
-def solid_of(mesh: trimesh.Trimesh) -> Solid:
-    return Solid(vertices=np.asarray(mesh.vertices), faces=np.asarray(mesh.faces, dtype=np.int64))
 
 
 def longest_edge(solid: Solid) -> float:

@@ -2,40 +2,26 @@
 
 from __future__ import annotations
 
-import ctypes
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 import trimesh
+from helpers.machine import needs_egl
+from helpers.meshes import box_distance
+from helpers.objects import model_of
 
 from drakegrasp.config import CameraConfig
 from drakegrasp.frames import Array, invert_pose, make_pose, transform_points
 from drakegrasp.hand.files import MODELS
-from drakegrasp.objects.model import ObjectModel, object_colour, prepare_object
-from drakegrasp.objects.sources import MeshSource
+from drakegrasp.objects.model import ObjectModel, object_colour
 from drakegrasp.vision.appearance import TABLE_COLOUR, Appearance, usual_appearance
 from drakegrasp.vision.camera import intrinsics, project, unproject
 from drakegrasp.vision.rendering import RenderedView, Renderer, build_renderer, paint, render
 
-
-def has_egl() -> bool:
-    try:
-        ctypes.CDLL("libEGL.so.1")
-    except OSError:
-        return False
-    return True
-
-
-pytestmark = [
-    pytest.mark.sim,
-    pytest.mark.skipif(
-        sys.platform == "linux" and not has_egl(), reason="rendering needs libEGL.so.1"
-    ),
-]
+pytestmark = [pytest.mark.sim, needs_egl]
 
 CONFIG = CameraConfig()
 K = intrinsics(CONFIG)
@@ -58,23 +44,9 @@ GARISH = Appearance(
 R_FROM_ABOVE = np.diag([1.0, -1.0, -1.0])
 
 
-#: Drake's images are drawn as if its principal point were measured from the corner of pixel
-#: (0, 0), half a pixel from where the camera matrix says it is.
-
-
 @pytest.fixture(scope="module")
-def make_object(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., ObjectModel]:
-    def make(mesh: trimesh.Trimesh, name: str) -> ObjectModel:
-        path = tmp_path_factory.mktemp("mesh") / f"{name}.stl"
-        mesh.export(path)
-        return prepare_object(MeshSource(name=name, class_name=name, path=path))
-
-    return make
-
-
-@pytest.fixture(scope="module")
-def box(make_object: Callable[..., ObjectModel]) -> ObjectModel:
-    return make_object(trimesh.creation.box(EXTENTS), "box")
+def box(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
+    return model_of(trimesh.creation.box(EXTENTS), tmp_path_factory.mktemp("mesh"), "box")
 
 
 @pytest.fixture(scope="module")
@@ -102,12 +74,6 @@ def object_points(seen: RenderedView, X_TC: Array) -> Array:
     rows, columns = np.nonzero(seen.mask)
     p_CQ = unproject(K, np.column_stack([columns, rows]), seen.image[3][rows, columns])
     return transform_points(invert_pose(X_TO) @ X_TC, p_CQ)
-
-
-def box_distance(p: Array) -> Array:
-    """Return the signed distance (n,) of points from the box's surface [m]."""
-    q = np.abs(p) - HALF
-    return np.linalg.norm(np.maximum(q, 0.0), axis=1) + np.minimum(q.max(axis=1), 0.0)
 
 
 @pytest.mark.parametrize("distance", [0.1, 0.25, 0.6])
@@ -188,11 +154,11 @@ def test_mask_and_depth_agree(renderer: Renderer) -> None:
     X_TC = oblique()
     seen = render(renderer, X_TO, X_TC)
     assert 500 < seen.mask.sum() < 128 * 128 / 2
-    assert np.abs(box_distance(object_points(seen, X_TC))).max() < 1e-6
+    assert np.abs(box_distance(object_points(seen, X_TC), HALF)).max() < 1e-6
     inverted = RenderedView(image=seen.image, mask=1 - seen.mask)
     # The table's pixels at the foot of the box come near to it.
-    assert np.median(box_distance(object_points(inverted, X_TC))) > 0.02
-    assert box_distance(object_points(inverted, X_TC)).min() > -1e-6
+    assert np.median(box_distance(object_points(inverted, X_TC), HALF)) > 0.02
+    assert box_distance(object_points(inverted, X_TC), HALF).min() > -1e-6
 
 
 def test_all_that_is_drawn_is_object_table_or_nothing(renderer: Renderer) -> None:

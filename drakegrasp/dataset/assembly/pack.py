@@ -8,11 +8,10 @@ rows, and the samples' other columns. The client reads a part front to back, and
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -29,13 +28,13 @@ from drakegrasp.runtime.files import disk_full_named, temporary_name
 
 #: Rows of a task: some ten of the largest shards, 30 MB in memory.
 TASK_ROWS = 8 * COLUMN_CHUNK
-#: Place of the chunk of an image, without its row.
+#: Offset of the chunk of an image, without its row.
 _ORIGIN = {f.name: (0,) * len(f.axes) for f in DATA_FIELDS if f.name in IMAGES}
 
 
 @dataclass(frozen=True, kw_only=True)
 class ShardSlice:
-    """The rows of a shard that the dataset takes, and their place.
+    """The rows of a shard that the dataset takes, and their ids.
 
     Attributes:
         header: Of the shard.
@@ -105,7 +104,13 @@ def pack_rows(task: PackTask) -> Part:
     count = task.stop - task.start
     columns = {f.name: np.empty((count, *f.row_shape(task.sizes)), f.dtype) for f in TRIAL_FIELDS}
     columns["trial_id"][:] = np.arange(task.start, task.stop)
-    samples = {split: _Samples(task.sizes) for split in SPLITS}
+    samples = {
+        split: _Samples(
+            {camera: [np.zeros(0, record_type(task.sizes))] for camera in CAMERAS},
+            {(camera, name): [] for camera in CAMERAS for name in IMAGES},
+        )
+        for split in SPLITS
+    }
     load = lru_cache(1)(load_object)  # the shards of an object come one after the other
     for piece in task.slices:
         path = piece.header.path(Path(task.out))
@@ -123,11 +128,12 @@ def pack_rows(task: PackTask) -> Part:
                 images = [
                     (stream.write(chunk), skipped)
                     for split in SPLITS
-                    for chunk, skipped in samples[split].in_order()
+                    for chunk, skipped in chain.from_iterable(samples[split].images.values())
                 ]
                 for split in SPLITS:
                     for camera in CAMERAS:
-                        np.save(stream, samples[split].numbers(camera), allow_pickle=False)
+                        numbers = np.concatenate(samples[split].records[camera])
+                        np.save(stream, numbers, allow_pickle=False)
             temporary.replace(task.part)
         finally:
             temporary.unlink(missing_ok=True)
@@ -158,8 +164,8 @@ def unpack_rows(
         each = len(part.chunks) // len(columns)
         for k, size in enumerate(part.chunks):
             column = columns[k // each]
-            place = (part.start + k % each * COLUMN_CHUNK, *(0,) * (column.ndim - 1))
-            column.id.write_direct_chunk(place, stream.read(size))
+            offset = (part.start + k % each * COLUMN_CHUNK, *(0,) * (column.ndim - 1))
+            column.id.write_direct_chunk(offset, stream.read(size))
 
         # The samples: what is stored, then the numbers.
         images = iter(part.images)
@@ -175,40 +181,19 @@ def unpack_rows(
     path.unlink()
 
 
+@dataclass(frozen=True, eq=False)
 class _Samples:
     """The samples of a split among the rows of a task, in order.
 
     Attributes:
+        records: (1,) arrays of all numbers of each, by camera.
+        images: Stored bytes of each image and its skipped filters, by camera and field.
         objects: Row of /objects of each.
     """
 
-    def __init__(self, sizes: Mapping[str, int]) -> None:
-        self.objects: list[int] = []
-        self._type = record_type(sizes)
-        self._records: dict[str, list[AnyArray]] = {camera: [] for camera in CAMERAS}
-        self._images: dict[tuple[str, str], list[tuple[bytes, int]]] = {
-            (camera, name): [] for camera in CAMERAS for name in IMAGES
-        }
-
-    def add_record(self, camera: str, values: Mapping[str, Any]) -> None:
-        """Add the numbers of a sample."""
-        record = np.zeros(1, dtype=self._type)
-        for name, value in values.items():
-            record[name][0] = value
-        self._records[camera].append(record)
-
-    def add_image(self, camera: str, name: str, chunk: bytes, skipped: int) -> None:
-        """Add what is stored of an image of a sample."""
-        self._images[camera, name].append((chunk, skipped))
-
-    def in_order(self) -> Iterator[tuple[bytes, int]]:
-        """Yield what is stored of the images, by camera, field and sample."""
-        for images in self._images.values():
-            yield from images
-
-    def numbers(self, camera: str) -> AnyArray:
-        """Return the records (n,) of a data file."""
-        return np.concatenate([np.zeros(0, dtype=self._type), *self._records[camera]])
+    records: dict[str, list[AnyArray]]
+    images: dict[tuple[str, str], list[tuple[bytes, int]]]
+    objects: list[int] = field(default_factory=list)
 
 
 def _fill_rows(
@@ -255,17 +240,20 @@ def _add_samples(
             for camera in CAMERAS:
                 values = sample_values(model, trial, look, camera)
                 values |= {"trial_id": trial_id, "grasp_props/weight": weight}
-                samples[split].add_record(camera, values)
+                record = np.zeros_like(samples[split].records[camera][0], shape=1)
+                for name, value in values.items():
+                    record[name][0] = value
+                samples[split].records[camera].append(record)
                 for name, own in IMAGES.items():
                     skipped, chunk = looks[f"{own}_{camera}"].id.read_direct_chunk(
                         (k, *_ORIGIN[name])
                     )
-                    samples[split].add_image(camera, name, chunk, skipped)
+                    samples[split].images[camera, name].append((chunk, skipped))
 
 
 def _packed_columns(columns: Mapping[str, AnyArray]) -> Iterator[bytes]:
-    """Yield the chunks of the columns, by field and place."""
-    for field in TRIAL_FIELDS:
-        values = columns[field.name]
+    """Yield the chunks of the columns, field by field, from the first row on."""
+    for f in TRIAL_FIELDS:
+        values = columns[f.name]
         for start in range(0, len(values), COLUMN_CHUNK):
             yield packed_chunk(values[start : start + COLUMN_CHUNK], COLUMN_CHUNK)

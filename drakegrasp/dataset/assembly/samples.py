@@ -65,18 +65,18 @@ class SampleRows:
         """
         self._group, self._texts = file.create_group(split), texts
         for field in DATA_FIELDS:
-            create_field(self._group, field, field.row_shape(sizes)).resize(count, axis=0)
+            create_field(self._group, field, field.row_shape(sizes), count)
         self._images = {name: self._group[name].id for name in IMAGES}
         self._origins = {n: (0,) * (self._group[n].ndim - 1) for n in IMAGES}
-        self._placed = dict.fromkeys(IMAGES, 0)
+        self._next = dict.fromkeys(IMAGES, 0)
         self._written = 0
         self._waiting: list[tuple[AnyArray, npt.NDArray[np.int32]]] = []
 
     def add_image(self, name: str, chunk: bytes, skipped: int) -> None:
         """Write the next row of images or masks: its stored bytes, and the skipped filters."""
-        place = (self._placed[name], *self._origins[name])
-        self._images[name].write_direct_chunk(place, chunk, skipped)
-        self._placed[name] += 1
+        offset = (self._next[name], *self._origins[name])
+        self._images[name].write_direct_chunk(offset, chunk, skipped)
+        self._next[name] += 1
 
     def add_numbers(self, records: AnyArray, objects: npt.NDArray[np.int32]) -> None:
         """Add the next records (n,), with the row of /objects of each."""

@@ -117,7 +117,7 @@ def rank_in_split(group: str, seed: int) -> float:
 
     It is uniform over seeds, so the share x of all groups has a number below x, more or less.
     """
-    # Another place than that of a class: it may have the same name.
+    # Another stream than that of a class: it may have the same name.
     return float(Stream(seed, object_key(group), 0, 2).uniform(1)[0])
 
 

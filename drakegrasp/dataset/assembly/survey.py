@@ -12,7 +12,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from drakegrasp.config import Config
@@ -20,7 +19,7 @@ from drakegrasp.dataset.filters import Removal, Successes, judge_successes
 from drakegrasp.dataset.hdf5 import AnyArray, read_column
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.schema import CAMERAS, CERTIFICATE_FIELDS, sizes
-from drakegrasp.dataset.shards import ShardHeader, open_shard, read_outcomes
+from drakegrasp.dataset.shards import ShardHeader, open_shard, read_trials
 from drakegrasp.dataset.suspicion import COLUMNS, suspicion
 from drakegrasp.frames import Array, invert_pose, transform_points, unpack_pose
 from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp
@@ -93,10 +92,10 @@ def survey_tasks(out: Path, manifest: Manifest) -> Iterator[SurveyTask]:
 
 def headers_by_object(manifest: Manifest) -> list[tuple[ShardHeader, ...]]:
     """Return the work units of each object."""
-    found: dict[str, list[ShardHeader]] = {entry.name: [] for entry in manifest.objects}
+    by_name: dict[str, list[ShardHeader]] = {entry.name: [] for entry in manifest.objects}
     for header in manifest.headers():
-        found[header.object_name].append(header)
-    return [tuple(headers) for headers in found.values()]
+        by_name[header.object_name].append(header)
+    return [tuple(headers) for headers in by_name.values()]
 
 
 def survey_object(task: SurveyTask) -> Survey:
@@ -123,9 +122,13 @@ def survey_object(task: SurveyTask) -> Survey:
             looks = {name: read_column(file["looks"], name)[: len(hits)] for name in _LOOKS}
             images = file["looks/image_otm"]
             depths = images[: len(hits), 3] if len(hits) else np.zeros((0, 1, 1))
-            found = successes_of(trials, looks, depths, object=task.object, K=task.K)
-            parts.append(replace(found, trial_id=first + hits))
-            letters = letters or sizes_of(file)
+            successes = successes_of(trials, looks, depths, object=task.object, K=task.K)
+            parts.append(replace(successes, trial_id=first + hits))
+            letters = letters or sizes(
+                fingers=trials["closed_touching"].shape[1],
+                joints=file["trials/closed_q"].shape[1],
+                image=looks["mask_oto"].shape[1],
+            )
         digest.update(read_seal(header.path(out)))
         rows.append(count)
         first += count
@@ -148,15 +151,6 @@ def count_samples(out: Path, header: ShardHeader, config: Config) -> int:
     task = SurveyTask(out=str(out), object=0, headers=(header,), wanted=None, K=K)
     removal = judge_successes(survey_object(task).successes, filters)
     return int(np.count_nonzero(removal == Removal.KEPT))
-
-
-def sizes_of(file: h5py.File) -> dict[str, int]:
-    """Return the lengths of the letters in the shapes of the columns of a shard."""
-    return sizes(
-        fingers=file["trials/closed_touching"].shape[1],
-        joints=file["trials/closed_q"].shape[1],
-        image=file["looks/mask_oto"].shape[1],
-    )
 
 
 def join_successes(parts: Sequence[Successes]) -> Successes:
@@ -193,8 +187,8 @@ def _read_seals(task: SurveyTask) -> tuple[int, bytes]:
             break
         digest.update(read_seal(header.path(out)))
         if left is not None:
-            outcomes = read_outcomes(header.path(out), header, verify_seal=False)
-            left -= int(np.count_nonzero(outcomes == Outcome.SUCCESS))
+            rows = read_trials(header.path(out), header, ("outcome",), verify_seal=False)
+            left -= int(np.count_nonzero(rows["outcome"] == Outcome.SUCCESS))
     return task.object, digest.digest()
 
 

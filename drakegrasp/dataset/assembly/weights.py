@@ -60,11 +60,11 @@ def number_poses(meshes: Sequence[str], up: Sequence[npt.ArrayLike]) -> list[npt
             known[mesh] = directions, own
         else:
             # The nearest pose of another seed.
-            theirs, places = known[mesh]
+            theirs, indices = known[mesh]
             cosine = dot(directions[:, None], theirs[None])
             near = cosine.max(axis=1) >= np.cos(NEAR_TURN)
-            own = np.where(near, places[cosine.argmax(axis=1)], own)
-            known[mesh] = np.concatenate([theirs, directions]), np.concatenate([places, own])
+            own = np.where(near, indices[cosine.argmax(axis=1)], own)
+            known[mesh] = np.concatenate([theirs, directions]), np.concatenate([indices, own])
         numbers.append(own)
     return numbers
 

@@ -108,4 +108,4 @@ def structure(
     """
     image = None if config is None else config.camera.size
     for found in differences(file, tables, image=image, thorough=True):
-        yield Violation(file=name, group=found.place, what=found.what, got=found.got), found
+        yield Violation(file=name, group=found.path, what=found.what, got=found.got), found

@@ -38,11 +38,7 @@ def _is_whole(value: Any) -> bool:
 
 
 def _is_positive(value: Any) -> bool:
-    return _is_number(value) and bool(value > 0.0)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, float | np.floating) and bool(np.isfinite(value))
+    return isinstance(value, float | np.floating) and bool(0.0 < value < np.inf)
 
 
 def _is_matrix(value: Any) -> bool:
@@ -58,8 +54,6 @@ def _is_matrix(value: Any) -> bool:
 Rule = tuple[str, Callable[[Any], bool]]
 TEXT: Rule = ("a text", _is_text)
 COUNT: Rule = ("a whole number that is not negative", _is_whole)
-NUMBER: Rule = ("a finite number", _is_number)
-TRUTH: Rule = ("true or false", lambda value: isinstance(value, bool | np.bool_))
 _POSITIVE: Rule = ("a positive number", _is_positive)
 _MAPPING: Rule = ("a mapping in JSON", _is_mapping)
 

@@ -17,12 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.hdf5 import open_hdf5
-from drakegrasp.dataset.layout.attributes import (
-    OF_CAMERA,
-    ORIGIN,
-    Rule,
-    attribute_mistakes,
-)
+from drakegrasp.dataset.layout.attributes import OF_CAMERA, ORIGIN, Rule, attribute_mistakes
 from drakegrasp.dataset.layout.structure import DATA_TABLES, TRIAL_TABLES, Tables, differences
 from drakegrasp.dataset.schema import refuse_other_schema
 from drakegrasp.errors import DataError, first_line, printable
@@ -136,7 +131,7 @@ def read_codes(
 
 def refuse_other_codes(
     path: Path,
-    place: str,
+    name: str,
     values: npt.NDArray[Any],
     codes: int | Sequence[int],
     first: int = 0,
@@ -152,4 +147,4 @@ def refuse_other_codes(
         bad, must = ~np.isin(values, codes), f"{min(codes)} to {max(codes)}"
     if bad.any():
         row = int(np.argmax(bad))
-        raise DataError(f"{path}: {place} must be {must}, got {values[row]} in row {first + row}")
+        raise DataError(f"{path}: {name} must be {must}, got {values[row]} in row {first + row}")

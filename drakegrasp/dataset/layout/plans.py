@@ -50,9 +50,9 @@ def _other_arrays(file: h5py.File) -> Iterator[str]:
         if dataset.dtype != np.dtype(dtype):
             yield f"/{name}: type must be {dtype}, got {dataset.dtype}"
         # The first array with a letter tells its length.
-        found = dataset.shape or ()
-        if isinstance(axes[0], str) and found:
-            lengths.setdefault(axes[0], found[0])
+        stored = dataset.shape or ()
+        if isinstance(axes[0], str) and stored:
+            lengths.setdefault(axes[0], stored[0])
         shape = tuple(lengths.get(a, 0) if isinstance(a, str) else a for a in axes)
-        if found != shape:
+        if stored != shape:
             yield f"/{name}: shape must be {shape}, got {dataset.shape}"

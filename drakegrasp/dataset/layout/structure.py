@@ -38,19 +38,19 @@ class Difference:
     """How a file differs from the schema.
 
     Attributes:
-        place: Path of the group or the dataset; empty for the whole file.
+        path: Path of the group or the dataset; empty for the whole file.
         what: What must be there, in words.
         got: What is there instead.
         text_only: Whether it is in the words beside the values: the rows can be read.
     """
 
-    place: str = ""
+    path: str = ""
     what: str
     got: str
     text_only: bool = False
 
     def __str__(self) -> str:
-        return f"{self.place + ': ' if self.place else ''}{self.what}, got {self.got}"
+        return f"{self.path + ': ' if self.path else ''}{self.what}, got {self.got}"
 
 
 def differences(
@@ -73,26 +73,26 @@ def differences(
     }
 
     # The headers of all datasets, each looked at once.
-    found = {name: _datasets(file, name, fields) for name, fields in tables.items()}
-    lengths = _lengths(tables, found)
+    headers = {name: _datasets(file, name, fields) for name, fields in tables.items()}
+    lengths = _lengths(tables, headers)
     if image is not None:
         lengths["S"] = image
 
     if thorough:
         yield from _extras(file, tables)
     for name, fields in tables.items():
-        datasets = found[name]
+        datasets = headers[name]
         if datasets is None:
-            yield Difference(place=f"/{name}", what="the group must be there", got="none")
+            yield Difference(path=f"/{name}", what="the group must be there", got="none")
             continue
 
         # Each field by itself; the number of rows is that of most datasets.
         rows = _most_frequent([dataset.shape[0] for dataset in datasets.values() if dataset.shape])
         for f in fields:
-            place, dataset = f"/{name}/{f.name}", datasets.get(f.name)
-            yield from _of_field(place, dataset, f, rows, lengths)
+            path, dataset = f"/{name}/{f.name}", datasets.get(f.name)
+            yield from _of_field(path, dataset, f, rows, lengths)
             if thorough and dataset is not None:
-                yield from _of_attributes(place, h5py.Dataset(dataset), f)
+                yield from _of_attributes(path, h5py.Dataset(dataset), f)
 
 
 def _datasets(
@@ -102,15 +102,15 @@ def _datasets(
     group = file.get(name)
     if not isinstance(group, h5py.Group):
         return None
-    found = {}
+    datasets = {}
     for f in fields:
         try:
             item = h5py.h5o.open(group.id, f.name.encode())
         except KeyError:
             continue
         if isinstance(item, h5py.h5d.DatasetID):
-            found[f.name] = item
-    return found
+            datasets[f.name] = item
+    return datasets
 
 
 def _extras(file: h5py.File, tables: Tables) -> Iterator[Difference]:
@@ -129,16 +129,16 @@ def _extras(file: h5py.File, tables: Tables) -> Iterator[Difference]:
             group.visititems(visit)
         for key in sorted(paths - {f.name for f in fields}):
             got = f"{key} too"
-            yield Difference(place=f"/{name}", what="datasets must be those of the schema", got=got)
+            yield Difference(path=f"/{name}", what="datasets must be those of the schema", got=got)
 
 
 def _lengths(
-    tables: Tables, found: Mapping[str, dict[str, h5py.h5d.DatasetID] | None]
+    tables: Tables, headers: Mapping[str, dict[str, h5py.h5d.DatasetID] | None]
 ) -> dict[str, int]:
     """Return the lengths of the letters in the shapes that most datasets of a file agree on."""
     votes: dict[str, list[int]] = {"k": [], "j": [], "S": []}
     for name, fields in tables.items():
-        datasets = found[name] or {}
+        datasets = headers[name] or {}
         for f in fields:
             shape = datasets[f.name].shape if f.name in datasets else None
             if not shape or len(shape) != 1 + len(f.axes):
@@ -157,7 +157,7 @@ def _most_frequent(numbers: list[int]) -> int:
 
 
 def _of_field(
-    place: str,
+    path: str,
     dataset: h5py.h5d.DatasetID | None,
     field: Field,
     rows: int,
@@ -166,37 +166,37 @@ def _of_field(
     """Yield how the type and shape of a dataset differ from its field.
 
     Args:
-        place: Path of the dataset.
+        path: Path of the dataset.
         dataset: The dataset; None if it is missing.
         field: The field.
         rows: Number of rows that it must have.
         lengths: Of the letters in the shapes, where they are known.
     """
     if dataset is None:
-        yield Difference(place=place, what="the dataset must be there", got="none")
+        yield Difference(path=path, what="the dataset must be there", got="none")
         return
 
-    dtype, found = dataset.dtype, dataset.shape
+    dtype, stored = dataset.dtype, dataset.shape
     text = h5py.check_string_dtype(dtype) is not None
     if text != (field.dtype == "str") or not (text or dtype == np.dtype(field.dtype)):
-        yield Difference(place=place, what=f"type must be {field.dtype}", got=str(dtype))
+        yield Difference(path=path, what=f"type must be {field.dtype}", got=str(dtype))
     try:
         shape = (rows, *field.row_shape(lengths))
     except KeyError:
         # No sound dataset tells the length of a letter; one without a space has no shape.
-        shape = (rows, *(found or ())[1:])
-    if found != shape:
-        yield Difference(place=place, what=f"shape must be {shape}", got=str(found))
+        shape = (rows, *(stored or ())[1:])
+    if stored != shape:
+        yield Difference(path=path, what=f"shape must be {shape}", got=str(stored))
 
 
-def _of_attributes(place: str, dataset: h5py.Dataset, field: Field) -> Iterator[Difference]:
+def _of_attributes(path: str, dataset: h5py.Dataset, field: Field) -> Iterator[Difference]:
     """Yield how the attributes of a dataset differ from its field."""
     attrs = dict(dataset.attrs)
     for key, value in (("unit", field.unit), ("frame", field.frame)):
         if not (isinstance(attrs.get(key), str) and attrs[key] == value):
             what, got = f"attribute {key} must be {value!r}", repr(attrs.get(key))
-            yield Difference(place=place, what=what, got=got, text_only=True)
+            yield Difference(path=path, what=what, got=got, text_only=True)
     # Wording may improve without a new version of the schema.
     if not str(attrs.get("meaning", "")):
         what = "attribute meaning must be there"
-        yield Difference(place=place, what=what, got="none", text_only=True)
+        yield Difference(path=path, what=what, got="none", text_only=True)

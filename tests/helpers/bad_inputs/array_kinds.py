@@ -12,7 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 from helpers.bad_inputs.hdf5_kinds import WAYS, dataset_kind
-from helpers.bad_inputs.kinds import ANY_FILE, Kind, one_of
+from helpers.bad_inputs.kinds import ANY_FILE, Kind, whole_file
 
 from drakegrasp.runtime.files import seal
 
@@ -45,10 +45,6 @@ def _with(index: int, value: float) -> Any:
     return grasp
 
 
-def _bytes(name: str, content: bytes) -> Kind:
-    return Kind(name, lambda path: path.write_bytes(content))
-
-
 def _version(major: int) -> Callable[[Path], None]:
     def spoil(path: Path) -> None:
         content = path.read_bytes()
@@ -78,9 +74,9 @@ _HEADERS: tuple[Kind, ...] = (
     Kind("cut in the magic text", lambda path: path.write_bytes(path.read_bytes()[:4])),
     Kind("version 9", _version(9)),
     Kind("version 2", _version(2)),
-    _bytes("a header of 4 GB", b"\x93NUMPY\x02\x00\xff\xff\xff\xff{'descr'"),
-    _bytes("a zip", b"PK\x05\x06" + bytes(18)),
-    _bytes("a pickle", b"\x80\x04K\x05."),
+    whole_file("a header of 4 GB", b"\x93NUMPY\x02\x00\xff\xff\xff\xff{'descr'"),
+    whole_file("a zip", b"PK\x05\x06" + bytes(18)),
+    whole_file("a pickle", b"\x80\x04K\x05."),
 )
 PREDICTIONS_NPY: tuple[Kind, ...] = (
     *ANY_FILE,
@@ -124,30 +120,25 @@ CAMERA_NPY: tuple[Kind, ...] = (
 )
 
 
-def _csv(name: str, text: str | bytes) -> Kind:
-    content = text if isinstance(text, bytes) else text.encode()
-    return Kind(name, lambda path: path.write_bytes(content))
-
-
 _LINE = ",".join(map(str, GRASP))
 PREDICTIONS_CSV: tuple[Kind, ...] = (
     *ANY_FILE,
-    _csv("only a header", ",".join("abc") + "\n"),
-    _csv("17 numbers", ",".join(map(str, GRASP[:17]))),
-    _csv("lines of unequal length", f"{_LINE}\n{_LINE},1\n"),
-    _csv("semicolons", _LINE.replace(",", ";")),
-    _csv("blanks", _LINE.replace(",", " ")),
-    _csv("a text in between", _LINE.replace("0.03", "x", 1)),
-    _csv("an empty cell", _LINE.replace("0.03", "", 1)),
-    _csv("quotes", _LINE.replace("0.03", '"0.03"', 1)),
-    _csv("NaN", _LINE.replace("0.03", "nan", 1)),
-    _csv("infinite", _LINE.replace("0.03", "1e999", 1)),
-    _csv("digits of 10,000", _LINE.replace("0.03", "9" * 10_000, 1)),
-    _csv("UTF-16", _LINE.encode("utf-16")),
-    _csv("a null byte", _LINE.replace("0.03", "\x00", 1)),
-    _csv("two headers", f"{','.join('a' * 18)}\n{','.join('b' * 18)}\n{_LINE}"),
-    _csv("commas", "," * 17),
-    _csv("steering", _LINE.replace("0.03", "\x1b]0;x\x07", 1)),
+    whole_file("only a header", ",".join("abc") + "\n"),
+    whole_file("17 numbers", ",".join(map(str, GRASP[:17]))),
+    whole_file("lines of unequal length", f"{_LINE}\n{_LINE},1\n"),
+    whole_file("semicolons", _LINE.replace(",", ";")),
+    whole_file("blanks", _LINE.replace(",", " ")),
+    whole_file("a text in between", _LINE.replace("0.03", "x", 1)),
+    whole_file("an empty cell", _LINE.replace("0.03", "", 1)),
+    whole_file("quotes", _LINE.replace("0.03", '"0.03"', 1)),
+    whole_file("NaN", _LINE.replace("0.03", "nan", 1)),
+    whole_file("infinite", _LINE.replace("0.03", "1e999", 1)),
+    whole_file("digits of 10,000", _LINE.replace("0.03", "9" * 10_000, 1)),
+    whole_file("UTF-16", _LINE.encode("utf-16")),
+    whole_file("a null byte", _LINE.replace("0.03", "\x00", 1)),
+    whole_file("two headers", f"{','.join('a' * 18)}\n{','.join('b' * 18)}\n{_LINE}"),
+    whole_file("commas", "," * 17),
+    whole_file("steering", _LINE.replace("0.03", "\x1b]0;x\x07", 1)),
 )
 
 
@@ -184,21 +175,15 @@ PREDICTIONS_HDF5: tuple[Kind, ...] = (
     *ANY_FILE,
     Kind("no array", lambda path: h5py.File(path, "w").close()),
     *(
-        Kind(f"grasps {way}", one_spoil)
+        Kind(f"grasps {way}", dataset_kind("grasps", way).spoil)
         for way in WAYS
         if way not in ("of another type", "one row less", "one row more")
-        for one_spoil in [dataset_kind("grasps", way).spoil]
     ),
-    *(
-        Kind(f"rows {way}", one_spoil)
-        for way in WAYS
-        if way != "missing"
-        for one_spoil in [dataset_kind("rows", way).spoil]
-    ),
+    *(Kind(f"rows {way}", dataset_kind("rows", way).spoil) for way in WAYS if way != "missing"),
     _predictions_hdf5("rows that do not exist", _instead("rows", np.array([0, 99]))),
     _predictions_hdf5("rows below zero", _instead("rows", np.array([0, -1]))),
     _predictions_hdf5("rows beyond 64 bits", _instead("rows", np.full(2, 2**64 - 1, np.uint64))),
-    _predictions_hdf5("rows that are a group", lambda file: _instead("rows", 1)(file)),
+    _predictions_hdf5("rows that are a group", _instead("rows", 1)),
     _predictions_hdf5("grasps in two groups", _grouped),
     _predictions_hdf5("grasps beyond memory", _beyond),
     _predictions_hdf5("NaN", _instead("grasps", np.full((2, 18), np.nan))),
@@ -290,5 +275,3 @@ MODEL: tuple[Kind, ...] = (
         )
     ),
 )
-#: Used where a table needs one of them.
-EMPTY = one_of(ANY_FILE, "empty")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,19 +37,21 @@ def _cut(share: float) -> Spoil:
     return cut
 
 
-def _write(content: bytes) -> Spoil:
-    return lambda path: path.write_bytes(content)
+def whole_file(name: str, content: str | bytes) -> Kind:
+    """Return a kind whose file has this content."""
+    data = content if isinstance(content, bytes) else content.encode()
+    return Kind(name, lambda path: path.write_bytes(data))
 
 
 #: Any file may be one of these.
 ANY_FILE = (
-    Kind("empty", _write(b"")),
+    whole_file("empty", b""),
     Kind("a directory", _folder),
     Kind("a link to itself", _loop),
     Kind("cut to a tenth", _cut(0.1)),
     Kind("cut in half", _cut(0.5)),
-    Kind("random bytes", _write(bytes(range(128, 256)) * 8)),
-    Kind("zeros", _write(bytes(4096))),
+    whole_file("random bytes", bytes(range(128, 256)) * 8),
+    whole_file("zeros", bytes(4096)),
 )
 
 #: And a text file that must be JSON or YAML of mappings.
@@ -57,16 +59,11 @@ ANY_TEXT = (
     *ANY_FILE,
     Kind("Latin-1", lambda path: path.write_bytes(path.read_bytes() + '\n"ü'.encode("latin-1"))),
     Kind("UTF-16", lambda path: path.write_bytes(path.read_text().encode("utf-16"))),
-    Kind("nested too deeply", _write(b"[" * 100_000)),
-    Kind("a list", _write(b"[1, 2]")),
-    Kind("a text", _write(b'"manifest"')),
-    Kind("a number of 10,000 digits", _write(b"9" * 10_000)),
+    whole_file("nested too deeply", b"[" * 100_000),
+    whole_file("a list", b"[1, 2]"),
+    whole_file("a text", b'"manifest"'),
+    whole_file("a number of 10,000 digits", b"9" * 10_000),
 )
-
-
-def one_of(kinds: Sequence[Kind], name: str) -> Kind:
-    (found,) = [kind for kind in kinds if kind.name == name]
-    return found
 
 
 class Workplace:
@@ -74,22 +71,22 @@ class Workplace:
 
     Args:
         pristine: What it holds when it is sound; it is not changed.
-        place: Where the copy goes.
+        folder: Where the copy goes.
     """
 
-    def __init__(self, pristine: Path, place: Path) -> None:
-        self.pristine, self.place = pristine, place
-        shutil.copytree(pristine, place, symlinks=True)
+    def __init__(self, pristine: Path, folder: Path) -> None:
+        self.pristine, self.folder = pristine, folder
+        shutil.copytree(pristine, folder, symlinks=True)
         self.sound = self.state()
 
     def state(self) -> dict[str, tuple[int, ...]]:
-        """Return what changes when something below the place is written or replaced."""
-        found = {}
-        for path in self.place.rglob("*"):
+        """Return what changes when something below the folder is written or replaced."""
+        state = {}
+        for path in self.folder.rglob("*"):
             status = path.lstat()
             times = () if path.is_dir() else (status.st_mtime_ns, status.st_size, status.st_ino)
-            found[str(path.relative_to(self.place))] = (status.st_mode, *times)
-        return found
+            state[str(path.relative_to(self.folder))] = (status.st_mode, *times)
+        return state
 
     def restore(self) -> None:
         """Put back what differs."""
@@ -97,7 +94,7 @@ class Workplace:
         for name in sorted(now.keys() | self.sound.keys()):
             if now.get(name) == self.sound.get(name):
                 continue
-            path, source = self.place / name, self.pristine / name
+            path, source = self.folder / name, self.pristine / name
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path)
             else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from helpers.bad_inputs.json_kinds import table, twice, value_kind
-from helpers.bad_inputs.kinds import ANY_TEXT, Kind
+from helpers.bad_inputs.kinds import ANY_TEXT, Kind, whole_file
 
 _OBJECT = {
     "name": "name",
@@ -95,7 +95,7 @@ MANIFEST: tuple[Kind, ...] = (
 )
 
 DECISIONS: tuple[Kind, ...] = (
-    *(kind for kind in ANY_TEXT),
+    *ANY_TEXT,
     *table(
         {
             ("version",): "count",
@@ -115,13 +115,9 @@ DECISIONS: tuple[Kind, ...] = (
 )
 
 
-def _line(text: bytes) -> Kind:
-    return Kind(f"the line {text[:20]!r}", lambda path: path.write_bytes(b"3\n" + text + b"\n"))
-
-
 #: A text of trial ids; 0 is a success, 1 is none.
 REJECTED_IDS: tuple[Kind, ...] = tuple(
-    _line(text)
+    whole_file(f"the line {text[:20]!r}", b"3\n" + text + b"\n")
     for text in (
         *(b"-1", b"1", b"1.5", b"nan", b"x", b"0 3", b"0,3", b"99999999", b"9" * 5000),
         *(b"\xff\xfe", b"\x00", "²".encode(), "٣".encode()),

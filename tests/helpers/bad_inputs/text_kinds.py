@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from helpers.bad_inputs.kinds import ANY_TEXT, Kind
+from helpers.bad_inputs.kinds import ANY_TEXT, Kind, whole_file
 
 #: Values of a key of YAML by the name of the way.
 VALUES: dict[str, Any] = {
@@ -25,33 +25,28 @@ VALUES: dict[str, Any] = {
 }
 
 
-def _file(name: str, text: str | bytes) -> Kind:
-    content = text if isinstance(text, bytes) else text.encode()
-    return Kind(name, lambda path: path.write_bytes(content))
-
-
 #: Texts that are no YAML, or none that anybody reads.
 ANY_YAML: tuple[Kind, ...] = (
     *(k for k in ANY_TEXT if k.name not in ("empty", "cut to a tenth", "cut in half", "UTF-16")),
-    _file("a tab", "a:\n\tb: 1\n"),
-    _file("an open bracket", "a: [1\n"),
-    _file("a tag of Python", "!!python/object/apply:os.getcwd []\n"),
-    _file("two documents", "a: 1\n---\nb: 2\n"),
-    _file("an alias of nothing", "a: *b\n"),
-    _file("an alias of itself", "a: &a [*a]\n"),
-    _file(
+    whole_file("a tab", "a:\n\tb: 1\n"),
+    whole_file("an open bracket", "a: [1\n"),
+    whole_file("a tag of Python", "!!python/object/apply:os.getcwd []\n"),
+    whole_file("two documents", "a: 1\n---\nb: 2\n"),
+    whole_file("an alias of nothing", "a: *b\n"),
+    whole_file("an alias of itself", "a: &a [*a]\n"),
+    whole_file(
         "aliases of aliases",
         _bomb := "\n".join(
             ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
             + [f"a{k + 1}: &a{k + 1} [{', '.join([f'*a{k}'] * 10)}]" for k in range(9)]
         ),
     ),
-    _file("a key twice", "seed: 1\nseed: 2\n"),
-    _file("a key that is a list", "? [a]\n: 1\n"),
-    _file("a key that is a number", "5: 1\n"),
-    _file("a key that is nothing", "~: 1\n"),
-    _file("a control character", "seed: \x07\n"),
-    _file("a text with a null byte", "seed: \x00\n"),
+    whole_file("a key twice", "seed: 1\nseed: 2\n"),
+    whole_file("a key that is a list", "? [a]\n: 1\n"),
+    whole_file("a key that is a number", "5: 1\n"),
+    whole_file("a key that is nothing", "~: 1\n"),
+    whole_file("a control character", "seed: \x07\n"),
+    whole_file("a text with a null byte", "seed: \x00\n"),
 )
 
 
