@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from drakegrasp.config import Config
 from drakegrasp.errors import first_line
 from drakegrasp.frames import X_WT, Array, invert_pose, rotation_angle
-from drakegrasp.simulation.scene import Scene, advance, reset_object
+from drakegrasp.simulation.scene import ObjectScene, advance, reset_object
 from drakegrasp.simulation.stepping import StateError
 from drakegrasp.simulation.trajectory import LiftPath, carrying_force, lift_path
 from drakegrasp.verification.forces.contact_forces import (
@@ -92,7 +92,7 @@ class ForceLift:
 
 
 def lift_by_forces(
-    scene: Scene,
+    scene: ObjectScene,
     X_TO: npt.ArrayLike,
     p_OQ: npt.ArrayLike,
     nhat_Q_O: npt.ArrayLike,
@@ -107,19 +107,13 @@ def lift_by_forces(
     ran before.
 
     Args:
-        scene: Of the object, without a hand.
+        scene: Of the object; a hand would be in the way.
         X_TO: Resting pose of the object, (4, 4).
         p_OQ: (k, 3), contact points in {O} [m].
         nhat_Q_O: (k, 3), unit normals out of the object in {O}.
         force_limit: (k,), largest normal force of each contact [N], as `strength.fingertip_forces`.
         config: Physics, lift and limits.
-
-    Raises:
-        ValueError: If the scene has a hand.
     """
-    if scene.handles is not None:
-        raise ValueError("the scene must have no hand, got one with a hand")
-
     # Are there forces within the limit at all?
     path = lift_path(X_TO, config)
     program = ForceProgram(
@@ -155,7 +149,7 @@ def lift_by_forces(
 class _Fingers:
     """Applies contact forces to the object at points that are fixed to it."""
 
-    scene: Scene
+    scene: ObjectScene
     p_OQ: Array  # (k, 3) [m]
     program: ForceProgram
 
@@ -229,7 +223,7 @@ def _simulate(fingers: _Fingers, planned: ForceLift, path: LiftPath, config: Con
     )
 
 
-def _deviation(scene: Scene, path: LiftPath) -> tuple[float, float]:
+def _deviation(scene: ObjectScene, path: LiftPath) -> tuple[float, float]:
     """Return the object's distance from its path [m], and its angle to it [rad]."""
     X_WO = scene.pose(scene.object)
     p, _, _ = path.at(scene.time)
@@ -243,7 +237,7 @@ def _within(deviation: tuple[float, float], config: Config, times: float) -> boo
     return all(d <= times * limit for d, limit in zip(deviation, allowed, strict=True))
 
 
-def _wanted_wrench(scene: Scene, path: LiftPath, frequency: float) -> Array:
+def _wanted_wrench(scene: ObjectScene, path: LiftPath, frequency: float) -> Array:
     """Return the wrench (6,) about Ocm in {O} that keeps the object on its path [N m, N].
 
     It balances gravity and inertia, and corrects errors of position and orientation by critically

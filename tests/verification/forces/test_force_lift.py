@@ -14,8 +14,8 @@ from drakegrasp.frames import X_WT, make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.simulation.construction import build_scene
-from drakegrasp.simulation.scene import Scene, advance, reset_object
+from drakegrasp.simulation.construction import build_object_scene
+from drakegrasp.simulation.scene import ObjectScene, advance, reset_object
 from drakegrasp.simulation.trajectory import PEAK_ACCELERATION, lift_duration, lift_path
 from drakegrasp.verification.forces import lift as force_lift_module
 from drakegrasp.verification.forces.contact_forces import patch_torsion_radius
@@ -42,8 +42,8 @@ def cube(tmp_path_factory) -> ObjectModel:
 
 
 @pytest.fixture(scope="module")
-def scene(cube, config) -> Scene:
-    return build_scene(cube, config.physics)
+def scene(cube, config) -> ObjectScene:
+    return build_object_scene(cube, config.physics)
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +98,7 @@ def test_slippery_cube_takes_more_than_a_fingertip_can_give(scene, cube):
 
 def test_friction_of_the_object_wins_over_the_configured_one(cube, config):
     slippery = replace(cube, friction=0.05)
-    bare = build_scene(slippery, config.physics)
+    bare = build_object_scene(slippery, config.physics)
     assert bare.physics.friction_hand == bare.physics.friction_table == 0.05
     found = lift_by_forces(bare, standing(cube), P, N, force_limit=LIMIT, config=config)
     assert found.planned_force == pytest.approx(heaviest(config) / 0.1, rel=1e-6)
@@ -135,7 +135,7 @@ def test_lift_keeps_its_speed_and_its_straight_path(scene, cube, config, monkeyp
     heights: list[float] = []
     sideways: list[float] = []
 
-    def watch(scene: Scene, duration: float) -> None:
+    def watch(scene: ObjectScene, duration: float) -> None:
         advance(scene, duration)
         p = scene.pose(scene.object)[:3, 3]
         heights.append(p[2])
@@ -173,7 +173,7 @@ def test_nudged_cube_is_held_by_a_grasp_and_lost_by_a_balance(
 ):
     """One finger below carries the cube, but nothing turns it back once it leans."""
 
-    def nudge(scene: Scene, duration: float) -> None:
+    def nudge(scene: ObjectScene, duration: float) -> None:
         advance(scene, duration)
         if 1.0 < scene.time < 1.0 + 1.5 * duration:
             velocity = np.zeros(6)
@@ -190,7 +190,7 @@ def test_same_lift_gives_the_same_bits_whatever_ran_before(scene, cube, config, 
     deceived = replace(scene, model=replace(cube, mass=0.1))
     lift_by_forces(deceived, standing(cube), P, N, force_limit=LIMIT, config=config)
     again = lift_by_forces(scene, standing(cube), P, N, force_limit=LIMIT, config=config)
-    fresh = build_scene(cube, config.physics)
+    fresh = build_object_scene(cube, config.physics)
     for other in (
         again,
         lift_by_forces(fresh, standing(cube), P, N, force_limit=LIMIT, config=config),
@@ -204,7 +204,7 @@ def test_no_force_is_left_behind(scene, cube, config, held):
     """The cube falls from the air as in a scene that never knew a force."""
     lift_by_forces(scene, standing(cube), P, N, force_limit=LIMIT, config=config)
     heights = []
-    for used in (scene, build_scene(cube, config.physics)):
+    for used in (scene, build_object_scene(cube, config.physics)):
         reset_object(used, X_WT @ make_pose(np.eye(3), [0.0, 0.0, 0.5]))
         used.simulator.Initialize()
         advance(used, 0.1)
@@ -259,12 +259,6 @@ def test_two_fingertips_hold_a_cube_beside_its_centre_by_torsion(scene, cube, co
     assert found.planned_force == pytest.approx(heaviest(config) * share / mu, rel=1e-4)
     assert found.end is LiftEnd.HELD
     assert found.angle_error < 1e-3
-
-
-def test_scene_with_a_hand_is_refused(cube, config):
-    with_hand = build_scene(cube, config.physics, load_hand())
-    with pytest.raises(ValueError, match="must have no hand"):
-        lift_by_forces(with_hand, standing(cube), P, N, force_limit=LIMIT, config=config)
 
 
 @pytest.mark.parametrize(
