@@ -14,10 +14,9 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.simulation.construction import build_object_scene, build_scene
-from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.scene import ObjectScene
+from drakegrasp.verification.forces.contact_forces import hand_contacts
 from drakegrasp.verification.forces.lift import ForceLift, lift_by_forces
 from drakegrasp.visualization.recording import (
     HEAD_RADIUS,
@@ -82,24 +81,17 @@ def record_lift(verified: Verification, path: Path) -> ForceLift:
         OSError: If the file cannot be written.
     """
     placed, config = verified.placed, verified.config
-    hand = load_hand(config.hand)
-    limit = fingertip_forces(hand, drive_of(hand, config.lift))
+    contacts = hand_contacts(placed.model, verified.p_OQ, verified.nhat_Q_O, config)
+    largest = float(np.max(contacts.force_limit))
 
     def run(meshcat: Meshcat) -> ForceLift:
         scene = build_object_scene(placed.model, config.physics, meshcat=meshcat)
         # A lift that fails before it is simulated is shown at its start.
         show_object(meshcat, scene, placed.X_TO_simulated, config)
         # The scene belongs to this function, so the monitor disturbs nobody else.
-        scene.simulator.set_monitor(_ForceArrows(meshcat, scene, float(limit.max())).record)
+        scene.simulator.set_monitor(_ForceArrows(meshcat, scene, largest).record)
         try:
-            lift = lift_by_forces(
-                scene,
-                placed.X_TO_simulated,
-                verified.p_OQ,
-                verified.nhat_Q_O,
-                force_limit=limit,
-                config=config,
-            )
+            lift = lift_by_forces(scene, placed.X_TO_simulated, contacts, config)
         finally:
             # Scene and monitor refer to each other in a way that the garbage collector cannot see.
             scene.simulator.clear_monitor()

@@ -17,16 +17,15 @@ from drakegrasp.errors import OffSurfaceError
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import coordinate_limits
-from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.blas import one_thread
 from drakegrasp.runtime.timing import timed
 from drakegrasp.simulation.candidates import Pregrasp
-from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.scene_cache import cached_object_scene, cached_scene, forget_scenes
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.verification.contact_surface import face_distances, points_outward
+from drakegrasp.verification.forces.contact_forces import hand_contacts
 from drakegrasp.verification.forces.lift import LiftEnd, lift_by_forces
 from drakegrasp.verification.forces.quality import force_margin
 from drakegrasp.verification.result import Verification, in_mm
@@ -138,7 +137,8 @@ def verify_placed(grasp: PlacedGrasp) -> Verification:
 
     # What forces at the contacts alone can do, whatever the method.
     with timed(seconds, "margin"):
-        margin = force_margin(placed.model, placed.X_TO_simulated, p_OQ, nhat_Q_O, config)
+        contacts = hand_contacts(placed.model, p_OQ, nhat_Q_O, config)
+        margin = force_margin(placed.model, placed.X_TO_simulated, contacts, config)
     base = replace(base, epsilon=margin.epsilon, smallest_friction=margin.smallest_friction)
 
     # The trial.
@@ -195,17 +195,11 @@ def _lift_by_hand(base: Verification, config: Config) -> Verification:
 
 def _lift_by_forces(base: Verification, config: Config) -> Verification:
     """Lift the object by forces at the contacts, without a hand."""
-    hand = load_hand(config.hand)
+    placed = base.placed
     with timed(base.seconds, "simulate"):
-        scene = cached_object_scene(base.placed.model, config.physics)
-        lift = lift_by_forces(
-            scene,
-            base.placed.X_TO_simulated,
-            base.p_OQ,
-            base.nhat_Q_O,
-            force_limit=fingertip_forces(hand, drive_of(hand, config.lift)),
-            config=config,
-        )
+        contacts = hand_contacts(placed.model, base.p_OQ, base.nhat_Q_O, config)
+        scene = cached_object_scene(placed.model, config.physics)
+        lift = lift_by_forces(scene, placed.X_TO_simulated, contacts, config)
     if _ENDS[lift.end].inconclusive:
         forget_scenes()
 

@@ -21,12 +21,12 @@ from helpers.objects import CUBE, box_model, from_above, standing
 from drakegrasp.build.replay import record_trial
 from drakegrasp.config import Config, load_config
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.construction import MESHCAT_RATE, build_object_scene, build_scene
 from drakegrasp.simulation.trial import run_attempt
+from drakegrasp.verification.forces.contact_forces import hand_contacts
 from drakegrasp.verification.forces.lift import LiftEnd, lift_by_forces
 from drakegrasp.verification.recording import record_lift, record_verification
 from drakegrasp.visualization import recording
@@ -115,9 +115,9 @@ def test_recording_a_trial_changes_no_bit_of_it(
 def test_recording_a_lift_changes_no_bit_of_it(
     cube: ObjectModel, config: Config, tmp_path: Path
 ) -> None:
-    limit = fingertip_forces(load_hand(config.hand), "worm")
+    contacts = hand_contacts(cube, P_OQ, NHAT_Q_O, config)
     scene = build_object_scene(cube, config.physics)
-    plain = lift_by_forces(scene, standing(cube), P_OQ, NHAT_Q_O, force_limit=limit, config=config)
+    plain = lift_by_forces(scene, standing(cube), contacts, config)
     path = tmp_path / "lift.html"
     recorded = record_lift(not_simulated(cube, config), path)
     assert plain.end is recorded.end is LiftEnd.HELD

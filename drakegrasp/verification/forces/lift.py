@@ -29,8 +29,8 @@ from drakegrasp.simulation.stepping import StateError
 from drakegrasp.simulation.trajectory import LiftPath, carrying_force, lift_path
 from drakegrasp.verification.forces.contact_forces import (
     ForceProgram,
+    GraspContacts,
     hardest_forces,
-    patch_torsion_radius,
 )
 
 #: Time steps of the simulation per solution of the contact forces. Between two solutions the
@@ -92,13 +92,7 @@ class ForceLift:
 
 
 def lift_by_forces(
-    scene: ObjectScene,
-    X_TO: npt.ArrayLike,
-    p_OQ: npt.ArrayLike,
-    nhat_Q_O: npt.ArrayLike,
-    *,
-    force_limit: npt.ArrayLike,
-    config: Config,
+    scene: ObjectScene, X_TO: npt.ArrayLike, contacts: GraspContacts, config: Config
 ) -> ForceLift:
     """Return what happens when forces at contact points lift the object.
 
@@ -109,21 +103,13 @@ def lift_by_forces(
     Args:
         scene: Of the object; a hand would be in the way.
         X_TO: Resting pose of the object, (4, 4).
-        p_OQ: (k, 3), contact points in {O} [m].
-        nhat_Q_O: (k, 3), unit normals out of the object in {O}.
-        force_limit: (k,), largest normal force of each contact [N], as `strength.fingertip_forces`.
+        contacts: Where the forces act, and how large they may be.
         config: Physics, lift and limits.
     """
     # Are there forces within the limit at all?
     path = lift_path(X_TO, config)
-    program = ForceProgram(
-        p_OQ,
-        nhat_Q_O,
-        scene.model.p_OOcm,
-        scene.model.own_physics(config.physics).friction_hand,
-        force_limit=force_limit,
-        torsion_radius=patch_torsion_radius(len(np.asarray(p_OQ))),
-    )
+    friction = scene.model.own_physics(config.physics).friction_hand
+    program = ForceProgram(contacts, friction)
     needed = hardest_forces(program, path.wrenches(scene.model))
     force = float(needed.normal[np.argmax(needed.shares)])
     planned = ForceLift(end=LiftEnd.INFEASIBLE, planned_force=force, planned_share=needed.share)
@@ -133,7 +119,7 @@ def lift_by_forces(
         return replace(planned, end=LiftEnd.OVER_LIMIT)
 
     # Simulate the lift.
-    fingers = _Fingers(scene, np.asarray(p_OQ, dtype=float), program)
+    fingers = _Fingers(scene, np.asarray(contacts.p_OQ, dtype=float), program)
     try:
         return _simulate(fingers, planned, path, config)
     except (MemoryError, OSError):
