@@ -287,7 +287,12 @@ def object_friction(physics: PhysicsConfig) -> float:
 
 
 def partner_friction(effective: float, physics: PhysicsConfig) -> float:
-    """Return the coefficient of hand or table that gives the effective one with the object."""
+    """Return the coefficient of hand or table that gives the effective one with the object.
+
+    With the object's own coefficient a, Drake's rule is solved for the partner's b:
+
+        μ = 2 a b / (a + b)   ⇔   b = μ a / (2 a − μ)
+    """
     mu = object_friction(physics)
     return effective * mu / (2.0 * mu - effective)
 
@@ -386,6 +391,17 @@ def _add_wrist(plant: MultibodyPlant, instance: ModelInstanceIndex) -> tuple[Pri
 
 
 def _add_actuation(plant: MultibodyPlant, hand: Hand, instance: ModelInstanceIndex) -> None:
+    """Add each finger's motor, and couple the joints that follow its closing joint.
+
+    With the closing joint's position q and the speed ω at which the hand closes, a motor gives
+
+        τ = K (0 − q) + D (ω − dq/dt), cut off at ± the finger's effort limit,
+        K = `FINGER_STIFFNESS` / u², D = `FINGER_DAMPING` / u²,
+
+    where u = 1 rad, or the slide that counts as 1 rad (`Hand.closing_unit`). A rotor of inertia I
+    behind a gear of ratio n adds n² I to the joint. A coupled joint is at r q + q₀, with the ratio
+    and the offset of the hand file.
+    """
     for finger, unit in zip(hand.fingers, hand.closing_unit.tolist(), strict=True):
         joint = plant.GetJointByName(finger.closing_joint, instance)
         actuator = plant.AddJointActuator(finger.name, joint, finger.effort_limit)

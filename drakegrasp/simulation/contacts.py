@@ -184,7 +184,20 @@ class _Reader:
     def _add_tip_patch(
         self, i: int, surface: ContactSurface, force_W: Array, object_is_M: bool
     ) -> None:
-        """Add a patch of fingertip i and the object, split into pad and rest of the link."""
+        """Add a patch of fingertip i and the object, split into pad and rest of the link.
+
+        Face e of a patch has the area A, the pressure p at its centroid c and the outward normal n
+        of the object; it weighs w_e = A_e p_e. Over the faces of all patches that are the pad's,
+
+            point = Σ w_e c_e / Σ w_e,   normal = Σ w_e n_e / |Σ w_e n_e|.
+
+        σ = (Σ_pad w_e) / (Σ w_e) is the pad's share of a patch with the force f on the object. From
+        σ = 1 − `MAX_BESIDE` on the whole patch is the pad's. Below, the pad's force is
+
+            f_pad = − Σ_pad w_e n_e + σ (f + Σ w_e n_e):
+
+        the pressure of its own faces, and its share of what friction and damping add to all.
+        """
         faces = _read_faces(surface, object_is_M)
 
         # Which faces are on the pad, and how much of the patch they carry.
@@ -275,8 +288,11 @@ class _Faces:
 
 
 def _read_faces(surface: ContactSurface, object_is_M: bool) -> _Faces:
-    # The fingertip's pressure is zero at its surface, so pressure over gradient is the depth of the
-    # face below it.
+    """Return the faces of a patch.
+
+    The fingertip's pressure p is zero at its surface and grows with the depth below it, so the
+    depth of a face is p / |∇p| to first order.
+    """
     field, compliant_is_M = surface.poly_e_MN(), not object_is_M
     has_gradient = surface.HasGradE_M() if compliant_is_M else surface.HasGradE_N()
     gradient = surface.EvaluateGradE_M_W if compliant_is_M else surface.EvaluateGradE_N_W

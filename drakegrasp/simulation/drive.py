@@ -95,7 +95,14 @@ def hand_over(scene: Scene, before: Scene) -> None:
 
 
 def opening_torques(scene: Scene) -> Array:
-    """Return the torque (k,) [N m or N] by which contacts push each closing joint open now."""
+    """Return the torque (k,) [N m or N] by which contacts push each closing joint open now.
+
+    Contacts act on joint j of the hand with the torque τ_j = Σ J_jᵀ f, the sum over all contact
+    forces f, where J_j dq_j/dt is the velocity that the joint gives to a force's point. Where motor
+    i moves joint j at the ratio r_ij, virtual work makes the load of its closing joint
+
+        τ_i = − Σ_j r_ij τ_j,   with r = 1 for the closing joint itself.
+    """
     # Contact forces in the coordinates of all joints of the hand.
     plant = scene.plant
     port = plant.get_generalized_contact_forces_output_port(scene.instance)
@@ -118,7 +125,16 @@ def _start_worms(scene: Scene) -> None:
 
 
 def _turn_worms(scene: Scene, _: Context) -> EventStatus:
-    """Between two steps: follow the fingers that closed, and yield where a load is too large."""
+    """Between two steps: follow the fingers that closed, and yield where a load is too large.
+
+    With the position q, the lower limit l and the load τ (`opening_torques`) of a closing joint:
+
+        it holds:   l ← max(l, q);   it yields from the step on at which τ > τ_hold
+        it yields:  l ← that of the hand's files, and the motor gives up to τ_hold;
+                    it holds again, with l ← q, once dq/dt ≥ −`STANDING` u
+
+    where τ_hold is the finger's `holding_effort` and u its `Hand.closing_unit`.
+    """
     angles, rates = closing_angles(scene), closing_rates(scene)
 
     # Set the limits before loads are read: Drake solves this state once, for the loads and for the

@@ -87,6 +87,10 @@ def hand_contacts(
 def patch_torsion_radius(fingers: int) -> float:
     """Return the torsion radius [m] of the contacts of a hand: 0 for points.
 
+    A disc of the area A under even pressure resists a torsional moment of 2/3 R μ f_n, so
+
+        r = 2/3 R,   R = √(A / π),   A = `PATCH_AREA`.
+
     Args:
         fingers: Number of fingertips of the hand.
     """
@@ -133,6 +137,15 @@ class ContactForces:
 
 class ForceProgram:
     """The cone programs of one grasp: built when first needed, solved for many wrenches.
+
+    For a wrench w on the object, contact forces f_i with normal parts f_n, tangential parts f_t and
+    torsional moments m_i about the inward normals n_i, limits N_i and the grasp map G:
+
+        smallest:  minimise t        subject to  Σ_i (G_i f_i + [m_i n_i; 0]) = w
+        closest:   minimise |r|²     subject to  Σ_i (G_i f_i + [m_i n_i; 0]) + r = w
+        both:      √(|f_t|² + (m_i / radius)²) ≤ μ f_n,   f_n ≤ t N_i  (closest: t = 1)
+
+    (Lobo et al., 3.4; Howe and Cutkosky). For points m_i = 0.
 
     The unknowns x are m per contact: the three components of its force along the axes of the
     contact, the tangential ones divided by the friction coefficient mu, and for a patch its
@@ -315,6 +328,8 @@ def contact_axes(nhat_Q_O: npt.ArrayLike) -> Array:
 
 def grasp_map(p_OcmQ: Array) -> Array:
     """Return the grasp map G (6, 3k): wrench = G @ f for forces f (3k,), contact by contact.
+
+    The block of a contact with the arm p is G_i = [[p]×; 1], with [p]× f = p × f.
 
     Args:
         p_OcmQ: (k, 3), arms of the contacts about the centre of mass [m].

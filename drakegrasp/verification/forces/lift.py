@@ -227,8 +227,12 @@ def _wanted_wrench(scene: ObjectScene, path: LiftPath, frequency: float) -> Arra
     """Return the wrench (6,) about Ocm in {O} that keeps the object on its path [N m, N].
 
     It balances gravity and inertia, and corrects errors of position and orientation by critically
-    damped feedback: an error e gives the acceleration omega^2 e + 2 omega de/dt, with the natural
-    frequency omega [rad/s].
+    damped feedback of the natural frequency ω [rad/s]. With the path's acceleration a*, the errors
+    e of position and θ of orientation (a rotation vector), the object's angular velocity Ω, its
+    mass m and its inertia I about the centre of mass:
+
+        F = m (a* + ω² e + 2 ω de/dt + g ẑ)
+        τ = I (ω² θ − 2 ω Ω) + Ω × I Ω   (Euler; the path does not turn)
     """
     # The object's motion, and that of the path.
     model = scene.model

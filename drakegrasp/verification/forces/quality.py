@@ -67,7 +67,13 @@ def ferrari_canny(contacts: GraspContacts, *, friction: float, length: float) ->
     The L1 version of C. Ferrari and J. Canny, "Planning optimal grasps", ICRA 1992: the
     distance of the origin from the surface of the convex hull of all contacts' friction
     cones with unit normal forces, that is, for normal forces that sum to one. Each cone is
-    approximated by a pyramid of `FRICTION_EDGES` edges.
+    approximated by a pyramid of `FRICTION_EDGES` edges. Edge e of contact i, with the inward normal
+    n_i, the tangents t, the arm p_i, the length L and the torsion radius r, has the wrench
+
+        w_ie = [(p_i × f_ie + μ r sin(β_e) n_i) / L; f_ie],
+        f_ie = n_i + μ cos(β_e) (cos(α_e) t_i1 + sin(α_e) t_i2),   β_e = 0 for points,
+
+    and, with the origin inside their hull, ε = min over |u| = 1 of max over i, e of u·w_ie.
 
     Args:
         contacts: Of the grasp.
@@ -154,6 +160,10 @@ def force_margin(
 
 def smallest_friction(contacts: GraspContacts, wrenches_O: npt.ArrayLike) -> float:
     """Return the smallest friction coefficient at which all wrenches can be applied.
+
+    With t(w, μ) the share of the limits that a wrench takes (`ForceProgram`), it is
+
+        μ* = min {μ : max over w of t(w, μ) ≤ 1}.
 
     The force that is needed never grows with friction, so bisection finds the coefficient.
 
