@@ -67,7 +67,7 @@ from drakegrasp.hand.shapes import hull_corners
 from drakegrasp.mesh.surfaces import Solid
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import ObjectModel, object_colour
-from drakegrasp.simulation.scene import ObjectScene, Scene
+from drakegrasp.simulation.scene import ObjectScene, Scene, joint_limits
 
 #: Mass of each of the three bodies that carry the wrist [kg]; small compared to the hand's.
 WRIST_BODY_MASS = 0.02
@@ -338,9 +338,6 @@ def _add_hand(plant: MultibodyPlant, scene_graph: SceneGraph, hand: Hand) -> dic
 
     # The fingers.
     joints = [plant.GetJointByName(f.closing_joint, instance) for f in hand.fingers]
-    limits = [
-        (joint.position_lower_limits()[0], joint.position_upper_limits()[0]) for joint in joints
-    ]
     followers = [
         {plant.GetJointByName(c.joint, instance): c.ratio for c in f.coupled} for f in hand.fingers
     ]
@@ -352,7 +349,7 @@ def _add_hand(plant: MultibodyPlant, scene_graph: SceneGraph, hand: Hand) -> dic
         "wrist_frame": wrist_frame,
         "fingertips": tuple(plant.GetBodyByName(f.fingertip, instance) for f in hand.fingers),
         "closing_joints": tuple(joints),
-        "closing_limits": tuple((float(lower), float(upper)) for lower, upper in limits),
+        "closing_limits": tuple(joint_limits(joint) for joint in joints),
         "driven": tuple(
             {joint: 1.0, **coupled} for joint, coupled in zip(joints, followers, strict=True)
         ),

@@ -27,7 +27,13 @@ from drakegrasp.errors import ConfigError
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.file_format import Drive
-from drakegrasp.simulation.scene import ClosingJoint, Scene, closing_angles, closing_rates
+from drakegrasp.simulation.scene import (
+    ClosingJoint,
+    Scene,
+    closing_angles,
+    closing_rates,
+    joint_limits,
+)
 
 #: A finger that opens more slowly than this stands, in the unit of its closing joint [1/s].
 STANDING = 1e-4
@@ -85,7 +91,7 @@ def hand_over(scene: Scene, before: Scene) -> None:
         before: The scene that simulated the lift until now.
     """
     for i, joint in enumerate(before.closing_joints):
-        _set_limits(scene.closing_joints[i], *_limits(joint))
+        _set_limits(scene.closing_joints[i], *joint_limits(joint))
         scene.motors[i].set_effort_limit(before.motors[i].effort_limit())
 
     worms_turn = before.simulator.get_monitor() is not None
@@ -141,7 +147,7 @@ def _turn_worms(scene: Scene, _: Context) -> EventStatus:
     # step that follows.
     for i, finger in enumerate(scene.hand.fingers):
         joint, motor = scene.closing_joints[i], scene.motors[i]
-        lower, upper = _limits(joint)
+        lower, upper = joint_limits(joint)
         yields = motor.effort_limit() > finger.effort_limit
         if yields and rates[i] >= -STANDING:
             # A finger that yielded stands again: from now on the worm holds it here.
@@ -164,10 +170,6 @@ def _turn_worms(scene: Scene, _: Context) -> EventStatus:
     if overloaded:
         scene.plant.SetPositions(scene.context, scene.plant.GetPositions(scene.context))
     return EventStatus.DidNothing()
-
-
-def _limits(joint: ClosingJoint) -> tuple[float, float]:
-    return float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0])
 
 
 def _set_limits(joint: ClosingJoint, lower: float, upper: float) -> None:

@@ -41,6 +41,11 @@ from drakegrasp.objects.model import ObjectModel
 ClosingJoint: TypeAlias = RevoluteJoint | PrismaticJoint
 
 
+def joint_limits(joint: ClosingJoint) -> tuple[float, float]:
+    """Return the limits of a joint now [rad or m]; they belong to the plant."""
+    return float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0])
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectScene:
     """An object on the table: a built diagram with its one context.

@@ -27,13 +27,12 @@ from drakegrasp.hand.files import hand_digest
 from drakegrasp.simulation.placement import (
     Placed,
     PlacedObject,
-    config_of,
+    config_for,
     place_object,
     refuse_no_config,
     refuse_other_objects,
 )
 from drakegrasp.verification.prediction import (
-    boxes_away,
     read_grasps,
     refuse_other_units,
     to_object_frame,
@@ -71,7 +70,7 @@ def place_on_mesh(
         method=method,
         config=config,
     )
-    _refuse_other_units(placed_grasps)
+    _refuse_units(placed_grasps)
     return placed_grasps
 
 
@@ -118,7 +117,7 @@ def place_on_rows(
             method=method,
             config=used,
         )
-    _refuse_other_units(placed_grasps)
+    _refuse_units(placed_grasps)
 
     if config is not None:
         return placed_grasps
@@ -132,9 +131,7 @@ def mesh_config(mesh: Mesh, config: Config | None, hand: str | Path | None = Non
     Raises:
         ConfigError: If it is not a `Config`.
     """
-    config = config_of(mesh) if config is None else config
-    refuse_no_config(config)
-    return _with_hand(config, hand)
+    return _with_hand(config_for(mesh, config), hand)
 
 
 def dataset_config(
@@ -296,8 +293,6 @@ def _choose_rows(
     return chosen
 
 
-def _refuse_other_units(grasps: Sequence[PlacedGrasp]) -> None:
-    """Refuse grasps that are all far from their objects; single ones are wrong predictions."""
-    if grasps:
-        nearest = min(grasps, key=lambda g: boxes_away(g.p_OQ, g.placed.model.half_extents))
-        refuse_other_units(nearest.p_OQ, nearest.placed.model.half_extents)
+def _refuse_units(grasps: Sequence[PlacedGrasp]) -> None:
+    boxes = [grasp.placed.model.half_extents for grasp in grasps]
+    refuse_other_units([grasp.p_OQ for grasp in grasps], boxes)

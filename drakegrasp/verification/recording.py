@@ -82,7 +82,7 @@ def record_lift(verified: Verification, path: Path) -> ForceLift:
     """
     placed, config = verified.placed, verified.config
     contacts = hand_contacts(placed.model, verified.p_OQ, verified.nhat_Q_O, config)
-    largest = float(np.max(contacts.force_limit))
+    largest = float(np.asarray(contacts.force_limit).max())
 
     def run(meshcat: Meshcat) -> ForceLift:
         scene = build_object_scene(placed.model, config.physics, meshcat=meshcat)
