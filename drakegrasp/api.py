@@ -39,13 +39,12 @@ from drakegrasp.simulation.drive import drive_of
 from drakegrasp.verification.batch import ResultCallback, ignore_result, verify_batch
 from drakegrasp.verification.placed_grasp import (
     Mesh,
-    PlacedGrasp,
-    VerifyArguments,
-    place_grasps,
-    verify_placed,
+    mesh_config,
+    place_on_mesh,
+    place_on_rows,
 )
 from drakegrasp.verification.result import Verification
-from drakegrasp.verification.verify import refuse_off_surface
+from drakegrasp.verification.verify import PlacedGrasp, refuse_off_surface
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -232,19 +231,19 @@ def verify_grasp(
         MeshError: If the mesh cannot be simulated.
         ConfigError, HandError, DataError: If configuration, hand or dataset cannot be used.
     """
-    # Read one grasp, and put its object on the table.
+    # One grasp, for one object.
     vector = as_numbers(grasp, "a grasp must be a vector of numbers")
     if vector.ndim != 1:
         raise GraspError(
             f"one grasp must be a vector, got an array of shape {vector.shape}; "
             "verify_grasps takes many"
         )
-    if dataset is not None and row is None:
-        raise GraspError("row must be the row of the dataset that the grasp is for, got None")
-    if dataset is None and row is not None:
-        raise GraspError(f"row must be None without a dataset, got {row}")
-    arguments = VerifyArguments(
-        mesh=mesh,
+    if (row is None) != (dataset is None):
+        raise GraspError(f"row must be given with a dataset, and only then, got {row}")
+
+    (result,) = verify_grasps(
+        vector,
+        mesh,
         frame=frame,
         X_TC=X_TC,
         X_TO=X_TO,
@@ -255,10 +254,6 @@ def verify_grasp(
         dataset=dataset,
         rows=None if row is None else [row],
     )
-    (placed_grasp,) = place_grasps(vector, arguments)
-
-    # Verify it.
-    result = verify_placed(placed_grasp)
     refuse_off_surface(result)
     return result
 
@@ -304,19 +299,42 @@ def verify_grasps(
             anything is simulated.
         MachineError: If a worker would give other results than this machine.
     """
-    arguments = VerifyArguments(
-        mesh=mesh,
-        frame=frame,
-        X_TC=X_TC,
-        X_TO=X_TO,
-        units=units,
-        hand=hand,
-        method=method,
-        config=config,
-        dataset=dataset,
-        rows=rows,
-    )
-    return _verify_on(client, place_grasps(grasps, arguments), show=show)
+    # Put each grasp on its object: on one of a dataset's, or all on the given mesh.
+    if dataset is not None:
+        _refuse_what_rows_define(dataset, mesh=mesh, X_TC=X_TC, X_TO=X_TO, units=units)
+        placed = place_on_rows(
+            grasps, dataset, rows, frame=frame, hand=hand, method=method, config=config
+        )
+    elif mesh is None:
+        raise GraspError("a mesh or a dataset must be given, got neither")
+    elif rows is not None:
+        raise GraspError("rows must be None without a dataset, got rows")
+    else:
+        placed = place_on_mesh(
+            grasps,
+            mesh,
+            frame=frame,
+            X_TC=X_TC,
+            X_TO=X_TO,
+            units=units,
+            method=method,
+            config=mesh_config(mesh, config, hand),
+        )
+
+    # Try them there.
+    return _verify_on(client, placed, show=show)
+
+
+def _refuse_what_rows_define(dataset: object, **values: object) -> None:
+    """Refuse what is no dataset, and values that the rows of a dataset define."""
+    if not isinstance(dataset, GraspDataset):
+        raise GraspError(
+            "dataset must be a GraspDataset, which has a file and a split, "
+            f"got a {type(dataset).__name__}"
+        )
+    for name, value in values.items():
+        if value is not None:
+            raise GraspError(f"{name} must be None with a dataset, which defines it, got a value")
 
 
 def run_verification(
@@ -334,7 +352,7 @@ def run_verification(
     longer.
 
     Args:
-        grasps: From `placed_grasp.place_grasps`.
+        grasps: From `verification.placed_grasp`.
         workers: Processes on this machine; one per core if None.
         scheduler: Address of a running Dask scheduler to use instead.
         scheduler_file: Its JSON file, instead of the address.

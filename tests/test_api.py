@@ -24,8 +24,9 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.progress import silent
 from drakegrasp.simulation.placement import PlacedObject, place_object
 from drakegrasp.verification.batch import verify_batch
-from drakegrasp.verification.placed_grasp import PlacedGrasp, VerifyArguments, place_grasps
+from drakegrasp.verification.placed_grasp import mesh_config, place_on_mesh, place_on_rows
 from drakegrasp.verification.result_files import write_results
+from drakegrasp.verification.verify import PlacedGrasp
 
 pytestmark = pytest.mark.sim
 
@@ -41,8 +42,8 @@ def cube() -> PlacedObject:
     return place_object(trimesh.creation.box([EDGE] * 3))
 
 
-def place(grasps: np.ndarray, mesh: object = None, **options: object) -> list[PlacedGrasp]:
-    return place_grasps(grasps, VerifyArguments(mesh=mesh, **{"method": "forces", **options}))
+def place(grasps: np.ndarray, cube: PlacedObject) -> list[PlacedGrasp]:
+    return place_on_mesh(grasps, cube, method="forces", config=cube.config)
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +98,7 @@ def test_grasps_of_one_object_stand_together(test_split: GraspDataset) -> None:
     rows = rows_of_two_objects(test_split)
     rows += rows
     names = test_split.column("object_props/object_name")[rows]
-    placed = place(test_split.column("grasps")[rows], dataset=test_split, rows=rows)
+    placed = place_on_rows(test_split.column("grasps")[rows], test_split, rows)
     assert sorted(grasp.index for grasp in placed) == list(range(len(rows)))
     of_objects = [grasp.placed.model.name for grasp in placed]
     assert of_objects == names[[grasp.index for grasp in placed]].tolist()
@@ -121,7 +122,6 @@ def test_results_are_delivered_in_order_from_any_executor(cube: PlacedObject) ->
 
 @pytest.mark.parametrize("where", [{}, {"frame": "camera", "X_TC": np.eye(4)}])
 def test_no_grasps_are_no_work(cube: PlacedObject, where: dict) -> None:
-    assert place(np.zeros((0, 18)), cube, **where) == []
     assert verify_grasps(np.zeros((0, 18)), cube, **where) == []
 
 
@@ -130,11 +130,11 @@ def test_one_far_grasp_among_good_ones_is_a_result(test_split: GraspDataset) -> 
     rows = [*rows_of_two_objects(test_split)[:1], 0]
     grasps = test_split.column("grasps")[rows].astype(float)
     grasps[0, :9] += 5.0
-    placed = place(grasps, dataset=test_split, rows=rows)
+    placed = place_on_rows(grasps, test_split, rows)
     assert sorted(grasp.index for grasp in placed) == [0, 1]
     grasps[1, :9] += 5.0
     with pytest.raises(GraspError, match="contact points must lie on the object"):
-        place(grasps, dataset=test_split, rows=rows)
+        verify_grasps(grasps, dataset=test_split, rows=rows)
 
 
 @pytest.mark.parametrize(
@@ -150,12 +150,7 @@ def test_one_far_grasp_among_good_ones_is_a_result(test_split: GraspDataset) -> 
 def test_wrong_rows_are_refused(test_split: GraspDataset, rows: list | None, words: str) -> None:
     grasps = test_split.column("grasps")[:1]
     with pytest.raises(GraspError, match=words):
-        place(grasps, dataset=test_split, rows=rows)
-
-
-def test_rows_without_a_dataset_are_refused(cube: PlacedObject) -> None:
-    with pytest.raises(GraspError, match="rows must be None without a dataset, got rows"):
-        place(GRASP.ravel(), cube, rows=[0])
+        verify_grasps(grasps, dataset=test_split, rows=rows)
 
 
 @pytest.mark.parametrize(
@@ -163,12 +158,18 @@ def test_rows_without_a_dataset_are_refused(cube: PlacedObject) -> None:
     [
         ({"units": "cm"}, "units must be None with a dataset"),
         ({"X_TC": np.eye(4)}, "X_TC must be None with a dataset"),
-        ({"mesh": "cup.obj"}, "a mesh or a dataset must be given, got both"),
+        ({"mesh": "cup.obj"}, "mesh must be None with a dataset"),
         ({"dataset": "grasps.hdf5"}, "dataset must be a GraspDataset, .*, got a str"),
         ({"dataset": None}, "a mesh or a dataset must be given, got neither"),
+        ({"dataset": None, "mesh": "cup.obj"}, "rows must be None without a dataset, got rows"),
         ({"config": "paper"}, "config must be a Config, see load_config, got a str"),
         ({"config": {}}, "config must be a Config, see load_config, got a dict"),
         ({"rows": []}, r"rows must be one per grasp \(1\), got 0"),
+        # Its objects are prepared: what the configuration says of them could not be kept.
+        (
+            {"config": load_config(overrides=["objects.mass=2"])},
+            "objects must be as in the dataset",
+        ),
     ],
 )
 def test_what_does_not_go_together_is_refused(
@@ -176,40 +177,31 @@ def test_what_does_not_go_together_is_refused(
 ) -> None:
     asked = {"dataset": test_split, "rows": [0], **options}
     with pytest.raises((GraspError, ConfigError), match=words):
-        place(test_split.column("grasps")[:1], **asked)
+        verify_grasps(test_split.column("grasps")[:1], **asked)
 
 
-def test_row_must_be_named(test_split: GraspDataset) -> None:
-    with pytest.raises(GraspError, match=r"row must be the row of the dataset .* got None"):
-        verify_grasp(test_split.column("grasps")[0], dataset=test_split)
-    with pytest.raises(GraspError, match="row must be None without a dataset, got 3"):
-        verify_grasp(test_split.column("grasps")[0], "cup.obj", row=3)
+@pytest.mark.parametrize(("with_dataset", "row"), [(True, None), (False, 3)])
+def test_row_is_that_of_a_dataset(
+    test_split: GraspDataset, with_dataset: bool, row: int | None
+) -> None:
+    where = {"dataset": test_split} if with_dataset else {"mesh": "cup.obj"}
+    with pytest.raises(GraspError, match=f"row must be given with a dataset, .* got {row}"):
+        verify_grasp(test_split.column("grasps")[0], row=row, **where)
 
 
 def test_object_keeps_the_rules_that_it_was_placed_by() -> None:
     heavy = load_config(overrides=["objects.mass=2", "physics.friction_hand=0.3"])
     box = trimesh.creation.box([EDGE] * 3)
     placed = place_object(box, config=heavy)
-    (grasp,) = place(GRASP.ravel(), placed)
-    assert grasp.config == heavy
+    assert mesh_config(placed, None) == heavy
     # Friction is no matter of the object, its mass is.
     slick = load_config(overrides=["objects.mass=2", "physics.friction_hand=0.1"])
-    (grasp,) = place(GRASP.ravel(), placed, config=slick)
+    (grasp,) = place_on_mesh(GRASP.ravel(), placed, config=slick)
     assert grasp.config == slick
     with pytest.raises(ConfigError, match="objects must be as the object was placed with"):
-        place(GRASP.ravel(), placed, config=load_config())
+        verify_grasp(GRASP.ravel(), placed, config=load_config())
     with pytest.raises(MeshError, match="units must be None for a prepared object"):
-        place(GRASP.ravel(), placed, units="cm")
-
-
-def test_other_mass_than_the_datasets_is_refused(test_split: GraspDataset) -> None:
-    """Its objects are prepared: what the configuration says of them could not be kept."""
-    with pytest.raises(ConfigError, match="objects must be as in the dataset"):
-        place(
-            test_split.column("grasps"),
-            dataset=test_split,
-            config=load_config(overrides=["objects.mass=2"]),
-        )
+        verify_grasp(GRASP.ravel(), placed, units="cm")
 
 
 @pytest.mark.parametrize("objects", [True, False], ids=["files", "builtin"])

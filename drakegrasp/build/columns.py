@@ -83,10 +83,8 @@ def fill_look(looks: dict[str, AnyArray], k: int, views: dict[str, View]) -> Non
 
 def array_sizes(setup: TrialSetup) -> dict[str, int]:
     """Return the array lengths that `schema` leaves open: fingers, joints and pixels."""
-    handles = setup.scene.handles
-    assert handles is not None
     return sizes(
-        fingers=handles.hand.num_fingers,
+        fingers=setup.scene.hand.num_fingers,
         joints=len(hand_joint_names(setup.scene)),
         image=setup.config.camera.size,
     )

@@ -16,10 +16,10 @@ from drakegrasp.frames import Array
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file
 from drakegrasp.verification.placed_grasp import (
-    PlacedGrasp,
-    VerifyArguments,
-    chosen_config,
-    place_grasps,
+    dataset_config,
+    mesh_config,
+    place_on_mesh,
+    place_on_rows,
 )
 from drakegrasp.verification.prediction import (
     HDF5_SUFFIXES,
@@ -28,6 +28,7 @@ from drakegrasp.verification.prediction import (
     read_predictions,
 )
 from drakegrasp.verification.result_files import refuse_unwritable
+from drakegrasp.verification.verify import PlacedGrasp
 
 #: The split of a dataset if none is named.
 DEFAULT_SPLIT = "test"
@@ -77,27 +78,41 @@ def _place(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
     data = None if path is None else GraspDataset(path, split=split or DEFAULT_SPLIT)
     predicted = read_predictions(request.grasps, split=split)
 
-    # A configuration that is given is used as it is; that of a dataset with what its rows drew.
-    config: Config | None = None
-    overrides = request.overrides
+    # Without a dataset all grasps are for the one mesh.
+    overrides, given = request.overrides, None
     if path is None or request.config is not None:
-        config, overrides = load_config(request.config, overrides), ()
+        given, overrides = load_config(request.config, overrides), ()
+    if data is None:
+        if predicted.rows is not None:
+            raise GraspError("rows must be in a file of grasps for --dataset only, got rows")
+        assert request.mesh is not None
+        config = mesh_config(request.mesh, given, request.hand)
+        _refuse_no_grasps(request.grasps, predicted.grasps, config)
+        placed = place_on_mesh(
+            predicted.grasps,
+            request.mesh,
+            frame=request.frame,
+            X_TC=None if request.camera is None else read_numbers(request.camera),
+            units=request.units,
+            method=request.method,
+            config=config,
+        )
+        return placed, config
 
-    arguments = VerifyArguments(
-        mesh=request.mesh,
+    # A configuration that is given is used as it is; that of a dataset with what its rows drew.
+    config = dataset_config(data, given, request.hand, overrides)
+    _refuse_no_grasps(request.grasps, predicted.grasps, config)
+    placed = place_on_rows(
+        predicted.grasps,
+        data,
+        None if predicted.rows is None else predicted.rows.tolist(),
         frame=request.frame,
-        X_TC=None if request.camera is None else read_numbers(request.camera),
-        units=request.units,
         hand=request.hand,
         method=request.method,
-        config=config,
+        config=given,
         overrides=overrides,
-        dataset=data,
-        rows=None if predicted.rows is None else predicted.rows.tolist(),
     )
-    chosen = chosen_config(arguments)
-    _refuse_no_grasps(request.grasps, predicted.grasps, chosen)
-    return place_grasps(predicted.grasps, arguments), chosen
+    return placed, config
 
 
 def _refuse_no_grasps(path: Path, grasps: Array, config: Config) -> None:

@@ -25,7 +25,11 @@ def fingertip_forces(hand: Hand, drive: Drive) -> Array:
 
     Only motors press. What a worm carries beyond its own motor's torque comes from the motors of
     the other fingers, which press on it through the object: so a finger carries at most what they
-    give together, and never more than its `holding_effort`.
+    give together, and never more than its `holding_effort`. With the efforts τ_i of the motors and
+    the levers l_i:
+
+        N_i = τ_i / l_i                                                     (torque)
+        N_i = min(max(τ_i / l_i, Σ_{j≠i} τ_j / l_j), `holding_effort` / l_i)   (worm, locked)
 
     Args:
         hand: Of k fingers.
@@ -48,6 +52,10 @@ def fingertip_forces(hand: Hand, drive: Drive) -> Array:
 
 def closing_levers(hand: Hand, closing: npt.ArrayLike) -> Array:
     """Return how far each pad point moves with its closing joint, (k,) [m/rad, or m/m].
+
+    With the pad point P, and the axes a_j, origins o_j and ratios r_j of the finger's joints,
+
+        l = |Σ_j r_j a_j × (P − o_j)|,   where a joint that slides along a_j adds r_j a_j instead.
 
     By virtual work this is the lever of a force along that motion, coupled joints included: the
     same torque that `simulation.drive.opening_torques` measures, over the force.

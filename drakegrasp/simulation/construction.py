@@ -1,6 +1,7 @@
 """Building a scene: object, table and hand as one Drake diagram.
 
-In: an object, the physics configuration and, if wanted, a hand. Out: a `scene.Scene`.
+In: an object, the physics configuration and, for grasps, a hand. Out: a `scene.Scene`, or a
+`scene.ObjectScene` without a hand.
 
 The hand hangs on three prismatic joints from the world and on a frame that is welded to the palm.
 That frame's rotation is set in the context: the palm's orientation is exact and constant, and the
@@ -13,8 +14,10 @@ Sampled output ports report the contacts of the step before.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cache, partial
+from typing import Any
 
 import numpy as np
 from pydrake.common import MemoryFile
@@ -64,7 +67,7 @@ from drakegrasp.hand.shapes import hull_corners
 from drakegrasp.mesh.surfaces import Solid
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import ObjectModel, object_colour
-from drakegrasp.simulation.scene import HandHandles, Scene
+from drakegrasp.simulation.scene import ObjectScene, Scene, joint_limits
 
 #: Mass of each of the three bodies that carry the wrist [kg]; small compared to the hand's.
 WRIST_BODY_MASS = 0.02
@@ -87,97 +90,137 @@ MESHCAT_RATE = 32.0
 
 
 def build_scene(
-    model: ObjectModel,
-    physics: PhysicsConfig,
-    hand: Hand | None = None,
-    *,
-    meshcat: Meshcat | None = None,
-    resting_surface: Solid | None = None,
+    model: ObjectModel, physics: PhysicsConfig, hand: Hand, *, meshcat: Meshcat | None = None
 ) -> Scene:
-    """Return the scene of an object and the table, with the hand if one is given.
-
-    With a hand, `Scene.coarse_scene` builds the scene with coarse steps when it is first called.
+    """Return the scene of an object, the table and a hand.
 
     The object has two rigid hydroelastic surfaces: the hand meets its exact collision mesh, the
     table a surface that carries well. The table and every part of the hand are compliant, so that
     each contact with the object is hydroelastic.
+
+    `Scene.coarse_scene` builds the scene with coarse steps when it is first called.
 
     Args:
         model: The object; its own friction, if it has one, wins.
         physics: Materials, solver and time step.
         hand: The hand.
         meshcat: Where to show the scene while it is simulated; the results are the same bits.
-        resting_surface: What the table meets, in {O}; the object's `resting_surface` if None.
     """
     physics = model.own_physics(physics)
-    resting_surface = resting_surface or model.resting_surface
-    scene = _build(model, physics, hand, meshcat, resting_surface)
-    if hand is None or physics.coarse_steps == 1:
+    scene = _build(model, physics, hand, meshcat)
+    if physics.coarse_steps == 1:
         return scene
     time_step = physics.coarse_steps * physics.time_step
     coarse = physics.model_copy(update={"time_step": time_step})
-    build_coarse = partial(_build, model, coarse, hand, meshcat, resting_surface)
-    return replace(scene, coarse_scene=cache(build_coarse))
+    return replace(scene, coarse_scene=cache(partial(_build, model, coarse, hand, meshcat)))
 
 
-def _build(
+def build_object_scene(
     model: ObjectModel,
     physics: PhysicsConfig,
-    hand: Hand | None,
-    meshcat: Meshcat | None,
-    resting_surface: Solid,
-) -> Scene:
+    *,
+    meshcat: Meshcat | None = None,
+    resting_surface: Solid | None = None,
+) -> ObjectScene:
+    """Return the scene of an object and the table; see `build_scene`.
+
+    Args:
+        model: The object; its own friction, if it has one, wins.
+        physics: Materials, solver and time step.
+        meshcat: Where to show the scene while it is simulated.
+        resting_surface: What the table meets, in {O}; the object's `resting_surface` if None.
+    """
+    physics = model.own_physics(physics)
+    draft = _draft(model, physics, resting_surface or model.resting_surface, meshcat)
+    draft.plant.Finalize()
+    _part_surfaces(draft, [])
+    return ObjectScene(**draft.scene_fields())
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Draft:
+    """A scene that is being built: the attributes of `ObjectScene`, and what else is needed.
+
+    Attributes:
+        builder: Of the diagram.
+        hand_side: The object's surface that a hand meets.
+    """
+
+    builder: DiagramBuilder
+    model: ObjectModel
+    physics: PhysicsConfig
+    plant: MultibodyPlant
+    scene_graph: SceneGraph
+    object: RigidBody
+    hand_side: GeometryId
+    table_side: GeometryId
+    table: RigidBody
+
+    def scene_fields(self) -> dict[str, Any]:
+        """Build the diagram, with a simulator that owns its one context."""
+        names = ("model", "physics", "plant", "scene_graph", "object", "table_side", "table")
+        simulator = Simulator(self.builder.Build())
+        return {"simulator": simulator, **{name: getattr(self, name) for name in names}}
+
+
+def _draft(
+    model: ObjectModel, physics: PhysicsConfig, resting_surface: Solid, meshcat: Meshcat | None
+) -> _Draft:
+    """Return a diagram with the free object and the table."""
+    # The free object has one surface for the hand and one for the table.
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlant(_plant_config(physics), builder)
-
-    # The free object and the table.
     object_body = plant.AddRigidBody(
         "object", plant.AddModelInstance("object"), object_inertia(model, model.mass)
     )
     hand_side = _add_surface(plant, object_body, "hand", model.collision_solid, physics)
     table_side = _add_surface(plant, object_body, "table", resting_surface, physics)
     table = _add_table(plant, scene_graph, physics)
+
+    # A recording shows it.
     if meshcat is not None:
         _add_visual(plant, object_body, model)
         rate = MeshcatVisualizerParams(publish_period=1.0 / MESHCAT_RATE)
         MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat, rate)
-
-    # The hand on its wrist, which follows a trajectory.
-    handles = None
-    if hand is not None:
-        trajectory = builder.AddSystem(
-            TrajectorySource(PiecewisePolynomial(np.zeros((3, 1))), output_derivative_order=1)
-        )
-        handles = _add_hand(plant, scene_graph, hand, trajectory)
-        _make_compliant_hand(plant, scene_graph, handles, physics)
-    plant.Finalize()
-
-    # What needs the finalized plant: collision filters and the wrist's input.
-    _part_surfaces(plant, scene_graph, hand_side, table_side, table, handles)
-    if handles is not None:
-        _filter_within_hand(plant, scene_graph, handles)
-        builder.Connect(
-            handles.wrist_trajectory.get_output_port(),
-            plant.get_desired_state_input_port(handles.wrist_instance),
-        )
-
-    # One simulator owns the one context; in it the fingers' command never changes.
-    simulator = Simulator(builder.Build())
-    scene = Scene(
+    return _Draft(
+        builder=builder,
         model=model,
-        simulator=simulator,
+        physics=physics,
         plant=plant,
         scene_graph=scene_graph,
         object=object_body,
+        hand_side=hand_side,
         table_side=table_side,
         table=table,
-        handles=handles,
-        physics=physics,
     )
-    if handles is not None:
-        plant.get_desired_state_input_port(handles.instance).FixValue(
-            scene.context, _closing_command(handles.hand)
-        )
+
+
+def _build(
+    model: ObjectModel, physics: PhysicsConfig, hand: Hand, meshcat: Meshcat | None
+) -> Scene:
+    # The object on the table, and the hand on its wrist, which follows a trajectory.
+    draft = _draft(model, physics, model.resting_surface, meshcat)
+    plant, scene_graph = draft.plant, draft.scene_graph
+    trajectory = draft.builder.AddSystem(
+        TrajectorySource(PiecewisePolynomial(np.zeros((3, 1))), output_derivative_order=1)
+    )
+    parts_of_hand = _add_hand(plant, scene_graph, hand)
+    instance, fingertips = parts_of_hand["instance"], parts_of_hand["fingertips"]
+    _make_compliant_hand(plant, scene_graph, instance, fingertips, physics)
+    plant.Finalize()
+
+    # What needs the finalized plant: collision filters and the wrist's input.
+    _part_surfaces(draft, [geometry for geometry, _ in parts_of_hand["parts"]])
+    _filter_within_hand(plant, scene_graph, instance, fingertips)
+    draft.builder.Connect(
+        trajectory.get_output_port(),
+        plant.get_desired_state_input_port(parts_of_hand["wrist_instance"]),
+    )
+
+    # The fingers' command never changes.
+    scene = Scene(**draft.scene_fields(), **parts_of_hand, wrist_trajectory=trajectory)
+    command = plant.get_desired_state_input_port(instance)
+    command.FixValue(scene.context, _closing_command(hand))
     return scene
 
 
@@ -244,7 +287,12 @@ def object_friction(physics: PhysicsConfig) -> float:
 
 
 def partner_friction(effective: float, physics: PhysicsConfig) -> float:
-    """Return the coefficient of hand or table that gives the effective one with the object."""
+    """Return the coefficient of hand or table that gives the effective one with the object.
+
+    With the object's own coefficient a, Drake's rule is solved for the partner's b:
+
+        μ = 2 a b / (a + b)   ⇔   b = μ a / (2 a − μ)
+    """
     mu = object_friction(physics)
     return effective * mu / (2.0 * mu - effective)
 
@@ -268,52 +316,46 @@ def _assign_proximity(
         scene_graph.AssignRole(plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
 
 
-def _add_hand(
-    plant: MultibodyPlant, scene_graph: SceneGraph, hand: Hand, trajectory: TrajectorySource
-) -> HandHandles:
+def _add_hand(plant: MultibodyPlant, scene_graph: SceneGraph, hand: Hand) -> dict[str, Any]:
+    """Add the hand on its wrist, and return the attributes of `Scene` that are parts of them."""
     # Weld the palm to the wrist by frames whose poses are parameters of the context.
     wrist_instance = plant.AddModelInstance("wrist")
-    joints = _add_wrist(plant, wrist_instance)
+    wrist_joints = _add_wrist(plant, wrist_instance)
     instance = add_model(plant, hand.model)
     base = plant.GetBodyByName(hand.palm_link, instance)
     # Links of any name may be in the hand's model: ours must not be one of them.
     palm = plant.AddFrame(
         FixedOffsetFrame("drakegrasp_palm", base.body_frame(), RigidTransform(hand.X_BG), instance)
     )
-    wrist = plant.AddFrame(
-        FixedOffsetFrame("wrist", joints[-1].child_body().body_frame(), RigidTransform())
-    )
-    plant.WeldFrames(wrist, palm, RigidTransform())
+    carrier = wrist_joints[-1].child_body().body_frame()
+    wrist_frame = plant.AddFrame(FixedOffsetFrame("wrist", carrier, RigidTransform()))
+    plant.WeldFrames(wrist_frame, palm, RigidTransform())
 
     _add_actuation(plant, hand, instance)
     # The arm, which is not simulated, carries the weight of the hand.
     for weightless in (instance, wrist_instance):
         plant.set_gravity_enabled(weightless, False)
 
-    closing_joints = tuple(plant.GetJointByName(f.closing_joint, instance) for f in hand.fingers)
-    return HandHandles(
-        hand=hand,
-        instance=instance,
-        wrist_instance=wrist_instance,
-        wrist_joints=joints,
-        wrist_frame=wrist,
-        wrist_trajectory=trajectory,
-        fingertips=tuple(plant.GetBodyByName(f.fingertip, instance) for f in hand.fingers),
-        closing_joints=closing_joints,
-        closing_limits=tuple(
-            (float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0]))
-            for joint in closing_joints
+    # The fingers.
+    joints = [plant.GetJointByName(f.closing_joint, instance) for f in hand.fingers]
+    followers = [
+        {plant.GetJointByName(c.joint, instance): c.ratio for c in f.coupled} for f in hand.fingers
+    ]
+    return {
+        "hand": hand,
+        "instance": instance,
+        "wrist_instance": wrist_instance,
+        "wrist_joints": wrist_joints,
+        "wrist_frame": wrist_frame,
+        "fingertips": tuple(plant.GetBodyByName(f.fingertip, instance) for f in hand.fingers),
+        "closing_joints": tuple(joints),
+        "closing_limits": tuple(joint_limits(joint) for joint in joints),
+        "driven": tuple(
+            {joint: 1.0, **coupled} for joint, coupled in zip(joints, followers, strict=True)
         ),
-        driven=tuple(
-            {
-                plant.GetJointByName(f.closing_joint, instance): 1.0,
-                **{plant.GetJointByName(c.joint, instance): c.ratio for c in f.coupled},
-            }
-            for f in hand.fingers
-        ),
-        motors=tuple(plant.GetJointActuatorByName(f.name, instance) for f in hand.fingers),
-        parts=_points_inside(plant, scene_graph, instance),
-    )
+        "motors": tuple(plant.GetJointActuatorByName(f.name, instance) for f in hand.fingers),
+        "parts": _points_inside(plant, scene_graph, instance),
+    }
 
 
 def _points_inside(
@@ -346,6 +388,17 @@ def _add_wrist(plant: MultibodyPlant, instance: ModelInstanceIndex) -> tuple[Pri
 
 
 def _add_actuation(plant: MultibodyPlant, hand: Hand, instance: ModelInstanceIndex) -> None:
+    """Add each finger's motor, and couple the joints that follow its closing joint.
+
+    With the closing joint's position q and the speed ω at which the hand closes, a motor gives
+
+        τ = K (0 − q) + D (ω − dq/dt), cut off at ± the finger's effort limit,
+        K = `FINGER_STIFFNESS` / u², D = `FINGER_DAMPING` / u²,
+
+    where u = 1 rad, or the slide that counts as 1 rad (`Hand.closing_unit`). A rotor of inertia I
+    behind a gear of ratio n adds n² I to the joint. A coupled joint is at r q + q₀, with the ratio
+    and the offset of the hand file.
+    """
     for finger, unit in zip(hand.fingers, hand.closing_unit.tolist(), strict=True):
         joint = plant.GetJointByName(finger.closing_joint, instance)
         actuator = plant.AddJointActuator(finger.name, joint, finger.effort_limit)
@@ -364,12 +417,16 @@ def _closing_command(hand: Hand) -> Array:
 
 
 def _make_compliant_hand(
-    plant: MultibodyPlant, scene_graph: SceneGraph, handles: HandHandles, physics: PhysicsConfig
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    instance: ModelInstanceIndex,
+    fingertips: Sequence[RigidBody],
+    physics: PhysicsConfig,
 ) -> None:
     """Give each link the stiffness of a fingertip or of another link, and the hand's friction."""
-    tips = {body.index() for body in handles.fingertips}
+    tips = {body.index() for body in fingertips}
     mu = partner_friction(physics.friction_hand, physics)
-    for index in plant.GetBodyIndices(handles.instance):
+    for index in plant.GetBodyIndices(instance):
         modulus = physics.fingertip_modulus if index in tips else physics.link_modulus
         properties = ProximityProperties()
         AddCompliantHydroelasticProperties(RESOLUTION_HINT, modulus, properties)
@@ -377,43 +434,37 @@ def _make_compliant_hand(
         _assign_proximity(plant, scene_graph, plant.get_body(index), properties)
 
 
-def _part_surfaces(
-    plant: MultibodyPlant,
-    scene_graph: SceneGraph,
-    hand_side: GeometryId,
-    table_side: GeometryId,
-    table: RigidBody,
-    handles: HandHandles | None,
-) -> None:
-    """Let the hand meet one surface of the object alone, and the table the other one alone."""
-    slab = plant.GetCollisionGeometriesForBody(table)
-    parts = [] if handles is None else [geometry for geometry, _ in handles.parts]
+def _part_surfaces(draft: _Draft, parts: Sequence[GeometryId]) -> None:
+    """Let the hand's parts meet one surface of the object alone, the table the other one alone."""
+    slab = draft.plant.GetCollisionGeometriesForBody(draft.table)
     declare = CollisionFilterDeclaration()
-    declare.ExcludeBetween(GeometrySet(hand_side), GeometrySet(slab))
-    declare.ExcludeBetween(GeometrySet(table_side), GeometrySet(parts))
-    scene_graph.collision_filter_manager().Apply(declare)
+    declare.ExcludeBetween(GeometrySet(draft.hand_side), GeometrySet(slab))
+    declare.ExcludeBetween(GeometrySet(draft.table_side), GeometrySet(parts))
+    draft.scene_graph.collision_filter_manager().Apply(declare)
 
 
 def _filter_within_hand(
-    plant: MultibodyPlant, scene_graph: SceneGraph, handles: HandHandles
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    instance: ModelInstanceIndex,
+    fingertips: Sequence[RigidBody],
 ) -> None:
     """Let only fingertips of different fingers collide within the hand.
 
     The shapes of the other links overlap at their joints by design, and the fingertips meet before
     other links can.
     """
-
-    def geometries(body: RigidBody) -> list[GeometryId]:
-        return list(plant.GetCollisionGeometriesForBody(body))
-
-    bodies = [plant.get_body(i) for i in plant.GetBodyIndices(handles.instance)]
-    tips = {body.index() for body in handles.fingertips}
-    others = GeometrySet([g for b in bodies if b.index() not in tips for g in geometries(b)])
-    every_tip = GeometrySet([g for b in handles.fingertips for g in geometries(b)])
+    links = {
+        index: plant.GetCollisionGeometriesForBody(plant.get_body(index))
+        for index in plant.GetBodyIndices(instance)
+    }
+    tips = [links.pop(body.index()) for body in fingertips]
+    every_tip = GeometrySet([geometry for tip in tips for geometry in tip])
+    others = GeometrySet([geometry for link in links.values() for geometry in link])
 
     # Exclude all pairs but those of two fingertips.
     manager = scene_graph.collision_filter_manager()
     manager.Apply(CollisionFilterDeclaration().ExcludeWithin(others))
     manager.Apply(CollisionFilterDeclaration().ExcludeBetween(others, every_tip))
-    for tip in handles.fingertips:
-        manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(geometries(tip))))
+    for tip in tips:
+        manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(tip)))

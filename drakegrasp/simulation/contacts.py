@@ -20,7 +20,7 @@ from pydrake.multibody.tree import BodyIndex
 from drakegrasp.arithmetic import norm
 from drakegrasp.frames import Array, invert_pose, rotate_vectors, transform_points
 from drakegrasp.mesh.surfaces import winding_numbers
-from drakegrasp.simulation.scene import Scene
+from drakegrasp.simulation.scene import ObjectScene, Scene
 
 #: Largest share of a patch's pressure that may lie beside the pad of a fingertip's contact; own
 #: choice, see docs/explanation/physics.md, "Pads".
@@ -72,26 +72,33 @@ def read_contacts(scene: Scene) -> Contacts:
     return reader.contacts()
 
 
-def bodies_on_object(scene: Scene) -> set[BodyIndex]:
+def table_force(scene: ObjectScene) -> Array:
+    """Return the force (3,) of the table on the object now, in {W} [N]."""
+    return _forces_on_object(scene).get(scene.table.index(), np.zeros(3))
+
+
+def bodies_on_object(scene: ObjectScene) -> set[BodyIndex]:
     """Return the bodies that touch the object now with more than `physics.contact_force`.
 
     These are the contacts of `read_contacts`, without points, normals and areas.
     """
-    results = scene.plant.get_contact_results_output_port().Eval(scene.context)
-    grasped = scene.object.index()
+    limit = scene.physics.contact_force
+    forces = _forces_on_object(scene)
+    return {body for body, force in forces.items() if float(norm(force)) > limit}
 
-    # Sum the forces of the patches between each body and the object.
-    forces: dict[BodyIndex, Array] = {}
+
+def _forces_on_object(scene: ObjectScene) -> dict[BodyIndex, Array]:
+    """Return the force (3,) of each body on the object, in {W} [N]: the sum of its patches."""
+    results = scene.plant.get_contact_results_output_port().Eval(scene.context)
+    grasped, forces = scene.object.index(), dict[BodyIndex, Array]()
     for i in range(results.num_hydroelastic_contacts()):
         info = results.hydroelastic_contact_info(i)
-        surface = info.contact_surface()
+        surface, force_on_M = info.contact_surface(), np.array(info.F_Ac_W().translational())
         M, N = _body_of(scene, surface.id_M()), _body_of(scene, surface.id_N())
         if grasped in (M, N):
-            other = N if grasped == M else M
-            forces[other] = forces.get(other, np.zeros(3)) + info.F_Ac_W().translational()
-
-    limit = scene.physics.contact_force
-    return {body for body, force in forces.items() if float(norm(force)) > limit}
+            other, force = (N, force_on_M) if grasped == M else (M, -force_on_M)
+            forces[other] = forces.get(other, np.zeros(3)) + force
+    return forces
 
 
 def open_hand_collides(scene: Scene) -> bool:
@@ -101,9 +108,6 @@ def open_hand_collides(scene: Scene) -> bool:
     contact surfaces. A part that is wholly inside the object has none, so a point inside each part
     is tested against the object's volume as well.
     """
-    handles = scene.handles
-    if handles is None:
-        return False
     query = scene.plant.get_geometry_query_input_port().Eval(scene.context)
     hand = hand_bodies(scene)
 
@@ -117,11 +121,11 @@ def open_hand_collides(scene: Scene) -> bool:
         return True
 
     # Parts that are wholly inside the object.
-    points = [query.GetPoseInWorld(geometry) @ p for geometry, p in handles.parts]
+    points = [query.GetPoseInWorld(geometry) @ p for geometry, p in scene.parts]
     return is_inside(scene, np.array(points))
 
 
-def is_inside(scene: Scene, p_WP: Array) -> bool:
+def is_inside(scene: ObjectScene, p_WP: Array) -> bool:
     """Return whether any of the points (n, 3) [m] is inside the object's volume.
 
     Drake's point distance refuses meshes with very sharp edges; winding numbers work on them.
@@ -143,8 +147,7 @@ class _Reader:
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
         self._X_OW = invert_pose(scene.pose(scene.object))
-        handles = scene.handles
-        self._tips = [] if handles is None else [b.index() for b in handles.fingertips]
+        self._tips = [body.index() for body in scene.fingertips]
         self._hand = hand_bodies(scene)
         k = len(self._tips)
         self._force_W, self._area = np.zeros((k, 3)), np.zeros(k)
@@ -181,14 +184,26 @@ class _Reader:
     def _add_tip_patch(
         self, i: int, surface: ContactSurface, force_W: Array, object_is_M: bool
     ) -> None:
-        """Add a patch of fingertip i and the object, split into pad and rest of the link."""
-        assert self._scene.handles is not None
+        """Add a patch of fingertip i and the object, split into pad and rest of the link.
+
+        Face e of a patch has the area A, the pressure p at its centroid c and the outward normal n
+        of the object; it weighs w_e = A_e p_e. Over the faces of all patches that are the pad's,
+
+            point = Σ w_e c_e / Σ w_e,   normal = Σ w_e n_e / |Σ w_e n_e|.
+
+        σ = (Σ_pad w_e) / (Σ w_e) is the pad's share of a patch with the force f on the object. From
+        σ = 1 − `MAX_BESIDE` on the whole patch is the pad's. Below, the pad's force is
+
+            f_pad = − Σ_pad w_e n_e + σ (f + Σ w_e n_e):
+
+        the pressure of its own faces, and its share of what friction and damping add to all.
+        """
         faces = _read_faces(surface, object_is_M)
 
         # Which faces are on the pad, and how much of the patch they carry.
-        tip = self._scene.handles.fingertips[i]
+        tip = self._scene.fingertips[i]
         p_FiQ = transform_points(invert_pose(self._scene.pose(tip)), faces.centres_W)
-        on_pad = self._scene.handles.hand.fingers[i].on_pad(p_FiQ)
+        on_pad = self._scene.hand.fingers[i].on_pad(p_FiQ)
         weight = faces.areas * faces.pressures
         moment_n = weight[:, None] * faces.normals_W
 
@@ -249,9 +264,8 @@ class _Reader:
 
 
 def hand_bodies(scene: Scene) -> set[BodyIndex]:
-    """Return the links of the scene's hand; none if it has no hand."""
-    handles = scene.handles
-    return set() if handles is None else set(scene.plant.GetBodyIndices(handles.instance))
+    """Return the links of the scene's hand."""
+    return set(scene.plant.GetBodyIndices(scene.instance))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -274,8 +288,11 @@ class _Faces:
 
 
 def _read_faces(surface: ContactSurface, object_is_M: bool) -> _Faces:
-    # The fingertip's pressure is zero at its surface, so pressure over gradient is the depth of the
-    # face below it.
+    """Return the faces of a patch.
+
+    The fingertip's pressure p is zero at its surface and grows with the depth below it, so the
+    depth of a face is p / |∇p| to first order.
+    """
     field, compliant_is_M = surface.poly_e_MN(), not object_is_M
     has_gradient = surface.HasGradE_M() if compliant_is_M else surface.HasGradE_N()
     gradient = surface.EvaluateGradE_M_W if compliant_is_M else surface.EvaluateGradE_N_W
@@ -298,6 +315,6 @@ def _read_faces(surface: ContactSurface, object_is_M: bool) -> _Faces:
     )
 
 
-def _body_of(scene: Scene, geometry_id: object) -> BodyIndex:
+def _body_of(scene: ObjectScene, geometry_id: object) -> BodyIndex:
     inspector = scene.scene_graph.model_inspector()
     return scene.plant.GetBodyFromFrameId(inspector.GetFrameId(geometry_id)).index()

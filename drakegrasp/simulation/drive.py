@@ -32,7 +32,7 @@ from drakegrasp.simulation.scene import (
     Scene,
     closing_angles,
     closing_rates,
-    hand_handles,
+    joint_limits,
 )
 
 #: A finger that opens more slowly than this stands, in the unit of its closing joint [1/s].
@@ -60,14 +60,13 @@ def engage(scene: Scene, drive: Drive) -> None:
     """Let the drive hold the closing joints at their angles from now on.
 
     Args:
-        scene: A scene with a hand, whose motors are on.
+        scene: Its motors are on.
         drive: See the module.
     """
     if drive == "torque":
         return
-    handles = hand_handles(scene)
     for joint, angle, (_, upper) in zip(
-        handles.closing_joints, closing_angles(scene), handles.closing_limits, strict=True
+        scene.closing_joints, closing_angles(scene), scene.closing_limits, strict=True
     ):
         # A joint that closed up to its limit may be a little beyond.
         least = angle if drive == "locked" else min(angle, upper)
@@ -78,11 +77,10 @@ def engage(scene: Scene, drive: Drive) -> None:
 
 def disengage(scene: Scene) -> None:
     """Give the closing joints and their motors the limits of the hand's files again."""
-    handles = hand_handles(scene)
     scene.simulator.clear_monitor()
-    for i, joint in enumerate(handles.closing_joints):
-        _set_limits(joint, *handles.closing_limits[i])
-        handles.motors[i].set_effort_limit(handles.hand.fingers[i].effort_limit)
+    for i, joint in enumerate(scene.closing_joints):
+        _set_limits(joint, *scene.closing_limits[i])
+        scene.motors[i].set_effort_limit(scene.hand.fingers[i].effort_limit)
 
 
 def hand_over(scene: Scene, before: Scene) -> None:
@@ -92,10 +90,9 @@ def hand_over(scene: Scene, before: Scene) -> None:
         scene: The scene that continues, with the state of the other one.
         before: The scene that simulated the lift until now.
     """
-    source, target = hand_handles(before), hand_handles(scene)
-    for i, joint in enumerate(source.closing_joints):
-        _set_limits(target.closing_joints[i], *_limits(joint))
-        target.motors[i].set_effort_limit(source.motors[i].effort_limit())
+    for i, joint in enumerate(before.closing_joints):
+        _set_limits(scene.closing_joints[i], *joint_limits(joint))
+        scene.motors[i].set_effort_limit(before.motors[i].effort_limit())
 
     worms_turn = before.simulator.get_monitor() is not None
     disengage(before)
@@ -104,18 +101,25 @@ def hand_over(scene: Scene, before: Scene) -> None:
 
 
 def opening_torques(scene: Scene) -> Array:
-    """Return the torque (k,) [N m or N] by which contacts push each closing joint open now."""
+    """Return the torque (k,) [N m or N] by which contacts push each closing joint open now.
+
+    Contacts act on joint j of the hand with the torque τ_j = Σ J_jᵀ f, the sum over all contact
+    forces f, where J_j dq_j/dt is the velocity that the joint gives to a force's point. Where motor
+    i moves joint j at the ratio r_ij, virtual work makes the load of its closing joint
+
+        τ_i = − Σ_j r_ij τ_j,   with r = 1 for the closing joint itself.
+    """
     # Contact forces in the coordinates of all joints of the hand.
-    handles, plant = hand_handles(scene), scene.plant
-    port = plant.get_generalized_contact_forces_output_port(handles.instance)
+    plant = scene.plant
+    port = plant.get_generalized_contact_forces_output_port(scene.instance)
     torques = np.zeros(plant.num_velocities())
-    plant.SetVelocitiesInArray(handles.instance, port.Eval(scene.context), torques)
+    plant.SetVelocitiesInArray(scene.instance, port.Eval(scene.context), torques)
 
     # A motor moves its joints at fixed ratios, so it carries their torques by the same ratios.
     return np.array(
         [
             -sum(ratio * torques[joint.velocity_start()] for joint, ratio in driven.items())
-            for driven in handles.driven
+            for driven in scene.driven
         ]
     )
 
@@ -127,15 +131,23 @@ def _start_worms(scene: Scene) -> None:
 
 
 def _turn_worms(scene: Scene, _: Context) -> EventStatus:
-    """Between two steps: follow the fingers that closed, and yield where a load is too large."""
-    handles = hand_handles(scene)
+    """Between two steps: follow the fingers that closed, and yield where a load is too large.
+
+    With the position q, the lower limit l and the load τ (`opening_torques`) of a closing joint:
+
+        it holds:   l ← max(l, q);   it yields from the step on at which τ > τ_hold
+        it yields:  l ← that of the hand's files, and the motor gives up to τ_hold;
+                    it holds again, with l ← q, once dq/dt ≥ −`STANDING` u
+
+    where τ_hold is the finger's `holding_effort` and u its `Hand.closing_unit`.
+    """
     angles, rates = closing_angles(scene), closing_rates(scene)
 
     # Set the limits before loads are read: Drake solves this state once, for the loads and for the
     # step that follows.
-    for i, finger in enumerate(handles.hand.fingers):
-        joint, motor = handles.closing_joints[i], handles.motors[i]
-        lower, upper = _limits(joint)
+    for i, finger in enumerate(scene.hand.fingers):
+        joint, motor = scene.closing_joints[i], scene.motors[i]
+        lower, upper = joint_limits(joint)
         yields = motor.effort_limit() > finger.effort_limit
         if yields and rates[i] >= -STANDING:
             # A finger that yielded stands again: from now on the worm holds it here.
@@ -146,11 +158,11 @@ def _turn_worms(scene: Scene, _: Context) -> EventStatus:
 
     # A finger whose load exceeds what its worm holds opens against just that torque.
     loads, overloaded = opening_torques(scene), False
-    for i, finger in enumerate(handles.hand.fingers):
+    for i, finger in enumerate(scene.hand.fingers):
         assert finger.holding_effort is not None
-        motor = handles.motors[i]
+        motor = scene.motors[i]
         if loads[i] > finger.holding_effort and motor.effort_limit() <= finger.effort_limit:
-            _set_limits(handles.closing_joints[i], *handles.closing_limits[i])
+            _set_limits(scene.closing_joints[i], *scene.closing_limits[i])
             motor.set_effort_limit(finger.holding_effort)
             overloaded = True
 
@@ -158,10 +170,6 @@ def _turn_worms(scene: Scene, _: Context) -> EventStatus:
     if overloaded:
         scene.plant.SetPositions(scene.context, scene.plant.GetPositions(scene.context))
     return EventStatus.DidNothing()
-
-
-def _limits(joint: ClosingJoint) -> tuple[float, float]:
-    return float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0])
 
 
 def _set_limits(joint: ClosingJoint, lower: float, upper: float) -> None:

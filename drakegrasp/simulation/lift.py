@@ -20,7 +20,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.multibody.tree import RigidBody
 
 from drakegrasp.arithmetic import multiply, norm
 from drakegrasp.config import Config
@@ -95,7 +94,6 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
         TrialTimeout: See `TrialLimits.advance`.
         StateError: See `TrialLimits.advance`.
     """
-    assert scene.handles is not None
     X_GO_start, start = _object_in_hand(scene), scene.time
 
     # `scene` takes fine steps, `current` is the one that takes the steps that are needed now.
@@ -104,7 +102,7 @@ def lift(scene: Scene, limits: TrialLimits, config: Config) -> Lift:
     try:
         # Free the object in the hand; later the wrist goes to its target.
         release(scene)
-        engage(scene, drive_of(scene.handles.hand, config.lift))
+        engage(scene, drive_of(scene.hand, config.lift))
         motion = _plan_motion(scene, config)
         end = motion.begin + motion.duration + config.lift.hold_time
 
@@ -188,10 +186,10 @@ class _Monitor:
     """
 
     def __init__(self, scene: Scene) -> None:
-        assert scene.handles is not None
-        self._tips = {body.index() for body in _required_tips(scene)}
+        tips = zip(scene.fingertips, scene.hand.required, strict=True)
+        self._tips = {body.index() for body, required in tips if required}
         self._X_GO, self._angles = _object_in_hand(scene), closing_angles(scene)
-        self._unit = scene.handles.hand.closing_unit
+        self._unit = scene.hand.closing_unit
         # Whether all fingertips touched the object at a check since which nothing moved: then
         # contacts need not be computed again.
         self._held = False
@@ -232,25 +230,15 @@ class _Monitor:
 
 def _has_lost_tip(scene: Scene) -> bool:
     """Return whether the pad of some required fingertip has lost the object for good."""
-    assert scene.handles is not None
     field, X_OW = scene.model.field, invert_pose(scene.pose(scene.object))
-    pads = pad_points(scene.handles.hand)
-    tips = zip(scene.handles.fingertips, scene.handles.hand.required, pads, strict=True)
-    for tip, required, p_FiQ in tips:
-        if not required:
-            continue
+    pads = pad_points(scene.hand)
+    tips = zip(scene.fingertips, pads, scene.hand.required, strict=True)
+    for tip, p_FiQ in [(tip, points) for tip, points, required in tips if required]:
         p_OQ = transform_points(multiply(X_OW, scene.pose(tip)), p_FiQ)
         distance = field.interpolate(*p_OQ.astype(np.float32).T)
         if distance.min() > LOST + extra_margin(field):
             return True
     return False
-
-
-def _required_tips(scene: Scene) -> list[RigidBody]:
-    """Return the fingertips that a grasp needs on the object."""
-    assert scene.handles is not None
-    pairs = zip(scene.handles.fingertips, scene.handles.hand.required, strict=True)
-    return [tip for tip, required in pairs if required]
 
 
 def _object_in_hand(scene: Scene) -> Array:

@@ -93,8 +93,7 @@ def place_object(
         ConfigError: If config is none, or an object was placed before with other values.
     """
     # Check the arguments that do not depend on the kind of mesh.
-    config = config_of(mesh) if config is None else config
-    refuse_no_config(config)
+    config = config_for(mesh, config)
     if units is not None and units not in UNITS:
         raise MeshError(f"units must be one of {', '.join(UNITS)}, got {units!r}")
 
@@ -122,9 +121,16 @@ def place_object(
     return PlacedObject(model=model, X_TO=X_TO, config=config)
 
 
-def config_of(mesh: object) -> Config:
-    """Return the configuration of a placed object, and the defaults for any other mesh."""
-    return mesh.config if isinstance(mesh, PlacedObject) else load_config()
+def config_for(mesh: object, config: Config | None) -> Config:
+    """Return the given configuration, else that of a placed object, else the defaults.
+
+    Raises:
+        ConfigError: If the given one is not a `Config`.
+    """
+    if config is None:
+        return mesh.config if isinstance(mesh, PlacedObject) else load_config()
+    refuse_no_config(config)
+    return config
 
 
 def refuse_no_config(config: object) -> None:

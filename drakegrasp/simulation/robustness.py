@@ -21,7 +21,7 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.candidates import Attempt, palm_motion
 from drakegrasp.simulation.construction import build_scene
-from drakegrasp.simulation.randomization.conditions import Materials, usual_conditions
+from drakegrasp.simulation.randomization.conditions import Conditions, usual_conditions
 from drakegrasp.simulation.screen import Prediction, predict
 from drakegrasp.simulation.trial import run_attempt
 
@@ -63,20 +63,19 @@ def certify(model: ObjectModel, X_TO: Array, attempt: Attempt, config: Config) -
         config: The rules; `certify` has the number of repeats and the noise.
     """
     # Repeat the attempt with noise; inconclusive repeats do not count.
-    usual = usual_conditions(model, config.physics)
-    attempt = replace(attempt, conditions=attempt.conditions or usual)
+    known = attempt.conditions or usual_conditions(model, config.physics)
     repeater = _Repeater(model, X_TO, config)
     stream = Stream(attempt.seed, attempt.standoff_index)
-    repeats = [repeater.holds(noisy) for noisy in _noisy_attempts(stream, attempt, config.certify)]
+    repeats = [repeater.holds(each) for each in _noisy(stream, attempt, known, config.certify)]
     conclusive = [holds for holds in repeats if holds is not None]
 
     # Search for the least friction; what geometry decides does not depend on friction.
     prediction = repeater.predict(attempt)
 
     def holds(friction: float) -> bool | None:
-        return repeater.holds(_with_materials(attempt, friction_hand=friction), prediction)
+        return repeater.holds(_with_materials(attempt, known, friction_hand=friction), prediction)
 
-    highest = _materials(attempt).friction_hand
+    highest = known.materials.friction_hand
     return Certificate(
         share=float(np.mean(conclusive)) if conclusive else np.nan,
         friction=least_friction(holds, highest, config.certify.friction_steps),
@@ -109,28 +108,24 @@ def least_friction(holds: Callable[[float], bool | None], highest: float, steps:
     return high
 
 
-def _noisy_attempts(stream: Stream, attempt: Attempt, rules: CertifyConfig) -> Iterator[Attempt]:
+def _noisy(
+    stream: Stream, attempt: Attempt, known: Conditions, rules: CertifyConfig
+) -> Iterator[Attempt]:
     """Yield each repeat of an attempt: with noise on palm pose, friction and mass."""
-    known = _materials(attempt)
+    materials = known.materials
     for _ in range(rules.repeats):
         # The order of the draws is part of the seed's meaning: palm, friction, mass.
         X_GH = palm_motion(stream.normal(6), rules.palm_noise, np.deg2rad(rules.palm_noise_deg))
         noisy = replace(attempt, X_OG=multiply(attempt.X_OG, X_GH))
-        friction = known.friction_hand * _noise_factor(stream, rules.friction_noise)
-        mass = known.mass * _noise_factor(stream, rules.mass_noise)
-        yield _with_materials(noisy, friction_hand=friction, mass=mass)
+        friction = materials.friction_hand * _noise_factor(stream, rules.friction_noise)
+        mass = materials.mass * _noise_factor(stream, rules.mass_noise)
+        yield _with_materials(noisy, known, friction_hand=friction, mass=mass)
 
 
-def _materials(attempt: Attempt) -> Materials:
-    assert attempt.conditions is not None
-    return attempt.conditions.materials
-
-
-def _with_materials(attempt: Attempt, **changes: float) -> Attempt:
-    """Return an attempt with another friction or mass."""
-    assert attempt.conditions is not None
-    materials = replace(attempt.conditions.materials, **changes)
-    return replace(attempt, conditions=replace(attempt.conditions, materials=materials))
+def _with_materials(attempt: Attempt, known: Conditions, **changes: float) -> Attempt:
+    """Return an attempt with another friction or mass than the known one."""
+    materials = replace(known.materials, **changes)
+    return replace(attempt, conditions=replace(known, materials=materials))
 
 
 def _noise_factor(stream: Stream, deviation: float) -> float:

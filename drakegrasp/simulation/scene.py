@@ -1,8 +1,9 @@
-"""The state of a scene: one object, the table and, if given, one hand in a Drake diagram.
+"""The state of a scene: one object, the table and one hand in a Drake diagram.
 
-A scene is built once per object (`construction.build_scene`) and reset for each attempt: building
-costs more than simulating, and a reset context gives the same bits as a new one. A scene makes no
-decisions; `settle` and `trial` do.
+An `ObjectScene` has no hand: objects settle in it, and forces alone lift them. A scene is built
+once per object (`construction`) and reset for each attempt: building costs more than simulating,
+and a reset context gives the same bits as a new one. A scene makes no decisions; `settle` and
+`trial` do.
 """
 
 from __future__ import annotations
@@ -40,38 +41,22 @@ from drakegrasp.objects.model import ObjectModel
 ClosingJoint: TypeAlias = RevoluteJoint | PrismaticJoint
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class HandHandles:
-    """The parts of a scene's plant that belong to the hand."""
-
-    hand: Hand
-    instance: ModelInstanceIndex
-    wrist_instance: ModelInstanceIndex
-    wrist_joints: tuple[PrismaticJoint, ...]
-    wrist_frame: FixedOffsetFrame
-    wrist_trajectory: TrajectorySource
-    fingertips: tuple[RigidBody, ...]
-    closing_joints: tuple[ClosingJoint, ...]
-    closing_limits: tuple[tuple[float, float], ...]  # of the closing joints [rad or m]
-    driven: tuple[dict[ClosingJoint, float], ...]  # joints that each motor moves, and their ratios
-    motors: tuple[JointActuator, ...]  # of the closing joints
-    parts: tuple[tuple[GeometryId, Array], ...]  # each shape of the hand with a point inside it
+def joint_limits(joint: ClosingJoint) -> tuple[float, float]:
+    """Return the limits of a joint now [rad or m]; they belong to the plant."""
+    return float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Scene:
-    """A built diagram with its one context.
+class ObjectScene:
+    """An object on the table: a built diagram with its one context.
 
     Attributes:
         model: The object.
         simulator: Owns the diagram's context.
         plant, scene_graph: The two systems of the diagram.
         object, table: The bodies.
-        table_side: The object's surface that meets the table; the hand meets the other one.
-        handles: The parts of the hand, or None in a scene without a hand.
+        table_side: The object's surface that meets the table; a hand meets the other one.
         physics: The configuration that it was built with.
-        coarse_scene: Returns the scene whose step is `physics.coarse_steps` times as long; every
-            call returns the same one. None where there is no such scene.
     """
 
     model: ObjectModel
@@ -81,9 +66,7 @@ class Scene:
     object: RigidBody
     table_side: GeometryId
     table: RigidBody
-    handles: HandHandles | None
     physics: PhysicsConfig
-    coarse_scene: Callable[[], Scene] | None = None
 
     @property
     def context(self) -> Context:
@@ -100,7 +83,46 @@ class Scene:
         return self.plant.EvalBodyPoseInWorld(self.context, body).GetAsMatrix4()
 
 
-def reset_object(scene: Scene, X_WO: npt.ArrayLike) -> None:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scene(ObjectScene):
+    """An object on the table, and a hand of k fingers.
+
+    Attributes:
+        hand: The hand.
+        instance: The plant's model of the hand; that of the wrist is `wrist_instance`.
+        wrist_joints: Three joints that slide along the axes of {W}.
+        wrist_frame: Its rotation in the context is the palm's orientation.
+        wrist_trajectory: The path that the wrist follows.
+        fingertips: The k links.
+        closing_joints, motors: Each finger's closing joint, and what drives it.
+        closing_limits: Of the closing joints [rad or m].
+        driven: The joints that each motor moves, with their ratios.
+        parts: Each shape of the hand with a point inside it, (3,) in the shape's frame [m].
+        coarse_scene: Returns the scene whose step is `physics.coarse_steps` times as long; every
+            call returns the same one. None where there is no such scene.
+    """
+
+    hand: Hand
+    instance: ModelInstanceIndex
+    wrist_instance: ModelInstanceIndex
+    wrist_joints: tuple[PrismaticJoint, ...]
+    wrist_frame: FixedOffsetFrame
+    wrist_trajectory: TrajectorySource
+    fingertips: tuple[RigidBody, ...]
+    closing_joints: tuple[ClosingJoint, ...]
+    closing_limits: tuple[tuple[float, float], ...]
+    driven: tuple[dict[ClosingJoint, float], ...]
+    motors: tuple[JointActuator, ...]
+    parts: tuple[tuple[GeometryId, Array], ...]
+    coarse_scene: Callable[[], Scene] | None = None
+
+    @property
+    def links(self) -> list[RigidBody]:
+        """The hand's links."""
+        return [self.plant.get_body(index) for index in self.plant.GetBodyIndices(self.instance)]
+
+
+def reset_object(scene: ObjectScene, X_WO: npt.ArrayLike) -> None:
     """Set the time to zero, and put the object at X_WO (4, 4), free and at rest."""
     scene.simulator.get_mutable_context().SetTime(0.0)
     scene.object.Unlock(scene.context)
@@ -120,53 +142,51 @@ def reset_attempt(
     """Put hand and object at the start of an attempt; only the fingers are not locked.
 
     Args:
-        scene: A scene with a hand.
+        scene: With the hand.
         X_WO: Pose of the object (4, 4).
         X_WG: Pose of the palm (4, 4).
         spread: Angle of the spread joints [rad].
         closing: Position of each finger's closing joint (k,) [rad or m]; None is the open hand.
     """
     # Unlock the wrist before positions are set, then place the object.
-    handles = hand_handles(scene)
     context, plant = scene.context, scene.plant
-    for joint in handles.wrist_joints:
+    for joint in scene.wrist_joints:
         joint.Unlock(context)
     reset_object(scene, X_WO)
 
     # Orientation of the palm, by its frame; joints of the fingers; position of the palm.
     X = np.asarray(X_WG, dtype=float)
     R_WG = RotationMatrix(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]))
-    handles.wrist_frame.SetPoseInParentFrame(context, RigidTransform(R_WG, np.zeros(3)))
-    angles = np.zeros(handles.hand.num_fingers) if closing is None else closing
-    for name, position in joint_positions(handles.hand, spread, angles).items():
-        joint = plant.GetJointByName(name, handles.instance)
+    scene.wrist_frame.SetPoseInParentFrame(context, RigidTransform(R_WG, np.zeros(3)))
+    angles = np.zeros(scene.hand.num_fingers) if closing is None else closing
+    for name, position in joint_positions(scene.hand, spread, angles).items():
+        joint = plant.GetJointByName(name, scene.instance)
         slides = isinstance(joint, PrismaticJoint)
         (joint.set_translation if slides else joint.set_angle)(context, position)
-    for joint, p in zip(handles.wrist_joints, X[:3, 3], strict=True):
+    for joint, p in zip(scene.wrist_joints, X[:3, 3], strict=True):
         joint.set_translation(context, float(p))
         joint.Lock(context)
 
     # The spread keeps its angle: one motor drives it, and the released code locks it too. So do
     # the joints of the preshape.
-    for name in handles.hand.locked_joints:
-        plant.GetJointByName(name, handles.instance).Lock(context)
+    _lock_still_joints(scene)
 
     # Only the fingers move while the hand closes.
     scene.object.Lock(context)
     _let_object_meet_table(scene, False)
-    handles.wrist_trajectory.UpdateTrajectory(PiecewisePolynomial(X[:3, 3:4]))
+    scene.wrist_trajectory.UpdateTrajectory(PiecewisePolynomial(X[:3, 3:4]))
     scene.simulator.Initialize()
 
 
 def release(scene: Scene) -> None:
     """Free the object and the wrist for the lift."""
-    for joint in hand_handles(scene).wrist_joints:
+    for joint in scene.wrist_joints:
         joint.Unlock(scene.context)
     scene.object.Unlock(scene.context)
     _let_object_meet_table(scene, True)
 
 
-def _let_object_meet_table(scene: Scene, meet: bool) -> None:
+def _let_object_meet_table(scene: ObjectScene, meet: bool) -> None:
     """Include contacts between object and table in the simulation, or exclude them.
 
     While both are static such a contact changes nothing, but computing it at each step costs more
@@ -181,6 +201,11 @@ def _let_object_meet_table(scene: Scene, meet: bool) -> None:
         GeometrySet(scene.plant.GetCollisionGeometriesForBody(scene.table)),
     )
     manager.Apply(declare.AllowBetween(*sides) if meet else declare.ExcludeBetween(*sides))
+
+
+def _lock_still_joints(scene: Scene) -> None:
+    for name in scene.hand.locked_joints:
+        scene.plant.GetJointByName(name, scene.instance).Lock(scene.context)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -205,17 +230,13 @@ def move_wrist(
     """Command a straight minimum-jerk motion of the wrist from where it is now.
 
     Args:
-        scene: A scene with a hand.
+        scene: With the hand.
         p_WG_target: Target of the palm's origin, (3,) [m]; it stays there afterwards.
         duration: Of the motion [s].
         begin: Time at which it begins [s]; None is now.
-
-    Raises:
-        ValueError: If the scene has no hand.
     """
-    joints = hand_handles(scene).wrist_joints
     motion = WristMotion(
-        p_start=np.array([joint.get_translation(scene.context) for joint in joints]),
+        p_start=np.array([j.get_translation(scene.context) for j in scene.wrist_joints]),
         p_end=np.asarray(p_WG_target, dtype=float),
         begin=scene.time if begin is None else begin,
         duration=duration,
@@ -232,7 +253,7 @@ def _follow(scene: Scene, motion: WristMotion) -> None:
     # has no lag at any step size.
     begin = motion.begin - scene.physics.time_step
     curve = BezierCurve(begin, begin + motion.duration, points)
-    hand_handles(scene).wrist_trajectory.UpdateTrajectory(curve)
+    scene.wrist_trajectory.UpdateTrajectory(curve)
 
 
 def transfer_state(scene: Scene, before: Scene, time: float, motion: WristMotion) -> None:
@@ -243,9 +264,6 @@ def transfer_state(scene: Scene, before: Scene, time: float, motion: WristMotion
         before: The scene whose state and palm orientation it takes over.
         time: Of the state [s]; a step of both scenes begins there.
         motion: Of the wrist.
-
-    Raises:
-        ValueError: If one of them has no hand.
     """
     # Drake steps at whole multiples of the step: a time just before one would skip a step.
     step = scene.physics.time_step
@@ -253,20 +271,18 @@ def transfer_state(scene: Scene, before: Scene, time: float, motion: WristMotion
 
     # Copy the palm's orientation and the state. A plant's context cannot be copied as a whole: it
     # refers to the geometries of its own diagram.
-    source, target = hand_handles(before), hand_handles(scene)
-    X = source.wrist_frame.GetPoseInParentFrame(before.context)
-    target.wrist_frame.SetPoseInParentFrame(scene.context, X)
+    X = before.wrist_frame.GetPoseInParentFrame(before.context)
+    scene.wrist_frame.SetPoseInParentFrame(scene.context, X)
     state = before.plant.GetPositionsAndVelocities(before.context)
     scene.plant.SetPositionsAndVelocities(scene.context, state)
 
     # Lock spread and preshape, and follow the same path of the wrist.
-    for name in target.hand.locked_joints:
-        scene.plant.GetJointByName(name, target.instance).Lock(scene.context)
+    _lock_still_joints(scene)
     _follow(scene, motion)
     scene.simulator.Initialize()
 
 
-def advance(scene: Scene, duration: float) -> None:
+def advance(scene: ObjectScene, duration: float) -> None:
     """Simulate for a duration [s]."""
     scene.simulator.AdvanceTo(scene.time + duration, interruptible=False)
 
@@ -276,9 +292,8 @@ def closing_rates(scene: Scene) -> Array:
 
     The unit is `Hand.closing_unit`: one speed limit serves joints that turn and joints that slide.
     """
-    handles = hand_handles(scene)
-    rates = [joint.GetOneVelocity(scene.context) for joint in handles.closing_joints]
-    return np.array(rates) / handles.hand.closing_unit
+    rates = [joint.GetOneVelocity(scene.context) for joint in scene.closing_joints]
+    return np.array(rates) / scene.hand.closing_unit
 
 
 def finger_speed(scene: Scene) -> float:
@@ -288,37 +303,23 @@ def finger_speed(scene: Scene) -> float:
 
 def closing_angles(scene: Scene) -> Array:
     """Return the position of each finger's closing joint (k,) [rad or m]."""
-    return np.array(
-        [joint.GetOnePosition(scene.context) for joint in hand_handles(scene).closing_joints]
-    )
+    return np.array([joint.GetOnePosition(scene.context) for joint in scene.closing_joints])
 
 
 def hand_positions(scene: Scene) -> Array:
     """Return the positions of all joints of the hand in the plant's order [rad or m]."""
-    return scene.plant.GetPositions(scene.context, hand_handles(scene).instance)
+    return scene.plant.GetPositions(scene.context, scene.instance)
 
 
 def hand_joint_names(scene: Scene) -> list[str]:
     """Return the joints' names in the order of `hand_positions`."""
     names = scene.plant.GetPositionNames(
-        hand_handles(scene).instance, add_model_instance_prefix=False, always_add_suffix=False
+        scene.instance, add_model_instance_prefix=False, always_add_suffix=False
     )
     return list(names)
 
 
 def palm_pose(scene: Scene) -> Array:
     """Return the pose X_WG (4, 4) of the palm now."""
-    handles = hand_handles(scene)
-    base = scene.plant.GetBodyByName(handles.hand.palm_link, handles.instance)
-    return multiply(scene.pose(base), handles.hand.X_BG)
-
-
-def hand_handles(scene: Scene) -> HandHandles:
-    """Return the parts of the scene's hand.
-
-    Raises:
-        ValueError: If the scene has no hand.
-    """
-    if scene.handles is None:
-        raise ValueError("the scene must have a hand, got one without")
-    return scene.handles
+    base = scene.plant.GetBodyByName(scene.hand.palm_link, scene.instance)
+    return multiply(scene.pose(base), scene.hand.X_BG)

@@ -22,30 +22,38 @@ import numpy.typing as npt
 from drakegrasp.config import CameraConfig, PhysicsConfig
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.simulation.construction import build_scene
-from drakegrasp.simulation.scene import Scene
+from drakegrasp.simulation.construction import build_object_scene, build_scene
+from drakegrasp.simulation.scene import ObjectScene, Scene
 from drakegrasp.vision.rendering import Renderer, build_renderer
 
 #: How many diagrams are kept: a build needs the scene and the renderer of two objects, verification
 #: the scenes of two objects with the hand and without.
 KEPT = 4
 
-_Diagram = TypeVar("_Diagram", Scene, Renderer)
+_Diagram = TypeVar("_Diagram", ObjectScene, Scene, Renderer)
 
 #: The last in order is the last used.
-_kept: dict[Hashable, Scene | Renderer] = {}
+_kept: dict[Hashable, ObjectScene | Renderer] = {}
 _lock = threading.Lock()
 
 
-def cached_scene(model: ObjectModel, physics: PhysicsConfig, hand_name: str | None) -> Scene:
-    """Return the scene of an object, with a hand by its name or YAML file, or without one."""
+def cached_scene(model: ObjectModel, physics: PhysicsConfig, hand_name: str) -> Scene:
+    """Return the scene of an object with a hand, by its name or YAML file."""
     # A hand whose files have changed is loaded anew, and is then another key.
-    hand = None if hand_name is None else load_hand(hand_name)
+    hand = load_hand(hand_name)
+    return _cached((*_scene_key(model, physics), hand), lambda: build_scene(model, physics, hand))
+
+
+def cached_object_scene(model: ObjectModel, physics: PhysicsConfig) -> ObjectScene:
+    """Return the scene of an object without a hand."""
+    return _cached(_scene_key(model, physics), lambda: build_object_scene(model, physics))
+
+
+def _scene_key(model: ObjectModel, physics: PhysicsConfig) -> tuple[Hashable, ...]:
+    """Return what a scene without a hand is known by."""
     shape = (model.collision_vertices, model.collision_faces, model.half_extents)
     mass = (model.p_OOcm, model.I_OOcm_O, np.float64(model.mass))
-    physics = model.own_physics(physics)
-    key = "scene", _digest(model.name, *shape, *mass), physics, hand
-    return _cached(key, lambda: build_scene(model, physics, hand))
+    return "scene", _digest(model.name, *shape, *mass), model.own_physics(physics)
 
 
 def cached_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
@@ -57,7 +65,7 @@ def cached_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
 def forget_scenes() -> None:
     """Drop every scene: one in which Drake failed must not be used again."""
     with _lock:
-        for key in [key for key, diagram in _kept.items() if isinstance(diagram, Scene)]:
+        for key in [key for key, diagram in _kept.items() if isinstance(diagram, ObjectScene)]:
             del _kept[key]
         gc.collect()
 

@@ -19,9 +19,9 @@ from drakegrasp.mesh.subdivision import subdivide
 from drakegrasp.mesh.surfaces import Solid
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key
-from drakegrasp.simulation.construction import build_scene
-from drakegrasp.simulation.contacts import read_contacts
-from drakegrasp.simulation.scene import Scene, advance, reset_object
+from drakegrasp.simulation.construction import build_object_scene
+from drakegrasp.simulation.contacts import table_force
+from drakegrasp.simulation.scene import ObjectScene, advance, reset_object
 
 #: Simulated time between two checks of the object's speed [s].
 CHECK_PERIOD = 0.05
@@ -159,7 +159,7 @@ def _settle(model: ObjectModel, config: Config, R_TO: Array, surface: Solid) -> 
     # the first step in contact would find it millimetres deep, and throw it up and over.
     rules = config.settle
     physics = config.physics.model_copy(update={"time_step": rules.time_step})
-    scene = build_scene(model, physics, resting_surface=surface)
+    scene = build_object_scene(model, physics, resting_surface=surface)
     lowest = float(dot(model.collision_vertices, R_TO[2]).min())
     fall = max(rules.drop_height + lowest, 0.0)
     reset_object(scene, multiply(X_WT, make_pose(R_TO, [0.0, 0.0, -lowest])))
@@ -185,7 +185,7 @@ def _settle(model: ObjectModel, config: Config, R_TO: Array, surface: Solid) -> 
     X_TO = snapped(X_TO)
 
     # At rest the table carries the weight: a check of the contact itself.
-    force = float(read_contacts(scene).table_force[2])
+    force = float(table_force(scene)[2])
     weight = model.mass * GRAVITY
     if abs(force - weight) > MAX_FORCE_ERROR * weight:
         raise MeshError(
@@ -199,7 +199,7 @@ def settling_surface(model: ObjectModel) -> Solid:
     return subdivide(model.collision_solid, MAX_EDGE, MAX_FACES)
 
 
-def _wait_for_rest(scene: Scene, config: Config) -> bool:
+def _wait_for_rest(scene: ObjectScene, config: Config) -> bool:
     """Simulate until the object has been slow for long enough; return whether it was stopped."""
     # Refuse what takes too long.
     rules, name = config.settle, scene.model.name
@@ -230,13 +230,13 @@ def _wait_for_rest(scene: Scene, config: Config) -> bool:
     return stopped
 
 
-def _sink(scene: Scene) -> float:
+def _sink(scene: ObjectScene) -> float:
     """Return how deep the object's lowest point is in the table [m]; negative above it."""
     X_TO = multiply(invert_pose(X_WT), scene.pose(scene.object))
     return -float(transform_points(X_TO, scene.model.collision_vertices)[:, 2].min())
 
 
-def _raise(scene: Scene, height: float) -> None:
+def _raise(scene: ObjectScene, height: float) -> None:
     """Move the object up by a height [m], at rest."""
     X_WO = scene.pose(scene.object).copy()
     X_WO[2, 3] += height
@@ -269,7 +269,7 @@ def _rotation(wxyz: Array) -> Array:
     )
 
 
-def _speeds(scene: Scene) -> tuple[float, float]:
+def _speeds(scene: ObjectScene) -> tuple[float, float]:
     """Return the object's linear [m/s] and angular [rad/s] speed."""
     velocity = scene.plant.EvalBodySpatialVelocityInWorld(scene.context, scene.object)
     linear = float(norm(velocity.translational()))

@@ -42,7 +42,14 @@ class LiftPath:
         return self.X_WO[:3, :3]
 
     def at(self, time: float) -> tuple[Array, Array, Array]:
-        """Return position [m], velocity [m/s] and acceleration [m/s^2] of {O} at a time [s]."""
+        """Return position [m], velocity [m/s] and acceleration [m/s^2] of {O} at a time [s].
+
+        With s = t / T from 0 to 1 over the duration T, and the whole way d (Flash and Hogan, 1985):
+
+            p = p₀ + d (10 s³ − 15 s⁴ + 6 s⁵)
+            v = d 30 s² (1 − s)² / T
+            a = d 60 s (1 − s) (1 − 2 s) / T²
+        """
         s = min(time / self.duration, 1.0)
         start = self.X_WO[:3, 3]
         shift = self.p_WO_end - start
@@ -56,7 +63,9 @@ class LiftPath:
         """Return the wrenches (2, 6) at the two peaks of acceleration, about Ocm in {O}.
 
         Each is [torque; force] on the object [N m, N]. The orientation is constant, so there is no
-        torque, and every wrench of the motion lies between these two.
+        torque, and every wrench of the motion lies between these two, which are
+
+            w = [0; m R_OW (g ẑ ± a_max)],   a_max = 10/√3 d / T².
         """
         shift = self.p_WO_end - self.X_WO[:3, 3]
         peak = PEAK_ACCELERATION * shift / self.duration**2
@@ -84,7 +93,12 @@ def lift_path(X_TO: npt.ArrayLike, config: Config) -> LiftPath:
 
 
 def lift_duration(distance: float, config: Config) -> float:
-    """Return the shortest duration [s] of a minimum-jerk motion over a distance [m]."""
+    """Return the shortest duration [s] of a minimum-jerk motion over a distance [m].
+
+    Its peaks are 15/8 d/T and 10/√3 d/T², so within the limits of speed and acceleration
+
+        T = max(15/8 d / v_max, √(10/√3 d / a_max)).
+    """
     at_speed_limit = PEAK_SPEED * distance / config.lift.max_speed
     at_acceleration_limit = np.sqrt(PEAK_ACCELERATION * distance / config.lift.max_acceleration)
     return float(max(at_speed_limit, at_acceleration_limit))

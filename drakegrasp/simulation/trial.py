@@ -108,7 +108,7 @@ def run_attempt(
     The same scene, attempt and configuration give the same bits, whatever ran before.
 
     Args:
-        scene: Of the object, with the hand.
+        scene: Of the object and the hand.
         X_TO: Resting pose of the object in the table-top frame, (4, 4).
         attempt: What to try.
         config: The rules.
@@ -123,10 +123,8 @@ def run_attempt(
         MemoryError: If the machine runs out of memory.
         OSError: If a file of the hand cannot be read.
     """
-    required: npt.ArrayLike = True
-    if scene.handles is not None:
-        drive_of(scene.handles.hand, config.lift)
-        required = scene.handles.hand.required
+    drive_of(scene.hand, config.lift)
+    required = scene.hand.required
     X_TO = np.asarray(X_TO, dtype=float)
     start = TrialRecord(outcome=Outcome.RAY_MISS, X_TO=X_TO, X_OG=attempt.X_OG)
     X_WO = multiply(X_WT, X_TO)
@@ -197,16 +195,13 @@ def run_attempt(
 
 
 def _predict(scene: Scene, X_TO: Array, attempt: Pregrasp, config: Config) -> Prediction | None:
-    if scene.handles is None:
-        return None
-    (prediction,) = predict(scene.model, scene.handles.hand, X_TO, [attempt], config.screen)
+    (prediction,) = predict(scene.model, scene.hand, X_TO, [attempt], config.screen)
     return prediction
 
 
 def _chance(scene: Scene, X_TO: Array, attempt: Pregrasp, closed: Contacts) -> float:
     """Return the chance that lifting a closed hand gives a sample; NaN for a hand without one."""
-    assert scene.handles is not None
-    model = scene.handles.hand.lift_chance
+    model = scene.hand.lift_chance
     if model is None:
         return np.nan
     grasp = ClosedGrasp(
@@ -232,8 +227,7 @@ def _close(
     # Closing that geometry skipped counts as time, and an angle beyond its last contact as a miss.
     end, last = config.close.max_time, np.array(np.inf)
     if prediction is not None:
-        assert scene.handles is not None
-        hand = scene.handles.hand
+        hand = scene.hand
         end -= float((prediction.closing / hand.closing_speed).min())
         # A fingertip that need not touch ends nothing by missing the object.
         last = np.where(hand.required, prediction.last + BEYOND * hand.closing_unit, np.inf)

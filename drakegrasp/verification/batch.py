@@ -12,8 +12,8 @@ from typing import TypeAlias
 
 from drakegrasp.runtime.executor import Executor
 from drakegrasp.runtime.progress import Report
-from drakegrasp.verification.placed_grasp import PlacedGrasp, verify_placed
 from drakegrasp.verification.result import Verification
+from drakegrasp.verification.verify import PlacedGrasp, verify_placed
 
 #: Receives results as they come: called with a grasp's index and its result.
 ResultCallback: TypeAlias = Callable[[int, Verification], None]

@@ -76,11 +76,12 @@ def _draw_figure(verified: Verification, model: ObjectModel, views: Sequence[Vie
 
 def _lift_line(verified: Verification) -> str:
     """Return the line on slip, turn and other links; empty if the hand lifted nothing."""
-    if verified.lifted is None:
+    lift = None if verified.trial is None else verified.trial.lift
+    if lift is None:
         return ""
     return (
-        f"in the hand: slip {1e3 * verified.slip:.1f} mm, turn {np.rad2deg(verified.turn):.1f}°; "
-        f"other links at the end: {verified.other_links}"
+        f"in the hand: slip {1e3 * lift.slip:.1f} mm, turn {np.rad2deg(lift.turn):.1f}°; "
+        f"other links at the end: {lift.contacts.other_links}"
     )
 
 

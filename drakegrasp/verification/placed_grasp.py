@@ -1,13 +1,14 @@
 """What a caller asks to be verified: each grasp in {O} of its object on the table.
 
-In: grasp vectors in one of three frames, with a mesh, or with rows of a dataset. Out: a
-`PlacedGrasp` for each. Every mistake of the caller is found here, before anything is simulated.
+In: grasp vectors in one of three frames, with a mesh (`place_on_mesh`) or with rows of a dataset
+(`place_on_rows`). Out: a `PlacedGrasp` for each. Every mistake of the caller is found here, before
+anything is simulated.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -26,202 +27,147 @@ from drakegrasp.hand.files import hand_digest
 from drakegrasp.simulation.placement import (
     Placed,
     PlacedObject,
-    config_of,
+    config_for,
     place_object,
     refuse_no_config,
     refuse_other_objects,
 )
 from drakegrasp.verification.prediction import (
-    boxes_away,
     read_grasps,
     refuse_other_units,
     to_object_frame,
 )
-from drakegrasp.verification.result import Verification
-from drakegrasp.verification.verify import METHODS, verify_contacts
+from drakegrasp.verification.verify import METHODS, PlacedGrasp
 
 Mesh: TypeAlias = str | Path | trimesh.Trimesh | Placed
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class VerifyArguments:
-    """The keyword arguments of `api.verify_grasps` that say what is verified, and how; see there.
+def place_on_mesh(
+    grasps: npt.ArrayLike,
+    mesh: Mesh,
+    *,
+    frame: str | None = None,
+    X_TC: npt.ArrayLike | None = None,
+    X_TO: npt.ArrayLike | None = None,
+    units: str | None = None,
+    method: str = "hand",
+    config: Config,
+) -> list[PlacedGrasp]:
+    """Return grasps in {O} of one object, in their order.
 
-    `api.verify_grasp` has the same, but for `row`, which is a list of one here, and `overrides`.
-
-    Attributes:
-        overrides: `"a.b=c"` strings, applied to the configuration. Unlike a configuration they
-            leave what was drawn for a dataset's rows, but for what they name.
+    Arguments and errors are those of `api.verify_grasps`, but that the configuration is complete,
+    see `mesh_config`.
     """
-
-    mesh: Mesh | None = None
-    frame: str | None = None
-    X_TC: npt.ArrayLike | None = None
-    X_TO: npt.ArrayLike | None = None
-    units: str | None = None
-    hand: str | Path | None = None
-    method: str = "hand"
-    config: Config | None = None
-    overrides: tuple[str, ...] = ()
-    dataset: GraspDataset | None = None
-    rows: Sequence[int] | None = None
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PlacedGrasp:
-    """A grasp of k contacts on an object on the table: all that its verification needs.
-
-    Attributes:
-        index: Its place among the caller's grasps.
-        placed: The object on the table.
-        p_OQ, nhat_Q_O: (k, 3), contact points [m] and outward unit normals in {O}.
-        method: "hand" or "forces".
-        config: Hand, physics, lift and limits.
-    """
-
-    index: int
-    placed: PlacedObject
-    p_OQ: Array
-    nhat_Q_O: Array
-    method: str
-    config: Config
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Target:
-    """An object, and which of the caller's grasps are for it.
-
-    Attributes:
-        placed: The object on the table.
-        indices: (m,), of the grasps.
-        X_TC: For grasps in {C}: pose of the camera, (4, 4), or one per grasp (m, 4, 4).
-    """
-
-    placed: PlacedObject
-    indices: npt.NDArray[np.int64]
-    X_TC: Array | None
-
-
-def verify_placed(grasp: PlacedGrasp) -> Verification:
-    """Return whether a grasp holds its object, see `verify.verify_contacts`."""
-    return verify_contacts(
-        grasp.placed, grasp.p_OQ, grasp.nhat_Q_O, method=grasp.method, config=grasp.config
+    # Read all grasps before the mesh: a wrong number is reported at once.
+    points, normals = _read(grasps, method, config)
+    placed = place_object(mesh, units=units, X_TO=X_TO, config=config)
+    placed_grasps = _placed(
+        placed,
+        np.arange(len(points)),
+        (points, normals),
+        frame=frame or "object",
+        X_TC=None if X_TC is None else read_pose(X_TC, "X_TC"),
+        method=method,
+        config=config,
     )
+    _refuse_units(placed_grasps)
+    return placed_grasps
 
 
-def place_grasps(grasps: npt.ArrayLike, arguments: VerifyArguments) -> list[PlacedGrasp]:
-    """Return grasps in {O} of the objects that they are for.
+def place_on_rows(
+    grasps: npt.ArrayLike,
+    dataset: GraspDataset,
+    rows: Sequence[int] | None = None,
+    *,
+    frame: str | None = None,
+    hand: str | Path | None = None,
+    method: str = "hand",
+    config: Config | None = None,
+    overrides: tuple[str, ...] = (),
+) -> list[PlacedGrasp]:
+    """Return grasps in {O} of the objects of a dataset's rows.
+
+    Those of the same object stand together, so that its scene is built once. Arguments and errors
+    are those of `api.verify_grasps`, and of `dataset_config`. Where no configuration is given, each
+    grasp has the friction and mass that were drawn for its row, but for what is overridden.
+    """
+    # Read all grasps before any object: a wrong number is reported at once.
+    used = dataset_config(dataset, config, hand, overrides)
+    points, normals = _read(grasps, method, used)
+    chosen = _choose_rows(dataset, rows, len(points))
+
+    # The object, its resting pose, and the camera of each row.
+    names = dataset.column("object_props/object_name")[chosen]
+    resting = dataset.column("grasp_props/resting")[chosen]
+    X_TC = unpack_pose(dataset.column(f"object_props/frame_work2cam_{dataset.camera}")[chosen])
+
+    # Each object in each resting pose once, with its grasps.
+    manifest, placed_grasps = read_manifest(dataset.path.parent), list[PlacedGrasp]()
+    frame = frame or "camera"
+    for name, k in dict.fromkeys(zip(names.tolist(), resting.tolist(), strict=True)):
+        prepared = load_prepared(dataset.path.parent, name, manifest.config_of(name))
+        X_TO = prepared.resting_poses[k]
+        indices = np.flatnonzero((names == name) & (resting == k))
+        placed_grasps += _placed(
+            PlacedObject(model=prepared.model, X_TO=X_TO, config=manifest.config_of(name)),
+            indices,
+            (points[indices], normals[indices]),
+            frame=frame,
+            X_TC=read_pose(X_TC[indices], "the camera's pose") if frame == "camera" else None,
+            method=method,
+            config=used,
+        )
+    _refuse_units(placed_grasps)
+
+    if config is not None:
+        return placed_grasps
+    kept = {text.partition("=")[0].strip() for text in overrides}
+    return _as_tried(placed_grasps, dataset, chosen, manifest.config.randomize, kept)
+
+
+def mesh_config(mesh: Mesh, config: Config | None, hand: str | Path | None = None) -> Config:
+    """Return the configuration for a mesh: the given one, else its own, with the given hand.
+
+    Raises:
+        ConfigError: If it is not a `Config`.
+    """
+    return _with_hand(config_for(mesh, config), hand)
+
+
+def dataset_config(
+    dataset: GraspDataset,
+    config: Config | None = None,
+    hand: str | Path | None = None,
+    overrides: tuple[str, ...] = (),
+) -> Config:
+    """Return the configuration for a dataset's objects.
 
     Args:
-        grasps: (n, 6k), or (6k,) for one.
-        arguments: What else the caller gave.
-
-    Returns:
-        One per grasp; those of the same object stand together, so that its scene is built once.
-
-    Raises:
-        GraspError: If a grasp, frame or pose cannot be used.
-        MeshError: If the mesh cannot be simulated.
-        ConfigError, HandError, DataError: If configuration, hand or dataset cannot be used.
-    """
-    _refuse_contradictions(arguments)
-    known, config = _known_config(arguments), chosen_config(arguments)
-    frame = _frame(arguments)
-
-    # Read all grasps before any mesh: a wrong number is reported at once.
-    points, normals = read_grasps(grasps, load_hand(config.hand).num_fingers)
-
-    # Put the objects on the table.
-    if arguments.dataset is None:
-        targets = [_target_of_mesh(arguments, config, len(points))]
-    else:
-        rows = _choose_rows(arguments.dataset, arguments.rows, len(points))
-        targets = _targets_of_rows(arguments.dataset, rows, in_camera=frame == "camera")
-
-    # Express the contacts in {O} of their objects.
-    placed_grasps: list[PlacedGrasp] = []
-    for target in targets:
-        contacts = to_object_frame(
-            points[target.indices],
-            normals[target.indices],
-            frame=frame,
-            X_TC=target.X_TC,
-            X_TO=target.placed.X_TO,
-        )
-        placed_grasps += [
-            PlacedGrasp(
-                index=int(index),
-                placed=target.placed,
-                p_OQ=p_OQ,
-                nhat_Q_O=nhat_Q_O,
-                method=arguments.method,
-                config=config,
-            )
-            for index, p_OQ, nhat_Q_O in zip(target.indices, *contacts, strict=True)
-        ]
-    _refuse_other_units(placed_grasps)
-    if arguments.dataset is None or arguments.config is not None:
-        return placed_grasps
-    kept = {text.partition("=")[0].strip() for text in arguments.overrides}
-    return _as_tried(placed_grasps, arguments.dataset, rows, known.randomize, kept)
-
-
-def _refuse_contradictions(arguments: VerifyArguments) -> None:
-    """Refuse arguments of the wrong kind, and those that do not go together.
+        dataset: The data file.
+        config: The given one; that of the dataset if None.
+        hand: Name or YAML file of the hand; that of the configuration if None.
+        overrides: `"a.b=c"` strings, applied to the configuration.
 
     Raises:
-        GraspError: If there are any.
-        ConfigError: If the configuration is not a `Config`.
-    """
-    mesh, dataset = arguments.mesh, arguments.dataset
-    if arguments.method not in METHODS:
-        raise GraspError(f"method must be one of {', '.join(METHODS)}, got {arguments.method!r}")
-    if (mesh is None) == (dataset is None):
-        got = "neither" if mesh is None else "both"
-        raise GraspError(f"a mesh or a dataset must be given, got {got}")
-    if arguments.config is not None:
-        refuse_no_config(arguments.config)
-    if dataset is None:
-        if arguments.rows is not None:
-            raise GraspError("rows must be None without a dataset, got rows")
-        return
-
-    # A dataset has the objects, their poses and the cameras' poses.
-    if not isinstance(dataset, GraspDataset):
-        raise GraspError(
-            "dataset must be a GraspDataset, which has a file and a split, "
-            f"got a {type(dataset).__name__}"
-        )
-    for name in ("X_TC", "X_TO", "units"):
-        if getattr(arguments, name) is not None:
-            raise GraspError(f"{name} must be None with a dataset, which defines it, got a value")
-
-
-def _known_config(arguments: VerifyArguments) -> Config:
-    """Return the configuration of the dataset, else that of the mesh."""
-    if arguments.dataset is not None:
-        return read_manifest(arguments.dataset.path.parent).config
-    return config_of(arguments.mesh)
-
-
-def chosen_config(arguments: VerifyArguments) -> Config:
-    """Return the given configuration, else the known one, with the overrides and the given hand.
-
-    Raises:
-        ConfigError: If a dataset's objects were prepared with other values.
-        HandError: If a dataset's hand has other files now, and the caller names none.
+        ConfigError: If it is not a `Config`, or the objects were prepared with other values.
+        HandError: If the dataset's hand has other files now, and the caller names none.
         DataError: If the dataset cannot be used.
     """
-    known = _known_config(arguments)
-    config = known if arguments.config is None else arguments.config
-    config = override_config(config, arguments.overrides) if arguments.overrides else config
-    if arguments.hand is not None:
-        config = parse_config({**config.to_dict(), "hand": absolute_hand(arguments.hand)})
-    if arguments.dataset is not None:
-        refuse_other_objects(config, known, "as in the dataset, whose objects are prepared")
-        if arguments.hand is None and config.hand == known.hand:
-            _refuse_other_hand(arguments.dataset, config.hand)
-    return config
+    if config is not None:
+        refuse_no_config(config)
+    known = read_manifest(dataset.path.parent).config
+    used = override_config(config or known, overrides) if overrides else config or known
+    used = _with_hand(used, hand)
+    refuse_other_objects(used, known, "as in the dataset, whose objects are prepared")
+    if hand is None and used.hand == known.hand:
+        _refuse_other_hand(dataset, used.hand)
+    return used
+
+
+def _with_hand(config: Config, hand: str | Path | None) -> Config:
+    if hand is None:
+        return config
+    return parse_config({**config.to_dict(), "hand": absolute_hand(hand)})
 
 
 def _refuse_other_hand(dataset: GraspDataset, hand: str) -> None:
@@ -239,46 +185,36 @@ def _refuse_other_hand(dataset: GraspDataset, hand: str) -> None:
         )
 
 
-def _frame(arguments: VerifyArguments) -> str:
-    """Return the given frame, else the camera of a dataset or the object of a mesh."""
-    return arguments.frame or ("object" if arguments.dataset is None else "camera")
+def _read(grasps: npt.ArrayLike, method: str, config: Config) -> tuple[Array, Array]:
+    """Return points and unit normals (n, k, 3) of the grasps of the configuration's hand."""
+    if method not in METHODS:
+        raise GraspError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
+    return read_grasps(grasps, load_hand(config.hand).num_fingers)
 
 
-def _target_of_mesh(arguments: VerifyArguments, config: Config, count: int) -> _Target:
-    """Return the given mesh on the table, as the target of all `count` grasps."""
-    assert arguments.mesh is not None
-    placed = place_object(arguments.mesh, units=arguments.units, X_TO=arguments.X_TO, config=config)
-    X_TC = None if arguments.X_TC is None else read_pose(arguments.X_TC, "X_TC")
-    return _Target(placed=placed, indices=np.arange(count), X_TC=X_TC)
-
-
-def _targets_of_rows(
-    dataset: GraspDataset, rows: npt.NDArray[np.int64], *, in_camera: bool
-) -> list[_Target]:
-    """Return the objects of a dataset's rows.
-
-    Args:
-        dataset: The data file.
-        rows: (n,), the row of each grasp.
-        in_camera: Whether the grasps are in {C}.
-    """
-    # The object, its resting pose, and the camera of each row.
-    names = dataset.column("object_props/object_name")[rows]
-    resting = dataset.column("grasp_props/resting")[rows]
-    X_TC = unpack_pose(dataset.column(f"object_props/frame_work2cam_{dataset.camera}")[rows])
-
-    # Each object in each resting pose once, with its grasps.
-    out, targets = dataset.path.parent, []
-    manifest = read_manifest(out)
-    for name, k in dict.fromkeys(zip(names.tolist(), resting.tolist(), strict=True)):
-        indices = np.flatnonzero((names == name) & (resting == k))
-        config = manifest.config_of(name)
-        prepared = load_prepared(out, name, config)
-        X_TO = prepared.resting_poses[k]
-        placed = PlacedObject(model=prepared.model, X_TO=X_TO, config=config)
-        poses = read_pose(X_TC[indices], "the camera's pose") if in_camera else None
-        targets.append(_Target(placed=placed, indices=indices, X_TC=poses))
-    return targets
+def _placed(
+    placed: PlacedObject,
+    indices: npt.NDArray[np.int64],
+    contacts: tuple[Array, Array],
+    *,
+    frame: str,
+    X_TC: Array | None,
+    method: str,
+    config: Config,
+) -> list[PlacedGrasp]:
+    """Return the grasps of one object; contacts are points and normals (m, k, 3) in the frame."""
+    in_object = to_object_frame(*contacts, frame=frame, X_TC=X_TC, X_TO=placed.X_TO)
+    return [
+        PlacedGrasp(
+            index=int(index),
+            placed=placed,
+            p_OQ=p_OQ,
+            nhat_Q_O=nhat_Q_O,
+            method=method,
+            config=config,
+        )
+        for index, p_OQ, nhat_Q_O in zip(indices, *in_object, strict=True)
+    ]
 
 
 def _as_tried(
@@ -357,8 +293,6 @@ def _choose_rows(
     return chosen
 
 
-def _refuse_other_units(grasps: Sequence[PlacedGrasp]) -> None:
-    """Refuse grasps that are all far from their objects; single ones are wrong predictions."""
-    if grasps:
-        nearest = min(grasps, key=lambda g: boxes_away(g.p_OQ, g.placed.model.half_extents))
-        refuse_other_units(nearest.p_OQ, nearest.placed.model.half_extents)
+def _refuse_units(grasps: Sequence[PlacedGrasp]) -> None:
+    boxes = [grasp.placed.model.half_extents for grasp in grasps]
+    refuse_other_units([grasp.p_OQ for grasp in grasps], boxes)

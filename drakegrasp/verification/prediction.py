@@ -7,6 +7,7 @@ that says in one line what is wrong. Whether the contacts are on the object is c
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -124,37 +125,30 @@ def to_object_frame(
     return np.reshape(moved, points.shape), np.reshape(turned, normals.shape)
 
 
-def boxes_away(p_OQ: Array, half_extents: Array) -> float:
-    """Return how far out the nearest point is, as a multiple of the bounding box.
+def refuse_other_units(points: Sequence[Array], half_extents: Sequence[Array]) -> None:
+    """Refuse grasps that are all far from their objects: another unit of length, or another frame.
+
+    One grasp that is near is enough: the others are wrong predictions.
 
     Args:
-        p_OQ: (..., 3), points in {O} [m].
-        half_extents: (3,), of the box [m].
-
-    Returns:
-        1 on the box, below 1 inside it, inf without points.
-    """
-    return float(np.abs(p_OQ / half_extents).max(axis=-1).min(initial=np.inf))
-
-
-def refuse_other_units(p_OQ: Array, half_extents: Array) -> None:
-    """Refuse points that are all far from the object: another unit of length, or another frame.
-
-    Args:
-        p_OQ: (..., 3), points in {O} [m].
-        half_extents: (3,), of the object's bounding box [m].
+        points: (k, 3) of each grasp, in {O} [m].
+        half_extents: (3,), of the bounding box of each grasp's object [m].
 
     Raises:
         GraspError: If every point is outside `UNIT_FACTOR` times the bounding box.
     """
-    factor = boxes_away(p_OQ, half_extents)
-    if p_OQ.size and factor > UNIT_FACTOR:
-        size = " x ".join(f"{edge:.3g}" for edge in 2.0 * half_extents)
-        raise GraspError(
-            f"contact points must lie on the object, whose box is {size} m, got points all "
-            f"outside {UNIT_FACTOR:g} times that (the nearest at {factor:.3g} times); check the "
-            "units (grasps are in metres, meshes in units) and the frame"
-        )
+    # How far out the nearest point of each grasp is, as a multiple of the box.
+    pairs = zip(points, half_extents, strict=True)
+    factors = [float(np.abs(p_OQ / half).max(axis=-1).min()) for p_OQ, half in pairs]
+    nearest = int(np.argmin(factors)) if factors else None
+    if nearest is None or not factors[nearest] > UNIT_FACTOR:
+        return
+    size = " x ".join(f"{edge:.3g}" for edge in 2.0 * half_extents[nearest])
+    raise GraspError(
+        f"contact points must lie on the object, whose box is {size} m, got points all "
+        f"outside {UNIT_FACTOR:g} times that (the nearest at {factors[nearest]:.3g} times); check "
+        "the units (grasps are in metres, meshes in units) and the frame"
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

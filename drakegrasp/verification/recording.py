@@ -9,22 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 from pydrake.geometry import Cylinder, Meshcat, MeshcatCone
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
-from drakegrasp.config import Config
-from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.strength import fingertip_forces
-from drakegrasp.objects.model import ObjectModel
-from drakegrasp.simulation.construction import build_scene
-from drakegrasp.simulation.drive import drive_of
-from drakegrasp.simulation.placement import canonical_pose
-from drakegrasp.simulation.scene import Scene
+from drakegrasp.simulation.construction import build_object_scene, build_scene
+from drakegrasp.simulation.scene import ObjectScene
+from drakegrasp.verification.forces.contact_forces import hand_contacts
 from drakegrasp.verification.forces.lift import ForceLift, lift_by_forces
-from drakegrasp.verification.wrist.solver import WristFit
 from drakegrasp.visualization.recording import (
     HEAD_RADIUS,
     OBJECT_PATH,
@@ -34,6 +27,7 @@ from drakegrasp.visualization.recording import (
     record_attempt,
     record_html,
     rgba,
+    show_object,
     show_start,
 )
 from drakegrasp.visualization.style import REACHED
@@ -43,49 +37,6 @@ if TYPE_CHECKING:
 
 #: Length of the arrow of a force as large as the strongest fingertip's limit [m].
 LARGEST_FORCE = 0.08
-
-
-def record_lift(
-    model: ObjectModel,
-    X_TO: npt.ArrayLike,
-    p_OQ: Array,
-    nhat_Q_O: Array,
-    config: Config,
-    path: Path,
-) -> ForceLift:
-    """Return the result of `lift.lift_by_forces`, and write a recording of it.
-
-    The recording shows the contacts on the object, and the forces as they are applied.
-
-    Args:
-        model: The object.
-        X_TO: (4, 4), its resting pose in the table-top frame.
-        p_OQ: (k, 3), contacts in {O} [m].
-        nhat_Q_O: (k, 3), their outward unit normals in {O}.
-        config: Hand (for the limits of its forces), physics, lift and limits.
-        path: The HTML file.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
-    hand = load_hand(config.hand)
-    limit = fingertip_forces(hand, drive_of(hand, config.lift))
-
-    def run(meshcat: Meshcat) -> ForceLift:
-        scene = build_scene(model, config.physics, meshcat=meshcat)
-        # A lift that fails before it is simulated is shown at its start.
-        show_start(meshcat, scene, X_TO, config)
-        # The scene belongs to this function, so the monitor disturbs nobody else.
-        scene.simulator.set_monitor(_ForceArrows(meshcat, scene, float(limit.max())).record)
-        try:
-            lift = lift_by_forces(scene, X_TO, p_OQ, nhat_Q_O, force_limit=limit, config=config)
-        finally:
-            # Scene and monitor refer to each other in a way that the garbage collector cannot see.
-            scene.simulator.clear_monitor()
-        draw_predicted(meshcat, p_OQ, nhat_Q_O)
-        return lift
-
-    return record_html(run, path)
 
 
 def record_verification(verified: Verification, path: Path) -> None:
@@ -101,36 +52,68 @@ def record_verification(verified: Verification, path: Path) -> None:
     Raises:
         OSError: If the file cannot be written.
     """
-    model, X_TO = verified.placed.model, canonical_pose(verified.placed.X_TO)
-    config = verified.config
-    p_OQ, nhat_Q_O = verified.p_OQ, verified.nhat_Q_O
-    if verified.pregrasp is not None:
-        record_attempt(model, X_TO, verified.pregrasp, config, path, p_OQ=p_OQ, nhat_Q_O=nhat_Q_O)
-    elif verified.lift is not None:
-        record_lift(model, X_TO, p_OQ, nhat_Q_O, config, path)
+    if verified.lift is not None:
+        record_lift(verified, path)
+    elif verified.pregrasp is None:
+        _record_still(verified, path)
     else:
-        _record_still(model, X_TO, verified.fit, p_OQ, nhat_Q_O, config, path)
+        record_attempt(
+            verified.placed.model,
+            verified.placed.X_TO_simulated,
+            verified.pregrasp,
+            verified.config,
+            path,
+            p_OQ=verified.p_OQ,
+            nhat_Q_O=verified.nhat_Q_O,
+        )
 
 
-def _record_still(
-    model: ObjectModel,
-    X_TO: Array,
-    fit: WristFit | None,
-    p_OQ: Array,
-    nhat_Q_O: Array,
-    config: Config,
-    path: Path,
-) -> None:
+def record_lift(verified: Verification, path: Path) -> ForceLift:
+    """Lift an object by forces again and return the result, and write a recording of it.
+
+    The recording shows the contacts on the object, and the forces as they are applied.
+
+    Args:
+        verified: The verdict by method `forces`.
+        path: The HTML file.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    placed, config = verified.placed, verified.config
+    contacts = hand_contacts(placed.model, verified.p_OQ, verified.nhat_Q_O, config)
+    largest = float(np.asarray(contacts.force_limit).max())
+
+    def run(meshcat: Meshcat) -> ForceLift:
+        scene = build_object_scene(placed.model, config.physics, meshcat=meshcat)
+        # A lift that fails before it is simulated is shown at its start.
+        show_object(meshcat, scene, placed.X_TO_simulated, config)
+        # The scene belongs to this function, so the monitor disturbs nobody else.
+        scene.simulator.set_monitor(_ForceArrows(meshcat, scene, largest).record)
+        try:
+            lift = lift_by_forces(scene, placed.X_TO_simulated, contacts, config)
+        finally:
+            # Scene and monitor refer to each other in a way that the garbage collector cannot see.
+            scene.simulator.clear_monitor()
+        draw_predicted(meshcat, verified.p_OQ, verified.nhat_Q_O)
+        return lift
+
+    return record_html(run, path)
+
+
+def _record_still(verified: Verification, path: Path) -> None:
     """Write a recording of the object, the predicted contacts and the hand of a fit, at rest."""
+    model, X_TO = verified.placed.model, verified.placed.X_TO_simulated
+    config, fit = verified.config, verified.fit
 
     def run(meshcat: Meshcat) -> None:
-        hand = None if fit is None else load_hand(config.hand)
-        scene = build_scene(model, config.physics, hand, meshcat=meshcat)
         if fit is None:
-            show_start(meshcat, scene, X_TO, config)
+            alone = build_object_scene(model, config.physics, meshcat=meshcat)
+            show_object(meshcat, alone, X_TO, config)
         else:
+            scene = build_scene(model, config.physics, load_hand(config.hand), meshcat=meshcat)
             show_start(meshcat, scene, X_TO, config, fit.X_OG, fit.spread, fit.closing)
-        draw_predicted(meshcat, p_OQ, nhat_Q_O)
+        draw_predicted(meshcat, verified.p_OQ, verified.nhat_Q_O)
 
     record_html(run, path)
 
@@ -138,7 +121,7 @@ def _record_still(
 class _ForceArrows:
     """Draws the forces on the object at every step: arrows whose tips are at the contacts."""
 
-    def __init__(self, meshcat: Meshcat, scene: Scene, force_limit: float) -> None:
+    def __init__(self, meshcat: Meshcat, scene: ObjectScene, force_limit: float) -> None:
         self._meshcat, self._scene = meshcat, scene
         self._length = LARGEST_FORCE / force_limit  # [m/N]
         self._made = 0

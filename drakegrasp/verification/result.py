@@ -16,7 +16,7 @@ from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.lift import Lift
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.trial import TrialRecord
-from drakegrasp.simulation.verdict import is_precision, is_stable
+from drakegrasp.simulation.verdict import is_stable
 from drakegrasp.verification.forces.lift import ForceLift
 from drakegrasp.verification.wrist.solver import WristFit
 
@@ -80,7 +80,7 @@ class Verification:
     @property
     def precision(self) -> bool:
         """Whether the grasp is held, and by the fingertips alone."""
-        return bool(is_precision(self.outcome, self.other_links))
+        return self.held and (self.trial is None or self.trial.precision)
 
     @property
     def stable(self) -> bool:
@@ -88,11 +88,10 @@ class Verification:
 
         With method `forces`: from its path.
         """
-        # A lift by forces has no hand; what it has instead is the path that the forces follow.
-        moved = (self.slip, self.turn)
         if self.lift is not None:
             moved = (self.lift.position_error, self.lift.angle_error)
-        return bool(is_stable(self.outcome, self.other_links, *moved))
+            return bool(is_stable(self.outcome, 0, *moved))
+        return self.held and self.trial is not None and self.trial.stable
 
     @property
     def words(self) -> str:
@@ -103,46 +102,6 @@ class Verification:
         return ", ".join(name for name in names if getattr(self, name))
 
     @property
-    def slip(self) -> float:
-        """Distance that the object moved in the hand during the lift [m]."""
-        return np.nan if self._lift is None else self._lift.slip
-
-    @property
-    def turn(self) -> float:
-        """Angle that the object turned in the hand during the lift [rad]."""
-        return np.nan if self._lift is None else self._lift.turn
-
-    @property
-    def other_links(self) -> int:
-        """Number of other links of the hand that touch the object after the lift."""
-        return 0 if self.lifted is None else self.lifted.other_links
-
-    @property
-    def X_OG(self) -> Array | None:
-        """Palm pose (4, 4) in {O}."""
-        return None if self.fit is None else self.fit.X_OG
-
-    @property
-    def spread(self) -> float:
-        """Angle of the spread joints [rad]."""
-        return np.nan if self.fit is None else self.fit.spread
-
-    @property
-    def closing(self) -> Array | None:
-        """Closing positions (k,) at which the fingertips meet the predicted points [rad or m]."""
-        return None if self.fit is None else self.fit.closing
-
-    @property
-    def residual(self) -> Array | None:
-        """Distance (k,) of the predicted points from the fingertips before closing [m]."""
-        return None if self.fit is None else self.fit.residual
-
-    @property
-    def normal_error_deg(self) -> Array | None:
-        """Angle (k,) between the pads' and the predicted normals before closing [degree]."""
-        return None if self.fit is None else np.rad2deg(self.fit.normal_error)
-
-    @property
     def closed(self) -> Contacts | None:
         """Contacts after closing; `trial.closed` has the joints then, too."""
         end = None if self.trial is None else self.trial.closed
@@ -150,22 +109,21 @@ class Verification:
 
     @property
     def lifted(self) -> Contacts | None:
-        """Contacts after the lift; `trial.lift` has joints and poses then, too."""
-        return None if self._lift is None else self._lift.contacts
+        """Contacts after the lift; `trial.lift` has joints, poses, slip and turn then, too."""
+        end = None if self.trial is None else self.trial.lift
+        return None if end is None else end.contacts
 
     @property
     def X_TO_lifted(self) -> Array | None:
         """Pose (4, 4) of the object after the lift, by the hand or by forces alone."""
-        return self._lift.X_TO if self._lift else self.lift.X_TO_lifted if self.lift else None
+        if self.lift is not None:
+            return self.lift.X_TO_lifted
+        return self.trial.lift.X_TO if self.trial is not None and self.trial.lift else None
 
     @property
     def solver_status(self) -> int:
         """Exit mode of SLSQP, 0 for success; -1 where it was not asked."""
         return -1 if self.fit is None else self.fit.status
-
-    @property
-    def _lift(self) -> Lift | None:
-        return None if self.trial is None else self.trial.lift
 
     def save_html(self, path: str | Path) -> None:
         """Write an HTML file that plays the simulation in a browser, from any side.
@@ -195,20 +153,21 @@ class Verification:
         sentences = [f"The grasp of {self.placed.model.name} {verdict}: {self.reason}."]
 
         # What happened in the hand.
-        if self.lifted is not None:
-            sentences.append(self._explain_lift())
+        if self.trial is not None and self.trial.lift is not None:
+            sentences.append(self._explain_lift(self.trial.lift))
 
         # How well the hand makes the predicted contacts.
         if self.fit is not None:
             angle = np.rad2deg(self.fit.normal_error).max()
             sentences.append(
-                f"Before closing, the fingertips are within {_mm(self.fit.residual)} of the "
-                f"predicted points, and the pads within {angle:.0f}° of the predicted normals."
+                f"Before closing, the fingertips are within "
+                f"{in_mm(self.fit.residual.max())} of the predicted points, and the pads within "
+                f"{angle:.0f}° of the predicted normals."
             )
         if self.contact_error is not None:
             sentences.append(
                 "After closing, they touch the object within "
-                f"{_mm(self.contact_error)} of the predicted points."
+                f"{in_mm(np.nanmax(self.contact_error))} of the predicted points."
             )
 
         # What forces at the contacts alone can do.
@@ -216,15 +175,16 @@ class Verification:
             sentences.append(self._explain_margin())
         return " ".join(sentences)
 
-    def _explain_lift(self) -> str:
+    def _explain_lift(self, lift: Lift) -> str:
         """Return the sentence on what moved in the hand, and what touched the object at the end."""
         # What happened.
+        links = lift.contacts.other_links
         touching = {0: "no other link of the hand touches it", 1: "another link touches it"}.get(
-            self.other_links, f"{self.other_links} other links touch it"
+            links, f"{links} other links touch it"
         )
         text = (
-            f"During the lift the object slips by {_mm(np.array(self.slip))} and turns by "
-            f"{np.rad2deg(self.turn):.1f}° in the hand, and at the end {touching}"
+            f"During the lift the object slips by {in_mm(lift.slip)} and turns by "
+            f"{np.rad2deg(lift.turn):.1f}° in the hand, and at the end {touching}"
         )
 
         # What that is called, if it is held at all.
@@ -252,6 +212,6 @@ class Verification:
         return f"Verification({self.method}, {self.words}: {self.reason})"
 
 
-def _mm(values: Array) -> str:
-    """Return the largest of lengths [m] as text in millimetres."""
-    return f"{1e3 * float(np.nanmax(values)):.1f} mm"
+def in_mm(length: float) -> str:
+    """Return a length [m] as text in millimetres."""
+    return f"{1e3 * length:.1f} mm"

@@ -139,39 +139,31 @@ def as_dict(index: int, result: Verification) -> dict[str, Any]:
         index: Of the grasp.
         result: Its verdict.
     """
-    # In the order in which a person reads them: verdict, contacts, hand, lift, margin.
     fit, trial, lift = result.fit, result.trial, result.lift
+    values = {field.name: field.value_of(result) for field in VERIFICATION_FIELDS}
 
+    def fields(*names: str) -> dict[str, Any]:
+        return {name: values[name] for name in names}
+
+    # In the order in which a person reads them: verdict, contacts, hand, lift, margin.
     return {
         "index": index,
-        "object": result.placed.model.name,
-        "method": result.method,
+        **fields("object", "method"),
         "success": result.success,
-        "precision": result.precision,
-        "stable": result.stable,
+        **fields("precision", "stable"),
         "outcome": result.outcome.label,
         "reason": result.reason,
         "explain": result.explain(),
-        "X_TO": result.placed.X_TO,
-        "p_OQ": result.p_OQ,
-        "nhat_Q_O": result.nhat_Q_O,
-        "surface_distance": result.surface_distance,
-        "X_OG": result.X_OG,
-        "spread": result.spread,
-        "closing": result.closing,
-        "residual": result.residual,
-        "normal_error_deg": result.normal_error_deg,
-        "contact_error": result.contact_error,
-        "tries": result.tries,
-        "solver": None
-        if fit is None
-        else {"status": fit.status, "message": fit.message, "iterations": fit.iterations},
+        **fields("X_TO", "p_OQ", "nhat_Q_O", "surface_distance"),
+        **fields("X_OG", "spread", "closing", "residual"),
+        "normal_error_deg": None if fit is None else np.rad2deg(fit.normal_error),
+        **fields("contact_error", "tries"),
+        "solver": None if fit is None else _attributes(fit, "status", "message", "iterations"),
         "closed": None if trial is None else _end_as_dict(trial.closed),
         "lifted": None if trial is None else _end_as_dict(trial.lift),
-        "slip": result.slip,
-        "turn_deg": math.degrees(result.turn),
-        "epsilon": result.epsilon,
-        "smallest_friction": result.smallest_friction,
+        "slip": values["slip"],
+        "turn_deg": None if values["turn"] is None else math.degrees(values["turn"]),
+        **fields("epsilon", "smallest_friction"),
         # A null above is either infinity or not computed; this tells which.
         "friction_can_hold": None
         if math.isnan(result.smallest_friction)
@@ -179,10 +171,7 @@ def as_dict(index: int, result: Verification) -> dict[str, Any]:
         "forces": None
         if lift is None
         else {
-            "end": lift.end.value,
-            "planned_force": lift.planned_force,
-            "planned_share": lift.planned_share,
-            "applied_force": lift.applied_force,
+            **_attributes(lift, "end", "planned_force", "planned_share", "applied_force"),
             "position_error": lift.position_error,
             "angle_error_deg": math.degrees(lift.angle_error),
         },
@@ -190,13 +179,16 @@ def as_dict(index: int, result: Verification) -> dict[str, Any]:
     }
 
 
+def _attributes(source: object, *names: str) -> dict[str, Any]:
+    return {name: getattr(source, name) for name in names}
+
+
 def _end_as_dict(stage: Closed | Lift | None) -> dict[str, Any] | None:
     """Return the JSON object of the contacts and joint positions at the end of a stage."""
     if stage is None:
         return None
     names = ("touching", "p_OQ", "nhat_Q_O", "f_Q_O", "other_links", "hand_on_table")
-    values = {name: getattr(stage.contacts, name) for name in (*names, "object_on_table")}
-    return values | {"q": stage.q}
+    return {**_attributes(stage.contacts, *names, "object_on_table"), "q": stage.q}
 
 
 def _plain(value: Any) -> Any:

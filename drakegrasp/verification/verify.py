@@ -1,6 +1,6 @@
 """The verdict on one grasp of one object, from its contacts in {O}.
 
-In: an object on the table and k contact points with normals. Out: a `Verification`. Method
+In: a `PlacedGrasp`. Out: a `Verification`. Method
 `hand` finds palm poses that bring the fingertips to the points and runs a trial from each, as a
 build does. Method `forces` lifts the object by forces at the contacts alone. A wrong prediction, a
 failed solver and a lost object are outcomes, not exceptions.
@@ -8,8 +8,7 @@ failed solver and a lost object are outcomes, not exceptions.
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Literal, get_args
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,23 +17,21 @@ from drakegrasp.errors import OffSurfaceError
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import coordinate_limits
-from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.blas import one_thread
 from drakegrasp.runtime.timing import timed
 from drakegrasp.simulation.candidates import Pregrasp
-from drakegrasp.simulation.drive import drive_of
-from drakegrasp.simulation.placement import PlacedObject, canonical_pose
-from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
+from drakegrasp.simulation.placement import PlacedObject
+from drakegrasp.simulation.scene_cache import cached_object_scene, cached_scene, forget_scenes
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.verification.contact_surface import face_distances, points_outward
+from drakegrasp.verification.forces.contact_forces import hand_contacts
 from drakegrasp.verification.forces.lift import LiftEnd, lift_by_forces
 from drakegrasp.verification.forces.quality import force_margin
-from drakegrasp.verification.result import Verification
+from drakegrasp.verification.result import Verification, in_mm
 from drakegrasp.verification.wrist.solver import WristFit, fit_wrist
 
-Method = Literal["hand", "forces"]
-METHODS: tuple[str, ...] = get_args(Method)
+METHODS = ("hand", "forces")
 
 #: Decimals to which points [m] and unit normals are rounded: 0.1 mm and 0.06 degrees. This is
 #: finer than any contact is known and coarser than single precision, so the same grasp given in
@@ -81,25 +78,36 @@ _RANK = (
 )
 
 
-@one_thread
-def verify_contacts(
-    placed: PlacedObject, p_OQ: Array, nhat_Q_O: Array, *, method: str, config: Config
-) -> Verification:
-    """Return whether a grasp holds an object, given its contacts in {O}.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlacedGrasp:
+    """A grasp of k contacts on an object on the table: all that its verification needs.
 
-    Args:
+    Attributes:
+        index: Its place among the caller's grasps.
         placed: The object on the table.
-        p_OQ: (k, 3), contact points [m]; they are rounded to 0.1 mm.
-        nhat_Q_O: (k, 3), outward unit normals.
+        p_OQ, nhat_Q_O: (k, 3), contact points [m] and outward unit normals in {O}.
         method: "hand" or "forces".
         config: Hand, physics, lift and limits. What ends or avoids lifts (`lift.stop_when`,
             `lift.least_chance`, `lift.least_depth_variance`) is without effect: the verdict is that
             of a whole lift.
     """
+
+    index: int
+    placed: PlacedObject
+    p_OQ: Array
+    nhat_Q_O: Array
+    method: str
+    config: Config
+
+
+@one_thread
+def verify_placed(grasp: PlacedGrasp) -> Verification:
+    """Return whether a grasp holds its object; the contacts are rounded to 0.1 mm."""
     # Round the contacts; adding zero turns -0.0 into 0.0.
-    config = with_whole_lifts(config)
+    placed, config = grasp.placed, with_whole_lifts(grasp.config)
     rules, seconds = config.verify, dict[str, float]()
-    p_OQ, nhat_Q_O = np.round(p_OQ, POINT_DIGITS) + 0.0, np.round(nhat_Q_O, NORMAL_DIGITS) + 0.0
+    p_OQ = np.round(grasp.p_OQ, POINT_DIGITS) + 0.0
+    nhat_Q_O = np.round(grasp.nhat_Q_O, NORMAL_DIGITS) + 0.0
     nhat_Q_O /= np.linalg.norm(nhat_Q_O, axis=1, keepdims=True)
 
     # Contacts off the surface, and normals that point inwards, are no grasp.
@@ -107,7 +115,7 @@ def verify_contacts(
         distance = face_distances(placed.model, p_OQ)
         outward = points_outward(placed.model, distance, nhat_Q_O)
     base = Verification(
-        method=method,
+        method=grasp.method,
         outcome=Outcome.OFF_SURFACE,
         reason="",
         placed=placed,
@@ -121,8 +129,8 @@ def verify_contacts(
     if base.surface_distance[farthest] > rules.max_surface_distance:
         return replace(
             base,
-            reason=f"contact {farthest + 1} is {_mm(base.surface_distance[farthest])} from the "
-            f"object's surface, more than {_mm(rules.max_surface_distance)}",
+            reason=f"contact {farthest + 1} is {in_mm(base.surface_distance[farthest])} from the "
+            f"object's surface, more than {in_mm(rules.max_surface_distance)}",
         )
     if not outward.all():
         finger = int(np.argmin(outward))
@@ -130,11 +138,13 @@ def verify_contacts(
 
     # What forces at the contacts alone can do, whatever the method.
     with timed(seconds, "margin"):
-        margin = force_margin(placed.model, canonical_pose(placed.X_TO), p_OQ, nhat_Q_O, config)
+        contacts = hand_contacts(placed.model, p_OQ, nhat_Q_O, config)
+        margin = force_margin(placed.model, placed.X_TO_simulated, contacts, config)
     base = replace(base, epsilon=margin.epsilon, smallest_friction=margin.smallest_friction)
 
     # The trial.
-    return _lift_by_hand(base, config) if method == "hand" else _lift_by_forces(base, config)
+    lift = _lift_by_hand if grasp.method == "hand" else _lift_by_forces
+    return lift(base, config)
 
 
 def refuse_off_surface(result: Verification) -> None:
@@ -150,7 +160,7 @@ def refuse_off_surface(result: Verification) -> None:
 def _lift_by_hand(base: Verification, config: Config) -> Verification:
     """Find palm poses for the contacts and try them until one holds the object."""
     # Palm poses that bring the fingertips to the contacts, the best first.
-    rules, X_TO = config.verify, canonical_pose(base.placed.X_TO)
+    rules, X_TO = config.verify, base.placed.X_TO_simulated
     with timed(base.seconds, "fit"):
         fits = fit_wrist(
             load_hand(config.hand),
@@ -186,22 +196,16 @@ def _lift_by_hand(base: Verification, config: Config) -> Verification:
 
 def _lift_by_forces(base: Verification, config: Config) -> Verification:
     """Lift the object by forces at the contacts, without a hand."""
-    hand = load_hand(config.hand)
+    placed = base.placed
     with timed(base.seconds, "simulate"):
-        scene = cached_scene(base.placed.model, config.physics, None)
-        lift = lift_by_forces(
-            scene,
-            canonical_pose(base.placed.X_TO),
-            base.p_OQ,
-            base.nhat_Q_O,
-            force_limit=fingertip_forces(hand, drive_of(hand, config.lift)),
-            config=config,
-        )
+        contacts = hand_contacts(placed.model, base.p_OQ, base.nhat_Q_O, config)
+        scene = cached_object_scene(placed.model, config.physics)
+        lift = lift_by_forces(scene, placed.X_TO_simulated, contacts, config)
     if _ENDS[lift.end].inconclusive:
         forget_scenes()
 
     # The verdict, and why.
-    moved = f"{_mm(lift.position_error)} and {np.rad2deg(lift.angle_error):.1f}°"
+    moved = f"{in_mm(lift.position_error)} and {np.rad2deg(lift.angle_error):.1f}°"
     reasons = {
         LiftEnd.HELD: f"normal forces of at most {lift.applied_force:.1f} N carry it, and it "
         f"arrives within {moved} of its target",
@@ -221,7 +225,7 @@ def _misfit(fit: WristFit, config: Config) -> str:
     if fit.residual[finger] > rules.max_residual:
         return (
             "no palm pose was found that brings all fingertips to their points: fingertip "
-            f"{finger + 1} stays {_mm(fit.residual[finger])} away"
+            f"{finger + 1} stays {in_mm(fit.residual[finger])} away"
         )
     finger = int(np.argmax(fit.normal_error))
     angle = np.rad2deg(fit.normal_error[finger])
@@ -277,12 +281,7 @@ def _judge(result: Verification, config: Config) -> Verification:
         if error[finger] > config.verify.max_contact_error:
             outcome = Outcome.UNREACHABLE
             reason = (
-                f"fingertip {finger + 1} closes on the object {_mm(error[finger])} from its "
-                f"point, more than {_mm(config.verify.max_contact_error)}"
+                f"fingertip {finger + 1} closes on the object {in_mm(error[finger])} from its "
+                f"point, more than {in_mm(config.verify.max_contact_error)}"
             )
     return replace(result, outcome=outcome, reason=reason, contact_error=error)
-
-
-def _mm(length: float) -> str:
-    """Return a length [m] as text in millimetres."""
-    return f"{1e3 * length:.1f} mm"

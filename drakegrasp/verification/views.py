@@ -22,7 +22,6 @@ from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.mesh.rays import first_hits
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.contacts import Contacts
-from drakegrasp.simulation.placement import canonical_pose
 from drakegrasp.vision.camera import Picture
 from drakegrasp.visualization.style import ARROW, HIDDEN, LIFTED, PREDICTED, REACHED
 from drakegrasp.visualization.third_person import (
@@ -110,7 +109,7 @@ def render_views(verified: Verification) -> list[View]:
     """
     # The contacts: predicted ones, those after closing, and where these are after the lift.
     renderer = _Renderer(verified.placed.model, load_hand(verified.config.hand))
-    X_WO = X_WT @ canonical_pose(verified.placed.X_TO)
+    X_WO = X_WT @ verified.placed.X_TO_simulated
     marks = [
         _predicted(verified),
         *_reached(verified.closed, _force_scale(verified)),
@@ -133,7 +132,7 @@ def _last_view(
 
     The azimuth [rad] is that of the camera where the object is shown alone.
     """
-    X_WO = X_WT @ canonical_pose(verified.placed.X_TO)
+    X_WO = X_WT @ verified.placed.X_TO_simulated
     trial, lift, fit = verified.trial, verified.lift, verified.fit
 
     # After the lift, by forces or by the hand.

@@ -22,7 +22,12 @@ LOOKS_VERTICALLY = 1e-3
 
 
 def intrinsics(config: CameraConfig) -> Array:
-    """Return the camera matrix K (3, 3) [px]: square pixels, centre in the image's middle."""
+    """Return the camera matrix K (3, 3) [px]: square pixels, centre in the image's middle.
+
+    For S × S pixels, whose centres have integer coordinates, and the field of view φ:
+
+        f = S / (2 tan(φ/2)),   c = (S − 1) / 2,   K = [[f, 0, c], [0, f, c], [0, 0, 1]]
+    """
     sine, cosine = sin_cos_deg(config.fov_y_deg / 2.0)
     focal = float(config.size * cosine / (2.0 * sine))
     centre = (config.size - 1) / 2.0
@@ -63,13 +68,19 @@ def camera_pose_otm(
 
 
 def project(K: npt.ArrayLike, p_CQ: npt.ArrayLike) -> Array:
-    """Return pixel coordinates (n, 2), (u to the right, v down), of points (n, 3) [m]."""
+    """Return pixel coordinates (n, 2), (u to the right, v down), of points (n, 3) [m].
+
+    (u, v) = (f x/z + c, f y/z + c) for p_CQ = (x, y, z).
+    """
     points = multiply(p_CQ, np.asarray(K, dtype=float).T)
     return points[:, :2] / points[:, 2:]
 
 
 def unproject(K: npt.ArrayLike, pixels: npt.ArrayLike, depth: npt.ArrayLike) -> Array:
-    """Return points p_CQ (n, 3) [m] of pixels (n, 2) at depths (n,) [m]."""
+    """Return points p_CQ (n, 3) [m] of pixels (n, 2) at depths (n,) [m].
+
+    p_CQ = z ((u − c)/f, (v − c)/f, 1), the inverse of `project` at the depth z.
+    """
     uv, lens = np.asarray(pixels, dtype=float), np.asarray(K, dtype=float)
     at_one = (uv - lens[:2, 2]) / lens[[0, 1], [0, 1]]
     return np.column_stack([at_one, np.ones(len(uv))]) * np.asarray(depth, dtype=float)[:, None]
@@ -117,8 +128,10 @@ def image_frame(K: npt.ArrayLike, mask: npt.ArrayLike, depth: npt.ArrayLike) -> 
 def _principal_axis(centred: Array) -> Array:
     """Return the unit direction (2,) of largest variance of points (n, 2) about their mean.
 
-    In closed form, because LAPACK's last bits depend on the CPU. It is +u where no direction is
-    larger than others.
+    In closed form, because LAPACK's last bits depend on the CPU. With C = [[a, b], [b, d]] the
+    points' scatter matrix and h = (a − d)/2, the eigenvalues are (a + d)/2 ± √(h² + b²), and the
+    first eigenvector is parallel to (h + √(h² + b²), b), or to (b, √(h² + b²) − h). It is +u where
+    no direction is larger than others.
     """
     (uu, vv), uv = (centred**2).sum(axis=0), (centred[:, 0] * centred[:, 1]).sum()
     half = (uu - vv) / 2.0

@@ -26,7 +26,7 @@ from drakegrasp.runtime.environment import allow_network
 from drakegrasp.runtime.files import write_atomic
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.construction import MESHCAT_RATE, build_scene
-from drakegrasp.simulation.scene import Scene, reset_attempt, reset_object
+from drakegrasp.simulation.scene import ObjectScene, Scene, reset_attempt, reset_object
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.visualization.style import PREDICTED
 
@@ -88,32 +88,38 @@ def show_start(
     scene: Scene,
     X_TO: npt.ArrayLike,
     config: Config,
-    X_OG: Array | None = None,
-    spread: float = 0.0,
-    closing: Array | None = None,
+    X_OG: Array,
+    spread: float,
+    closing: Array | None,
 ) -> None:
-    """Show the object, and the hand if its pose is given, at the start, and aim the camera.
+    """Show object and hand at the start, and aim the camera.
 
     Args:
         meshcat: Where to show them.
-        scene: Of the object, with a hand if X_OG is given.
+        scene: Of the object and the hand.
         X_TO: (4, 4), resting pose of the object in the table-top frame.
         config: With the target of the lift.
         X_OG: (4, 4), pose of the palm.
         spread: Angle of the spread joints [rad].
         closing: (k,), closing positions [rad or m]; the open hand if None.
     """
-    # Publish the start.
     X_WO = X_WT @ np.asarray(X_TO, dtype=float)
-    if X_OG is None:
-        reset_object(scene, X_WO)
-        scene.simulator.Initialize()
-        side_W = np.array([1.0, 0.0, 0.0])
-    else:
-        reset_attempt(scene, X_WO, X_WO @ X_OG, spread=spread, closing=closing)
-        side_W = X_WO[:3, :3] @ X_OG[:3, 3]
+    reset_attempt(scene, X_WO, X_WO @ X_OG, spread=spread, closing=closing)
+    _aim_camera(meshcat, scene, X_WO, config, side_W=X_WO[:3, :3] @ X_OG[:3, 3])
 
-    # Look from beside the palm, from far enough to see the whole lift.
+
+def show_object(meshcat: Meshcat, scene: ObjectScene, X_TO: npt.ArrayLike, config: Config) -> None:
+    """Show the object alone at the start, and aim the camera; see `show_start`."""
+    X_WO = X_WT @ np.asarray(X_TO, dtype=float)
+    reset_object(scene, X_WO)
+    scene.simulator.Initialize()
+    _aim_camera(meshcat, scene, X_WO, config, side_W=np.array([1.0, 0.0, 0.0]))
+
+
+def _aim_camera(
+    meshcat: Meshcat, scene: ObjectScene, X_WO: Array, config: Config, *, side_W: Array
+) -> None:
+    """Look from beside the palm, whose direction is side_W, far enough to see the whole lift."""
     way = X_WT[:3, 3] + config.lift.p_TG - X_WO[:3, 3]
     radius = np.linalg.norm(way) / 2.0 + np.linalg.norm(scene.model.half_extents) + HAND_RADIUS
     azimuth = np.arctan2(side_W[1], side_W[0]) + AZIMUTH

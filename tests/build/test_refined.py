@@ -39,7 +39,7 @@ from drakegrasp.inspection.query import Query, select
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
-from drakegrasp.verification.placed_grasp import VerifyArguments, place_grasps
+from drakegrasp.verification.placed_grasp import place_on_rows
 from drakegrasp.visualization.figures.held_grasps import read_approaches, read_held
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
@@ -173,8 +173,7 @@ def test_samples_are_verified_as_they_lay(refined: Path) -> None:
     dataset = GraspDataset(refined / "grasping_oto.hdf5")
     rows = trials(refined)
     tried, grasps = dataset.column("trial_id"), dataset.column("grasps")
-    arguments = VerifyArguments(dataset=dataset, rows=list(range(len(grasps))), method="forces")
-    placed = place_grasps(grasps, arguments)
+    placed = place_on_rows(grasps, dataset, method="forces")
     assert sorted(each.index for each in placed) == list(range(len(grasps)))
     assert len(np.unique(rows["resting"][tried])) > 1
     for each in placed:

@@ -16,6 +16,7 @@ from drakegrasp.frames import X_WT
 from drakegrasp.hand.description import Hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.construction import (
+    build_object_scene,
     build_scene,
     object_friction,
     object_inertia,
@@ -47,7 +48,7 @@ def cone(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
 
 def test_plant_has_the_mass_properties_of_the_model(cone: ObjectModel, config: Config) -> None:
     assert np.linalg.norm(cone.p_OOcm) > 0.005
-    scene = build_scene(cone, config.physics)
+    scene = build_object_scene(cone, config.physics)
     M = scene.object.CalcSpatialInertiaInBodyFrame(scene.context)
     assert M.get_mass() == pytest.approx(cone.mass)
     np.testing.assert_allclose(M.get_com(), cone.p_OOcm, atol=1e-12)
@@ -89,16 +90,14 @@ def test_materials_are_the_configured_ones(cone: ObjectModel, config: Config, ha
     )
     physics = other.physics
     scene = build_scene(cone, physics, hand)
-    handles = scene.handles
-    assert handles is not None
-    palm = scene.plant.GetBodyByName(hand.palm_link, handles.instance)
+    palm = scene.plant.GetBodyByName(hand.palm_link, scene.instance)
     own, held = object_friction(physics), partner_friction(0.35, physics)
     assert (own, 2.0 * own * held / (own + held)) == (0.85, pytest.approx(0.35))
     for body, modulus, friction in (
         (scene.object, None, own),
         (scene.table, 4.5e6, partner_friction(0.85, physics)),
         (palm, 3.5e6, held),
-        *((tip, 2.5e5, held) for tip in handles.fingertips),
+        *((tip, 2.5e5, held) for tip in scene.fingertips),
     ):
         assert set(properties(scene, body, "material", "hunt_crossley_dissipation")) == {3.5}
         assert set(properties(scene, body, "material", "relaxation_time")) == {0.07}
@@ -139,35 +138,29 @@ def test_open_hand_closes_at_its_speed(
 
 def test_the_arm_carries_the_hand(scene: Scene, cube: ObjectModel, config: Config) -> None:
     """Only the object has a weight: the hand hangs still where nothing touches it."""
-    plant, handles = scene.plant, scene.handles
-    assert handles is not None
-    weightless = (handles.instance, handles.wrist_instance)
+    plant = scene.plant
+    weightless = (scene.instance, scene.wrist_instance)
     assert [plant.is_gravity_enabled(i) for i in weightless] == [False, False]
     assert plant.is_gravity_enabled(scene.object.model_instance())
 
 
 def test_motors_are_those_of_the_hand_file(scene: Scene, hand: Hand) -> None:
-    handles = scene.handles
-    assert handles is not None
-    for motor, joint, finger in zip(
-        handles.motors, handles.closing_joints, hand.fingers, strict=True
-    ):
+    for motor, joint, finger in zip(scene.motors, scene.closing_joints, hand.fingers, strict=True):
         assert motor.joint().name() == joint.name() == finger.closing_joint
         assert motor.effort_limit() == finger.effort_limit
         assert motor.default_rotor_inertia() == finger.rotor_inertia
         assert motor.default_gear_ratio() == finger.gear_ratio
-    for driven, finger in zip(handles.driven, hand.fingers, strict=True):
+    for driven, finger in zip(scene.driven, hand.fingers, strict=True):
         ratios = {joint.name(): ratio for joint, ratio in driven.items()}
         coupled = {coupling.joint: coupling.ratio for coupling in finger.coupled}
         assert ratios == {finger.closing_joint: 1.0, **coupled}
 
 
 def test_only_fingertips_of_different_fingers_meet(scene: Scene) -> None:
-    handles, plant = scene.handles, scene.plant
-    assert handles is not None
+    plant = scene.plant
     inspector = scene.scene_graph.model_inspector()
-    bodies = [plant.get_body(i) for i in plant.GetBodyIndices(handles.instance)]
-    tips = {body.name() for body in handles.fingertips}
+    bodies = [plant.get_body(i) for i in plant.GetBodyIndices(scene.instance)]
+    tips = {body.name() for body in scene.fingertips}
     for a in bodies:
         for b in bodies:
             meet = {
@@ -203,16 +196,14 @@ def test_hand_and_table_meet_a_surface_of_their_own(
     """Whatever part of an attempt comes next, and whatever was allowed before."""
     X_WO = X_WT @ standing(cube)
     X_WG = X_WO @ from_above(cube, 0.1).X_OG
-    handles = scene.handles
-    assert handles is not None
-    links = {scene.plant.get_body(i).name() for i in scene.plant.GetBodyIndices(handles.instance)}
+    links = {scene.plant.get_body(i).name() for i in scene.plant.GetBodyIndices(scene.instance)}
     for _ in range(2):
         reset_attempt(scene, X_WO, X_WG, spread=0.0)
         assert (partners(scene, "hand"), partners(scene, "table")) == (links, set())
         release(scene)
         assert (partners(scene, "hand"), partners(scene, "table")) == (links, {"table"})
 
-    alone = build_scene(cube, config.physics)
+    alone = build_object_scene(cube, config.physics)
     assert (partners(alone, "hand"), partners(alone, "table")) == (set(), {"table"})
     reset_object(alone, X_WO)
     assert (partners(alone, "hand"), partners(alone, "table")) == (set(), {"table"})

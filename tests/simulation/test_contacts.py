@@ -38,13 +38,12 @@ def closed(cube: ObjectModel, config: Config, hand: Hand) -> Scene:
 
 def with_pads(scene: Scene, *regions: tuple[HalfSpace, ...]) -> Contacts:
     """Return the contacts as they are with other pad regions of the three fingers."""
-    hand = scene.handles.hand
+    hand = scene.hand
     fingers = tuple(
         replace(finger, pad_region=region, pad_point=_inside(region, finger.pad_point))
         for finger, region in zip(hand.fingers, regions, strict=True)
     )
-    handles = replace(scene.handles, hand=replace(hand, fingers=fingers))
-    return read_contacts(replace(scene, handles=handles))
+    return read_contacts(replace(scene, hand=replace(hand, fingers=fingers)))
 
 
 def _inside(region: tuple[HalfSpace, ...], usual: tuple[float, ...]) -> tuple[float, ...]:
@@ -57,7 +56,7 @@ def _inside(region: tuple[HalfSpace, ...], usual: tuple[float, ...]) -> tuple[fl
 
 
 def test_contact_off_the_pad_is_one_of_another_link(closed):
-    pads = [finger.pad_region for finger in closed.handles.hand.fingers]
+    pads = [finger.pad_region for finger in closed.hand.fingers]
     contacts = with_pads(closed, NOWHERE, *pads[1:])
     assert contacts.touching.tolist() == [False, True, True]
     assert contacts.other_links == 1
@@ -101,7 +100,7 @@ def test_patch_mostly_beside_the_pad_is_split(closed, scale):
 
 def _contact_in_link(scene: Scene, contacts: Contacts) -> float:
     """Return how far along its link finger 1 touches [m]."""
-    tip = scene.handles.fingertips[0]
+    tip = scene.fingertips[0]
     X_FO = invert_pose(scene.pose(tip)) @ scene.pose(scene.object)
     return float(transform_points(X_FO, contacts.p_OQ[:1])[0, 0])
 
@@ -111,7 +110,7 @@ def test_barretts_pad_is_the_front_of_its_fingertip(closed):
 
     Its band of 1 mm has the corners of the tip.
     """
-    (finger, *_) = closed.handles.hand.fingers
+    (finger, *_) = closed.hand.fingers
     on = np.array([[0.04, 0.011, 0.0], [0.0171, 0.0, 0.01], [0.0593, -0.0044, 0.005]])
     off = np.array([[0.0169, 0.01, 0.0], [0.03, -0.0021, 0.011], [0.059, -0.0046, 0.0]])
     assert finger.on_pad(on).all()
@@ -121,7 +120,7 @@ def test_barretts_pad_is_the_front_of_its_fingertip(closed):
 def test_weak_contacts_do_not_count(closed: Scene) -> None:
     """Fingertips press with some 10 N: a limit above that leaves nothing that touches."""
     forces = np.linalg.norm(read_contacts(closed).f_Q_O, axis=1)
-    tips = {body.index() for body in closed.handles.fingertips}
+    tips = {body.index() for body in closed.fingertips}
     for limit in (0.9 * forces.min(), 1.1 * forces.max()):
         strict = replace(closed, physics=closed.physics.model_copy(update={"contact_force": limit}))
         expected = [limit < forces.min()] * 3
@@ -175,7 +174,7 @@ def test_point_and_normal_are_weighted_by_pressure(
 def test_contact_point_is_where_drakes_force_acts(closed: Scene) -> None:
     """On a plane, force and moment about the patch's centroid tell the centre of pressure."""
     results = closed.plant.get_contact_results_output_port().Eval(closed.context)
-    tips, found = [body.index() for body in closed.handles.fingertips], read_contacts(closed)
+    tips, found = [body.index() for body in closed.fingertips], read_contacts(closed)
     X_OW = invert_pose(closed.pose(closed.object))
     seen = set()
     for i in range(results.num_hydroelastic_contacts()):
@@ -198,8 +197,8 @@ def test_contact_point_is_where_drakes_force_acts(closed: Scene) -> None:
 
 def test_depth_of_a_fingertip_is_how_far_it_is_in_the_cube(closed: Scene) -> None:
     """A convex shape is deepest at a corner. Drake's field of pressure is not quite a distance."""
-    found, hand = read_contacts(closed), closed.handles.hand
-    for k, tip in enumerate(closed.handles.fingertips):
+    found, hand = read_contacts(closed), closed.hand
+    for k, tip in enumerate(closed.fingertips):
         corners = np.concatenate(link_shapes(hand)[hand.fingers[k].fingertip])
         X_OF = invert_pose(closed.pose(closed.object)) @ closed.pose(tip)
         y = np.abs(transform_points(X_OF, corners)[:, 1])
@@ -228,7 +227,7 @@ def test_point_contacts_are_counted(closed: Scene) -> None:
     """Those of the object; one of hand and table means that they touch."""
     reader = contacts_module._Reader(closed)
     grasped, table = closed.object.index(), closed.table.index()
-    tip, *_ = (body.index() for body in closed.handles.fingertips)
+    tip, *_ = (body.index() for body in closed.fingertips)
     for pair, count, on_table in (
         ({tip, grasped}, 1, False),
         ({grasped, table}, 2, False),
@@ -259,7 +258,7 @@ def test_palm_on_the_object_is_another_link(scene: Scene, cube: ObjectModel) -> 
     found = read_contacts(scene)
     assert not found.touching.any()
     assert found.other_links == 1
-    palm = scene.plant.GetBodyByName(scene.handles.hand.palm_link)
+    palm = scene.plant.GetBodyByName(scene.hand.palm_link)
     assert bodies_on_object(scene) == {palm.index()}
 
     # It counts by what it presses with, as Drake adds it up.

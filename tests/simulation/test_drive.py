@@ -118,7 +118,7 @@ def test_worm_lets_no_finger_open(
     angles = _pushed(current, FORCE, steps=20)
     loads = opening_torques(current)
     disengage(current)
-    torques = [finger.torque_limit for finger in current.handles.hand.fingers]
+    torques = [finger.torque_limit for finger in current.hand.fingers]
     assert np.any(loads > 1.2 * np.array(torques))
     assert np.diff(angles, axis=0).min() > -STILL
 
@@ -159,7 +159,7 @@ def test_worm_yields_beyond_its_strength_and_holds_again(
     # Once the load is gone the motors close the fingers, with their own torque again.
     stood = _pushed(scene, 0.0, steps=20)
     assert np.diff(stood[2:, :2], axis=0).min() > -STILL
-    limits = [motor.effort_limit() for motor in scene.handles.motors[:2]]
+    limits = [motor.effort_limit() for motor in scene.motors[:2]]
     assert limits == [finger.torque_limit for finger in weak.fingers[:2]]
     disengage(scene)
 
@@ -178,9 +178,8 @@ def test_lift_leaves_the_hand_as_it_was(
     """Also where it is cut off: limits belong to the plant, which the next attempt uses."""
 
     def limits() -> list[float]:
-        handles = scene.handles
-        lower = [float(joint.position_lower_limits()[0]) for joint in handles.closing_joints]
-        return [*lower, *(motor.effort_limit() for motor in handles.motors)]
+        lower = [float(joint.position_lower_limits()[0]) for joint in scene.closing_joints]
+        return [*lower, *(motor.effort_limit() for motor in scene.motors)]
 
     before = limits()
     _closed_on(scene, cube)
@@ -212,7 +211,7 @@ def test_lift_cut_off_in_coarse_steps_leaves_their_scene_as_it_was(
     scene: Scene, cube: ObjectModel, config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     coarse = scene.coarse_scene()
-    hand = coarse.handles.hand
+    hand = coarse.hand
     updates = []
 
     def rest_then_fail(monitor: lifting._Monitor, current: Scene, *_: object) -> bool:
@@ -227,9 +226,9 @@ def test_lift_cut_off_in_coarse_steps_leaves_their_scene_as_it_was(
     with pytest.raises(TrialTimeout):
         lifting.lift(scene, start_limits(config), config)
     assert updates == [scene, coarse]
-    lower = [float(joint.position_lower_limits()[0]) for joint in coarse.handles.closing_joints]
-    assert lower == [limits[0] for limits in coarse.handles.closing_limits]
-    efforts = [motor.effort_limit() for motor in coarse.handles.motors]
+    lower = [float(joint.position_lower_limits()[0]) for joint in coarse.closing_joints]
+    assert lower == [limits[0] for limits in coarse.closing_limits]
+    efforts = [motor.effort_limit() for motor in coarse.motors]
     assert efforts == [finger.torque_limit for finger in hand.fingers]
     assert coarse.simulator.get_monitor() is None
 
@@ -278,8 +277,6 @@ def test_worm_holds_a_finger_that_is_a_little_beyond_its_limit(tmp_path: Path) -
     X_WG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 1.2])
     reset_attempt(scene, X_WT, X_WG, spread=0.0, closing=[0.04 + 1e-5, 0.03])
     engage(scene, "worm")
-    handles = scene.handles
-    assert handles is not None
-    assert [j.position_lower_limits()[0] for j in handles.closing_joints] == [0.04, 0.03]
+    assert [j.position_lower_limits()[0] for j in scene.closing_joints] == [0.04, 0.03]
     disengage(scene)
-    assert [j.position_lower_limits()[0] for j in handles.closing_joints] == [0.0, 0.0]
+    assert [j.position_lower_limits()[0] for j in scene.closing_joints] == [0.0, 0.0]

@@ -92,8 +92,8 @@ def test_another_diagram_goes_on_where_one_stopped(scene, cube, config, back):
     assert np.array_equal(palm_pose(after), palm_pose(before))
     assert np.array_equal(after.pose(after.object), before.pose(before.object))
     assert np.array_equal(hand_positions(after), hand_positions(before))
-    hand = scene.handles.hand
-    spread = [after.plant.GetJointByName(n, after.handles.instance) for n in hand.spread.joints]
+    hand = scene.hand
+    spread = [after.plant.GetJointByName(n, after.instance) for n in hand.spread.joints]
     assert spread
     assert all(joint.is_locked(after.context) for joint in spread)
     step = after.physics.time_step
@@ -115,7 +115,7 @@ def test_another_diagram_goes_on_where_one_stopped(scene, cube, config, back):
 @pytest.mark.parametrize("where", ["off", "near", "on table"])
 def test_lift_ends_where_a_fingertip_stays_off(scene, cube, config, monkeypatch, where):
     """Not if it may yet creep there, or the object stands on the table, which decides nothing."""
-    tips = [body.index() for body in scene.handles.fingertips]
+    tips = [body.index() for body in scene.fingertips]
     seen = {*tips[1:], *([scene.table.index()] if where == "on table" else [])}
     monkeypatch.setattr(lifting, "bodies_on_object", lambda _: seen)
     if where != "near":
@@ -279,8 +279,8 @@ def test_monitor_judges_what_moved_since_the_last_look(
     turn = make_pose(rotation_about([0.0, 1.0, 0.0], np.deg2rad(angle_deg)), [0.0, shift, 0.0])
     monkeypatch.setattr(lifting, "_object_in_hand", lambda _: X_GO @ turn)
     monkeypatch.setattr(lifting, "closing_angles", lambda _: angles + np.eye(3)[1] * closed)
-    tips = {body.index() for body in scene.handles.fingertips}
-    palm = scene.plant.GetBodyByName(scene.handles.hand.palm_link).index()
+    tips = {body.index() for body in scene.fingertips}
+    palm = scene.plant.GetBodyByName(scene.hand.palm_link).index()
     table = scene.table.index()
     on_object = {
         "all": tips,
@@ -317,7 +317,7 @@ def test_lift_is_looked_at_in_even_periods_just_before_a_step(scene, cube, confi
 def test_monitor_looks_again_after_a_motion(scene, cube, monkeypatch):
     """While nothing moves, contacts are looked for once; after a motion they are again."""
     close(scene, cube)
-    tips, looks = {body.index() for body in scene.handles.fingertips}, []
+    tips, looks = {body.index() for body in scene.fingertips}, []
 
     def look(_):
         looks.append(True)

@@ -46,16 +46,19 @@ def write(path: Path, mesh: trimesh.Trimesh) -> Path:
 
 
 @pytest.mark.parametrize(("units", "scale"), [("m", 1.0), ("cm", 100.0), ("mm", 1000.0)])
-def test_file_is_read_in_its_units_about_the_boxs_centre(
+def test_file_or_mesh_is_taken_in_its_units_about_the_boxs_centre(
     tmp_path: Path, units: str, scale: float
 ) -> None:
-    path = write(tmp_path / "3_mug_red.obj", box(scale, at=0.3 * scale))
-    for given_as in (path, str(path)):
+    mesh = box(scale, at=0.3 * scale)
+    before, path = np.array(mesh.vertices), write(tmp_path / "3_mug_red.obj", mesh)
+    for given_as in (mesh, path, str(path)):
         placed = place_object(given_as, units=units, X_TO=X_TO)
         np.testing.assert_allclose(placed.model.half_extents, EXTENTS / 2.0, atol=1e-9)
         np.testing.assert_allclose(placed.model.visual_vertices.mean(axis=0), 0.0, atol=1e-9)
         np.testing.assert_array_equal(placed.X_TO, X_TO)
-        assert (placed.model.name, placed.model.class_name) == ("3_mug_red", "mug")
+        assert placed.model.collision.is_watertight
+    assert (placed.model.name, placed.model.class_name) == ("3_mug_red", "mug")
+    np.testing.assert_array_equal(mesh.vertices, before)
 
 
 def test_manifest_beside_the_file_wins_over_units(tmp_path: Path) -> None:
@@ -136,16 +139,6 @@ def test_what_is_no_object_is_refused_in_one_line(tmp_path: Path, case: str) -> 
 
 
 # From a mesh
-
-
-@pytest.mark.parametrize(("units", "scale"), [("m", 1.0), ("cm", 100.0), ("mm", 1000.0)])
-def test_mesh_is_taken_in_its_units(units: str, scale: float) -> None:
-    mesh = box(scale, at=0.2 * scale)
-    before = np.array(mesh.vertices)
-    placed = place_object(mesh, units=units, X_TO=X_TO)
-    np.testing.assert_allclose(placed.model.half_extents, EXTENTS / 2.0, atol=1e-9)
-    assert placed.model.collision.is_watertight
-    np.testing.assert_array_equal(mesh.vertices, before)
 
 
 def test_mesh_is_known_by_its_surface() -> None:
@@ -256,11 +249,7 @@ def pose_of(yaw: float, tilt: float, about: float, x: float = 0.0, y: float = 0.
     return make_pose(R.as_matrix(), [x, y, 0.04])
 
 
-@given(angles, st.floats(0.0, np.pi), angles, st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
-def test_canonical_pose_keeps_up_and_height_and_forgets_the_rest(
-    yaw: float, tilt: float, about: float, x: float, y: float
-) -> None:
-    X = pose_of(yaw, tilt, about, x, y)
+def assert_keeps_up_and_height(X: Array) -> None:
     rest = canonical_pose(X)
     np.testing.assert_allclose(rest[2], X[2], atol=1e-9)
     np.testing.assert_array_equal(rest[:2, 3], 0.0)
@@ -268,6 +257,13 @@ def test_canonical_pose_keeps_up_and_height_and_forgets_the_rest(
     R = rest[:3, :3]
     np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-12)
     assert np.linalg.det(R) == pytest.approx(1.0)
+
+
+@given(angles, st.floats(0.0, np.pi), angles, st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
+def test_canonical_pose_keeps_up_and_height_and_forgets_the_rest(
+    yaw: float, tilt: float, about: float, x: float, y: float
+) -> None:
+    assert_keeps_up_and_height(pose_of(yaw, tilt, about, x, y))
 
 
 # Nearly upside down every small tilt has its own direction, so rounding decides.
@@ -284,12 +280,7 @@ def test_canonical_pose_does_not_depend_on_yaw_or_place(
 @pytest.mark.parametrize("yaw", [0.0, 0.5, 3.0])
 @pytest.mark.parametrize("slant", [0.0, 1e-12, 1e-9, 1e-7, 1e-5, 1e-4])
 def test_canonical_pose_works_upside_down(yaw: float, slant: float) -> None:
-    X = pose_of(yaw, np.pi - slant, 0.7)
-    rest = canonical_pose(X)
-    np.testing.assert_allclose(rest[2], X[2], atol=1e-9)
-    R = rest[:3, :3]
-    np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-12)
-    assert np.linalg.det(R) == pytest.approx(1.0)
+    assert_keeps_up_and_height(pose_of(yaw, np.pi - slant, 0.7))
 
 
 def test_canonical_pose_of_an_upright_object_is_the_identity() -> None:

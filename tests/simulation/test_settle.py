@@ -23,9 +23,8 @@ from drakegrasp.mesh.surfaces import half_edges, signed_volume
 from drakegrasp.objects.model import ObjectModel, make_object, prepare_object
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.simulation import settle as settle_module
-from drakegrasp.simulation.construction import build_scene
-from drakegrasp.simulation.contacts import Contacts
-from drakegrasp.simulation.scene import Scene, advance, reset_object
+from drakegrasp.simulation.construction import build_object_scene
+from drakegrasp.simulation.scene import ObjectScene, advance, reset_object
 from drakegrasp.simulation.settle import Resting, settle, snapped
 
 pytestmark = pytest.mark.sim
@@ -80,7 +79,7 @@ def test_trial_keeps_standing_what_rests(name: str, gap: float, config: Config):
     model = as_dropped(SHAPES[name])
     X_TO = settle(model, config).X_TO.copy()
     X_TO[2, 3] += gap
-    scene = build_scene(model, config.physics)
+    scene = build_object_scene(model, config.physics)
     reset_object(scene, X_WT @ X_TO)
     for _ in range(3):
         advance(scene, 0.4)
@@ -93,13 +92,13 @@ def test_surface_that_lands_is_the_collision_mesh_without_long_edges(
     config: Config, monkeypatch: pytest.MonkeyPatch
 ):
     """Not its hull, on which some objects rest otherwise."""
-    built, build = [], settle_module.build_scene
+    built, build = [], settle_module.build_object_scene
 
-    def watch(*args: Any, **kwargs: Any) -> Scene:
+    def watch(*args: Any, **kwargs: Any) -> ObjectScene:
         built.append(kwargs["resting_surface"])
         return build(*args, **kwargs)
 
-    monkeypatch.setattr(settle_module, "build_scene", watch)
+    monkeypatch.setattr(settle_module, "build_object_scene", watch)
     ring = trimesh.creation.annulus(r_min=0.03, r_max=0.06, height=0.05, sections=16)
     settle(as_dropped(ring), config)
     (landed,) = built
@@ -140,7 +139,7 @@ def test_object_falls_from_its_own_origin_and_a_tall_one_from_the_table(
     landing = []
     wait = settle_module._wait_for_rest
 
-    def watch(scene: Scene, config: Config) -> bool:
+    def watch(scene: ObjectScene, config: Config) -> bool:
         landing.append(scene.plant.GetVelocities(scene.context)[5])
         return wait(scene, config)
 
@@ -154,13 +153,8 @@ def test_table_must_carry_the_weight(
     config: Config, monkeypatch: pytest.MonkeyPatch, share: float, refused: bool
 ):
     """To one per cent: more or less is an error of the contact."""
-    read = settle_module.read_contacts
-
-    def wrong(scene: Scene) -> Contacts:
-        contacts = read(scene)
-        return replace(contacts, table_force=share * contacts.table_force)
-
-    monkeypatch.setattr(settle_module, "read_contacts", wrong)
+    read = settle_module.table_force
+    monkeypatch.setattr(settle_module, "table_force", lambda scene: share * read(scene))
     box = as_dropped(trimesh.creation.box([0.05] * 3))
     if refused:
         with pytest.raises(MeshError, match=r"must carry its 9\.81 N at rest, got"):
@@ -177,7 +171,7 @@ def test_what_lands_deep_is_raised_and_set_down_again(
     measured, lift = settle_module._sink, settle_module._raise
     monkeypatch.setattr(settle_module, "_sink", lambda scene: measured(scene) + deep)
 
-    def watch(scene: Scene, height: float) -> None:
+    def watch(scene: ObjectScene, height: float) -> None:
         before = scene.pose(scene.object)[2, 3]
         lift(scene, height)
         raised.append(scene.pose(scene.object)[2, 3] - before - height)
@@ -190,7 +184,7 @@ def test_what_lands_deep_is_raised_and_set_down_again(
 
 
 def test_object_that_left_the_table_is_refused(config: Config, monkeypatch: pytest.MonkeyPatch):
-    def fall(scene: Scene, config: Config) -> bool:
+    def fall(scene: ObjectScene, config: Config) -> bool:
         settle_module._raise(scene, -1.0)
         return False
 
@@ -227,7 +221,7 @@ def test_what_turns_or_moves_does_not_rest(
 
 def test_depth_in_the_table_is_that_of_the_lowest_point(config: Config):
     box = as_dropped(trimesh.creation.box([0.04, 0.05, 0.06]))
-    scene = build_scene(box, config.physics)
+    scene = build_object_scene(box, config.physics)
     for height in (0.03, 0.025, 0.04):
         reset_object(scene, X_WT @ make_pose(np.eye(3), [0.0, 0.0, height]))
         assert settle_module._sink(scene) == pytest.approx(0.03 - height, abs=1e-12)

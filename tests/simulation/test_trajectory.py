@@ -12,6 +12,7 @@ from drakegrasp.frames import X_WT, make_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.simulation.trajectory import LiftPath, carrying_force, lift_path
+from drakegrasp.verification.forces.contact_forces import hand_contacts
 from drakegrasp.verification.forces.quality import force_margin
 
 GRAVITY = 9.81
@@ -81,7 +82,7 @@ def test_path_of_an_object_at_its_target_stays(cube):
 def test_margin_of_a_pinched_cube_is_its_closed_form(cube):
     """The finger that opposes two carries half of the load: mu = m (g + a) / (2 limit)."""
     config = load_config()
-    margin = force_margin(cube, standing(cube), P, N, config)
+    margin = force_margin(cube, standing(cube), hand_contacts(cube, P, N, config), config)
     load = lift_path(standing(cube), config).wrenches(cube)[0, 5]
     limit = fingertip_forces(load_hand(config.hand), "worm")[2]
     assert load > cube.mass * GRAVITY
@@ -93,6 +94,7 @@ def test_margin_of_a_pinched_cube_is_its_closed_form(cube):
     ("p", "n"), [(np.abs(P), np.abs(N)), (P, N * [[-1.0], [-1.0], [1.0]]), (P * np.nan, N)]
 )
 def test_contacts_that_cannot_hold_have_no_margin(cube, p, n):
-    margin = force_margin(cube, standing(cube), p, n, load_config())
+    config = load_config()
+    margin = force_margin(cube, standing(cube), hand_contacts(cube, p, n, config), config)
     assert margin.epsilon == 0.0
     assert margin.smallest_friction == np.inf

@@ -27,7 +27,12 @@ from drakegrasp.objects.sources import MeshSource
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.simulation import stepping
 from drakegrasp.simulation.candidates import Attempt
-from drakegrasp.simulation.construction import build_scene, object_friction, partner_friction
+from drakegrasp.simulation.construction import (
+    build_object_scene,
+    build_scene,
+    object_friction,
+    partner_friction,
+)
 from drakegrasp.simulation.contacts import is_inside, read_contacts
 from drakegrasp.simulation.scene import (
     advance,
@@ -104,8 +109,8 @@ def test_image_that_cannot_be_rendered_is_no_outcome(scene, cube, config):
 
 
 def test_hand_without_weights_lifts_all_that_it_may(scene, cube, held):
-    hand = replace(scene.handles.hand, lift_chance=None)
-    bare = replace(scene, handles=replace(scene.handles, hand=hand))
+    hand = replace(scene.hand, lift_chance=None)
+    bare = replace(scene, hand=hand)
     rules = load_config(overrides=["lift.least_chance=0.99"])
     record = run_attempt(bare, standing(cube), from_above(cube, STANDOFF), rules)
     assert record.outcome is Outcome.SUCCESS
@@ -217,7 +222,7 @@ def test_points_inside_of_a_real_mesh_with_needles_are_found(name, g3db, config)
     """Drake's point distance gives up on such meshes; the inside test agrees with rays."""
     source = MeshSource(name=name, class_name="thing", path=g3db / f"{name}.obj", scale=0.01)
     model = prepare_object(source)
-    scene = build_scene(model, config.physics)
+    scene = build_object_scene(model, config.physics)
     reset_object(scene, X_WT @ standing(model))
     rng = np.random.default_rng(0)
     p_OP = rng.uniform(-1.0, 1.0, (400, 3)) * model.half_extents
@@ -351,7 +356,7 @@ def test_table_friction_stops_a_sliding_block(tmp_path):
     ).physics
     speeds = []
     for start in (0.5, 1.0):
-        scene = build_scene(model, physics)
+        scene = build_object_scene(model, physics)
         reset_object(scene, X_WT @ standing(model))
         scene.simulator.Initialize()
         advance(scene, 0.1)
@@ -410,7 +415,7 @@ def test_object_rests_on_the_table_after_an_attempt_that_ended_early(scene, cube
 
 def test_hand_that_presses_beside_a_pad_does_not_lift(scene, cube, config, held):
     """The patch of the first fingertip lies mostly beside a pad with its band."""
-    tip = scene.handles.fingertips[0]
+    tip = scene.fingertips[0]
     reset_attempt(
         scene,
         X_WT @ standing(cube),
@@ -422,12 +427,12 @@ def test_hand_that_presses_beside_a_pad_does_not_lift(scene, cube, config, held)
     x = float((X_FO[:3, :3] @ held.closed.contacts.p_OQ[0] + X_FO[:3, 3])[0])
     begin = x + PAD_BAND + 1e-3
     beyond = {"pad_region": ((1.0, 0.0, 0.0, begin),), "pad_point": (x + 0.01, 0.01, 0.0)}
-    first, *others = scene.handles.hand.fingers
+    first, *others = scene.hand.fingers
     fingers = (replace(first, **beyond), *others)
-    handles = replace(scene.handles, hand=replace(scene.handles.hand, fingers=fingers))
+    other = replace(scene, hand=replace(scene.hand, fingers=fingers))
     everything = override_config(config, ["screen.mode=off"])
     attempt = from_above(cube, STANDOFF)
-    record = run_attempt(replace(scene, handles=handles), standing(cube), attempt, everything)
+    record = run_attempt(other, standing(cube), attempt, everything)
     assert record.closed.contacts.touching.all()
     assert record.closed.contacts.other_links == 1
     assert record.outcome is Outcome.HAND_CONTACT

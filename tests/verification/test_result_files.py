@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.objects import standing
+from helpers.verdicts import some_contacts, some_trial
 
 from drakegrasp.config import load_config
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, VERIFICATION_FIELDS, sizes
@@ -23,9 +24,7 @@ from drakegrasp.objects.model import make_object
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import Contacts
-from drakegrasp.simulation.lift import Lift
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.simulation.trial import Closed, TrialRecord
 from drakegrasp.verification.forces.lift import ForceLift, LiftEnd
 from drakegrasp.verification.result import Verification
 from drakegrasp.verification.result_files import (
@@ -46,17 +45,13 @@ X_OG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.1])
 def contacts() -> Contacts:
     """Two fingertips touch, the second does not."""
     touching = np.array([True, False, True])
-    return Contacts(
+    return some_contacts(
         touching=touching,
         p_OQ=np.where(touching[:, None], RNG.normal(size=(3, 3)), np.nan),
         nhat_Q_O=np.where(touching[:, None], [1.0, 0.0, 0.0], np.nan),
         f_Q_O=RNG.normal(size=(3, 3)),
-        area=RNG.random(3),
-        penetration=RNG.random(3),
         other_links=2,
-        hand_on_table=False,
         object_on_table=True,
-        table_force=np.zeros(3),
         point_contacts=1,
     )
 
@@ -92,23 +87,8 @@ def results() -> list[Verification]:
         evaluations=15,
     )
     pregrasp = Pregrasp(X_OG=X_OG, spread=0.25, closing=np.array([0.1, 0.2, 0.3]))
-    trial = TrialRecord(
-        outcome=Outcome.SUCCESS,
-        X_TO=placed.X_TO,
-        X_OG=X_OG,
-        closed=Closed(contacts=contacts(), q=RNG.random(8), duration=1.5),
-        lift=Lift(
-            contacts=contacts(),
-            q=RNG.random(8),
-            duration=2.5,
-            X_TO=make_pose(np.eye(3), [0.0, 0.0, 0.5]),
-            X_OG=X_OG,
-            slip=0.002,
-            turn=0.01,
-            slip_released=0.001,
-            turn_released=0.005,
-            moved=False,
-        ),
+    trial = some_trial(
+        placed.X_TO, contacts(), contacts(), outcome=Outcome.SUCCESS, slip=0.002, turn=0.01
     )
     lift = ForceLift(
         end=LiftEnd.HELD,

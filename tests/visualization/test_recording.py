@@ -21,12 +21,12 @@ from helpers.objects import CUBE, box_model, from_above, standing
 from drakegrasp.build.replay import record_trial
 from drakegrasp.config import Config, load_config
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Attempt
-from drakegrasp.simulation.construction import MESHCAT_RATE, build_scene
+from drakegrasp.simulation.construction import MESHCAT_RATE, build_object_scene, build_scene
 from drakegrasp.simulation.trial import run_attempt
+from drakegrasp.verification.forces.contact_forces import hand_contacts
 from drakegrasp.verification.forces.lift import LiftEnd, lift_by_forces
 from drakegrasp.verification.recording import record_lift, record_verification
 from drakegrasp.visualization import recording
@@ -73,6 +73,15 @@ def keys_of(path: Path) -> bytes:
     return animation
 
 
+def not_simulated(cube: ObjectModel, config: Config, fit: object = None) -> SimpleNamespace:
+    """Return a verification that ended before its simulation."""
+    placed = SimpleNamespace(model=cube, X_TO_simulated=standing(cube))
+    return SimpleNamespace(
+        placed=placed, p_OQ=P_OQ, nhat_Q_O=NHAT_Q_O, fit=fit, pregrasp=None, lift=None,
+        config=config,
+    )  # fmt: skip
+
+
 def test_recording_a_trial_changes_no_bit_of_it(
     cube: ObjectModel, attempt: Attempt, config: Config, tmp_path: Path
 ) -> None:
@@ -106,11 +115,11 @@ def test_recording_a_trial_changes_no_bit_of_it(
 def test_recording_a_lift_changes_no_bit_of_it(
     cube: ObjectModel, config: Config, tmp_path: Path
 ) -> None:
-    limit = fingertip_forces(load_hand(config.hand), "worm")
-    scene = build_scene(cube, config.physics)
-    plain = lift_by_forces(scene, standing(cube), P_OQ, NHAT_Q_O, force_limit=limit, config=config)
+    contacts = hand_contacts(cube, P_OQ, NHAT_Q_O, config)
+    scene = build_object_scene(cube, config.physics)
+    plain = lift_by_forces(scene, standing(cube), contacts, config)
     path = tmp_path / "lift.html"
-    recorded = record_lift(cube, standing(cube), P_OQ, NHAT_Q_O, config, path)
+    recorded = record_lift(not_simulated(cube, config), path)
     assert plain.end is recorded.end is LiftEnd.HELD
     assert np.array_equal(plain.X_TO_lifted, recorded.X_TO_lifted)
     assert plain.applied_force == recorded.applied_force
@@ -137,11 +146,7 @@ def test_verification_without_a_trial_shows_what_there_is(
 ) -> None:
     X_OG = from_above(cube, 0.06).X_OG
     fit = SimpleNamespace(X_OG=X_OG, spread=0.3, closing=np.full(3, 0.8)) if fitted else None
-    verified = SimpleNamespace(
-        placed=SimpleNamespace(model=cube, X_TO=standing(cube)),
-        p_OQ=P_OQ, nhat_Q_O=NHAT_Q_O, fit=fit, pregrasp=None, lift=None, config=config,
-    )  # fmt: skip
-    record_verification(verified, tmp_path / "still.html")
+    record_verification(not_simulated(cube, config, fit), tmp_path / "still.html")
     everything = b"".join(commands_of(tmp_path / "still.html"))
     assert b"predicted/1" in everything
     assert (HAND in everything) == fitted
@@ -167,7 +172,7 @@ def test_only_this_machine_is_served_and_only_meanwhile(
     monkeypatch.setattr(recording, "_make_meshcat", spy)
     missed = replace(attempt, ray_hits=False)
     record_attempt(cube, standing(cube), missed, config, tmp_path / "a.html")
-    record_lift(cube, standing(cube), P_OQ, NHAT_Q_O, config, tmp_path / "b.html")
+    record_lift(not_simulated(cube, config), tmp_path / "b.html")
     assert os.environ["DRAKE_ALLOW_NETWORK"] == "none"
     assert [url.hostname for url in urls] == ["localhost"] * 2
     for url in urls:

@@ -28,7 +28,7 @@ def set_materials(scene: Scene, materials: Materials) -> None:
     """Give a scene the friction and mass of an attempt; nothing is done where it has them.
 
     Args:
-        scene: Of the object, with the hand or without.
+        scene: Of the object and a hand.
         materials: What the scene has from now on.
     """
     if scene.object.get_mass(scene.context) != materials.mass:
@@ -96,6 +96,4 @@ def _geometries(scene: Scene) -> list[GeometryId]:
 
 def _bodies(scene: Scene) -> list[RigidBody]:
     """Return object, table and the links of the hand."""
-    plant, handles = scene.plant, scene.handles
-    links = [] if handles is None else plant.GetBodyIndices(handles.instance)
-    return [scene.object, scene.table, *(plant.get_body(index) for index in links)]
+    return [scene.object, scene.table, *scene.links]

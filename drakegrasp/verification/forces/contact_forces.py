@@ -22,7 +22,12 @@ import numpy as np
 import numpy.typing as npt
 from pydrake.solvers import ClarabelSolver, LinearEqualityConstraint, MathematicalProgram
 
+from drakegrasp.config import Config
 from drakegrasp.frames import Array
+from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.strength import fingertip_forces
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.simulation.drive import drive_of
 
 #: Forces count as applying a wrench if their error is below this share of it.
 MAX_ERROR = 1e-7
@@ -34,8 +39,57 @@ PATCH_AREA = 68e-6
 ENOUGH_POINTS = 3
 
 
+@dataclass(frozen=True, eq=False)
+class GraspContacts:
+    """Contacts of k fingertips on an object, and how hard they can press.
+
+    Attributes:
+        p_OQ: (k, 3), contact points in {O} [m].
+        nhat_Q_O: (k, 3), normals out of the object in {O}.
+        p_OOcm: (3,), centre of mass of the object in {O} [m].
+        force_limit: (k,), largest normal force of each contact, or one for all, positive [N].
+        torsion_radius: Of the contacts' patches [m]; 0 for points.
+    """
+
+    p_OQ: npt.ArrayLike
+    nhat_Q_O: npt.ArrayLike
+    p_OOcm: npt.ArrayLike
+    force_limit: npt.ArrayLike = 1.0
+    torsion_radius: float = 0.0
+
+    @property
+    def p_OcmQ(self) -> Array:
+        """(k, 3), arms of the contacts about the centre of mass, in {O} [m]."""
+        return np.asarray(self.p_OQ, dtype=float) - np.asarray(self.p_OOcm, dtype=float)
+
+
+def hand_contacts(
+    model: ObjectModel, p_OQ: npt.ArrayLike, nhat_Q_O: npt.ArrayLike, config: Config
+) -> GraspContacts:
+    """Return contacts that the fingertips of the configuration's hand make on an object.
+
+    Args:
+        model: The object.
+        p_OQ: (k, 3), contact points in {O} [m].
+        nhat_Q_O: (k, 3), normals out of the object in {O}.
+        config: The hand and its drive.
+    """
+    hand = load_hand(config.hand)
+    return GraspContacts(
+        p_OQ,
+        nhat_Q_O,
+        model.p_OOcm,
+        force_limit=fingertip_forces(hand, drive_of(hand, config.lift)),
+        torsion_radius=patch_torsion_radius(hand.num_fingers),
+    )
+
+
 def patch_torsion_radius(fingers: int) -> float:
     """Return the torsion radius [m] of the contacts of a hand: 0 for points.
+
+    A disc of the area A under even pressure resists a torsional moment of 2/3 R μ f_n, so
+
+        r = 2/3 R,   R = √(A / π),   A = `PATCH_AREA`.
 
     Args:
         fingers: Number of fingertips of the hand.
@@ -84,6 +138,15 @@ class ContactForces:
 class ForceProgram:
     """The cone programs of one grasp: built when first needed, solved for many wrenches.
 
+    For a wrench w on the object, contact forces f_i with normal parts f_n, tangential parts f_t and
+    torsional moments m_i about the inward normals n_i, limits N_i and the grasp map G:
+
+        smallest:  minimise t        subject to  Σ_i (G_i f_i + [m_i n_i; 0]) = w
+        closest:   minimise |r|²     subject to  Σ_i (G_i f_i + [m_i n_i; 0]) + r = w
+        both:      √(|f_t|² + (m_i / radius)²) ≤ μ f_n,   f_n ≤ t N_i  (closest: t = 1)
+
+    (Lobo et al., 3.4; Howe and Cutkosky). For points m_i = 0.
+
     The unknowns x are m per contact: the three components of its force along the axes of the
     contact, the tangential ones divided by the friction coefficient mu, and for a patch its
     torsional moment, divided by mu and the torsion radius. So every cone is
@@ -92,48 +155,30 @@ class ForceProgram:
     are in units of the largest one.
     """
 
-    def __init__(
-        self,
-        p_OQ: npt.ArrayLike,
-        nhat_Q_O: npt.ArrayLike,
-        p_OOcm: npt.ArrayLike,
-        friction: float,
-        *,
-        force_limit: npt.ArrayLike = 1.0,
-        torsion_radius: float = 0.0,
-    ) -> None:
-        """Compute the map from the unknowns to the wrench.
-
-        Args:
-            p_OQ: (k, 3), contact points in {O} [m].
-            nhat_Q_O: (k, 3), normals out of the object in {O}.
-            p_OOcm: (3,), centre of mass in {O} [m].
-            friction: Coulomb coefficient, zero or more.
-            force_limit: (k,), largest normal force of each contact, or one for all, positive [N].
-            torsion_radius: Of the contacts' patches [m]; 0 for points.
-        """
+    def __init__(self, contacts: GraspContacts, friction: float) -> None:
+        """Compute the map from the unknowns to the wrench, for a Coulomb coefficient."""
         # Units of torque and force.
-        p_OcmQ = np.asarray(p_OQ, dtype=float) - np.asarray(p_OOcm, dtype=float)
+        p_OcmQ, radius = contacts.p_OcmQ, contacts.torsion_radius
         self._k = len(p_OcmQ)
         arm = float(np.linalg.norm(p_OcmQ, axis=1).max())
         self._units = np.repeat([arm or 1.0, 1.0], 3)
 
         # Forces and moments of the unknowns, (k, 3, m) each.
-        axes, self._m = contact_axes(nhat_Q_O), 4 if torsion_radius > 0.0 else 3
+        axes, self._m = contact_axes(contacts.nhat_Q_O), 4 if radius > 0.0 else 3
         self._force = np.zeros((self._k, 3, self._m))
         self._force[:, :, :3] = axes * [1.0, friction, friction]
         self._moment = np.zeros_like(self._force)
-        self._moment[:, :, 3:] = friction * torsion_radius * axes[:, :, :1]
+        self._moment[:, :, 3:] = friction * radius * axes[:, :, :1]
 
         # The wrench is A @ x.
-        blocks = grasp_map(p_OcmQ, np.zeros(3)).reshape(6, self._k, 3)
+        blocks = grasp_map(p_OcmQ).reshape(6, self._k, 3)
         A = np.einsum("wki,kij->wkj", blocks, self._force)
         A[:3] += self._moment.transpose(1, 0, 2)
         A = A.reshape(6, -1) / self._units[:, None]
         # Contacts that are not finite hold nothing; a map of zeros says the same.
         self._map = A if np.isfinite(A).all() else np.zeros_like(A)
 
-        self._limit = np.broadcast_to(np.asarray(force_limit, dtype=float), (self._k,))
+        self._limit = np.broadcast_to(np.asarray(contacts.force_limit, dtype=float), (self._k,))
         self._largest = float(self._limit.max())
 
     def smallest(self, wrench_O: npt.ArrayLike) -> ContactForces:
@@ -281,15 +326,15 @@ def contact_axes(nhat_Q_O: npt.ArrayLike) -> Array:
     return np.stack([inward, first, np.cross(inward, first)], axis=2)
 
 
-def grasp_map(p_OQ: npt.ArrayLike, p_OOcm: npt.ArrayLike) -> Array:
+def grasp_map(p_OcmQ: Array) -> Array:
     """Return the grasp map G (6, 3k): wrench = G @ f for forces f (3k,), contact by contact.
 
+    The block of a contact with the arm p is G_i = [[p]×; 1], with [p]× f = p × f.
+
     Args:
-        p_OQ: (k, 3), contact points in {O} [m].
-        p_OOcm: (3,), the centre of mass in {O} [m].
+        p_OcmQ: (k, 3), arms of the contacts about the centre of mass [m].
     """
-    arms = np.asarray(p_OQ, dtype=float) - np.asarray(p_OOcm, dtype=float)
     # Column j of a block is the moment of the unit force along axis j.
     with np.errstate(invalid="ignore"):
-        moments = np.cross(arms[:, None, :], np.eye(3)).transpose(2, 0, 1).reshape(3, -1)
-    return np.vstack([moments, np.tile(np.eye(3), len(arms))])
+        moments = np.cross(p_OcmQ[:, None, :], np.eye(3)).transpose(2, 0, 1).reshape(3, -1)
+    return np.vstack([moments, np.tile(np.eye(3), len(p_OcmQ))])

@@ -24,13 +24,13 @@ from scipy.spatial.transform import Rotation
 from drakegrasp.config import Config
 from drakegrasp.errors import first_line
 from drakegrasp.frames import X_WT, Array, invert_pose, rotation_angle
-from drakegrasp.simulation.scene import Scene, advance, reset_object
+from drakegrasp.simulation.scene import ObjectScene, advance, reset_object
 from drakegrasp.simulation.stepping import StateError
 from drakegrasp.simulation.trajectory import LiftPath, carrying_force, lift_path
 from drakegrasp.verification.forces.contact_forces import (
     ForceProgram,
+    GraspContacts,
     hardest_forces,
-    patch_torsion_radius,
 )
 
 #: Time steps of the simulation per solution of the contact forces. Between two solutions the
@@ -92,13 +92,7 @@ class ForceLift:
 
 
 def lift_by_forces(
-    scene: Scene,
-    X_TO: npt.ArrayLike,
-    p_OQ: npt.ArrayLike,
-    nhat_Q_O: npt.ArrayLike,
-    *,
-    force_limit: npt.ArrayLike,
-    config: Config,
+    scene: ObjectScene, X_TO: npt.ArrayLike, contacts: GraspContacts, config: Config
 ) -> ForceLift:
     """Return what happens when forces at contact points lift the object.
 
@@ -107,29 +101,15 @@ def lift_by_forces(
     ran before.
 
     Args:
-        scene: Of the object, without a hand.
+        scene: Of the object; a hand would be in the way.
         X_TO: Resting pose of the object, (4, 4).
-        p_OQ: (k, 3), contact points in {O} [m].
-        nhat_Q_O: (k, 3), unit normals out of the object in {O}.
-        force_limit: (k,), largest normal force of each contact [N], as `strength.fingertip_forces`.
+        contacts: Where the forces act, and how large they may be.
         config: Physics, lift and limits.
-
-    Raises:
-        ValueError: If the scene has a hand.
     """
-    if scene.handles is not None:
-        raise ValueError("the scene must have no hand, got one with a hand")
-
     # Are there forces within the limit at all?
     path = lift_path(X_TO, config)
-    program = ForceProgram(
-        p_OQ,
-        nhat_Q_O,
-        scene.model.p_OOcm,
-        scene.model.own_physics(config.physics).friction_hand,
-        force_limit=force_limit,
-        torsion_radius=patch_torsion_radius(len(np.asarray(p_OQ))),
-    )
+    friction = scene.model.own_physics(config.physics).friction_hand
+    program = ForceProgram(contacts, friction)
     needed = hardest_forces(program, path.wrenches(scene.model))
     force = float(needed.normal[np.argmax(needed.shares)])
     planned = ForceLift(end=LiftEnd.INFEASIBLE, planned_force=force, planned_share=needed.share)
@@ -139,7 +119,7 @@ def lift_by_forces(
         return replace(planned, end=LiftEnd.OVER_LIMIT)
 
     # Simulate the lift.
-    fingers = _Fingers(scene, np.asarray(p_OQ, dtype=float), program)
+    fingers = _Fingers(scene, np.asarray(contacts.p_OQ, dtype=float), program)
     try:
         return _simulate(fingers, planned, path, config)
     except (MemoryError, OSError):
@@ -155,7 +135,7 @@ def lift_by_forces(
 class _Fingers:
     """Applies contact forces to the object at points that are fixed to it."""
 
-    scene: Scene
+    scene: ObjectScene
     p_OQ: Array  # (k, 3) [m]
     program: ForceProgram
 
@@ -229,7 +209,7 @@ def _simulate(fingers: _Fingers, planned: ForceLift, path: LiftPath, config: Con
     )
 
 
-def _deviation(scene: Scene, path: LiftPath) -> tuple[float, float]:
+def _deviation(scene: ObjectScene, path: LiftPath) -> tuple[float, float]:
     """Return the object's distance from its path [m], and its angle to it [rad]."""
     X_WO = scene.pose(scene.object)
     p, _, _ = path.at(scene.time)
@@ -243,12 +223,16 @@ def _within(deviation: tuple[float, float], config: Config, times: float) -> boo
     return all(d <= times * limit for d, limit in zip(deviation, allowed, strict=True))
 
 
-def _wanted_wrench(scene: Scene, path: LiftPath, frequency: float) -> Array:
+def _wanted_wrench(scene: ObjectScene, path: LiftPath, frequency: float) -> Array:
     """Return the wrench (6,) about Ocm in {O} that keeps the object on its path [N m, N].
 
     It balances gravity and inertia, and corrects errors of position and orientation by critically
-    damped feedback: an error e gives the acceleration omega^2 e + 2 omega de/dt, with the natural
-    frequency omega [rad/s].
+    damped feedback of the natural frequency ω [rad/s]. With the path's acceleration a*, the errors
+    e of position and θ of orientation (a rotation vector), the object's angular velocity Ω, its
+    mass m and its inertia I about the centre of mass:
+
+        F = m (a* + ω² e + 2 ω de/dt + g ẑ)
+        τ = I (ω² θ − 2 ω Ω) + Ω × I Ω   (Euler; the path does not turn)
     """
     # The object's motion, and that of the path.
     model = scene.model

@@ -19,17 +19,14 @@ from scipy.spatial import ConvexHull, QhullError
 
 from drakegrasp.config import Config
 from drakegrasp.frames import Array
-from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.trajectory import lift_path
 from drakegrasp.verification.forces.contact_forces import (
     ForceProgram,
+    GraspContacts,
     contact_axes,
     grasp_map,
     hardest_forces,
-    patch_torsion_radius,
 )
 
 #: Edges of the pyramid that approximates a friction cone from inside. With 16, epsilon is about
@@ -64,42 +61,38 @@ def characteristic_length(vertices: npt.ArrayLike, p_OOcm: npt.ArrayLike) -> flo
     return float(np.linalg.norm(arms, axis=1).max())
 
 
-def ferrari_canny(
-    p_OQ: npt.ArrayLike,
-    nhat_Q_O: npt.ArrayLike,
-    p_OOcm: npt.ArrayLike,
-    *,
-    friction: float,
-    length: float,
-    torsion_radius: float = 0.0,
-) -> float:
+def ferrari_canny(contacts: GraspContacts, *, friction: float, length: float) -> float:
     """Return the epsilon of a grasp: the smallest wrench that can break it.
 
     The L1 version of C. Ferrari and J. Canny, "Planning optimal grasps", ICRA 1992: the
     distance of the origin from the surface of the convex hull of all contacts' friction
     cones with unit normal forces, that is, for normal forces that sum to one. Each cone is
-    approximated by a pyramid of `FRICTION_EDGES` edges.
+    approximated by a pyramid of `FRICTION_EDGES` edges. Edge e of contact i, with the inward normal
+    n_i, the tangents t, the arm p_i, the length L and the torsion radius r, has the wrench
+
+        w_ie = [(p_i × f_ie + μ r sin(β_e) n_i) / L; f_ie],
+        f_ie = n_i + μ cos(β_e) (cos(α_e) t_i1 + sin(α_e) t_i2),   β_e = 0 for points,
+
+    and, with the origin inside their hull, ε = min over |u| = 1 of max over i, e of u·w_ie.
 
     Args:
-        p_OQ: (k, 3), contact points in {O} [m].
-        nhat_Q_O: (k, 3), normals out of the object in {O}.
-        p_OOcm: (3,), the centre of mass in {O} [m].
+        contacts: Of the grasp.
         friction: Coulomb coefficient.
         length: Length by which torques are divided [m], see `characteristic_length`.
-        torsion_radius: Of the contacts' patches [m], see `contact_forces`; 0 for points.
 
     Returns:
         Epsilon, without unit; 0 if the origin is not inside the hull, the hull is flat, or a
         number is not finite.
     """
     # Directions of the edges of a contact's cone: tangential forces, and torsional moments.
-    edges = _edges(patch=torsion_radius > 0.0)
-    tangential, torsional = friction * edges[:, :2], friction * torsion_radius * edges[:, 2]
+    radius = contacts.torsion_radius
+    edges = _edges(patch=radius > 0.0)
+    tangential, torsional = friction * edges[:, :2], friction * radius * edges[:, 2]
 
     # Their wrenches, for a normal force of one.
-    axes = contact_axes(nhat_Q_O)
+    axes = contact_axes(contacts.nhat_Q_O)
     forces = axes @ np.column_stack([np.ones(len(edges)), tangential]).T  # (k, 3, edges)
-    blocks = grasp_map(p_OQ, p_OOcm).reshape(6, -1, 3)
+    blocks = grasp_map(contacts.p_OcmQ).reshape(6, -1, 3)
     wrenches = np.einsum("wki,kie->kew", blocks, forces)
     wrenches[..., :3] += axes[:, None, :, 0] * torsional[:, None]
     wrenches = wrenches.reshape(-1, 6)
@@ -145,66 +138,38 @@ class ForceMargin:
 
 
 def force_margin(
-    model: ObjectModel,
-    X_TO: npt.ArrayLike,
-    p_OQ: npt.ArrayLike,
-    nhat_Q_O: npt.ArrayLike,
-    config: Config,
+    model: ObjectModel, X_TO: npt.ArrayLike, contacts: GraspContacts, config: Config
 ) -> ForceMargin:
     """Return the margin of a grasp for the lift of `lift.lift_by_forces`.
 
     Args:
         model: The object.
         X_TO: (4, 4), its resting pose.
-        p_OQ: (k, 3), contact points in {O} [m].
-        nhat_Q_O: (k, 3), normals out of the object in {O}.
-        config: Hand, its drive, friction and lift.
+        contacts: Of the grasp.
+        config: Friction and lift.
     """
-    # What the hand's fingertips can do.
-    hand = load_hand(config.hand)
-    limits = fingertip_forces(hand, drive_of(hand, config.lift))
-    radius = patch_torsion_radius(hand.num_fingers)
-
     return ForceMargin(
-        smallest_friction=smallest_friction(
-            p_OQ,
-            nhat_Q_O,
-            model.p_OOcm,
-            lift_path(X_TO, config).wrenches(model),
-            limits,
-            torsion_radius=radius,
-        ),
+        smallest_friction=smallest_friction(contacts, lift_path(X_TO, config).wrenches(model)),
         epsilon=ferrari_canny(
-            p_OQ,
-            nhat_Q_O,
-            model.p_OOcm,
+            contacts,
             friction=model.own_physics(config.physics).friction_hand,
             length=characteristic_length(model.visual_vertices, model.p_OOcm),
-            torsion_radius=radius,
         ),
     )
 
 
-def smallest_friction(
-    p_OQ: npt.ArrayLike,
-    nhat_Q_O: npt.ArrayLike,
-    p_OOcm: npt.ArrayLike,
-    wrenches_O: npt.ArrayLike,
-    force_limit: npt.ArrayLike,
-    *,
-    torsion_radius: float = 0.0,
-) -> float:
+def smallest_friction(contacts: GraspContacts, wrenches_O: npt.ArrayLike) -> float:
     """Return the smallest friction coefficient at which all wrenches can be applied.
+
+    With t(w, μ) the share of the limits that a wrench takes (`ForceProgram`), it is
+
+        μ* = min {μ : max over w of t(w, μ) ≤ 1}.
 
     The force that is needed never grows with friction, so bisection finds the coefficient.
 
     Args:
-        p_OQ: (k, 3), contact points in {O} [m].
-        nhat_Q_O: (k, 3), normals out of the object in {O}.
-        p_OOcm: (3,), centre of mass in {O} [m].
+        contacts: Of the grasp.
         wrenches_O: (n, 6), each torque about Ocm and force on the object in {O} [N m, N].
-        force_limit: (k,), largest normal force of each contact, or one for all [N].
-        torsion_radius: Of the contacts' patches [m], see `contact_forces`; 0 for points.
 
     Returns:
         The coefficient, rounded up by at most `FRICTION_TOLERANCE`; inf if `MAX_FRICTION` is not
@@ -212,15 +177,7 @@ def smallest_friction(
     """
 
     def holds(friction: float) -> bool:
-        program = ForceProgram(
-            p_OQ,
-            nhat_Q_O,
-            p_OOcm,
-            friction,
-            force_limit=force_limit,
-            torsion_radius=torsion_radius,
-        )
-        return hardest_forces(program, wrenches_O).share <= 1.0
+        return hardest_forces(ForceProgram(contacts, friction), wrenches_O).share <= 1.0
 
     low, high = 0.0, MAX_FRICTION
     if not holds(high):

@@ -174,7 +174,10 @@ def _features(p: Array, n: Array) -> Array:
 def _align(p_GP: Array, n_G: Array, p_OQ: Array, n_O: Array) -> tuple[Array, Array]:
     """Return the palm poses that bring N sets of contacts closest to the given ones.
 
-    Kabsch (1976), on the points and on points `LEVER` along the normals.
+    Kabsch (1976), on the points and on points `LEVER` along the normals: with the centred sets A
+    and B as rows, AᵀB = U Σ Vᵀ, the sum Σ_i |R a_i + p − b_i|² is smallest for
+
+        R = V diag(1, 1, det(U Vᵀ)) Uᵀ,   p = mean(b) − R mean(a).
 
     Args:
         p_GP: (N, k, 3), points of the postures in {G} [m].

@@ -135,6 +135,17 @@ def nearest_on_pads(pads: Pads, p_FiQ: Array) -> Array:
 def signed_distance(pads: Pads, p_FiQ: Array) -> PadContact:
     """Return the smooth signed distance of each point from its pad, with derivatives.
 
+    With the heights h_j = n_j·p − d_j of a point p over the face planes and the rounding s:
+
+        φ = s log Σ_j exp(h_j / s),   max h_j ≤ φ ≤ max h_j + s log M for M planes
+        w_j = exp(h_j / s) / Σ exp(h_j / s)
+        g = ∇φ = Σ_j w_j n_j
+        H = ∇∇φ = (Σ_j w_j n_j n_jᵀ − g gᵀ) / s
+        m = g / |g|,   ∂m/∂p = (1 − m mᵀ) H / |g|
+
+    (Boyd and Vandenberghe, 3.1.5), and outside of a half-space n·p ≥ d of the pad region by
+    o = max(0, d − n·p).
+
     Args:
         pads: Of k fingertips.
         p_FiQ: (k, 3), a point in each fingertip's frame [m].

@@ -207,11 +207,18 @@ def _rotation(angles: Array) -> tuple[Array, Array]:
 def _forward(constants: HandConstants, coordinates: Array) -> tuple[Array, Array, Array, Array]:
     """Return X_GFi (k, 4, 4), and each joint's axis, direction and origin (m, k, 3) in {G}.
 
-    A joint that slides has no axis, and one that turns no direction: they are zero.
+    A joint that slides has no axis, and one that turns no direction: they are zero. From the palm
+    outwards the poses are
+
+        X_GF = Π_j X_PJ(j) M_j(q_j) · X_JF,   q_j = Σ_c gain_jc c + offset_j,
+        M(q) = 1 + sin(q) K + (1 − cos(q)) K K   (Rodrigues; turns)
+        M(q) = 1 + q K                           (slides)
+
+    with the 4 × 4 matrix K of the joint's motion per position: the cross product by its axis, or
+    the translation along its direction, whose square is zero.
     """
-    # Rodrigues' formula R = 1 + sin(q) K + (1 - cos(q)) K K, as poses. `frames.rotation_about` has
-    # one axis for all angles; here each joint has its own, and K K is computed once per hand. The
-    # square of a translation's matrix is zero.
+    # `frames.rotation_about` has one axis for all angles; here each joint has its own, and K K is
+    # computed once per hand.
     q = (constants.gain @ coordinates + constants.offset)[..., None, None]  # (m, k, 1, 1)
     first = np.where(constants.slides[..., None, None], q, np.sin(q))
     motion = np.eye(4) + first * constants.twist + (1.0 - np.cos(q)) * constants.twist2
@@ -232,6 +239,14 @@ def _closing_direction(
     constants: HandConstants, p_GQ: Array, axes: Array, arms: Array, velocity: Array
 ) -> tuple[Array, Array]:
     """Return the unit direction in which each fingertip moves at Q when its finger closes.
+
+    With the axes a_j, directions s_j and origins o_j of the finger's joints, and the joints' motion
+    κ_j per closing position:
+
+        arm_j = a_j × (Q − o_j) + s_j,   V = Σ_j κ_j arm_j,   v = V / |V|
+        ∂V/∂(palm) = − Ω × dQ,   Ω = Σ_j κ_j a_j, with dQ the fingertip's motion at Q
+        ∂V/∂q_j = Σ_{l>j} κ_l (a_j × arm_l − a_l × arm_j)
+        dv = (1 − v vᵀ) dV / |V|
 
     Args:
         constants: Of the hand.

@@ -142,7 +142,8 @@ def solve(problem: WristProblem) -> WristFit:
 def _refine(problem: WristProblem, coordinates: Array) -> tuple[Evaluation, Array]:
     """Close or open each finger until its pad meets its point; the palm does not move.
 
-    Newton's method on the distance of each finger from its point, by its own closing angle.
+    Newton's method on the distance φ_i of each finger from its point, by its own closing position:
+    c_i ← c_i − φ_i / (∂φ_i/∂c_i), within the limits, as long as Σ |φ_i| falls.
 
     Args:
         problem: With its start at the palm's pose.
@@ -174,9 +175,13 @@ def _refine(problem: WristProblem, coordinates: Array) -> tuple[Evaluation, Arra
 class _ScaledProblem:
     """The problem in scaled unknowns y with x = x_S + S y, as SLSQP needs it.
 
-    S is the inverse square root of the Gauss-Newton matrix at the start x_S. SLSQP's first step
-    assumes an identity Hessian, so in y it is the Gauss-Newton step. The last evaluation is kept,
-    because SLSQP asks for objective and constraints at the same point.
+    S is an inverse square root of the Gauss-Newton matrix H at the start x_S: with the residuals'
+    Jacobian J there, n unknowns, the unit U (`UNIT`) and λ (`DAMPING`),
+
+        H₀ = 2 Jᵀ J / U,   H = H₀ + λ tr(H₀)/n · 1 = L Lᵀ (Cholesky),   S = L⁻ᵀ,   Sᵀ H S = 1.
+
+    SLSQP's first step assumes an identity Hessian, so in y it is the Gauss-Newton step. The last
+    evaluation is kept, because SLSQP asks for objective and constraints at the same point.
     """
 
     def __init__(self, problem: WristProblem) -> None:

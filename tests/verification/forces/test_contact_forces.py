@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from drakegrasp.verification.forces.contact_forces import (
     ContactForces,
     ForceProgram,
+    GraspContacts,
     contact_axes,
     grasp_map,
     hardest_forces,
@@ -37,7 +38,7 @@ def ring(k: int, radius: float = 0.04) -> tuple[np.ndarray, np.ndarray]:
 
 def smallest_forces(p, n, p_OOcm, wrench, friction, **limits) -> ContactForces:
     """Return the smallest forces of one wrench."""
-    return ForceProgram(p, n, p_OOcm, friction, **limits).smallest(wrench)
+    return ForceProgram(GraspContacts(p, n, p_OOcm, **limits), friction).smallest(wrench)
 
 
 #: Two contacts on one face of a box, one in the middle of the opposite face.
@@ -94,7 +95,7 @@ def test_forces_stay_in_their_cones_and_sum_to_the_wrench(seed, k):
     forces = smallest_forces(p, n, p_OOcm, wrench, MU)
     assert forces.feasible
     assert_in_cones(forces, n, MU)
-    assert np.allclose(grasp_map(p, p_OOcm) @ forces.f_Q_O.ravel(), wrench, atol=1e-6)
+    assert np.allclose(grasp_map(p - p_OOcm) @ forces.f_Q_O.ravel(), wrench, atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -103,7 +104,7 @@ def test_linear_programme_with_pyramids_needs_hardly_more(seed):
     p, n, p_OOcm = some_grasp(seed)
     angles = 2.0 * np.pi * np.arange(64) / 64
     pyramid = np.stack([np.ones(64), MU * np.cos(angles), MU * np.sin(angles)])
-    blocks = grasp_map(p, p_OOcm).reshape(6, 3, 3)
+    blocks = grasp_map(p - p_OOcm).reshape(6, 3, 3)
     edges = np.einsum("wki,kie->wke", blocks, contact_axes(n) @ pyramid).reshape(6, -1)
     found = linprog(
         np.append(np.zeros(edges.shape[1]), 1.0),
@@ -131,12 +132,12 @@ def test_forces_move_and_turn_with_the_frame(seed):
 
 def test_one_programme_serves_all_wrenches_in_any_order():
     p, n, p_OOcm = some_grasp(3)
-    program = ForceProgram(p, n, p_OOcm, MU, force_limit=20.0)
+    program = ForceProgram(GraspContacts(p, n, p_OOcm, force_limit=20.0), MU)
     heavy = program.smallest(2.0 * CARRY)
     program.closest([1.0, 0.0, 0.0, 0.0, 0.0, 100.0])
     light = program.smallest(CARRY)
     assert heavy.largest_normal == pytest.approx(2.0 * light.largest_normal, rel=1e-6)
-    alone = ForceProgram(p, n, p_OOcm, MU).smallest(CARRY)
+    alone = ForceProgram(GraspContacts(p, n, p_OOcm), MU).smallest(CARRY)
     assert np.array_equal(light.f_Q_O, alone.f_Q_O)
 
 
@@ -165,11 +166,11 @@ def test_grasp_that_cannot_carry_the_object_says_so(p, n):
     assert not forces.feasible
     assert forces.largest_normal == np.inf
     assert np.isnan(forces.f_Q_O).all()
-    assert smallest_friction(p, n, ORIGIN, [CARRY], 20.0) == np.inf
+    assert smallest_friction(GraspContacts(p, n, ORIGIN, 20.0), [CARRY]) == np.inf
 
 
 def test_wrench_that_is_not_finite_cannot_be_given():
-    program = ForceProgram(*PINCH, ORIGIN, MU)
+    program = ForceProgram(GraspContacts(*PINCH, ORIGIN), MU)
     assert not program.smallest(CARRY * np.nan).feasible
     assert not program.closest(CARRY * np.nan).feasible
 
@@ -180,15 +181,15 @@ def test_pinch_without_friction_cannot_carry():
 
 def test_closest_forces_give_a_wrench_that_is_within_the_limit():
     p, n, p_OOcm = some_grasp(1)
-    forces = ForceProgram(p, n, p_OOcm, MU, force_limit=20.0).closest(CARRY)
+    forces = ForceProgram(GraspContacts(p, n, p_OOcm, force_limit=20.0), MU).closest(CARRY)
     assert_in_cones(forces, n, MU)
-    assert np.allclose(grasp_map(p, p_OOcm) @ forces.f_Q_O.ravel(), CARRY, atol=1e-3)
+    assert np.allclose(grasp_map(p - p_OOcm) @ forces.f_Q_O.ravel(), CARRY, atol=1e-3)
 
 
 def test_closest_forces_to_a_load_that_is_too_heavy_are_at_the_limit():
     """Three contacts around a cylinder carry at most 3 mu times the limit."""
     p, n = ring(3)
-    forces = ForceProgram(p, n, ORIGIN, MU, force_limit=20.0).closest(100.0 * CARRY)
+    forces = ForceProgram(GraspContacts(p, n, ORIGIN, force_limit=20.0), MU).closest(100.0 * CARRY)
     assert not forces.feasible
     assert_in_cones(forces, n, MU)
     assert forces.largest_normal == pytest.approx(20.0, rel=1e-5)
@@ -198,13 +199,13 @@ def test_closest_forces_to_a_load_that_is_too_heavy_are_at_the_limit():
 def test_no_forces_within_friction_are_closer_than_the_closest():
     p, n, p_OOcm = some_grasp(4)
     wrench = np.array([0.8, -0.5, 1.0, 30.0, -10.0, 40.0])
-    forces = ForceProgram(p, n, p_OOcm, MU, force_limit=20.0).closest(wrench)
+    forces = ForceProgram(GraspContacts(p, n, p_OOcm, force_limit=20.0), MU).closest(wrench)
     assert_in_cones(forces, n, MU)
     arm = np.linalg.norm(p - p_OOcm, axis=1).max()
     units = np.repeat([arm, 1.0], 3)
 
     def error(f_Q_O: np.ndarray) -> float:
-        return float(np.linalg.norm((grasp_map(p, p_OOcm) @ f_Q_O.ravel() - wrench) / units))
+        return float(np.linalg.norm((grasp_map(p - p_OOcm) @ f_Q_O.ravel() - wrench) / units))
 
     rng = np.random.default_rng(0)
     for _ in range(500):
@@ -221,7 +222,7 @@ def test_no_forces_within_friction_are_closer_than_the_closest():
 @pytest.mark.parametrize("limit", [5.0, 20.0])
 def test_smallest_friction_of_a_ring_is_its_share_of_the_weight(limit):
     p, n = ring(3)
-    friction = smallest_friction(p, n, ORIGIN, [CARRY, 0.5 * CARRY], limit)
+    friction = smallest_friction(GraspContacts(p, n, ORIGIN, limit), [CARRY, 0.5 * CARRY])
     exact = WEIGHT / (3.0 * limit)
     assert exact <= friction <= exact + FRICTION_TOLERANCE * (1.0 + 1e-6)
 
@@ -230,21 +231,25 @@ def test_smallest_friction_of_a_ring_is_its_share_of_the_weight(limit):
 def test_smallest_friction_is_where_the_force_limit_is_met(seed):
     p, n, p_OOcm = some_grasp(seed)
     loads = np.array([1.1 * CARRY, 0.9 * CARRY])
-    friction = smallest_friction(p, n, p_OOcm, loads, 20.0)
-    at = hardest_forces(ForceProgram(p, n, p_OOcm, friction), loads).largest_normal
-    below = hardest_forces(ForceProgram(p, n, p_OOcm, friction - 2e-4), loads).largest_normal
+    friction = smallest_friction(GraspContacts(p, n, p_OOcm, 20.0), loads)
+    at = hardest_forces(ForceProgram(GraspContacts(p, n, p_OOcm), friction), loads).largest_normal
+    below = hardest_forces(
+        ForceProgram(GraspContacts(p, n, p_OOcm), friction - 2e-4), loads
+    ).largest_normal
     assert at <= 20.0 < below
 
 
 def test_smallest_friction_is_nothing_for_a_finger_below():
-    friction = smallest_friction([[0.0, 0.0, -0.03]], [[0.0, 0.0, -1.0]], ORIGIN, [CARRY], 20.0)
+    friction = smallest_friction(
+        GraspContacts([[0.0, 0.0, -0.03]], [[0.0, 0.0, -1.0]], ORIGIN, 20.0), [CARRY]
+    )
     assert friction <= FRICTION_TOLERANCE
 
 
 def test_smallest_friction_is_infinite_where_the_limit_is_too_low():
     p, n = ring(3)
     limit = 0.99 * WEIGHT / (3.0 * MAX_FRICTION)
-    assert smallest_friction(p, n, ORIGIN, [CARRY], limit) == np.inf
+    assert smallest_friction(GraspContacts(p, n, ORIGIN, limit), [CARRY]) == np.inf
 
 
 def test_weak_finger_is_spared():
@@ -273,7 +278,9 @@ def test_no_forces_take_a_smaller_share_of_unequal_limits():
 def test_closest_forces_keep_to_the_limit_of_each_finger():
     p, n = ring(3)
     limits = np.array([5.0, 20.0, 20.0])
-    forces = ForceProgram(p, n, ORIGIN, MU, force_limit=limits).closest(100.0 * CARRY)
+    forces = ForceProgram(GraspContacts(p, n, ORIGIN, force_limit=limits), MU).closest(
+        100.0 * CARRY
+    )
     assert np.all(forces.normal <= limits * (1.0 + 1e-6))
     assert forces.normal[0] == pytest.approx(5.0, rel=1e-4)
 
@@ -318,7 +325,9 @@ def test_patches_are_for_hands_that_points_cannot_hold_with():
 
 def test_smallest_friction_of_two_patches_is_their_closed_form():
     p, n = two_pads(0.004)
-    friction = smallest_friction(p, n, ORIGIN, [CARRY], [20.0, 30.0], torsion_radius=0.003)
-    assert smallest_friction(p, n, ORIGIN, [CARRY], [20.0, 30.0]) == np.inf
+    friction = smallest_friction(
+        GraspContacts(p, n, ORIGIN, [20.0, 30.0], torsion_radius=0.003), [CARRY]
+    )
+    assert smallest_friction(GraspContacts(p, n, ORIGIN, [20.0, 30.0]), [CARRY]) == np.inf
     exact = WEIGHT / 2.0 * np.hypot(1.0, 4.0 / 3.0) / 20.0
     assert friction == pytest.approx(exact, abs=2e-4)

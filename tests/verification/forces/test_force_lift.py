@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from helpers.objects import CUBE, box_model, standing
 from scipy.spatial.transform import Rotation
@@ -14,11 +15,15 @@ from drakegrasp.frames import X_WT, make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.simulation.construction import build_scene
-from drakegrasp.simulation.scene import Scene, advance, reset_object
+from drakegrasp.simulation.construction import build_object_scene
+from drakegrasp.simulation.scene import ObjectScene, advance, reset_object
 from drakegrasp.simulation.trajectory import PEAK_ACCELERATION, lift_duration, lift_path
 from drakegrasp.verification.forces import lift as force_lift_module
-from drakegrasp.verification.forces.contact_forces import patch_torsion_radius
+from drakegrasp.verification.forces.contact_forces import (
+    GraspContacts,
+    hand_contacts,
+    patch_torsion_radius,
+)
 from drakegrasp.verification.forces.lift import ForceLift, LiftEnd, lift_by_forces
 from drakegrasp.verification.forces.quality import force_margin
 
@@ -42,13 +47,26 @@ def cube(tmp_path_factory) -> ObjectModel:
 
 
 @pytest.fixture(scope="module")
-def scene(cube, config) -> Scene:
-    return build_scene(cube, config.physics)
+def scene(cube, config) -> ObjectScene:
+    return build_object_scene(cube, config.physics)
+
+
+def lifted(
+    scene: ObjectScene,
+    config: Config,
+    p: npt.ArrayLike = P,
+    n: npt.ArrayLike = N,
+    limit: npt.ArrayLike = LIMIT,
+    X_TO: np.ndarray | None = None,
+) -> ForceLift:
+    """Lift the cube of a scene by forces at contacts."""
+    contacts = GraspContacts(p, n, scene.model.p_OOcm, limit, patch_torsion_radius(len(p)))
+    return lift_by_forces(scene, standing(scene.model) if X_TO is None else X_TO, contacts, config)
 
 
 @pytest.fixture(scope="module")
 def held(scene, cube, config) -> ForceLift:
-    return lift_by_forces(scene, standing(cube), P, N, force_limit=LIMIT, config=config)
+    return lifted(scene, config)
 
 
 def heaviest(config: Config) -> float:
@@ -76,18 +94,20 @@ def test_forces_of_the_lift_are_the_closed_form(held, config):
 
 
 def test_more_friction_than_the_smallest_holds_and_less_does_not(scene, cube, config):
-    smallest = force_margin(cube, standing(cube), P, N, config).smallest_friction
+    smallest = force_margin(
+        cube, standing(cube), hand_contacts(cube, P, N, config), config
+    ).smallest_friction
     for factor, outcome in ((1.001, LiftEnd.HELD), (0.999, LiftEnd.OVER_LIMIT)):
         friction = factor * smallest
         changed = load_config(overrides=[f"physics.friction_hand={friction}"])
         limits = fingertip_forces(load_hand(), "worm")
-        found = lift_by_forces(scene, standing(cube), P, N, force_limit=limits, config=changed)
+        found = lifted(scene, changed, limit=limits)
         assert found.end is outcome
 
 
-def test_slippery_cube_takes_more_than_a_fingertip_can_give(scene, cube):
+def test_slippery_cube_takes_more_than_a_fingertip_can_give(scene):
     slippery = load_config(overrides=["physics.friction_hand=0.05"])
-    found = lift_by_forces(scene, standing(cube), P, N, force_limit=LIMIT, config=slippery)
+    found = lifted(scene, slippery)
     assert found.end is LiftEnd.OVER_LIMIT
     assert not found.held
     assert found.planned_force == pytest.approx(heaviest(slippery) / 0.1, rel=1e-6)
@@ -98,11 +118,14 @@ def test_slippery_cube_takes_more_than_a_fingertip_can_give(scene, cube):
 
 def test_friction_of_the_object_wins_over_the_configured_one(cube, config):
     slippery = replace(cube, friction=0.05)
-    bare = build_scene(slippery, config.physics)
+    bare = build_object_scene(slippery, config.physics)
     assert bare.physics.friction_hand == bare.physics.friction_table == 0.05
-    found = lift_by_forces(bare, standing(cube), P, N, force_limit=LIMIT, config=config)
+    found = lifted(bare, config)
     assert found.planned_force == pytest.approx(heaviest(config) / 0.1, rel=1e-6)
-    margins = [force_margin(model, standing(cube), P, N, config) for model in (cube, slippery)]
+    margins = [
+        force_margin(model, standing(cube), hand_contacts(model, P, N, config), config)
+        for model in (cube, slippery)
+    ]
     assert margins[1].epsilon < margins[0].epsilon
 
 
@@ -115,8 +138,8 @@ def test_friction_of_the_object_wins_over_the_configured_one(cube, config):
         (P * np.nan, N),
     ],
 )
-def test_contacts_that_cannot_carry_the_cube_are_infeasible(scene, cube, config, p, n):
-    found = lift_by_forces(scene, standing(cube), p, n, force_limit=LIMIT, config=config)
+def test_contacts_that_cannot_carry_the_cube_are_infeasible(scene, config, p, n):
+    found = lifted(scene, config, p, n)
     assert found.end is LiftEnd.INFEASIBLE
     assert found.planned_force == np.inf
 
@@ -125,24 +148,24 @@ def test_turned_cube_is_held_as_well(scene, cube, config, held):
     """Turned about the vertical, with the contacts of {O}; no figure may change."""
     X_TO = standing(cube)
     X_TO[:3, :3] = Rotation.from_rotvec([0.0, 0.0, 0.7]).as_matrix()
-    found = lift_by_forces(scene, X_TO, P, N, force_limit=LIMIT, config=config)
+    found = lifted(scene, config, X_TO=X_TO)
     assert found.held
     assert found.planned_force == pytest.approx(held.planned_force, rel=1e-6)
     assert np.allclose(found.X_TO_lifted[:3, :3], X_TO[:3, :3], atol=1e-3)
 
 
-def test_lift_keeps_its_speed_and_its_straight_path(scene, cube, config, monkeypatch):
+def test_lift_keeps_its_speed_and_its_straight_path(scene, config, monkeypatch):
     heights: list[float] = []
     sideways: list[float] = []
 
-    def watch(scene: Scene, duration: float) -> None:
+    def watch(scene: ObjectScene, duration: float) -> None:
         advance(scene, duration)
         p = scene.pose(scene.object)[:3, 3]
         heights.append(p[2])
         sideways.append(float(np.abs(p[:2]).max()))
 
     monkeypatch.setattr(force_lift_module, "advance", watch)
-    found = lift_by_forces(scene, standing(cube), P, N, force_limit=LIMIT, config=config)
+    found = lifted(scene, config)
     assert found.held
     assert len(heights) == found.steps
     step = config.physics.time_step * force_lift_module.STEPS_PER_CONTROL
@@ -154,7 +177,7 @@ def test_lift_keeps_its_speed_and_its_straight_path(scene, cube, config, monkeyp
 def test_object_that_is_heavier_than_believed_is_lost(scene, cube, config, limit):
     """The forces are computed for a tenth of the mass, the simulation has all of it."""
     deceived = replace(scene, model=replace(cube, mass=0.1, I_OOcm_O=0.1 * cube.I_OOcm_O))
-    found = lift_by_forces(deceived, standing(cube), P, N, force_limit=limit, config=config)
+    found = lifted(deceived, config, limit=limit)
     assert found.planned_force < limit
     assert found.end is LiftEnd.STRAYED
     assert found.position_error > config.verify.max_position_error
@@ -173,7 +196,7 @@ def test_nudged_cube_is_held_by_a_grasp_and_lost_by_a_balance(
 ):
     """One finger below carries the cube, but nothing turns it back once it leans."""
 
-    def nudge(scene: Scene, duration: float) -> None:
+    def nudge(scene: ObjectScene, duration: float) -> None:
         advance(scene, duration)
         if 1.0 < scene.time < 1.0 + 1.5 * duration:
             velocity = np.zeros(6)
@@ -181,19 +204,19 @@ def test_nudged_cube_is_held_by_a_grasp_and_lost_by_a_balance(
             scene.plant.SetVelocities(scene.context, velocity)
 
     monkeypatch.setattr(force_lift_module, "advance", nudge)
-    found = lift_by_forces(scene, standing(cube), p, n, force_limit=LIMIT, config=config)
+    found = lifted(scene, config, p, n)
     assert found.planned_force < LIMIT
     assert found.end is end
 
 
 def test_same_lift_gives_the_same_bits_whatever_ran_before(scene, cube, config, held):
     deceived = replace(scene, model=replace(cube, mass=0.1))
-    lift_by_forces(deceived, standing(cube), P, N, force_limit=LIMIT, config=config)
-    again = lift_by_forces(scene, standing(cube), P, N, force_limit=LIMIT, config=config)
-    fresh = build_scene(cube, config.physics)
+    lifted(deceived, config)
+    again = lifted(scene, config)
+    fresh = build_object_scene(cube, config.physics)
     for other in (
         again,
-        lift_by_forces(fresh, standing(cube), P, N, force_limit=LIMIT, config=config),
+        lifted(fresh, config),
     ):
         assert np.array_equal(other.X_TO_lifted, held.X_TO_lifted)
         assert other.applied_force == held.applied_force
@@ -202,9 +225,9 @@ def test_same_lift_gives_the_same_bits_whatever_ran_before(scene, cube, config, 
 
 def test_no_force_is_left_behind(scene, cube, config, held):
     """The cube falls from the air as in a scene that never knew a force."""
-    lift_by_forces(scene, standing(cube), P, N, force_limit=LIMIT, config=config)
+    lifted(scene, config)
     heights = []
-    for used in (scene, build_scene(cube, config.physics)):
+    for used in (scene, build_object_scene(cube, config.physics)):
         reset_object(used, X_WT @ make_pose(np.eye(3), [0.0, 0.0, 0.5]))
         used.simulator.Initialize()
         advance(used, 0.1)
@@ -214,27 +237,27 @@ def test_no_force_is_left_behind(scene, cube, config, held):
 
 
 @pytest.mark.parametrize("error", [RuntimeError("broken\nlong story"), SystemExit("abort")])
-def test_error_within_drake_is_an_outcome(scene, cube, config, monkeypatch, error):
+def test_error_within_drake_is_an_outcome(scene, config, monkeypatch, error):
     def fail(*_):
         raise error
 
     monkeypatch.setattr(force_lift_module, "advance", fail)
-    found = lift_by_forces(scene, standing(cube), P, N, force_limit=LIMIT, config=config)
+    found = lifted(scene, config)
     assert found.end is LiftEnd.ERROR
     assert found.message == str(error).splitlines()[0]
     assert not found.held
 
 
-def test_lift_that_takes_too_long_is_a_timeout(scene, cube, config):
+def test_lift_that_takes_too_long_is_a_timeout(scene, config):
     """Computing time, as of an attempt; what was planned is there all the same."""
     hasty = config.model_copy(update={"attempt_seconds": 1e-9})
-    found = lift_by_forces(scene, standing(cube), P, N, force_limit=LIMIT, config=hasty)
+    found = lifted(scene, hasty)
     assert found.end is LiftEnd.TIMEOUT
     assert found.planned_force > 0.0
     assert not found.held
 
 
-def test_limit_is_that_of_the_finger(scene, cube, config):
+def test_limit_is_that_of_the_finger(scene, config):
     """Finger 3 opposes two: it needs twice their force, and only its own limit counts for it."""
     mu = config.physics.friction_hand
     needed = heaviest(config) / (2.0 * mu)
@@ -243,17 +266,17 @@ def test_limit_is_that_of_the_finger(scene, cube, config):
         ([weak, weak, 1.1 * needed], LiftEnd.HELD),
         ([1.1 * needed, 1.1 * needed, weak], LiftEnd.OVER_LIMIT),
     ):
-        found = lift_by_forces(scene, standing(cube), P, N, force_limit=limits, config=config)
+        found = lifted(scene, config, limit=limits)
         assert found.end is outcome
         assert found.planned_force == pytest.approx(needed, rel=1e-4)
         assert found.planned_share == pytest.approx(needed / limits[2], rel=1e-4)
 
 
-def test_two_fingertips_hold_a_cube_beside_its_centre_by_torsion(scene, cube, config):
+def test_two_fingertips_hold_a_cube_beside_its_centre_by_torsion(scene, config):
     """As points they would let it swing about the line between them."""
     p = np.array([[0.004, HALF, 0.0], [0.004, -HALF, 0.0]])
     n = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
-    found = lift_by_forces(scene, standing(cube), p, n, force_limit=[LIMIT, LIMIT], config=config)
+    found = lifted(scene, config, p, n, [LIMIT, LIMIT])
     share = np.hypot(1.0, 0.004 / patch_torsion_radius(2)) / 2.0
     mu = config.physics.friction_hand
     assert found.planned_force == pytest.approx(heaviest(config) * share / mu, rel=1e-4)
@@ -261,17 +284,11 @@ def test_two_fingertips_hold_a_cube_beside_its_centre_by_torsion(scene, cube, co
     assert found.angle_error < 1e-3
 
 
-def test_scene_with_a_hand_is_refused(cube, config):
-    with_hand = build_scene(cube, config.physics, load_hand())
-    with pytest.raises(ValueError, match="must have no hand"):
-        lift_by_forces(with_hand, standing(cube), P, N, force_limit=LIMIT, config=config)
-
-
 @pytest.mark.parametrize(
     ("limit", "found"),
     [("max_position_error", "position_error"), ("max_angle_error_deg", "angle_error")],
 )
-def test_lift_that_ends_beyond_a_limit_has_strayed(scene, cube, config, monkeypatch, limit, found):
+def test_lift_that_ends_beyond_a_limit_has_strayed(scene, config, monkeypatch, limit, found):
     """At each look it is off by 1 mm and 1 degree; the other limit is far above."""
     off = (1e-3, np.deg2rad(1.0))
     monkeypatch.setattr(force_lift_module, "_deviation", lambda *_: off)
@@ -279,7 +296,7 @@ def test_lift_that_ends_beyond_a_limit_has_strayed(scene, cube, config, monkeypa
     for factor, end in ((1.01, LiftEnd.HELD), (0.99, LiftEnd.STRAYED), (0.2, LiftEnd.STRAYED)):
         rules = ["verify.max_position_error=1", "verify.max_angle_error_deg=90"]
         limited = override_config(config, [*rules, f"verify.{limit}={factor * amount}"])
-        ended = lift_by_forces(scene, standing(cube), P, N, force_limit=LIMIT, config=limited)
+        ended = lifted(scene, limited)
         assert ended.end is end
         assert getattr(ended, found) == off[found == "angle_error"]
 

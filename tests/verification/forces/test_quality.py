@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
-from drakegrasp.verification.forces.contact_forces import contact_axes, grasp_map
+from drakegrasp.verification.forces.contact_forces import GraspContacts, contact_axes, grasp_map
 from drakegrasp.verification.forces.quality import (
     FRICTION_EDGES,
     characteristic_length,
@@ -52,7 +52,7 @@ def test_contact_axes_are_right_handed_and_start_with_the_inward_normal():
 def test_grasp_map_sums_forces_and_their_moments_about_the_centre_of_mass():
     p, _, p_OOcm = some_grasp(1)
     forces = np.random.default_rng(1).normal(size=p.shape)
-    wrench = grasp_map(p, p_OOcm) @ forces.ravel()
+    wrench = grasp_map(p - p_OOcm) @ forces.ravel()
     assert np.allclose(wrench[:3], np.cross(p - p_OOcm, forces).sum(axis=0))
     assert np.allclose(wrench[3:], forces.sum(axis=0))
 
@@ -70,7 +70,7 @@ def test_epsilon_of_six_contacts_on_a_cube_is_its_closed_form():
     three such parts of a unit vector is smallest, sqrt(2/3), on the diagonal. The inscribed
     pyramids lose at most 1 - cos(pi / edges).
     """
-    epsilon = ferrari_canny(CUBE, CUBE, np.zeros(3), friction=0.1, length=1.0)
+    epsilon = ferrari_canny(GraspContacts(CUBE, CUBE, np.zeros(3)), friction=0.1, length=1.0)
     exact = 0.1 * np.sqrt(2.0 / 3.0)
     assert exact * np.cos(np.pi / FRICTION_EDGES) <= epsilon <= exact
 
@@ -79,7 +79,7 @@ def test_epsilon_of_six_contacts_on_a_cube_is_its_closed_form():
 def test_epsilon_is_the_radius_that_linear_programmes_find(seed):
     """No direction is weaker than epsilon, and the hull's own weakest one is as weak."""
     p, n, p_OOcm = some_grasp(seed)
-    epsilon = ferrari_canny(p, n, p_OOcm, friction=0.6, length=0.06)
+    epsilon = ferrari_canny(GraspContacts(p, n, p_OOcm), friction=0.6, length=0.06)
     edges = edge_wrenches(p, n, p_OOcm, friction=0.6, length=0.06)
     assert epsilon > 0.0
     rng = np.random.default_rng(seed)
@@ -134,17 +134,22 @@ def test_epsilon_is_the_same_in_any_frame(seed):
     p, n, p_OOcm = some_grasp(seed)
     R = Rotation.from_rotvec([0.3, -1.0, 0.5]).as_matrix()
     shift = np.array([0.2, 0.1, -0.4])
-    here = ferrari_canny(p, n, p_OOcm, friction=0.7, length=0.05)
-    there = ferrari_canny(p @ R.T + shift, n @ R.T, R @ p_OOcm + shift, friction=0.7, length=0.05)
-    assert there == pytest.approx(here, rel=0.05)
-    assert ferrari_canny(10.0 * p, n, 10.0 * p_OOcm, friction=0.7, length=0.5) == pytest.approx(
-        here, rel=1e-9
+    here = ferrari_canny(GraspContacts(p, n, p_OOcm), friction=0.7, length=0.05)
+    there = ferrari_canny(
+        GraspContacts(p @ R.T + shift, n @ R.T, R @ p_OOcm + shift), friction=0.7, length=0.05
     )
+    assert there == pytest.approx(here, rel=0.05)
+    assert ferrari_canny(
+        GraspContacts(10.0 * p, n, 10.0 * p_OOcm), friction=0.7, length=0.5
+    ) == pytest.approx(here, rel=1e-9)
 
 
 def test_epsilon_grows_with_friction():
     p, n, p_OOcm = some_grasp(2)
-    values = [ferrari_canny(p, n, p_OOcm, friction=mu, length=0.05) for mu in (0.3, 0.6, 0.9)]
+    values = [
+        ferrari_canny(GraspContacts(p, n, p_OOcm), friction=mu, length=0.05)
+        for mu in (0.3, 0.6, 0.9)
+    ]
     assert values == sorted(values)
     assert values[0] < values[-1]
 
@@ -161,19 +166,23 @@ def test_epsilon_grows_with_friction():
     ],
 )
 def test_grasp_that_some_wrench_breaks_at_once_has_epsilon_zero(p, n):
-    assert ferrari_canny(p, n, np.zeros(3), friction=0.5, length=1.0) == 0.0
+    assert ferrari_canny(GraspContacts(p, n, np.zeros(3)), friction=0.5, length=1.0) == 0.0
 
 
 def test_epsilon_of_two_patches_is_what_they_resist_by_torsion():
     """The weakest wrench is the torque mu r about the line between them; points have none."""
     p, n = CUBE[[0, 3]], CUBE[[0, 3]]
-    assert ferrari_canny(p, n, np.zeros(3), friction=0.5, length=1.0) == 0.0
-    epsilon = ferrari_canny(p, n, np.zeros(3), friction=0.5, length=1.0, torsion_radius=0.02)
+    assert ferrari_canny(GraspContacts(p, n, np.zeros(3)), friction=0.5, length=1.0) == 0.0
+    epsilon = ferrari_canny(
+        GraspContacts(p, n, np.zeros(3), torsion_radius=0.02), friction=0.5, length=1.0
+    )
     assert epsilon == pytest.approx(0.5 * 0.02, rel=1e-4)
 
 
 def test_patches_resist_no_less_than_points():
     p, n, p_OOcm = some_grasp(3)
-    points = ferrari_canny(p, n, p_OOcm, friction=0.6, length=0.06)
-    patches = ferrari_canny(p, n, p_OOcm, friction=0.6, length=0.06, torsion_radius=0.003)
+    points = ferrari_canny(GraspContacts(p, n, p_OOcm), friction=0.6, length=0.06)
+    patches = ferrari_canny(
+        GraspContacts(p, n, p_OOcm, torsion_radius=0.003), friction=0.6, length=0.06
+    )
     assert points < patches < 1.2 * points

@@ -1,0 +1,45 @@
+"""A made-up trial, for tests of what is said and written about verdicts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from drakegrasp.frames import Array, make_pose
+from drakegrasp.outcomes import Outcome
+from drakegrasp.simulation.contacts import Contacts
+from drakegrasp.simulation.lift import Lift
+from drakegrasp.simulation.trial import Closed, TrialRecord
+
+
+def some_contacts(**values: Any) -> Contacts:
+    """Return contacts of three fingertips, all of which touch, with other values where given."""
+    usual: dict[str, Any] = {
+        "touching": np.ones(3, dtype=bool), "p_OQ": np.zeros((3, 3)), "nhat_Q_O": np.eye(3),
+        "f_Q_O": np.eye(3), "area": np.ones(3), "penetration": np.zeros(3), "other_links": 0,
+        "hand_on_table": False, "object_on_table": False, "table_force": np.zeros(3),
+        "point_contacts": 0,
+    }  # fmt: skip
+    return Contacts(**usual | values)
+
+
+def some_trial(
+    X_TO: Array, closed: Contacts, lifted: Contacts, *, outcome: Outcome, slip: float, turn: float
+) -> TrialRecord:
+    """Return the record of a trial that lifted, with these contacts and motions [m], [rad]."""
+    X_OG, rng = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.1]), np.random.default_rng(1)
+    lift = Lift(
+        contacts=lifted,
+        q=rng.random(8),
+        duration=2.5,
+        X_TO=make_pose(np.eye(3), [0.0, 0.0, 0.5]),
+        X_OG=X_OG,
+        slip=slip,
+        turn=turn,
+        slip_released=0.5 * slip,
+        turn_released=0.5 * turn,
+        moved=False,
+    )
+    closing = Closed(contacts=closed, q=rng.random(8), duration=1.5)
+    return TrialRecord(outcome=outcome, X_TO=X_TO, X_OG=X_OG, closed=closing, lift=lift)
