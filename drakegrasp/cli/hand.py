@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from drakegrasp.cli.errors import say
-from drakegrasp.cli.options import PathType
+from drakegrasp.cli.options import NEW_FILE
 from drakegrasp.errors import printable
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def list_hands() -> None:
 @click.argument("hand_file", metavar="NAME|YAML")
 @click.option(
     "--picture",
-    type=PathType(path_type=Path, dir_okay=False),
+    type=NEW_FILE,
     metavar="PNG",
     help="Write a picture of the hand, open and closed, with pads and palm frame.",
 )

@@ -323,7 +323,7 @@ def test_predictions(base: Path, tmp_path: Path, suffix: str) -> None:
 
     sound = _npy(tmp_path, array_kinds.GRASP)
     if suffix == ".csv":
-        sound = array_kinds._LINE.encode()
+        sound = array_kinds.LINE.encode()
     elif suffix == ".h5":
         with h5py.File(tmp_path / "sound.h5", "w") as file:
             file["grasps"] = np.tile(array_kinds.GRASP, (2, 1))

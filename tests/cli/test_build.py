@@ -18,6 +18,7 @@ import pytest
 import trimesh
 from click.testing import CliRunner, Result
 from distributed.security import Security
+from helpers.bad_inputs.array_kinds import LINE
 from helpers.builds import start_build, workers_of
 from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
 
@@ -248,7 +249,7 @@ def test_empty_address_of_a_scheduler_is_refused(
     tmp_path: Path, address: str, command: str
 ) -> None:
     trimesh.creation.box([0.06, 0.05, 0.12]).export(tmp_path / "1_box.obj")
-    (tmp_path / "grasps.csv").touch()
+    (tmp_path / "grasps.csv").write_text(LINE)
     arguments = {
         "build": ["--objects", tmp_path, "--out", tmp_path / "out"],
         "verify": [tmp_path / "grasps.csv", "--object", tmp_path / "1_box.obj"],

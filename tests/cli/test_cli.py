@@ -172,7 +172,8 @@ def test_options_of_built_in_objects_are_values_of_the_configuration(tmp_path: P
         ]
     ) | {"objects": "builtin", "out": tmp_path, "overrides": ["builtin.seed=9"], "units": "m"}
     for per_class, seed, expected in ((3, None, (3, 9)), (None, 4, (2, 4)), (None, None, (2, 9))):
-        config = parse_request(**request, per_class=per_class, objects_seed=seed).config
+        options = {**request, "per_class": per_class, "objects_seed": seed}
+        config = parse_request(options).config
         assert (config.builtin.per_class, config.builtin.seed) == expected
 
 

@@ -129,25 +129,25 @@ def _csv(name: str, text: str | bytes) -> Kind:
     return Kind(name, lambda path: path.write_bytes(content))
 
 
-_LINE = ",".join(map(str, GRASP))
+LINE = ",".join(map(str, GRASP))
 PREDICTIONS_CSV: tuple[Kind, ...] = (
     *ANY_FILE,
     _csv("only a header", ",".join("abc") + "\n"),
     _csv("17 numbers", ",".join(map(str, GRASP[:17]))),
-    _csv("lines of unequal length", f"{_LINE}\n{_LINE},1\n"),
-    _csv("semicolons", _LINE.replace(",", ";")),
-    _csv("blanks", _LINE.replace(",", " ")),
-    _csv("a text in between", _LINE.replace("0.03", "x", 1)),
-    _csv("an empty cell", _LINE.replace("0.03", "", 1)),
-    _csv("quotes", _LINE.replace("0.03", '"0.03"', 1)),
-    _csv("NaN", _LINE.replace("0.03", "nan", 1)),
-    _csv("infinite", _LINE.replace("0.03", "1e999", 1)),
-    _csv("digits of 10,000", _LINE.replace("0.03", "9" * 10_000, 1)),
-    _csv("UTF-16", _LINE.encode("utf-16")),
-    _csv("a null byte", _LINE.replace("0.03", "\x00", 1)),
-    _csv("two headers", f"{','.join('a' * 18)}\n{','.join('b' * 18)}\n{_LINE}"),
+    _csv("lines of unequal length", f"{LINE}\n{LINE},1\n"),
+    _csv("semicolons", LINE.replace(",", ";")),
+    _csv("blanks", LINE.replace(",", " ")),
+    _csv("a text in between", LINE.replace("0.03", "x", 1)),
+    _csv("an empty cell", LINE.replace("0.03", "", 1)),
+    _csv("quotes", LINE.replace("0.03", '"0.03"', 1)),
+    _csv("NaN", LINE.replace("0.03", "nan", 1)),
+    _csv("infinite", LINE.replace("0.03", "1e999", 1)),
+    _csv("digits of 10,000", LINE.replace("0.03", "9" * 10_000, 1)),
+    _csv("UTF-16", LINE.encode("utf-16")),
+    _csv("a null byte", LINE.replace("0.03", "\x00", 1)),
+    _csv("two headers", f"{','.join('a' * 18)}\n{','.join('b' * 18)}\n{LINE}"),
     _csv("commas", "," * 17),
-    _csv("steering", _LINE.replace("0.03", "\x1b]0;x\x07", 1)),
+    _csv("steering", LINE.replace("0.03", "\x1b]0;x\x07", 1)),
 )
 
 
