@@ -23,7 +23,7 @@ from drakegrasp.build.work_unit import WorkUnit, run_unit
 from drakegrasp.config import Config, SplitConfig
 from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
 from drakegrasp.dataset.assembly.survey import headers_by_object
-from drakegrasp.dataset.card.files import write_card
+from drakegrasp.dataset.card.text import write_card
 from drakegrasp.dataset.lock import Holder, build_lock
 from drakegrasp.dataset.manifest import (
     Manifest,
