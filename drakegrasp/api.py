@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 
 import numpy.typing as npt
 
-from drakegrasp.build.counts import NAMED
 from drakegrasp.build.pipeline import BuildReport, build_locked
 from drakegrasp.build.request import BUILTIN
 from drakegrasp.build.target import refuse_two_ends
@@ -26,7 +25,7 @@ from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import claim_directory
 from drakegrasp.dataset.paths import BUILTIN_FOLDER
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.errors import ConfigError, GraspError, MeshError
+from drakegrasp.errors import ConfigError, GraspError, MeshError, listed
 from drakegrasp.frames import as_numbers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import with_hand_defaults
@@ -181,8 +180,7 @@ def _refuse_unknown(only: Sequence[str], names: Sequence[str]) -> None:
     """
     unknown = [name for name in only if name not in names]
     if unknown:
-        more = ", ..." * (len(names) > NAMED)
-        known = f"{', '.join(names[:NAMED])}{more}"
+        known = listed(names)
         raise MeshError(f"only must be names of objects ({known}), got {unknown[0]!r}")
 
 

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from drakegrasp.cli.errors import say
+from drakegrasp.cli.errors import say, say_finding
 from drakegrasp.cli.options import NEW_FILE
-from drakegrasp.errors import printable
 
 if TYPE_CHECKING:
     from drakegrasp.commissioning.finding import Finding
@@ -62,5 +61,4 @@ def check_hand_file(hand_file: str, picture: Path | None) -> None:
 
 
 def _print(finding: Finding) -> None:
-    mark = click.style("ok  ", fg="green") if finding.ok else click.style("FAIL", fg="red")
-    click.echo(f"{mark}  {finding.name:<20} {printable(finding.text)}")
+    say_finding(finding.ok, "FAIL", f"{finding.name:<20} {finding.text}")

@@ -18,7 +18,7 @@ from drakegrasp import __version__
 from drakegrasp.cli.audit import audit
 from drakegrasp.cli.bench import bench
 from drakegrasp.cli.build import assemble, build, merge, stats
-from drakegrasp.cli.errors import Commands, say
+from drakegrasp.cli.errors import Commands, say, say_finding
 from drakegrasp.cli.export import export
 from drakegrasp.cli.hand import hand
 from drakegrasp.cli.inspect import figures, inspect_
@@ -47,10 +47,7 @@ def doctor(directory: Path) -> None:
     # A line per need, and one more with the remedy where it is not met.
     findings = diagnose(directory)
     for finding in findings:
-        mark = (
-            click.style("ok     ", fg="green") if finding.ok else click.style("MISSING", fg="red")
-        )
-        click.echo(f"{mark}  {finding.name:<18} {finding.what}")
+        say_finding(finding.ok, "MISSING", f"{finding.name:<18} {finding.what}")
         if not finding.ok:
             click.echo(f"         -> {finding.remedy}")
     if not all(finding.ok for finding in findings):

@@ -24,7 +24,7 @@ from drakegrasp.runtime.allocator import (
     dask_setup,
     has_jemalloc,
     jemalloc_environment,
-    own_environment,
+    kept_variables,
     restart_with_jemalloc,
 )
 
@@ -158,7 +158,7 @@ def test_nanny_is_told_on_its_machine() -> None:
 def test_environment_of_the_caller_is_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(PRELOAD, "theirs.so")
     monkeypatch.delenv(SETTINGS, raising=False)
-    with own_environment():
+    with kept_variables(allocator.PRELOAD, allocator.SETTINGS):
         os.environ.update(OURS)
     assert os.environ[PRELOAD] == "theirs.so"
     assert SETTINGS not in os.environ

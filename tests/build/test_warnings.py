@@ -1,4 +1,4 @@
-"""A build says which objects are too heavy for its hand."""
+"""A build warns of what the user should know before it spends hours."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 from helpers.hands import write_pincer
 
-from drakegrasp.build.payload import too_heavy
+from drakegrasp.build.warnings import too_heavy
 from drakegrasp.config import load_config
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry
 
