@@ -30,8 +30,8 @@ R = TypeVar("R")
 
 #: Processes on one machine; more are a mistyped number.
 MOST_PROCESSES = 10_000
-#: Starting processes takes about so long [s].
-ALONE_SECONDS = 2.0
+#: Work that ends within this time starts no processes, which takes seconds by itself [s].
+ALONE_SECONDS = 5.0
 
 
 class Executor(Protocol):

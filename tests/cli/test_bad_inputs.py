@@ -42,9 +42,9 @@ _BUILD = (
 #: Commands by their names in the table.
 COMMANDS: dict[str, tuple[str, ...]] = {
     "stats": ("stats", "{out}"),
-    "assemble": ("assemble", "{out}"),
-    "check": ("check", "{out}"),
-    "check FILE": ("check", "{out}/{file}"),
+    "assemble": ("assemble", "{out}", "--workers", "1"),
+    "check": ("check", "{out}", "--workers", "1"),
+    "check FILE": ("check", "{out}/{file}", "--workers", "1"),
     "replay": ("replay", "{out}", "--trial", "0"),
     "figures": ("figures", "{out}", "--out", "{to}/figures", "--quiet"),
     "inspect": ("inspect", "{out}", "--static", "{to}/site"),
@@ -343,7 +343,7 @@ def test_cameras(base: Path, tmp_path: Path) -> None:
 
 def test_decisions(base: Path, tmp_path: Path) -> None:
     out = Path(shutil.copytree(base / "out", tmp_path / "out"))
-    before, command = (out / MANIFEST).read_bytes(), "assemble {out} --reject {file}"
+    before, command = (out / MANIFEST).read_bytes(), "assemble {out} --reject {file} --workers 1"
     sound = (base / REJECT).read_bytes()
     walk_file(base, tmp_path, sound, ".json", manifests.DECISIONS, command)
     kinds = manifests.REJECTED_IDS
