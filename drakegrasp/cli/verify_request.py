@@ -59,18 +59,19 @@ def place_requested(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
     Raises:
         GraspError, MeshError, ConfigError, HandError: If a file or an option cannot be used.
     """
+    try:
+        return _place(request)
+    except DataError as error:
+        raise GraspError(str(error)) from None
+
+
+def _place(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
     # Refuse results that could not be written, and options without effect.
     if request.out is not None:
         refuse_unwritable(request.out)
     path = _dataset_path(request)
     _refuse_idle(request, path)
-    try:
-        return _place(request, path)
-    except DataError as error:
-        raise GraspError(str(error)) from None
 
-
-def _place(request: VerifyRequest, path: Path | None) -> tuple[list[PlacedGrasp], Config]:
     # A dataset has a default split. An HDF5 file of grasps may have no groups at all.
     split = request.split if path is None else request.split or DEFAULT_SPLIT
     data = None if path is None else GraspDataset(path, split=split or DEFAULT_SPLIT)
