@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 
 import numpy.typing as npt
 
-from drakegrasp.build.counts import NAMED
 from drakegrasp.build.pipeline import BuildReport, build_locked
 from drakegrasp.build.request import BUILTIN
 from drakegrasp.build.target import refuse_two_ends
@@ -26,14 +25,13 @@ from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import claim_directory
 from drakegrasp.dataset.paths import BUILTIN_FOLDER
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.errors import ConfigError, GraspError, MeshError
+from drakegrasp.errors import ConfigError, GraspError, MeshError, listed
 from drakegrasp.frames import as_numbers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.builtin.catalog import builtin_sources, draw_builtin
 from drakegrasp.objects.sources import MeshSource, find_meshes
-from drakegrasp.runtime.environment import available_cores
-from drakegrasp.runtime.executor import run_here
+from drakegrasp.runtime.executor import count_workers, run_here
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.simulation.drive import drive_of
 from drakegrasp.verification.batch import ResultCallback, ignore_result, verify_batch
@@ -181,8 +179,7 @@ def _refuse_unknown(only: Sequence[str], names: Sequence[str]) -> None:
     """
     unknown = [name for name in only if name not in names]
     if unknown:
-        more = ", ..." * (len(names) > NAMED)
-        known = f"{', '.join(names[:NAMED])}{more}"
+        known = listed(names)
         raise MeshError(f"only must be names of objects ({known}), got {unknown[0]!r}")
 
 
@@ -364,7 +361,7 @@ def run_verification(
         MachineError: If a worker would give other results than this machine.
     """
     _refuse_workers(workers, scheduler, scheduler_file)
-    alone = len(grasps) <= FEW_GRASPS or (workers or available_cores()) == 1
+    alone = len(grasps) <= FEW_GRASPS or count_workers(workers) == 1
     if alone and not (scheduler or scheduler_file):
         return _verify_on(None, grasps, on_result, show=show)
     with connect(workers, scheduler, scheduler_file) as client:
@@ -386,10 +383,6 @@ def _verify_on(
             return verify_batch(grasps, DaskExecutor(client), report, on_result)
 
 
-#: Processes on one machine; more are a mistyped number.
-MOST_PROCESSES = 10_000
-
-
 def _refuse_workers(
     workers: int | None, scheduler: str | None, scheduler_file: str | Path | None
 ) -> None:
@@ -402,7 +395,4 @@ def _refuse_workers(
         raise ConfigError(f"scheduler must be an address like tcp://host:8786, got {scheduler!r}")
     if workers is not None and (scheduler or scheduler_file):
         raise ConfigError("workers must not be given with a scheduler, which has its own")
-    if workers is not None and workers < 1:
-        raise ConfigError(f"workers must be at least 1, got {workers}")
-    if workers is not None and workers > MOST_PROCESSES:
-        raise ConfigError(f"workers must be at most {MOST_PROCESSES:,}, got {workers}")
+    count_workers(workers)

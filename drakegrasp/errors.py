@@ -19,6 +19,10 @@ texts of strangers safe to show.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+#: A line that lists many names has this many of them.
+NAMED = 10
 #: Characters that `one_line` keeps of a message.
 LONGEST_MESSAGE = 200
 
@@ -81,3 +85,14 @@ def one_line(error: BaseException) -> str:
     For parsers, which say on later lines where in the file the mistake is.
     """
     return " ".join(str(error).split())[:LONGEST_MESSAGE] or type(error).__name__
+
+
+def listed(names: Sequence[str], total: int | None = None) -> str:
+    """Return names in a line, of many only the first `NAMED` and how many more there are.
+
+    Args:
+        names: All of them, or at least the first `NAMED`.
+        total: How many there are; as many as are given if None.
+    """
+    more = (len(names) if total is None else total) - NAMED
+    return ", ".join(names[:NAMED]) + (f" and {more:,} more" if more > 0 else "")

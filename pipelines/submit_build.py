@@ -25,13 +25,7 @@ from distributed import Client
 from drakegrasp.api import build_on, find_sources
 from drakegrasp.cli.build import print_plan, print_report
 from drakegrasp.cli.errors import OneCommand
-from drakegrasp.cli.options import (
-    build_options,
-    parse_request,
-    times_option,
-    tls_files,
-    tls_options,
-)
+from drakegrasp.cli.options import build_options, parse_request, shared, tls_files, tls_options
 from drakegrasp.cluster.connect import dashboard_line
 from drakegrasp.cluster.launch import start_cluster
 from drakegrasp.cluster.request import KINDS, ClusterRequest, describe, worker_count
@@ -51,9 +45,7 @@ from drakegrasp.cluster.request import KINDS, ClusterRequest, describe, worker_c
 )
 @click.argument("where", nargs=-1, metavar="[HOST...|ADDRESS|PATH]")
 @build_options
-@click.option(
-    "--workers", type=int, metavar="N", help="Processes in all.  [default with local: one per core]"
-)
+@shared("--workers", help="Processes in all.  [default with local: one per core]")
 @click.option(
     "--cores", type=int, metavar="N", help="Cores of each SSH host or SLURM job, a worker on each."
 )
@@ -67,7 +59,7 @@ from drakegrasp.cluster.request import KINDS, ClusterRequest, describe, worker_c
     "--tls", is_flag=True, help="Encrypt, with certificates made for this run; local always does."
 )
 @tls_options
-@times_option
+@shared("--times")
 @click.option("--dry-run", is_flag=True, help="Only print what would run.")
 def main(
     kind: str,
@@ -79,15 +71,13 @@ def main(
     interface: str | None,
     host: str | None,
     tls: bool,
-    tls_ca_file: Path | None,
-    tls_cert: Path | None,
-    tls_key: Path | None,
     times: Path | None,
     dry_run: bool,
     **options: Any,
 ) -> None:
     """Run the script."""
-    request = parse_request(**options)
+    files = tls_files(options)
+    request = parse_request(options)
     cluster = ClusterRequest(
         kind=kind,
         where=where,
@@ -98,7 +88,7 @@ def main(
         host=host,
         interface=interface,
         tls=tls,
-        tls_files=tls_files(tls_ca_file, tls_cert, tls_key),
+        tls_files=files,
     )
 
     # Say what will run before anything starts.

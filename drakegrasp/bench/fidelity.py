@@ -7,7 +7,6 @@ other drives of the fingers.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -119,16 +118,13 @@ def compare_labels(
 
 def sum_fidelity(reports: Sequence[Mapping[str, Mapping[str, int]]]) -> dict[str, dict[str, Any]]:
     """Return the counts of all objects by variant, with shares."""
-    sums: dict[str, dict[str, Any]] = {}
+    sums = {}
     for name in reports[0]:
-        counts: Counter[str] = Counter()
-        for report in reports:
-            counts.update(report[name])
-        flips = counts["flips"]
+        counts = _total([report[name] for report in reports])
         sums[name] = {
             **counts,
-            "flip_share": flips / max(1, counts["attempts"]),
-            "flip_share_of_simulated": flips / max(1, counts["simulated"]),
+            "flip_share": counts["flips"] / max(1, counts["attempts"]),
+            "flip_share_of_simulated": counts["flips"] / max(1, counts["simulated"]),
             "flip_share_of_lifted": counts["lifted_flips"] / max(1, counts["lifted"]),
         }
 
@@ -142,15 +138,16 @@ def sum_fidelity(reports: Sequence[Mapping[str, Mapping[str, int]]]) -> dict[str
 
 def sum_drive(reports: Sequence[Mapping[str, int]]) -> dict[str, Any]:
     """Return how many labels of all objects depend on the drive, with shares."""
-    counts: Counter[str] = Counter()
-    for report in reports:
-        counts.update(report)
-    flips = counts["flips"]
+    counts = _total(reports)
     return {
         **counts,
-        "flip_share": flips / max(1, counts["attempts"]),
-        "flip_share_of_lifted": flips / max(1, counts["lifted"]),
+        "flip_share": counts["flips"] / max(1, counts["attempts"]),
+        "flip_share_of_lifted": counts["flips"] / max(1, counts["lifted"]),
     }
+
+
+def _total(reports: Sequence[Mapping[str, int]]) -> dict[str, Any]:
+    return {key: sum(report[key] for report in reports) for key in reports[0]}
 
 
 def _simulate(

@@ -10,12 +10,11 @@ from collections import Counter
 
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.shards import ShardHeader
+from drakegrasp.errors import NAMED
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import WorkerPool
 from drakegrasp.runtime.progress import Report
 
-#: A line that lists many things names this many of them.
-NAMED = 10
 #: Outcomes of attempts that the machine, or an error of the simulator, ended.
 ENDED = (Outcome.CRASHED, Outcome.TIMEOUT)
 #: Share of an object's attempts that may end so, and a number that always may. Of the millions of

@@ -7,24 +7,23 @@ work unit. Results may come back in any order; the files are the same.
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from drakegrasp.build.counts import NAMED, Counts
+from drakegrasp.build.counts import Counts
 from drakegrasp.build.done_units import find_tasks, find_units
 from drakegrasp.build.events import BuildEvents
-from drakegrasp.build.payload import too_heavy
 from drakegrasp.build.prepare import PrepareTask, prepare_one
 from drakegrasp.build.target import Target, refuse_two_ends, target_of
+from drakegrasp.build.warnings import nothing_trains, too_heavy
 from drakegrasp.build.work_unit import WorkUnit, run_unit
-from drakegrasp.config import Config, SplitConfig
+from drakegrasp.config import Config
 from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
-from drakegrasp.dataset.assembly.split import may_train, rank_in_split, split_rule
+from drakegrasp.dataset.assembly.split import rank_in_split
 from drakegrasp.dataset.assembly.survey import headers_by_object
-from drakegrasp.dataset.card.files import write_card
+from drakegrasp.dataset.card.text import write_card
 from drakegrasp.dataset.lock import Holder, build_lock
 from drakegrasp.dataset.manifest import (
     Manifest,
@@ -39,7 +38,7 @@ from drakegrasp.dataset.manifest import (
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import is_assembled
-from drakegrasp.errors import DataError, DrakegraspError
+from drakegrasp.errors import DataError, DrakegraspError, listed
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.sources import MeshSource, source_sha256
@@ -187,7 +186,7 @@ def _build(
     manifest = replace(known or new, config=config)
     write_manifest(manifest, out)
     job.events.started(manifest, notices)
-    if (warning := nothing_trains(sources, config.split)) is not None:
+    if warning := nothing_trains(sources, config.split):
         job.events.warn(warning)
 
     # Prepare each object, or refuse its mesh.
@@ -199,8 +198,8 @@ def _build(
         reasons = "; ".join(f"{entry.name}: {entry.reason}" for entry in manifest.refused)
         raise DataError(f"no mesh can be simulated: {reasons}")
     write_manifest(manifest, out)
-    if heavy := too_heavy(manifest):
-        job.events.warn(heavy)
+    if warning := too_heavy(manifest):
+        job.events.warn(warning)
 
     # Simulate the work units that are not done; killed workers leave temporary files.
     with progress_bar("simulate", "attempts", show=job.show) as report:
@@ -238,25 +237,6 @@ def _build(
         unexplained=unexplained,
         assembled=stale,
         assembly=summarise(out),
-    )
-
-
-def nothing_trains(sources: Sequence[MeshSource], split: SplitConfig) -> str | None:
-    """Return a warning if no sample of these meshes can be in the split `train`, else None."""
-    classes = [source.class_name for source in sources]
-    if split_rule(split, classes, [source.group or source.name for source in sources]) == "object":
-        return None
-    counts = Counter(classes)
-    if any(may_train(name, count, split) for name, count in counts.items()):
-        return None
-    if split.train_classes is not None:
-        why = "split.train_classes names none of the classes"
-    else:
-        why = "every class has one object, which is tested"
-    return (
-        f"nothing will train: {why}. Split by object (--set split.by=object), give classes more "
-        "objects (--per-class for built-in ones; objects.yaml says which meshes are of one class), "
-        f"or name the classes to train on, e.g. --set split.train_classes=[{min(counts)}]"
     )
 
 
@@ -453,6 +433,5 @@ def _count_done(
 
 def _count(names: Sequence[str], what: str, total: int | None = None) -> str:
     """Return e.g. `3 shards (a, b, c)`; of many only the first are named."""
-    total = len(names) if total is None else total
-    more = ", ..." if total > NAMED else ""
-    return f"{total} {what}{'s' * (total != 1)} ({', '.join(names[:NAMED])}{more})"
+    count = len(names) if total is None else total
+    return f"{count} {what}{'s' * (count != 1)} ({listed(names, total)})"

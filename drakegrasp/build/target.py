@@ -15,10 +15,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import takewhile
 
-from drakegrasp.build.counts import NAMED
 from drakegrasp.config import Config
 from drakegrasp.dataset.shards import ShardHeader
-from drakegrasp.errors import ConfigError
+from drakegrasp.errors import ConfigError, listed
 
 
 @dataclass(kw_only=True)
@@ -106,9 +105,8 @@ class Target:
             (spent, "all palm poses were tried, --candidates allows more"),
         ):
             if names:
-                said = ", ".join(f"{name} ({counts[name]:,})" for name in names[:NAMED])
-                more = f" and {len(names) - NAMED:,} more" if len(names) > NAMED else ""
-                lines.append(f"too few samples, {why}: {said}{more}")
+                said = listed([f"{name} ({counts[name]:,})" for name in names])
+                lines.append(f"too few samples, {why}: {said}")
         return lines
 
     def _active(self, taken: Mapping[str, int], counts: Mapping[str, int]) -> list[str]:

@@ -35,7 +35,6 @@ from drakegrasp.config import Config, FilterConfig
 from drakegrasp.dataset.assembly.survey import count_samples, successes_of
 from drakegrasp.dataset.filters import Removal, judge_successes
 from drakegrasp.dataset.hdf5 import AnyArray
-from drakegrasp.dataset.prepared_objects import PreparedObject
 from drakegrasp.dataset.shards import Shard, ShardHeader, read_trials, write_shard
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.outcomes import Outcome
@@ -160,7 +159,7 @@ def _run_experiment(unit: WorkUnit, journal: Journal) -> UnitSummary:
     # Build the object's scene, or take the one of the unit before, and list the attempts.
     with _stage(journal, "build", header.object_name, seconds):
         setup = _build_setup(out, header, config)
-        attempts = unit_attempts(setup.prepared, header, config)
+        attempts = list_attempts(setup.prepared, range(header.start, header.stop), config)
 
     # Run the attempts, then those about the samples among them, and so on.
     rounds = list[_Round]()
@@ -255,13 +254,6 @@ def find_outcomes(out: Path, header: ShardHeader) -> dict[Outcome, int] | None:
     if not path.exists():
         return None
     return count_outcomes(read_trials(path, header, ("outcome",))["outcome"])
-
-
-def unit_attempts(
-    prepared: PreparedObject, header: ShardHeader, config: Config
-) -> Sequence[Attempt]:
-    """Return the attempts of a unit in the order of its rows."""
-    return list_attempts(prepared, range(header.start, header.stop), config)
 
 
 def count_outcomes(outcomes: AnyArray) -> dict[Outcome, int]:

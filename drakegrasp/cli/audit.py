@@ -9,23 +9,18 @@ from pathlib import Path
 import click
 
 from drakegrasp.cli.errors import say
-from drakegrasp.cli.options import PathType, manifest_option, units_option
+from drakegrasp.cli.options import PATH, shared
 
 
 @click.command()
-@click.argument("mesh_dir", type=PathType(path_type=Path))
-@units_option
-@manifest_option
+@click.argument("mesh_dir", type=PATH)
+@shared("--units", "--manifest")
 @click.option(
-    "--json",
-    "json_file",
-    type=PathType(path_type=Path),
-    metavar="FILE",
-    help="Write all findings as JSON too.",
+    "--json", "json_file", type=PATH, metavar="FILE", help="Write all findings as JSON too."
 )
 @click.option(
     "--sheet",
-    type=PathType(path_type=Path),
+    type=PATH,
     metavar="FILE",
     help="Write a picture of every object with its status (.png).",
 )

@@ -10,39 +10,16 @@ import click
 
 from drakegrasp.build.request import BUILTIN
 from drakegrasp.cli.errors import say
-from drakegrasp.cli.options import (
-    PathType,
-    builtin_overrides,
-    manifest_option,
-    objects_seed_option,
-    per_class_option,
-    set_option,
-    units_option,
-)
+from drakegrasp.cli.options import FILE, NEW_FILE, PATH, chosen_settings, shared
 
 
 @click.command()
-@click.option(
-    "--objects", default=BUILTIN, show_default=True, metavar="MESH_DIR|builtin", help="The meshes."
-)
-@per_class_option
-@objects_seed_option
-@click.option(
-    "--only",
-    multiple=True,
-    metavar="NAME",
-    help="Only objects whose names begin with NAME; may be given several times.",
-)
-@click.option("--config", "preset", metavar="YAML|PRESET", help="Configuration.  [default: paper]")
-@set_option
-@click.option(
-    "--candidates",
-    type=click.IntRange(min=1),
-    default=100,
-    show_default=True,
-    metavar="N",
-    help="Palm poses per object.",
-)
+@shared("--objects", required=False, default=BUILTIN, show_default=True, help="The meshes.")
+@shared("--per-class", "--objects-seed")
+@shared("--only", help="Only objects whose names begin with NAME; may be given several times.")
+@shared("--config", help="Configuration.  [default: paper]")
+@shared("--set")
+@shared("--candidates", default=100, show_default=True, help="Palm poses per object.")
 @click.option(
     "--fidelity",
     type=click.IntRange(min=0),
@@ -54,45 +31,30 @@ from drakegrasp.cli.options import (
 @click.option("--peer", "mujoco", is_flag=True, help="Run the same attempts in MuJoCo as well.")
 @click.option(
     "--cross-check",
-    type=(PathType(path_type=Path), click.IntRange(min=1)),
+    type=(PATH, click.IntRange(min=1)),
     metavar="OUT N",
     help="Instead, try N stored lifts of the dataset OUT again in MuJoCo.",
 )
 @click.option(
-    "--compare",
-    type=PathType(path_type=Path, exists=True, dir_okay=False),
-    metavar="FILE",
-    help="Print the ratios to this earlier report.",
+    "--compare", type=FILE, metavar="FILE", help="Print the ratios to this earlier report."
 )
 @click.option(
     "--out",
-    type=PathType(path_type=Path, dir_okay=False),
+    type=NEW_FILE,
     default=Path("bench.json"),
     show_default=True,
     metavar="FILE",
     help="Where the report goes, as JSON.",
 )
-@units_option
-@manifest_option
-@click.option("--quiet", is_flag=True, help="No progress bar.")
+@shared("--units", "--manifest", "--quiet")
 @click.pass_context
 def bench(
     context: click.Context,
-    objects: str,
-    per_class: int | None,
-    objects_seed: int | None,
-    only: tuple[str, ...],
-    preset: str | None,
-    overrides: tuple[str, ...],
-    candidates: int,
-    fidelity: int,
-    mujoco: bool,
+    /,
     cross_check: tuple[Path, int] | None,
-    compare: Path | None,
     out: Path,
-    units: str,
-    manifest: Path | None,
     quiet: bool,
+    **options: Any,
 ) -> None:
     """Measure how fast this machine simulates attempts.
 
@@ -107,40 +69,52 @@ def bench(
     lost, again in MuJoCo and says how many of them hold there.
     """
     import json
+
+    # What cannot be used is refused before the measurement, which takes a while.
+    if not os.access(out if out.exists() else out.absolute().parent, os.W_OK):
+        raise click.UsageError(f"--out must be a file that can be written, got {out}")
+    if cross_check is None:
+        report = _measure(**options, quiet=quiet)
+    else:
+        _refuse_other_options(context)
+        report = _cross_check(*cross_check, quiet)
+    out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    say(str(out))
+
+
+def _measure(
+    *,
+    only: tuple[str, ...],
+    config: str | None,
+    fidelity: int,
+    mujoco: bool,
+    compare: Path | None,
+    units: str,
+    manifest: Path | None,
+    quiet: bool,
+    **options: Any,
+) -> dict[str, Any]:
+    """Measure what attempts cost, print it and return the report."""
     import tempfile
 
     from drakegrasp.bench import measure as measuring
-    from drakegrasp.cli.tables import (
-        bench_lines,
-        bench_table,
-        drive_line,
-        fidelity_table,
-        print_table,
-    )
+    from drakegrasp.cli import tables
     from drakegrasp.config import load_config
     from drakegrasp.objects.builtin.catalog import builtin_sources
     from drakegrasp.objects.sources import find_meshes
     from drakegrasp.runtime.progress import progress_bar
 
-    # What cannot be used is refused before the measurement, which takes a while.
-    if not os.access(out if out.exists() else out.absolute().parent, os.W_OK):
-        raise click.UsageError(f"--out must be a file that can be written, got {out}")
-    if cross_check is not None:
-        _refuse_other_options(context)
-        _cross_check(*cross_check, out, quiet)
-        return
     if mujoco:
         _require_mujoco("--peer")
     # The time of OpenGL's threads would count as this core's.
     os.environ.setdefault("LP_NUM_THREADS", "0")
-    drawn = builtin_overrides(objects, per_class, objects_seed)
-    config = load_config(preset, [*overrides, *drawn, f"candidates.max={candidates}"])
+    rules, objects = load_config(config, chosen_settings(options)), options["objects"]
     earlier = None if compare is None else _read_report(compare)
 
     with tempfile.TemporaryDirectory() as folder:
         if objects == BUILTIN:
             with progress_bar("objects", "meshes", show=not quiet) as progress:
-                every = builtin_sources(folder, config.builtin, progress)
+                every = builtin_sources(folder, rules.builtin, progress)
         else:
             every = find_meshes(objects, units=units, manifest=manifest)
         sources = [s for s in every if not only or s.name.startswith(only)]
@@ -148,41 +122,37 @@ def bench(
             raise click.UsageError(f"--only must name objects of {objects}, got {', '.join(only)}")
         with progress_bar("bench", "attempts", show=not quiet) as progress:
             measured = measuring.measure(
-                sources, config, sample=fidelity, mujoco=mujoco, progress=progress
+                sources, rules, sample=fidelity, mujoco=mujoco, progress=progress
             )
-            report = measuring.summarize(list(measured), config)
+            report = measuring.summarize(list(measured), rules)
 
-    print_table(bench_table(report))
-    for line in bench_lines(report):
+    tables.print_table(tables.bench_table(report))
+    for line in tables.bench_lines(report):
         say(line)
     if fidelity:
-        print_table(fidelity_table(report["all"]["fidelity"]))
-        say(drive_line(report["all"]["drive"]))
+        tables.print_table(tables.fidelity_table(report["all"]["fidelity"]))
+        say(tables.drive_line(report["all"]["drive"]))
     if earlier is not None:
         report["ratio"] = measuring.compare(report, earlier)
         for key, ratio in report["ratio"].items():
             times = "none to compare with" if ratio is None else f"{ratio:.2f} times that"
             say(f"{key.replace('_', ' ')}: {times} of {compare}")
-    out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    say(str(out))
+    return report
 
 
-def _cross_check(dataset: Path, count: int, out: Path, quiet: bool) -> None:
-    """Try lifts of a dataset again in MuJoCo, print the agreement and write the report."""
-    import json
-
+def _cross_check(dataset: Path, count: int, quiet: bool) -> dict[str, Any]:
+    """Try lifts of a dataset again in MuJoCo, print the agreement and return the report."""
     _require_mujoco("--cross-check")
     from drakegrasp.bench.cross_check import cross_check
-    from drakegrasp.cli.tables import cross_check_lines, cross_check_table, print_table
+    from drakegrasp.cli import tables
     from drakegrasp.runtime.progress import progress_bar
 
     with progress_bar("cross-check", "lifts", show=not quiet) as progress:
         report = cross_check(dataset, count, progress=progress)
-    print_table(cross_check_table(report["groups"]))
-    for line in cross_check_lines(report):
+    tables.print_table(tables.cross_check_table(report["groups"]))
+    for line in tables.cross_check_lines(report):
         say(line)
-    out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    say(str(out))
+    return report
 
 
 def _refuse_other_options(context: click.Context) -> None:
@@ -219,10 +189,10 @@ def _read_report(path: Path) -> dict[str, Any]:
     Raises:
         click.UsageError: If the file is none.
     """
-    import json
+    from drakegrasp.runtime.json_text import read_json
 
     try:
-        report: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        report: dict[str, Any] = read_json(path)
         _ = report["all"]["resolved_per_core_second"] + report["all"]["grasps_per_core_hour"]
     except (ValueError, KeyError, TypeError):
         raise click.UsageError(

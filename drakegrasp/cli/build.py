@@ -9,17 +9,14 @@ import click
 
 from drakegrasp.cli.errors import say
 from drakegrasp.cli.options import (
-    PathType,
+    FILE,
+    PATH,
     build_options,
-    out_argument,
+    dataset_argument,
     parse_request,
-    processes_option,
-    scheduler_file_option,
-    scheduler_option,
-    times_option,
+    shared,
     tls_files,
     tls_options,
-    workers_option,
 )
 
 if TYPE_CHECKING:
@@ -29,21 +26,16 @@ if TYPE_CHECKING:
 
 @click.command()
 @build_options
-@workers_option
-@scheduler_option
-@scheduler_file_option
+@shared("--workers", "--scheduler", "--scheduler-file")
 @tls_options
 @click.option(
     "--plan", is_flag=True, help="Only print the hours and bytes that the build would take."
 )
-@times_option
+@shared("--times")
 def build(
     workers: int | None,
     scheduler: str | None,
     scheduler_file: Path | None,
-    tls_ca_file: Path | None,
-    tls_cert: Path | None,
-    tls_key: Path | None,
     plan: bool,
     times: Path | None,
     **options: Any,
@@ -55,8 +47,8 @@ def build(
     """
     from drakegrasp.api import build_dataset
 
-    request = parse_request(**options)
-    files = tls_files(tls_ca_file, tls_cert, tls_key)
+    files = tls_files(options)
+    request = parse_request(options)
     if plan:
         print_plan(request, workers, times)
         return
@@ -77,24 +69,23 @@ def build(
 
 
 @click.command()
-@out_argument
+@dataset_argument()
 @click.option(
     "--reject",
-    type=PathType(path_type=Path, exists=True, dir_okay=False),
+    type=FILE,
     metavar="FILE",
     help="Trials that must not become samples: the reject.json of an inspection, or a text file "
     "with an id per line; # starts a comment.",
 )
-@click.option(
+@shared(
     "--set",
-    "overrides",
-    multiple=True,
-    metavar="KEY=VALUE",
     help="Change a setting of the filters or the split, e.g. filters.outlier_sigma=3; may be given "
     "several times.",
 )
-@processes_option
-def assemble(out: Path, reject: Path | None, overrides: tuple[str, ...], workers: int) -> None:
+@shared("--workers")
+def assemble(
+    out: Path, reject: Path | None, overrides: tuple[str, ...], workers: int | None
+) -> None:
     """Filter and split again, without simulating.
 
     The command writes trials.hdf5 and both data files again from the shards in OUT.
@@ -117,10 +108,10 @@ def assemble(out: Path, reject: Path | None, overrides: tuple[str, ...], workers
 
 
 @click.command()
-@click.argument("into", type=PathType(path_type=Path), metavar="INTO")
-@click.argument("outs", type=PathType(path_type=Path), metavar="OUTS...", nargs=-1, required=True)
-@processes_option
-def merge(into: Path, outs: tuple[Path, ...], workers: int) -> None:
+@click.argument("into", type=PATH, metavar="INTO")
+@click.argument("outs", type=PATH, metavar="OUTS...", nargs=-1, required=True)
+@shared("--workers")
+def merge(into: Path, outs: tuple[Path, ...], workers: int | None) -> None:
     """Make one dataset of several that were built apart.
 
     Their objects or their seeds may differ, and nothing else. INTO must be new or empty, and
@@ -136,7 +127,7 @@ def merge(into: Path, outs: tuple[Path, ...], workers: int) -> None:
 
 
 @click.command()
-@out_argument
+@dataset_argument()
 def stats(out: Path) -> None:
     """Count outcomes, how well grasps hold, and samples.
 

@@ -207,13 +207,6 @@ def _existing(directory: Path) -> Path:
     return path
 
 
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "of unknown version"
-
-
 def _numbers(version: str) -> tuple[int, ...]:
     """Return the leading numbers of a version: `1.52.0.post1` is (1, 52, 0)."""
     match = re.match(r"\d+(\.\d+)*", version)

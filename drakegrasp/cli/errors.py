@@ -32,6 +32,12 @@ AGAIN_SECONDS = 0.05
 WRONG_USAGE = (ConfigError, GraspError, HandError, MeshError)
 
 
+def say_finding(ok: bool, bad: str, text: str) -> None:
+    """Print a line that begins with a green `ok`, or with another word in red."""
+    word = click.style("ok".ljust(len(bad)), fg="green") if ok else click.style(bad, fg="red")
+    click.echo(f"{word}  {printable(text)}")
+
+
 def say(text: str, *, err: bool = False) -> None:
     """Print a text; what would steer the terminal is shown as its code.
 
@@ -42,36 +48,27 @@ def say(text: str, *, err: bool = False) -> None:
     click.echo("\n".join(map(printable, text.split("\n"))), err=err)
 
 
-class Commands(click.Group):
-    """Commands in the order of their definition, and errors in one line."""
-
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        """Return the commands' names."""
-        return list(self.commands)
+class OneCommand(click.Command):
+    """The only command of a script that builds, with errors in one line."""
 
     def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
-        """Read the options before the command's name."""
+        """Read the command line; of a group, the options before the command's name."""
         with one_line_errors():
             return super().make_context(*args, **kwargs)
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command that was asked for."""
-        with one_line_errors(resumable=lambda: ctx.invoked_subcommand == "build"):
+        of_group = isinstance(self, click.Group)
+        with one_line_errors(lambda: not of_group or ctx.invoked_subcommand == "build"):
             return super().invoke(ctx)
 
 
-class OneCommand(click.Command):
-    """The only command of a script that builds, with errors in one line."""
+class Commands(OneCommand, click.Group):
+    """Commands in the order of their definition, and errors in one line."""
 
-    def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
-        """Read the command line."""
-        with one_line_errors():
-            return super().make_context(*args, **kwargs)
-
-    def invoke(self, ctx: click.Context) -> Any:
-        """Run the command."""
-        with one_line_errors(resumable=lambda: True):
-            return super().invoke(ctx)
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the commands' names."""
+        return list(self.commands)
 
 
 @contextmanager

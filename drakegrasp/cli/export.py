@@ -7,25 +7,25 @@ from pathlib import Path
 import click
 
 from drakegrasp.cli.errors import say
-from drakegrasp.cli.options import PathType, out_argument
+from drakegrasp.cli.options import PATH, dataset_argument, shared
 
 #: The formats as the help lists them; loading them would take longer than printing the help.
 FORMATS = ("hf", "original", "dexgraspbench", "glb")
 
 
 @click.command()
-@out_argument
-@click.argument("directory", type=PathType(path_type=Path), required=False)
+@dataset_argument()
+@click.argument("directory", type=PATH, required=False)
 @click.option("--to", "form", type=click.Choice(FORMATS), required=True, help="The format.")
 @click.option(
+    "--licence",
     "--license",
-    "licence",
     metavar="ID",
     default="unknown",
     show_default=True,
     help="Licence that the card of format hf names, e.g. cc-by-4.0.",
 )
-@click.option("--quiet", is_flag=True, help="Show no progress.")
+@shared("--quiet")
 def export(out: Path, directory: Path | None, form: str, licence: str, quiet: bool) -> None:
     """Write the samples of a dataset in another format.
 

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from drakegrasp.cli.errors import say
-from drakegrasp.cli.options import PathType
-from drakegrasp.errors import printable
+from drakegrasp.cli.errors import say, say_finding
+from drakegrasp.cli.options import NEW_FILE
 
 if TYPE_CHECKING:
     from drakegrasp.commissioning.finding import Finding
@@ -34,7 +33,7 @@ def list_hands() -> None:
 @click.argument("hand_file", metavar="NAME|YAML")
 @click.option(
     "--picture",
-    type=PathType(path_type=Path, dir_okay=False),
+    type=NEW_FILE,
     metavar="PNG",
     help="Write a picture of the hand, open and closed, with pads and palm frame.",
 )
@@ -62,5 +61,4 @@ def check_hand_file(hand_file: str, picture: Path | None) -> None:
 
 
 def _print(finding: Finding) -> None:
-    mark = click.style("ok  ", fg="green") if finding.ok else click.style("FAIL", fg="red")
-    click.echo(f"{mark}  {finding.name:<20} {printable(finding.text)}")
+    say_finding(finding.ok, "FAIL", f"{finding.name:<20} {finding.text}")

@@ -7,14 +7,14 @@ from pathlib import Path
 import click
 
 from drakegrasp.cli.errors import say
-from drakegrasp.cli.options import PathType, out_argument
+from drakegrasp.cli.options import PATH, dataset_argument, shared
 
 #: Port without --port; the same every time, so that a tunnel to another machine can stay.
 PORT = 8321
 
 
 @click.command("inspect")
-@out_argument
+@dataset_argument()
 @click.option(
     "--port",
     type=click.IntRange(0, 65535),
@@ -26,7 +26,7 @@ PORT = 8321
 @click.option(
     "--static",
     "folder",
-    type=PathType(path_type=Path),
+    type=PATH,
     metavar="DIR",
     help="Write the pages to DIR as files that open without a server, and end.",
 )
@@ -64,24 +64,20 @@ def inspect_(out: Path, port: int, folder: Path | None, no_browser: bool) -> Non
 
 
 @click.command()
-@out_argument
+@dataset_argument()
 @click.option(
-    "--out",
-    "folder",
-    type=PathType(path_type=Path),
-    metavar="DIR",
-    help="Where to write.  [default: OUT/figures]",
+    "--out", "folder", type=PATH, metavar="DIR", help="Where to write.  [default: OUT/figures]"
 )
 @click.option(
     "--trial", type=int, metavar="ID", help="The grasp whose phases are drawn: row of trials.hdf5."
 )
 @click.option(
     "--compare",
-    type=PathType(path_type=Path),
+    type=PATH,
     metavar="OTHER",
     help="A dataset of the same objects by the other method of palm poses (candidates.method).",
 )
-@click.option("--quiet", is_flag=True, help="Show no progress.")
+@shared("--quiet")
 def figures(
     out: Path, folder: Path | None, trial: int | None, compare: Path | None, quiet: bool
 ) -> None:

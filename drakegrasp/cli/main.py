@@ -10,33 +10,32 @@ from __future__ import annotations
 import math
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 
+from drakegrasp import __version__
 from drakegrasp.cli.audit import audit
 from drakegrasp.cli.bench import bench
 from drakegrasp.cli.build import assemble, build, merge, stats
-from drakegrasp.cli.errors import say
+from drakegrasp.cli.errors import Commands, say, say_finding
 from drakegrasp.cli.export import export
-from drakegrasp.cli.group import main
 from drakegrasp.cli.hand import hand
 from drakegrasp.cli.inspect import figures, inspect_
 from drakegrasp.cli.morph import morph
-from drakegrasp.cli.options import (
-    PathType,
-    builtin_overrides,
-    objects_seed_option,
-    out_argument,
-    per_class_option,
-    processes_option,
-    tidied,
-)
+from drakegrasp.cli.options import PATH, chosen_settings, dataset_argument, shared
 from drakegrasp.cli.verify import verify
 from drakegrasp.runtime.allocator import restart_with_jemalloc
 
 
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="drakegrasp")
+def main() -> None:
+    """Simulate multi-finger grasps of object meshes and write datasets of them."""
+
+
 @click.command()
-@click.argument("directory", type=PathType(path_type=Path), default=Path("."))
+@click.argument("directory", type=PATH, default=Path("."))
 def doctor(directory: Path) -> None:
     """Check that this machine can run drakegrasp.
 
@@ -48,10 +47,7 @@ def doctor(directory: Path) -> None:
     # A line per need, and one more with the remedy where it is not met.
     findings = diagnose(directory)
     for finding in findings:
-        mark = (
-            click.style("ok     ", fg="green") if finding.ok else click.style("MISSING", fg="red")
-        )
-        click.echo(f"{mark}  {finding.name:<18} {finding.what}")
+        say_finding(finding.ok, "MISSING", f"{finding.name:<18} {finding.what}")
         if not finding.ok:
             click.echo(f"         -> {finding.remedy}")
     if not all(finding.ok for finding in findings):
@@ -74,10 +70,9 @@ def list_objects() -> None:
 
 
 @objects.command("export")
-@click.argument("directory", type=PathType(path_type=Path))
-@per_class_option
-@objects_seed_option
-def export_objects(directory: Path, per_class: int | None, objects_seed: int | None) -> None:
+@click.argument("directory", type=PATH)
+@shared("--per-class", "--objects-seed")
+def export_objects(directory: Path, **options: Any) -> None:
     """Write the built-in objects' meshes (.obj, metres) to DIRECTORY.
 
     Equal options write equal bytes on every machine.
@@ -87,16 +82,16 @@ def export_objects(directory: Path, per_class: int | None, objects_seed: int | N
     from drakegrasp.objects.builtin.catalog import export_builtin
     from drakegrasp.runtime.progress import progress_bar
 
-    config = load_config(overrides=builtin_overrides(BUILTIN, per_class, objects_seed))
+    config = load_config(overrides=chosen_settings({"objects": BUILTIN, **options}))
     with progress_bar("objects", "meshes") as progress:
         paths = export_builtin(directory, config=config.builtin, progress=progress)
     say(f"{len(paths)} meshes in {directory}")
 
 
 @click.command()
-@click.argument("path", type=PathType(path_type=Path), metavar="OUT|FILE", callback=tidied)
-@processes_option
-def check(path: Path, workers: int) -> None:
+@dataset_argument("path", "OUT|FILE")
+@shared("--workers")
+def check(path: Path, workers: int | None) -> None:
     """Check every invariant of a dataset.
 
     OUT is a dataset's directory; FILE is one of its three main files. Exit code 1 if an
@@ -116,11 +111,11 @@ def check(path: Path, workers: int) -> None:
 
 
 @click.command()
-@out_argument
+@dataset_argument()
 @click.option("--trial", required=True, type=int, metavar="ID", help="Row of trials.hdf5.")
 @click.option(
     "--html",
-    type=PathType(path_type=Path),
+    type=PATH,
     metavar="FILE",
     help="Write a recording of the trial that plays in a browser.",
 )

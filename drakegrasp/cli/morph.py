@@ -7,11 +7,11 @@ from pathlib import Path
 import click
 
 from drakegrasp.cli.errors import say
-from drakegrasp.cli.options import PathType, manifest_option, units_option
+from drakegrasp.cli.options import PATH, shared
 
 
 @click.command()
-@click.argument("mesh_dir", type=PathType(path_type=Path))
+@click.argument("mesh_dir", type=PATH)
 @click.option(
     "--per-mesh",
     required=True,
@@ -19,23 +19,9 @@ from drakegrasp.cli.options import PathType, manifest_option, units_option
     metavar="N",
     help="Morphs of each mesh.",
 )
-@click.option(
-    "--seed",
-    type=click.IntRange(min=0),
-    default=0,
-    show_default=True,
-    metavar="S",
-    help="Seed of the draws.",
-)
-@click.option(
-    "--out",
-    required=True,
-    type=PathType(path_type=Path),
-    metavar="DIR",
-    help="Directory of the morphs; new or empty.",
-)
-@units_option
-@manifest_option
+@shared("--seed", type=click.IntRange(min=0), default=0, help="Seed of the draws.  [default: 0]")
+@shared("--out", help="Directory of the morphs; new or empty.")
+@shared("--units", "--manifest")
 def morph(
     mesh_dir: Path, per_mesh: int, seed: int, out: Path, units: str, manifest: Path | None
 ) -> None:

@@ -1,4 +1,4 @@
-"""Options that several commands share, and those of a build.
+"""Options that several commands share, each told once in a table, and those of a build.
 
 In: what click parsed. Out: a `BuildRequest`, with the configuration resolved.
 """
@@ -6,7 +6,7 @@ In: what click parsed. Out: a `BuildRequest`, with the configuration resolved.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -35,113 +35,143 @@ class PathType(click.Path):
         return super().convert(value, param, ctx)
 
 
-#: Which built-in objects there are, for every command that takes them.
-per_class_option = click.option(
-    "--per-class",
-    type=click.IntRange(min=1),
-    metavar="N",
-    help="Built-in objects of each class.  [default: 2]",
-)
-objects_seed_option = click.option(
-    "--objects-seed",
-    type=click.IntRange(min=0),
-    metavar="S",
-    help="Seed of the sizes of the built-in objects.  [default: 0]",
-)
-units_option = click.option(
-    "--units",
-    default="m",
-    show_default=True,
-    metavar="m|cm|mm",
-    help="Unit of length of the meshes.",
-)
-manifest_option = click.option(
-    "--manifest",
-    type=PathType(path_type=Path),
-    metavar="FILE",
-    help="YAML file with units and classes by mesh.  [default: objects.yaml beside the meshes]",
-)
-set_option = click.option(
-    "--set",
-    "overrides",
-    multiple=True,
-    metavar="KEY=VALUE",
-    help="Change one setting, e.g. lift.hold_time=1; may be given several times.",
-)
-times_option = click.option(
-    "--times",
-    type=PathType(path_type=Path, exists=True, dir_okay=False),
-    metavar="FILE",
-    help="Estimate from these times, which measure_stages.py of pipelines/measurements printed.  "
-    "[default: OUT/log.jsonl, else times measured on other meshes]",
-)
+#: Types of options: any path, a file to write, a file that is there.
+PATH = PathType(path_type=Path)
+NEW_FILE = PathType(path_type=Path, dir_okay=False)
+FILE = PathType(path_type=Path, exists=True, dir_okay=False)
 
-_OPTIONS = (
-    click.option(
-        "--objects",
+
+def _row(metavar: str | None, text: str, **attributes: Any) -> dict[str, Any]:
+    """Return a row of the table: what click calls metavar and help, and its other attributes."""
+    return {"metavar": metavar, "help": text, **attributes}
+
+
+#: The options that more than one command has.
+_TABLE = {
+    # What is built.
+    "--objects": _row(
+        "MESH_DIR|builtin",
+        "A directory of .obj, .stl, .ply or .glb files, or the built-in objects.",
         required=True,
-        metavar="MESH_DIR|builtin",
-        help="A directory of .obj, .stl, .ply or .glb files, or the built-in objects.",
     ),
-    per_class_option,
-    objects_seed_option,
-    click.option(
-        "--out",
+    "--per-class": _row("N", "Built-in objects of each class.  [default: 2]", type=int),
+    "--objects-seed": _row(
+        "S", "Seed of the sizes of the built-in objects.  [default: 0]", type=int
+    ),
+    "--units": _row("m|cm|mm", "Unit of length of the meshes.", default="m", show_default=True),
+    "--manifest": _row(
+        "FILE",
+        "YAML file with units and classes by mesh.  [default: objects.yaml beside the meshes]",
+        type=PATH,
+    ),
+    "--only": _row("NAME", "Build this object only; may be given several times.", multiple=True),
+    "--out": _row(
+        "DIR",
+        "Directory of the dataset. The same command continues an interrupted build.",
+        type=PATH,
         required=True,
-        type=PathType(path_type=Path),
-        metavar="DIR",
-        help="Directory of the dataset. The same command continues an interrupted build.",
     ),
-    click.option(
-        "--config",
-        metavar="YAML|PRESET",
-        help="Configuration: a file, or the preset paper, fast, randomized or released.  [default: "
+    # By which rules.
+    "--config": _row(
+        "YAML|PRESET",
+        "Configuration: a file, or the preset paper, fast, randomized or released.  [default: "
         "paper, but with split.by=auto]",
     ),
-    set_option,
-    click.option(
-        "--candidates", type=int, metavar="N", help="Palm poses per object.  [default: 10000]"
-    ),
-    click.option(
-        "--max-grasps",
-        type=int,
-        metavar="N",
-        help="Stop an object after N successes.  [default: no limit]",
-    ),
-    click.option(
-        "--samples",
-        type=int,
-        metavar="N",
-        help="Stop when there are N samples, which the objects share in turns; a larger N goes on "
-        "from there.  [default: no limit]",
-    ),
-    click.option(
-        "--samples-per-object",
-        type=int,
-        metavar="N",
-        help="Stop an object when it has N samples.  [default: no limit]",
-    ),
-    click.option(
-        "--only",
+    "--set": _row(
+        "KEY=VALUE",
+        "Change one setting, e.g. lift.hold_time=1; may be given several times.",
         multiple=True,
-        metavar="NAME",
-        help="Build this object only; may be given several times.",
     ),
-    click.option(
-        "--certify",
-        type=click.IntRange(min=0),
-        metavar="K",
-        help="Repeat each success K times with noise and store how robust it is.",
-        show_default="0",
+    "--candidates": _row("N", "Palm poses per object.  [default: 10000]", type=int),
+    "--max-grasps": _row("N", "Stop an object after N successes.  [default: no limit]", type=int),
+    "--samples": _row(
+        "N",
+        "Stop when there are N samples, which the objects share in turns; a larger N goes on from "
+        "there.  [default: no limit]",
+        type=int,
     ),
-    click.option("--seed", type=int, metavar="S", help="Seed of all random draws.  [default: 0]"),
-    units_option,
-    manifest_option,
-    click.option("--quiet", is_flag=True, help="Show no progress."),
+    "--samples-per-object": _row(
+        "N", "Stop an object when it has N samples.  [default: no limit]", type=int
+    ),
+    "--certify": _row(
+        "K",
+        "Repeat each success K times with noise and store how robust it is.  [default: 0]",
+        type=int,
+    ),
+    "--seed": _row("S", "Seed of all random draws.  [default: 0]", type=int),
+    # Who does the work.
+    "--workers": _row("N", "Processes on this machine.  [default: one per core]", type=int),
+    "--scheduler": _row("ADDRESS", "Use the running Dask scheduler at this address."),
+    "--scheduler-file": _row(
+        "FILE", "Use the running Dask scheduler that wrote this file.", type=PATH
+    ),
+    "--tls-ca-file": _row(
+        "FILE",
+        "Encrypt, with your own certificate authority (PEM); needs the next two options.",
+        type=FILE,
+    ),
+    "--tls-cert": _row(
+        "FILE",
+        "Certificate of client, scheduler and workers, signed by that authority.",
+        type=FILE,
+    ),
+    "--tls-key": _row("FILE", "The certificate's private key.", type=FILE),
+    # What is said.
+    "--times": _row(
+        "FILE",
+        "Estimate from these times, which measure_stages.py of pipelines/measurements printed.  "
+        "[default: OUT/log.jsonl, else times measured on other meshes]",
+        type=FILE,
+    ),
+    "--quiet": _row(None, "Show no progress.", is_flag=True),
+}
+#: The options of the table that stand for `--set KEY=VALUE`, and their keys.
+SETTINGS = {
+    "--per-class": "builtin.per_class",
+    "--objects-seed": "builtin.seed",
+    "--candidates": "candidates.max",
+    "--max-grasps": "max_grasps",
+    "--samples": "samples",
+    "--samples-per-object": "samples_per_object",
+    "--certify": "certify.repeats",
+    "--seed": "seed",
+}
+_BUILD = (
+    *("--objects", "--per-class", "--objects-seed", "--out", "--config", "--set", "--candidates"),
+    *("--max-grasps", "--samples", "--samples-per-object", "--only", "--certify", "--seed"),
+    *("--units", "--manifest", "--quiet"),
 )
+_TLS = ("--tls-ca-file", "--tls-cert", "--tls-key")
 
 
-def tidied(context: click.Context, parameter: click.Parameter, out: Path) -> Path:
+def shared(*names: str, **changes: Any) -> Callable[[F], F]:
+    """Give a command options of the table, which its help lists in this order.
+
+    Args:
+        names: Of the options; `--set` becomes the parameter `overrides`.
+        changes: What click shall know of them otherwise than the table says.
+    """
+
+    def give(command: F) -> F:
+        for name in reversed(names):
+            words = (name, "overrides") if name == "--set" else (name,)
+            command = click.option(*words, **(_TABLE[name] | changes))(command)
+        return command
+
+    return give
+
+
+def build_options(command: F) -> F:
+    """Give a command the options of a build; it passes them on to `parse_request`."""
+    return shared(*_BUILD)(command)
+
+
+def tls_options(command: F) -> F:
+    """Give a command the files of TLS; it passes them on to `tls_files`."""
+    return shared(*_TLS)(command)
+
+
+def _tidied(context: click.Context, parameter: click.Parameter, out: Path) -> Path:
     """Put in order what a dead process left in a dataset, before a command looks at it."""
     from drakegrasp.dataset.lock import tidy
 
@@ -150,114 +180,30 @@ def tidied(context: click.Context, parameter: click.Parameter, out: Path) -> Pat
     return out
 
 
-out_argument = click.argument("out", type=PathType(path_type=Path), metavar="OUT", callback=tidied)
-workers_option = click.option(
-    "--workers",
-    type=int,
-    metavar="N",
-    help="Processes on this machine.  [default: one per core]",
-)
+def dataset_argument(name: str = "out", metavar: str = "OUT") -> Callable[[F], F]:
+    """Give a command the directory of a dataset, or one of its files."""
+    return click.argument(name, type=PATH, metavar=metavar, callback=_tidied)
 
 
-processes_option = click.option(
-    "--workers",
-    type=click.IntRange(1, 1024),
-    default=1,
-    show_default=True,
-    metavar="N",
-    help="Processes on this machine; the result is the same.",
-)
+def tls_files(options: dict[str, Any]) -> tuple[Path, Path, Path] | None:
+    """Take the values of `tls_options` out of a command's options.
 
-
-def _address(context: click.Context, parameter: click.Parameter, text: str | None) -> str | None:
-    """Refuse an empty address, as of a variable that is not set."""
-    if text is not None and not text.strip():
-        raise click.UsageError(f"--scheduler must be an address like tcp://host:8786, got {text!r}")
-    return text
-
-
-scheduler_option = click.option(
-    "--scheduler",
-    metavar="ADDRESS",
-    callback=_address,
-    help="Use the running Dask scheduler at this address.",
-)
-scheduler_file_option = click.option(
-    "--scheduler-file",
-    type=PathType(path_type=Path),
-    metavar="FILE",
-    help="Use the running Dask scheduler that wrote this file.",
-)
-_TLS_OPTIONS = (
-    click.option(
-        "--tls-ca-file",
-        type=PathType(path_type=Path, exists=True, dir_okay=False),
-        metavar="FILE",
-        help="Encrypt, with your own certificate authority (PEM); needs the next two options.",
-    ),
-    click.option(
-        "--tls-cert",
-        type=PathType(path_type=Path, exists=True, dir_okay=False),
-        metavar="FILE",
-        help="Certificate of client, scheduler and workers, signed by that authority.",
-    ),
-    click.option(
-        "--tls-key",
-        type=PathType(path_type=Path, exists=True, dir_okay=False),
-        metavar="FILE",
-        help="The certificate's private key.",
-    ),
-)
-
-
-def tls_options(command: F) -> F:
-    """Give a command the files of TLS; it passes them on to `tls_files`."""
-    for option in reversed(_TLS_OPTIONS):
-        command = option(command)
-    return command
-
-
-def tls_files(*paths: Path | None) -> tuple[Path, Path, Path] | None:
-    """Return the authority, the certificate and its key, or None if none of them is given.
+    Returns:
+        The authority, the certificate and its key; None if none of them is given.
 
     Raises:
         click.UsageError: If only some are given.
     """
-    match paths:
-        case (None, None, None):
+    match [options.pop(_parameter(name)) for name in _TLS]:
+        case [None, None, None]:
             return None
-        case (Path() as ca, Path() as cert, Path() as key):
+        case [Path() as ca, Path() as cert, Path() as key]:
             return ca, cert, key
-    raise click.UsageError("--tls-ca-file, --tls-cert and --tls-key must be given together")
+    raise click.UsageError(f"{', '.join(_TLS[:-1])} and {_TLS[-1]} must be given together")
 
 
-def build_options(command: F) -> F:
-    """Give a command the options of a build; it passes them on to `parse_request`."""
-    for option in reversed(_OPTIONS):
-        command = option(command)
-    return command
-
-
-def parse_request(
-    *,
-    objects: str,
-    per_class: int | None,
-    objects_seed: int | None,
-    out: Path,
-    config: str | None,
-    overrides: Sequence[str],
-    candidates: int | None,
-    max_grasps: int | None,
-    samples: int | None,
-    samples_per_object: int | None,
-    only: tuple[str, ...],
-    certify: int | None,
-    seed: int | None,
-    units: str,
-    manifest: Path | None,
-    quiet: bool,
-) -> BuildRequest:
-    """Return what the options of `build_options` ask for.
+def parse_request(options: Mapping[str, Any]) -> BuildRequest:
+    """Return what the options of `build_options` ask for, given their values by parameter.
 
     Raises:
         click.UsageError: If options of the built-in objects are given with other meshes.
@@ -268,42 +214,40 @@ def parse_request(
     from drakegrasp.config import load_config
     from drakegrasp.hand.file_format import with_hand_defaults
 
-    chosen = [*overrides, *builtin_overrides(objects, per_class, objects_seed)]
-    if candidates is not None:
-        chosen.append(f"candidates.max={candidates}")
-    if certify is not None:
-        chosen.append(f"certify.repeats={certify}")
-    stops = {
-        "max_grasps": max_grasps,
-        "samples": samples,
-        "samples_per_object": samples_per_object,
-    }
-    resolved = load_config(config, chosen, seed=seed, **stops)
     return BuildRequest(
-        objects=objects,
-        out=out.absolute(),
-        config=with_hand_defaults(resolved),
-        units=units,
-        manifest=manifest,
-        only=only,
-        show=not quiet,
+        objects=options["objects"],
+        out=options["out"].absolute(),
+        config=with_hand_defaults(load_config(options["config"], chosen_settings(options))),
+        units=options["units"],
+        manifest=options["manifest"],
+        only=options["only"],
+        show=not options["quiet"],
     )
 
 
-def builtin_overrides(objects: str, per_class: int | None, seed: int | None) -> list[str]:
-    """Return what the options of the built-in objects change in the configuration.
+def chosen_settings(options: Mapping[str, Any]) -> list[str]:
+    """Return the changes of the configuration that a command's options ask for, as `KEY=VALUE`.
 
     Args:
-        objects: A directory of meshes, or "builtin".
-        per_class: Objects of each class; the configuration's if None.
-        seed: Seed of their sizes; the configuration's if None.
+        options: Values by parameter: of `--set` and the options of `SETTINGS`, as far as the
+            command has them, and of `--objects`.
 
     Raises:
-        click.UsageError: If they are given with a directory of meshes.
+        click.UsageError: If options of the built-in objects are given with a directory of meshes.
     """
-    values = {"per-class": per_class, "objects-seed": seed}
-    given = [f"--{name}" for name, value in values.items() if value is not None]
-    if given and objects != BUILTIN:
-        raise click.UsageError(f"{given[0]} must be used with --objects builtin, got {objects}")
-    keys = {"builtin.per_class": per_class, "builtin.seed": seed}
-    return [f"{key}={value}" for key, value in keys.items() if value is not None]
+    chosen = list(options.get("overrides", ()))
+    for name, key in SETTINGS.items():
+        value = options.get(_parameter(name))
+        if value is None:
+            continue
+        if key.startswith("builtin.") and options["objects"] != BUILTIN:
+            raise click.UsageError(
+                f"{name} must be used with --objects builtin, got {options['objects']}"
+            )
+        chosen.append(f"{key}={value}")
+    return chosen
+
+
+def _parameter(name: str) -> str:
+    """Return the name of the parameter that click makes of an option's name."""
+    return name.removeprefix("--").replace("-", "_")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -37,8 +37,6 @@ _OUTCOME_HEADS = {
     Outcome.CRASHED: "crashed",
     Outcome.SUCCESS: "success",
 }
-
-
 #: Groups of outcomes, for terminals that are too narrow for a column of each.
 _COMPACT_HEADS = {
     "no ray": (Outcome.RAY_MISS, Outcome.BELOW_TABLE),
@@ -51,8 +49,6 @@ _COMPACT_HEADS = {
     "success": (Outcome.SUCCESS,),
 }
 _RARE = ("left", "moved")
-
-
 #: Objects without samples of which it is said why.
 BARREN = 10
 #: Width of a terminal from which the audit has all of its columns [characters].
@@ -77,17 +73,13 @@ def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
     removed = [r for r in Removal if r is not Removal.KEPT and funnel.removals[:, r].any()]
     heads = ["poses", "attempts", *groups]
     heads += [] if compact else [f"- {r.label}".replace("_", "\n") for r in removed]
-    table = _table("From palm poses to samples")
-    table.add_column("object", no_wrap=True, overflow="ellipsis", max_width=24)
-    for head in [*heads, "samples"]:
-        table.add_column(head, justify="right", no_wrap=True)
+    table = _table("From palm poses to samples", "object", *heads, "samples")
     if funnel.refined.any():
         tried, held, samples = (f"{n:,}" for n in funnel.refined.sum(axis=0).tolist())
         table.caption = (
             f"Besides, palm poses about those of samples (refined): {tried} attempts, {held} held, "
             f"{samples} samples"
         )
-        table.caption_justify = "left"
 
     def row(outcomes: Sequence[int], removals: Sequence[int], poses: int) -> list[str]:
         cells = [poses, sum(outcomes), *(sum(outcomes[o] for o in g) for g in groups.values())]
@@ -105,52 +97,51 @@ def funnel_table(funnel: Funnel, *, compact: bool = False) -> Table:
 
 def hold_table(funnel: Funnel) -> Table:
     """Return how well the successes hold, a row per object and one of all."""
-    table = _table("How well the hand holds")
-    table.add_column("object", no_wrap=True, overflow="ellipsis", max_width=24)
-    for head in ("attempts", "held", "precision", "stable", "stable\nof held", "samples"):
-        table.add_column(head, justify="right", no_wrap=True)
+    # Where the chance of a sample chose the lifts, only the audited ones tell the share.
+    held, stable, head = funnel.outcomes[:, Outcome.SUCCESS], funnel.stable, "stable\nof held"
+    whole, part = held, stable
+    if not funnel.all_lifted:
+        head, (whole, part) = "in the audit:\nstable of held", funnel.audited.T[1:3]
+    heads = ("attempts", "held", "precision", "stable", head, "samples")
+    table = _table("How well the hand holds", "object", *heads)
 
-    # A column per count, with the sum of all objects below. Where the chance chose the lifts, the
-    # audited ones tell the share.
-    held = funnel.outcomes[:, Outcome.SUCCESS]
-    columns = (
-        funnel.outcomes.sum(axis=1),
-        held,
-        funnel.precision,
-        funnel.stable,
-        funnel.removals[:, Removal.KEPT],
-        *((held, funnel.stable) if funnel.all_lifted else funnel.audited.T[1:3]),
-    )
-    rows = [(_safe(name), [int(c[i]) for c in columns]) for i, name in enumerate(funnel.names)]
-    rows.append(("all", [int(c.sum()) for c in columns]))
-    for i, (name, (attempts, *counts, samples, whole, part)) in enumerate(rows):
-        if i == len(rows) - 1:
-            table.add_section()
-        share = f"{part / whole:.0%}" if whole else "-"
-        cells = [f"{n:,}" for n in (attempts, *counts)]
-        table.add_row(name, *cells, share, f"{samples:,}")
-    table.caption = (
+    def row(objects: slice) -> list[str]:
+        counts = (funnel.outcomes.sum(axis=1), held, funnel.precision, stable)
+        all_held, all_stable = int(whole[objects].sum()), int(part[objects].sum())
+        share = f"{all_stable / all_held:.0%}" if all_held else "-"
+        if not funnel.all_lifted:
+            share = f"{all_stable:,} of {all_held:,}, {share}"
+        samples = funnel.removals[objects, Removal.KEPT].sum()
+        return [*(f"{count[objects].sum():,}" for count in counts), share, f"{samples:,}"]
+
+    for i, name in enumerate(funnel.names):
+        table.add_row(_safe(name), *row(slice(i, i + 1)))
+    table.add_section()
+    table.add_row("all", *row(slice(None)))
+
+    notes = [
         "held: the outcome success; precision: with the fingertips alone; stable: of these, moved "
         "by less than 5 mm and 5° in the hand"
-    )
+    ]
+    if not funnel.all_lifted:
+        notes.append(
+            "in the audit: a part of the hands was lifted whatever the chance of a sample; their "
+            "counts alone say which share of the held grasps is stable"
+        )
     if note := held_note(funnel):
-        table.caption += f"\n{note}"
-    table.caption_justify = "left"
+        notes.append(note)
+    table.caption = "\n".join(notes)
     return table
 
 
 def split_table(counts: Sequence[SplitCount]) -> Table:
     """Return the paper's Table III with a column of objects."""
-    table = _table("Samples by split")
-    table.add_column("split")
-    for head in ("samples", "in effect", "objects", "classes"):
-        table.add_column(head, justify="right")
+    table = _table("Samples by split", "split", "samples", "in effect", "objects", "classes")
     for count in counts:
         effective = "-" if np.isnan(count.effective) else f"{count.effective:,.0f}"
         numbers = (f"{n:,}" for n in (count.objects, count.classes))
         table.add_row(count.split, f"{count.samples:,}", effective, *numbers)
     table.caption = "in effect: where samples with almost the same palm count as one"
-    table.caption_justify = "left"
     return table
 
 
@@ -187,6 +178,19 @@ def unfinished_line(unfinished: Unfinished) -> str:
     )
 
 
+#: Columns of the audit: head, cell, and whether a narrow terminal has it, too.
+_AUDIT: tuple[tuple[str, Callable[[AuditRow], str], bool], ...] = (
+    ("faces", lambda row: _number(row.faces, ","), True),
+    ("size [mm]", lambda row: "x".join(f"{1e3 * e:.0f}" for e in row.extents or ()) or "-", True),
+    ("bodies", lambda row: _number(row.bodies, ","), False),
+    ("water-\ntight", lambda row: {True: "yes", False: "no", None: "-"}[row.watertight], False),
+    ("wall\n[mm]", lambda row: _number(row.wall, ".1f", 1e3), False),
+    ("contact\n[mm]", lambda row: _number(row.collision_error, ".1f", 1e3), False),
+    ("memory\n[MB]", lambda row: _number(row.memory, ".0f", 1e-6), False),
+    ("prepare\n[MB]", lambda row: _number(row.preparing, ".0f", 1e-6), False),
+)
+
+
 def audit_table(rows: Sequence[AuditRow], *, compact: bool = False) -> Table:
     """Return the findings on each mesh, a row per mesh.
 
@@ -195,43 +199,23 @@ def audit_table(rows: Sequence[AuditRow], *, compact: bool = False) -> Table:
         compact: Whether to leave out what warnings tell anyway.
     """
     # Few columns on a narrow terminal; what is unusual is in words in any case.
-    table = _table("Meshes")
-    most = 24 if compact else 40
-    table.add_column("object", no_wrap=True, overflow="ellipsis", max_width=most)
-    table.add_column("status", no_wrap=True)
-    table.add_column("faces", justify="right", no_wrap=True)
-    table.add_column(escape("size [mm]"), justify="right", no_wrap=True)
-    if not compact:
-        table.add_column("bodies", justify="right", no_wrap=True)
-        table.add_column("water-\ntight", no_wrap=True)
-        table.add_column(escape("wall\n[mm]"), justify="right", no_wrap=True)
-        table.add_column(escape("contact\n[mm]"), justify="right", no_wrap=True)
-        table.add_column(escape("memory\n[MB]"), justify="right", no_wrap=True)
-        table.add_column(escape("prepare\n[MB]"), justify="right", no_wrap=True)
+    columns = [column for column in _AUDIT if column[2] or not compact]
+    table = _table("Meshes", "object", "status", *(head for head, _, _ in columns))
+    table.columns[0].max_width, table.columns[1].justify = 24 if compact else 40, "left"
     table.add_column("notes, and what may be wrong (!)", overflow="fold")
 
-    # A row each.
     colours = {"fit": "green", "repaired": "yellow", "refused": "red"}
     for row in rows:
-        size = "-" if row.extents is None else "x".join(f"{1e3 * e:.0f}" for e in row.extents)
-        cells = [
-            _safe(row.name),
-            f"[{colours[row.status]}]{row.status}[/]",
-            "-" if row.faces is None else f"{row.faces:,}",
-            size,
-        ]
-        if not compact:
-            cells += [
-                "-" if row.bodies is None else f"{row.bodies:,}",
-                {True: "yes", False: "no", None: "-"}[row.watertight],
-                "-" if row.wall is None else f"{1e3 * row.wall:.1f}",
-                "-" if row.collision_error is None else f"{1e3 * row.collision_error:.1f}",
-                "-" if row.memory is None else f"{row.memory / 1e6:.0f}",
-                "-" if row.preparing is None else f"{row.preparing / 1e6:.0f}",
-            ]
+        status = f"[{colours[row.status]}]{row.status}[/]"
         words = [*row.notes, *(f"! {text}" for text in row.warnings)]
-        table.add_row(*cells, "\n".join(map(_safe, words)))
+        cells = (cell(row) for _, cell, _ in columns)
+        table.add_row(_safe(row.name), status, *cells, "\n".join(map(_safe, words)))
     return table
+
+
+def _number(value: float | None, form: str, unit: float = 1) -> str:
+    """Return a number in another unit, or a dash."""
+    return "-" if value is None else f"{unit * value:{form}}"
 
 
 def _safe(text: str) -> str:
@@ -264,10 +248,7 @@ def verdict_table(outcomes: Sequence[Outcome]) -> Table:
     """Return how many grasps had each outcome, and their share of those with a verdict."""
     counts = Counter(outcomes)
     judged = sum(n for outcome, n in counts.items() if not outcome.inconclusive)
-    table = _table("Verdicts")
-    table.add_column("outcome", no_wrap=True)
-    for head in ("grasps", "share"):
-        table.add_column(head, justify="right", no_wrap=True)
+    table = _table("Verdicts", "outcome", "grasps", "share")
     others = sorted(counts.keys() - {Outcome.SUCCESS}, key=lambda o: (-counts[o], o))
     for outcome in (Outcome.SUCCESS, *others):
         share = "-" if outcome.inconclusive or not judged else f"{counts[outcome] / judged:.1%}"
@@ -279,15 +260,12 @@ def verdict_table(outcomes: Sequence[Outcome]) -> Table:
 
 def bench_table(report: Mapping[str, Any]) -> Table:
     """Return a report of `measure.summarize` as a table: rates, and CPU seconds by stage."""
-    table = _table("Attempts on one core")
     stages = ("scene", "field", "screen", "try", "look")
     with_mujoco = "peer" in report["all"]
     heads = ["faces", "attempts", "grasps", "attempts\nper s", "grasps\nper h"]
-    heads += [f"{stage}\n{escape('[s]')}" for stage in stages]
+    heads += [f"{stage}\n[s]" for stage in stages]
     heads += ["MuJoCo\ngrasps/h", "ratio"] if with_mujoco else []
-    table.add_column("object", no_wrap=True, overflow="ellipsis", max_width=24)
-    for head in heads:
-        table.add_column(head, justify="right", no_wrap=True)
+    table = _table("Attempts on one core", "object", *heads)
 
     def row(name: str, rates: Mapping[str, Any]) -> None:
         mujoco = rates.get("peer", {})
@@ -327,31 +305,20 @@ def bench_lines(report: Mapping[str, Any]) -> list[str]:
 
 def fidelity_table(counts_by_variant: Mapping[str, Mapping[str, Any]]) -> Table:
     """Return how labels differ where variants simulate the same attempts."""
-    # A column of labels, then numbers of attempts and of grasps.
-    table = _table("The same attempts, simulated in other ways")
-    table.add_column("variant", no_wrap=True)
-    heads = (
-        "attempts",
-        "simulated",
-        "other\nlabels",
-        "of the\nsimulated",
-        "lifts",
-        "other\nverdicts",
-        "of the\nlifts",
-        "grasps",
-        "variant's\ngrasps",
-    )
-    for head in heads:
-        table.add_column(head, justify="right", no_wrap=True)
-
+    columns = {
+        "attempts": "attempts",
+        "simulated": "simulated",
+        "flips": "other\nlabels",
+        "flip_share_of_simulated": "of the\nsimulated",
+        "lifted": "lifts",
+        "lifted_flips": "other\nverdicts",
+        "flip_share_of_lifted": "of the\nlifts",
+        "successes": "grasps",
+        "successes_other": "variant's\ngrasps",
+    }
+    table = _table("The same attempts, simulated in other ways", "variant", *columns.values())
     for name, counts in counts_by_variant.items():
-        numbers = [counts[key] for key in ("attempts", "simulated", "flips")]
-        grasps = [counts[key] for key in ("successes", "successes_other")]
-        lifts = [counts[key] for key in ("lifted", "lifted_flips")]
-        share = f"{counts['flip_share_of_simulated']:.1%}"
-        lift_share = f"{counts['flip_share_of_lifted']:.1%}"
-        cells = [*(f"{n:,}" for n in numbers), share, *(f"{n:,}" for n in lifts), lift_share]
-        cells += [f"{n:,}" for n in grasps]
+        cells = (f"{counts[key]:{'.1%' if 'share' in key else ','}}" for key in columns)
         table.add_row(name.replace("_", " "), *cells)
 
     # Without the screen, the variant's grasps show what the screen loses.
@@ -359,7 +326,6 @@ def fidelity_table(counts_by_variant: Mapping[str, Mapping[str, Any]]) -> Table:
     lost, successes = off["successes_lost_by_screen"], off["successes_other"]
     counted = f"{lost:,} of {successes:,}" if successes else "unknown, as there are no grasps"
     table.caption = f"grasps that the screen removed: {counted}"
-    table.caption_justify = "left"
     return table
 
 
@@ -378,12 +344,9 @@ _GROUP_HEADS = {"sample": "samples", "removed": "held, no samples", "lost": "los
 
 def cross_check_table(groups: Mapping[str, Mapping[str, Any]]) -> Table:
     """Return how many stored lifts hold in MuJoCo, of all and of those lifted there, by group."""
-    table = _table("Stored lifts, tried again in MuJoCo")
-    table.add_column("in the dataset", no_wrap=True)
-    heads = ("lifts", "hold\nthere", "share", "95 %\nconfidence")
-    for head in (*heads, "lifted\nthere", "share\nof these", "95 %\nconfidence"):
-        table.add_column(head, justify="right", no_wrap=True)
-
+    shares = ("share", "95 %\nconfidence"), ("share\nof these", "95 %\nconfidence")
+    heads = ("lifts", "hold\nthere", *shares[0], "lifted\nthere", *shares[1])
+    table = _table("Stored lifts, tried again in MuJoCo", "in the dataset", *heads)
     for group, counts in groups.items():
         cells = [f"{counts[key]:,}" for key in ("drawn", "held")]
         cells += [*_share_cells(counts["of_all"]), f"{counts['lifted']:,}"]
@@ -409,15 +372,21 @@ def cross_check_lines(report: Mapping[str, Any]) -> list[str]:
     return [*lines, f"with {versions}"]
 
 
-def _table(title: str) -> Table:
-    return Table(
+def _table(title: str, first: str, *numbers: str) -> Table:
+    """Return an empty table: a column of names and columns of numbers, by their heads."""
+    table = Table(
         title=title,
         title_justify="left",
+        caption_justify="left",
         box=SIMPLE,
         pad_edge=False,
         collapse_padding=True,
         padding=(0, 1, 0, 0),
     )
+    table.add_column(first, no_wrap=True, overflow="ellipsis", max_width=24)
+    for head in numbers:
+        table.add_column(escape(head), justify="right", no_wrap=True)
+    return table
 
 
 def make_console(*, stderr: bool = False) -> Console:

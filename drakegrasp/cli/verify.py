@@ -10,31 +10,25 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from drakegrasp.cli.errors import say
-from drakegrasp.cli.options import (
-    PathType,
-    scheduler_file_option,
-    scheduler_option,
-    set_option,
-    workers_option,
-)
+from drakegrasp.cli.options import PATH, shared
 
 if TYPE_CHECKING:
     from drakegrasp.verification.result import Verification
 
 
 @click.command()
-@click.argument("grasps", type=PathType(path_type=Path), metavar="GRASPS")
+@click.argument("grasps", type=PATH, metavar="GRASPS")
 @click.option(
     "--object",
     "mesh",
-    type=PathType(path_type=Path),
+    type=PATH,
     metavar="MESH",
     help="The object: a .obj, .stl, .ply or .glb file.",
 )
 @click.option("--units", metavar="m|cm|mm", help="Unit of length of the mesh.  [default: m]")
 @click.option(
     "--dataset",
-    type=PathType(path_type=Path),
+    type=PATH,
     metavar="FILE",
     help="Instead of --object: the data file OUT/grasping_oto.hdf5 or _otm. Each row gives the "
     "object, its pose and the camera's pose.",
@@ -51,7 +45,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--camera",
-    type=PathType(path_type=Path),
+    type=PATH,
     metavar="FILE",
     help="With --object and --frame camera: .npy file with the camera's pose in the table-top "
     "frame X_TC, as (4, 4), or per grasp as (n, 4, 4) or (n, 12).",
@@ -71,17 +65,15 @@ if TYPE_CHECKING:
     help="Configuration: a file, or the preset paper, fast, randomized or released.  [default: "
     "that of the dataset, else the defaults]",
 )
-@set_option
+@shared("--set")
 @click.option(
     "--out",
-    type=PathType(path_type=Path),
+    type=PATH,
     metavar="NAME",
     help="Write NAME.jsonl and NAME.h5 instead of printing lines of JSON.",
 )
-@workers_option
-@scheduler_option
-@scheduler_file_option
-@click.option("--quiet", is_flag=True, help="Show neither progress nor the table.")
+@shared("--workers", "--scheduler", "--scheduler-file")
+@shared("--quiet", help="Show neither progress nor the table.")
 def verify(
     out: Path | None,
     workers: int | None,

@@ -16,7 +16,7 @@ from distributed.security import Security
 from drakegrasp.cluster.admission import SATURATION, SILENCE_SECONDS, worker_environment
 from drakegrasp.cluster.local import PrivateCluster, undisturbed_loop
 from drakegrasp.errors import MachineError
-from drakegrasp.runtime.allocator import own_environment
+from drakegrasp.runtime.allocator import PRELOAD, SETTINGS, kept_variables
 from drakegrasp.runtime.environment import available_cores
 
 #: How long to wait for a scheduler to answer [s].
@@ -83,13 +83,14 @@ def connect(
     Raises:
         MachineError: If there is no scheduler at the address.
     """
-    with own_environment(), dask.config.set(dask_settings()):
+    # Dask sets variables here for the workers that it starts here.
+    with kept_variables(PRELOAD, SETTINGS), dask.config.set(dask_settings()):
         if scheduler or scheduler_file:
-            with _connect_remote(scheduler, scheduler_file, security) as client:
-                yield client
+            cluster = _connect_remote(scheduler, scheduler_file, security)
         else:
-            with _start_local(workers, security, memory) as client:
-                yield client
+            cluster = _start_local(workers, security, memory)
+        with cluster as client:
+            yield client
 
 
 def _connect_remote(

@@ -10,12 +10,10 @@ this machine unless `host` or `interface` says so.
 from __future__ import annotations
 
 import logging
-import math
 import shlex
 import subprocess
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
-from functools import partial
+from contextlib import contextmanager
 from pathlib import Path
 
 import dask
@@ -33,10 +31,12 @@ from drakegrasp.cluster.certificates import (
 from drakegrasp.cluster.connect import NANNY_PRELOAD, closing_cluster, connect, dask_settings
 from drakegrasp.cluster.request import (
     LOOPBACK,
-    WORKER_MEMORY,
     ClusterRequest,
     cores_per_host,
     cores_per_job,
+    job_count,
+    job_memory,
+    job_walltime,
     jobqueue,
     memory_bytes,
     scheduler_listening,
@@ -69,31 +69,29 @@ def start_cluster(request: ClusterRequest, out: Path) -> Iterator[Client]:
         MachineError: If a package or a program is missing, or the workers do not start.
     """
     worker_count(request)
+    makers = {"ssh": _ssh, "slurm": _slurm}
     with _security(request, out) as security, dask.config.set(dask_settings()):
-        if request.kind == "ssh":
-            with _running(partial(_ssh, request, security)) as client:
-                yield client
-        elif request.kind == "slurm":
-            with _running(partial(_slurm, request, security)) as client:
-                yield client
+        if request.kind in makers:
+            running = _running(makers[request.kind], request, security)
         else:
-            with _connected(request, security) as client:
-                yield client
-
-
-def _connected(
-    request: ClusterRequest, security: Security | None
-) -> AbstractContextManager[Client]:
-    address = request.where[0] if request.kind == "scheduler" else None
-    file = request.where[0] if request.kind == "scheduler-file" else None
-    return connect(request.workers, address, file, security=security, memory=request.memory)
+            address = request.where[0] if request.kind == "scheduler" else None
+            file = request.where[0] if request.kind == "scheduler-file" else None
+            running = connect(
+                request.workers, address, file, security=security, memory=request.memory
+            )
+        with running as client:
+            yield client
 
 
 @contextmanager
-def _running(make: Callable[[], SpecCluster]) -> Iterator[Client]:
-    """Run a cluster while the block runs."""
+def _running(
+    make: Callable[[ClusterRequest, Security | None], SpecCluster],
+    request: ClusterRequest,
+    security: Security | None,
+) -> Iterator[Client]:
+    """Run a cluster on other machines while the block runs."""
     try:
-        cluster = make()
+        cluster = make(request, security)
     except (ConfigError, MachineError):
         raise
     # Each kind of cluster fails in its own ways; to the user they are all the machine's.
@@ -152,8 +150,7 @@ def _slurm(request: ClusterRequest, security: Security | None) -> SpecCluster:
 
     # Whatever is None or not named here is as the user's jobqueue.yaml says.
     cores, listening = cores_per_job(request), scheduler_listening(request)
-    jobs = math.ceil((request.workers or 0) / cores)
-    memory = request.memory or (None if jobqueue("memory") else WORKER_MEMORY)
+    jobs, memory = job_count(request), job_memory(request)
     cluster = SLURMCluster(
         job_cls=QuotedJob,
         cores=cores,
@@ -164,7 +161,7 @@ def _slurm(request: ClusterRequest, security: Security | None) -> SpecCluster:
         security=security,
         worker_extra_args=[
             *(jobqueue("worker-extra-args") or ()),
-            *_lifetime(request.walltime or jobqueue("walltime")),
+            *_lifetime(job_walltime(request)),
             f"--dashboard-address={LOOPBACK}:0",
             # The settings' preload is not read by the command that starts a worker.
             f"--preload-nanny={NANNY_PRELOAD}",

@@ -18,27 +18,26 @@ from dask.utils import parse_bytes
 
 from drakegrasp.errors import ConfigError, MachineError
 
-KINDS = ("local", "ssh", "slurm", "scheduler", "scheduler-file")
 #: Memory of a worker under SLURM, if neither the user nor jobqueue.yaml gives it.
 WORKER_MEMORY = "2GB"
 #: Address that only this machine can reach.
 LOOPBACK = "127.0.0.1"
-#: Least and largest number of words after each kind, and what they are.
-_WHERE: dict[str, tuple[int, float, str]] = {
-    "local": (0, 0, "nothing"),
-    "ssh": (1, math.inf, "the names of the hosts"),
-    "slurm": (0, 0, "nothing"),
-    "scheduler": (1, 1, "its address"),
-    "scheduler-file": (1, 1, "its path"),
+#: Options of a cluster on other machines. A cluster on this one has fewer, and a running scheduler,
+#: which has its own workers, none.
+_REMOTE = ("workers", "cores", "memory", "host", "interface", "tls")
+#: By kind: least and largest number of words that follow it, what they are, and its options.
+_KINDS: dict[str, tuple[int, float, str, tuple[str, ...]]] = {
+    "local": (0, 0, "nothing", ("workers", "memory", "tls")),
+    "ssh": (1, math.inf, "the names of the hosts", _REMOTE),
+    "slurm": (0, 0, "nothing", (*_REMOTE, "walltime")),
+    "scheduler": (1, 1, "its address", ()),
+    "scheduler-file": (1, 1, "its path", ()),
 }
-#: Options of each kind; a running scheduler has its own workers.
-_OPTIONS: dict[str, tuple[str, ...]] = {
-    "local": ("workers", "memory", "tls"),
-    "ssh": ("workers", "cores", "memory", "host", "interface", "tls"),
-    "slurm": ("workers", "cores", "memory", "walltime", "host", "interface", "tls"),
-    "scheduler": (),
-    "scheduler-file": (),
-}
+KINDS = tuple(_KINDS)
+#: More memory than a worker has [B].
+MOST_MEMORY = 10**15
+#: A number of days, hours, minutes or seconds.
+_NUMBER = re.compile("[0-9]{1,6}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,8 +80,7 @@ def worker_count(request: ClusterRequest) -> int | None:
     if request.kind == "ssh":
         return len(request.where) * cores_per_host(request)
     if request.kind == "slurm":
-        cores = cores_per_job(request)
-        return cores * math.ceil((request.workers or 0) / cores)
+        return cores_per_job(request) * job_count(request)
     return request.workers
 
 
@@ -104,12 +102,6 @@ def describe(request: ClusterRequest) -> list[str]:
             "warning: anybody who reaches the scheduler's port can run programs as you; give --tls"
         )
     return lines
-
-
-#: More memory than a worker has [B].
-MOST_MEMORY = 10**15
-#: A number of days, hours, minutes or seconds.
-_NUMBER = re.compile("[0-9]{1,6}")
 
 
 def walltime_seconds(text: str) -> float:
@@ -227,8 +219,7 @@ def _job_size(request: ClusterRequest) -> str:
     """Return what each SLURM job asks for, in words; nothing for other clusters."""
     if request.kind != "slurm":
         return ""
-    memory = request.memory or (None if jobqueue("memory") else WORKER_MEMORY)
-    walltime = request.walltime or jobqueue("walltime")
+    memory, walltime = job_memory(request), job_walltime(request)
     asked = [
         f"of {cores_per_job(request)}",
         "memory as in jobqueue.yaml" if memory is None else f"{memory} each",
@@ -242,15 +233,30 @@ def cores_per_job(request: ClusterRequest) -> int:
     return int(request.cores or jobqueue("cores") or 1)
 
 
+def job_count(request: ClusterRequest) -> int:
+    """Return how many SLURM jobs have the workers of a request."""
+    return math.ceil((request.workers or 0) / cores_per_job(request))
+
+
+def job_memory(request: ClusterRequest) -> str | None:
+    """Return the memory of each worker in a SLURM job; None if jobqueue.yaml says that of a job."""
+    return request.memory or (None if jobqueue("memory") else WORKER_MEMORY)
+
+
+def job_walltime(request: ClusterRequest) -> str | None:
+    """Return the time limit of each SLURM job; None if there is none."""
+    return request.walltime or jobqueue("walltime")
+
+
 def _refuse_contradictions(request: ClusterRequest) -> None:
     # Each kind of cluster has its own words and options.
-    least, most, what = _WHERE[request.kind]
+    least, most, what, options = _KINDS[request.kind]
     if not least <= len(request.where) <= most:
         got = " ".join(request.where) or "nothing"
         raise ConfigError(f"--cluster {request.kind} must be followed by {what}, got {got}")
-    for name in ("workers", "cores", "memory", "walltime", "host", "interface", "tls"):
+    for name in (*_REMOTE, "walltime"):
         value = getattr(request, name)
-        if value not in (None, False) and name not in _OPTIONS[request.kind]:
+        if value not in (None, False) and name not in options:
             raise ConfigError(f"--{name} must not be given with --cluster {request.kind}")
         if name in ("workers", "cores") and value is not None and value < 1:
             raise ConfigError(f"{name} must be at least 1, got {value}")

@@ -39,7 +39,7 @@ from drakegrasp.dataset.assembly.survey import (
 )
 from drakegrasp.dataset.assembly.weights import weigh_samples
 from drakegrasp.dataset.card.content import content_of
-from drakegrasp.dataset.card.files import card_files
+from drakegrasp.dataset.card.text import card_files
 from drakegrasp.dataset.filters import Removal, Successes, judge_successes
 from drakegrasp.dataset.hdf5 import AnyArray, create_field, write_field
 from drakegrasp.dataset.layout.opening import open_samples, open_trials, read_codes

@@ -1,7 +1,8 @@
 """A folder for the Hugging Face Hub: Parquet files, a dataset card and Croissant metadata.
 
 In: a dataset. Out: `<camera>/<split>-00000-of-00001.parquet` for both cameras and all splits that
-have samples, `README.md` and `croissant.json`. `datasets.load_dataset(folder, "oto")` reads it.
+have samples, `README.md` (whose head in YAML the Hub and `datasets` read) and `croissant.json`.
+`datasets.load_dataset(folder, "oto")` reads it.
 
 Colour is an 8-bit PNG, depth a 16-bit PNG in units of `DEPTH_UNIT`, the mask an 8-bit PNG of 0 and
 255. All other columns are those of the data file, by their last names. Needs the extra `[hub]`.
@@ -11,25 +12,50 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+import yaml
 
+from drakegrasp.dataset.card.content import card_content
+from drakegrasp.dataset.card.text import card_text
+from drakegrasp.dataset.layout.opening import open_samples
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS, SPLITS, Field
 from drakegrasp.errors import MachineError
-from drakegrasp.exchange.hub_card import DEPTH_UNIT, IMAGES, ParquetFile, card, croissant
+from drakegrasp.exchange.croissant import ParquetFile, croissant
 from drakegrasp.runtime.progress import Report
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
+#: Depth of one unit of a depth image [m]: a tenth of a millimetre, up to 6.5 m.
+DEPTH_UNIT = 1e-4
+#: Columns that are images, made of the fields `images` and `masks`, and what they hold.
+IMAGES = {
+    "image": "colour, 8-bit PNG",
+    "depth": "16-bit PNG in units of 0.1 mm",
+    "mask": "8-bit PNG, 255 where the object is seen, else 0",
+}
+#: The files of a folder, in words.
+FILES = {
+    "oto/, otm/": "the samples, as each camera sees them, in Parquet files",
+    "croissant.json": "the same for programs, with a hash of each file",
+}
+#: What is not as in the files of a dataset.
+CONVENTIONS = {
+    "depth": "z of the camera frame in units of 0.1 mm; see Camera for pixels that show nothing",
+    "images": "PNG files; row 0 is the top",
+}
 #: Samples in a file, which takes about 150 MB, and in a group of rows, which is read as a whole.
 FILE_ROWS, GROUP_ROWS = 4000, 100
+#: What a data file says of its camera: intrinsics [px] and the range of depths [m].
+_CAMERA = ("K", "near", "far")
 #: What the other fields are called here, where it is not their last name.
 NAMES = {"grasps": "grasp", "grasps_held": "grasp_held"}
 
@@ -68,7 +94,7 @@ def write_hub(out: Path, folder: Path, progress: Report, *, licence: str) -> int
             progress(done, total)
 
     # What they are, for people and for programs.
-    text = card(out, written, columns(), licence=licence)
+    text = _card(out, written, licence)
     (folder / "README.md").write_text(text, encoding="utf-8")
     description = croissant(folder, written, columns(), licence=licence)
     (folder / "croissant.json").write_text(json.dumps(description, indent=1), encoding="utf-8")
@@ -82,6 +108,45 @@ def columns() -> dict[str, Field | None]:
         if not field.sample:
             found[NAMES.get(field.name, field.name.rpartition("/")[2])] = field
     return found
+
+
+def _card(out: Path, files: Sequence[ParquetFile], licence: str) -> str:
+    """Return the text of the dataset card: that of the dataset, its files and its columns."""
+    content = card_content(out) | {"files": FILES, "depth_unit": DEPTH_UNIT}
+    content["conventions"] = {**content["conventions"], **CONVENTIONS}
+    rows: Counter[tuple[str, str]] = Counter()
+    for file in files:
+        rows[file.camera, file.split] += file.rows
+    content["samples_by_camera"] = {c: {s: rows[c, s] for s in SPLITS} for c in CAMERAS}
+    with open_samples(out / DATA_FILES["oto"]) as data:
+        content["camera"] = {key: np.asarray(data.attrs[key]).tolist() for key in _CAMERA}
+    content["columns"] = {
+        name: ("", "", "", IMAGES[name])
+        if field is None
+        else (" x ".join(map(str, field.axes)), field.unit, field.frame, field.meaning)
+        for name, field in columns().items()
+    }
+
+    # The head names the files of each configuration and split.
+    configs = [
+        {
+            "config_name": camera,
+            "data_files": [
+                {"split": split, "path": f"{camera}/{split}-*.parquet"}
+                for split in SPLITS
+                if rows[camera, split]
+            ],
+        }
+        for camera in CAMERAS
+    ]
+    head = {
+        "license": licence,
+        "pretty_name": content["title"],
+        "task_categories": ["robotics"],
+        "tags": ["robotics", "grasping", "simulation", "croissant"],
+        "configs": configs,
+    }
+    return f"---\n{yaml.safe_dump(head, sort_keys=False).strip()}\n---\n\n{card_text(content)}"
 
 
 def encode_images(image: npt.ArrayLike, mask: npt.ArrayLike) -> dict[str, bytes]:

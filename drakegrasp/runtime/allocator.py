@@ -103,9 +103,9 @@ def restart_with_jemalloc() -> None:
 
 
 @contextmanager
-def own_environment() -> Iterator[None]:
-    """Take back, when the block ends, what Dask sets here for workers that it starts here."""
-    before = {name: os.environ.get(name) for name in (PRELOAD, SETTINGS)}
+def kept_variables(*names: str) -> Iterator[None]:
+    """Give variables of the environment their values back when the block ends."""
+    before = {name: os.environ.get(name) for name in names}
     try:
         yield
     finally:

@@ -16,7 +16,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from drakegrasp.runtime.allocator import has_jemalloc
+from drakegrasp.runtime.allocator import has_jemalloc, kept_variables
 
 #: Least time between two returns of free memory [s]; one takes about 20 ms.
 TRIM_SECONDS = 5.0
@@ -61,12 +61,6 @@ def _trim() -> None:
 @contextmanager
 def allow_network(kind: str) -> Iterator[None]:
     """Allow Drake one kind of network use, e.g. `package_map`, while the block runs."""
-    allowed = os.environ.get(_VARIABLE)
-    os.environ[_VARIABLE] = kind
-    try:
+    with kept_variables(_VARIABLE):
+        os.environ[_VARIABLE] = kind
         yield
-    finally:
-        if allowed is None:
-            del os.environ[_VARIABLE]
-        else:
-            os.environ[_VARIABLE] = allowed

@@ -10,6 +10,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -21,10 +22,16 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import wait as wait_for
 from typing import Protocol, TypeVar
 
-from drakegrasp.errors import MachineError
+from drakegrasp.errors import ConfigError, MachineError
+from drakegrasp.runtime.environment import available_cores
 
 T = TypeVar("T")
 R = TypeVar("R")
+
+#: Processes on one machine; more are a mistyped number.
+MOST_PROCESSES = 10_000
+#: Work that ends within this time starts no processes, which takes seconds by itself [s].
+ALONE_SECONDS = 5.0
 
 
 class Executor(Protocol):
@@ -85,23 +92,42 @@ def _numbered(function: Callable[[T], R], item: tuple[int, T]) -> tuple[int, R]:
     return number, function(argument)
 
 
+def count_workers(workers: int | None) -> int:
+    """Return how many processes of this machine to start: one per core if None.
+
+    Raises:
+        ConfigError: If the number is none that anybody means.
+    """
+    if workers is not None and workers < 1:
+        raise ConfigError(f"workers must be at least 1, got {workers}")
+    if workers is not None and workers > MOST_PROCESSES:
+        raise ConfigError(f"workers must be at most {MOST_PROCESSES:,}, got {workers}")
+    return available_cores() if workers is None else workers
+
+
 @contextmanager
-def processes(workers: int) -> Iterator[Executor]:
+def processes(workers: int | None = None) -> Iterator[Executor]:
     """Run tasks in processes of this machine while the block runs; one worker is this process.
 
     Args:
-        workers: Number of processes.
+        workers: Number of processes. If None it is one per core, and this process does the work
+            of the first `ALONE_SECONDS`: small datasets need no other.
+
+    Raises:
+        ConfigError: If there cannot be so many.
     """
-    if workers == 1:
+    count = count_workers(workers)
+    if count == 1:
         yield run_here
         return
 
     # A forked process could hang: this one may have threads.
     context = multiprocessing.get_context("spawn")
     resource_tracker.ensure_running()  # it clears the mask of the thread that starts it
-    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin_worker)
+    pool = ProcessPoolExecutor(count, mp_context=context, initializer=_begin_worker)
     try:
-        yield _PoolExecutor(pool, 2 * workers)
+        alone = ALONE_SECONDS if workers is None else 0.0
+        yield _PoolExecutor(pool, 2 * count, time.monotonic() + alone)
     finally:
         pool.shutdown(cancel_futures=True)
 
@@ -113,10 +139,12 @@ class _PoolExecutor:
     Attributes:
         pool: The pool.
         in_flight: Number of tasks that run or wait for a process.
+        alone_until: Time by the monotonic clock until which this process does the work [s].
     """
 
     pool: ProcessPoolExecutor
     in_flight: int
+    alone_until: float
 
     def __call__(self, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
         """Yield function(item) of every item as they are done.
@@ -126,6 +154,8 @@ class _PoolExecutor:
             Exception: What the function raised.
         """
         remaining, pending = iter(items), set[Future[R]]()
+        while time.monotonic() < self.alone_until and (first := list(islice(remaining, 1))):
+            yield function(first[0])
         try:
             while True:
                 for item in islice(remaining, self.in_flight - len(pending)):

@@ -27,7 +27,7 @@ from typing import Any
 import click
 
 from drakegrasp.api import build_dataset
-from drakegrasp.cli.options import set_option, units_option
+from drakegrasp.cli.options import shared
 from drakegrasp.config import Config, load_config
 from drakegrasp.dataset.log import read_log
 from drakegrasp.objects.builtin.catalog import export_builtin
@@ -124,8 +124,7 @@ def measure(objects: str | Path, units: str, config: Config, workers: int) -> di
     metavar="MESH_DIR",
     help="[six built-in objects]",
 )
-@units_option
-@set_option
+@shared("--units", "--set")
 @click.option("--candidates", default=100, show_default=True, help="Per object.")
 def main(objects: Path | None, units: str, overrides: tuple[str, ...], candidates: int) -> None:
     """Run the script."""

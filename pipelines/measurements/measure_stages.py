@@ -25,7 +25,7 @@ from drakegrasp.build.pipeline import build
 from drakegrasp.build.prepare import prepare_one
 from drakegrasp.build.stage_times import StageTimes
 from drakegrasp.build.work_unit import UnitSummary
-from drakegrasp.cli.options import manifest_option, set_option, units_option
+from drakegrasp.cli.options import shared
 from drakegrasp.config import load_config
 from drakegrasp.dataset.assembly.pack import pack_rows
 from drakegrasp.dataset.assembly.survey import survey_object
@@ -68,12 +68,11 @@ class Clock:
 @click.option(
     "--config", "config_name", metavar="YAML|PRESET", help="Configuration.  [default: paper]"
 )
-@set_option
+@shared("--set")
 @click.option(
     "--candidates", type=int, default=20, show_default=True, help="Palm poses per object."
 )
-@units_option
-@manifest_option
+@shared("--units", "--manifest")
 def main(
     meshes: Path,
     out: Path,

@@ -24,7 +24,7 @@ from distributed import Client
 
 from drakegrasp.build.pipeline import build
 from drakegrasp.build.work_unit import UnitSummary, WorkUnit
-from drakegrasp.cli.options import manifest_option, set_option, units_option
+from drakegrasp.cli.options import shared
 from drakegrasp.cluster.connect import connect
 from drakegrasp.cluster.executor import DaskExecutor
 from drakegrasp.config import load_config
@@ -88,9 +88,7 @@ def mixed(items: Iterable[T]) -> Iterator[T]:
 )
 @click.option("--trials", default=5000, show_default=True)
 @click.option("--candidates", default=2000, show_default=True, help="Palm poses per object.")
-@set_option
-@units_option
-@manifest_option
+@shared("--set", "--units", "--manifest")
 def main(
     meshes: Path,
     only: tuple[str, ...],

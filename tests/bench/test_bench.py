@@ -6,11 +6,10 @@ import json
 
 import pytest
 import trimesh
-from click.testing import CliRunner
+from helpers.commands import run
 
 from drakegrasp.bench import measure
 from drakegrasp.bench.fidelity import VARIANTS
-from drakegrasp.cli.main import main
 from drakegrasp.errors import DataError
 
 pytestmark = pytest.mark.sim
@@ -26,7 +25,7 @@ def meshes(tmp_path_factory):
 def test_report_says_what_attempts_cost(meshes, tmp_path):
     path, other = tmp_path / "first.json", tmp_path / "second.json"
     arguments = ["bench", "--objects", str(meshes), "--candidates", "4", "--quiet"]
-    first = CliRunner().invoke(main, [*arguments, "--fidelity", "2", "--peer", "--out", str(path)])
+    first = run(*arguments, "--fidelity", "2", "--peer", "--out", str(path))
     assert first.exit_code == 0, first.output
     report = json.loads(path.read_text())
     (found,) = report["objects"]
@@ -45,7 +44,7 @@ def test_report_says_what_attempts_cost(meshes, tmp_path):
     assert "double resolution" in first.stdout
     assert "labels that depend on the drive: " in first.stdout
     assert report["all"]["drive"]["attempts"] == 2
-    again = CliRunner().invoke(main, [*arguments, "--out", str(other), "--compare", str(path)])
+    again = run(*arguments, "--out", str(other), "--compare", str(path))
     ratio = json.loads(other.read_text())["ratio"]["resolved_per_core_second"]
     assert f"{ratio:.2f} times that of {path}" in again.stdout.replace("\n", "")
 
@@ -54,13 +53,13 @@ def test_report_of_something_else_is_wrong_usage(meshes, tmp_path):
     path = tmp_path / "report.json"
     path.write_text("[]")
     arguments = ["bench", "--objects", str(meshes), "--compare", str(path)]
-    result = CliRunner().invoke(main, arguments)
+    result = run(*arguments)
     assert result.exit_code == 2
     assert "--compare must be a report" in result.output
 
 
 def test_name_that_no_mesh_has_is_wrong_usage(meshes):
-    result = CliRunner().invoke(main, ["bench", "--objects", str(meshes), "--only", "9_cup"])
+    result = run("bench", "--objects", str(meshes), "--only", "9_cup")
     assert result.exit_code == 2
     assert "--only must name objects" in result.output
 
@@ -79,21 +78,21 @@ def test_only_the_same_attempts_are_compared():
 
 def test_report_that_cannot_be_written_is_refused_before_measuring(meshes, tmp_path):
     arguments = ["bench", "--objects", str(meshes), "--out", str(tmp_path / "no" / "x.json")]
-    result = CliRunner().invoke(main, arguments)
+    result = run(*arguments)
     assert result.exit_code == 2
     assert "--out must be a file that can be written" in result.output
 
 
 @pytest.mark.parametrize("number", ["0", "-3", "many"])
 def test_number_of_lifts_must_be_positive(tmp_path, number):
-    result = CliRunner().invoke(main, ["bench", "--cross-check", str(tmp_path), number])
+    result = run("bench", "--cross-check", str(tmp_path), number)
     assert result.exit_code == 2
     assert "'--cross-check'" in result.output
 
 
 def test_cross_check_takes_no_option_of_the_measurement(tmp_path):
     arguments = ["bench", "--cross-check", str(tmp_path), "3", "--candidates", "100"]
-    result = CliRunner().invoke(main, arguments)
+    result = run(*arguments)
     assert result.exit_code == 2
     assert "must be used with --out and --quiet alone, got --candidates" in result.output
 
@@ -101,6 +100,6 @@ def test_cross_check_takes_no_option_of_the_measurement(tmp_path):
 @pytest.mark.parametrize("option", [["--peer"], ["--cross-check", ".", "3"]])
 def test_option_that_needs_mujoco_says_so(monkeypatch, tmp_path, option):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    result = CliRunner().invoke(main, ["bench", *option, "--out", str(tmp_path / "report.json")])
+    result = run("bench", *option, "--out", str(tmp_path / "report.json"))
     assert result.exit_code == 2
     assert f"{option[0]} needs mujoco: pip install 'drakegrasp[peer]'" in result.output

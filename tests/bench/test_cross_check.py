@@ -7,7 +7,7 @@ from collections import Counter
 
 import h5py
 import pytest
-from click.testing import CliRunner
+from helpers.commands import run
 from helpers.datasets import (
     AFTER_LIFT,
     BOXES,
@@ -19,7 +19,6 @@ from helpers.datasets import (
 )
 
 from drakegrasp.bench.cross_check import GROUPS, agreement, draw_lifts, wilson_interval
-from drakegrasp.cli.main import main
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome
@@ -168,7 +167,7 @@ def test_command_prints_the_agreement(dataset, tmp_path):
     pytest.importorskip("coacd")
     path = tmp_path / "report.json"
     arguments = ["bench", "--cross-check", str(dataset), "6", "--out", str(path), "--quiet"]
-    result = CliRunner().invoke(main, arguments)
+    result = run(*arguments)
     assert result.exit_code == 0, result.output
     report = json.loads(path.read_text())
     assert [row["trial_id"] for row in report["lifts"]] == sorted(

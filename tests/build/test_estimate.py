@@ -7,14 +7,13 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from helpers.commands import run
 from helpers.scripts import load_script
 from hypothesis import given
 from hypothesis import strategies as st
 
 from drakegrasp.build.estimate import CERTIFY_SECONDS, START_SECONDS, plan_build, plan_lines
 from drakegrasp.build.stage_times import MEASURED, logged_times, read_times
-from drakegrasp.cli.main import main
 from drakegrasp.config import load_config, override_config
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.log import BuildLog
@@ -101,7 +100,7 @@ def test_nothing_to_do_and_nobody_to_do_it_are_refused(objects: int, workers: in
 def test_plan_of_the_command_line_builds_nothing(tmp_path: Path) -> None:
     out = tmp_path / "out"
     arguments = ["build", "--objects", "builtin", "--out", str(out), "--plan", "--workers", "8"]
-    result = CliRunner().invoke(main, arguments)
+    result = run(*arguments)
     assert result.exit_code == 0, result.output
     assert "3,840,000 attempts in 3,584 work units" in result.stdout
     assert "on 8 workers" in result.stdout

@@ -8,11 +8,7 @@ import random
 import shutil
 import signal
 import subprocess
-import sys
-import threading
 import time
-from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +16,12 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
-from dask.utils import parse_timedelta
-from distributed import Client, LocalCluster, SpecCluster, get_worker
 from helpers.assertions import assert_same_dataset
 from helpers.builds import FAST, finish, start_build, wait_for_shards, workers_of
 
 from drakegrasp.build import attempts
 from drakegrasp.build.pipeline import build
-from drakegrasp.build.prepare import PREPARE_SECONDS
 from drakegrasp.build.work_unit import WorkUnit, run_unit
-from drakegrasp.cluster import executor as tasks
-from drakegrasp.cluster.connect import connect, dask_settings
-from drakegrasp.cluster.executor import DaskExecutor
 from drakegrasp.config import Config, load_config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import PreparedObject
@@ -40,9 +30,11 @@ from drakegrasp.errors import BlankImageError, DiskFullError, MachineError
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
-from drakegrasp.runtime.journal import Journal, Verdict, wall_limit
+from drakegrasp.runtime.journal import Journal, Verdict
 from drakegrasp.runtime.processes import host_label
 from drakegrasp.vision import rendering
+
+pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
 UNITS = 28
 KILLS = 20
@@ -92,8 +84,6 @@ def assert_clean(out: Path, *patterns: str) -> None:
 
 
 @pytest.mark.cluster
-@pytest.mark.sim
-@pytest.mark.slow
 def test_random_kills_change_nothing(meshes: Path, undisturbed: Path, tmp_path: Path) -> None:
     """All of four workers are killed while objects are prepared, and twenty times one of them.
 
@@ -126,8 +116,6 @@ def test_random_kills_change_nothing(meshes: Path, undisturbed: Path, tmp_path: 
 
 
 @pytest.mark.cluster
-@pytest.mark.sim
-@pytest.mark.slow
 def test_client_that_is_stopped_goes_on(meshes: Path, undisturbed: Path, tmp_path: Path) -> None:
     """One that is killed: test_interruptions.py."""
     out = tmp_path / "out"
@@ -153,8 +141,6 @@ def test_client_that_is_stopped_goes_on(meshes: Path, undisturbed: Path, tmp_pat
     assert len(events(out, "finished")) == 1
 
 
-@pytest.mark.sim
-@pytest.mark.slow
 def test_objects_are_prepared_once_whatever_died(
     meshes: Path, undisturbed: Path, config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -172,8 +158,6 @@ def test_objects_are_prepared_once_whatever_died(
 
 
 @pytest.mark.cluster
-@pytest.mark.sim
-@pytest.mark.slow
 def test_fault_costs_what_is_guilty_and_nothing_else(
     meshes: Path, undisturbed: Path, tmp_path: Path
 ) -> None:
@@ -207,8 +191,6 @@ def test_fault_costs_what_is_guilty_and_nothing_else(
 
 
 @pytest.mark.cluster
-@pytest.mark.sim
-@pytest.mark.slow
 def test_suspended_worker_changes_no_label(meshes: Path, tmp_path: Path) -> None:
     """As SLURM suspends a job: for longer than an attempt may take."""
     out = tmp_path / "out"
@@ -228,8 +210,6 @@ def test_suspended_worker_changes_no_label(meshes: Path, tmp_path: Path) -> None
 
 
 @pytest.mark.cluster
-@pytest.mark.sim
-@pytest.mark.slow
 def test_mesh_that_takes_too_much_memory_is_refused_and_the_others_go_on(
     meshes: Path, tmp_path: Path
 ) -> None:
@@ -245,12 +225,6 @@ def test_mesh_that_takes_too_much_memory_is_refused_and_the_others_go_on(
     build(find_meshes(meshes), out, load_config(overrides=[*FAST, few[1]]), run_here, show=False)
     assert [entry.name for entry in read_manifest(out).objects] == ["1_box_a", "2_box_b"]
     assert not read_manifest(out).refused
-
-
-def test_scheduler_is_more_patient_than_the_limits_of_steps() -> None:
-    """A step may hold the interpreter, so that its worker gives no sign of life."""
-    patience = parse_timedelta(dask_settings()["distributed.scheduler.worker-ttl"])
-    assert patience > wall_limit(PREPARE_SECONDS)
 
 
 @pytest.mark.parametrize("step", ["build", "predict", "measure", "write"])
@@ -288,14 +262,13 @@ def _exchange(shard: Path) -> None:
     shutil.copyfile(other, shard)
 
 
-@pytest.mark.sim
-@pytest.mark.slow
 def test_what_is_harmed_is_named_and_run_again(
     meshes: Path, undisturbed: Path, config: Config, tmp_path: Path
 ) -> None:
     out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
     shards = sorted(out.glob("shards/*/*.h5"))
-    for harm, shard in zip((_cut, _flip, _exchange), shards, strict=False):
+    harms = (_cut, _flip, _exchange, Path.unlink)
+    for harm, shard in zip(harms, shards, strict=False):
         harm(shard)
     dead = subprocess.Popen(["true"])
     dead.wait()
@@ -309,7 +282,7 @@ def test_what_is_harmed_is_named_and_run_again(
     lock = {"process": {"host": "h", "pid": 5, "began": 1, "boot": ""}, "since": "s", "command": []}
     (out / "build.lock").write_text(json.dumps(lock))
     report = build(find_meshes(meshes), out, config, run_here, show=False)
-    assert (report.simulated, report.reused) == (3, UNITS - 3)
+    assert (report.simulated, report.reused) == (4, UNITS - 4)
     taken, swept, damaged = report.notices
     assert taken == "the lock of a dead build was taken over: process 5 on h, since s"
     assert swept.startswith("2 temporary files (shards/1_box_a/.")
@@ -320,8 +293,6 @@ def test_what_is_harmed_is_named_and_run_again(
     assert_same_dataset(undisturbed, out)
 
 
-@pytest.mark.sim
-@pytest.mark.slow
 def test_full_disk_stops_and_goes_on(meshes: Path, undisturbed: Path, tmp_path: Path) -> None:
     """A limit on the size of files is what a full disk is to a shard with images."""
     out = tmp_path / "out"
@@ -340,7 +311,6 @@ def test_full_disk_stops_and_goes_on(meshes: Path, undisturbed: Path, tmp_path: 
     assert_same_dataset(undisturbed, out)
 
 
-@pytest.mark.sim
 def test_full_disk_of_the_client_is_one_error(
     meshes: Path, config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -353,8 +323,6 @@ def test_full_disk_of_the_client_is_one_error(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.sim
-@pytest.mark.slow
 def test_blank_image_never_becomes_data(
     meshes: Path, undisturbed: Path, config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -378,8 +346,6 @@ def test_blank_image_never_becomes_data(
 
 
 @pytest.mark.cluster
-@pytest.mark.sim
-@pytest.mark.slow
 def test_second_build_is_refused_before_it_starts(
     meshes: Path, undisturbed: Path, tmp_path: Path
 ) -> None:
@@ -393,172 +359,3 @@ def test_second_build_is_refused_before_it_starts(
     assert len(errors.splitlines()) == 1
     finish(first)
     assert_same_dataset(undisturbed, out)
-
-
-# The executor
-
-
-@pytest.mark.cluster
-def test_worker_that_takes_its_time_to_end_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    def late(cluster: SpecCluster, timeout: float | None = None) -> None:
-        close(cluster, timeout)
-        raise TimeoutError
-
-    close = SpecCluster.close
-    monkeypatch.setattr(SpecCluster, "close", late)
-    with connect(workers=1) as client:
-        assert client.submit(abs, -1).result() == 1
-    with pytest.raises(KeyboardInterrupt), connect(workers=1):
-        raise KeyboardInterrupt
-
-
-@pytest.fixture(scope="module")
-def client() -> Iterator[Client]:
-    with (
-        LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
-        ) as cluster,
-        Client(cluster) as client,
-    ):
-        yield client
-
-
-def _blank_at_first(path: str) -> str:
-    """Fail as often as the name says, and say so in a file."""
-    done = Path(path).read_text() if Path(path).exists() else ""
-    if len(done) < int(path[-1]):
-        Path(path).write_text(done + "x")
-        raise BlankImageError(rendering.BLANK)
-    return path
-
-
-@pytest.mark.cluster
-def test_blank_image_is_tried_again_but_not_for_ever(client: Client, tmp_path: Path) -> None:
-    execute, names = DaskExecutor(client), [str(tmp_path / f"f{i}") for i in range(3)]
-    assert sorted(execute(_blank_at_first, names)) == names
-    with pytest.raises(BlankImageError):
-        list(execute(_blank_at_first, [str(tmp_path / "f3")]))
-
-
-@pytest.mark.cluster
-def test_items_are_taken_as_there_is_room(client: Client) -> None:
-    taken = 0
-
-    def items() -> Iterator[int]:
-        nonlocal taken
-        while taken < 1000:
-            taken += 1
-            yield taken
-
-    results = DaskExecutor(client)(abs, items())
-    for done, _ in enumerate(results):
-        assert taken <= done + 1 + 2 * 2 * tasks.LARGEST
-    assert taken == 1000
-
-
-def _task_of(seconds: float) -> str:
-    """Return which task an item is in, after a while."""
-    time.sleep(seconds)
-    return str(get_worker().get_current_task())
-
-
-@pytest.mark.cluster
-def test_quick_items_go_together_and_slow_ones_alone(client: Client) -> None:
-    execute = DaskExecutor(client)
-    together = list(execute(_task_of, [0.0] * 400))
-    assert len(together) == 400
-    assert len(set(together)) < 2 * 400 / tasks.LARGEST
-    assert max(Counter(together).values()) <= tasks.LARGEST
-    alone = list(execute(_task_of, [1.5 * tasks.TASK_SECONDS] * 40))
-    assert len(set(alone)) == 40
-
-
-def test_error_costs_no_results_of_the_items_before_it() -> None:
-    def invert(value: float) -> float:
-        return 1.0 / value
-
-    assert tasks._run_items(invert, [1.0, 2.0, 0.0, 4.0]).results == [1.0, 0.5]
-    with pytest.raises(ZeroDivisionError):
-        tasks._run_items(invert, [0.0, 4.0])
-
-
-@pytest.fixture
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tasks, "COUNT_SECONDS", 0.1)
-    monkeypatch.setattr(tasks, "SAY_SECONDS", 0.2)
-    monkeypatch.setattr(tasks, "LOST_SECONDS", 0.5)
-
-
-@pytest.fixture
-def cluster() -> Iterator[LocalCluster]:
-    """A cluster of one worker, in this process."""
-    with LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
-    ) as cluster:
-        yield cluster
-
-
-@pytest.mark.cluster
-@pytest.mark.usefixtures("impatient")
-def test_where_no_worker_comes_back_it_says_so(cluster: LocalCluster) -> None:
-    with Client(cluster) as client:
-        execute = DaskExecutor(client)
-        changes: list[tuple[int, int]] = []
-        execute.pool.on_change = lambda joined, left: changes.append((len(joined), len(left)))
-        results = execute(time.sleep, [0.0, 5.0])
-        assert next(results) is None
-        cluster.scale(0)
-        with pytest.raises(MachineError, match=r"no worker for 0\.5 s; the same"):
-            next(results)
-        assert changes == [(1, 0), (0, 1)]
-
-
-@pytest.mark.cluster
-@pytest.mark.usefixtures("impatient")
-def test_where_workers_may_come_the_work_waits(cluster: LocalCluster) -> None:
-    """As under SLURM, where all jobs reached their walltime and the next ones queue."""
-    with Client(cluster.scheduler_address) as client:
-        execute, said = DaskExecutor(client), 0
-
-        def say() -> None:
-            nonlocal said
-            said += 1
-
-        execute.pool.on_none = say
-        results = execute(str, [1, 2, 3, 4])
-        found = [next(results)]
-        cluster.scale(0)
-        threading.Timer(2.0, lambda: cluster.scale(1)).start()
-        client.run_on_scheduler(lambda dask_scheduler: None)
-        while client.nthreads():
-            time.sleep(0.05)
-        found += list(results)
-        assert sorted(found) == ["1", "2", "3", "4"]
-
-
-@pytest.mark.cluster
-def test_lost_scheduler_is_one_error(tmp_path: Path) -> None:
-    command, file = [sys.executable, "-m"], tmp_path / "scheduler.json"
-    options = ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
-    scheduler = subprocess.Popen(
-        [*command, "distributed.cli.dask_scheduler", *options, "--scheduler-file", str(file)],
-        stderr=subprocess.DEVNULL,
-    )
-    worker = subprocess.Popen(
-        [*command, "distributed.cli.dask_worker", "--scheduler-file", str(file), "--no-nanny"],
-        stderr=subprocess.DEVNULL,
-    )
-    try:
-        while not file.exists():
-            time.sleep(0.1)
-        with connect(scheduler_file=file) as client:
-            client.wait_for_workers(1, timeout=60)
-            results = DaskExecutor(client)(time.sleep, [0.0, 0.0, 600.0, 600.0])
-            assert [next(results), next(results)] == [None, None]
-            scheduler.kill()
-            with pytest.raises(MachineError, match=r"the scheduler was lost: .*; the same"):
-                next(results)
-    finally:
-        for process in (worker, scheduler):
-            process.kill()
-            process.wait(60)

@@ -42,9 +42,9 @@ _BUILD = (
 #: Commands by their names in the table.
 COMMANDS: dict[str, tuple[str, ...]] = {
     "stats": ("stats", "{out}"),
-    "assemble": ("assemble", "{out}"),
-    "check": ("check", "{out}"),
-    "check FILE": ("check", "{out}/{file}"),
+    "assemble": ("assemble", "{out}", "--workers", "1"),
+    "check": ("check", "{out}", "--workers", "1"),
+    "check FILE": ("check", "{out}/{file}", "--workers", "1"),
     "replay": ("replay", "{out}", "--trial", "0"),
     "figures": ("figures", "{out}", "--out", "{to}/figures", "--quiet"),
     "inspect": ("inspect", "{out}", "--static", "{to}/site"),
@@ -171,18 +171,6 @@ def report(title: str, kinds: Sequence[object], wrong: dict[str, str]) -> None:
     assert not wrong, f"{title}: {len(wrong)} of {len(kinds)} kinds:\n" + "\n".join(lines)
 
 
-def some(kinds: Sequence[Kind], command: str, commands: Sequence[str]) -> Sequence[Kind]:
-    """Return all kinds for the first command, and for each other one its share.
-
-    All of them read a file by the same function, so most kinds are tried twice. With the variable
-    ALL_BAD_INPUTS in the environment each is tried with every command, which takes long.
-    """
-    k = commands.index(command)
-    if k == 0 or "ALL_BAD_INPUTS" in os.environ:
-        return kinds
-    return kinds[k - 1 :: max(len(commands) - 1, 6)]
-
-
 def test_every_kind_has_a_name() -> None:
     modules = (array_kinds, hdf5_kinds, manifests, text_kinds)
     tables = {
@@ -196,36 +184,53 @@ def test_every_kind_has_a_name() -> None:
     assert sum(map(len, tables.values())) > 1500
 
 
-READ_MANIFEST = (
-    *("stats", "assemble", "check", "replay", "figures", "export glb", "export dexgraspbench"),
-    *("verify", "bench", "build"),
-)
-READ_TRIALS = (
-    *("stats", "check", "check FILE", "replay", "figures", "inspect", "export glb"),
-    *("export dexgraspbench", "bench"),
-)
-READ_DATA = (
-    *("stats", "check", "check FILE", "inspect", "export glb", "export dexgraspbench"),
-    *("export original", "export hf", "verify"),
-)
-READ_SHARDS = ("assemble", "check")
-READ_PLANS = ("replay", "check")
-READ_MODELS = ("replay", "assemble", "check")
+#: By file: how it can be spoiled, and the commands that read it.
+FILES: dict[str, tuple[Sequence[Kind], tuple[str, ...]]] = {
+    MANIFEST: (
+        manifests.MANIFEST,
+        (
+            *("stats", "assemble", "check", "replay", "figures", "export glb"),
+            *("export dexgraspbench", "verify", "bench", "build"),
+        ),
+    ),
+    TRIALS: (
+        hdf5_kinds.TRIALS,
+        (
+            *("stats", "check", "check FILE", "replay", "figures", "inspect", "export glb"),
+            *("export dexgraspbench", "bench"),
+        ),
+    ),
+    OTO: (
+        hdf5_kinds.DATA,
+        (
+            *("stats", "check", "check FILE", "inspect", "export glb", "export dexgraspbench"),
+            *("export original", "export hf", "verify"),
+        ),
+    ),
+    SHARD: (hdf5_kinds.SHARD, ("assemble", "check")),
+    PLAN: (hdf5_kinds.PLAN, ("replay", "check")),
+    MODEL: (array_kinds.MODEL, ("replay", "assemble", "check")),
+}
 
 
-@pytest.mark.parametrize("command", READ_MANIFEST)
-def test_manifest(base: Path, tmp_path: Path, command: str) -> None:
-    kinds = some(manifests.MANIFEST, command, READ_MANIFEST)
-    walk(base, tmp_path, MANIFEST, kinds, command)
+@pytest.mark.parametrize(
+    ("file", "command"), [(file, c) for file, (_, commands) in FILES.items() for c in commands]
+)
+def test_files(base: Path, tmp_path: Path, file: str, command: str) -> None:
+    """All kinds with the first command, and a share of them with each other one.
+
+    All of them read a file by the same function, so most kinds are tried twice. With the variable
+    ALL_BAD_INPUTS in the environment each is tried with every command, which takes long.
+    """
+    kinds, commands = FILES[file]
+    k = commands.index(command)
+    if k and "ALL_BAD_INPUTS" not in os.environ:
+        kinds = kinds[k - 1 :: max(len(commands) - 1, 6)]
+    walk(base, tmp_path, file, kinds, command)
 
 
 def test_manifest_of_unfinished(base: Path, tmp_path: Path) -> None:
     walk(base, tmp_path, MANIFEST, manifests.MANIFEST[::5], "inspect", OTO, OTM, TRIALS)
-
-
-@pytest.mark.parametrize("command", READ_TRIALS)
-def test_trials(base: Path, tmp_path: Path, command: str) -> None:
-    walk(base, tmp_path, TRIALS, some(hdf5_kinds.TRIALS, command, READ_TRIALS), command)
 
 
 @pytest.mark.parametrize("command", ["stats", "check", "inspect"])
@@ -233,30 +238,10 @@ def test_values_of_trials(base: Path, tmp_path: Path, command: str) -> None:
     walk(base, tmp_path, TRIALS, hdf5_kinds.TRIAL_VALUES, command)
 
 
-@pytest.mark.parametrize("command", READ_DATA)
-def test_data(base: Path, tmp_path: Path, command: str) -> None:
-    walk(base, tmp_path, OTO, some(hdf5_kinds.DATA, command, READ_DATA), command)
-
-
 @pytest.mark.parametrize("name", [TRIALS, OTO])
 @pytest.mark.parametrize("command", ["check", "check FILE"])
 def test_attributes_that_contradict(base: Path, tmp_path: Path, command: str, name: str) -> None:
     walk(base, tmp_path, name, hdf5_kinds.CONTRADICTIONS, command)
-
-
-@pytest.mark.parametrize("command", READ_SHARDS)
-def test_shards(base: Path, tmp_path: Path, command: str) -> None:
-    walk(base, tmp_path, SHARD, some(hdf5_kinds.SHARD, command, READ_SHARDS), command)
-
-
-@pytest.mark.parametrize("command", READ_PLANS)
-def test_plans(base: Path, tmp_path: Path, command: str) -> None:
-    walk(base, tmp_path, PLAN, some(hdf5_kinds.PLAN, command, READ_PLANS), command)
-
-
-@pytest.mark.parametrize("command", READ_MODELS)
-def test_models(base: Path, tmp_path: Path, command: str) -> None:
-    walk(base, tmp_path, MODEL, some(array_kinds.MODEL, command, READ_MODELS), command)
 
 
 def test_log_is_skipped_where_no_build_wrote_it(base: Path, tmp_path: Path) -> None:
@@ -281,20 +266,33 @@ def test_log_is_skipped_where_no_build_wrote_it(base: Path, tmp_path: Path) -> N
 
 
 def walk_file(
+    base: Path,
     tmp_path: Path,
     sound: bytes,
     suffix: str,
     kinds: Sequence[Kind],
-    command: Sequence[str],
+    command: str,
     *names: str,
 ) -> None:
-    """Give each kind of a single file to a command; fail with all answers that are wrong."""
+    """Give each kind of a single file to a command; fail with all answers that are wrong.
+
+    Args:
+        base: Of the sound dataset and its meshes.
+        tmp_path: Where the file is written.
+        sound: Its content, which the kinds spoil.
+        suffix: Its suffix.
+        kinds: Ways to spoil it.
+        command: Its words; `{file}` stands for the file, `{to}` for where results go.
+        names: What an error must name one of, if not the file.
+    """
     file, to, wrong = tmp_path / f"spoiled{suffix}", tmp_path / "to", {}
+    places = {"file": file, "to": to, "meshes": base / "meshes", "out": tmp_path / "out"}
+    places["mesh"] = base / "meshes" / "1_box_a.stl"
     for kind in kinds:
         to.mkdir()
         file.write_bytes(sound)
         kind.spoil(file)
-        result = run(command, file=file, to=to)
+        result = run(command.split(), **places, data=base / "out" / OTO, tmp=tmp_path)
         answer = wrong_answer(result, ("spoiled", *names))
         if answer is None and any(to.iterdir()):
             answer = f"left {[path.name for path in to.iterdir()]}"
@@ -302,7 +300,7 @@ def walk_file(
             wrong[kind.name] = answer
         shutil.rmtree(to)
         shutil.rmtree(file) if file.is_dir() else file.unlink()
-    report(" ".join(command[:1]) + f" {suffix}", kinds, wrong)
+    report(f"{command.split()[0]} {suffix}", kinds, wrong)
 
 
 def _npy(path: Path, array: np.ndarray) -> bytes:
@@ -310,10 +308,11 @@ def _npy(path: Path, array: np.ndarray) -> bytes:
     return (path / "sound.npy").read_bytes()
 
 
+#: Predictions by suffix: how they can be spoiled, and what they are verified against.
 PREDICTIONS = {
-    ".npy": array_kinds.PREDICTIONS_NPY,
-    ".csv": array_kinds.PREDICTIONS_CSV,
-    ".h5": array_kinds.PREDICTIONS_HDF5,
+    ".npy": (array_kinds.PREDICTIONS_NPY, "--object {mesh}"),
+    ".csv": (array_kinds.PREDICTIONS_CSV, "--object {mesh}"),
+    ".h5": (array_kinds.PREDICTIONS_HDF5, "--dataset {data}"),
 }
 
 
@@ -323,66 +322,32 @@ def test_predictions(base: Path, tmp_path: Path, suffix: str) -> None:
 
     sound = _npy(tmp_path, array_kinds.GRASP)
     if suffix == ".csv":
-        sound = array_kinds._LINE.encode()
+        sound = array_kinds.LINE.encode()
     elif suffix == ".h5":
         with h5py.File(tmp_path / "sound.h5", "w") as file:
             file["grasps"] = np.tile(array_kinds.GRASP, (2, 1))
             file["rows"] = np.arange(2)
         sound = (tmp_path / "sound.h5").read_bytes()
-    command = ("verify", "{file}", "--out", "{to}/verdicts", "--workers", "1", "--quiet")
-    target = (
-        ("--dataset", str(base / "out" / OTO))
-        if suffix == ".h5"
-        else ("--object", str(base / "meshes" / "1_box_a.stl"))
-    )
-    walk_file(
-        tmp_path, sound, suffix, PREDICTIONS[suffix], (*command, *target), "rows", "contact points"
-    )
+    kinds, target = PREDICTIONS[suffix]
+    command = f"verify {{file}} {target} --out {{to}}/verdicts --workers 1 --quiet"
+    walk_file(base, tmp_path, sound, suffix, kinds, command, "rows", "contact points")
 
 
 def test_cameras(base: Path, tmp_path: Path) -> None:
     np.save(tmp_path / "grasp.npy", array_kinds.GRASP)
-    command = (
-        "verify",
-        str(tmp_path / "grasp.npy"),
-        "--object",
-        str(base / "meshes" / "1_box_a.stl"),
-        "--frame",
-        "camera",
-        "--camera",
-        "{file}",
-        "--out",
-        "{to}/verdicts",
-        "--workers",
-        "1",
-        "--quiet",
-    )
-    walk_file(
-        tmp_path,
-        _npy(tmp_path, np.eye(4)),
-        ".npy",
-        array_kinds.CAMERA_NPY,
-        command,
-        "X_TC",
-        "contact points",
-    )
+    sound, kinds = _npy(tmp_path, np.eye(4)), array_kinds.CAMERA_NPY
+    command = "verify {tmp}/grasp.npy --object {mesh} --frame camera --camera {file}"
+    command += " --out {to}/verdicts --workers 1 --quiet"
+    walk_file(base, tmp_path, sound, ".npy", kinds, command, "X_TC", "contact points")
 
 
 def test_decisions(base: Path, tmp_path: Path) -> None:
-    sound = (base / REJECT).read_bytes()
     out = Path(shutil.copytree(base / "out", tmp_path / "out"))
-    before = (out / MANIFEST).read_bytes()
-    walk_file(
-        tmp_path, sound, ".json", manifests.DECISIONS, ("assemble", str(out), "--reject", "{file}")
-    )
-    walk_file(
-        tmp_path,
-        b"0\n",
-        ".txt",
-        manifests.REJECTED_IDS,
-        ("assemble", str(out), "--reject", "{file}"),
-        "rejected trials",
-    )
+    before, command = (out / MANIFEST).read_bytes(), "assemble {out} --reject {file} --workers 1"
+    sound = (base / REJECT).read_bytes()
+    walk_file(base, tmp_path, sound, ".json", manifests.DECISIONS, command)
+    kinds = manifests.REJECTED_IDS
+    walk_file(base, tmp_path, b"0\n", ".txt", kinds, command, "rejected trials")
     assert (out / MANIFEST).read_bytes() == before
 
 
@@ -391,67 +356,31 @@ def test_decisions_in_the_dataset(base: Path, tmp_path: Path) -> None:
 
 
 def test_configurations(base: Path, tmp_path: Path) -> None:
-    sound = yaml.safe_dump(
-        {
-            "seed": 1,
-            "builtin": {"seed": 0},
-            "candidates": {"max": 4},
-            "physics": {},
-            "lift": {},
-            "camera": {},
-            "split": {},
-        }
-    )
-    walk_file(
-        tmp_path,
-        sound.encode(),
-        ".yaml",
-        text_kinds.CONFIG,
-        (
-            "build",
-            "--objects",
-            str(base / "meshes"),
-            "--out",
-            "{to}/out",
-            "--config",
-            "{file}",
-            "--plan",
-        ),
-    )
+    sound = b"""{seed: 1, builtin: {seed: 0}, candidates: {max: 4},
+        physics: {}, lift: {}, camera: {}, split: {}}"""
+    sound = yaml.safe_dump(yaml.safe_load(sound)).encode()
+    command = "build --objects {meshes} --out {to}/out --config {file} --plan"
+    walk_file(base, tmp_path, sound, ".yaml", text_kinds.CONFIG, command)
 
 
-@pytest.mark.parametrize("command", ["build", "audit", "morph"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        "build --objects {meshes} --out {to}/out --plan",
+        "audit {meshes} --json {to}/a.json",
+        "objects morph {meshes} --per-mesh 1 --out {to}/morphs",
+    ],
+)
 def test_objects_yaml(base: Path, tmp_path: Path, command: str) -> None:
     sound = b"units: m\nlicence: x\nobjects:\n  1_box_a: {friction: 0.5}\n"
-    meshes = str(base / "meshes")
-    words = {
-        "build": ("build", "--objects", meshes, "--out", "{to}/out", "--plan"),
-        "audit": ("audit", meshes, "--json", "{to}/a.json"),
-        "morph": ("objects", "morph", meshes, "--per-mesh", "1", "--out", "{to}/morphs"),
-    }[command]
-    walk_file(tmp_path, sound, ".yaml", text_kinds.OBJECTS, (*words, "--manifest", "{file}"))
+    command += " --manifest {file}"
+    walk_file(base, tmp_path, sound, ".yaml", text_kinds.OBJECTS, command)
 
 
 def test_hands(base: Path, tmp_path: Path) -> None:
     sound = (MODELS / "barrett_hand.yaml").read_bytes()
-    walk_file(
-        tmp_path,
-        sound,
-        ".yaml",
-        text_kinds.HAND,
-        (
-            "build",
-            "--objects",
-            str(base / "meshes"),
-            "--out",
-            "{to}/out",
-            "--set",
-            "hand={file}",
-            "--workers",
-            "1",
-            "--quiet",
-        ),
-    )
+    command = "build --objects {meshes} --out {to}/out --set hand={file} --workers 1 --quiet"
+    walk_file(base, tmp_path, sound, ".yaml", text_kinds.HAND, command)
 
 
 @pytest.mark.parametrize("option", text_kinds.OPTIONS)

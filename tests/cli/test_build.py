@@ -16,14 +16,14 @@ from typing import Any
 import h5py
 import pytest
 import trimesh
-from click.testing import CliRunner, Result
 from distributed.security import Security
+from helpers.bad_inputs.array_kinds import LINE
 from helpers.builds import start_build, workers_of
+from helpers.commands import run
 from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
 
 from drakegrasp.build.counts import Counts
 from drakegrasp.build.pipeline import build
-from drakegrasp.cli.main import main
 from drakegrasp.config import Config
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import read_manifest
@@ -45,10 +45,6 @@ LISTED = 2
 RENAMES = LISTED + len(FILES) + len(CARD_FILES) + 1
 #: A filter that would remove every sample.
 SLIPPED = ("--set", f"filters.max_slip={SLIP / 2}")
-
-
-def run(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(main, [str(a) for a in arguments])
 
 
 def state(out: Path) -> dict[str, bytes]:
@@ -248,7 +244,7 @@ def test_empty_address_of_a_scheduler_is_refused(
     tmp_path: Path, address: str, command: str
 ) -> None:
     trimesh.creation.box([0.06, 0.05, 0.12]).export(tmp_path / "1_box.obj")
-    (tmp_path / "grasps.csv").touch()
+    (tmp_path / "grasps.csv").write_text(LINE)
     arguments = {
         "build": ["--objects", tmp_path, "--out", tmp_path / "out"],
         "verify": [tmp_path / "grasps.csv", "--object", tmp_path / "1_box.obj"],

@@ -91,6 +91,7 @@ def test_drake_that_crashes_or_is_too_old_is_told(
     mend = "" if ok else "pip install 'drake>=1.51.1,!=1.52.0'"
     finding = doctor.check_drake()
     assert (finding.ok, finding.what.partition(":")[0], finding.remedy) == (ok, version, mend)
+    assert ("a tenth longer" in finding.what) == (version in ("1.51.1", "1.52.1"))
 
 
 def test_missing_drake_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,16 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
+from helpers.commands import run
 from helpers.datasets import make_dataset
 
-from drakegrasp.cli.main import main
 from drakegrasp.errors import DataError
 from drakegrasp.visualization.figures import write
-
-
-def run(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(main, ["figures", *map(str, arguments)])
 
 
 def test_figures_are_written_beside_the_dataset(
@@ -25,7 +20,7 @@ def test_figures_are_written_beside_the_dataset(
 
     monkeypatch.setattr(write, "_phases", refuse)
     out = make_dataset(tmp_path / "out", tmp_path)
-    result = run(out, "--quiet")
+    result = run("figures", out, "--quiet")
     assert result.exit_code == 0, result.output
     assert result.stdout.splitlines() == [
         "phases is left out: not in this test",
@@ -33,7 +28,7 @@ def test_figures_are_written_beside_the_dataset(
     ]
     assert (out / "figures" / "hold.svg").is_file()
     # A build that goes on, and a second run, are not disturbed by them.
-    assert run(out, "--out", tmp_path / "other", "--quiet").exit_code == 0
+    assert run("figures", out, "--out", tmp_path / "other", "--quiet").exit_code == 0
     names = [
         {path.name for path in folder.iterdir()} for folder in (out / "figures", tmp_path / "other")
     ]
@@ -41,7 +36,7 @@ def test_figures_are_written_beside_the_dataset(
 
 
 def test_mistakes_are_one_line_and_leave_nothing(tmp_path: Path) -> None:
-    result = run(tmp_path, "--quiet")
+    result = run("figures", tmp_path, "--quiet")
     assert result.exit_code == 1
     assert result.stderr.startswith(f"error: {tmp_path}/trials.hdf5: must be the trials")
     assert result.stderr.count("\n") == 1

@@ -12,10 +12,9 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
-from click.testing import CliRunner, Result
+from helpers.commands import run
 from helpers.datasets import OTO, TRIALS, make_dataset
 
-from drakegrasp.cli.main import main
 from drakegrasp.dataset.log import BuildLog, read_log
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError
@@ -36,10 +35,6 @@ def theirs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def out(theirs: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(theirs, tmp_path / "out"))
-
-
-def run(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(main, [str(a) for a in arguments])
 
 
 def refusal(*arguments: str | Path) -> str:

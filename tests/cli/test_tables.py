@@ -7,11 +7,43 @@ from io import StringIO
 import numpy as np
 import pytest
 from rich.console import Console
+from rich.table import Table
 
 from drakegrasp.cli.tables import funnel_table, hold_table
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.statistics import Funnel
 from drakegrasp.outcomes import Outcome
+
+
+def make_funnel(outcomes: np.ndarray, *names: str, **counts: np.ndarray) -> Funnel:
+    """Return a funnel of objects by their outcomes (m, ...); what is not said is zero."""
+    none, tried = np.zeros(len(names), dtype=np.int64), outcomes.sum(axis=1)
+    usual = {
+        "precision": none,
+        "stable": none,
+        "removals": np.zeros((len(names), 1 + max(Removal)), dtype=np.int64),
+        "refined": np.zeros((len(names), 3), dtype=np.int64),
+        "audited": np.zeros((len(names), 4), dtype=np.int64),
+    }
+    return Funnel(
+        names=names,
+        classes=("thing",) * len(names),
+        candidates=tried,
+        distinct=tried,
+        valid=tried,
+        outcomes=outcomes,
+        **{**usual, **counts},
+    )
+
+
+def printed(table: Table, width: int = 400) -> str:
+    text = StringIO()
+    Console(width=width, file=text).print(table)
+    return text.getvalue()
+
+
+def cells(text: str) -> list[list[str]]:
+    return [line.split() for line in text.splitlines()]
 
 
 def test_hold_table_tells_what_share_of_the_held_ones_is_stable() -> None:
@@ -20,59 +52,30 @@ def test_hold_table_tells_what_share_of_the_held_ones_is_stable() -> None:
     outcomes[0, Outcome.SUCCESS] = 20
     removals = np.zeros((2, 1 + max(Removal)), dtype=np.int64)
     removals[0, [Removal.OTHER_LINKS, Removal.KEPT]] = 8, 12
-    counts = np.array([1200, 7])
-    funnel = Funnel(
-        names=("1_mug", "2_[box]"),
-        classes=("mug", "box"),
-        candidates=counts,
-        distinct=counts,
-        valid=counts,
-        outcomes=outcomes,
-        precision=np.array([12, 0]),
-        stable=np.array([9, 0]),
-        removals=removals,
-        refined=np.zeros_like(removals[:, :3]),
-        audited=np.zeros_like(removals[:, :4]),
-    )
-    text = StringIO()
-    Console(width=80, file=text).print(hold_table(funnel))
-    lines = [line.split() for line in text.getvalue().splitlines()]
-    assert ["1_mug", "1,200", "20", "12", "9", "45%", "12"] in lines
-    assert ["2_[box]", "7", "0", "0", "0", "-", "0"] in lines
-    assert ["all", "1,207", "20", "12", "9", "45%", "12"] in lines
-    assert "lower bound" not in text.getvalue()
+    held = {"precision": np.array([12, 0]), "stable": np.array([9, 0])}
+    funnel = make_funnel(outcomes, "1_mug", "2_[box]", removals=removals, **held)
+    text = printed(hold_table(funnel), width=80)
+    assert ["1_mug", "1,200", "20", "12", "9", "45%", "12"] in cells(text)
+    assert ["2_[box]", "7", "0", "0", "0", "-", "0"] in cells(text)
+    assert ["all", "1,207", "20", "12", "9", "45%", "12"] in cells(text)
+    assert "lower bound" not in text and "audit" not in text
 
     # What was ended might have been held.
     outcomes[1, Outcome.MOVED] = 1234
-    text = StringIO()
-    Console(width=400, file=text).print(hold_table(funnel))
-    assert "lower bound" in text.getvalue()
-    assert "(moved): 1,234" in text.getvalue()
+    text = printed(hold_table(funnel))
+    assert "lower bound" in text
+    assert "(moved): 1,234" in text
 
 
 def test_share_of_stable_ones_is_that_of_audited_lifts_where_lifts_were_chosen() -> None:
     outcomes = np.zeros((1, 1 + max(Outcome)), dtype=np.int64)
     outcomes[0, [Outcome.SUCCESS, Outcome.NOT_LIFTED]] = 20, 100
-    count = outcomes.sum(axis=1)
-    funnel = Funnel(
-        names=("1_mug",),
-        classes=("mug",),
-        candidates=count,
-        distinct=count,
-        valid=count,
-        outcomes=outcomes,
-        precision=np.array([12]),
-        stable=np.array([9]),
-        removals=np.zeros((1, 1 + max(Removal)), dtype=np.int64),
-        refined=np.zeros((1, 3), dtype=np.int64),
-        audited=np.array([[11, 5, 4, 3]]),
-    )
-    text = StringIO()
-    Console(width=400, file=text).print(hold_table(funnel))
-    assert ["1_mug", "120", "20", "12", "9", "80%", "0"] in map(
-        str.split, text.getvalue().split("\n")
-    )
-    assert "flat: 100; of 11" in " ".join(text.getvalue().split())
+    held = {"precision": np.array([12]), "stable": np.array([9])}
+    funnel = make_funnel(outcomes, "1_mug", audited=np.array([[11, 5, 4, 3]]), **held)
+    text = printed(hold_table(funnel))
+    assert ["1_mug", "120", "20", "12", "9", "4", "of", "5,", "80%", "0"] in cells(text)
+    assert "in the audit: a part of the hands was lifted whatever the chance" in text
+    assert "flat: 100; of 11" in " ".join(text.split())
 
 
 @pytest.mark.parametrize("compact", [False, True])
@@ -81,29 +84,15 @@ def test_columns_of_the_funnel_add_up_to_the_attempts(compact: bool) -> None:
     outcomes = np.zeros((1, 1 + max(Outcome)), dtype=np.int64)
     built = [outcome for outcome in Outcome if not outcome.verification_only]
     outcomes[0, built] = 2 ** np.arange(len(built))
-    count = outcomes.sum(axis=1)
     removals = np.zeros((1, 1 + max(Removal)), dtype=np.int64)
     removals[0, Removal.KEPT] = outcomes[0, Outcome.SUCCESS]
-    funnel = Funnel(
-        names=("1_mug",),
-        classes=("mug",),
-        candidates=count,
-        distinct=count,
-        valid=count,
-        outcomes=outcomes,
-        precision=removals[:, 0],
-        stable=removals[:, 0],
-        removals=removals,
-        refined=np.zeros_like(removals[:, :3]),
-        audited=np.zeros_like(removals[:, :4]),
-    )
-    text = StringIO()
-    Console(width=400, file=text).print(funnel_table(funnel, compact=compact))
-    (row,) = (line.split() for line in text.getvalue().splitlines() if "1_mug" in line)
+    funnel = make_funnel(outcomes, "1_mug", removals=removals)
+    text, count = printed(funnel_table(funnel, compact=compact)), outcomes.sum()
+    (row,) = (line for line in cells(text) if "1_mug" in line)
     numbers = [int(cell.replace(",", "")) for cell in row if cell.replace(",", "").isdigit()]
     # The number of grasps is also that of the samples.
-    assert sum(set(numbers) - {count[0]}) == count[0]
-    assert "moved" in text.getvalue()
+    assert sum(set(numbers) - {count}) == count
+    assert "moved" in text
     if compact:
         lost = 2 ** built.index(Outcome.DROPPED) + 2 ** built.index(Outcome.SLIPPED)
         assert lost in numbers
@@ -112,6 +101,4 @@ def test_columns_of_the_funnel_add_up_to_the_attempts(compact: bool) -> None:
 
     # Without one there is no column of lifts that were ended.
     outcomes[0, Outcome.MOVED] = 0
-    text = StringIO()
-    Console(width=400, file=text).print(funnel_table(funnel, compact=compact))
-    assert "moved" not in text.getvalue()
+    assert "moved" not in printed(funnel_table(funnel, compact=compact))

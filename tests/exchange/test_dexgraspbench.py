@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,16 +12,13 @@ import trimesh
 
 from drakegrasp.exchange.closed_grasps import ClosedGrasp
 from drakegrasp.exchange.dexgraspbench import SQUEEZE, grasp_dictionary, pose_of_vector
-from drakegrasp.exchange.export import export_dataset
 from drakegrasp.hand.description import load_hand
 from drakegrasp.visualization.posed_hand import PosedHand
 
 
 @pytest.fixture(scope="module")
-def folder(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    to = tmp_path_factory.mktemp("bench") / "to"
-    export_dataset(dataset, to, "dexgraspbench")
-    return to
+def folder(exported: Callable[[str], Path]) -> Path:
+    return exported("dexgraspbench")
 
 
 def test_poses_and_joints_come_back(folder: Path, grasps: list[ClosedGrasp]) -> None:

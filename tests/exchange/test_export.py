@@ -6,10 +6,9 @@ import shutil
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from helpers.commands import run
 
 from drakegrasp.cli import export as command
-from drakegrasp.cli.main import main
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError
@@ -31,13 +30,13 @@ def test_closed_grasps_are_the_samples_of_all_splits(
 
 def test_help_names_every_format() -> None:
     assert command.FORMATS == FORMATS
-    text = CliRunner().invoke(main, ["export", "--help"]).output
+    text = run("export", "--help").output
     assert all(f"\n  {form} " in text for form in FORMATS)
 
 
 def test_command_says_how_many(dataset: Path, grasps: list[ClosedGrasp], tmp_path: Path) -> None:
     to = tmp_path / "new" / "folder"
-    done = CliRunner().invoke(main, ["export", str(dataset), str(to), "--to", "dexgraspbench"])
+    done = run("export", str(dataset), str(to), "--to", "dexgraspbench")
     assert done.exit_code == 0, done.output
     assert f"{len(grasps)} samples in {to}" in done.output
     assert len(list(to.rglob("*.npy"))) == len(grasps)
@@ -67,7 +66,7 @@ def test_dataset_without_samples_is_refused(dataset: Path, tmp_path: Path, form:
 
 def test_samples_go_into_the_dataset_by_default(dataset: Path, tmp_path: Path) -> None:
     out = Path(shutil.copytree(dataset, tmp_path / "out"))
-    done = CliRunner().invoke(main, ["export", str(out), "--to", "original"])
+    done = run("export", str(out), "--to", "original")
     assert done.exit_code == 0
     assert (out / "export_original" / "grasping_oto.hdf5").is_file()
 

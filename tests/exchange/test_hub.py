@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -50,10 +51,8 @@ print(json.dumps({"rows": found, "croissant": counts}))
 
 
 @pytest.fixture(scope="module")
-def folder(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    to = tmp_path_factory.mktemp("hub") / "to"
-    export_dataset(dataset, to, "hf", licence="cc-by-4.0")
-    return to
+def folder(exported: Callable[[str], Path]) -> Path:
+    return exported("hf")
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -9,17 +10,14 @@ import numpy as np
 import pytest
 
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.exchange.export import export_dataset
 from drakegrasp.frames import rotate_vectors, transform_points, unpack_pose
 
 SPLITS = ("train", "valid", "test")
 
 
 @pytest.fixture(scope="module")
-def folder(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    to = tmp_path_factory.mktemp("original") / "to"
-    export_dataset(dataset, to, "original")
-    return to
+def folder(exported: Callable[[str], Path]) -> Path:
+    return exported("original")
 
 
 @pytest.mark.parametrize("camera", ["oto", "otm"])

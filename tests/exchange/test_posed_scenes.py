@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,6 @@ import trimesh
 
 from drakegrasp.dataset.paths import model_path
 from drakegrasp.exchange.closed_grasps import ClosedGrasp
-from drakegrasp.exchange.export import export_dataset
 from drakegrasp.exchange.posed_scenes import X_UT, link_meshes, posed_scene
 from drakegrasp.frames import invert_pose
 from drakegrasp.hand.description import load_hand
@@ -20,10 +20,8 @@ from drakegrasp.visualization.posed_hand import PosedHand
 
 
 @pytest.fixture(scope="module")
-def folder(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    to = tmp_path_factory.mktemp("glb") / "to"
-    export_dataset(dataset, to, "glb")
-    return to
+def folder(exported: Callable[[str], Path]) -> Path:
+    return exported("glb")
 
 
 def test_bodies_are_where_they_are(folder: Path, grasps: list[ClosedGrasp]) -> None:

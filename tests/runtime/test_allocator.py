@@ -22,9 +22,8 @@ from drakegrasp.runtime.allocator import (
     SETTINGS,
     TUNING,
     dask_setup,
-    has_jemalloc,
     jemalloc_environment,
-    own_environment,
+    kept_variables,
     restart_with_jemalloc,
 )
 
@@ -158,7 +157,7 @@ def test_nanny_is_told_on_its_machine() -> None:
 def test_environment_of_the_caller_is_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(PRELOAD, "theirs.so")
     monkeypatch.delenv(SETTINGS, raising=False)
-    with own_environment():
+    with kept_variables(*OURS):
         os.environ.update(OURS)
     assert os.environ[PRELOAD] == "theirs.so"
     assert SETTINGS not in os.environ
@@ -212,16 +211,3 @@ def test_doctor_tells_the_allocator(monkeypatch: pytest.MonkeyPatch) -> None:
     assert finding.ok
     assert allocator.allocator() in finding.what
     assert "libjemalloc2" in finding.what
-
-
-def test_doctor_tells_what_an_older_drake_costs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor.metadata, "version", lambda name: "1.51.1")
-    finding = doctor.check_drake()
-    assert finding.ok
-    assert "a tenth longer" in finding.what
-    monkeypatch.setattr(doctor.metadata, "version", lambda name: "1.58.0")
-    assert doctor.check_drake().what == "1.58.0"
-
-
-def test_this_process_may_have_either() -> None:
-    assert has_jemalloc() == allocator.allocator().startswith("libjemalloc")

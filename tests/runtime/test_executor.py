@@ -14,7 +14,8 @@ from typing import TypeVar
 
 import pytest
 
-from drakegrasp.errors import MachineError
+from drakegrasp.errors import ConfigError, MachineError
+from drakegrasp.runtime import executor
 from drakegrasp.runtime.executor import in_order, processes
 
 T = TypeVar("T")
@@ -38,6 +39,28 @@ def test_what_is_begun_ends_before_the_executor_does(tmp_path: Path) -> None:
         assert len(there) < len(paths)
         time.sleep(1.5)
         assert set(tmp_path.iterdir()) == there
+
+
+def pid_later(seconds: float) -> int:
+    time.sleep(seconds)
+    return os.getpid()
+
+
+def test_processes_start_by_default_only_where_the_work_is_long(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(executor, "available_cores", lambda: 2)
+    monkeypatch.setattr(executor, "ALONE_SECONDS", 0.5)
+    with processes() as execute:
+        assert list(execute(pid_later, [0.0] * 3)) == [os.getpid()] * 3
+        assert next(execute(pid_later, [0.6])) == os.getpid()
+        assert os.getpid() not in list(execute(pid_later, [0.0] * 3))
+
+
+@pytest.mark.parametrize("workers", [0, -1, 10**6])
+def test_number_of_processes_that_nobody_means_is_refused(workers: int) -> None:
+    with pytest.raises(ConfigError, match=r"workers must be at (least|most)"), processes(workers):
+        pass
 
 
 def test_results_come_in_the_order_of_the_items() -> None:

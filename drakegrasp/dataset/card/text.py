@@ -1,33 +1,58 @@
-"""A data card as Markdown, for people. In: its content. Out: the text of `DATACARD.md`."""
+"""The data card as files: JSON for programs, Markdown for people.
+
+In: the content of a card. Out: `DATACARD.json` and `DATACARD.md` of a dataset, and the text of the
+card that goes with an export.
+"""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-#: Counts of a row, in the order of the tables.
-_COUNTS = (
-    *("attempts", "held", "precision", "stable", "refined", "samples"),
-    *("train", "valid", "test"),
-)
+from drakegrasp.dataset.card.content import card_content
+from drakegrasp.dataset.paths import CARD_FILES
+from drakegrasp.dataset.schema import SPLITS
+from drakegrasp.runtime.files import write_atomic
+
+
+def write_card(out: Path) -> None:
+    """Write both files of the card, each whole or not at all.
+
+    Args:
+        out: Directory of the dataset, whose three files are there.
+
+    Raises:
+        DataError: If a file of the dataset is missing or damaged.
+        OSError: If the disk is full.
+    """
+    for name, text in card_files(card_content(out)).items():
+        write_atomic(out / name, text)
+
+
+def card_files(content: dict[str, Any]) -> dict[str, bytes]:
+    """Return the bytes of both files by their names.
+
+    Args:
+        content: Of the card, see `card_content`.
+    """
+    text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+    return dict(zip(CARD_FILES, (text.encode(), card_text(content).encode()), strict=True))
 
 
 def card_text(content: Mapping[str, Any]) -> str:
     """Return a card as Markdown.
 
     Args:
-        content: As `card_content` gives it.
+        content: As `card_content` gives it; that of an export also has the samples by camera, the
+            camera and the columns (`exchange.hub`).
     """
-    return f"# {_plain(content['title'])}\n\n" + "\n\n".join(
-        [
-            _what(content),
-            _files(content),
-            _how(content),
-            _licences(content),
-            _how_many(content),
-            _limits(content),
-        ]
-    )
+    sections = [_what, _files, _how, _licences, _how_many, _limits]
+    if "columns" in content:
+        sections += [_cameras, _columns]
+    text = "\n\n".join(section(content) for section in sections)
+    return f"# {_plain(content['title'])}\n\n{text}\n"
 
 
 def _what(content: Mapping[str, Any]) -> str:
@@ -74,11 +99,11 @@ As it was stated in `objects.yaml`; that of the built-in objects is the package'
 
 def _how_many(content: Mapping[str, Any]) -> str:
     counts = content["counts"]
+    names = tuple(counts["all"])
     splits = [(name, *row.values()) for name, row in counts["splits"].items()]
-    classes = [(name, row["objects"], *_numbers(row)) for name, row in counts["classes"].items()]
-    classes.append(("**all**", len(counts["objects"]), *_numbers(counts["all"])))
-    objects = [(name, row["class"], *_numbers(row)) for name, row in counts["objects"].items()]
-    refused = [(name, reason) for name, reason in content["refused"].items()]
+    classes = [(name, *row.values()) for name, row in counts["classes"].items()]
+    classes.append(("**all**", len(counts["objects"]), *counts["all"].values()))
+    objects = [(name, *row.values()) for name, row in counts["objects"].items()]
 
     # Tables that would be empty are left out.
     tables = [
@@ -87,11 +112,11 @@ def _how_many(content: Mapping[str, Any]) -> str:
             ("split", "samples", "in effect", "objects", "classes"),
             splits,
         ),
-        ("By class", ("class", "objects", *_COUNTS), classes),
-        ("By object", ("object", "class", *_COUNTS), objects),
+        ("By class", ("class", "objects", *names), classes),
+        ("By object", ("object", "class", *names), objects),
         ("Outcomes of the attempts", ("outcome", "attempts"), list(counts["outcomes"].items())),
         ("Held grasps that are no samples", ("filter", "grasps"), list(counts["removed"].items())),
-        ("Meshes that were refused", ("mesh", "reason"), refused),
+        ("Meshes that were refused", ("mesh", "reason"), list(content["refused"].items())),
     ]
     parts = [f"### {head}\n\n{_table(heads, rows)}" for head, heads, rows in tables if rows]
     head = """## How many
@@ -106,11 +131,32 @@ passed all filters; *in effect* their number where those with almost the same pa
 
 def _limits(content: Mapping[str, Any]) -> str:
     lines = "\n".join(f"* {each['limit']} ({each['docs']})" for each in content["limits"])
-    return f"## Known limits\n\nThe pages are those of drakegrasp's repository.\n\n{lines}\n"
+    return f"## Known limits\n\nThe pages are those of drakegrasp's repository.\n\n{lines}"
 
 
-def _numbers(row: Mapping[str, Any]) -> list[int]:
-    return [row[key] for key in _COUNTS]
+def _cameras(content: Mapping[str, Any]) -> str:
+    """Return how many samples each camera has, and how a pixel of a depth image is a point."""
+    cameras, unit = content["samples_by_camera"], content["depth_unit"]
+    rows = [(split, *(counts[split] for counts in cameras.values())) for split in SPLITS]
+    (fx, _, cx), (_, fy, cy) = content["camera"]["K"][:2]
+    near, far = content["camera"]["near"], content["camera"]["far"]
+    return f"""## Samples by camera
+
+{_table(("split", *(f"camera `{camera}`" for camera in cameras)), rows)}
+
+## Camera
+
+Both cameras have focal lengths {fx:.6f} and {fy:.6f} and their centre at ({cx:g}, {cy:g}) [px].
+A pixel (u, v) of depth z [m], {1.0 / unit:g} units of the image to a metre, is the point
+((u - {cx:g}) z / {fx:.6f}, (v - {cy:g}) z / {fy:.6f}, z) in the camera's frame. The camera sees
+from {near:g} m on; where nothing is before {far:g} m, the depth is {far:g} m."""
+
+
+def _columns(content: Mapping[str, Any]) -> str:
+    rows = [(f"`{name}`", *column) for name, column in content["columns"].items()]
+    return f"""## Columns
+
+{_table(("column", "shape", "unit", "frame", "what it is"), rows)}"""
 
 
 def _table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

@@ -120,25 +120,25 @@ CAMERA_NPY: tuple[Kind, ...] = (
 )
 
 
-_LINE = ",".join(map(str, GRASP))
+LINE = ",".join(map(str, GRASP))
 PREDICTIONS_CSV: tuple[Kind, ...] = (
     *ANY_FILE,
     whole_file("only a header", ",".join("abc") + "\n"),
     whole_file("17 numbers", ",".join(map(str, GRASP[:17]))),
-    whole_file("lines of unequal length", f"{_LINE}\n{_LINE},1\n"),
-    whole_file("semicolons", _LINE.replace(",", ";")),
-    whole_file("blanks", _LINE.replace(",", " ")),
-    whole_file("a text in between", _LINE.replace("0.03", "x", 1)),
-    whole_file("an empty cell", _LINE.replace("0.03", "", 1)),
-    whole_file("quotes", _LINE.replace("0.03", '"0.03"', 1)),
-    whole_file("NaN", _LINE.replace("0.03", "nan", 1)),
-    whole_file("infinite", _LINE.replace("0.03", "1e999", 1)),
-    whole_file("digits of 10,000", _LINE.replace("0.03", "9" * 10_000, 1)),
-    whole_file("UTF-16", _LINE.encode("utf-16")),
-    whole_file("a null byte", _LINE.replace("0.03", "\x00", 1)),
-    whole_file("two headers", f"{','.join('a' * 18)}\n{','.join('b' * 18)}\n{_LINE}"),
+    whole_file("lines of unequal length", f"{LINE}\n{LINE},1\n"),
+    whole_file("semicolons", LINE.replace(",", ";")),
+    whole_file("blanks", LINE.replace(",", " ")),
+    whole_file("a text in between", LINE.replace("0.03", "x", 1)),
+    whole_file("an empty cell", LINE.replace("0.03", "", 1)),
+    whole_file("quotes", LINE.replace("0.03", '"0.03"', 1)),
+    whole_file("NaN", LINE.replace("0.03", "nan", 1)),
+    whole_file("infinite", LINE.replace("0.03", "1e999", 1)),
+    whole_file("digits of 10,000", LINE.replace("0.03", "9" * 10_000, 1)),
+    whole_file("UTF-16", LINE.encode("utf-16")),
+    whole_file("a null byte", LINE.replace("0.03", "\x00", 1)),
+    whole_file("two headers", f"{','.join('a' * 18)}\n{','.join('b' * 18)}\n{LINE}"),
     whole_file("commas", "," * 17),
-    whole_file("steering", _LINE.replace("0.03", "\x1b]0;x\x07", 1)),
+    whole_file("steering", LINE.replace("0.03", "\x1b]0;x\x07", 1)),
 )
 
 

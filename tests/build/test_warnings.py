@@ -1,14 +1,17 @@
-"""A build says which objects are too heavy for its hand."""
+"""A build warns of what the user should know before it spends hours."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+import pytest
 from helpers.hands import write_pincer
 
-from drakegrasp.build.payload import too_heavy
-from drakegrasp.config import load_config
+from drakegrasp.build.warnings import nothing_trains, too_heavy
+from drakegrasp.config import SplitConfig, load_config
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry
+from drakegrasp.objects.sources import MeshSource
 
 
 def entry(name: str, mass: float) -> ObjectEntry:
@@ -49,3 +52,27 @@ def test_objects_beyond_the_payload_are_named_in_one_line() -> None:
 
 def test_a_hand_without_a_payload_has_no_warning(tmp_path: Path) -> None:
     assert too_heavy(manifest(str(write_pincer(tmp_path)), 50.0)) == ""
+
+
+@pytest.mark.parametrize(
+    ("classes", "split", "warning"),
+    [
+        (["a", "b"], {"by": "class"}, "every class has one object, which is tested"),
+        (["a", "b"], {}, ""),
+        (["a", "b", "b"], {}, ""),
+        (["a", "b"], {"train_classes": ("b",)}, ""),
+        (["a", "a"], {"train_classes": ("c",)}, "split.train_classes names none of the classes"),
+    ],
+)
+def test_a_split_that_trains_nothing_is_a_warning(
+    classes: list[str], split: dict[str, Any], warning: str
+) -> None:
+    sources = [
+        MeshSource(name=f"{i}_{name}", class_name=name, path=Path("x.obj"))
+        for i, name in enumerate(classes)
+    ]
+    said = nothing_trains(sources, SplitConfig(**split))
+    assert bool(said) == bool(warning)
+    if said:
+        assert said.startswith(f"nothing will train: {warning}. ")
+        assert "--per-class" in said and "--set split.train_classes=[a]" in said

@@ -1,0 +1,190 @@
+"""Tasks on Dask's workers: what is in flight, what is tried again, and when it ends."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from dask.utils import parse_timedelta
+from distributed import Client, LocalCluster, SpecCluster, get_worker
+
+from drakegrasp.build.prepare import PREPARE_SECONDS
+from drakegrasp.cluster import executor as tasks
+from drakegrasp.cluster.connect import connect, dask_settings
+from drakegrasp.cluster.executor import DaskExecutor
+from drakegrasp.errors import BlankImageError, MachineError
+from drakegrasp.runtime.journal import wall_limit
+from drakegrasp.vision import rendering
+
+pytestmark = pytest.mark.cluster
+
+
+def test_scheduler_is_more_patient_than_the_limits_of_steps() -> None:
+    """A step may hold the interpreter, so that its worker gives no sign of life."""
+    patience = parse_timedelta(dask_settings()["distributed.scheduler.worker-ttl"])
+    assert patience > wall_limit(PREPARE_SECONDS)
+
+
+def test_worker_that_takes_its_time_to_end_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def late(cluster: SpecCluster, timeout: float | None = None) -> None:
+        close(cluster, timeout)
+        raise TimeoutError
+
+    close = SpecCluster.close
+    monkeypatch.setattr(SpecCluster, "close", late)
+    with connect(workers=1) as client:
+        assert client.submit(abs, -1).result() == 1
+    with pytest.raises(KeyboardInterrupt), connect(workers=1):
+        raise KeyboardInterrupt
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[Client]:
+    with (
+        LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client
+
+
+def _blank_at_first(path: str) -> str:
+    """Fail as often as the name says, and say so in a file."""
+    done = Path(path).read_text() if Path(path).exists() else ""
+    if len(done) < int(path[-1]):
+        Path(path).write_text(done + "x")
+        raise BlankImageError(rendering.BLANK)
+    return path
+
+
+def test_blank_image_is_tried_again_but_not_for_ever(client: Client, tmp_path: Path) -> None:
+    execute, names = DaskExecutor(client), [str(tmp_path / f"f{i}") for i in range(3)]
+    assert sorted(execute(_blank_at_first, names)) == names
+    with pytest.raises(BlankImageError):
+        list(execute(_blank_at_first, [str(tmp_path / "f3")]))
+
+
+def test_items_are_taken_as_there_is_room(client: Client) -> None:
+    taken = 0
+
+    def items() -> Iterator[int]:
+        nonlocal taken
+        while taken < 1000:
+            taken += 1
+            yield taken
+
+    results = DaskExecutor(client)(abs, items())
+    for done, _ in enumerate(results):
+        assert taken <= done + 1 + 2 * 2 * tasks.LARGEST
+    assert taken == 1000
+
+
+def _task_of(seconds: float) -> str:
+    """Return which task an item is in, after a while."""
+    time.sleep(seconds)
+    return str(get_worker().get_current_task())
+
+
+def test_quick_items_go_together_and_slow_ones_alone(client: Client) -> None:
+    execute = DaskExecutor(client)
+    together = list(execute(_task_of, [0.0] * 400))
+    assert len(together) == 400
+    assert len(set(together)) < 2 * 400 / tasks.LARGEST
+    assert max(Counter(together).values()) <= tasks.LARGEST
+    alone = list(execute(_task_of, [1.5 * tasks.TASK_SECONDS] * 40))
+    assert len(set(alone)) == 40
+
+
+def test_error_costs_no_results_of_the_items_before_it() -> None:
+    def invert(value: float) -> float:
+        return 1.0 / value
+
+    assert tasks._run_items(invert, [1.0, 2.0, 0.0, 4.0]).results == [1.0, 0.5]
+    with pytest.raises(ZeroDivisionError):
+        tasks._run_items(invert, [0.0, 4.0])
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tasks, "COUNT_SECONDS", 0.1)
+    monkeypatch.setattr(tasks, "SAY_SECONDS", 0.2)
+    monkeypatch.setattr(tasks, "LOST_SECONDS", 0.5)
+
+
+@pytest.fixture
+def cluster() -> Iterator[LocalCluster]:
+    """A cluster of one worker, in this process."""
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
+    ) as cluster:
+        yield cluster
+
+
+@pytest.mark.usefixtures("impatient")
+def test_where_no_worker_comes_back_it_says_so(cluster: LocalCluster) -> None:
+    with Client(cluster) as client:
+        execute = DaskExecutor(client)
+        changes: list[tuple[int, int]] = []
+        execute.pool.on_change = lambda joined, left: changes.append((len(joined), len(left)))
+        results = execute(time.sleep, [0.0, 5.0])
+        assert next(results) is None
+        cluster.scale(0)
+        with pytest.raises(MachineError, match=r"no worker for 0\.5 s; the same"):
+            next(results)
+        assert changes == [(1, 0), (0, 1)]
+
+
+@pytest.mark.usefixtures("impatient")
+def test_where_workers_may_come_the_work_waits(cluster: LocalCluster) -> None:
+    """As under SLURM, where all jobs reached their walltime and the next ones queue."""
+    with Client(cluster.scheduler_address) as client:
+        execute, said = DaskExecutor(client), 0
+
+        def say() -> None:
+            nonlocal said
+            said += 1
+
+        execute.pool.on_none = say
+        results = execute(str, [1, 2, 3, 4])
+        found = [next(results)]
+        cluster.scale(0)
+        threading.Timer(2.0, lambda: cluster.scale(1)).start()
+        client.run_on_scheduler(lambda dask_scheduler: None)
+        while client.nthreads():
+            time.sleep(0.05)
+        found += list(results)
+        assert sorted(found) == ["1", "2", "3", "4"]
+
+
+def test_lost_scheduler_is_one_error(tmp_path: Path) -> None:
+    command, file = [sys.executable, "-m"], tmp_path / "scheduler.json"
+    options = ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
+    scheduler = subprocess.Popen(
+        [*command, "distributed.cli.dask_scheduler", *options, "--scheduler-file", str(file)],
+        stderr=subprocess.DEVNULL,
+    )
+    worker = subprocess.Popen(
+        [*command, "distributed.cli.dask_worker", "--scheduler-file", str(file), "--no-nanny"],
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        while not file.exists():
+            time.sleep(0.1)
+        with connect(scheduler_file=file) as client:
+            client.wait_for_workers(1, timeout=60)
+            results = DaskExecutor(client)(time.sleep, [0.0, 0.0, 600.0, 600.0])
+            assert [next(results), next(results)] == [None, None]
+            scheduler.kill()
+            with pytest.raises(MachineError, match=r"the scheduler was lost: .*; the same"):
+                next(results)
+    finally:
+        for process in (worker, scheduler):
+            process.kill()
+            process.wait(60)
