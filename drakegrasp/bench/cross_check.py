@@ -195,6 +195,8 @@ def _read_lifts(out: Path) -> list[StoredLift]:
     trials = trials[np.isfinite(trials["time_lift"])]
     names = [field.name for field in fields(Materials)]
     columns = ("outcome", "object_name", "removal", "X_OG", "spread", "resting", *names)
+
+    # Each lift with its group.
     lifts = []
     for trial_id, *values in zip(
         trials.trial_ids.tolist(), *trials.columns(columns).values(), strict=True

@@ -301,12 +301,16 @@ class Trials:
             raise DataError(f"when must be closed or lifted, got {when!r}")
         if frame not in ("O", "T", "G", "W"):
             raise DataError(f"frame must be O, T, G or W, got {frame!r}")
+
+        # Contacts in {O}, and the poses of object and palm at that moment.
         lifted = "_lifted" if when == "lifted" else ""
         keys = [f"{when}_{name}" for name in ("touching", "p_OQ", "nhat_Q_O", "f_Q_O")]
         poses = [f"X_TO{lifted}", f"X_OG{lifted}"]
         columns = self.columns([*keys, *poses])
         X_TO, X_OG = (unpack_pose(columns[name]) for name in poses)
         touching, points, normals, forces = (columns[key] for key in keys)
+
+        # In the frame that is wanted.
         if frame == "O":
             return TrialContacts(touching=touching, points=points, normals=normals, forces=forces)
         X_FO = {"T": X_TO, "G": invert_pose(X_OG), "W": multiply(X_WT, X_TO)}[frame]
@@ -336,6 +340,8 @@ class Trials:
             raise MachineError("to_pandas needs pandas, got none: pip install pandas") from None
         if names is None:
             names = [name for name, field in _FIELDS.items() if not field.shape] + [*DERIVED]
+
+        # Several values of an attempt are columns of their own.
         series: dict[str, Any] = {}
         for name, values in self.columns(names).items():
             if values.ndim > 1:
@@ -343,6 +349,8 @@ class Trials:
                 series |= {f"{name}.{i}": flat[:, i] for i in range(flat.shape[1])}
             else:
                 series[name] = values
+
+        # Numbers that stand for something become words.
         if "outcome" in series:
             labels = {outcome.value: outcome.label for outcome in Outcome}
             series["outcome"] = [labels[int(value)] for value in series["outcome"]]
