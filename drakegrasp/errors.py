@@ -19,7 +19,7 @@ texts of strangers safe to show.
 
 from __future__ import annotations
 
-#: Characters that `one_line` keeps of a message.
+#: Most characters of a message that `one_line` keeps.
 LONGEST_MESSAGE = 200
 
 
@@ -40,7 +40,7 @@ class HandError(DrakegraspError, ValueError):
 
 
 class DataError(DrakegraspError, ValueError):
-    """A dataset, shard or manifest that is missing, foreign or broken."""
+    """A dataset, shard or manifest that is missing, damaged or not written by drakegrasp."""
 
 
 class GraspError(DrakegraspError, ValueError):
@@ -52,7 +52,7 @@ class OffSurfaceError(GraspError):
 
 
 class MachineError(DrakegraspError, RuntimeError):
-    """Something that this machine lacks; the message says how to get it."""
+    """A resource that this machine lacks; the message says how to get it."""
 
 
 class DiskFullError(MachineError):
