@@ -101,18 +101,7 @@ def pack_rows(task: PackTask) -> Part:
         DataError: If a shard is no longer there.
         DiskFullError: If there is no room for the part.
     """
-    # Read the shards, whose seals the survey has verified.
-    count = task.stop - task.start
-    columns = {f.name: np.empty((count, *f.row_shape(task.sizes)), f.dtype) for f in TRIAL_FIELDS}
-    columns["trial_id"][:] = np.arange(task.start, task.stop)
-    samples = {split: _Samples(task.sizes) for split in SPLITS}
-    load = lru_cache(1)(load_object)  # the shards of an object come one after the other
-    for piece in task.slices:
-        path = piece.header.path(Path(task.out))
-        with open_shard(path, piece.header, verify_seal=False, again=True) as (file, _):
-            trials = {f.name: read_column(file["trials"], f.name) for f in trial_columns()}
-            _fill_rows(columns, trials, piece, task)
-            _add_samples(samples, trials, file["looks"], piece, task, load)
+    columns, samples = read_rows(task)
 
     # Write the part under a name of this process: another may be at the same one.
     temporary = temporary_name(Path(task.part))
@@ -138,6 +127,27 @@ def pack_rows(task: PackTask) -> Part:
         images=images,
         objects={s: np.array(samples[s].objects, dtype=np.int32) for s in SPLITS},
     )
+
+
+def read_rows(task: PackTask) -> tuple[dict[str, AnyArray], dict[str, SplitSamples]]:
+    """Return the rows of a range: the columns of /trials, and the samples of each split.
+
+    Raises:
+        DataError: If a shard is no longer there.
+    """
+    # The survey has verified the seals.
+    count = task.stop - task.start
+    columns = {f.name: np.empty((count, *f.row_shape(task.sizes)), f.dtype) for f in TRIAL_FIELDS}
+    columns["trial_id"][:] = np.arange(task.start, task.stop)
+    samples = {split: SplitSamples(task.sizes) for split in SPLITS}
+    load = lru_cache(1)(load_object)  # the shards of an object come one after the other
+    for piece in task.slices:
+        path = piece.header.path(Path(task.out))
+        with open_shard(path, piece.header, verify_seal=False, again=True) as (file, _):
+            trials = {f.name: read_column(file["trials"], f.name) for f in trial_columns()}
+            _fill_rows(columns, trials, piece, task)
+            _add_samples(samples, trials, file["looks"], piece, task, load)
+    return columns, samples
 
 
 def unpack_rows(
@@ -175,18 +185,20 @@ def unpack_rows(
     path.unlink()
 
 
-class _Samples:
+class SplitSamples:
     """The samples of a split among the rows of a task, in order.
 
     Attributes:
         objects: Row of /objects of each.
+        images: What is stored of the images and which filters HDF5 skipped, by camera and field of
+            IMAGES.
     """
 
     def __init__(self, sizes: Mapping[str, int]) -> None:
         self.objects: list[int] = []
         self._type = record_type(sizes)
         self._records: dict[str, list[AnyArray]] = {camera: [] for camera in CAMERAS}
-        self._images: dict[tuple[str, str], list[tuple[bytes, int]]] = {
+        self.images: dict[tuple[str, str], list[tuple[bytes, int]]] = {
             (camera, name): [] for camera in CAMERAS for name in IMAGES
         }
 
@@ -199,11 +211,11 @@ class _Samples:
 
     def add_image(self, camera: str, name: str, chunk: bytes, skipped: int) -> None:
         """Add what is stored of an image of a sample."""
-        self._images[camera, name].append((chunk, skipped))
+        self.images[camera, name].append((chunk, skipped))
 
     def in_order(self) -> Iterator[tuple[bytes, int]]:
         """Yield what is stored of the images, by camera, field and sample."""
-        for images in self._images.values():
+        for images in self.images.values():
             yield from images
 
     def numbers(self, camera: str) -> AnyArray:
@@ -226,7 +238,7 @@ def _fill_rows(
 
 
 def _add_samples(
-    samples: Mapping[str, _Samples],
+    samples: Mapping[str, SplitSamples],
     trials: Mapping[str, AnyArray],
     looks: h5py.Group,
     piece: ShardSlice,
@@ -243,6 +255,7 @@ def _add_samples(
     model = load(model_path(Path(task.out), piece.header.object_name))
     names = ("X_CI_otm", *(f"X_TC_{camera}" for camera in CAMERAS))
     poses = {name: read_column(looks, name) for name in names}
+    images = {(c, name): looks[f"{own}_{c}"].id for c in CAMERAS for name, own in IMAGES.items()}
     look_of = {row: k for k, row in enumerate(read_column(looks, "row").tolist())}
     for split, (start, stop) in bounds.items():
         ids, weights = (values[split][start:stop].tolist() for values in (task.ids, task.weights))
@@ -256,10 +269,8 @@ def _add_samples(
                 values = sample_values(model, trial, look, camera)
                 values |= {"trial_id": trial_id, "grasp_props/weight": weight}
                 samples[split].add_record(camera, values)
-                for name, own in IMAGES.items():
-                    skipped, chunk = looks[f"{own}_{camera}"].id.read_direct_chunk(
-                        (k, *_ORIGIN[name])
-                    )
+                for name in IMAGES:
+                    skipped, chunk = images[camera, name].read_direct_chunk((k, *_ORIGIN[name]))
                     samples[split].add_image(camera, name, chunk, skipped)
 
 
