@@ -144,7 +144,9 @@ def compare_trials(
     """
     rows = np.arange(start, start + len(columns["trial_id"]))
     for batch in trials.batches(file, "trials", rows, size, findings):
-        own = {name: values[batch.rows - start] for name, values in columns.items()}
+        rows = batch.rows - start
+        place = slice(rows[0], rows[-1] + 1) if rows[-1] - rows[0] + 1 == len(rows) else rows
+        own = {name: values[place] for name, values in columns.items()}
         yield trials.judge(batch, findings, *_rules(own, batch, "its shard"))
 
 

@@ -79,19 +79,19 @@ def resting_poses(batch: Batch, manifest: Manifest) -> Iterator[Violation]:
 def conditions(batch: Batch, manifest: Manifest, model: LoadModel) -> Iterator[Violation]:
     """Friction, mass, looks, cameras and noise are what the seed gives, or the usual ones."""
     due = {f.name: np.array(batch[f.name]) for f in CONDITION_FIELDS}
-    for known, rows in _by_object(batch, manifest, model):
-        own = manifest.config_of(known.name)
+    for name, known, rows in _by_object(batch, manifest, model):
+        own = manifest.config_of(name)
         # Where nothing is drawn all attempts of an object have the same conditions.
         if own.randomize == RandomizeConfig():
-            for name, value in draw_conditions(known, own, 0, 0).values().items():
-                due[name][rows] = value
+            for key, value in draw_conditions(known, own, 0, 0).values().items():
+                due[key][rows] = value
             continue
         for row in rows.tolist():
             numbers = (int(batch[key][row]) for key in ("candidate", "standoff_index", "child"))
-            for name, value in draw_conditions(known, own, *numbers).values().items():
-                due[name][row] = value
-    for name, values in due.items():
-        yield from batch.follows(name, values, "what the seed gives the attempt", 0.0)
+            for key, value in draw_conditions(known, own, *numbers).values().items():
+                due[key][row] = value
+    for key, values in due.items():
+        yield from batch.follows(key, values, "what the seed gives the attempt", 0.0)
 
 
 def chances(
@@ -118,7 +118,7 @@ def chances(
     verdict = judge_closed(*(batch[name] for name in fields), required=required)
     lifts = np.isfinite(batch["time_close"]) & (verdict == Outcome.SUCCESS)
     due = np.where(lifts & (chance is not None), batch["chance"], np.nan)
-    for known, rows in _by_object(batch, manifest, model):
+    for _, known, rows in _by_object(batch, manifest, model):
         own = rows[lifts[rows]]
         if chance is not None and len(own):
             due[own] = _chance(chance, batch.where(_mask(own, len(batch))), known)
@@ -138,12 +138,14 @@ def _chance(chance: LiftChance, closed: Batch, model: ObjectModel) -> AnyArray:
 
 def _by_object(
     batch: Batch, manifest: Manifest, model: LoadModel
-) -> Iterator[tuple[ObjectModel, AnyArray]]:
-    """Yield each object that can be read, and the indices of its rows in a batch."""
+) -> Iterator[tuple[str, ObjectModel, AnyArray]]:
+    """Yield name and model of each object that can be read, and the indices of its rows."""
     for index in np.unique(batch["object"]).tolist():
-        known = model(manifest.objects[index].name)
+        # Its file may have another name of it, see `ObjectEntry.drawn_as`.
+        name = manifest.objects[index].name
+        known = model(name)
         if known is not None:
-            yield known, np.flatnonzero(batch["object"] == index)
+            yield name, known, np.flatnonzero(batch["object"] == index)
 
 
 def _mask(indices: AnyArray, count: int) -> AnyArray:

@@ -17,7 +17,7 @@ from drakegrasp.config import CameraConfig, Config
 from drakegrasp.dataset.checks.findings import Violation
 from drakegrasp.dataset.checks.rows import UNIT_TOLERANCE, AnyArray, Batch
 from drakegrasp.dataset.schema import CAMERAS
-from drakegrasp.frames import Array, invert_pose, transform_points
+from drakegrasp.frames import Array, invert_pose
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.vision.camera import intrinsics, project, unproject
 from drakegrasp.vision.depth_sensor import DepthSensor, clean_depth
@@ -287,4 +287,5 @@ def _nearest_depth(depth: AnyArray, lens: Lens, pixel: Array) -> float:
 
 def _points(X_AC: Array, lens: Lens, depth: AnyArray, chosen: AnyArray) -> Array:
     """Return the points p_AQ (m, 3) of the pixels where `chosen` (S, S) is true."""
-    return transform_points(X_AC, (lens.rays_C[:, chosen] * depth[chosen]).T)
+    p_CQ = lens.rays_C[:, chosen] * depth[chosen]
+    return np.asarray((X_AC[:3, :3] @ p_CQ).T + X_AC[:3, 3])

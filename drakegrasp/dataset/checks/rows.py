@@ -115,9 +115,9 @@ class Batch:
             tolerance: How far a number may be off; `LAST_PLACES` of rounding if None.
         """
         values = self.columns[name]
-        due = np.asarray(due).astype(values.dtype).reshape(values.shape)
-        if np.array_equal(values, due, equal_nan=values.dtype.kind == "f"):
-            return
+        due = np.asarray(due).astype(values.dtype, copy=False).reshape(values.shape)
+        if values.dtype.kind != "O" and values.tobytes() == due.tobytes():
+            return  # mostly
         bad, off = ~all_per_row(values == due), np.zeros(len(self))
         if values.dtype.kind == "f":
             apart = np.where(np.isnan(values) & np.isnan(due), 0.0, np.abs(values - due))
@@ -222,11 +222,10 @@ class CheckedFile:
         # HDF5 reads a slice far faster than the same rows as a list.
         dense = len(rows) > 0 and rows[-1] - rows[0] + 1 == len(rows)
         choice = slice(int(rows[0]), int(rows[-1]) + 1) if dense else rows
-        datasets = {f.name: file[group][f.name] for f in fields}
-        columns = {
-            f.name: (datasets[f.name].asstr() if f.dtype == "str" else datasets[f.name])[choice]
-            for f in fields
-        }
+        own, columns = file[group], {}
+        for f in fields:
+            dataset = own[f.name]
+            columns[f.name] = (dataset.asstr() if f.dtype == "str" else dataset)[choice]
         return Batch(file=self.name, group=f"/{group}", rows=rows, columns=columns)
 
     def batches(
@@ -273,15 +272,6 @@ class CheckedFile:
             self.bad[group] = np.union1d(self.bad_rows(group), rows)
 
 
-@contextmanager
-def readable(file: CheckedFile, findings: Findings) -> Iterator[None]:
-    """Let whole columns of a file be read in the block; that they cannot be is a finding."""
-    try:
-        yield
-    except (OSError, UnicodeDecodeError) as error:
-        findings.add([of_file(file.name, "all columns must be readable", first_line(error))])
-
-
 def identity(file: h5py.File) -> tuple[int, int]:
     """Return what tells an open file from others, also from one of the same name."""
     found = os.fstat(file.id.get_vfd_handle())
@@ -307,49 +297,47 @@ class RowsTask(Protocol):
 
 
 @dataclass(kw_only=True, eq=False)
-class Progress:
-    """How far a check is.
+class Check:
+    """A check while it runs.
 
     Attributes:
+        execute: Runs the tasks.
         report: Called with the number of rows and shards that are done and to do.
         total: Number of rows and shards to do.
         done: Number of rows and shards that are done.
+        findings: The violations.
     """
 
+    execute: Executor
     report: Report
-    total: int
+    total: int = 0
     done: int = 0
+    findings: Findings = field(default_factory=Findings)
 
     def advance(self, count: int) -> None:
         """Report that more rows or shards are done."""
         self.done += count
         self.report(self.done, self.total)
 
+    def judge(self, tasks: Iterable[RowsTask], files: Mapping[str, CheckedFile]) -> None:
+        """Judge rows in tasks; their files remember the bad ones."""
+        bad: dict[tuple[str, str], list[Rows]] = {}
+        for size, found, marked in in_order(self.execute)(_judge, tasks):
+            self.advance(size)
+            self.findings.merge(found)
+            for key, rows in marked.items():
+                bad.setdefault(key, []).append(rows)
+        for (camera, group), parts in bad.items():
+            files[camera].mark_bad(group, np.concatenate(parts))
 
-def judge_rows(
-    tasks: Iterable[RowsTask],
-    files: Mapping[str, CheckedFile],
-    execute: Executor,
-    findings: Findings,
-    progress: Progress,
-) -> None:
-    """Judge rows in tasks.
-
-    Args:
-        tasks: The tasks.
-        files: Their files; they remember the bad rows.
-        execute: Runs the tasks.
-        findings: Takes the violations, in the order of the tasks.
-        progress: Told of the rows that are done.
-    """
-    bad: dict[tuple[str, str], list[Rows]] = {}
-    for size, found, marked in in_order(execute)(_judge, tasks):
-        progress.advance(size)
-        findings.merge(found)
-        for key, rows in marked.items():
-            bad.setdefault(key, []).append(rows)
-    for (camera, group), parts in bad.items():
-        files[camera].mark_bad(group, np.concatenate(parts))
+    @contextmanager
+    def readable(self, file: CheckedFile) -> Iterator[None]:
+        """Let whole columns of a file be read in the block; that they cannot be is a finding."""
+        try:
+            yield
+        except (OSError, UnicodeDecodeError) as error:
+            what = "all columns must be readable"
+            self.findings.add([of_file(file.name, what, first_line(error))])
 
 
 def _judge(task: RowsTask) -> tuple[int, Findings, dict[tuple[str, str], Rows]]:

@@ -22,7 +22,7 @@ from drakegrasp.dataset.checks.data_file import samples_tasks, splits
 from drakegrasp.dataset.checks.findings import Findings, Violation, of_file
 from drakegrasp.dataset.checks.layout import look_at
 from drakegrasp.dataset.checks.object_files import check_object, object_tasks
-from drakegrasp.dataset.checks.rows import CheckedFile, Progress, judge_rows, readable
+from drakegrasp.dataset.checks.rows import Check, CheckedFile
 from drakegrasp.dataset.checks.trials_file import successes, trials_tasks
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.manifest import read_manifest, refuse_older
@@ -51,15 +51,15 @@ def check_dataset(
         DataError: If the path is neither, cannot be read, or is of another schema. In a directory
             a file that cannot be read is a violation, and the others are still checked.
     """
-    path, findings, report = Path(path), Findings(), progress or silent
-    if path.is_dir():
-        _check_directory(path, findings, report, execute)
+    check = Check(execute=execute, report=progress or silent)
+    if Path(path).is_dir():
+        _check_directory(Path(path), check)
     else:
-        _check_file(path, findings, report, execute)
-    return findings.violations()
+        _check_file(Path(path), check)
+    return check.findings.violations()
 
 
-def _check_file(path: Path, findings: Findings, report: Report, execute: Executor) -> None:
+def _check_file(path: Path, check: Check) -> None:
     """Check a file alone."""
     try:
         file = open_hdf5(path)
@@ -78,23 +78,23 @@ def _check_file(path: Path, findings: Findings, report: Report, execute: Executo
             )
         refuse_other_schema(path, file.attrs.get("schema_version"))
         camera = camera if camera in CAMERAS else ""
-        files = {camera: look_at(path.name, file, camera, findings)}
-    _check_rows(files, findings, Progress(report=report, total=_rows(files)), execute)
+        files = {camera: look_at(path.name, file, camera, check.findings)}
+    check.total = _rows(files)
+    _check_rows(files, check)
 
 
-def _check_directory(out: Path, findings: Findings, report: Report, execute: Executor) -> None:
+def _check_directory(out: Path, check: Check) -> None:
     """Check the files of a dataset, each with its objects, its shards and the other files."""
     manifest = read_manifest(out)
     refuse_older(manifest, out)
-    files = _look_at_files(out, findings)
-    palms = sum(entry.candidates for entry in manifest.objects)
-    progress = Progress(report=report, total=_rows(files) + palms)
+    files = _look_at_files(out, check.findings)
+    check.total = _rows(files) + sum(entry.candidates for entry in manifest.objects)
 
     # The files that all others follow from.
     objects, surveys = set[str](), []
-    for found in in_order(execute)(check_object, object_tasks(out, manifest)):
-        findings.merge(found.findings)
-        progress.advance(found.candidates)
+    for found in in_order(check.execute)(check_object, object_tasks(out, manifest)):
+        check.findings.merge(found.findings)
+        check.advance(found.candidates)
         if found.readable:
             objects.add(found.name)
         if found.survey is not None:
@@ -109,23 +109,21 @@ def _check_directory(out: Path, findings: Findings, report: Report, execute: Exe
     for camera, file in files.items():
         other = [*origin(file, manifest, again.shards.seals if again else "", camera)]
         other += row_counts(file, again, camera) if again and not other else []
-        findings.add(other)
+        check.findings.add(other)
         if again is not None and file.config is not None and not other:
             compared.add(camera)
     if (trials := files.get("")) is not None:
         decided = again if "" in compared else None
-        with readable(trials, findings):
-            objects_and_successes(trials, manifest, decided, findings)
-    _check_rows(files, findings, progress, execute, dataset, again, frozenset(compared))
-    if not findings:
-        _check_card(out, findings)  # else it would differ for the same cause
+        with check.readable(trials):
+            objects_and_successes(trials, manifest, decided, check.findings)
+    _check_rows(files, check, dataset, again, frozenset(compared))
+    if not check.findings:
+        _check_card(out, check.findings)  # else it would differ for the same cause
 
 
 def _check_rows(
     files: Mapping[str, CheckedFile],
-    findings: Findings,
-    progress: Progress,
-    execute: Executor,
+    check: Check,
     dataset: Dataset | None = None,
     again: Again | None = None,
     compared: frozenset[str] = frozenset(),
@@ -134,24 +132,21 @@ def _check_rows(
 
     Args:
         files: The files; the trials come under "".
-        findings: Takes the violations.
-        progress: Told of the rows that are done.
-        execute: Runs the tasks.
+        check: Runs the tasks, and takes the violations.
         dataset: The dataset around the files, if there is one.
         again: The dataset assembled again, if its shards are sound.
         compared: Cameras of the files that are compared with it; "" for the trials.
     """
-    judge_rows(trials_tasks(files, dataset, again, compared), files, execute, findings, progress)
+    check.judge(trials_tasks(files, dataset, again, compared), files)
     for camera, file in files.items():
         # What is compared follows from the shards; other files are judged by themselves.
         if camera not in compared:
-            with readable(file, findings):
+            with check.readable(file):
                 entries = dataset.manifest.objects if dataset else ()
                 known = {entry.name: entry for entry in entries}
-                findings.add(splits(file, known) if camera else successes(file))
+                check.findings.add(splits(file, known) if camera else successes(file))
         if camera:
-            tasks = samples_tasks(file, camera, dataset)
-            judge_rows(tasks, {camera: file}, execute, findings, progress)
+            check.judge(samples_tasks(file, camera, dataset), files)
 
 
 def _look_at_files(out: Path, findings: Findings) -> dict[str, CheckedFile]:
