@@ -118,9 +118,9 @@ def bench(
         print_table,
     )
     from drakegrasp.config import load_config
-    from drakegrasp.objects.builtin.catalog import builtin_sources
     from drakegrasp.objects.sources import find_meshes
     from drakegrasp.runtime.progress import progress_bar
+    from drakegrasp.shapes.catalog import builtin_sources
 
     # What cannot be used is refused before the measurement, which takes a while.
     if not os.access(out if out.exists() else out.absolute().parent, os.W_OK):
