@@ -117,7 +117,7 @@ def bench(
         fidelity_table,
         print_table,
     )
-    from drakegrasp.config import load_config
+    from drakegrasp.hand.settings import load_config
     from drakegrasp.objects.sources import find_meshes
     from drakegrasp.runtime.progress import progress_bar
     from drakegrasp.shapes.catalog import builtin_sources

@@ -83,7 +83,7 @@ def export_objects(directory: Path, per_class: int | None, objects_seed: int | N
     Equal options write equal bytes on every machine.
     """
     from drakegrasp.build.request import BUILTIN
-    from drakegrasp.config import load_config
+    from drakegrasp.hand.settings import load_config
     from drakegrasp.runtime.progress import progress_bar
     from drakegrasp.shapes.catalog import export_builtin
 

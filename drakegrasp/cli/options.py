@@ -265,8 +265,7 @@ def parse_request(
         HandError: If the hand's file cannot be read.
     """
     # Loading pydantic takes a while, and `--help` must answer at once.
-    from drakegrasp.config import load_config
-    from drakegrasp.hand.file_format import with_hand_defaults
+    from drakegrasp.hand.settings import load_config
 
     chosen = [*overrides, *builtin_overrides(objects, per_class, objects_seed)]
     if candidates is not None:
@@ -278,11 +277,10 @@ def parse_request(
         "samples": samples,
         "samples_per_object": samples_per_object,
     }
-    resolved = load_config(config, chosen, seed=seed, **stops)
     return BuildRequest(
         objects=objects,
         out=out.absolute(),
-        config=with_hand_defaults(resolved),
+        config=load_config(config, chosen, seed=seed, **stops),
         units=units,
         manifest=manifest,
         only=only,

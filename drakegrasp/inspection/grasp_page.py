@@ -131,7 +131,7 @@ def _facts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[tuple[str, s
         space = "" if unit == "°" else " "
         return f"{value:.{digits}f}{space}{unit}" if np.isfinite(value) else "–"
 
-    standoffs = snapshot.config.candidates.drawn_standoffs
+    standoffs = snapshot.config.candidates.standoffs
     s = key.standoff_index
     standoff = f"{1e3 * standoffs[s]:.0f} mm" if s < len(standoffs) else str(s)
     return [

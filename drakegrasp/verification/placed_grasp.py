@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from drakegrasp.config import Config, RandomizeConfig, absolute_hand, override_config, parse_config
+from drakegrasp.config import Config, RandomizeConfig
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.reader import GraspDataset
@@ -23,6 +23,7 @@ from drakegrasp.errors import GraspError, HandError
 from drakegrasp.frames import Array, read_pose, unpack_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.files import hand_digest
+from drakegrasp.hand.settings import override_config
 from drakegrasp.simulation.placement import (
     Placed,
     PlacedObject,
@@ -216,7 +217,7 @@ def chosen_config(arguments: VerifyArguments) -> Config:
     config = known if arguments.config is None else arguments.config
     config = override_config(config, arguments.overrides) if arguments.overrides else config
     if arguments.hand is not None:
-        config = parse_config({**config.to_dict(), "hand": absolute_hand(arguments.hand)})
+        config = override_config(config, [], hand=str(arguments.hand))
     if arguments.dataset is not None:
         refuse_other_objects(config, known, "as in the dataset, whose objects are prepared")
         if arguments.hand is None and config.hand == known.hand:

@@ -11,9 +11,9 @@ from helpers.meshes import SMALL
 
 from drakegrasp.build.pipeline import BuildReport, build
 from drakegrasp.build.replay import replay_trial
-from drakegrasp.config import load_config
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.filters import Removal
+from drakegrasp.hand.settings import load_config
 from drakegrasp.inspection.catalog import Catalog
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.executor import run_here

@@ -7,8 +7,8 @@ from pathlib import Path
 from helpers.hands import write_pincer
 
 from drakegrasp.build.payload import too_heavy
-from drakegrasp.config import load_config
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry
+from drakegrasp.hand.settings import load_config
 
 
 def entry(name: str, mass: float) -> ObjectEntry:

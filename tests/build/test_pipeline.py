@@ -20,7 +20,7 @@ from drakegrasp.build.pipeline import build, nothing_trains
 from drakegrasp.build.prepare import prepare_one
 from drakegrasp.build.replay import replay_trial
 from drakegrasp.build.work_unit import run_unit
-from drakegrasp.config import Config, SplitConfig, load_config, override_config
+from drakegrasp.config import Config, SplitConfig
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.filters import Removal
@@ -30,6 +30,7 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.shards import read_shard, trial_columns, write_shard
 from drakegrasp.dataset.statistics import count_funnel, count_splits
 from drakegrasp.errors import ConfigError, DataError, MachineError, MeshError
+from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here

@@ -17,7 +17,7 @@ from drakegrasp.bench.cross_check import cross_check
 from drakegrasp.build.pipeline import build
 from drakegrasp.build.replay import replay_trial
 from drakegrasp.build.work_unit import WorkUnit, run_unit
-from drakegrasp.config import Config, load_config, override_config
+from drakegrasp.config import Config
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.filters import Removal
@@ -32,6 +32,7 @@ from drakegrasp.dataset.rejections import (
 from drakegrasp.dataset.split import rank_in_split, split_samples
 from drakegrasp.dataset.statistics import count_funnel, count_splits
 from drakegrasp.frames import unpack_pose
+from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.inspection.catalog import Catalog
 from drakegrasp.inspection.query import Query, select
 from drakegrasp.objects.sources import MeshSource, find_meshes

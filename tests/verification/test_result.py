@@ -9,8 +9,8 @@ import pytest
 import trimesh
 from helpers.objects import standing
 
-from drakegrasp.config import load_config
 from drakegrasp.frames import make_pose
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import make_object
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.contacts import Contacts

@@ -15,10 +15,10 @@ import pytest
 import trimesh
 from helpers.objects import standing
 
-from drakegrasp.config import load_config
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, VERIFICATION_FIELDS, sizes
 from drakegrasp.errors import DataError
 from drakegrasp.frames import make_pose, pack_pose
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import make_object
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Pregrasp

@@ -15,7 +15,7 @@ from helpers.meshes import write_fixed
 from helpers.scripts import PIPELINES
 from matplotlib.image import imread
 
-from drakegrasp.config import CameraConfig, load_config
+from drakegrasp.config import CameraConfig
 from drakegrasp.dataset.hdf5 import create_field, write_field
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import (
@@ -30,6 +30,7 @@ from drakegrasp.dataset.schema import (
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, make_pose, pack_pose
 from drakegrasp.grasp import pack_grasp
+from drakegrasp.hand.settings import load_config
 from drakegrasp.vision.camera import intrinsics, project
 from drakegrasp.visualization.contact_sheet import contact_sheet, draw_sheet, spread_over_objects
 
