@@ -7,15 +7,18 @@ contacts are the paper's (Veres et al., "Postprocessing"); those of the hold are
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import FilterConfig
+from drakegrasp.errors import ConfigError
 from drakegrasp.frames import Array
+from drakegrasp.runtime.user_code import own_class, run_own
 
 
 class Removal(IntEnum):
@@ -37,6 +40,7 @@ class Removal(IntEnum):
     SUSPICIOUS = 12  # the suspicion score or a part of it is too high; before OUTLIER
     MISSING_FINGER = 13  # a fingertip that is not required does not touch; the first of all
     REFINED_TEST = 14  # a refined palm pose whose split is test; after the split is drawn
+    OWN = 15  # a filter of the user's own; before OUTLIER
 
     @property
     def label(self) -> str:
@@ -106,6 +110,9 @@ def judge_successes(
         successes: The n successes.
         config: Limits of the filters.
         rejected: Ids of trials that an inspection rejects.
+
+    Raises:
+        ConfigError: If a filter of the user's own cannot be run, or returns something else.
     """
     # Filters that judge a grasp alone.
     removal = np.full(len(successes.trial_id), Removal.KEPT, dtype=np.uint8)
@@ -122,6 +129,7 @@ def judge_successes(
         (Removal.OFF_SURFACE, ~np.isfinite(successes.held_O).all(axis=1)),
         *breaks_surface(config, successes.surface_distance, successes.normal_angle),
         *((Removal.SUSPICIOUS, bad) for bad in _breaks_suspicion(config, successes)),
+        *((Removal.OWN, ~kept) for kept in _kept_by_own(config, successes)),
     ):
         removal[bad & (removal == Removal.KEPT)] = reason
 
@@ -186,6 +194,32 @@ def _breaks_suspicion(config: FilterConfig, successes: Successes) -> list[npt.ND
         (successes.normal_sum, config.max_normal_sum),
     )
     return [~(values <= limit) for values, limit in rules if limit is not None]
+
+
+def own_filters(config: FilterConfig) -> list[type[Any]]:
+    """Return the classes of the user's own filters.
+
+    Raises:
+        ConfigError: If one cannot be imported, or is of another signature.
+    """
+    return [
+        own_class(name, config.code, method="keep", takes=("successes",)) for name in config.own
+    ]
+
+
+def _kept_by_own(config: FilterConfig, successes: Successes) -> Iterator[npt.NDArray[np.bool_]]:
+    """Yield which successes (n,) each filter of the user's own keeps."""
+    due = successes.trial_id.shape
+    if due == (0,):
+        return
+    for name, found in zip(config.own, own_filters(config), strict=True):
+        kept = np.asarray(run_own(name, lambda found=found: found().keep(successes)))
+        if kept.dtype != np.bool_ or kept.shape != due:
+            raise ConfigError(
+                f"{name.partition('@')[0]}: keep must return {due} of bool, "
+                f"got {kept.shape} of {kept.dtype}"
+            )
+        yield kept
 
 
 def is_outlier(values: Array, sigma: float) -> npt.NDArray[np.bool_]:

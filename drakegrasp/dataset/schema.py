@@ -234,7 +234,7 @@ _LIFTED = _contacts("lifted", "trial.lift", "after the lift")
 _LINEAGE = _new(
     Field("resting", "", "uint8", "-", "-", "index of the object's resting pose"),
     Field("source", "", "uint8", "-", "-",
-          "sampler of the palm pose: 0 rotations, 1 normals, 2 refine"),
+          "sampler of the palm pose: 0 rotations, 1 normals, 2 refine, 3 own"),
     Field("generation", "", "uint8", "-", "-",
           "0: first round; else the number of refined palm poses up to this one"),
     Field("child", "", "int32", "-", "-",
@@ -468,7 +468,7 @@ SUCCESS_FIELDS: tuple[Field, ...] = (
     Field("removal", "", "uint8", "-", "-",
           "why it is no sample: 0 kept, 1 other_links, 2 slid, 3 turned, 4 not_seen, "
           "5 out_of_view, 6 bisects_table, 7 flat_depth, 8 off_surface, 9 normal_off, 10 outlier, "
-          "11 rejected, 12 suspicious, 13 missing_finger, 14 refined_test"),
+          "11 rejected, 12 suspicious, 13 missing_finger, 14 refined_test, 15 own"),
     *CERTIFICATE_FIELDS,
 )
 

@@ -102,8 +102,8 @@ def lineage(batch: Batch, children: int | None) -> Iterator[Violation]:
         generation,
     )
     yield from batch.broken(
-        "source must be 2 (refine) for a refined palm pose, and 0 or 1 for another",
-        np.where(refined, batch["source"] != Source.REFINE, batch["source"] >= Source.REFINE),
+        "source must be 2 (refine) for a refined palm pose, and 0, 1 or 3 for another",
+        ((batch["source"] == Source.REFINE) != refined) | (batch["source"] > max(Source)),
         batch["source"],
     )
     if children is not None:
