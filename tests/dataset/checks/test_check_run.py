@@ -142,6 +142,19 @@ def test_files_of_other_shards_are_found(out: Path) -> None:
     must_find(out, *((name, "", None, what) for name in (OTO, OTM, TRIALS)))
 
 
+@pytest.mark.parametrize("packing", [{"compression": "gzip", "compression_opts": 9}, {}])
+def test_images_that_are_packed_otherwise_are_compared_by_value(
+    out: Path, packing: dict[str, object]
+) -> None:
+    with h5py.File(out / OTO, "r+") as file:
+        values, attributes = file["train/images"][:], dict(file["train/images"].attrs)
+        del file["train/images"]
+        file.create_dataset("train/images", data=values, **packing).attrs.update(attributes)
+    must_find(out)
+    change(out, OTO, "train/images", 1, set_at(0, 0, 0, to=0.25))
+    must_find(out, (OTO, "/train", 1, "images must be what the shard holds"))
+
+
 def test_trials_without_sound_objects_are_not_compared(out: Path) -> None:
     def spoil(file: h5py.File) -> None:
         del file["objects/valid"]
