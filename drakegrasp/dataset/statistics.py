@@ -20,10 +20,11 @@ from drakegrasp.dataset.assembly.weights import effective_number
 from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.hdf5 import open_hdf5, read_names
 from drakegrasp.dataset.layout.opening import open_samples, open_trials
+from drakegrasp.dataset.layout.trial_files import NONE, shard_part
 from drakegrasp.dataset.manifest import read_manifest, refuse_older
 from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.schema import SCHEMA_VERSION, SPLITS
-from drakegrasp.dataset.trials import NONE, Trials, shard_part
+from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.runtime.executor import Executor, run_here

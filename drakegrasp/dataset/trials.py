@@ -9,28 +9,24 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
-import h5py
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.dataset.hdf5 import read_names, read_texts
-from drakegrasp.dataset.layout.opening import (
-    open_samples,
-    open_trials,
-    opened,
-    read_codes,
-    refuse_other_codes,
+from drakegrasp.dataset.hdf5 import AnyArray
+from drakegrasp.dataset.layout.trial_files import (
+    DERIVED,
+    FIELDS,
+    NONE,
+    TrialFiles,
+    TrialPart,
+    whole_file,
 )
-from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
-from drakegrasp.dataset.schema import CAMERAS, OBJECT_FIELDS, READABLE, SPLITS, TRIAL_FIELDS
-from drakegrasp.dataset.shards import ShardHeader, open_shard, trial_columns
+from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.frames import X_WT, Array, invert_pose, unpack_pose
 from drakegrasp.outcomes import Outcome
@@ -38,19 +34,8 @@ from drakegrasp.outcomes import Outcome
 if TYPE_CHECKING:
     import pandas
 
-AnyArray = npt.NDArray[Any]
-#: Number of a removal or a split that an attempt does not have.
-NONE = 255
-#: Rows that are read at once: 8 chunks of a column.
-BLOCK = 16_384
-#: Columns besides those of `/trials`: names of the row's object, why a success is no sample
-#: (`removal` in the schema), and the split of a sample (index into SPLITS); NONE for all others.
-DERIVED = ("object_name", "class_name", "removal", "split")
-#: What changes when a file is replaced; None if it is not there.
-Stamp = tuple[int, ...] | None
 #: Frames in which contacts can be given: object, table top, palm, world.
 Frame = Literal["O", "T", "G", "W"]
-_FIELDS = {field.name: field for field in TRIAL_FIELDS}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -70,23 +55,6 @@ class TrialContacts:
     forces: Array
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TrialPart:
-    """The rows of one file: all of trials.hdf5, or the first of a shard while a build runs.
-
-    Attributes:
-        path: Of the file.
-        count: Number of rows.
-        header: Identity of the shard; None for trials.hdf5.
-        object: Row of the shard's object among the objects.
-    """
-
-    path: Path
-    count: int
-    header: ShardHeader | None = None
-    object: int = 0
-
-
 class Trials:
     """Attempts of a dataset as columns and rows; a choice of them is `Trials` again.
 
@@ -102,7 +70,7 @@ class Trials:
     """
 
     def __init__(self, out: str | Path, *, any_name: bool = False) -> None:
-        self._files = _whole_file(Path(out), any_name)
+        self._files = whole_file(Path(out), any_name)
         self._rows: npt.NDArray[np.int64] | None = None
 
     @classmethod
@@ -116,10 +84,10 @@ class Trials:
             objects: Columns of its objects, `name` and `class_name` at least.
             parts: In the order of the rows.
         """
-        return cls._of(_Files(out=out, objects=objects, parts=tuple(parts)), None)
+        return cls._of(TrialFiles(out=out, objects=objects, parts=tuple(parts)), None)
 
     @classmethod
-    def _of(cls, files: _Files, rows: npt.NDArray[np.int64] | None) -> Trials:
+    def _of(cls, files: TrialFiles, rows: npt.NDArray[np.int64] | None) -> Trials:
         trials = cls.__new__(cls)
         trials._files, trials._rows = files, rows
         return trials
@@ -171,15 +139,15 @@ class Trials:
     def __getitem__(self, key: slice | npt.NDArray[Any] | Sequence[int]) -> Trials: ...
 
     def __getitem__(self, key: Any) -> AnyArray | dict[str, Any] | Trials:
-        """Return a column by its name, one attempt by its place, or a choice of them.
+        """Return a column by its name, one attempt by its index, or a choice of them.
 
         Args:
-            key: Name of a column, see `columns`; a place, which counts from the end if it is
-                negative; or a slice, places, or a mask (n,), as NumPy takes them.
+            key: Name of a column, see `columns`; an index, which counts from the end if it is
+                negative; or a slice, indices, or a mask (n,), as NumPy takes them.
 
         Raises:
             DataError: If there is no such column, or a file was replaced.
-            IndexError: If there is no such place.
+            IndexError: If the index is out of range.
         """
         if isinstance(key, str):
             return self.columns([key])[key]
@@ -187,13 +155,13 @@ class Trials:
             if not isinstance(key, slice):
                 key = np.asarray(key) if len(key) else np.zeros(0, dtype=np.int64)
             return self._of(self._files, self.trial_ids[key])
-        place = operator.index(key)
-        if not -len(self) <= place < len(self):
-            raise IndexError(f"place must be below {len(self)}, got {place}")
-        return {name: values[0] for name, values in self[[place]].columns().items()}
+        index = operator.index(key)
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"index must be below {len(self)}, got {index}")
+        return {name: values[0] for name, values in self[[index]].columns().items()}
 
     def trial(self, trial_id: int) -> dict[str, Any]:
-        """Return an attempt by its row in trials.hdf5, as `trials[place]` does.
+        """Return an attempt by its row in trials.hdf5, as `trials[index]` does.
 
         Raises:
             DataError: If there is no such row.
@@ -251,11 +219,18 @@ class Trials:
         Raises:
             DataError: If there is no such column, or a file was replaced.
         """
-        names = [*_FIELDS, *DERIVED[:-1]] if names is None else names
-        rows, back = np.unique(self.trial_ids, return_inverse=True)
-        parts = list(self._of(self._files, rows).blocks(names))
-        whole = {name: np.concatenate([part[name] for part in parts]) for name in names}
-        return {name: values[back] for name, values in whole.items()}
+        names = [*FIELDS, *DERIVED[:-1]] if names is None else names
+        if not self._rising:
+            rows, back = np.unique(self.trial_ids, return_inverse=True)
+            columns = self._of(self._files, rows).columns(names)
+            return {name: values[back] for name, values in columns.items()}
+        blocks = list(self.blocks(names))
+        return {name: np.concatenate([block[name] for block in blocks]) for name in names}
+
+    @property
+    def _rising(self) -> bool:
+        """Whether the attempts are in the order of the file, each once."""
+        return self._rows is None or bool((np.diff(self._rows) > 0).all())
 
     def blocks(self, names: Sequence[str]) -> Iterator[dict[str, AnyArray]]:
         """Yield columns of some thousand attempts after the other, which must be in rising order.
@@ -266,11 +241,13 @@ class Trials:
             names: See `columns`.
 
         Raises:
-            DataError: See `columns`.
+            DataError: See `columns`, or if the attempts are in another order.
         """
+        if not self._rising:
+            raise DataError("attempts must be in rising order to be read in blocks, got another")
         for name in names:
-            if name not in _FIELDS and name not in DERIVED:
-                known = ", ".join([*_FIELDS, *DERIVED])
+            if name not in FIELDS and name not in DERIVED:
+                known = ", ".join([*FIELDS, *DERIVED])
                 raise DataError(f"column must be one of {known}, got {name!r}")
         empty = True
         for part, start in self._files.starts():
@@ -339,7 +316,7 @@ class Trials:
         except ModuleNotFoundError:
             raise MachineError("to_pandas needs pandas, got none: pip install pandas") from None
         if names is None:
-            names = [name for name, field in _FIELDS.items() if not field.shape] + [*DERIVED]
+            names = [name for name, field in FIELDS.items() if not field.shape] + [*DERIVED]
 
         # Several values of an attempt are columns of their own.
         series: dict[str, Any] = {}
@@ -362,199 +339,6 @@ class Trials:
             name for name in ("outcome", "split", "object_name", "class_name") if name in frame
         ]
         return frame.astype(dict.fromkeys(words, "category"))
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Files:
-    """The files of all attempts, in the order of the rows.
-
-    Attributes:
-        out: Directory of the dataset, or its trials.hdf5.
-        objects: See `Trials.objects`.
-        parts: The files.
-        attributes: Of trials.hdf5.
-        stamp: Of trials.hdf5 when it was first opened; None for shards, which never change.
-    """
-
-    out: Path
-    objects: Mapping[str, AnyArray]
-    parts: tuple[TrialPart, ...]
-    attributes: Mapping[str, Any] = field(default_factory=dict)
-    stamp: Stamp = None
-
-    @property
-    def count(self) -> int:
-        return sum(part.count for part in self.parts)
-
-    def starts(self) -> Iterator[tuple[TrialPart, int]]:
-        """Yield each part with the number of rows before it."""
-        start = 0
-        for part in self.parts:
-            yield part, start
-            start += part.count
-
-    @contextmanager
-    def open(self, part: TrialPart) -> Iterator[h5py.File]:
-        """Open a part: the file that was looked at first, or none."""
-        if part.header is not None:
-            with open_shard(part.path, part.header, verify_seal=False, again=True) as (file, _):
-                yield file
-            return
-        with opened(part.path, "the trials of a dataset", again=True) as file:
-            if stamp(part.path) != self.stamp:
-                raise DataError(f"{part.path}: must stay while it is read, got another; read again")
-            yield file
-
-    def read(
-        self, part: TrialPart, start: int, rows: npt.NDArray[np.int64], names: Sequence[str]
-    ) -> Iterator[dict[str, AnyArray]]:
-        """Yield columns of some rows of a part, which begins with row `start` of all."""
-        stored = [name for name in dict.fromkeys((*names, "object")) if name in _FIELDS]
-        with self.open(part) as file:
-            for block in np.split(rows, np.flatnonzero(np.diff(rows // BLOCK)) + 1):
-                columns = self._stored(file["trials"], part, block, stored)
-                columns |= self._derived(columns, start + block, names)
-                yield {name: columns[name] for name in names}
-
-    def _stored(
-        self,
-        trials: h5py.Group,
-        part: TrialPart,
-        rows: npt.NDArray[np.int64],
-        names: Sequence[str],
-    ) -> dict[str, AnyArray]:
-        """Return columns of rows that lie close together, as they are stored."""
-        columns: dict[str, AnyArray] = {}
-        near = slice(int(rows[0]), int(rows[-1]) + 1)
-        for name in names:
-            if name in trials:
-                columns[name] = trials[name][near][rows - near.start]
-            elif _FIELDS[name].since > min(READABLE):
-                columns[name] = _FIELDS[name].empty(len(rows), {})
-            elif part.header is None:
-                raise DataError(f"{part.path}: /trials/{name} must be there, got none")
-        if part.header is not None:
-            columns["object"] = np.full(len(rows), part.object, dtype=np.int32)
-
-        # Numbers that stand for something must.
-        for name, codes in (("outcome", list(Outcome)), ("object", len(self.objects["name"]))):
-            if name in columns:
-                refuse_other_codes(part.path, f"/trials/{name}", columns[name], codes, near.start)
-        return columns
-
-    def _derived(
-        self, columns: Mapping[str, AnyArray], ids: npt.NDArray[np.int64], names: Sequence[str]
-    ) -> dict[str, AnyArray]:
-        """Return what the columns of some attempts are besides what is stored of each."""
-        values: dict[str, AnyArray] = {"trial_id": ids}
-        values["object_name"] = self.objects["name"][columns["object"]]
-        values["class_name"] = self.objects["class_name"][columns["object"]]
-        if "removal" in names:
-            values["removal"] = self.removal[ids]
-        if "split" in names:
-            values["split"] = self.split[ids]
-        return values
-
-    def nothing(self, names: Sequence[str]) -> dict[str, AnyArray]:
-        """Return columns of no attempts."""
-        sizes = {"k": 0, "j": 0}
-        if self.parts:
-            with self.open(self.parts[0]) as file:
-                touching, q = file["trials/closed_touching"], file["trials/closed_q"]
-                sizes = {"k": touching.shape[1], "j": q.shape[1]}
-        derived = {"removal": np.uint8, "split": np.uint8}
-        return {
-            name: _FIELDS[name].empty(0, sizes)
-            if name in _FIELDS
-            else np.zeros(0, dtype=derived.get(name, object))
-            for name in names
-        }
-
-    @cached_property
-    def removal(self) -> npt.NDArray[np.uint8]:
-        """Why each attempt is no sample, NONE where it is no success or nothing is decided."""
-        removal = np.full(self.count, NONE, dtype=np.uint8)
-        for part in self.parts:
-            if part.header is None:
-                with self.open(part) as file:
-                    success = read_codes(file["successes/trial_id"], self.count)
-                    removal[success] = file["successes/removal"][:]
-        return removal
-
-    @cached_property
-    def split(self) -> npt.NDArray[np.uint8]:
-        """Split of each attempt as an index into SPLITS, NONE if it is no sample."""
-        split = np.full(self.count, NONE, dtype=np.uint8)
-        if all(part.header is None for part in self.parts):
-            for number, ids in enumerate(sample_ids(self.out).values()):
-                split[ids[ids < len(split)]] = number
-        return split
-
-
-def _whole_file(out: Path, any_name: bool) -> _Files:
-    """Return the attempts of an assembled dataset, see `Trials`."""
-    path = out if out.is_file() else out / TRIALS_FILE
-    with open_trials(path) as file:
-        group = file["objects"]
-        if not any_name:
-            read_names(group["name"])
-        objects = {
-            f.name: np.array(read_texts(group[f.name]), dtype=object)
-            if f.dtype == "str"
-            else group[f.name][:]
-            for f in OBJECT_FIELDS
-        }
-        part = TrialPart(path=path, count=len(file["trials/outcome"]))
-        attributes = dict(file.attrs)
-    return _Files(out=out, objects=objects, parts=(part,), attributes=attributes, stamp=stamp(path))
-
-
-def shard_part(
-    out: Path, header: ShardHeader, object_: int, names: Sequence[str] | None = None
-) -> TrialPart:
-    """Return the attempts in a shard; its seal, which takes reading all of it, is not verified.
-
-    Args:
-        out: Directory of the dataset.
-        header: Of the shard.
-        object_: Row of its object among the objects.
-        names: Columns that must be there; all that a shard has, and its images, if None.
-
-    Raises:
-        DataError: If it is missing, damaged, or another shard.
-    """
-    path = header.path(out)
-    stored = tuple(f for f in trial_columns() if f.name in (*(names or ()), "outcome"))
-    tables = None if names is None else {"trials": stored}
-    with open_shard(path, header, tables, verify_seal=False) as (file, _):
-        count = len(file["trials/outcome"])
-    return TrialPart(path=path, count=count, header=header, object=object_)
-
-
-def sample_ids(out: Path) -> dict[str, npt.NDArray[np.int64]]:
-    """Return the trial ids of the samples by split, in rising order; none without data files.
-
-    Args:
-        out: Directory of the dataset, or its trials.hdf5.
-
-    Raises:
-        DataError: If a data file is damaged.
-    """
-    folder = out if out.is_dir() else out.parent
-    for camera in CAMERAS:
-        if (folder / DATA_FILES[camera]).is_file():
-            with open_samples(folder / DATA_FILES[camera]) as file:
-                return {split: file[split]["trial_id"][:] for split in SPLITS}
-    return {split: np.zeros(0, dtype=np.int64) for split in SPLITS}
-
-
-def stamp(path: Path) -> Stamp:
-    """Return what changes when a file is replaced; None if it is not there."""
-    try:
-        status = path.stat()
-    except OSError:
-        return None
-    return status.st_ino, status.st_size, status.st_mtime_ns
 
 
 def _outcome(outcome: Outcome | str) -> Outcome:

@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from drakegrasp.dataset.layout.opening import refuse_other_codes
+from drakegrasp.dataset.layout.trial_files import sample_ids
 from drakegrasp.dataset.paths import DATA_FILES
-from drakegrasp.dataset.trials import Trials, sample_ids
+from drakegrasp.dataset.trials import Trials
 from drakegrasp.frames import Array, unpack_pose
 
 

@@ -9,8 +9,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from drakegrasp.dataset.filters import Removal
+from drakegrasp.dataset.layout.trial_files import NONE
 from drakegrasp.dataset.statistics import count_splits
-from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DataError
 from drakegrasp.inspection.catalog import Snapshot
 from drakegrasp.inspection.query import QUANTITIES

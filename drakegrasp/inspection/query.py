@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.filters import Removal
+from drakegrasp.dataset.layout.trial_files import NONE
 from drakegrasp.dataset.rejections import Decisions
 from drakegrasp.dataset.schema import SPLITS, Shown
 from drakegrasp.dataset.suspicion import PARTS
-from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DataError
 from drakegrasp.inspection.catalog import Snapshot
 from drakegrasp.outcomes import Outcome

@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 from helpers.datasets import OTO, SUCCESS, TRIALS, edit_file
 
-from drakegrasp.dataset import trials as trials_module
 from drakegrasp.dataset.assemble import assemble
+from drakegrasp.dataset.layout import trial_files
+from drakegrasp.dataset.layout.trial_files import NONE, shard_part
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.schema import SPLITS, TRIAL_FIELDS
-from drakegrasp.dataset.trials import NONE, Trials, shard_part
+from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.frames import X_WT, invert_pose, rotate_vectors, transform_points, unpack_pose
 from drakegrasp.outcomes import Outcome
@@ -33,7 +34,7 @@ def stored(out: Path, name: str) -> Any:
 def test_columns_are_those_of_the_file(
     sound: Path, block: int, rows: list[int] | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(trials_module, "BLOCK", block)
+    monkeypatch.setattr(trial_files, "BLOCK", block)
     trials = Trials(sound) if rows is None else Trials(sound)[rows]
     columns = trials.columns([field.name for field in TRIAL_FIELDS])
     picked = slice(None) if rows is None else np.array(rows, dtype=int)
@@ -45,12 +46,18 @@ def test_columns_are_those_of_the_file(
 
 
 def test_blocks_are_the_columns_in_parts(sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trials_module, "BLOCK", 5)
+    monkeypatch.setattr(trial_files, "BLOCK", 5)
     blocks = list(Trials(sound).blocks(["slip", "object_name"]))
     assert [len(block["slip"]) for block in blocks] == [5] * 7 + [1]
     np.testing.assert_array_equal(
         np.concatenate([block["slip"] for block in blocks]), stored(sound, "slip")
     )
+
+
+def test_blocks_of_attempts_in_another_order_are_refused(sound: Path) -> None:
+    for rows in ([3, 1], [2, 2]):
+        with pytest.raises(DataError, match="must be in rising order to be read in blocks"):
+            list(Trials(sound)[rows].blocks(["slip"]))
 
 
 def test_what_is_derived_is_that_of_the_other_groups_and_files(sound: Path) -> None:
@@ -135,7 +142,7 @@ def test_row_or_column_that_is_not_there_is_refused(sound: Path) -> None:
     trials = Trials(sound)
     with pytest.raises(DataError, match=r"trials\.hdf5: trial must be 0 to 35, got 36"):
         trials.trial(36)
-    with pytest.raises(IndexError, match="place must be below 36, got -37"):
+    with pytest.raises(IndexError, match="index must be below 36, got -37"):
         trials[-37]
     with pytest.raises(DataError, match=r"column must be one of trial_id, .*, got 'mug'"):
         trials["mug"]
@@ -197,8 +204,8 @@ def test_file_that_was_replaced_is_refused(out: Path) -> None:
 
 def test_numbers_that_stand_for_nothing_are_refused(out: Path) -> None:
     edit_file(out / TRIALS, lambda f: f["trials/outcome"].write_direct(np.full(36, 99, "u1")))
-    with pytest.raises(DataError, match="/trials/outcome must be 0 to 16, got 99 in row 0"):
-        Trials(out)["outcome"]
+    with pytest.raises(DataError, match="/trials/outcome must be 0 to 16, got 99 in row 7"):
+        Trials(out)[[7, 9]]["outcome"]
     edit_file(out / TRIALS, lambda f: f["trials/object"].write_direct(np.full(36, 3, "i4")))
     with pytest.raises(DataError, match="/trials/object must be 0 to 2, got 3 in row 0"):
         Trials(out)["object_name"]

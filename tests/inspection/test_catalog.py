@@ -14,9 +14,9 @@ from helpers.pages import coded, numbered
 
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.filters import Removal
+from drakegrasp.dataset.layout.trial_files import NONE
 from drakegrasp.dataset.manifest import Manifest, read_manifest, write_manifest
 from drakegrasp.dataset.rejections import Decisions
-from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DataError
 from drakegrasp.inspection import catalog as catalog_module
 from drakegrasp.inspection.catalog import Catalog

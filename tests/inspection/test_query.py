@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from helpers.pages import numbered
 
+from drakegrasp.dataset.layout.trial_files import NONE
 from drakegrasp.dataset.rejections import AttemptKey, Decisions
-from drakegrasp.dataset.trials import NONE
 from drakegrasp.errors import DataError
 from drakegrasp.inspection.catalog import Catalog, Snapshot
 from drakegrasp.inspection.query import QUANTITIES, Query, parse_query, select
