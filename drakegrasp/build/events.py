@@ -29,7 +29,7 @@ class BuildEvents:
             show: Whether to tell the user on standard error what cannot wait for the end: a
                 warning, or that the build waits for workers.
         """
-        self._out, self._pool, self._show = out, pool, show
+        self._pool, self._show = pool, show
         self._log = BuildLog(out)
 
     def started(self, manifest: Manifest, notices: Sequence[str]) -> None:

@@ -53,8 +53,8 @@ class Replay:
 def replay_trial(out: str | Path, trial_id: int) -> Replay:
     """Run one trial of a dataset again, from its prepared object and its candidate.
 
-    The same machine and versions give the same bits. `versions` says which packages
-    have other versions now.
+    The same machine and versions give the same bits. `versions` says which packages have other
+    versions now.
 
     Raises:
         DataError: If the dataset or the trial is not there.

@@ -2,8 +2,7 @@
 
 In: a Dask client. Out: workers that give the results of this machine. A worker that cannot render a
 test image is closed. One with several threads, or with another version of Drake, drakegrasp or the
-hand, is refused: at the start with an
-error, later by closing it before its first task.
+hand, is refused: at the start with an error, later by closing it before its first task.
 """
 
 from __future__ import annotations
