@@ -20,14 +20,13 @@ from typing import Any, Literal, TypeVar, get_args
 import numpy as np
 
 from drakegrasp.config import Config
-from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.manifest import installed_versions, read_manifest, refuse_older
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
 from drakegrasp.frames import unpack_pose
 from drakegrasp.hand.description import load_hand
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.runtime.blas import one_thread
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.seeding import Stream, object_key

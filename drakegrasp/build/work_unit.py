@@ -33,11 +33,11 @@ from drakegrasp.build.columns import empty_looks, fill_look, trial_rows
 from drakegrasp.build.target import has_target
 from drakegrasp.config import Config, FilterConfig
 from drakegrasp.dataset.assembly.survey import count_samples, successes_of
-from drakegrasp.dataset.filters import Removal, judge_successes
+from drakegrasp.dataset.filters import judge_successes
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.shards import Shard, ShardHeader, read_trials, write_shard
 from drakegrasp.errors import DataError, MachineError
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.runtime.blas import one_thread
 from drakegrasp.runtime.environment import trim_memory
 from drakegrasp.runtime.fault_injection import inject_fault

@@ -12,12 +12,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.statistics import Funnel, SplitCount, Unfinished, held_note, why_no_samples
 from drakegrasp.errors import printable
 from drakegrasp.objects.audit import AuditRow
 from drakegrasp.objects.memory import needed_limit
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Removal
 
 #: Short heads of the outcomes, in the order of the funnel.
 _OUTCOME_HEADS = {

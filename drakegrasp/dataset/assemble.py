@@ -40,7 +40,7 @@ from drakegrasp.dataset.assembly.survey import (
 from drakegrasp.dataset.assembly.weights import weigh_samples
 from drakegrasp.dataset.card.content import content_of
 from drakegrasp.dataset.card.text import card_files
-from drakegrasp.dataset.filters import Removal, Successes, judge_successes
+from drakegrasp.dataset.filters import Successes, judge_successes
 from drakegrasp.dataset.hdf5 import AnyArray, create_field, write_field
 from drakegrasp.dataset.layout.opening import open_samples, open_trials, read_codes
 from drakegrasp.dataset.lock import build_lock
@@ -57,6 +57,7 @@ from drakegrasp.dataset.rejections import AttemptKey, find_keys
 from drakegrasp.dataset.schema import OBJECT_FIELDS, SPLITS, SUCCESS_FIELDS, TRIAL_FIELDS
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array
+from drakegrasp.outcomes import Removal
 from drakegrasp.runtime.executor import Executor, in_order, run_here
 from drakegrasp.runtime.file_set import replaced_together
 from drakegrasp.runtime.files import disk_full_named, new_hdf5, sweep_temporary, temporary_name

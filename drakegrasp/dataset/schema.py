@@ -6,7 +6,7 @@ that is not here is in no file. Imports NumPy only, so that a reader can load it
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.errors import DataError, printable
-from drakegrasp.outcomes import Outcome, Stage
+from drakegrasp.outcomes import Outcome, Removal, Stage
 
 #: Goes up with every change of the table that an older reader cannot read.
 SCHEMA_VERSION = 4
@@ -226,8 +226,12 @@ def _copied(group: str, *fields: Field) -> tuple[Field, ...]:
 
 
 def _verdict(of: str, outcomes: list[Outcome]) -> Field:
-    labels = ", ".join(f"{outcome.value} {outcome.label}" for outcome in outcomes)
-    return Field("outcome", "", "uint8", "-", "-", f"verdict: {labels}", of=of)
+    return Field("outcome", "", "uint8", "-", "-", f"verdict: {_labels(outcomes)}", of=of)
+
+
+def _labels(members: Sequence[Outcome] | Sequence[Removal]) -> str:
+    """Return the numbers and names of an enum, as in a field's meaning."""
+    return ", ".join(f"{member.value} {member.label}" for member in members)
 
 
 # A row per field on at most two lines is what makes this a table.
@@ -499,9 +503,7 @@ LOOK_FIELDS: tuple[Field, ...] = (
 SUCCESS_FIELDS: tuple[Field, ...] = (
     Field("trial_id", "", "int64", "-", "-", "row of /trials"),
     Field("removal", "", "uint8", "-", "-",
-          "why it is no sample: 0 kept, 1 other_links, 2 slid, 3 turned, 4 not_seen, "
-          "5 out_of_view, 6 bisects_table, 7 flat_depth, 8 off_surface, 9 normal_off, 10 outlier, "
-          "11 rejected, 12 suspicious, 13 missing_finger, 14 refined_test"),
+          f"why it is no sample: {_labels(list(Removal))}"),
     *CERTIFICATE_FIELDS,
 )
 

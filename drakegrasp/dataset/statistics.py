@@ -17,7 +17,6 @@ import numpy.typing as npt
 
 from drakegrasp.dataset.assembly.survey import shards_sha256
 from drakegrasp.dataset.assembly.weights import effective_number
-from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.hdf5 import open_hdf5, read_names
 from drakegrasp.dataset.layout.opening import open_samples, open_trials
 from drakegrasp.dataset.layout.trial_files import NONE, shard_part
@@ -26,7 +25,7 @@ from drakegrasp.dataset.paths import ASSEMBLED_FILES, DATA_FILES, FILE_NAME, TRI
 from drakegrasp.dataset.schema import SCHEMA_VERSION, SPLITS
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
-from drakegrasp.outcomes import Outcome, Stage
+from drakegrasp.outcomes import Outcome, Removal, Stage
 from drakegrasp.runtime.executor import Executor, run_here
 
 #: Columns of attempts that a funnel counts.
@@ -201,8 +200,6 @@ def funnel_of(trials: Trials) -> Funnel:
     refined, audited = np.zeros((count, 3), np.int64), np.zeros((count, 4), np.int64)
     for block in trials.blocks(_COUNTED):
         number, outcome, removal = (block[name] for name in ("object", "outcome", "removal"))
-        if not np.isin(removal, [*Removal, NONE]).all():
-            raise DataError(f"{trials.path}: /successes/removal must be 0 to {max(Removal)}")
         held, sample = outcome == Outcome.SUCCESS, removal == Removal.KEPT
 
         # Palm poses, outcomes, how well they hold and removals of the first round.

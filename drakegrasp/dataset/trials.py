@@ -29,7 +29,7 @@ from drakegrasp.dataset.layout.trial_files import (
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.frames import X_WT, Array, invert_pose, unpack_pose
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Removal
 
 if TYPE_CHECKING:
     import pandas
@@ -205,7 +205,7 @@ class Trials:
         if refined is not None:
             mask &= (self["generation"] > 0) == refined
         if sample is not None:
-            mask &= (self["removal"] == 0) == sample
+            mask &= (self["removal"] == Removal.KEPT) == sample
         return self[mask]
 
     def columns(self, names: Sequence[str] | None = None) -> dict[str, AnyArray]:

@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
-from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.layout.trial_files import NONE
 from drakegrasp.dataset.rejections import FILE_NAME, Decisions
 from drakegrasp.dataset.schema import SPLITS
@@ -34,7 +33,7 @@ from drakegrasp.inspection.query import (
     count_decisions,
 )
 from drakegrasp.inspection.rows import THUMBNAIL, contact_dots, read_rows
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.visualization.style import FINGER_COLOURS
 
 Places = npt.NDArray[np.int32]

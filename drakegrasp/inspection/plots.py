@@ -8,13 +8,12 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.layout.trial_files import NONE
 from drakegrasp.dataset.statistics import count_splits
 from drakegrasp.errors import DataError
 from drakegrasp.inspection.catalog import Snapshot
 from drakegrasp.inspection.query import QUANTITIES
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.visualization.distributions import (
     draw_counts,
     draw_distributions,

@@ -12,14 +12,13 @@ from urllib.parse import urlencode
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.layout.trial_files import NONE
 from drakegrasp.dataset.rejections import Decisions
 from drakegrasp.dataset.schema import SPLITS, Shown
 from drakegrasp.dataset.suspicion import PARTS
 from drakegrasp.errors import DataError
 from drakegrasp.inspection.catalog import Snapshot
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Removal
 
 #: Features of an attempt that can be filtered and sorted by, as people read them.
 QUANTITIES = {

@@ -19,9 +19,8 @@ from helpers.datasets import (
 )
 
 from drakegrasp.bench.cross_check import GROUPS, agreement, draw_lifts, wilson_interval
-from drakegrasp.dataset.filters import Removal
 from drakegrasp.errors import DataError
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Removal
 
 
 @pytest.fixture(scope="module")

@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from drakegrasp.build.estimate import CERTIFY_SECONDS, START_SECONDS, plan_build, plan_lines
 from drakegrasp.build.stage_times import MEASURED, logged_times, read_times
 from drakegrasp.config import load_config, override_config
-from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.log import BuildLog
 from drakegrasp.dataset.statistics import count_funnel
 from drakegrasp.errors import ConfigError, DataError
+from drakegrasp.outcomes import Removal
 
 EVEN = replace(
     MEASURED, prepare=2.0, scene=0.0, attempt=0.1, look=0.0, survey=0.0, pack=0.0, put=0.0

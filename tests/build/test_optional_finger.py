@@ -13,9 +13,9 @@ from drakegrasp.build.pipeline import BuildReport, build
 from drakegrasp.build.replay import replay_trial
 from drakegrasp.config import load_config
 from drakegrasp.dataset.checks.run import check_dataset
-from drakegrasp.dataset.filters import Removal
 from drakegrasp.inspection.catalog import Catalog
 from drakegrasp.objects.sources import find_meshes
+from drakegrasp.outcomes import Removal
 from drakegrasp.runtime.executor import run_here
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]

@@ -22,7 +22,6 @@ from drakegrasp.build.work_unit import run_unit
 from drakegrasp.config import Config, load_config, override_config
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
-from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.log import read_log
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.reader import GraspDataset
@@ -30,7 +29,7 @@ from drakegrasp.dataset.shards import read_shard, trial_columns, write_shard
 from drakegrasp.dataset.statistics import count_funnel
 from drakegrasp.errors import ConfigError, DataError, MachineError, MeshError
 from drakegrasp.objects.sources import find_meshes
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.runtime.executor import Executor, run_here
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]

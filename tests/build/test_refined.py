@@ -22,7 +22,6 @@ from drakegrasp.config import Config, load_config, override_config
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.assembly.split import rank_in_split, split_samples
 from drakegrasp.dataset.checks.run import check_dataset
-from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.rejections import (
@@ -37,7 +36,7 @@ from drakegrasp.frames import unpack_pose
 from drakegrasp.inspection.catalog import Catalog
 from drakegrasp.inspection.query import Query, select
 from drakegrasp.objects.sources import MeshSource, find_meshes
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.verification.placed_grasp import place_on_rows
 from drakegrasp.visualization.figures.held_grasps import read_approaches, read_held

@@ -10,9 +10,8 @@ from rich.console import Console
 from rich.table import Table
 
 from drakegrasp.cli.tables import funnel_table, hold_table
-from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.statistics import Funnel
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Removal
 
 
 def make_funnel(outcomes: np.ndarray, *names: str, **counts: np.ndarray) -> Funnel:

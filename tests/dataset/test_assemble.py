@@ -19,7 +19,6 @@ from drakegrasp.dataset import assemble as assemble_module
 from drakegrasp.dataset import hdf5, shards
 from drakegrasp.dataset.assemble import assemble, assemble_locked, summarise
 from drakegrasp.dataset.assembly import pack, samples, survey
-from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.lock import FILE_NAME, build_lock
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.schema import CAMERAS
@@ -33,6 +32,7 @@ from drakegrasp.frames import (
     unpack_pose,
 )
 from drakegrasp.grasp import pack_grasp, unpack_grasp
+from drakegrasp.outcomes import Removal
 from drakegrasp.runtime.executor import processes
 from drakegrasp.runtime.files import refuse_broken_seal
 

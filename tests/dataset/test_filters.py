@@ -10,12 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drakegrasp.config import FilterConfig
-from drakegrasp.dataset.filters import (
-    Removal,
-    Successes,
-    is_outlier,
-    judge_successes,
-)
+from drakegrasp.dataset.filters import Successes, is_outlier, judge_successes
+from drakegrasp.outcomes import Removal
 
 
 def good(count: int) -> Successes:

@@ -8,7 +8,6 @@ import pytest
 from helpers.datasets import make_dataset
 
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.rejections import (
     AttemptKey,
@@ -19,6 +18,7 @@ from drakegrasp.dataset.rejections import (
     write_decisions,
 )
 from drakegrasp.errors import DataError
+from drakegrasp.outcomes import Removal
 
 A, B = AttemptKey("1_box_a", 0, 0), AttemptKey("3_brick", 1, 0)
 

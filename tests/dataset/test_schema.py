@@ -19,14 +19,12 @@ from drakegrasp.build.replay import replay_trial
 from drakegrasp.config import Config
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
-from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.manifest import claim_directory
 from drakegrasp.dataset.paths import FILE_NAME
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import (
     DATA_FIELDS,
     SCHEMA_VERSION,
-    SUCCESS_FIELDS,
     TRIAL_FIELDS,
     VERIFICATION_FIELDS,
     Field,
@@ -123,11 +121,6 @@ def test_number_of_a_sample_is_a_column_of_its_trial_in_single_precision() -> No
             of = columns[field.of]
             assert np.dtype(field.dtype) == (np.float32 if of.dtype == "float64" else of.dtype)
             assert field.unit == of.unit
-
-
-def test_reasons_of_removal_are_those_of_the_filters() -> None:
-    (meaning,) = (field.meaning for field in SUCCESS_FIELDS if field.name == "removal")
-    assert meaning.endswith(", ".join(f"{reason.value} {reason.label}" for reason in Removal))
 
 
 @pytest.fixture(scope="module")

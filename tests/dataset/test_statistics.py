@@ -9,14 +9,13 @@ import pytest
 from helpers.datasets import MISSING, SLIPPED, SUCCESS, TRIALS, change
 
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.statistics import (
     count_funnel,
     count_splits,
     count_unfinished,
     why_no_samples,
 )
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Removal
 
 
 def test_words_are_counted_by_object(out: Path) -> None:

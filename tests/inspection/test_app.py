@@ -22,7 +22,6 @@ from matplotlib.image import imread
 from starlette.testclient import TestClient
 
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.rejections import AttemptKey, read_decisions, read_rejected
 from drakegrasp.dataset.schema import CAMERAS
@@ -31,6 +30,7 @@ from drakegrasp.frames import unpack_pose
 from drakegrasp.inspection import plots
 from drakegrasp.inspection.app import HEADERS, TOKEN_HEADER, Inspection, make_app
 from drakegrasp.inspection.query import PAGE
+from drakegrasp.outcomes import Removal
 
 PAGES = ("/", "/?outcome=any&page=2", "/grasp/0-0-0", "/grasp/0-0-1", "/plots")
 

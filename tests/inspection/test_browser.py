@@ -23,13 +23,13 @@ from helpers.pages import ATTACK, coded, numbered
 from matplotlib.image import imread
 
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.rejections import AttemptKey, read_decisions, read_rejected
 from drakegrasp.inspection.app import Inspection, make_app
 from drakegrasp.inspection.catalog import Catalog, Snapshot
 from drakegrasp.inspection.serve import listen
 from drakegrasp.inspection.static_site import write_site
+from drakegrasp.outcomes import Removal
 
 playwright = pytest.importorskip("playwright.sync_api")
 Browser, Page = playwright.Browser, playwright.Page

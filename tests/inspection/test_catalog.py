@@ -13,7 +13,6 @@ from helpers.datasets import OTM, OTO, SLIP, TRIALS, change, make_dataset, set_a
 from helpers.pages import coded, numbered
 
 from drakegrasp.dataset.assemble import assemble
-from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.layout.trial_files import NONE
 from drakegrasp.dataset.manifest import Manifest, read_manifest, write_manifest
 from drakegrasp.dataset.rejections import Decisions
@@ -23,7 +22,7 @@ from drakegrasp.inspection.catalog import Catalog
 from drakegrasp.inspection.query import parse_query, select
 from drakegrasp.inspection.rows import read_look, read_rows
 from drakegrasp.inspection.table import FEATURES
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Removal
 
 
 def build_again(out: Path) -> None:

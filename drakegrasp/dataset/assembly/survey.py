@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from drakegrasp.config import Config
-from drakegrasp.dataset.filters import Removal, Successes, judge_successes
+from drakegrasp.dataset.filters import Successes, judge_successes
 from drakegrasp.dataset.hdf5 import AnyArray, read_column
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.schema import CAMERAS, CERTIFICATE_FIELDS, sizes
@@ -23,7 +23,7 @@ from drakegrasp.dataset.shards import ShardHeader, open_shard, read_trials
 from drakegrasp.dataset.suspicion import COLUMNS, suspicion
 from drakegrasp.frames import Array, invert_pose, transform_points, unpack_pose
 from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.runtime.executor import Executor, run_here
 from drakegrasp.runtime.files import read_seal
 from drakegrasp.vision.camera import intrinsics, project

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from drakegrasp.config import Config
-from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.hdf5 import read_names
 from drakegrasp.dataset.layout.opening import open_samples
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry, read_manifest
@@ -30,7 +29,7 @@ from drakegrasp.dataset.statistics import (
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file, hand_names
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Removal
 
 #: What the licence is called of meshes for which none is stated.
 NOT_STATED = "not stated"

@@ -13,11 +13,11 @@ import numpy as np
 from drakegrasp.dataset.assembly.weights import weigh_samples
 from drakegrasp.dataset.checks.findings import AnyArray, Violation, of_file
 from drakegrasp.dataset.checks.open_file import OpenFile, column
-from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import FILE_NAME, TRIALS_FILE
 from drakegrasp.dataset.schema import OBJECT_FIELDS, SPLITS
 from drakegrasp.frames import unpack_pose
+from drakegrasp.outcomes import Removal
 
 
 def splits(

@@ -6,6 +6,7 @@ In: a path, or shards. Out: `TrialFiles`, which reads columns of rows, block by 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -29,7 +30,7 @@ from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.schema import CAMERAS, OBJECT_FIELDS, READABLE, SPLITS, TRIAL_FIELDS
 from drakegrasp.dataset.shards import ASSEMBLED_FIELDS, ShardHeader, open_shard, trial_columns
 from drakegrasp.errors import DataError
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Removal
 
 #: Number of a removal or a split that an attempt does not have.
 NONE = 255
@@ -160,7 +161,7 @@ class TrialFiles:
             if part.header is None:
                 with self.open(part) as file:
                     success = read_codes(file["successes/trial_id"], self.count)
-                    removal[success] = file["successes/removal"][:]
+                    removal[success] = read_codes(file["successes/removal"], list(Removal))
         return removal
 
     @cached_property
@@ -253,7 +254,7 @@ def sample_ids(out: Path) -> dict[str, npt.NDArray[np.int64]]:
     """
     folder = out if out.is_dir() else out.parent
     for camera in CAMERAS:
-        if (folder / DATA_FILES[camera]).is_file():
+        if os.path.lexists(folder / DATA_FILES[camera]):
             with open_samples(folder / DATA_FILES[camera]) as file:
                 return {split: file[split]["trial_id"][:] for split in SPLITS}
     return {split: np.zeros(0, dtype=np.int64) for split in SPLITS}

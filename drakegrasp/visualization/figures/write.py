@@ -19,12 +19,11 @@ import matplotlib.style
 import numpy as np
 from matplotlib.figure import Figure
 
-from drakegrasp.dataset.filters import Removal
 from drakegrasp.dataset.manifest import Manifest, read_manifest
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.statistics import Funnel, count_funnel
 from drakegrasp.errors import DataError, MachineError
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.runtime.files import write_atomic
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.visualization.distributions import (
