@@ -10,26 +10,28 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 import trimesh
-from pydrake.math import RigidTransform
-from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
-from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial import ConvexHull
 
 from drakegrasp.commissioning.finding import Finding, judge
-from drakegrasp.commissioning.pinch import Opposition, find_opposition, find_pinch, pad_fronts
+from drakegrasp.commissioning.pinch import (
+    Opposition,
+    closing_path,
+    find_opposition,
+    find_pinch,
+    pad_fronts,
+)
 from drakegrasp.frames import Array, transform_points
 from drakegrasp.hand.chains import Chain
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.finger_sweep import pad_points
 from drakegrasp.hand.kinematics import (
-    coordinate_limits,
+    closed_positions,
     fingertip_poses,
-    joint_positions,
     link_poses,
     still_links,
 )
-from drakegrasp.hand.parsing import add_model
 from drakegrasp.hand.shapes import hull_triangles, link_shapes, pad_surfaces
+from drakegrasp.visualization.still_scene import Poses, StillScene
 
 #: The origin of {G} may lie this deep in the hand [m]: in the Barrett Hand it is 1.35 mm deep.
 PALM_DEPTH = 0.005
@@ -100,7 +102,7 @@ def check_palm(hand: Hand) -> Finding:
         )
 
     # The fingertips close in front of the palm.
-    height = float(_pad_points(hand, _halfway(hand))[:, 2].mean())
+    height = float(_pad_points(hand, 0.5 * closed_positions(hand))[:, 2].mean())
     if height <= 0.0:
         faults.append(
             f"+Gz must point to where the fingertips close, got them {-1e3 * height:.0f} mm behind "
@@ -183,42 +185,23 @@ def check_overlaps(hand: Hand) -> Finding:
 
     In the simulation other links pass through each other, so they must not touch.
     """
-    # The hand alone, with its shapes.
-    builder = DiagramBuilder()
-    plant, scene_graph = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.01), builder)
-    instance = add_model(plant, hand.model)
-    base = plant.GetFrameByName(hand.palm_link, instance)
-    plant.WeldFrames(plant.world_frame(), base, RigidTransform())
-    plant.Finalize()
-    diagram = builder.Build()
-    context = diagram.CreateDefaultContext()
-    inspector = scene_graph.model_inspector()
-
     # Close it step by step, until two fingertips meet.
+    scene = StillScene(hand)
     movers = {link: _mover(chain) for link, chain in hand.link_chains.items()}
     faults: dict[str, float] = {}
-    for closing in np.linspace(0.0, 1.0, POSTURES)[:, None] * _ends(hand):
-        q = joint_positions(hand, 0.0, closing)
-        names = plant.GetPositionNames(
-            instance, add_model_instance_prefix=False, always_add_suffix=False
-        )
-        plant.SetPositions(plant.GetMyContextFromRoot(context), [q[name] for name in names])
-        query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
+    for closing in closing_path(hand, POSTURES):
+        scene.pose(Poses(X_WG=np.eye(4), q=scene.positions(0.0, closing)))
         met = False
-        for pair in query.ComputePointPairPenetration():
-            links = [
-                plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)).name()
-                for geometry in (pair.id_A, pair.id_B)
-            ]
+        for links, depth in scene.overlaps():
             # What carries the palm is no link of it; the fingers do not move it.
             one, other = (movers.get(link) for link in links)
             if one is None or other is None or one == other:
                 continue
             if set(links) <= set(hand.fingertip_links):
                 met = True
-            elif pair.depth > OVERLAP:
+            elif depth > OVERLAP:
                 key = f"links {links[0]!r} and {links[1]!r}"
-                faults[key] = max(faults.get(key, 0.0), pair.depth)
+                faults[key] = max(faults.get(key, 0.0), depth)
         if met:
             break
     texts = [f"{key} must not meet before fingertips do, got {1e3 * depth:.1f} mm of overlap"
@@ -232,15 +215,6 @@ def _mover(chain: Chain) -> int | None:
     return int(found[0]) if len(found) else None
 
 
-def _ends(hand: Hand) -> Array:
-    limits = coordinate_limits(hand)[1:, 1]
-    return np.where(np.isfinite(limits), np.maximum(limits, 0.0), 0.0)
-
-
-def _halfway(hand: Hand) -> Array:
-    return 0.5 * _ends(hand)
-
-
 def _pad_points(hand: Hand, closing: Array) -> Array:
     """Return the pad points (k, 3) in {G} at closing positions (k,) [m]."""
     X_GF = fingertip_poses(hand, spread=0.0, closing=closing)
@@ -251,7 +225,7 @@ def _pad_points(hand: Hand, closing: Array) -> Array:
 def _facing(hand: Hand) -> Array:
     """Return the cosine (k,) of the angle between each pad's normal and its motion, halfway."""
     # Motion of the pad points as the fingers close.
-    half, step = _halfway(hand), 1e-4 * hand.closing_unit
+    half, step = 0.5 * closed_positions(hand), 1e-4 * hand.closing_unit
     motion = _pad_points(hand, half + step) - _pad_points(hand, half)
 
     # Mean normal of each pad's surface, out of the fingertip.
@@ -292,7 +266,7 @@ def _surface_distance(triangles: Array, point: Array) -> float:
 def _least_gap(hand: Hand, group: npt.NDArray[np.bool_]) -> float:
     """Return the least distance between a pad of one group and one of the other [m]."""
     # The pads at each posture of their own finger.
-    path = np.linspace(0.0, 1.0, MEETING_STEPS)[:, None] * _ends(hand)
+    path = closing_path(hand, MEETING_STEPS)
     X_GF = fingertip_poses(hand, spread=0.0, closing=path)
     clouds = [
         np.stack([transform_points(X, points) for X in X_GF[:, i]])

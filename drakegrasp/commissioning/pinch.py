@@ -14,7 +14,7 @@ import numpy.typing as npt
 from drakegrasp.frames import Array, transform_points
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.finger_sweep import link_points, pad_points
-from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses, link_poses
+from drakegrasp.hand.kinematics import closed_positions, fingertip_poses, link_poses
 
 #: Postures of each group of fingers that are tried.
 STEPS = 60
@@ -118,7 +118,7 @@ def find_pinch(hand: Hand, width: float) -> Pinch | None:
 
 def reach(hand: Hand, direction: Array) -> float:
     """Return how far the closing hand reaches along a direction (3,) in {G} from its origin [m]."""
-    surfaces, closing, farthest = link_points(hand), _closing_path(hand, STEPS), -np.inf
+    surfaces, closing, farthest = link_points(hand), closing_path(hand, STEPS), -np.inf
     for link in hand.link_chains:
         if not len(surfaces[link]):
             continue
@@ -129,15 +129,14 @@ def reach(hand: Hand, direction: Array) -> float:
     return farthest
 
 
-def _closing_path(hand: Hand, steps: int) -> Array:
+def closing_path(hand: Hand, steps: int) -> Array:
     """Return closing positions (steps, k) from the open hand to the limits [rad or m]."""
-    limits = coordinate_limits(hand)[1:, 1]
-    return np.linspace(0.0, 1.0, steps)[:, None] * np.where(np.isfinite(limits), limits, 0.0)
+    return np.linspace(0.0, 1.0, steps)[:, None] * closed_positions(hand)
 
 
 def _pad_point_paths(hand: Hand) -> Array:
     """Return the pad points (steps, k, 3) in {G} from the open hand to the limits [m]."""
-    X_GF = fingertip_poses(hand, spread=0.0, closing=_closing_path(hand, STEPS))
+    X_GF = fingertip_poses(hand, spread=0.0, closing=closing_path(hand, STEPS))
     points = np.array([finger.p_FiP for finger in hand.fingers])
     return np.einsum("nkab,kb->nka", X_GF[..., :3, :3], points) + X_GF[..., :3, 3]
 
@@ -147,7 +146,7 @@ def pad_fronts(hand: Hand, opposition: Opposition) -> tuple[Array, Array]:
 
     The positions go from the open hand to the limits; foremost is along the opposition, in {G}.
     """
-    closing = _closing_path(hand, STEPS)
+    closing = closing_path(hand, STEPS)
     X_GF = fingertip_poses(hand, spread=0.0, closing=closing)
     front = np.zeros((len(closing), hand.num_fingers, 3))
     for i, points in enumerate(pad_points(hand)):

@@ -33,7 +33,7 @@ from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import load_object
 from drakegrasp.runtime.progress import Report
-from drakegrasp.visualization.posed_hand import PosedHand
+from drakegrasp.visualization.still_scene import StillScene
 
 #: By how much of their path the fingers are commanded to close further.
 SQUEEZE = 0.1
@@ -42,7 +42,7 @@ SQUEEZE = 0.1
 def write_dexgraspbench(out: Path, folder: Path, progress: Report) -> int:
     """Write a file per sample and return their number; see `export.export_dataset`."""
     hand = load_hand(read_manifest(out).config.hand)
-    posed, grasps = PosedHand(hand), list(read_closed_grasps(out))
+    posed, grasps = StillScene(hand), list(read_closed_grasps(out))
     progress(0, len(grasps))
     done = 0
     for name, same in groupby(grasps, key=lambda grasp: grasp.object_name):
@@ -63,7 +63,7 @@ def write_dexgraspbench(out: Path, folder: Path, progress: Report) -> int:
     return done
 
 
-def grasp_dictionary(hand: Hand, posed: PosedHand, grasp: ClosedGrasp) -> dict[str, Any]:
+def grasp_dictionary(hand: Hand, posed: StillScene, grasp: ClosedGrasp) -> dict[str, Any]:
     """Return what the file of a grasp holds, see the module.
 
     Args:
@@ -73,7 +73,7 @@ def grasp_dictionary(hand: Hand, posed: PosedHand, grasp: ClosedGrasp) -> dict[s
     """
     # The palm link's pose, and the joints at the three instants.
     X_TB = multiply(grasp.X_TG, invert_pose(hand.X_BG))
-    start = posed.open_positions(grasp.spread)
+    start = posed.positions(grasp.spread)
     spread = np.isin(posed.joints, hand.spread.joints)
     squeezed = grasp.q + SQUEEZE * np.where(spread, 0.0, grasp.q - start)
 

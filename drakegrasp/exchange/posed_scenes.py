@@ -23,7 +23,7 @@ from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.shapes import hull_triangles, link_shapes
 from drakegrasp.objects.model import ObjectModel, load_object, object_colour
 from drakegrasp.runtime.progress import Report
-from drakegrasp.visualization.posed_hand import PosedHand
+from drakegrasp.visualization.still_scene import Poses, StillScene
 
 #: Pose of {T} in the frame U of the file, whose +Y is up.
 X_UT = make_pose(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.zeros(3))
@@ -34,7 +34,7 @@ TIP_COLOUR, LINK_COLOUR = (0.93, 0.55, 0.20, 1.0), (0.45, 0.48, 0.52, 1.0)
 def write_glb(out: Path, folder: Path, progress: Report) -> int:
     """Write a scene per sample and return their number; see `export.export_dataset`."""
     hand = load_hand(read_manifest(out).config.hand)
-    posed, links = PosedHand(hand), link_meshes(hand)
+    posed, links = StillScene(hand), link_meshes(hand)
     grasps = list(read_closed_grasps(out))
     progress(0, len(grasps))
     done = 0
@@ -50,7 +50,7 @@ def write_glb(out: Path, folder: Path, progress: Report) -> int:
 
 
 def posed_scene(
-    model: ObjectModel, posed: PosedHand, links: dict[str, trimesh.Trimesh], grasp: ClosedGrasp
+    model: ObjectModel, posed: StillScene, links: dict[str, trimesh.Trimesh], grasp: ClosedGrasp
 ) -> trimesh.Scene:
     """Return object and hand as they are when the fingers have closed.
 
@@ -64,9 +64,9 @@ def posed_scene(
     body = model.visual.copy()
     body.visual = _paint(body, (*object_colour(model.name), 1.0))
     _add(scene, f"object/{model.name}", body, grasp.X_TO)
-    for link, X_TL in posed.link_poses(grasp.X_TG, grasp.q).items():
-        if link in links:
-            _add(scene, f"hand/{link}", links[link], X_TL)
+    posed.pose(Poses(X_WG=grasp.X_TG, q=grasp.q))
+    for link, mesh in links.items():
+        _add(scene, f"hand/{link}", mesh, posed.link_pose(link))
     return scene
 
 

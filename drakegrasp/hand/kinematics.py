@@ -34,6 +34,15 @@ def coordinate_limits(hand: Hand) -> Array:
     return limits
 
 
+def closed_positions(hand: Hand) -> Array:
+    """Return each finger's closing position in the closed hand, (k,) [rad or m]; 0 without a limit.
+
+    Closing positions on the way there are shares of it.
+    """
+    limits = coordinate_limits(hand)[1:, 1]
+    return np.where(np.isfinite(limits), np.maximum(limits, 0.0), 0.0)
+
+
 def still_links(hand: Hand) -> list[str]:
     """Return the links that neither spread nor closing moves: the palm and what is fixed to it."""
     return [link for link, chain in hand.link_chains.items() if not chain.gain.any()]

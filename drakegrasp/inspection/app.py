@@ -40,7 +40,7 @@ from drakegrasp.inspection.plots import plot_svg, plots_values
 from drakegrasp.inspection.query import Query, count_decisions, parse_query, select
 from drakegrasp.inspection.recording import Recordings
 from drakegrasp.inspection.rows import read_look, read_rows
-from drakegrasp.inspection.scene3d import HandView, object_mesh, scene_of
+from drakegrasp.inspection.scene3d import HandView, object_surface, scene_of
 from drakegrasp.outcomes import Outcome
 from drakegrasp.visualization.thumbnails import strip_png
 
@@ -146,7 +146,7 @@ def make_app(inspection: Inspection) -> Starlette:
             route("/", _gallery),
             route("/grasp/{label}", _grasp),
             route("/strip/{label}-{camera:str}.png", _strip),
-            route("/mesh/{kind}-{name}.glb", _mesh),
+            route("/mesh/{kind}-{name}.json", _mesh),
             route("/plots", _plots),
             route("/plot/{name}.svg", _plot),
             route("/recording/{label}.html", _recording),
@@ -248,12 +248,12 @@ def _mesh(inspection: Inspection, request: Request) -> Response:
     kind, name = request.path_params["kind"], request.path_params["name"]
     try:
         if kind == "link":
-            return Response(inspection.hand.glb(int(name)), media_type="model/gltf-binary")
+            return Response(inspection.hand.surface(int(name)), media_type="application/json")
         if kind == "object":
             path = find_model(snapshot.out, snapshot.names[snapshot.numbers[name]])
             if path is not None:
-                content = object_mesh(path, path.stat().st_mtime_ns)
-                return Response(content, media_type="model/gltf-binary")
+                content = object_surface(path, path.stat().st_mtime_ns)
+                return Response(content, media_type="application/json")
     except (IndexError, KeyError, ValueError, FileNotFoundError):
         pass
     raise HTTPException(404, "there is no such mesh")

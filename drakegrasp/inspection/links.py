@@ -59,7 +59,7 @@ class ServerLinks:
 
     def mesh(self, kind: str, name: str) -> str:
         """See `Links`."""
-        return f"/mesh/{kind}-{name}.glb"
+        return f"/mesh/{kind}-{name}.json"
 
     def plots(self) -> str:
         """See `Links`."""

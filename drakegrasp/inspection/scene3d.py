@@ -36,23 +36,23 @@ class HandView:
     def __init__(self, config: Config) -> None:
         self._name = config.hand
         self._lock = threading.Lock()
-        self._hand: Any = None
-        self._glbs: dict[str, bytes] = {}
+        self._scene: Any = None
+        self._surfaces: dict[str, bytes] = {}
         #: Why there is no hand to show, in words; empty if there is one.
         self.problem = ""
 
     def load(self) -> None:
         """Load the hand; a hand that cannot be loaded here is a `problem`, and no error."""
         with self._lock:
-            if self._hand is not None or self.problem:
+            if self._scene is not None or self.problem:
                 return
             from drakegrasp.hand.description import load_hand
-            from drakegrasp.visualization.posed_hand import PosedHand
+            from drakegrasp.visualization.still_scene import StillScene
+            from drakegrasp.visualization.surfaces import link_surfaces
 
             try:
-                hand = PosedHand(load_hand(self._name))
-                self._glbs = {link: hand.link_glb(link) for link in hand.links}
-                self._hand = hand
+                scene = StillScene(load_hand(self._name))
+                self._surfaces, self._scene = link_surfaces(scene), scene
             except (DrakegraspError, RuntimeError, OSError) as error:
                 self.problem = f"the hand cannot be shown: {str(error).splitlines()[0]}"
 
@@ -60,16 +60,16 @@ class HandView:
     def links(self) -> tuple[str, ...]:
         """Names of the links with a shape, in the order of their numbers in addresses."""
         self.load()
-        return tuple(self._glbs)
+        return tuple(self._surfaces)
 
-    def glb(self, number: int) -> bytes:
-        """Return a link's mesh as a GLB file.
+    def surface(self, number: int) -> bytes:
+        """Return what is shown of a link, see `visualization.surfaces`.
 
         Raises:
             IndexError: If there is no link of that number.
         """
         link = self.links[number]  # first, since it may load them
-        return self._glbs[link]
+        return self._surfaces[link]
 
     def poses(self, X_TG: Array, q: Array | None, spread: float) -> list[list[float]]:
         """Return the poses of the links, column by column as for three.js; none without a hand.
@@ -82,15 +82,17 @@ class HandView:
             spread: Angle of the spread joints of the open hand [rad].
         """
         self.load()
-        if self._hand is None:
+        if self._scene is None:
             return []
+        from drakegrasp.visualization.still_scene import Poses
+
         with self._lock:
-            rest = self._hand.open_positions(spread)
+            rest = self._scene.positions(spread)
             positions = rest if q is None else q
             if len(positions) != len(rest):
                 return []
-            poses = self._hand.link_poses(X_TG, positions)
-        return [_columns(poses[link]) for link in self._glbs]
+            self._scene.pose(Poses(X_WG=X_TG, q=positions))
+            return [_columns(self._scene.link_pose(link)) for link in self._surfaces]
 
 
 def scene_of(snapshot: Snapshot, i: int, row: Mapping[str, Any], hand: HandView) -> dict[str, Any]:
@@ -144,8 +146,8 @@ def _columns(X: Array) -> list[float]:
 
 
 @lru_cache(maxsize=KEPT_MESHES)
-def object_mesh(path: Path, modified: int) -> bytes:
-    """Return the mesh of an object's file as a GLB file.
+def object_surface(path: Path, modified: int) -> bytes:
+    """Return what is shown of an object, see `visualization.surfaces`.
 
     Args:
         path: Of the object's .npz.
@@ -155,6 +157,6 @@ def object_mesh(path: Path, modified: int) -> bytes:
         MeshError: If the file cannot be read.
     """
     from drakegrasp.objects.model import load_object
-    from drakegrasp.visualization.posed_hand import object_glb
+    from drakegrasp.visualization.surfaces import object_json
 
-    return object_glb(load_object(path))
+    return object_json(load_object(path))

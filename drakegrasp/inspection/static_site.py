@@ -2,12 +2,11 @@
 
 In: a dataset. Out: a folder with `index.html`, a page per success, their images and meshes. A page
 of a file may load no other file but scripts, styles and pictures, so each mesh is a script that
-holds the GLB file as text. Decisions are shown and cannot be changed.
+holds its JSON. Decisions are shown and cannot be changed.
 """
 
 from __future__ import annotations
 
-import base64
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,7 +24,7 @@ from drakegrasp.inspection.pages import Places, gallery_page, render
 from drakegrasp.inspection.plots import PLOTS, plot_svg, plots_values
 from drakegrasp.inspection.query import Query, select
 from drakegrasp.inspection.rows import read_look, read_rows
-from drakegrasp.inspection.scene3d import HandView, object_mesh, scene_of
+from drakegrasp.inspection.scene3d import HandView, object_surface, scene_of
 from drakegrasp.runtime.files import atomic_folder
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.visualization.thumbnails import strip_png
@@ -120,20 +119,20 @@ def _write_pages(
 def _write_meshes(snapshot: Snapshot, folder: Path, hand: HandView, places: Places) -> None:
     """Write the meshes of the hand's links and of the objects of attempts, each as a script."""
     for number in range(len(hand.links)):
-        _write_mesh(folder, f"link-{number}", hand.glb(number))
+        _write_mesh(folder, f"link-{number}", hand.surface(number))
     for number in np.unique(snapshot.table.object[places]).tolist():
         path = find_model(snapshot.out, snapshot.names[number])
         if path is not None:
             _write_mesh(
                 folder,
                 f"object-{snapshot.codes[number]}",
-                object_mesh(path, path.stat().st_mtime_ns),
+                object_surface(path, path.stat().st_mtime_ns),
             )
 
 
-def _write_mesh(folder: Path, name: str, glb: bytes) -> None:
-    text = base64.b64encode(glb).decode()
-    _write_text(folder / "mesh" / f"{name}.js", f'window.drakegraspMeshes["{name}"] = "{text}";\n')
+def _write_mesh(folder: Path, name: str, surface: bytes) -> None:
+    script = b'window.drakegraspMeshes["%b"] = %b;\n' % (name.encode(), surface)
+    _write(folder / "mesh" / f"{name}.js", script)
 
 
 def _write_text(path: Path, text: str) -> None:

@@ -3,7 +3,7 @@
 In: a verification. Out: the object from two sides with its contacts, then the last state that was
 reached, with the hand, or without it if forces lifted the object. `figure` draws them.
 
-The pictures come from `visualization.third_person`, so they need OpenGL and a single thread.
+The pictures come from `visualization.still_scene`, so they need OpenGL and a single thread.
 """
 
 from __future__ import annotations
@@ -17,33 +17,33 @@ import numpy.typing as npt
 from pydrake.geometry import LightParameter
 
 from drakegrasp.frames import X_WT, Array, invert_pose, make_pose, transform_points
-from drakegrasp.hand.description import Hand, load_hand
-from drakegrasp.hand.kinematics import joint_positions
+from drakegrasp.hand.description import load_hand
 from drakegrasp.mesh.rays import first_hits
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.vision.camera import Picture
-from drakegrasp.visualization.style import ARROW, HIDDEN, LIFTED, PREDICTED, REACHED
-from drakegrasp.visualization.third_person import (
+from drakegrasp.visualization.still_scene import (
     AZIMUTHS_DEG,
-    Snapshot,
-    build_render_scene,
+    Lighting,
+    Poses,
+    StillScene,
+    box_corners,
     camera_pose,
-    choose_view,
-    outline_points,
-    render_view,
-    set_snapshot,
 )
+from drakegrasp.visualization.style import ARROW, HIDDEN, LIFTED, PREDICTED, REACHED
 
 if TYPE_CHECKING:
     from drakegrasp.verification.result import Verification
 
 #: Lights beside the camera and above the table, without shadows: contacts are on all sides of an
 #: object, and none should be in the dark.
-LIGHTS = (
-    LightParameter(type="point", frame="camera", position=[-0.25, -0.15, 0.0], intensity=0.85),
-    LightParameter(type="point", frame="camera", position=[0.4, 0.0, 0.0], intensity=0.4),
-    LightParameter(type="point", frame="world", position=[0.0, 0.0, 4.0], intensity=0.4),
+LIGHTING = Lighting(
+    name="contacts",
+    lights=(
+        LightParameter(type="point", frame="camera", position=[-0.25, -0.15, 0.0], intensity=0.85),
+        LightParameter(type="point", frame="camera", position=[0.4, 0.0, 0.0], intensity=0.4),
+        LightParameter(type="point", frame="world", position=[0.0, 0.0, 4.0], intensity=0.4),
+    ),
 )
 #: Pose of the hand in pictures of the object alone: out of view.
 AWAY = make_pose(np.eye(3), [0.0, 0.0, -100.0])
@@ -108,7 +108,8 @@ def render_views(verified: Verification) -> list[View]:
         MachineError: If a picture is blank, which means that OpenGL failed.
     """
     # The contacts: predicted ones, those after closing, and where these are after the lift.
-    renderer = _Renderer(verified.placed.model, load_hand(verified.config.hand))
+    model = verified.placed.model
+    scene = StillScene(load_hand(verified.config.hand), model)
     X_WO = X_WT @ verified.placed.X_TO_simulated
     marks = [
         _predicted(verified),
@@ -117,16 +118,16 @@ def render_views(verified: Verification) -> list[View]:
     ]
 
     # The object from two sides, then the last state that was reached.
-    first, second = _two_sides(renderer.model, X_WO, marks)
+    first, second = _two_sides(model, X_WO, marks)
     return [
-        renderer.object_view("contacts", X_WO, marks, first),
-        renderer.object_view("from another side", X_WO, marks, second),
-        *_last_view(renderer, verified, marks, first),
+        _object_view(scene, "contacts", X_WO, marks, _camera(model, X_WO, marks, first)),
+        _object_view(scene, "from another side", X_WO, marks, _camera(model, X_WO, marks, second)),
+        *_last_view(scene, verified, marks, first),
     ]
 
 
 def _last_view(
-    renderer: _Renderer, verified: Verification, marks: Sequence[Marks], azimuth: float
+    scene: StillScene, verified: Verification, marks: Sequence[Marks], azimuth: float
 ) -> list[View]:
     """Return the view of the last state that was reached; no view if nothing was tried.
 
@@ -137,51 +138,40 @@ def _last_view(
 
     # After the lift, by forces or by the hand.
     if lift is not None and lift.X_TO_lifted is not None:
-        return [renderer.object_view("end of the lift", X_WT @ lift.X_TO_lifted, marks, azimuth)]
+        X_WO = X_WT @ lift.X_TO_lifted
+        X_WC = _camera(verified.placed.model, X_WO, marks, azimuth)
+        return [_object_view(scene, "end of the lift", X_WO, marks, X_WC)]
     if trial is not None and trial.lift is not None:
         X_WO = X_WT @ trial.lift.X_TO
-        snapshot = Snapshot(X_WG=X_WO @ trial.lift.X_OG, X_WO=X_WO, q=trial.lift.q)
         reached = _reached(verified.lifted, _force_scale(verified), kind="lifted", colour=LIFTED)
-        return [renderer.hand_view("end of the lift, with forces", snapshot, reached)]
+        title, X_OG, q = "end of the lift, with forces", trial.lift.X_OG, trial.lift.q
+        return [_hand_view(scene, title, X_WO, X_OG, q, reached)]
 
     # Before it: the closed hand, or the palm pose that comes closest.
     if trial is not None and trial.closed is not None:
-        snapshot = Snapshot(X_WG=X_WO @ trial.X_OG, X_WO=X_WO, q=trial.closed.q)
-        return [renderer.hand_view("after closing", snapshot, marks)]
+        return [_hand_view(scene, "after closing", X_WO, trial.X_OG, trial.closed.q, marks)]
     if fit is not None:
-        q = renderer.positions(fit.spread, fit.closing)
-        snapshot = Snapshot(X_WG=X_WO @ fit.X_OG, X_WO=X_WO, q=q)
-        return [renderer.hand_view("the hand where it comes closest", snapshot, marks)]
+        q, title = scene.positions(fit.spread, fit.closing), "the hand where it comes closest"
+        return [_hand_view(scene, title, X_WO, fit.X_OG, q, marks)]
     return []
 
 
-class _Renderer:
-    """Renders the views of one object and one hand."""
+def _object_view(
+    scene: StillScene, title: str, X_WO: Array, marks: Sequence[Marks], X_WC: Array
+) -> View:
+    """Return a view of the object alone."""
+    scene.pose(Poses(X_WG=AWAY, q=scene.positions(0.0), X_WO=X_WO))
+    picture = scene.picture(X_WC, (PIXELS, PIXELS), LIGHTING)
+    return View(title=title, picture=picture, X_WO=X_WO, marks=marks)
 
-    def __init__(self, model: ObjectModel, hand: Hand) -> None:
-        self.model = model
-        self._scene = build_render_scene(model, hand, lights=LIGHTS)
 
-    def object_view(self, title: str, X_WO: Array, marks: Sequence[Marks], azimuth: float) -> View:
-        """Return a view of the object alone, at X_WO (4, 4), from an azimuth [rad]."""
-        q = self.positions(0.0, np.zeros(self._scene.hand.num_fingers))
-        X_WC = _camera(self.model, X_WO, marks, azimuth)
-        return self._view(title, Snapshot(X_WG=AWAY, X_WO=X_WO, q=q), X_WC, marks)
-
-    def hand_view(self, title: str, snapshot: Snapshot, marks: Sequence[Marks]) -> View:
-        """Return a view of hand and object, from where most of both is visible."""
-        around = outline_points(self._scene, snapshot, self.model.half_extents)
-        return self._view(title, snapshot, choose_view(self._scene, around), marks)
-
-    def positions(self, spread: float, closing: Array) -> Array:
-        """Return the positions of the hand's joints [rad or m], in the order of `Snapshot.q`."""
-        angles = joint_positions(self._scene.hand, spread, closing)
-        return np.array([angles[name] for name in self._scene.joint_names])
-
-    def _view(self, title: str, snapshot: Snapshot, X_WC: Array, marks: Sequence[Marks]) -> View:
-        set_snapshot(self._scene, snapshot)
-        picture = render_view(self._scene, X_WC, (PIXELS, PIXELS))
-        return View(title=title, picture=picture, X_WO=snapshot.X_WO, marks=marks)
+def _hand_view(
+    scene: StillScene, title: str, X_WO: Array, X_OG: Array, q: Array, marks: Sequence[Marks]
+) -> View:
+    """Return a view of hand and object, from where most of both is visible."""
+    around = scene.outline(Poses(X_WG=X_WO @ X_OG, q=q, X_WO=X_WO))
+    picture = scene.picture(scene.choose_view(around), (PIXELS, PIXELS), LIGHTING)
+    return View(title=title, picture=picture, X_WO=X_WO, marks=marks)
 
 
 def _predicted(verified: Verification) -> Marks:
@@ -294,9 +284,7 @@ def _camera(
     model: ObjectModel, X_WO: Array, marks: Sequence[Marks], azimuth: float, fill: float = 1.3
 ) -> Array:
     """Return the pose X_WC (4, 4) of a camera that has the object and its marks in view."""
-    half = model.half_extents
-    corners = half * np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T
-    around = np.vstack([corners, *(m.tail_O for m in marks), *(m.tip_O for m in marks)])
+    around = np.vstack([box_corners(model), *(m.tail_O for m in marks), *(m.tip_O for m in marks)])
     return camera_pose(transform_points(X_WO, around), azimuth, ELEVATION, fill=fill)
 
 

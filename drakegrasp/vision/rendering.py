@@ -103,7 +103,9 @@ def build_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
 
     # The object, and the table of the simulation.
     builder, appearance = DiagramBuilder(), usual_appearance(model.name)
-    plant, body = add_drawn_object(builder, model, _engine_parameters(appearance))
+    plant, scene_graph = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.0), builder)
+    scene_graph.AddRenderer(ENGINE, MakeRenderEngineVtk(_engine_parameters(appearance)))
+    body = add_drawn_object(plant, model)
     (instance,) = make_parser(plant).AddModels(MODELS / "table.sdf")
     table = plant.GetBodyByName("table", instance)
     plant.WeldFrames(plant.world_frame(), table.body_frame(), RigidTransform(X_WT))
@@ -113,7 +115,7 @@ def build_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
         diagram=diagram,
         context=diagram.CreateDefaultContext(),
         plant=plant,
-        scene_graph=diagram.GetSubsystemByName("scene_graph"),
+        scene_graph=scene_graph,
         object=body,
         table=table,
         config=config,
@@ -168,29 +170,20 @@ def _set_colour(renderer: Renderer, body: RigidBody, colour: Array) -> None:
         graph.AssignRole(context, source, geometry, properties)
 
 
-def add_drawn_object(
-    builder: DiagramBuilder, model: ObjectModel, engine: RenderEngineVtkParams
-) -> tuple[MultibodyPlant, RigidBody]:
-    """Add a plant that is drawn, not simulated, with an object's full mesh.
+def add_drawn_object(plant: MultibodyPlant, model: ObjectModel) -> RigidBody:
+    """Add an object's full mesh to a plant that is drawn, not simulated; return its body.
 
     Args:
-        builder: Of the diagram.
+        plant: Not finalized; its shapes are drawn.
         model: The object.
-        engine: Background and lights of the render engine `ENGINE`.
-
-    Returns:
-        The plant, not finalized, and the object's body.
     """
-    plant, scene_graph = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.0), builder)
-    scene_graph.AddRenderer(ENGINE, MakeRenderEngineVtk(engine))
-
     # The mass properties are arbitrary: nothing moves by itself.
     body = plant.AddRigidBody("object", SpatialInertia.SolidSphereWithMass(1.0, 1.0))
     text = obj_text(model.visual_vertices, model.visual_faces, normals=True)
     mesh = Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", model.name)))
     colour = np.array([*object_colour(model.name), 1.0])
     plant.RegisterVisualGeometry(body, RigidTransform(), mesh, "surface", colour)
-    return plant, body
+    return body
 
 
 def render(renderer: Renderer, X_TO: npt.ArrayLike, X_TC: npt.ArrayLike) -> RenderedView:

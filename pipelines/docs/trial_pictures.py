@@ -16,16 +16,9 @@ from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.frames import X_WT, make_pose, rotate_vectors, transform_points, unpack_pose
 from drakegrasp.vision.camera import Picture
 from drakegrasp.visualization.figures.panels import Panel, Triad
-from drakegrasp.visualization.figures.trial_stages import LIFT_LIGHTS, frustum, load_trial
+from drakegrasp.visualization.figures.trial_stages import frustum, load_trial
+from drakegrasp.visualization.still_scene import NO_SHADOWS, StillScene, camera_pose
 from drakegrasp.visualization.style import ARROW
-from drakegrasp.visualization.third_person import (
-    build_render_scene,
-    camera_pose,
-    choose_view,
-    outline_points,
-    render_view,
-    set_snapshot,
-)
 
 #: Edge of the table where the world's origin below it must be seen [m].
 SMALL_TABLE = 0.28
@@ -49,22 +42,21 @@ def render_trial(out: Path, trial_id: int, *, size: tuple[int, int] = (480, 480)
     """
     # One view for the first two.
     trial = load_trial(out, trial_id)
-    scene, half = trial.scene, trial.model.half_extents
-    around = np.vstack([outline_points(scene, m, half) for m in (trial.place, trial.close)])
-    X_WC = choose_view(scene, around)
+    scene = trial.scene
+    X_WC = scene.choose_view(np.vstack([scene.outline(p) for p in (trial.place, trial.close)]))
     pictures = []
-    for snapshot in (trial.place, trial.close):
-        set_snapshot(scene, snapshot)
-        pictures.append(render_view(scene, X_WC, size))
+    for poses in (trial.place, trial.close):
+        scene.pose(poses)
+        pictures.append(scene.picture(X_WC, size))
 
     # For the lift the camera follows part of the way, so that the table stays in view and the gap
     # below the object is seen.
     rise = trial.lift.X_WG[:3, 3] - trial.close.X_WG[:3, 3]
     distance = float(np.linalg.norm(X_WC[:3, 3] - trial.close.X_WO[:3, 3]))
     back = make_pose(np.eye(3), [0.0, 0.0, -BACK * distance])
-    lifted = build_render_scene(trial.model, scene.hand, lights=LIFT_LIGHTS)
-    set_snapshot(lifted, trial.lift)
-    pictures.append(render_view(lifted, make_pose(np.eye(3), FOLLOW * rise) @ X_WC @ back, size))
+    scene.pose(trial.lift)
+    X_WC = make_pose(np.eye(3), FOLLOW * rise) @ X_WC @ back
+    pictures.append(scene.picture(X_WC, size, NO_SHADOWS))
     return pictures
 
 
@@ -89,19 +81,16 @@ def frames_panels(out: Path, trial_id: int) -> list[Panel]:
     normals = rotate_vectors(X_WO, trial.nhat_Q_O)
     tips = zip(p_WQ, p_WQ + ARROW * normals, strict=True)
     contacts = {f"Q{i + 1}": ends for i, ends in enumerate(tips)}
-    half = trial.model.half_extents
 
     # The overview, on a small table that does not hide the world's origin below it.
-    small = build_render_scene(trial.model, scene.hand, table_size=SMALL_TABLE)
-    around = np.vstack(
-        [np.zeros((1, 3)), outline_points(small, trial.close, half), X_WC[None, :3, 3]]
-    )
+    small = StillScene(scene.hand, trial.model, table_size=SMALL_TABLE)
+    around = np.vstack([np.zeros((1, 3)), small.outline(trial.close), X_WC[None, :3, 3]])
     # Look at the camera's line of sight almost from the side, so that its length is seen.
     azimuth = float(np.arctan2(X_WC[1, 2], X_WC[0, 2])) + SIDE_VIEW
     lines = [np.vstack([np.zeros(3), X_WT[:3, 3]]), np.vstack([X_WG[:3, 3], X_WC[:3, 3]])]
     afar = Panel(
         title="world, table, palm, camera",
-        picture=render_view(small, camera_pose(around, azimuth, np.deg2rad(12.0)), (520, 900)),
+        picture=small.picture(camera_pose(around, azimuth, np.deg2rad(12.0)), (520, 900)),
         triads=[
             Triad(label="W", X_WA=np.eye(4), length=0.15),
             Triad(label="T", X_WA=X_WT, length=0.1),
@@ -112,16 +101,16 @@ def frames_panels(out: Path, trial_id: int) -> list[Panel]:
     )
 
     # The close-up.
-    body = outline_points(scene, trial.close, half)
+    body = scene.outline(trial.close)
     near = Panel(
         title="object, hand, contacts",
-        picture=render_view(scene, choose_view(scene, body), (900, 900)),
+        picture=scene.picture(scene.choose_view(body), (900, 900)),
         triads=[
             Triad(label="O", X_WA=X_WO, length=0.04),
             Triad(label="T", X_WA=X_WT, length=0.04),
             Triad(label="G", X_WA=X_WG, length=0.04),
             *(
-                Triad(label=f"F{i + 1}", X_WA=scene.pose(link), length=0.022)
+                Triad(label=f"F{i + 1}", X_WA=scene.link_pose(link), length=0.022)
                 for i, link in enumerate(scene.hand.fingertip_links)
             ),
         ],

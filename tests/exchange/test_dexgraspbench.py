@@ -13,7 +13,7 @@ import trimesh
 from drakegrasp.exchange.closed_grasps import ClosedGrasp
 from drakegrasp.exchange.dexgraspbench import SQUEEZE, grasp_dictionary, pose_of_vector
 from drakegrasp.hand.description import load_hand
-from drakegrasp.visualization.posed_hand import PosedHand
+from drakegrasp.visualization.still_scene import StillScene
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def test_poses_and_joints_come_back(folder: Path, grasps: list[ClosedGrasp]) -> 
             X_TG = pose_of_vector(content[key][:7]) @ hand.X_BG
             assert pytest.approx(grasp.X_TG, abs=1e-9) == X_TG
         assert (content["grasp_qpos"][7:] == grasp.q).all()
-        assert content["joint_names"] == list(PosedHand(hand).joints)
+        assert content["joint_names"] == list(StillScene(hand).joints)
         assert set(content["joint_units"]) == {"rad"}
 
 
@@ -52,7 +52,7 @@ def test_fingers_begin_open_and_squeeze_further(folder: Path, grasps: list[Close
 def test_fingers_that_slide_have_lengths(grasps: list[ClosedGrasp]) -> None:
     hand = load_hand("franka")
     q = np.array([0.01, 0.02])
-    content = grasp_dictionary(hand, PosedHand(hand), replace(grasps[0], q=q, spread=0.0))
+    content = grasp_dictionary(hand, StillScene(hand), replace(grasps[0], q=q, spread=0.0))
     assert content["joint_units"] == ["m", "m"]
     assert len(content["joint_names"]) == 2
     start, closed, squeezed = (

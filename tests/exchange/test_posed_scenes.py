@@ -16,7 +16,7 @@ from drakegrasp.exchange.posed_scenes import X_UT, link_meshes, posed_scene
 from drakegrasp.frames import invert_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import load_object
-from drakegrasp.visualization.posed_hand import PosedHand
+from drakegrasp.visualization.still_scene import Poses, StillScene
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def folder(exported: Callable[[str], Path]) -> Path:
 
 def test_bodies_are_where_they_are(folder: Path, grasps: list[ClosedGrasp]) -> None:
     hand = load_hand()
-    posed = PosedHand(hand)
+    posed = StillScene(hand)
     assert len(list(folder.rglob("*.glb"))) == len(grasps)
     for grasp in grasps:
         scene = trimesh.load_scene(folder / grasp.object_name / f"{grasp.trial_id}.glb")
@@ -35,8 +35,8 @@ def test_bodies_are_where_they_are(folder: Path, grasps: list[ClosedGrasp]) -> N
             for name in scene.graph.nodes_geometry
         }
         assert poses.pop(f"object/{grasp.object_name}") == pytest.approx(grasp.X_TO, abs=1e-6)
-        links = posed.link_poses(grasp.X_TG, grasp.q)
-        nodes = {f"hand/{name}": X_TL for name, X_TL in links.items()}
+        posed.pose(Poses(X_WG=grasp.X_TG, q=grasp.q))
+        nodes = {f"hand/{link}": posed.link_pose(link) for link in posed.links}
         assert {f"hand/{name}" for name in hand.fingertip_links} <= set(poses) <= set(nodes)
         for name, X_TL in poses.items():
             assert pytest.approx(nodes[name], abs=1e-6) == X_TL
@@ -59,7 +59,7 @@ def test_an_object_may_have_any_name(dataset: Path, grasps: list[ClosedGrasp], n
     links = link_meshes(hand)
     model = load_object(model_path(dataset, grasps[0].object_name))
     named = replace(model, name=hand.palm_link if name == "palm" else name)
-    scene = posed_scene(named, PosedHand(hand), links, grasps[0])
+    scene = posed_scene(named, StillScene(hand), links, grasps[0])
     assert len(scene.graph.nodes_geometry) == len(links) + 1
     X, _ = scene.graph.get(f"object/{named.name}")
     assert invert_pose(X_UT) @ X == pytest.approx(grasps[0].X_TO, abs=1e-6)

@@ -1,11 +1,15 @@
-"""HTML pages, read as a browser reads them."""
+"""HTML pages and their 3D data, read as a browser reads them."""
 
 from __future__ import annotations
 
+import base64
+import json
 import re
 from html.parser import HTMLParser
 from typing import Any
 
+import numpy as np
+import trimesh
 from starlette.testclient import TestClient
 
 from drakegrasp.inspection.catalog import Snapshot
@@ -36,6 +40,17 @@ def coded(snapshot: Snapshot, text: str) -> str:
 def get(client: TestClient, address: str) -> Any:
     """Return the answer to an address with numbers for the codes of objects, see `coded`."""
     return client.get(coded(state_of(client), address))
+
+
+def surface_of(content: bytes | str) -> trimesh.Trimesh:
+    """Return the parts of an object or a link that the 3D view draws, as one mesh."""
+    parts = []
+    for part in json.loads(content):
+        assert re.fullmatch("#[0-9a-f]{6}", part["colour"])
+        vertices = np.frombuffer(base64.b64decode(part["vertices"]), dtype="<f4").reshape(-1, 3)
+        faces = np.frombuffer(base64.b64decode(part["faces"]), dtype="<u4").reshape(-1, 3)
+        parts.append(trimesh.Trimesh(vertices, faces, process=False))
+    return trimesh.util.concatenate(parts)
 
 
 def numbered(snapshot: Snapshot, text: str) -> str:

@@ -268,32 +268,21 @@ def test_chosen_view_sees_every_fingertip(dataset: Path) -> None:
     from drakegrasp.simulation.construction import build_scene
     from drakegrasp.simulation.scene import hand_joint_names
     from drakegrasp.visualization.figures.trial_stages import load_trial
-    from drakegrasp.visualization.third_person import (
-        choose_view,
-        outline_points,
-        render_labels,
-        render_view,
-        set_snapshot,
-    )
 
     trial = load_trial(dataset, 0)
-    render_scene, plant = trial.scene, trial.scene.plant
     scene = build_scene(trial.model, trial.config.physics, load_hand(trial.config.hand))
     # What trials.hdf5 holds is in the order of the simulated scene.
-    assert render_scene.joint_names == hand_joint_names(scene)
+    assert list(trial.scene.joints) == list(hand_joint_names(scene))
     assert trial.place.q.tolist().count(0.2) == 2
-    body = outline_points(render_scene, trial.close, trial.model.half_extents)
-    set_snapshot(render_scene, trial.close)
-    X_WC = choose_view(render_scene, body)
-    seen = render_labels(render_scene, X_WC, (128, 128))
-    for link in render_scene.hand.fingertip_links:
-        index = int(plant.GetBodyByName(link, render_scene.hand_instance).index())
-        assert np.sum(seen == index) > 30
+    body = trial.scene.outline(trial.close)
+    X_WC = trial.scene.choose_view(body)
+    *tips, box = trial.scene.seen(X_WC, (128, 128))
+    assert [tip.sum() > 30 for tip in tips] == [True] * 3
     # What is shown is in the picture, and the object where its frame projects to.
-    picture = render_view(render_scene, X_WC, (128, 128))
+    picture = trial.scene.picture(X_WC, (128, 128))
     uv = picture.pixels(body)
     assert np.all((uv >= 0.0) & (uv <= 127.0))
-    rows, columns = np.nonzero(seen == int(render_scene.object.index()))
+    rows, columns = np.nonzero(box)
     top = trial.close.X_WO[:3, 3] + [0.0, 0.0, trial.model.half_extents[2]]
     assert abs(picture.pixels(top[None])[0, 1] - rows.min()) < 6.0
     assert abs(picture.pixels(X_WT[None, :3, 3])[0, 0] - columns.mean()) < 6.0

@@ -108,11 +108,11 @@
 
   // A page that is a file may not read other files: there a mesh is a script.
   window.drakegraspMeshes = window.drakegraspMeshes || {};
-  async function bytes(url) {
-    if (url.endsWith(".glb")) {
+  async function read(url) {
+    if (url.endsWith(".json")) {
       const answer = await fetch(url);
       if (!answer.ok) throw new Error(`${url}: ${answer.status}`);
-      return answer.arrayBuffer();
+      return answer.json();
     }
     await new Promise((done, failed) => {
       const script = document.createElement("script");
@@ -122,19 +122,25 @@
       document.head.append(script);
     });
     const name = url.split("/").pop().replace(/\.js$/, "");
-    return Uint8Array.from(atob(window.drakegraspMeshes[name]), (c) => c.charCodeAt(0)).buffer;
+    return window.drakegraspMeshes[name];
+  }
+
+  // Numbers of four bytes, in base64.
+  function numbers(text, Kind) {
+    return new Kind(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
   }
 
   async function load(url, group) {
-    const content = await bytes(url);
-    const gltf = await new Promise((done, failed) => new THREE.GLTFLoader().parse(content, "", done, failed));
-    if (group.parent === hand) gltf.scene.traverse((part) => {
-      if (part.material) Object.assign(part.material, { transparent: true, opacity: 0.8, side: THREE.FrontSide });
-    });
-    group.add(gltf.scene);
+    for (const part of await read(url)) {
+      const surface = new THREE.BufferGeometry();
+      surface.setAttribute("position", new THREE.BufferAttribute(numbers(part.vertices, Float32Array), 3));
+      surface.setIndex(new THREE.BufferAttribute(numbers(part.faces, Uint32Array), 1));
+      const look = { color: part.colour, metalness: 0, roughness: 0.75, flatShading: true };
+      if (group.parent === hand) Object.assign(look, { transparent: true, opacity: 0.8 });
+      group.add(new THREE.Mesh(surface, new THREE.MeshStandardMaterial(look)));
+    }
   }
 
-  // glTF's files say y is up and mean nothing by it here: our meshes are in their own frames.
   function aim() {
     const bounds = new THREE.Box3().setFromObject(object);
     if (bounds.isEmpty()) bounds.set(new THREE.Vector3(-0.05, -0.05, 0), new THREE.Vector3(0.05, 0.05, 0.1));

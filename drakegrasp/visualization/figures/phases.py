@@ -26,23 +26,9 @@ from drakegrasp.frames import (
 )
 from drakegrasp.vision.camera import camera_pose_oto, intrinsics
 from drakegrasp.visualization.figures.panels import Panel, draw_panel, show_image
-from drakegrasp.visualization.figures.trial_stages import (
-    LIFT_LIGHTS,
-    TrialSnapshots,
-    frustum,
-    load_trial,
-)
+from drakegrasp.visualization.figures.trial_stages import TrialStages, frustum, load_trial
+from drakegrasp.visualization.still_scene import NO_SHADOWS, SHADOWS, Poses, camera_pose
 from drakegrasp.visualization.style import ARROW, FINGER_COLOURS, INK, add_axes, shortened
-from drakegrasp.visualization.third_person import (
-    RenderScene,
-    Snapshot,
-    build_render_scene,
-    camera_pose,
-    choose_view,
-    outline_points,
-    render_view,
-    set_snapshot,
-)
 
 #: Colours of the line of sight and of the field of view, as in the paper.
 SIGHT, FIELD = "#D81B9A", "#1F4FD8"
@@ -81,55 +67,47 @@ def phases_figure(out: Path, trial_id: int) -> Figure:
         FIELD: frustum(X_WC, intrinsics(camera), camera.size, FIELD_DEPTH),
     }
 
-    # The same side of all three; the lift has a scene of its own, for its lights.
-    lifted = build_render_scene(trial.model, trial.scene.hand, table_size=TABLE, lights=LIFT_LIGHTS)
+    # The same side of all three.
     azimuth, elevation = _side(trial, X_WC)
     panels = []
-    for scene, snapshot, title, when in (
-        (trial.scene, trial.place, _start_title(standoff), None),
-        (trial.scene, trial.close, _closed_title(trial.row), "closed"),
-        (lifted, trial.lift, _lifted_title(trial.row), "lifted"),
+    for poses, title, when in (
+        (trial.place, _start_title(standoff), None),
+        (trial.close, _closed_title(trial.row), "closed"),
+        (trial.lift, _lifted_title(trial.row), "lifted"),
     ):
-        around = [outline_points(scene, snapshot, trial.model.half_extents), X_WC[None, :3, 3]]
+        around = [trial.scene.outline(poses), X_WC[None, :3, 3]]
         if when == "lifted":
             around.append(X_WT[None, :3, 3])
-        view = camera_pose(np.vstack(around), azimuth, elevation, fill=1.0)
+        view = camera_pose(np.vstack(around), azimuth, elevation)
+        lighting = NO_SHADOWS if when == "lifted" else SHADOWS
         panels.append(
             Panel(
                 title=title,
-                picture=_render(scene, snapshot, view),
+                picture=trial.scene.picture(view, (PIXELS, PIXELS), lighting),
                 triads=[],
                 strokes=strokes,
                 points={"C": X_WC[:3, 3]},
-                arrows=_contacts(trial, snapshot, when) if when else {},
+                arrows=_contacts(trial, poses, when) if when else {},
             )
         )
-    name = trial.model.name
-    return _draw(
-        panels, f"{shortened(name, 30)}, trial {trial_id}", camera.fov_y_deg, camera.distance
-    )
+    name = f"{shortened(trial.model.name, 30)}, trial {trial_id}"
+    return _draw(panels, name, camera.fov_y_deg, camera.distance)
 
 
-def _render(scene: RenderScene, snapshot: Snapshot, view: Array) -> Any:
-    set_snapshot(scene, snapshot)
-    return render_view(scene, view, (PIXELS, PIXELS))
-
-
-def _side(trial: TrialSnapshots, X_WC: Array) -> tuple[float, float]:
+def _side(trial: TrialStages, X_WC: Array) -> tuple[float, float]:
     """Return azimuth and elevation [rad] of the side view that sees the closed fingers best."""
     # From straight above any side will do.
     x, y, _ = X_WC[:3, 2]
     along = 0.0 if np.hypot(x, y) < VERTICAL else float(np.arctan2(y, x))
-    around = outline_points(trial.scene, trial.close, trial.model.half_extents)
-    X_WV = choose_view(trial.scene, around, azimuths=along + SIDE_VIEWS)
+    X_WV = trial.scene.choose_view(trial.scene.outline(trial.close), azimuths=along + SIDE_VIEWS)
     x, y, z = -X_WV[:3, 2]
     return float(np.arctan2(y, x)), float(np.arcsin(z))
 
 
-def _contacts(trial: TrialSnapshots, snapshot: Snapshot, when: str) -> dict[str, Any]:
+def _contacts(trial: TrialStages, poses: Poses, when: str) -> dict[str, Any]:
     """Return tails and tips of the normals at the contacts of an instant, by finger, in {W}."""
-    p_WQ = transform_points(snapshot.X_WO, trial.row[f"{when}_p_OQ"])
-    tips = p_WQ + ARROW * rotate_vectors(snapshot.X_WO, trial.row[f"{when}_nhat_Q_O"])
+    p_WQ = transform_points(poses.X_WO, trial.row[f"{when}_p_OQ"])
+    tips = p_WQ + ARROW * rotate_vectors(poses.X_WO, trial.row[f"{when}_nhat_Q_O"])
     touching = trial.row[f"{when}_touching"]
     return {f"Q{k + 1}": (p_WQ[k], tips[k]) for k in np.flatnonzero(touching)}
 

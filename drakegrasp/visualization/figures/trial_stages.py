@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydrake.geometry import LightParameter
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
@@ -21,28 +20,14 @@ from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
 from drakegrasp.frames import X_WT, Array, transform_points, unpack_pose
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.vision.camera import unproject
-from drakegrasp.visualization.third_person import (
-    LIGHTS,
-    TABLE_SIZE,
-    RenderScene,
-    Snapshot,
-    build_render_scene,
-)
-
-#: Lights of the picture of the lift, the last without shadows: seen from that light the table is
-#: far behind the object, and VTK's shadow map is then too coarse and draws spots on the object.
-LIFT_LIGHTS = (
-    *LIGHTS[:2],
-    LightParameter(type="point", frame="camera", position=[-1.0, -1.3, 0.2], intensity=0.7),
-)
+from drakegrasp.visualization.still_scene import TABLE_SIZE, Poses, StillScene
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class TrialSnapshots:
+class TrialStages:
     """A trial at its three stages, and the scene to render them in.
 
     Attributes:
@@ -54,10 +39,10 @@ class TrialSnapshots:
         row: Fields of `/trials` by name.
     """
 
-    scene: RenderScene
-    place: Snapshot
-    close: Snapshot
-    lift: Snapshot
+    scene: StillScene
+    place: Poses
+    close: Poses
+    lift: Poses
     p_OQ: Array
     nhat_Q_O: Array
     model: ObjectModel
@@ -65,7 +50,7 @@ class TrialSnapshots:
     row: Mapping[str, Any]
 
 
-def load_trial(out: Path, trial_id: int, *, table_size: float = TABLE_SIZE) -> TrialSnapshots:
+def load_trial(out: Path, trial_id: int, *, table_size: float = TABLE_SIZE) -> TrialStages:
     """Return a trial that was lifted, ready to be rendered.
 
     Args:
@@ -90,17 +75,13 @@ def load_trial(out: Path, trial_id: int, *, table_size: float = TABLE_SIZE) -> T
     X_WO_lifted = X_WT @ unpack_pose(row["X_TO_lifted"])
     X_WG_lifted = X_WO_lifted @ unpack_pose(row["X_OG_lifted"])
 
-    # The scene, and the open hand's joints in its order.
-    hand = load_hand(config.hand)
     model = load_prepared(out, name, config).model
-    scene = build_render_scene(model, hand, table_size=table_size)
-    named = joint_positions(hand, float(row["spread"]), np.zeros(hand.num_fingers))
-    open_q = np.array([named[joint] for joint in scene.joint_names])
-    return TrialSnapshots(
+    scene = StillScene(load_hand(config.hand), model, table_size=table_size)
+    return TrialStages(
         scene=scene,
-        place=Snapshot(X_WG=X_WG, X_WO=X_WO, q=open_q),
-        close=Snapshot(X_WG=X_WG, X_WO=X_WO, q=row["closed_q"]),
-        lift=Snapshot(X_WG=X_WG_lifted, X_WO=X_WO_lifted, q=row["lifted_q"]),
+        place=Poses(X_WG=X_WG, q=scene.positions(float(row["spread"])), X_WO=X_WO),
+        close=Poses(X_WG=X_WG, q=row["closed_q"], X_WO=X_WO),
+        lift=Poses(X_WG=X_WG_lifted, q=row["lifted_q"], X_WO=X_WO_lifted),
         p_OQ=row["closed_p_OQ"],
         nhat_Q_O=row["closed_nhat_Q_O"],
         model=model,

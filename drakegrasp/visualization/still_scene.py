@@ -1,0 +1,355 @@
+"""A still scene: a hand, alone or with an object on a table, posed and drawn.
+
+In: a hand, an object's model if there is one, and `Poses`. Out: where the links are, which of them
+overlap, and pictures with their cameras, so that frames and contacts can be drawn over them.
+Nothing is simulated.
+
+OpenGL starts with the first picture. As in `vision.rendering`, all pictures of a process must be
+made in one thread.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+from pydrake.geometry import (
+    Box,
+    ClippingRange,
+    ColorRenderCamera,
+    GeometryId,
+    LightParameter,
+    MakeRenderEngineVtk,
+    QueryObject,
+    RenderCameraCore,
+    RenderEngineVtkParams,
+    SceneGraphInspector,
+)
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.tree import FixedOffsetFrame, ModelInstanceIndex, RigidBody
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.sensors import CameraInfo
+
+from drakegrasp.errors import MachineError
+from drakegrasp.frames import X_WT, Array, make_pose, transform_points
+from drakegrasp.hand.description import Hand
+from drakegrasp.hand.kinematics import joint_positions
+from drakegrasp.hand.parsing import add_model
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.vision.camera import Picture
+from drakegrasp.vision.rendering import BLANK, add_drawn_object
+
+#: Vertical field of view [deg]: narrow, so that perspective distorts little.
+FOV_Y_DEG = 26.0
+#: Viewpoints that `choose_view` tries: azimuths, and elevations above the horizontal [deg].
+AZIMUTHS_DEG, ELEVATIONS_DEG = range(0, 360, 20), (19.0, 28.0)
+#: Edge of the label images by which viewpoints are compared [px].
+TRIAL_SIZE = 120
+#: Pictures are rendered this many times larger and averaged: VTK alone leaves jagged edges.
+OVERSAMPLING = 2
+#: Space around the origins of the hand's links that the hand fills [m].
+MARGIN = 0.035
+BACKGROUND = np.array([0.95, 0.96, 0.97])
+TABLE_COLOUR = np.array([0.74, 0.70, 0.64, 1.0])
+#: Colour of links whose model names none: Drake's own is that of an object.
+GREY = np.array([0.70, 0.71, 0.73, 1.0])
+TABLE_SIZE, TABLE_THICKNESS = 1.6, 0.1
+#: Edge of the shadow map [px].
+SHADOW_MAP = 4096
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Lighting:
+    """The lights of a picture.
+
+    Attributes:
+        name: Each lighting has its own, which is that of Drake's render engine with these lights.
+        lights: In camera axes +X is right and +Y down. Spot lights cast shadows, others do not.
+    """
+
+    name: str
+    lights: Sequence[LightParameter]
+
+
+#: For pictures of hand and object together.
+SHADOWS = Lighting(
+    name="shadows",
+    lights=(
+        LightParameter(type="point", frame="camera", position=[0.3, -0.3, -0.5], intensity=0.5),
+        LightParameter(type="point", frame="world", position=[0.0, 0.0, 4.0], intensity=0.25),
+        LightParameter(
+            type="spot",
+            frame="camera",
+            position=[-1.0, -1.3, 0.2],
+            direction=[1.0, 1.3, 1.0],
+            intensity=0.7,
+            cone_angle=26.0,
+        ),
+    ),
+)
+#: For pictures of the lift, the last without shadows: seen from that light the table is far behind
+#: the object, and VTK's shadow map is then too coarse and draws spots on the object.
+NO_SHADOWS = Lighting(
+    name="no shadows",
+    lights=(
+        *SHADOWS.lights[:2],
+        LightParameter(type="point", frame="camera", position=[-1.0, -1.3, 0.2], intensity=0.7),
+    ),
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Poses:
+    """Where hand and object are.
+
+    Attributes:
+        X_WG: (4, 4), pose of the palm.
+        q: (j,), positions of the hand's joints [rad or m], in the order of the dataset's files.
+        X_WO: (4, 4), pose of the object; of no effect in a scene without one.
+    """
+
+    X_WG: Array
+    q: npt.ArrayLike
+    X_WO: Array = field(default_factory=lambda: np.eye(4))
+
+
+class StillScene:
+    """A hand in Drake, alone or with an object on a table. Not for several threads at once.
+
+    Args:
+        hand: The hand.
+        model: The object; without one there is no table.
+        table_size: Edge of the square table, whose top is at {T} [m].
+        add: Adds more shapes to the plant, which is not yet finalized, and to the hand in it.
+
+    Attributes:
+        hand, model: As given.
+        joints: Names of the hand's joints, in the order of the dataset's files.
+        links: Names of the hand's links.
+    """
+
+    def __init__(
+        self,
+        hand: Hand,
+        model: ObjectModel | None = None,
+        *,
+        table_size: float = TABLE_SIZE,
+        add: Callable[[MultibodyPlant, ModelInstanceIndex], None] | None = None,
+    ) -> None:
+        # The object, over a table.
+        builder = DiagramBuilder()
+        plant, graph = AddMultibodyPlant(MultibodyPlantConfig(time_step=0.0), builder)
+        self._object: RigidBody | None = None
+        if model is not None:
+            self._object = add_drawn_object(plant, model)
+            X_WB = RigidTransform(X_WT @ make_pose(np.eye(3), [0.0, 0.0, -TABLE_THICKNESS / 2.0]))
+            slab = Box(table_size, table_size, TABLE_THICKNESS)
+            plant.RegisterVisualGeometry(plant.world_body(), X_WB, slab, "table", TABLE_COLOUR)
+
+        # The hand, welded by its palm to a frame whose pose is a parameter of the context: the palm
+        # can be put anywhere without a joint. Links of any name may be in the hand's model: ours
+        # must not be one of them.
+        instance = add_model(plant, hand.model)
+        base = plant.GetBodyByName(hand.palm_link, instance)
+        X_BG = RigidTransform(hand.X_BG)
+        palm = plant.AddFrame(
+            FixedOffsetFrame("drakegrasp_palm", base.body_frame(), X_BG, instance)
+        )
+        self._wrist = plant.AddFrame(
+            FixedOffsetFrame("wrist", plant.world_frame(), RigidTransform())
+        )
+        plant.WeldFrames(self._wrist, palm)
+        if add is not None:
+            add(plant, instance)
+        plant.Finalize()
+
+        # The diagram with its one context.
+        self._diagram = builder.Build()
+        self._root = self._diagram.CreateDefaultContext()
+        self._plant, self._graph, self._instance = plant, graph, instance
+        self._context = plant.GetMyMutableContextFromRoot(self._root)
+        self.hand, self.model = hand, model
+        self.joints: tuple[str, ...] = tuple(plant.GetPositionNames(instance, False, False))
+        self.links = tuple(plant.get_body(i).name() for i in plant.GetBodyIndices(instance))
+
+    def positions(self, spread: float, closing: npt.ArrayLike | None = None) -> Array:
+        """Return the positions (j,) of the hand's joints [rad or m] for `Poses`.
+
+        Args:
+            spread: Angle of the spread joints [rad].
+            closing: (k,), positions of the closing joints [rad or m]; the open hand if None.
+        """
+        closing = np.zeros(self.hand.num_fingers) if closing is None else closing
+        named = joint_positions(self.hand, spread, closing)
+        return np.array([named[name] for name in self.joints])
+
+    def pose(self, poses: Poses) -> None:
+        """Move hand and object."""
+        self._wrist.SetPoseInParentFrame(self._context, RigidTransform(poses.X_WG))
+        self._plant.SetPositions(self._context, self._instance, np.asarray(poses.q, dtype=float))
+        if self._object is not None:
+            self._plant.SetFreeBodyPose(self._context, self._object, RigidTransform(poses.X_WO))
+
+    def link_pose(self, link: str) -> Array:
+        """Return the pose X_WL (4, 4) of a link of the hand."""
+        return self._plant.EvalBodyPoseInWorld(self._context, self._body(link)).GetAsMatrix4()
+
+    def shapes(self, link: str) -> tuple[SceneGraphInspector, list[GeometryId]]:
+        """Return the shapes that show a link, visual ones or else those of collisions.
+
+        They come with the inspector that describes them. A link may have none.
+        """
+        body = self._body(link)
+        shapes = self._plant.GetVisualGeometriesForBody(body)
+        shapes = shapes or self._plant.GetCollisionGeometriesForBody(body)
+        return self._graph.model_inspector(), list(shapes)
+
+    def overlaps(self) -> Iterator[tuple[tuple[str, str], float]]:
+        """Yield the names of two links whose collision shapes overlap, and by how much [m]."""
+        query = self._query()
+        for pair in query.ComputePointPairPenetration():
+            frames = (query.inspector().GetFrameId(shape) for shape in (pair.id_A, pair.id_B))
+            one, other = (self._plant.GetBodyFromFrameId(frame).name() for frame in frames)
+            yield (one, other), pair.depth
+
+    def picture(self, X_WC: Array, size: tuple[int, int], lighting: Lighting = SHADOWS) -> Picture:
+        """Return the picture of a camera.
+
+        Args:
+            X_WC: (4, 4), pose of the camera.
+            size: Width and height of the picture [px].
+            lighting: What lights it.
+
+        Raises:
+            MachineError: If the picture is blank, which means that OpenGL failed.
+        """
+        # Render larger, then average blocks of pixels.
+        width, height = size
+        camera = self._camera((OVERSAMPLING * width, OVERSAMPLING * height), lighting)
+        large = self._query().RenderColorImage(camera, self._world(), RigidTransform(X_WC)).data
+        if not large.any():
+            raise MachineError(BLANK)
+        blocks = large[:, :, :3].reshape(height, OVERSAMPLING, width, OVERSAMPLING, 3)
+        image = np.rint(blocks.mean(axis=(1, 3))).astype(np.uint8)
+
+        # The camera matrix of the averaged picture.
+        focal = height / (2.0 * np.tan(np.deg2rad(FOV_Y_DEG) / 2.0))
+        K = np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0, 0, 1.0]])
+        return Picture(image=image, K=K, X_WC=X_WC)
+
+    def seen(self, X_WC: Array, size: tuple[int, int]) -> npt.NDArray[np.bool_]:
+        """Return which pixels show each fingertip, and which the object if there is one.
+
+        Args:
+            X_WC: (4, 4), pose of the camera.
+            size: Width and height of the image [px].
+
+        Returns:
+            (k, height, width) without an object, else (k + 1, height, width), the object last.
+        """
+        camera = self._camera(size, SHADOWS)
+        labels = self._query().RenderLabelImage(camera, self._world(), RigidTransform(X_WC)).data
+        bodies = [self._body(link) for link in self.hand.fingertip_links]
+        bodies += [] if self._object is None else [self._object]
+        return np.stack([labels[:, :, 0] == int(body.index()) for body in bodies])
+
+    def choose_view(
+        self, p_WA: Array, *, fill: float = 1.0, azimuths: Array | None = None
+    ) -> Array:
+        """Return the pose X_WC (4, 4) of a camera that sees given points and all fingertips.
+
+        A ring of viewpoints is tried. The best is the one whose least visible fingertip covers the
+        most pixels; among equals the one with the most pixels of fingertips and object.
+
+        Args:
+            p_WA: (n, 3), points that must be in the picture [m].
+            fill: The camera's distance is divided by it; above 1 the points fill more of the
+                picture.
+            azimuths: Those to try [rad]; all around if None.
+        """
+        azimuths = np.deg2rad(AZIMUTHS_DEG) if azimuths is None else azimuths
+        best, most = np.eye(4), (-1, -1)
+        for elevation in np.deg2rad(ELEVATIONS_DEG):
+            for azimuth in azimuths:
+                X_WC = camera_pose(p_WA, azimuth, elevation, fill=fill)
+                pixels = self.seen(X_WC, (TRIAL_SIZE, TRIAL_SIZE)).sum(axis=(1, 2))
+                score = int(pixels[: self.hand.num_fingers].min()), int(pixels.sum())
+                if score > most:
+                    best, most = X_WC, score
+        return best
+
+    def outline(self, poses: Poses) -> Array:
+        """Move the scene, and return points (n, 3) in {W} that a picture of it must contain [m].
+
+        They are the origins of the hand's links, and the corners of the object's bounding box.
+        """
+        self.pose(poses)
+        points = [self.link_pose(link)[None, :3, 3] for link in self.links]
+        if self.model is not None:
+            points.insert(0, transform_points(poses.X_WO, box_corners(self.model)))
+        return np.vstack(points)
+
+    def _body(self, link: str) -> RigidBody:
+        return self._plant.GetBodyByName(link, self._instance)
+
+    def _query(self) -> QueryObject:
+        return self._plant.get_geometry_query_input_port().Eval(self._context)
+
+    def _world(self) -> object:
+        return self._plant.GetBodyFrameIdOrThrow(self._plant.world_body().index())
+
+    def _camera(self, size: tuple[int, int], lighting: Lighting) -> ColorRenderCamera:
+        """Return a camera of a size (width, height) [px], with a render engine of the lights."""
+        # Engines are added when they are needed: a scene that is not drawn starts no OpenGL.
+        context = self._graph.GetMyMutableContextFromRoot(self._root)
+        if not self._graph.HasRenderer(context, lighting.name):
+            # Software OpenGL would start threads of its own.
+            os.environ.setdefault("LP_NUM_THREADS", "0")
+            parameters = RenderEngineVtkParams(
+                default_clear_color=BACKGROUND,
+                default_diffuse=GREY,
+                lights=list(lighting.lights),
+                cast_shadows=any(light.type == "spot" for light in lighting.lights),
+                shadow_map_size=SHADOW_MAP,
+            )
+            self._graph.AddRenderer(context, lighting.name, MakeRenderEngineVtk(parameters))
+        info = CameraInfo(*size, np.deg2rad(FOV_Y_DEG))
+        core = RenderCameraCore(lighting.name, info, ClippingRange(0.05, 20.0), RigidTransform())
+        return ColorRenderCamera(core, False)
+
+
+def camera_pose(p_WA: Array, azimuth: float, elevation: float, *, fill: float = 1.0) -> Array:
+    """Return the pose X_WC (4, 4) of a camera that looks at the middle of points.
+
+    Args:
+        p_WA: (n, 3), points that must be in the picture [m].
+        azimuth: Direction of the camera about the vertical, from +x of {W} [rad].
+        elevation: Height of the camera above the horizontal [rad].
+        fill: The camera's distance is divided by it; above 1 the points fill more of the picture.
+    """
+    # Far enough away for a ball around the points to fit into the field of view.
+    middle = (p_WA.min(axis=0) + p_WA.max(axis=0)) / 2.0
+    radius = np.linalg.norm(p_WA - middle, axis=1).max() + MARGIN
+    distance = radius / np.sin(np.deg2rad(FOV_Y_DEG) / 2.0) / fill
+
+    # The camera's axes: +Z towards the points, +X horizontal to the right, +Y down.
+    z = -np.array(
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ]
+    )
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x)
+    return make_pose(np.column_stack([x, np.cross(z, x), z]), middle - distance * z)
+
+
+def box_corners(model: ObjectModel) -> Array:
+    """Return the corners (8, 3) of an object's bounding box, in {O} [m]."""
+    signs = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T
+    return np.asarray(model.half_extents * signs)
