@@ -31,7 +31,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from drakegrasp.errors import DataError, DrakegraspError, printable
-from drakegrasp.inspection.catalog import Catalog, Snapshot, find_model
+from drakegrasp.inspection.catalog import Catalog, Snapshot
 from drakegrasp.inspection.decisions import DecisionFile
 from drakegrasp.inspection.grasp_page import grasp_page
 from drakegrasp.inspection.links import ServerLinks
@@ -246,17 +246,17 @@ def _strip(inspection: Inspection, request: Request) -> Response:
 def _mesh(inspection: Inspection, request: Request) -> Response:
     snapshot = inspection.catalog.current()
     kind, name = request.path_params["kind"], request.path_params["name"]
+    content = None
     try:
         if kind == "link":
-            return Response(inspection.hand.surface(int(name)), media_type="application/json")
-        if kind == "object":
-            path = find_model(snapshot.out, snapshot.names[snapshot.numbers[name]])
-            if path is not None:
-                content = object_surface(path, path.stat().st_mtime_ns)
-                return Response(content, media_type="application/json")
+            content = inspection.hand.surface(int(name))
+        elif kind == "object":
+            content = object_surface(snapshot, snapshot.numbers[name])
     except (IndexError, KeyError, ValueError, FileNotFoundError):
         pass
-    raise HTTPException(404, "there is no such mesh")
+    if content is None:
+        raise HTTPException(404, "there is no such mesh")
+    return Response(content, media_type="application/json")
 
 
 def _plot(inspection: Inspection, request: Request) -> Response:

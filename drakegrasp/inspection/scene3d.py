@@ -145,17 +145,21 @@ def _columns(X: Array) -> list[float]:
     return [round(value, 6) for value in X.T.ravel().tolist()]
 
 
-@lru_cache(maxsize=KEPT_MESHES)
-def object_surface(path: Path, modified: int) -> bytes:
-    """Return what is shown of an object, see `visualization.surfaces`.
+def object_surface(snapshot: Snapshot, number: int) -> bytes | None:
+    """Return what is shown of an object by its number, see `visualization.surfaces`.
 
-    Args:
-        path: Of the object's .npz.
-        modified: When the file was written [ns]; another time reads it again.
+    It is None if the object's mesh is not in the directory.
 
     Raises:
         MeshError: If the file cannot be read.
     """
+    path = find_model(snapshot.out, snapshot.names[number])
+    return None if path is None else _read_surface(path, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=KEPT_MESHES)
+def _read_surface(path: Path, modified: int) -> bytes:
+    """Return what is shown of an object's file; one written at another time [ns] is read again."""
     from drakegrasp.objects.model import load_object
     from drakegrasp.visualization.surfaces import object_json
 

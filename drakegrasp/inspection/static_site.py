@@ -17,7 +17,7 @@ from drakegrasp.dataset.rejections import FILE_NAME, Decisions, read_decisions
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import DataError
 from drakegrasp.inspection.app import ASSETS
-from drakegrasp.inspection.catalog import Catalog, Snapshot, find_model
+from drakegrasp.inspection.catalog import Catalog, Snapshot
 from drakegrasp.inspection.grasp_page import grasp_page
 from drakegrasp.inspection.links import FileLinks
 from drakegrasp.inspection.pages import Places, gallery_page, render
@@ -121,13 +121,9 @@ def _write_meshes(snapshot: Snapshot, folder: Path, hand: HandView, places: Plac
     for number in range(len(hand.links)):
         _write_mesh(folder, f"link-{number}", hand.surface(number))
     for number in np.unique(snapshot.table.object[places]).tolist():
-        path = find_model(snapshot.out, snapshot.names[number])
-        if path is not None:
-            _write_mesh(
-                folder,
-                f"object-{snapshot.codes[number]}",
-                object_surface(path, path.stat().st_mtime_ns),
-            )
+        surface = object_surface(snapshot, number)
+        if surface is not None:
+            _write_mesh(folder, f"object-{snapshot.codes[number]}", surface)
 
 
 def _write_mesh(folder: Path, name: str, surface: bytes) -> None:

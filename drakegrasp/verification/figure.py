@@ -16,8 +16,9 @@ from matplotlib.patheffects import withStroke
 
 from drakegrasp.frames import Array, transform_points
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.verification.views import PIXELS, Marks, View, is_seen, largest_force, render_views
-from drakegrasp.visualization.style import INK, LIFTED, PREDICTED, REACHED, add_axes, hide_ticks
+from drakegrasp.verification.views import Marks, View, is_seen, largest_force, render_views
+from drakegrasp.visualization.figures.panels import show_image
+from drakegrasp.visualization.style import INK, LIFTED, PREDICTED, REACHED, add_axes
 
 if TYPE_CHECKING:
     from drakegrasp.verification.result import Verification
@@ -54,10 +55,8 @@ def _draw_figure(verified: Verification, model: ObjectModel, views: Sequence[Vie
     # The views, with their contacts.
     for k, view in enumerate(views):
         axes = add_axes(figure, margin + k * (EDGE + gap), head, EDGE, EDGE)
-        axes.imshow(view.picture.image, interpolation="antialiased")
-        axes.set(xlim=(-0.5, PIXELS - 0.5), ylim=(PIXELS - 0.5, -0.5))
+        show_image(axes, view.picture.image)
         axes.set_title(view.title, fontsize=9.5, color=INK, loc="left", pad=4)
-        hide_ticks(axes)
         for marks in view.marks:
             _draw_marks(axes, view, model, marks)
 

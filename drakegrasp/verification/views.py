@@ -177,8 +177,6 @@ def _hand_view(
 def _predicted(verified: Verification) -> Marks:
     """Return the predicted contacts, with arrows along their normals."""
     p, n = verified.p_OQ, verified.nhat_Q_O
-    names = [str(i + 1) for i in range(len(p))]
-    tip = p + ARROW * n
     return Marks(
         kind="predicted",
         colour=PREDICTED,
@@ -186,8 +184,8 @@ def _predicted(verified: Verification) -> Marks:
         p_OQ=p,
         nhat_Q_O=n,
         tail_O=p,
-        tip_O=tip,
-        names=names,
+        tip_O=p + ARROW * n,
+        names=[str(i + 1) for i in range(len(p))],
     )
 
 
@@ -198,25 +196,11 @@ def _reached(
 
     The arrow of a force ends at its contact; its length per force is `scale` [m/N].
     """
-    if contacts is None or not contacts.touching.any():
+    if contacts is None:
         return []
-    p, n, f = (
-        values[contacts.touching] for values in (contacts.p_OQ, contacts.nhat_Q_O, contacts.f_Q_O)
+    return _arriving(
+        contacts, contacts.touching, contacts.p_OQ - scale * contacts.f_Q_O, kind, colour, size=5.0
     )
-    tail = p - scale * f
-    names = [""] * len(p)
-    return [
-        Marks(
-            kind=kind,
-            colour=colour,
-            size=5.0,
-            p_OQ=p,
-            nhat_Q_O=n,
-            tail_O=tail,
-            tip_O=p,
-            names=names,
-        )
-    ]
 
 
 def _moved(closed: Contacts | None, lifted: Contacts | None) -> list[Marks]:
@@ -227,17 +211,30 @@ def _moved(closed: Contacts | None, lifted: Contacts | None) -> list[Marks]:
     if closed is None or lifted is None:
         return []
     both = closed.touching & lifted.touching
-    if not both.any():
+    return _arriving(lifted, both, closed.p_OQ, "lifted", LIFTED, size=4.0)
+
+
+def _arriving(
+    contacts: Contacts,
+    chosen: npt.NDArray[np.bool_],
+    tail_O: Array,
+    kind: str,
+    colour: str,
+    *,
+    size: float,
+) -> list[Marks]:
+    """Return chosen contacts (k,), if there is one, at the tips of arrows from tail_O (k, 3)."""
+    if not chosen.any():
         return []
-    p, n = lifted.p_OQ[both], lifted.nhat_Q_O[both]
+    p = contacts.p_OQ[chosen]
     return [
         Marks(
-            kind="lifted",
-            colour=LIFTED,
-            size=4.0,
+            kind=kind,
+            colour=colour,
+            size=size,
             p_OQ=p,
-            nhat_Q_O=n,
-            tail_O=closed.p_OQ[both],
+            nhat_Q_O=contacts.nhat_Q_O[chosen],
+            tail_O=tail_O[chosen],
             tip_O=p,
             names=[""] * len(p),
         )

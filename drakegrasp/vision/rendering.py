@@ -179,11 +179,16 @@ def add_drawn_object(plant: MultibodyPlant, model: ObjectModel) -> RigidBody:
     """
     # The mass properties are arbitrary: nothing moves by itself.
     body = plant.AddRigidBody("object", SpatialInertia.SolidSphereWithMass(1.0, 1.0))
-    text = obj_text(model.visual_vertices, model.visual_faces, normals=True)
-    mesh = Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", model.name)))
+    mesh = drawn_mesh(model.visual_vertices, model.visual_faces, model.name)
     colour = np.array([*object_colour(model.name), 1.0])
     plant.RegisterVisualGeometry(body, RigidTransform(), mesh, "surface", colour)
     return body
+
+
+def drawn_mesh(vertices: npt.ArrayLike, faces: npt.ArrayLike, name: str) -> Mesh:
+    """Return vertices (n, 3) [m] and faces (m, 3) as a named shape that is shaded smoothly."""
+    text = obj_text(vertices, faces, normals=True)
+    return Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", name)))
 
 
 def render(renderer: Renderer, X_TO: npt.ArrayLike, X_TC: npt.ArrayLike) -> RenderedView:

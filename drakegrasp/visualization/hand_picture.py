@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
-from pydrake.common import MemoryFile
-from pydrake.geometry import Cylinder, InMemoryMesh, LightParameter, Mesh
+from pydrake.geometry import Cylinder, LightParameter
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
@@ -21,7 +20,7 @@ from drakegrasp.hand.description import Hand
 from drakegrasp.hand.finger_sweep import link_points
 from drakegrasp.hand.kinematics import closed_positions
 from drakegrasp.hand.shapes import pad_surfaces
-from drakegrasp.mesh.wavefront import obj_text
+from drakegrasp.vision.rendering import drawn_mesh
 from drakegrasp.visualization.still_scene import Lighting, Poses, StillScene, camera_pose
 from drakegrasp.visualization.style import FINGER_COLOURS, INK, add_axes, hide_ticks, save_figure
 
@@ -96,8 +95,7 @@ def _add_marks(plant: MultibodyPlant, instance: ModelInstanceIndex, hand: Hand) 
     # The pads, a little in front of their surfaces.
     for i, (finger, pad) in enumerate(zip(hand.fingers, pad_surfaces(hand), strict=True)):
         body = plant.GetBodyByName(finger.fingertip, instance)
-        text = obj_text(*_lifted(pad), normals=True)
-        mesh = Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", f"pad {i}")))
+        mesh = drawn_mesh(*_lifted(pad), f"pad {i}")
         colour = np.array(to_rgba(_colour(i)))
         plant.RegisterVisualGeometry(body, RigidTransform(), mesh, f"drakegrasp pad {i}", colour)
 

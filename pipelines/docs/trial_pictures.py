@@ -13,12 +13,11 @@ import numpy as np
 from doc_figures import find_sample
 
 from drakegrasp.dataset.paths import DATA_FILES
-from drakegrasp.frames import X_WT, make_pose, rotate_vectors, transform_points, unpack_pose
+from drakegrasp.frames import X_WT, make_pose, transform_points, unpack_pose
 from drakegrasp.vision.camera import Picture
 from drakegrasp.visualization.figures.panels import Panel, Triad
 from drakegrasp.visualization.figures.trial_stages import frustum, load_trial
 from drakegrasp.visualization.still_scene import NO_SHADOWS, StillScene, camera_pose
-from drakegrasp.visualization.style import ARROW
 
 #: Edge of the table where the world's origin below it must be seen [m].
 SMALL_TABLE = 0.28
@@ -77,10 +76,7 @@ def frames_panels(out: Path, trial_id: int) -> list[Panel]:
     trial = load_trial(out, trial_id)
     scene = trial.scene
     X_WO, X_WG = trial.close.X_WO, trial.close.X_WG
-    p_WQ = transform_points(X_WO, trial.p_OQ)
-    normals = rotate_vectors(X_WO, trial.nhat_Q_O)
-    tips = zip(p_WQ, p_WQ + ARROW * normals, strict=True)
-    contacts = {f"Q{i + 1}": ends for i, ends in enumerate(tips)}
+    contacts = trial.normals("closed")
 
     # The overview, on a small table that does not hide the world's origin below it.
     small = StillScene(scene.hand, trial.model, table_size=SMALL_TABLE)

@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from helpers.hands import PINCER, PINCER_SDF, changed_finger, write_pincer
-from pydrake.geometry import Box, Convex, Cylinder, Role, SceneGraph
-from pydrake.math import RigidTransform
+from helpers.hands import PINCER, PINCER_SDF, changed_finger, drake_fingertip_poses, write_pincer
+from pydrake.geometry import Box, Convex, Cylinder, SceneGraph
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.framework import DiagramBuilder
 
@@ -19,9 +18,10 @@ from drakegrasp.frames import Array
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.file_format import Coupling
 from drakegrasp.hand.files import MODELS, hand_digest, hand_names
-from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses, joint_positions
+from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses
 from drakegrasp.hand.parsing import add_model
 from drakegrasp.hand.shapes import link_shapes
+from drakegrasp.visualization.still_scene import Poses, StillScene
 
 #: Mass [kg] and bounding box of the CAD mesh [m] of each kind of link.
 LINKS = {
@@ -42,20 +42,6 @@ def parsed_plant(hand: Hand) -> MultibodyPlant:
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(hand.palm_link))
     plant.Finalize()
     return plant
-
-
-def drake_fingertip_poses(hand: Hand, spread: float, closing: Array) -> Array:
-    plant = parsed_plant(hand)
-    context = plant.CreateDefaultContext()
-    for name, angle in joint_positions(hand, spread, closing).items():
-        plant.GetJointByName(name).set_angle(context, angle)
-    X_GB = RigidTransform(hand.X_BG).inverse()
-    return np.array(
-        [
-            (X_GB @ plant.GetBodyByName(f).EvalPoseInWorld(context)).GetAsMatrix4()
-            for f in hand.fingertip_links
-        ]
-    )
 
 
 def test_barrett_has_the_fields_of_its_file(hand: Hand) -> None:
@@ -141,7 +127,7 @@ def shape_points(shape: object) -> Array:
 
 
 def test_collision_shapes_are_convex_and_fill_the_cad_bounding_boxes(hand: Hand) -> None:
-    plant, scene_graph, _ = built_scene(hand)
+    plant, scene_graph = built_scene(hand)
     inspector = scene_graph.model_inspector()
     names = body_names(plant)
     assert len(names) == 9
@@ -158,7 +144,7 @@ def test_collision_shapes_are_convex_and_fill_the_cad_bounding_boxes(hand: Hand)
 
 
 def test_the_shapes_are_drawn_as_they_collide_and_carry_no_contact_properties(hand: Hand) -> None:
-    plant, scene_graph, _ = built_scene(hand)
+    plant, scene_graph = built_scene(hand)
     inspector = scene_graph.model_inspector()
     for name in body_names(plant):
         body = plant.GetBodyByName(name)
@@ -169,35 +155,26 @@ def test_the_shapes_are_drawn_as_they_collide_and_carry_no_contact_properties(ha
             assert not properties.HasGroup("hydroelastic")
 
 
-def built_scene(hand: Hand) -> tuple[MultibodyPlant, SceneGraph, object]:
-    builder = DiagramBuilder()
-    config = MultibodyPlantConfig(time_step=0.01)
-    plant, scene_graph = AddMultibodyPlant(config, builder)
+def built_scene(hand: Hand) -> tuple[MultibodyPlant, SceneGraph]:
+    plant, scene_graph = AddMultibodyPlant(MultibodyPlantConfig(), DiagramBuilder())
     add_model(plant, hand.model)
-    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(hand.palm_link))
-    plant.Finalize()
-    return plant, scene_graph, builder.Build()
+    return plant, scene_graph
 
 
 @pytest.mark.parametrize("spread_deg", [0.0, 11.25, 22.5, 90.0])
 def test_open_fingers_do_not_touch_each_other(hand: Hand, spread_deg: float) -> None:
-    plant, scene_graph, diagram = built_scene(hand)
-    context = diagram.CreateDefaultContext()
-    angles = joint_positions(hand, np.deg2rad(spread_deg), np.zeros(3))
-    for name, angle in angles.items():
-        plant.GetJointByName(name).set_angle(plant.GetMyContextFromRoot(context), angle)
-    query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
-    inspector = scene_graph.model_inspector()
+    scene = StillScene(hand)
+    scene.pose(Poses(X_WG=np.eye(4), q=scene.positions(np.deg2rad(spread_deg))))
+    assert meeting_fingers(scene) == set()
+    # Those that are closed do, at a spread.
+    scene.pose(Poses(X_WG=np.eye(4), q=scene.positions(np.pi / 2.0, [2.4, 2.4, 2.4])))
+    assert len(meeting_fingers(scene)) == 3
 
-    def link(geometry: object) -> str:
-        return inspector.GetName(inspector.GetFrameId(geometry)).rpartition("::")[2]
 
-    pairs = {
-        tuple(sorted((link(p.id_A), link(p.id_B)))) for p in query.ComputePointPairPenetration()
-    }
-    fingers = {(a.partition("_")[0], b.partition("_")[0]) for a, b in pairs}
-    assert not {(a, b) for a, b in fingers if a != b and "base" not in (a, b)}
-    assert inspector.NumGeometriesWithRole(Role.kProximity) == 28
+def meeting_fingers(scene: StillScene) -> set[frozenset[str]]:
+    """Return the pairs of fingers of which two links overlap."""
+    pairs = {frozenset(link.partition("_")[0] for link in links) for links, _ in scene.overlaps()}
+    return {pair for pair in pairs if len(pair) == 2 and "base" not in pair}
 
 
 def test_a_hand_of_two_fingers_without_spread_loads(tmp_path: Path) -> None:

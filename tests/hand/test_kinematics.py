@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pydrake.math import RigidTransform
-from pydrake.multibody.plant import MultibodyPlant
+from helpers.hands import drake_fingertip_poses
 
-from drakegrasp.frames import Array
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses, joint_positions
-from drakegrasp.hand.parsing import add_model
 
 #: The palm's surface above the base [m]; the table below is given from there.
 PALM_SURFACE = 0.0793
@@ -45,28 +42,6 @@ TABLE = """
 90 100 F2 0.0091 0.0000 0.0608 0.0188 0.0000 0.0586 -0.157 0.000 -0.988
 90 100 F3 0.0000 -0.0159 0.0608 0.0000 -0.0062 0.0586 0.000 -0.157 -0.988
 """
-
-
-def parsed_plant(hand: Hand) -> MultibodyPlant:
-    plant = MultibodyPlant(0.0)
-    add_model(plant, hand.model)
-    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(hand.palm_link))
-    plant.Finalize()
-    return plant
-
-
-def drake_fingertip_poses(hand: Hand, spread: float, closing: Array) -> Array:
-    plant = parsed_plant(hand)
-    context = plant.CreateDefaultContext()
-    for name, angle in joint_positions(hand, spread, closing).items():
-        plant.GetJointByName(name).set_angle(context, angle)
-    X_GB = RigidTransform(hand.X_BG).inverse()
-    return np.array(
-        [
-            (X_GB @ plant.GetBodyByName(f).EvalPoseInWorld(context)).GetAsMatrix4()
-            for f in hand.fingertip_links
-        ]
-    )
 
 
 @pytest.mark.parametrize("row", TABLE.strip().splitlines())

@@ -8,14 +8,11 @@ from typing import Any
 
 import numpy as np
 import yaml
-from pydrake.math import RigidTransform
-from pydrake.multibody.plant import MultibodyPlant
 
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.files import hand_file
-from drakegrasp.hand.kinematics import joint_positions
-from drakegrasp.hand.parsing import add_model
+from drakegrasp.visualization.still_scene import Poses, StillScene
 
 #: A gripper whose two fingers face each other along y, hinged at y = -+0.04, length 0.1.
 PINCER_SDF = """<sdf version="1.9"><model name="pincer">
@@ -118,19 +115,9 @@ def write_slider(folder: Path, urdf: str = SLIDER, **changes: object) -> Path:
 
 def drake_fingertip_poses(hand: Hand, spread: float, closing: Array) -> Array:
     """Return the poses X_GFi (k, 4, 4) of the fingertips as Drake computes them."""
-    plant = MultibodyPlant(0.0)
-    instance = add_model(plant, hand.model)
-    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(hand.palm_link))
-    plant.Finalize()
-    context = plant.CreateDefaultContext()
-    q = joint_positions(hand, spread, closing)
-    names = plant.GetPositionNames(
-        instance, add_model_instance_prefix=False, always_add_suffix=False
-    )
-    plant.SetPositions(context, [q[name] for name in names])
-    X_GB = RigidTransform(hand.X_BG).inverse()
-    bodies = [plant.GetBodyByName(name) for name in hand.fingertip_links]
-    return np.array([(X_GB @ body.EvalPoseInWorld(context)).GetAsMatrix4() for body in bodies])
+    scene = StillScene(hand)
+    scene.pose(Poses(X_WG=np.eye(4), q=scene.positions(spread, closing)))
+    return np.array([scene.link_pose(link) for link in hand.fingertip_links])
 
 
 #: The page of the tutorial's hand.

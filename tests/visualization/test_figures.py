@@ -10,30 +10,21 @@ import h5py
 import numpy as np
 import pytest
 from doc_figures import find_sample, frames_figure, hero_figure
+from helpers.datasets import MISSING, make_dataset
 from helpers.machine import needs_egl
-from helpers.meshes import write_fixed
 from helpers.scripts import PIPELINES
 from matplotlib.image import imread
 
-from drakegrasp.config import CameraConfig, load_config
-from drakegrasp.dataset.hdf5 import create_field, write_field
+from drakegrasp.config import CameraConfig
+from drakegrasp.dataset.hdf5 import create_field
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.dataset.schema import (
-    DATA_FIELDS,
-    OBJECT_FIELDS,
-    SCHEMA_VERSION,
-    SPLITS,
-    SUCCESS_FIELDS,
-    TRIAL_FIELDS,
-    sizes,
-)
+from drakegrasp.dataset.schema import DATA_FIELDS, SCHEMA_VERSION, SPLITS, sizes
 from drakegrasp.errors import DataError
 from drakegrasp.frames import Array, make_pose, pack_pose
 from drakegrasp.grasp import pack_grasp
 from drakegrasp.vision.camera import intrinsics, project
 from drakegrasp.visualization.contact_sheet import contact_sheet, draw_sheet, spread_over_objects
 
-BOX = "10_box_tall"
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 CAMERA = CameraConfig()
 K = intrinsics(CAMERA)
@@ -45,19 +36,7 @@ NHAT_Q_C = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 X_TC = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.5])
 
 
-def write_attributes(file: h5py.File) -> None:
-    """Write the attributes that every file has."""
-    file.attrs["schema_version"], file.attrs["K"] = SCHEMA_VERSION, K
-    file.attrs["near"], file.attrs["far"] = CAMERA.near, CAMERA.far
-    file.attrs["seed"] = 0
-    file.attrs["config"] = file.attrs["versions"] = "{}"
-    for key in ("signature", "shards", "config_hash"):
-        file.attrs[key] = "of a test"
-
-
-def write_data_file(
-    path: Path, names: list[str], split: str = "train", *, first_id: int = 10
-) -> None:
+def write_data_file(path: Path, names: list[str], split: str = "train") -> None:
     """Write a data file whose samples are all of a square block, 0.25 m before the camera."""
     image = np.full((4, CAMERA.size, CAMERA.size), 0.5, dtype=np.float32)
     mask = np.zeros((CAMERA.size, CAMERA.size), dtype=np.uint8)
@@ -72,8 +51,9 @@ def write_data_file(
         "object_props/frame_work2cam_otm": pack_pose(X_TC),
     }
     with h5py.File(path, "w") as file:
-        write_attributes(file)
-        file.attrs["camera"] = "oto"
+        file.attrs.update(schema_version=SCHEMA_VERSION, K=K, near=CAMERA.near, far=CAMERA.far)
+        file.attrs.update(seed=0, config="{}", versions="{}", camera="oto")
+        file.attrs.update(signature="of a test", shards="of a test", config_hash="of a test")
         for name in SPLITS:
             group, rows = file.create_group(name), len(names) if name == split else 0
             for field in DATA_FIELDS:
@@ -82,7 +62,7 @@ def write_data_file(
                 if rows and field.dtype == "str":
                     dataset[:] = names
                 elif rows and field.name == "trial_id":
-                    dataset[:] = first_id + np.arange(rows)
+                    dataset[:] = 10 + np.arange(rows)
                 elif rows:
                     dataset[:] = values.get(field.name, 0.0)
 
@@ -170,57 +150,9 @@ def test_examples_of_the_docs_run(
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a directory with one object and one trial, made up: a top grasp that is lifted."""
-    from drakegrasp.build.prepare import prepare
-    from drakegrasp.dataset.manifest import Manifest, installed_versions, write_manifest
-    from drakegrasp.dataset.prepared_objects import save_prepared
-    from drakegrasp.objects.sources import find_meshes
-    from drakegrasp.outcomes import Outcome
-
+    """Return a small dataset of boxes, see `helpers.datasets`. Read only."""
     folder = tmp_path_factory.mktemp("figures")
-    write_fixed(folder / "meshes", BOX)
-    config, out = load_config(None, ["candidates.max=1"]), folder / "out"
-    prepared = prepare(find_meshes(folder / "meshes")[0], config)
-    save_prepared(prepared, out, config)
-    write_manifest(
-        Manifest(config=config, objects=(prepared.entry(),), versions=installed_versions(config)),
-        out,
-    )
-    palm = prepared.model.half_extents[2] + 0.08
-    X_TO_lifted = prepared.X_TO.copy()
-    X_TO_lifted[2, 3] += 0.4
-    row = {
-        "outcome": Outcome.SUCCESS,
-        "spread": 0.2,
-        "X_TO": pack_pose(prepared.X_TO),
-        "X_OG": pack_pose(make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, palm])),
-        "X_TO_lifted": pack_pose(X_TO_lifted),
-        "X_OG_lifted": pack_pose(make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, palm])),
-        "time_lift": 2.5,
-        "closed_q": np.full(8, 0.3),
-        "lifted_q": np.full(8, 0.3),
-        "closed_p_OQ": np.zeros((3, 3)),
-        "closed_nhat_Q_O": np.eye(3),
-    }
-    objects = {"name": BOX, "class_name": "box", "mesh_sha256": ""}
-    with h5py.File(out / "trials.hdf5", "w") as file:
-        write_attributes(file)
-        for field in SUCCESS_FIELDS:
-            write_field(file.require_group("successes"), field, field.empty(1, LETTERS))
-        for field in TRIAL_FIELDS:
-            values = field.empty(2, LETTERS)
-            values[0] = row.get(field.name, values[0])
-            if field.name == "outcome":
-                values[1] = Outcome.RAY_MISS
-            write_field(file.require_group("trials"), field, values)
-        for field in OBJECT_FIELDS:
-            text = field.dtype == "str"
-            value = np.array([objects.get(field.name, "" if text else 0)], dtype=object)
-            dtype = object if text else field.dtype
-            write_field(file.require_group("objects"), field, value.astype(dtype))
-    for name in ("grasping_oto.hdf5", "grasping_otm.hdf5"):
-        write_data_file(out / name, [BOX], first_id=0)
-    return out
+    return make_dataset(folder / "out", folder / "meshes")
 
 
 @pytest.mark.sim
@@ -273,7 +205,7 @@ def test_chosen_view_sees_every_fingertip(dataset: Path) -> None:
     scene = build_scene(trial.model, trial.config.physics, load_hand(trial.config.hand))
     # What trials.hdf5 holds is in the order of the simulated scene.
     assert list(trial.scene.joints) == list(hand_joint_names(scene))
-    assert trial.place.q.tolist().count(0.2) == 2
+    assert trial.place.q.tolist().count(0.1) == 2
     body = trial.scene.outline(trial.close)
     X_WC = trial.scene.choose_view(body)
     *tips, box = trial.scene.seen(X_WC, (128, 128))
@@ -292,10 +224,10 @@ def test_chosen_view_sees_every_fingertip(dataset: Path) -> None:
 def test_only_lifted_trials_can_be_shown(dataset: Path) -> None:
     from drakegrasp.visualization.figures.trial_stages import load_trial
 
-    with pytest.raises(DataError, match="ray_miss"):
-        load_trial(dataset, 1)
-    with pytest.raises(DataError, match="0 to 1"):
-        load_trial(dataset, 2)
+    with pytest.raises(DataError, match="missing_fingertip"):
+        load_trial(dataset, MISSING)
+    with pytest.raises(DataError, match="0 to 35"):
+        load_trial(dataset, 36)
 
 
 def test_figures_import_no_drake() -> None:

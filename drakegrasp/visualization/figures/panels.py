@@ -54,7 +54,7 @@ class Panel:
 
     title: str
     picture: Picture
-    triads: Sequence[Triad]
+    triads: Sequence[Triad] = ()
     lines: Sequence[Array] = ()
     strokes: Mapping[str, Sequence[Array]] = field(default_factory=dict)
     points: Mapping[str, Array] = field(default_factory=dict)

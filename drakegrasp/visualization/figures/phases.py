@@ -6,7 +6,6 @@ its field of view. In: a dataset and a trial. Out: a figure. Needs Drake's rende
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +19,13 @@ from drakegrasp.frames import (
     X_WT,
     Array,
     invert_pose,
-    rotate_vectors,
-    transform_points,
     unpack_pose,
 )
 from drakegrasp.vision.camera import camera_pose_oto, intrinsics
 from drakegrasp.visualization.figures.panels import Panel, draw_panel, show_image
 from drakegrasp.visualization.figures.trial_stages import TrialStages, frustum, load_trial
-from drakegrasp.visualization.still_scene import NO_SHADOWS, SHADOWS, Poses, camera_pose
-from drakegrasp.visualization.style import ARROW, FINGER_COLOURS, INK, add_axes, shortened
+from drakegrasp.visualization.still_scene import NO_SHADOWS, SHADOWS, camera_pose
+from drakegrasp.visualization.style import FINGER_COLOURS, INK, add_axes, shortened
 
 #: Colours of the line of sight and of the field of view, as in the paper.
 SIGHT, FIELD = "#D81B9A", "#1F4FD8"
@@ -67,27 +64,30 @@ def phases_figure(out: Path, trial_id: int) -> Figure:
         FIELD: frustum(X_WC, intrinsics(camera), camera.size, FIELD_DEPTH),
     }
 
+    # What each picture says; that of the lift shows the table's middle, too.
+    force, slip = float(norm(trial.row["closed_f_Q_O"]).max()), 1e3 * float(trial.row["slip"])
+    turn, table = np.rad2deg(float(trial.row["turn"])), X_WT[None, :3, 3]
+    start = f"start\npalm {1e3 * standoff:.0f} mm from the surface"
+    closed = f"closed\nlargest force of a fingertip {force:.0f} N"
+    lifted = f"lifted\nslip {slip:.1f} mm, turn {turn:.1f}° in the hand"
+
     # The same side of all three.
     azimuth, elevation = _side(trial, X_WC)
     panels = []
-    for poses, title, when in (
-        (trial.place, _start_title(standoff), None),
-        (trial.close, _closed_title(trial.row), "closed"),
-        (trial.lift, _lifted_title(trial.row), "lifted"),
+    for title, poses, arrows, more, lighting in (
+        (start, trial.place, {}, [], SHADOWS),
+        (closed, trial.close, trial.normals("closed"), [], SHADOWS),
+        (lifted, trial.lift, trial.normals("lifted"), [table], NO_SHADOWS),
     ):
-        around = [trial.scene.outline(poses), X_WC[None, :3, 3]]
-        if when == "lifted":
-            around.append(X_WT[None, :3, 3])
-        view = camera_pose(np.vstack(around), azimuth, elevation)
-        lighting = NO_SHADOWS if when == "lifted" else SHADOWS
+        around = np.vstack([trial.scene.outline(poses), X_WC[None, :3, 3], *more])
+        view = camera_pose(around, azimuth, elevation)
         panels.append(
             Panel(
                 title=title,
                 picture=trial.scene.picture(view, (PIXELS, PIXELS), lighting),
-                triads=[],
                 strokes=strokes,
                 points={"C": X_WC[:3, 3]},
-                arrows=_contacts(trial, poses, when) if when else {},
+                arrows=arrows,
             )
         )
     name = f"{shortened(trial.model.name, 30)}, trial {trial_id}"
@@ -102,28 +102,6 @@ def _side(trial: TrialStages, X_WC: Array) -> tuple[float, float]:
     X_WV = trial.scene.choose_view(trial.scene.outline(trial.close), azimuths=along + SIDE_VIEWS)
     x, y, z = -X_WV[:3, 2]
     return float(np.arctan2(y, x)), float(np.arcsin(z))
-
-
-def _contacts(trial: TrialStages, poses: Poses, when: str) -> dict[str, Any]:
-    """Return tails and tips of the normals at the contacts of an instant, by finger, in {W}."""
-    p_WQ = transform_points(poses.X_WO, trial.row[f"{when}_p_OQ"])
-    tips = p_WQ + ARROW * rotate_vectors(poses.X_WO, trial.row[f"{when}_nhat_Q_O"])
-    touching = trial.row[f"{when}_touching"]
-    return {f"Q{k + 1}": (p_WQ[k], tips[k]) for k in np.flatnonzero(touching)}
-
-
-def _start_title(standoff: float) -> str:
-    return f"start\npalm {1e3 * standoff:.0f} mm from the surface"
-
-
-def _closed_title(row: Mapping[str, Any]) -> str:
-    force = float(norm(row["closed_f_Q_O"]).max())
-    return f"closed\nlargest force of a fingertip {force:.0f} N"
-
-
-def _lifted_title(row: Mapping[str, Any]) -> str:
-    slip, turn = 1e3 * float(row["slip"]), np.rad2deg(float(row["turn"]))
-    return f"lifted\nslip {slip:.1f} mm, turn {turn:.1f}° in the hand"
 
 
 def _draw(panels: list[Panel], name: str, field_deg: float, distance: float) -> Figure:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -18,12 +18,13 @@ from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
-from drakegrasp.frames import X_WT, Array, transform_points, unpack_pose
+from drakegrasp.frames import X_WT, Array, rotate_vectors, transform_points, unpack_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.vision.camera import unproject
 from drakegrasp.visualization.still_scene import TABLE_SIZE, Poses, StillScene
+from drakegrasp.visualization.style import ARROW
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,7 +34,6 @@ class TrialStages:
     Attributes:
         scene: Of the trial's object and hand.
         place, close, lift: At the start, after closing, after the lift.
-        p_OQ, nhat_Q_O: (k, 3), contacts after closing [m] and outward unit normals, in {O}.
         model: The object.
         config: Of the dataset.
         row: Fields of `/trials` by name.
@@ -43,11 +43,17 @@ class TrialStages:
     place: Poses
     close: Poses
     lift: Poses
-    p_OQ: Array
-    nhat_Q_O: Array
     model: ObjectModel
     config: Config
     row: Mapping[str, Any]
+
+    def normals(self, when: Literal["closed", "lifted"]) -> dict[str, tuple[Array, Array]]:
+        """Return tail and tip (3,) in {W} [m] of the normal at each contact, by Q and finger."""
+        X_WO = self.close.X_WO if when == "closed" else self.lift.X_WO
+        p_WQ = transform_points(X_WO, self.row[f"{when}_p_OQ"])
+        tips = p_WQ + ARROW * rotate_vectors(X_WO, self.row[f"{when}_nhat_Q_O"])
+        touching = self.row[f"{when}_touching"]
+        return {f"Q{k + 1}": (p_WQ[k], tips[k]) for k in np.flatnonzero(touching)}
 
 
 def load_trial(out: Path, trial_id: int, *, table_size: float = TABLE_SIZE) -> TrialStages:
@@ -82,8 +88,6 @@ def load_trial(out: Path, trial_id: int, *, table_size: float = TABLE_SIZE) -> T
         place=Poses(X_WG=X_WG, q=scene.positions(float(row["spread"])), X_WO=X_WO),
         close=Poses(X_WG=X_WG, q=row["closed_q"], X_WO=X_WO),
         lift=Poses(X_WG=X_WG_lifted, q=row["lifted_q"], X_WO=X_WO_lifted),
-        p_OQ=row["closed_p_OQ"],
-        nhat_Q_O=row["closed_nhat_Q_O"],
         model=model,
         config=config,
         row=row,
