@@ -88,6 +88,7 @@ lint: $(DEV)   ## style, types, and docs that are made from code
 	$(BIN)/mypy
 	$(BIN)/python pipelines/docs/dataset_format.py --check docs/reference/dataset-format.md
 	$(BIN)/python pipelines/docs/builtin_objects.py --check docs/reference/builtin-objects.md
+	$(BIN)/python pipelines/docs/example_gallery.py --check docs/examples/index.md
 
 format: $(DEV) ## let ruff lay out the code
 	$(BIN)/ruff check --fix .
@@ -99,6 +100,7 @@ docs: docs-pages ## the site of the docs in site/; every link must lead somewher
 docs-pages: $(DEV)  ## write the pages of the docs that are made from code
 	$(BIN)/python pipelines/docs/dataset_format.py docs/reference/dataset-format.md
 	$(BIN)/python pipelines/docs/builtin_objects.py docs/reference/builtin-objects.md
+	$(BIN)/python pipelines/docs/example_gallery.py docs/examples/index.md
 
 clean:           ## remove what was made here
 	rm -rf $(VENV) $(DEMO) site build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

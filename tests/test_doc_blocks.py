@@ -34,6 +34,7 @@ NOT_RUN = {
     "ssh ": "another machine",
     "dask ": "a cluster; tests/cluster starts one",
     "python pipelines/submit_build.py ": "a cluster; tests/cluster/test_submit.py",
+    "python docs/examples/": "tests/test_examples.py runs it",
     "python pipelines/measurements/": "measures for minutes to hours",
     "drakegrasp build ": "simulates for minutes to hours; tests/build; with --plan it is run",
     "drakegrasp objects export ": "makes hundreds of meshes; tests/objects/test_builtin.py",
@@ -44,6 +45,8 @@ NOT_RUN = {
 }
 #: A page whose commands measure for minutes to hours; test_docs.py knows their options.
 MEASURED = "docs/benchmarks.md"
+#: A page whose Python blocks are the scripts beside it; test_examples.py runs them.
+GALLERY = "docs/examples/index.md"
 #: Blocks that are no code, by their first lines, and what they are.
 NO_CODE = {
     "demo/meshes/ ": "files of the demo",
@@ -131,6 +134,8 @@ def test_every_block_is_run_or_in_a_list() -> None:
         where = f"{block.page}:{block.line}"
         # Python: test_docs.py runs the blocks of a page. XML: the hand of the tutorial. Text:
         # formulas.
+        if block.language == "py" and block.page == GALLERY:
+            continue
         if block.language == "py":
             assert any(part in block.text for part in PY_NOT_RUN), where
         elif block.page == MEASURED:

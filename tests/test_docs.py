@@ -145,9 +145,9 @@ def test_files_that_the_docs_name_exist(page: Path) -> None:
 def _bases(page: Path, name: str) -> list[Path]:
     """Return the folders in which a file that the docs name may lie."""
     package = ROOT / "drakegrasp"
-    # Pages on one room, and the recipes beside the scripts, name files by less.
+    # Pages on one room, the recipes beside the scripts, and the gallery name files by less.
     rooms = [package / "verification"] if page.stem == "wrist-problem" else []
-    return [ROOT, package, ROOT / "pipelines" / "recipes", *rooms]
+    return [ROOT, page.parent, package, ROOT / "pipelines" / "recipes", *rooms]
 
 
 def commands() -> dict[str, click.Command]:

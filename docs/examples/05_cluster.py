@@ -1,0 +1,50 @@
+"""Use a cluster.
+
+Start two Dask workers, let them build a dataset, and let them verify grasps.
+
+Concepts: scheduler, worker, client, work unit.
+"""
+
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+from distributed import Client, LocalCluster
+
+import drakegrasp as dg
+
+DATASET = "example/dataset/grasping_oto.hdf5"
+
+
+def main() -> None:
+    """Build the mesh of 03_own_mesh.py and verify grasps of 01_dataset.py on two workers."""
+    # Any Dask cluster does, of dask-jobqueue for example. A worker must have one thread.
+    with LocalCluster(n_workers=2, threads_per_worker=1) as cluster, Client(cluster) as client:
+        # A build connects by an address or by a scheduler file that every machine can read.
+        client.write_scheduler_file("example/scheduler.json")
+        overrides = ["candidates.max=8", "unit_candidates=4", "refine.children=0"]
+        config = dg.load_config("fast", overrides=overrides)
+        report = dg.build_dataset(
+            "example/meshes", "example/vase", config=config, scheduler_file="example/scheduler.json"
+        )
+        print(report.simulated, "work units simulated on", cluster.scheduler_address)
+
+        # Verification takes the client itself. The dataset's own grasps stand for predictions.
+        data = dg.GraspDataset(DATASET, split="test")
+        verdicts = dg.verify_grasps(data.column("grasps"), dataset=data, client=client)
+    Path("example/scheduler.json").unlink()
+
+    # The smallest friction coefficient at which forces at the contacts can hold the object: the
+    # less a grasp needs, the larger is its margin.
+    figure, axes = plt.subplots(figsize=(5.0, 2.6))
+    colours = ["tab:green" if verdict.held else "tab:red" for verdict in verdicts]
+    axes.bar(range(len(verdicts)), [v.smallest_friction for v in verdicts], color=colours)
+    axes.axhline(config.physics.friction_hand, color="black", label="friction in the simulation")
+    axes.set(xlabel="verified grasp (green: held)", ylabel="smallest friction", ylim=(0.0, 1.0))
+    axes.set_xticks(range(len(verdicts)))
+    axes.legend(loc="upper left")
+    figure.tight_layout()
+    figure.savefig("example/05_cluster.png")
+
+
+if __name__ == "__main__":
+    main()
