@@ -17,7 +17,8 @@ DEV    := $(VENV)/.installed-dev
 export LP_NUM_THREADS := 0
 export DRAKE_ALLOW_NETWORK := none
 
-.PHONY: FORCE help install demo test test-fast test-browser test-cluster lint format docs docs-pages clean
+.PHONY: FORCE help install demo test test-fast test-browser test-cluster lint format docs docs-pages \
+	package clean
 
 help:            ## what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -101,6 +102,12 @@ docs-pages: $(DEV)  ## write the pages of the docs that are made from code
 	$(BIN)/python pipelines/docs/dataset_format.py docs/reference/dataset-format.md
 	$(BIN)/python pipelines/docs/builtin_objects.py docs/reference/builtin-objects.md
 	$(BIN)/python pipelines/docs/example_gallery.py docs/examples/index.md
+
+# The wheel is built from the sdist, so what the sdist lacks the wheel lacks, too.
+package: $(DEV)  ## sdist and wheel in dist/, and the wheel tried in an empty environment
+	rm -rf dist
+	$(BIN)/python -m build . >/dev/null
+	$(BIN)/python pipelines/try_package.py dist
 
 clean:           ## remove what was made here
 	rm -rf $(VENV) $(DEMO) site build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
 import trimesh
+import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
+VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["version"]
 
 pytestmark = pytest.mark.slow
 
@@ -77,8 +81,18 @@ def test_wheel_has_every_file_of_the_package(wheel: Path) -> None:
 
 def test_environment_runs_the_wheel_and_not_the_checkout(installed: Path, tmp_path: Path) -> None:
     code = "import drakegrasp; print(drakegrasp.__file__); print(drakegrasp.__version__)"
-    file, _ = run(installed / "python", "-c", code, cwd=tmp_path).splitlines()
+    file, version = run(installed / "python", "-c", code, cwd=tmp_path).splitlines()
     assert Path(file).is_relative_to(installed.parent)
+    assert version == VERSION
+
+
+def test_version_is_the_newest_of_the_changelog_and_that_to_cite() -> None:
+    released = re.findall(
+        r"^## (\S+) \((\S+)\)$", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE
+    )
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+    assert released[0] == (VERSION, str(citation["date-released"]))
+    assert citation["version"] == VERSION
 
 
 def test_every_module_of_the_wheel_can_be_imported(installed: Path, tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """Draw a report of `drakegrasp bench`: outcomes of attempts, and what they cost.
 
 \b
-    python pipelines/measurements/bench_figure.py bench.json docs/images/bench.png
+    python pipelines/measurements/bench_figure.py bench.json bench.png
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations

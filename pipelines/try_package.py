@@ -1,0 +1,82 @@
+"""Install the wheel of a folder into an empty environment, and build a tiny dataset with it.
+
+The dependencies come from where pip is set up to take them. Nothing of the checkout is on the path,
+and everything is written to a temporary folder.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import venv
+from collections.abc import Sequence
+from pathlib import Path
+
+#: A box that the hand can grasp, in metres.
+MESH = "import trimesh; trimesh.creation.box([0.065, 0.05, 0.14]).subdivide().export('1_box.obj')"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the script; return its exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("dist", type=Path, help="folder with one sdist and one wheel")
+    dist = parser.parse_args(argv).dist.absolute()
+    (sdist,), (wheel,) = dist.glob("*.tar.gz"), dist.glob("*.whl")
+    version = wheel.name.split("-")[1]
+    if sdist.name != f"drakegrasp-{version}.tar.gz":
+        raise SystemExit(f"{sdist.name} and {wheel.name} must be of one version")
+
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        venv.create(folder / "environment", with_pip=True)
+        python = folder / "environment" / "bin" / "python"
+        command = python.with_name("drakegrasp")
+        # Most modules of the dependencies are never imported here: compiling them takes longer.
+        run(folder, python, "-m", "pip", "install", "--quiet", "--no-compile", wheel)
+
+        # What runs is the wheel.
+        printed = run(folder, command, "--version")
+        if version not in printed.split():
+            raise SystemExit(f"drakegrasp --version must print {version}, got {printed!r}")
+        module = run(folder, python, "-c", "import drakegrasp; print(drakegrasp.__file__)").strip()
+        if not Path(module).is_relative_to(folder):
+            raise SystemExit(f"drakegrasp must be imported from the wheel, got {module}")
+
+        # It sees the machine, builds, and finds nothing wrong with what it built.
+        run(folder, command, "doctor")
+        (folder / "meshes").mkdir()
+        run(folder / "meshes", python, "-c", MESH)
+        options = ("--candidates", "10", "--workers", "1", "--quiet")
+        run(folder, command, "build", "--objects", "meshes", "--out", "out", *options)
+        run(folder, command, "check", "out")
+    sys.stdout.write(f"{wheel.name}: installed, built a dataset and checked it\n")
+    return 0
+
+
+def run(folder: Path, *words: str | Path) -> str:
+    """Run a command in a folder without the paths of this process; return what it prints.
+
+    Raises:
+        SystemExit: If the command fails.
+    """
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(
+        [str(word) for word in words],
+        cwd=folder,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    if done.returncode != 0:
+        raise SystemExit(f"{' '.join(map(str, words))} failed:\n{done.stdout}")
+    return done.stdout
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
