@@ -47,7 +47,7 @@ from drakegrasp.verification.verify import PlacedGrasp, refuse_off_surface
 if TYPE_CHECKING:
     from distributed import Client
 
-#: At most so many grasps are verified in this process: it would take longer to start workers.
+#: Up to this many grasps are verified in this process: starting workers would take longer.
 FEW_GRASPS = 4
 
 
@@ -67,7 +67,7 @@ def build_dataset(
 ) -> BuildReport:
     """Build the dataset of a directory of meshes; the same as `drakegrasp build`.
 
-    What is complete in `out` is kept: the same call goes on where an earlier one stopped.
+    Work that is complete in `out` is kept: the same call continues where an earlier one stopped.
 
     Args:
         objects: Directory of meshes, or "builtin" for the built-in objects, of which
@@ -89,7 +89,7 @@ def build_dataset(
         DataError: If `out` cannot be used, another process builds there, or no mesh can be
             simulated.
         MachineError: If there is no scheduler, the workers cannot do the work, or no room is
-            left; the same call goes on when that is fixed.
+            left; the same call continues when that is fixed.
     """
     _refuse_workers(workers, scheduler, scheduler_file)
     out, config = Path(out).absolute(), config or load_config()
@@ -102,7 +102,7 @@ def build_dataset(
 
 @contextmanager
 def _announced(cluster: AbstractContextManager[Client], show: bool) -> Iterator[Client]:
-    """Enter a cluster, and say where its dashboard is; workers that are started here have none."""
+    """Enter a cluster and print the link to its dashboard, if it has one."""
     with cluster as client:
         if show and has_dashboard() and client.dashboard_link:
             sys.stderr.write(f"{dashboard_line(client)}\n")
@@ -172,7 +172,7 @@ def build_on(
 
 
 def _refuse_unknown(only: Sequence[str], names: Sequence[str]) -> None:
-    """Refuse a name that is not among those of the objects.
+    """Refuse names that no object has.
 
     Raises:
         MeshError: If there is one.

@@ -32,7 +32,7 @@ from pydantic_core import PydanticCustomError
 from drakegrasp.errors import ConfigError, one_line
 from drakegrasp.yaml_text import parse_yaml
 
-#: No quantity of ours is larger, or nearer to zero; sums of such numbers stay finite.
+#: Limits of every quantity, so that sums stay finite.
 LARGEST, SMALLEST = 1e12, 1e-12
 #: Counts are stored in 32 bits, seeds in 64.
 MOST, MOST_SEED = 2**31 - 1, 2**64 - 1
@@ -58,7 +58,7 @@ Angles = Annotated[tuple[Number, ...], Field(min_length=1)]
 Licence = Annotated[str, Field(pattern=r"^[ -~]*[!-~][ -~]*$", max_length=200)]
 
 
-#: Characters that are shown of a wrong value.
+#: Characters of a wrong value that an error shows.
 LONGEST_SHOWN = 200
 
 
@@ -96,7 +96,7 @@ class ObjectConfig(_Section):
 
 
 class BuiltinConfig(_Section):
-    """Which built-in objects there are, in a build of `builtin`; without effect on meshes of files.
+    """The built-in objects in a build of `builtin`; ignored for mesh files.
 
     With two objects of a class one trains and one tests.
     """
@@ -105,7 +105,7 @@ class BuiltinConfig(_Section):
     seed: Seed = 0  # of the draw of their sizes, apart from the others
 
 
-#: Longest coarse step that is allowed [s]; own choice, 24 ms are what was measured.
+#: Longest coarse step that is allowed [s]; own choice, labels were measured with 24 ms.
 MAX_COARSE_STEP = 0.06
 
 
@@ -200,7 +200,7 @@ class CandidateConfig(_Section):
 
 
 class RefineConfig(_Section):
-    """More palm poses about those of grasps that are samples by the default filters.
+    """More palm poses close to those of samples (by the default filters).
 
     A pose is moved by a normal draw along and about each axis of the palm.
     """
@@ -549,7 +549,7 @@ def load_config(
 
 
 def _refuse_mistakes(tree: dict[str, Any], name: str) -> None:
-    """Refuse what a preset or a file says by itself.
+    """Refuse a preset or a file that is invalid before overrides are applied.
 
     Raises:
         ConfigError: If it cannot be used, with its name.
@@ -722,7 +722,7 @@ def describe_mistake(mistake: Any, *, whole: str, legal: str) -> str:
 
 
 def _shown(value: Any) -> str:
-    """Return a value as it is shown, not all of a long one; Python prints no number of any size."""
+    """Return a value as errors show it, shortened; Python refuses to print huge integers."""
     try:
         return repr(value)[:LONGEST_SHOWN]
     except ValueError:
@@ -730,7 +730,7 @@ def _shown(value: Any) -> str:
 
 
 def _siblings(place: tuple[Any, ...]) -> list[str]:
-    """Return the known keys of the section that holds a place in the configuration."""
+    """Return the known keys of the section that holds a path of the configuration."""
     inside = len(place) > 1 and _is_section(place[0])
     section: Any = Config.model_fields[place[0]].annotation if inside else Config
     return list(section.model_fields)

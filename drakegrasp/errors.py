@@ -23,7 +23,7 @@ from collections.abc import Sequence
 
 #: A line that lists many names has this many of them.
 NAMED = 10
-#: Characters that `one_line` keeps of a message.
+#: Most characters of a message that `one_line` keeps.
 LONGEST_MESSAGE = 200
 
 
@@ -44,7 +44,7 @@ class HandError(DrakegraspError, ValueError):
 
 
 class DataError(DrakegraspError, ValueError):
-    """A dataset, shard or manifest that is missing, foreign or broken."""
+    """A dataset, shard or manifest that is missing, damaged or not written by drakegrasp."""
 
 
 class GraspError(DrakegraspError, ValueError):
@@ -56,7 +56,7 @@ class OffSurfaceError(GraspError):
 
 
 class MachineError(DrakegraspError, RuntimeError):
-    """Something that this machine lacks; the message says how to get it."""
+    """A resource that this machine lacks; the message says how to get it."""
 
 
 class DiskFullError(MachineError):

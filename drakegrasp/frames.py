@@ -27,7 +27,7 @@ P_WT = np.array([0.0, 0.0, 0.65])
 
 #: How far a rotation matrix may be from orthogonal: files hold them in single precision.
 ROTATION_TOLERANCE = 1e-4
-#: What else an array may hold, by NumPy's letter.
+#: Other kinds of array, by NumPy's letter, as errors name them.
 _OTHER_KINDS = {"U": "text", "S": "text", "b": "truth values", "c": "complex numbers"}
 
 

@@ -40,8 +40,8 @@ BUILTIN_PAGE = ROOT / "docs" / "reference" / "builtin-objects.md"
 COMMAND_PAGE = ROOT / "docs" / "reference" / "command-line.md"
 CONFIG_PAGE = ROOT / "docs" / "reference" / "configuration.md"
 DOCS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
-#: Lines of the README, whose reader has a few minutes.
-README_LINES = 120
+#: Lines of the README, whose reader has a few minutes, and words of the benchmarks.
+README_LINES, BENCHMARK_WORDS = 120, 2000
 SUBMIT = "pipelines/submit_build.py"
 
 
@@ -222,6 +222,16 @@ def test_the_configuration_page_has_every_setting() -> None:
 
 def test_the_readme_is_short() -> None:
     assert len(read(ROOT / "README.md").splitlines()) <= README_LINES
+
+
+def test_benchmarks_are_short_dated_and_of_now() -> None:
+    text = read(ROOT / "docs" / "benchmarks.md")
+    assert len(text.split()) <= BENCHMARK_WORDS
+    for section in re.split(r"^### ", text, flags=re.M)[1:]:
+        assert re.search(r"\b20\d\d-\d\d-\d\d\b", section), section.splitlines()[0]
+    # A commit's hash says nothing to a reader, and an older number belongs to the changelog.
+    assert not re.findall(r"\b(?=[a-f]*\d)(?=\d*[a-f])[0-9a-f]{7,40}\b", text)
+    assert not re.findall(r"^\|.*\bbefore \|.*\bnow \|", text, re.M)
 
 
 @pytest.mark.sim
