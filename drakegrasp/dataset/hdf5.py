@@ -191,6 +191,21 @@ def packed_chunk(values: AnyArray, rows: int) -> bytes:
     return zlib.compress(planes.tobytes(), GZIP_LEVEL)
 
 
+def unpacked_chunk(chunk: bytes, skipped: int, like: h5py.Dataset) -> AnyArray:
+    """Return the row (1, ...) that is a chunk, as `create_field` and `write_fixed` pack it.
+
+    Args:
+        chunk: What HDF5 stores.
+        skipped: The filters that it skipped: 1 the order of bytes, 2 the compression.
+        like: A dataset of the same type, with rows of the same shape.
+    """
+    content = chunk if skipped & 2 else zlib.decompress(chunk)
+    planes = np.frombuffer(content, dtype=np.uint8)
+    if not skipped & 1:
+        planes = planes.reshape(like.dtype.itemsize, -1).T.copy().reshape(-1)
+    return planes.view(like.dtype).reshape(1, *like.shape[1:])
+
+
 def write_fixed(group: h5py.Group, field: Field, values: AnyArray) -> None:
     """Create the dataset of a field that no row is added to, from all of its rows (n, ...).
 

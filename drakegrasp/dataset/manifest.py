@@ -17,7 +17,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
 
-import h5py
 import numpy as np
 import numpy.typing as npt
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, with_config
@@ -269,17 +268,19 @@ def installed_versions(config: Config) -> dict[str, str]:
     return {**packages, "hand": hand_digest(config.hand)}
 
 
-def write_origin(
-    file: h5py.File, config: Config, versions: dict[str, str], fingers: Mapping[str, bool]
-) -> None:
-    """Write the attributes that every file has: conventions, configuration, versions, fingers."""
-    file.attrs.update({f"convention_{key}": text for key, text in CONVENTIONS.items()})
-    file.attrs["schema_version"] = SCHEMA_VERSION
-    file.attrs["config"] = json.dumps(config.to_dict(), sort_keys=True)
-    file.attrs["config_hash"] = config.simulation_hash()
-    file.attrs["seed"] = config.seed
-    file.attrs["versions"] = json.dumps(versions, sort_keys=True)
-    file.attrs["fingers"] = json.dumps(dict(fingers))
+def origin_attributes(
+    config: Config, versions: dict[str, str], fingers: Mapping[str, bool]
+) -> dict[str, Any]:
+    """Return the attributes of every file: conventions, configuration, versions, fingers."""
+    return {
+        **{f"convention_{key}": text for key, text in CONVENTIONS.items()},
+        "schema_version": SCHEMA_VERSION,
+        "config": json.dumps(config.to_dict(), sort_keys=True),
+        "config_hash": config.simulation_hash(),
+        "seed": config.seed,
+        "versions": json.dumps(versions, sort_keys=True),
+        "fingers": json.dumps(dict(fingers)),
+    }
 
 
 def write_manifest(manifest: Manifest, out: Path) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.hdf5 import AnyArray, write_field
-from drakegrasp.dataset.manifest import finger_names, installed_versions, write_origin
+from drakegrasp.dataset.manifest import finger_names, installed_versions, origin_attributes
 from drakegrasp.dataset.schema import VERIFICATION_FIELDS, Field, sizes
 from drakegrasp.errors import DataError
 from drakegrasp.frames import pack_pose
@@ -222,7 +222,8 @@ def write_results(results: Sequence[Verification], path: Path, config: Config) -
     hand = load_hand(config.hand)
     shape = sizes(fingers=hand.num_fingers, joints=len(hand.joint_names), image=0)
     with atomic_hdf5(path) as file:
-        write_origin(file, config, installed_versions(config), finger_names(config))
+        origin = origin_attributes(config, installed_versions(config), finger_names(config))
+        file.attrs.update(origin)
         group = file.create_group(GROUP)
         for field in VERIFICATION_FIELDS:
             write_field(group, field, _column(field, results, shape))

@@ -79,12 +79,11 @@ def repeated(prepared: PreparedObject, name: str, count: int) -> PreparedObject:
     """Return an object under another name, with its palm poses in turn up to a number."""
     candidates = prepared.candidates
     rows = np.arange(count) % len(candidates)
+    columns = ("X_OG", "distance", "resting", "source", "log_density")
     return replace(
         prepared,
         model=replace(prepared.model, name=name),
-        candidates=replace(
-            candidates, X_OG=candidates.X_OG[rows], distance=candidates.distance[rows]
-        ),
+        candidates=replace(candidates, **{key: getattr(candidates, key)[rows] for key in columns}),
     )
 
 

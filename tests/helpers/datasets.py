@@ -345,6 +345,17 @@ def must_find(path: Path, *expected: tuple[str, str, int | None, str]) -> None:
     assert not missing and not extra, f"missing {missing}, extra {extra}"
 
 
+#: The last shard, and what is found where it is missing.
+LAST_SHARD = "shards/3_brick/0000002-0000004.h5"
+LOST = (LAST_SHARD, "", None, "the shard must be there")
+
+
+def must_find_without_shards(out: Path, *expected: tuple[str, str, int | None, str]) -> None:
+    """Require what is found where the files cannot be compared with the shards."""
+    (out / LAST_SHARD).unlink()
+    must_find(out, LOST, *expected)
+
+
 def edit_file(path: Path, edit: Callable[[h5py.File], Any]) -> None:
     with h5py.File(path, "r+") as file:
         edit(file)

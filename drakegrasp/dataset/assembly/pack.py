@@ -100,24 +100,7 @@ def pack_rows(task: PackTask) -> Part:
         DataError: If a shard is no longer there.
         DiskFullError: If there is no room for the part.
     """
-    # Read the shards, whose seals the survey has verified.
-    count = task.stop - task.start
-    columns = {f.name: np.empty((count, *f.row_shape(task.sizes)), f.dtype) for f in TRIAL_FIELDS}
-    columns["trial_id"][:] = np.arange(task.start, task.stop)
-    samples = {
-        split: _Samples(
-            {camera: [np.zeros(0, record_type(task.sizes))] for camera in CAMERAS},
-            {(camera, name): [] for camera in CAMERAS for name in IMAGES},
-        )
-        for split in SPLITS
-    }
-    load = lru_cache(1)(load_object)  # the shards of an object come one after the other
-    for piece in task.slices:
-        path = piece.header.path(Path(task.out))
-        with open_shard(path, piece.header, verify_seal=False, again=True) as (file, _):
-            trials = {f.name: read_column(file["trials"], f.name) for f in trial_columns()}
-            _fill_rows(columns, trials, piece, task)
-            _add_samples(samples, trials, file["looks"], piece, task, load)
+    columns, samples = read_rows(task)
 
     # Write the part under a name of this process: another may be at the same one.
     temporary = temporary_name(Path(task.part))
@@ -132,8 +115,7 @@ def pack_rows(task: PackTask) -> Part:
                 ]
                 for split in SPLITS:
                     for camera in CAMERAS:
-                        numbers = np.concatenate(samples[split].records[camera])
-                        np.save(stream, numbers, allow_pickle=False)
+                        np.save(stream, samples[split].numbers(camera), allow_pickle=False)
             temporary.replace(task.part)
         finally:
             temporary.unlink(missing_ok=True)
@@ -144,6 +126,33 @@ def pack_rows(task: PackTask) -> Part:
         images=images,
         objects={s: np.array(samples[s].objects, dtype=np.int32) for s in SPLITS},
     )
+
+
+def read_rows(task: PackTask) -> tuple[dict[str, AnyArray], dict[str, SplitSamples]]:
+    """Return the rows of a range: the columns of /trials, and the samples of each split.
+
+    Raises:
+        DataError: If a shard is no longer there.
+    """
+    # The survey has verified the seals.
+    count = task.stop - task.start
+    columns = {f.name: np.empty((count, *f.row_shape(task.sizes)), f.dtype) for f in TRIAL_FIELDS}
+    columns["trial_id"][:] = np.arange(task.start, task.stop)
+    samples = {
+        split: SplitSamples(
+            {camera: [np.zeros(0, record_type(task.sizes))] for camera in CAMERAS},
+            {(camera, name): [] for camera in CAMERAS for name in IMAGES},
+        )
+        for split in SPLITS
+    }
+    load = lru_cache(1)(load_object)  # the shards of an object come one after the other
+    for piece in task.slices:
+        path = piece.header.path(Path(task.out))
+        with open_shard(path, piece.header, verify_seal=False, again=True) as (file, _):
+            trials = {f.name: read_column(file["trials"], f.name) for f in trial_columns()}
+            _fill_rows(columns, trials, piece, task)
+            _add_samples(samples, trials, file["looks"], piece, task, load)
+    return columns, samples
 
 
 def unpack_rows(
@@ -182,7 +191,7 @@ def unpack_rows(
 
 
 @dataclass(frozen=True, eq=False)
-class _Samples:
+class SplitSamples:
     """The samples of a split among the rows of a task, in order.
 
     Attributes:
@@ -194,6 +203,10 @@ class _Samples:
     records: dict[str, list[AnyArray]]
     images: dict[tuple[str, str], list[tuple[bytes, int]]]
     objects: list[int] = field(default_factory=list)
+
+    def numbers(self, camera: str) -> AnyArray:
+        """Return all numbers of the samples, as records (n,)."""
+        return np.concatenate(self.records[camera])
 
 
 def _fill_rows(
@@ -211,7 +224,7 @@ def _fill_rows(
 
 
 def _add_samples(
-    samples: Mapping[str, _Samples],
+    samples: Mapping[str, SplitSamples],
     trials: Mapping[str, AnyArray],
     looks: h5py.Group,
     piece: ShardSlice,
@@ -228,6 +241,7 @@ def _add_samples(
     model = load(model_path(Path(task.out), piece.header.object_name))
     names = ("X_CI_otm", *(f"X_TC_{camera}" for camera in CAMERAS))
     poses = {name: read_column(looks, name) for name in names}
+    images = {(c, name): looks[f"{own}_{c}"].id for c in CAMERAS for name, own in IMAGES.items()}
     look_of = {row: k for k, row in enumerate(read_column(looks, "row").tolist())}
     for split, (start, stop) in bounds.items():
         ids, weights = (values[split][start:stop].tolist() for values in (task.ids, task.weights))
@@ -244,10 +258,8 @@ def _add_samples(
                 for name, value in values.items():
                     record[name][0] = value
                 samples[split].records[camera].append(record)
-                for name, own in IMAGES.items():
-                    skipped, chunk = looks[f"{own}_{camera}"].id.read_direct_chunk(
-                        (k, *_ORIGIN[name])
-                    )
+                for name in IMAGES:
+                    skipped, chunk = images[camera, name].read_direct_chunk((k, *_ORIGIN[name]))
                     samples[split].images[camera, name].append((chunk, skipped))
 
 

@@ -8,14 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.ndimage import binary_erosion
 
 from drakegrasp.config import CameraConfig, Config
-from drakegrasp.dataset.checks.findings import UNIT_TOLERANCE, AnyArray, Batch, Violation
+from drakegrasp.dataset.checks.findings import Violation
+from drakegrasp.dataset.checks.rows import UNIT_TOLERANCE, AnyArray, Batch
 from drakegrasp.dataset.schema import CAMERAS
-from drakegrasp.frames import Array, invert_pose, transform_points
+from drakegrasp.frames import Array, invert_pose
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.vision.camera import intrinsics, project, unproject
 from drakegrasp.vision.depth_sensor import DepthSensor, clean_depth
@@ -46,16 +48,25 @@ class Lens:
 
     Attributes:
         camera: `oto` or `otm`.
+        size: Edge of the images [px].
         K: Camera matrix (3, 3) [px].
         near, far: Range of the depth image [m].
         loses: Whether pixels that show something may have no depth, which is `far` then.
     """
 
     camera: str
+    size: int
     K: Array
     near: np.float32
     far: np.float32
     loses: bool
+
+    @cached_property
+    def rays_C(self) -> Array:
+        """What to multiply with a depth image for the points that it shows, (3, S, S)."""
+        v, u = np.indices((self.size, self.size)).reshape(2, -1)
+        rays = unproject(self.K, np.column_stack([u, v]), np.ones(len(u)))
+        return rays.T.reshape(3, self.size, self.size)
 
     @classmethod
     def of(cls, camera: str, config: Config) -> Lens:
@@ -63,6 +74,7 @@ class Lens:
         rules = config.randomize
         return cls(
             camera=camera,
+            size=config.camera.size,
             K=intrinsics(config.camera),
             near=np.float32(config.camera.near),
             far=np.float32(config.camera.far),
@@ -275,5 +287,5 @@ def _nearest_depth(depth: AnyArray, lens: Lens, pixel: Array) -> float:
 
 def _points(X_AC: Array, lens: Lens, depth: AnyArray, chosen: AnyArray) -> Array:
     """Return the points p_AQ (m, 3) of the pixels where `chosen` (S, S) is true."""
-    v, u = np.nonzero(chosen)
-    return transform_points(X_AC, unproject(lens.K, np.column_stack([u, v]), depth[v, u]))
+    p_CQ = lens.rays_C[:, chosen] * depth[chosen]
+    return np.asarray((X_AC[:3, :3] @ p_CQ).T + X_AC[:3, 3])

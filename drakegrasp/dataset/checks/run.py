@@ -4,29 +4,28 @@ In: a dataset's directory, or grasping_oto.hdf5, grasping_otm.hdf5 or trials.hdf
 list of violations, empty for a sound dataset. Rows are read in batches, so the memory is bounded,
 and judged in tasks, by an `Executor`. Imports no Drake.
 
-The rules are in `layout`, `object_files`, `samples`, `hold`, `images`, `conditions`, `trials` and
-`consistency`. `data_file`, `trials_file` and this module apply them in an order: a row that breaks
-a rule is not shown to the rules that build on it, so the check reports the cause and not all that
-follows from it.
+Of a whole dataset the three files are compared first with what assembling gives again of its shards
+(`assembled`). All other rules do not ask how a value was made: verdicts, poses, images, meshes.
+`trials_file` and `data_file` apply them in an order, see `rows`.
 """
 
 from __future__ import annotations
 
 import json
-from contextlib import ExitStack
+from collections.abc import Mapping
 from pathlib import Path
 
-from drakegrasp.dataset.assembly.survey import join_seals
 from drakegrasp.dataset.card.content import card_content
-from drakegrasp.dataset.checks import consistency
-from drakegrasp.dataset.checks.context import Context, Dataset
-from drakegrasp.dataset.checks.data_file import check_data_file, check_pair
+from drakegrasp.dataset.checks.assembled import Again, objects_and_successes, origin, row_counts
+from drakegrasp.dataset.checks.attempts import Dataset
+from drakegrasp.dataset.checks.data_file import samples_tasks, splits
 from drakegrasp.dataset.checks.findings import Findings, Violation, of_file
+from drakegrasp.dataset.checks.layout import look_at
 from drakegrasp.dataset.checks.object_files import check_object, object_tasks
-from drakegrasp.dataset.checks.open_file import OpenFile, open_file
-from drakegrasp.dataset.checks.trials_file import check_trials_file
+from drakegrasp.dataset.checks.rows import Check, CheckedFile
+from drakegrasp.dataset.checks.trials_file import successes, trials_tasks
 from drakegrasp.dataset.hdf5 import open_hdf5
-from drakegrasp.dataset.manifest import Manifest, read_manifest, refuse_older
+from drakegrasp.dataset.manifest import read_manifest, refuse_older
 from drakegrasp.dataset.paths import CARD_FILES, DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.schema import CAMERAS, refuse_other_schema
 from drakegrasp.errors import DataError, first_line
@@ -52,21 +51,18 @@ def check_dataset(
         DataError: If the path is neither, cannot be read, or is of another schema. In a directory
             a file that cannot be read is a violation, and the others are still checked.
     """
-    path, findings, report = Path(path), Findings(), progress or silent
-    with ExitStack() as stack:
-        if path.is_dir():
-            _check_directory(path, stack, findings, report, execute)
-        else:
-            _check_file(path, stack, findings, report, execute)
-    return findings.violations()
+    check = Check(execute=execute, report=progress or silent)
+    if Path(path).is_dir():
+        _check_directory(Path(path), check)
+    else:
+        _check_file(Path(path), check)
+    return check.findings.violations()
 
 
-def _check_file(
-    path: Path, stack: ExitStack, findings: Findings, report: Report, execute: Executor
-) -> None:
+def _check_file(path: Path, check: Check) -> None:
     """Check a file alone."""
     try:
-        file = stack.enter_context(open_hdf5(path))
+        file = open_hdf5(path)
     except OSError as error:
         raise DataError(
             f"{path}: must be the directory of a dataset or one of its HDF5 files, "
@@ -74,95 +70,101 @@ def _check_file(
         ) from None
 
     # Its attributes say which of the files it is, whatever its name.
-    camera = str(file.attrs.get("camera", ""))
-    if camera not in CAMERAS and "trials" not in file:
-        raise DataError(
-            f"{path}: must be a data file or the trials of a dataset, got another HDF5 file"
-        )
-    refuse_other_schema(path, file.attrs.get("schema_version"))
-    opened = open_file(path.name, file, camera if camera in CAMERAS else "", findings)
-    context = Context(findings=findings, report=report, total=_rows(opened), execute=execute)
-    if camera in CAMERAS:
-        check_data_file(opened, camera, context)
-    else:
-        check_trials_file(opened, context)
+    with file:
+        camera = str(file.attrs.get("camera", ""))
+        if camera not in CAMERAS and "trials" not in file:
+            raise DataError(
+                f"{path}: must be a data file or the trials of a dataset, got another HDF5 file"
+            )
+        refuse_other_schema(path, file.attrs.get("schema_version"))
+        camera = camera if camera in CAMERAS else ""
+        files = {camera: look_at(path.name, file, camera, check.findings)}
+    check.total = _rows(files)
+    _check_rows(files, check)
 
 
-def _check_directory(
-    out: Path, stack: ExitStack, findings: Findings, report: Report, execute: Executor
-) -> None:
+def _check_directory(out: Path, check: Check) -> None:
     """Check the files of a dataset, each with its objects, its shards and the other files."""
-    # Open the files; the trials come under the camera "".
     manifest = read_manifest(out)
     refuse_older(manifest, out)
-    files = _open_files(out, stack, findings)
-    rows = sum(map(_rows, files.values()))
-    findings.add(consistency.same_configuration(files.values(), manifest))
-    trials = files.pop("", None)
-    dataset = Dataset(out=out, manifest=manifest, trials=trials)
-    context = Context(
-        findings=findings,
-        report=report,
-        total=rows + sum(entry.candidates for entry in manifest.objects),
-        execute=execute,
-        dataset=dataset,
-    )
+    files = _look_at_files(out, check.findings)
+    check.total = _rows(files) + sum(entry.candidates for entry in manifest.objects)
 
     # The files that all others follow from.
-    shards = _check_objects(out, manifest, context)
-    if shards is not None:
-        findings.add(consistency.same_shards([*files.values(), *filter(None, [trials])], shards))
+    objects, surveys = set[str](), []
+    for found in in_order(check.execute)(check_object, object_tasks(out, manifest)):
+        check.findings.merge(found.findings)
+        check.advance(found.candidates)
+        if found.readable:
+            objects.add(found.name)
+        if found.survey is not None:
+            surveys.append(found.survey)
+    dataset = Dataset(out=out, manifest=manifest, readable=frozenset(objects))
+    sound = len(surveys) == sum(entry.candidates > 0 for entry in manifest.objects)
+    sound &= len(surveys) > 0 and len(objects) == len(manifest.objects)
+    again = Again.of(out, manifest, surveys) if sound else None
 
-    # The trials come first: a sample of a broken trial is not compared with it.
-    if trials is not None:
-        check_trials_file(trials, context)
-    for camera, data in files.items():
-        check_data_file(data, camera, context)
-        if trials is not None:
-            context.add(data, consistency.kept_are_samples(data, trials))
-            if not findings.violations():
-                context.add(data, consistency.likeness(data, trials, manifest))
-    if len(files) == len(CAMERAS) and all(data.config for data in files.values()):
-        check_pair(files[CAMERAS[0]], files[CAMERAS[1]], findings)
-    if not findings.violations():
-        _check_card(out, findings)  # else it would differ for the same cause
+    # Files of another state are not compared row by row.
+    compared = set()
+    for camera, file in files.items():
+        other = [*origin(file, manifest, again.shards.seals if again else "", camera)]
+        other += row_counts(file, again, camera) if again and not other else []
+        check.findings.add(other)
+        if again is not None and file.config is not None and not other:
+            compared.add(camera)
+    if (trials := files.get("")) is not None:
+        decided = again if "" in compared else None
+        with check.readable(trials):
+            objects_and_successes(trials, manifest, decided, check.findings)
+    _check_rows(files, check, dataset, again, frozenset(compared))
+    if not check.findings:
+        _check_card(out, check.findings)  # else it would differ for the same cause
 
 
-def _open_files(out: Path, stack: ExitStack, findings: Findings) -> dict[str, OpenFile]:
+def _check_rows(
+    files: Mapping[str, CheckedFile],
+    check: Check,
+    dataset: Dataset | None = None,
+    again: Again | None = None,
+    compared: frozenset[str] = frozenset(),
+) -> None:
+    """Judge all rows of some files, by camera: first the attempts, then what the samples show.
+
+    Args:
+        files: The files; the trials come under "".
+        check: Runs the tasks, and takes the violations.
+        dataset: The dataset around the files, if there is one.
+        again: The dataset assembled again, if its shards are sound.
+        compared: Cameras of the files that are compared with it; "" for the trials.
+    """
+    check.judge(trials_tasks(files, dataset, again, compared), files)
+    for camera, file in files.items():
+        # What is compared follows from the shards; other files are judged by themselves.
+        if camera not in compared:
+            with check.readable(file):
+                entries = dataset.manifest.objects if dataset else ()
+                known = {entry.name: entry for entry in entries}
+                check.findings.add(splits(file, known) if camera else successes(file))
+        if camera:
+            check.judge(samples_tasks(file, camera, dataset), files)
+
+
+def _look_at_files(out: Path, findings: Findings) -> dict[str, CheckedFile]:
     """Return the files of a dataset that can be read, by camera; the trials under ""."""
     files = {}
     for camera, name in (*DATA_FILES.items(), ("", TRIALS_FILE)):
         try:
-            file = stack.enter_context(open_hdf5(out / name))
+            with open_hdf5(out / name) as file:
+                files[camera] = look_at(name, file, camera, findings)
         except OSError as error:
             got = first_line(error) if (out / name).exists() else "none; `drakegrasp assemble`"
             findings.add([of_file(name, "the file must be there and readable", got)])
-            continue
         except DataError as error:
             # One with values elsewhere; that some files are half replaced concerns them all.
             refuse_half_replaced(out)
             got = first_line(error).rpartition(", got ")[2]
             findings.add([of_file(name, "the file must hold its own values", got)])
-            continue
-        files[camera] = open_file(name, file, camera, findings)
     return files
-
-
-def _check_objects(out: Path, manifest: Manifest, context: Context) -> str | None:
-    """The files of each object are as they were written.
-
-    Returns:
-        What `shards_sha256` is; None where a shard is missing or broken.
-    """
-    seals, whole = dict[int, bytes](), True
-    for found in in_order(context.execute)(check_object, object_tasks(out, manifest)):
-        context.advance(found.candidates)
-        context.findings.merge(found.findings)
-        if found.seals is None:
-            whole = False
-        elif found.candidates:
-            seals[found.object] = found.seals
-    return join_seals(seals) if whole else None
 
 
 def _check_card(out: Path, findings: Findings) -> None:
@@ -183,6 +185,7 @@ def _check_card(out: Path, findings: Findings) -> None:
         findings.add([of_file(path.name, what, "others; `drakegrasp assemble` writes it anew")])
 
 
-def _rows(opened: OpenFile) -> int:
-    """Return the number of samples or trials of a file."""
-    return sum(opened.count(g) for g in opened.groups if g not in ("objects", "successes"))
+def _rows(files: Mapping[str, CheckedFile]) -> int:
+    """Return the number of samples and trials of some files."""
+    counts = (item for file in files.values() for item in file.counts.items())
+    return sum(count for group, count in counts if group not in ("objects", "successes"))

@@ -12,15 +12,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from drakegrasp.config import LiftConfig
-from drakegrasp.dataset.checks.findings import (
-    POSITION_TOLERANCE,
-    AnyArray,
-    Batch,
-    Violation,
-    all_per_row,
-    rotation,
-    unit_length,
-)
+from drakegrasp.dataset.checks.findings import Violation
+from drakegrasp.dataset.checks.rows import AnyArray, Batch, all_per_row, rotation, unit_length
 from drakegrasp.dataset.schema import TRIAL_FIELDS
 from drakegrasp.frames import invert_pose
 from drakegrasp.outcomes import Outcome, Stage
@@ -45,70 +38,52 @@ MAX_FRICTION = 1.0
 
 
 def numbers(
-    batch: Batch, objects: int, candidates: Sequence[int] | None, standoffs: int | None
+    batch: Batch,
+    objects: int,
+    candidates: Sequence[int] | None,
+    standoffs: int | None,
+    children: int | None,
 ) -> Iterator[Violation]:
-    """The numbers of a trial are legal: its id, outcome, object, candidate and stand-off.
+    """The numbers of a trial are legal, and a refined palm pose has a parent.
 
     Args:
         batch: Rows of `/trials`.
         objects: Number of objects.
         candidates: Number of candidates by object, if known.
         standoffs: Number of stand-offs, if known.
-    """
-    # The trial itself.
-    yield from batch.broken(
-        "trial_id must be the row's number", batch["trial_id"] != batch.rows, batch["trial_id"]
-    )
-    outcome, known = batch["outcome"], [o.value for o in Outcome if not o.verification_only]
-    yield from batch.broken(
-        f"outcome must be one of {', '.join(map(str, known))}", ~np.isin(outcome, known), outcome
-    )
-
-    # Its object, and its candidate among the object's.
-    index, candidate = batch["object"], batch["candidate"]
-    unknown = (index < 0) | (index >= objects)
-    yield from batch.broken(f"object must be a row of /objects, 0..{objects - 1}", unknown, index)
-    limit = np.full(objects, np.iinfo(np.int64).max)
-    if candidates is not None and len(candidates) == objects:
-        limit = np.array(candidates, dtype=np.int64)
-    # An unknown object is a finding already; any object's limit will do.
-    above = candidate >= np.take(limit, index, mode="clip") if objects else np.zeros_like(unknown)
-    yield from batch.broken(
-        "candidate must be one of its object's candidates",
-        ~unknown & ((candidate < 0) | above),
-        candidate,
-    )
-
-    if standoffs is not None:
-        number = batch["standoff_index"]
-        yield from batch.broken(
-            f"standoff_index must be below {standoffs}", number >= standoffs, number
-        )
-
-
-def lineage(batch: Batch, children: int | None) -> Iterator[Violation]:
-    """A refined palm pose has a number, a parent and a generation that fit; a first one has none.
-
-    Args:
-        batch: Rows of `/trials`.
         children: Number of children of each parent, if known.
     """
-    child, parent, generation = (batch[name] for name in ("child", "parent", "generation"))
+    yield from batch.follows("trial_id", batch.rows, "the row's number")
+    outcome, known = batch["outcome"], [o.value for o in Outcome if not o.verification_only]
+    what = f"outcome must be one of {', '.join(map(str, known))}"
+    yield from batch.broken(what, ~np.isin(outcome, known), outcome)
+
+    # Of an unknown object, which is a finding, no number is too large.
+    most = np.full(len(batch), np.iinfo(np.int64).max)
+    index = batch["object"]
+    if candidates is not None and len(candidates) == objects:
+        there = (index >= 0) & (index < objects)
+        most[there] = np.array(candidates)[index[there]]
+    for name, of, limit in (
+        ("object", "rows of /objects", objects),
+        ("candidate", "candidates of its object", most),
+        ("standoff_index", "stand-offs", standoffs),
+        ("child", "numbers in a family", np.inf),
+    ):
+        bad = (batch[name] < 0) | (batch[name] >= (np.inf if limit is None else limit))
+        yield from batch.broken(f"{name} must be one of the {of}", bad, batch[name])
+
+    # The first of a family has no parent.
+    child, source = batch["child"], batch["source"]
     refined = child > 0
-    yield from batch.broken("child must not be negative", child < 0, child)
-    yield from batch.broken(
-        "generation must be 0 for the first of a family and positive for others",
-        (generation > 0) != refined,
-        generation,
-    )
-    yield from batch.broken(
-        "source must be 2 (refine) for a refined palm pose, and 0 or 1 for another",
-        np.where(refined, batch["source"] != Source.REFINE, batch["source"] >= Source.REFINE),
-        batch["source"],
-    )
+    what = "generation must be 0 for the first of a family and positive for others"
+    yield from batch.broken(what, (batch["generation"] > 0) != refined, batch["generation"])
+    what = "source must be 2 (refine) for a refined palm pose, and 0 or 1 for another"
+    bad = np.where(refined, source != Source.REFINE, source >= Source.REFINE)
+    yield from batch.broken(what, bad, source)
     if children is not None:
-        due = np.where(refined, (child - 1) // max(children, 1), 0)
-        yield from batch.broken("parent must follow from child", parent != due, parent)
+        parent = np.where(refined, (child - 1) // max(children, 1), 0)
+        yield from batch.follows("parent", parent, "child")
 
 
 def stages(batch: Batch) -> Iterator[Violation]:
@@ -251,28 +226,12 @@ def poses(batch: Batch) -> Iterator[Violation]:
         yield from rotation(batch, name)
 
 
-def words(batch: Batch) -> Iterator[Violation]:
-    """`precision` and `stable` follow from outcome, other links and the motion in the hand."""
-    outcome, other_links = batch["outcome"], batch["lifted_other_links"]
-    expected = {
-        "precision": is_precision(outcome, other_links),
-        "stable": is_stable(outcome, other_links, batch["slip"], batch["turn"]),
-    }
-    for name, due in expected.items():
-        yield from batch.broken(
-            f"{name} must follow from the outcome, lifted_other_links, slip and turn",
-            batch[name] != due,
-            batch[name],
-        )
-
-
 def motion(batch: Batch) -> Iterator[Violation]:
     """How the object moved in the hand is possible, and follows from the palm's two poses."""
-    for name in ("slip", "slip_released", "turn", "turn_released"):
-        values, largest = batch[name], np.inf if name.startswith("slip") else np.pi
-        yield from batch.broken(
-            f"{name} must be 0..{largest:.4g}", (values < 0.0) | (values > largest), values
-        )
+    for name, largest in (("slip", np.inf), ("turn", np.pi)):
+        for key in (name, f"{name}_released"):
+            bad = (batch[key] < 0.0) | (batch[key] > largest)
+            yield from batch.broken(f"{key} must be 0..{largest:.4g}", bad, batch[key])
 
     # X_GO before and after the lift.
     before, after = (invert_pose(batch.pose(name)) for name in ("X_OG", "X_OG_lifted"))
@@ -280,30 +239,15 @@ def motion(batch: Batch) -> Iterator[Violation]:
     cosine = (np.einsum("nij,nij->n", before[:, :3, :3], after[:, :3, :3]) - 1.0) / 2.0
     turn = np.arccos(np.clip(cosine, -1.0, 1.0))
     for name, due in (("slip", slip), ("turn", turn)):
-        off = np.abs(batch[name] - due)
-        yield from batch.broken(
-            f"{name} must follow from X_OG and X_OG_lifted",
-            off > MOTION_TOLERANCE,
-            lambda i, off=off: f"one that is off by {off[i]:.4g}",  # type: ignore[misc]
-        )
+        yield from batch.follows(name, due, "X_OG and X_OG_lifted", MOTION_TOLERANCE)
 
-
-def resting_poses(batch: Batch, X_TO: Sequence[Sequence[Sequence[float]]]) -> Iterator[Violation]:
-    """Every attempt starts from one of its object's resting poses X_TO (12,), given by object."""
-    counts = np.array([len(poses) for poses in X_TO])
-    unknown = batch["resting"] >= counts[batch["object"].astype(int)]
-    yield from batch.broken(
-        "resting must be one of its object's resting poses", unknown, batch["resting"]
+    # The words for it.
+    outcome, other_links = batch["outcome"], batch["lifted_other_links"]
+    stable = is_stable(outcome, other_links, batch["slip"], batch["turn"])
+    yield from batch.follows(
+        "precision", is_precision(outcome, other_links), "outcome and lifted_other_links"
     )
-
-    pairs = zip(batch["object"].tolist(), batch["resting"].tolist(), unknown, strict=True)
-    expected = np.array([X_TO[i][0 if bad else k] for i, k, bad in pairs]).reshape(-1, 12)
-    off = np.where(unknown, 0.0, np.abs(batch["X_TO"] - expected).max(axis=1))
-    yield from batch.broken(
-        "X_TO must be the object's resting pose in manifest.json",
-        off > POSITION_TOLERANCE,
-        lambda i: f"a pose that is off by {off[i]:.4g}",
-    )
+    yield from batch.follows("stable", stable, "precision, slip and turn")
 
 
 def _as_due(values: AnyArray, due: AnyArray) -> AnyArray:

@@ -1,134 +1,197 @@
-"""The order of the rules for trials.hdf5.
+"""The order of the rules for trials.hdf5, and of the comparison with the shards.
 
-In: an open trials.hdf5 and, if there is one, the dataset around it. Out: its violations, in the
-findings of the context.
+In: trials.hdf5 and the data files of a dataset, or trials.hdf5 alone. Out: tasks; each judges a
+range of the attempts. With the shards of the dataset it compares the attempts, and the samples
+among them in the data files, before any other rule.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from functools import partial
+from itertools import zip_longest
 
 import numpy as np
 
-from drakegrasp.dataset.checks import chances as chance_rules
-from drakegrasp.dataset.checks import conditions as condition_rules
-from drakegrasp.dataset.checks import consistency
+from drakegrasp.dataset.assembly.decisions import sample_texts
+from drakegrasp.dataset.assembly.pack import TASK_ROWS, PackTask, read_rows
+from drakegrasp.dataset.checks import attempts as attempt_rules
 from drakegrasp.dataset.checks import trials as trial_rules
-from drakegrasp.dataset.checks.context import Context, Dataset, Rows, RowsTask, judge_rows
-from drakegrasp.dataset.checks.findings import AnyArray, Findings
-from drakegrasp.dataset.checks.open_file import OpenFile, Rule
-from drakegrasp.dataset.layout.attributes import ORIGIN, attribute_mistakes
-from drakegrasp.errors import HandError
-from drakegrasp.hand.files import hand_digest
-from drakegrasp.hand.lift_chance import read_lift_chance
-from drakegrasp.outcomes import Outcome
+from drakegrasp.dataset.checks.assembled import Again, compare_samples, compare_trials, range_tasks
+from drakegrasp.dataset.checks.attempts import Dataset
+from drakegrasp.dataset.checks.findings import Findings, Violation, of_file
+from drakegrasp.dataset.checks.rows import Batch, CheckedFile, Rule
+from drakegrasp.dataset.schema import CAMERAS, SPLITS
+from drakegrasp.outcomes import Outcome, Removal
 
 #: Trials in a batch: some 10 MB.
 TRIAL_ROWS = 8192
-#: Trials in a task.
-TASK_ROWS = 2 * TRIAL_ROWS
 
 
-def check_trials_file(trials: OpenFile, context: Context) -> None:
-    """Apply every rule to the objects, trials and successes of a file.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrialsTask:
+    """A range of attempts to judge.
+
+    Attributes:
+        files: The files, by camera; the trials under "", if they can be read.
+        start, stop: Rows of /trials.
+        dataset: The dataset around them, if there is one.
+        again: Derives the rows again; None where they cannot be compared.
+        compared: Cameras of the files that are compared; "" for the trials.
+        firsts: Row of the first sample of the range in each split.
+    """
+
+    files: Mapping[str, CheckedFile]
+    start: int
+    stop: int
+    dataset: Dataset | None = None
+    again: PackTask | None = None
+    compared: frozenset[str] = frozenset()
+    firsts: Mapping[str, int]
+
+    @property
+    def size(self) -> int:
+        """Number of rows."""
+        return max(self.stop - self.start, 0)
+
+    def judge(self, findings: Findings) -> None:
+        """Apply every rule."""
+        columns, samples = ({}, {}) if self.again is None else read_rows(self.again)
+        if "" in self.files and self.size:
+            trials = self.files[""]
+            rules = _Rules.of(trials, self.dataset)
+            with trials.opened() as file:
+                if "" in self.compared and columns:
+                    batches = compare_trials(
+                        file, trials, columns, self.start, findings, TRIAL_ROWS
+                    )
+                else:
+                    rows = np.arange(self.start, self.stop)
+                    batches = trials.batches(file, "trials", rows, TRIAL_ROWS, findings)
+                for batch in batches:
+                    rules.judge(batch, trials, findings)
+
+        if self.dataset is None:
+            return
+        texts = sample_texts(self.dataset.manifest)
+        for camera in (camera for camera in CAMERAS if camera in self.compared):
+            for split, own in samples.items():
+                if split in self.files[camera].counts:
+                    first = self.firsts[split]
+                    compare_samples(self.files[camera], camera, split, first, own, texts, findings)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Rules:
+    """The rules of attempts by what they rely on.
+
+    Attributes:
+        first: For any values.
+        last: For finite values of known objects.
+        sound: For sound poses and contacts.
+    """
+
+    first: tuple[Rule, ...]
+    last: tuple[Rule, ...]
+    sound: tuple[Rule, ...]
+
+    @classmethod
+    def of(cls, trials: CheckedFile, dataset: Dataset | None) -> _Rules:
+        """Return the rules for a file and the dataset around it, if there is one."""
+        # What is known of the objects and the hand.
+        config, count = trials.config, trials.counts["objects"]
+        objects = dataset.manifest.objects if dataset else None
+        fingers = json.loads(trials.attributes.get("fingers", "{}"))
+        required = list(fingers.values()) or [True]
+
+        # What follows from the dataset needs all of its objects.
+        last: list[Rule] = [
+            partial(trial_rules.verdicts, required=required, rules=config.lift if config else None),
+            trial_rules.contacts,
+            trial_rules.poses,
+        ]
+        sound: list[Rule] = [trial_rules.motion]
+        if dataset is not None and count == len(dataset.manifest.objects):
+            model, manifest = dataset.loader(), dataset.manifest
+            last += [
+                partial(attempt_rules.resting_poses, manifest=manifest),
+                partial(attempt_rules.conditions, manifest=manifest, model=model),
+            ]
+            sound.append(
+                partial(attempt_rules.chances, required=required, manifest=manifest, model=model)
+            )
+
+        standoffs = config.candidates.standoffs if config else None
+        numbers = partial(
+            trial_rules.numbers,
+            objects=count,
+            candidates=None if objects is None else [entry.candidates for entry in objects],
+            standoffs=None if standoffs is None else len(standoffs),
+            children=config.refine.children if config else None,
+        )
+        return cls(first=(numbers,), last=tuple(last), sound=tuple(sound))
+
+    def judge(self, batch: Batch, trials: CheckedFile, findings: Findings) -> None:
+        """Apply the rules; stages need a legal outcome."""
+        for rules in (self.first, (trial_rules.stages,), self.last, self.sound):
+            batch = trials.judge(batch, findings, *rules)
+
+
+def trials_tasks(
+    files: Mapping[str, CheckedFile],
+    dataset: Dataset | None = None,
+    again: Again | None = None,
+    compared: frozenset[str] = frozenset(),
+) -> Iterator[TrialsTask]:
+    """Yield the tasks that judge all attempts, and compare what follows from the shards.
 
     Args:
-        trials: The file.
-        context: Takes the violations. Its manifest, if it has one, says which objects and
-            candidates there are.
+        files: As of a task.
+        dataset: As of a task.
+        again: The dataset assembled again, if its shards are sound.
+        compared: As of a task.
     """
-    dataset = context.dataset
-    if dataset is not None:
-        context.add(trials, consistency.same_objects(trials, dataset.manifest))
-    if not {"objects", "trials"} <= set(trials.groups):
-        return  # a broken layout, which is a finding already; trials need their objects
-
-    # The rows, and then the columns of the successes.
-    expected = judge_rows(_tasks(trials, dataset), trials, context)
-    if "successes" in trials.groups:
-        context.add(trials, consistency.successes(trials, expected))
-
-
-def _tasks(trials: OpenFile, dataset: Dataset | None) -> Iterator[RowsTask]:
-    count, place = trials.count("trials"), trials.place({})
-    for start in range(0, count, TASK_ROWS):
-        yield RowsTask(
-            judge=_judge_trials,
-            file=place,
-            group="trials",
-            start=start,
-            stop=min(start + TASK_ROWS, count),
-            out=None if dataset is None else dataset.out,
-            manifest=None if dataset is None else dataset.manifest,
+    # Trials need their objects: a broken layout is a finding already.
+    trials = files.get("")
+    sound = trials is not None and {"objects", "trials"} <= set(trials.counts)
+    count = trials.counts["trials"] if trials is not None and sound else 0
+    packs = range_tasks(again) if again is not None and compared else iter(())
+    firsts = dict.fromkeys(SPLITS, 0)
+    for start, pack in zip_longest(range(0, count, TASK_ROWS), packs):
+        first = pack.start if start is None else start
+        yield TrialsTask(
+            files={camera: file.for_task() for camera, file in files.items()},
+            start=first,
+            stop=min(first + TASK_ROWS, count),
+            dataset=dataset,
+            again=pack,
+            compared=compared,
+            firsts=dict(firsts),
         )
+        for split, ids in {} if pack is None else pack.ids.items():
+            firsts[split] += len(ids)
 
 
-def _judge_trials(rows: Rows, findings: Findings) -> AnyArray:
-    """Apply every rule to rows of /trials; return the ids of the successes among them."""
-    trials, dataset = rows.file, rows.dataset
+def successes(trials: CheckedFile) -> Iterator[Violation]:
+    """Every success is in /successes, in order, with a legal reason of removal and certificate."""
+    if not {"trials", "successes"} <= set(trials.counts):
+        return
+    with trials.opened() as file:
+        outcome = file["trials/outcome"]
+        blocks = range(0, len(outcome), TASK_ROWS)
+        hits = [np.flatnonzero(outcome[a : a + TASK_ROWS] == Outcome.SUCCESS) + a for a in blocks]
+        due = np.concatenate([np.zeros(0, dtype=np.int64), *hits])
+        batch = trials.read(file, "successes", np.arange(trials.counts["successes"]))
 
-    # The rules whose limits depend on the dataset.
-    objects = dataset.manifest.objects if dataset else None
-    standoffs = trials.config.candidates.standoffs if trials.config else None
-    numbers = partial(
-        trial_rules.numbers,
-        objects=trials.count("objects"),
-        candidates=None if objects is None else [entry.candidates for entry in objects],
-        standoffs=None if standoffs is None else len(standoffs),
-    )
-    wrong = {mistake.key for mistake in attribute_mistakes(trials.file, ORIGIN)}
-    named = "fingers" not in wrong and "fingers" in trials.file.attrs
-    fingers = json.loads(trials.file.attrs["fingers"]) if named else {}
-    last: list[Rule] = [
-        partial(
-            trial_rules.verdicts,
-            required=list(fingers.values()) or [True],
-            rules=trials.config.lift if trials.config else None,
-        ),
-        trial_rules.words,
-        trial_rules.contacts,
-        trial_rules.poses,
-    ]
-    sound: list[Rule] = [trial_rules.motion]
-    if objects is not None and trials.count("objects") == len(objects):
-        poses = [[pose.X_TO for pose in entry.resting] for entry in objects]
-        last.append(partial(trial_rules.resting_poses, X_TO=poses))
-    if dataset is not None and trials.count("objects") == len(dataset.names):
-        last.append(
-            partial(
-                condition_rules.as_drawn,
-                names=dataset.names,
-                model=rows.model,
-                config=dataset.manifest.config_of,
-            )
-        )
-        # Other files of the hand may have other weights.
-        hand = dataset.manifest.config.hand
-        with suppress(HandError):
-            if hand_digest(hand) == dataset.manifest.versions.get("hand"):
-                sound.append(
-                    partial(
-                        chance_rules.as_computed,
-                        required=list(fingers.values()) or [True],
-                        names=dataset.names,
-                        model=rows.model,
-                        chance=read_lift_chance(hand),
-                    )
-                )
-
-    # Numbers, then stages, which need a legal outcome, then what needs finite values, then what
-    # needs sound poses and contacts.
-    successes = [np.zeros(0, dtype=np.int64)]
-    for whole in trials.batches("trials", rows.start, rows.stop, TRIAL_ROWS, findings):
-        successes.append(whole["trial_id"][whole["outcome"] == Outcome.SUCCESS])
-        children = trials.config.refine.children if trials.config else None
-        batch = trials.judge(
-            whole, findings, numbers, partial(trial_rules.lineage, children=children)
-        )
-        batch = trials.judge(batch, findings, trial_rules.stages)
-        batch = trials.judge(batch, findings, *last)
-        trials.judge(batch, findings, *sound)
-    return np.concatenate(successes)
+    if not np.array_equal(batch["trial_id"], due):
+        different = sorted(set(batch["trial_id"].tolist()) ^ set(due.tolist()))
+        got = f"differences at trials {different[:5]}" if different else "another order"
+        yield of_file(trials.name, "trial_id must list the successes of /trials", got, "/successes")
+    bad = ~np.isin(batch["removal"], [r.value for r in Removal])
+    yield from batch.broken(f"removal must be 0..{max(Removal)}", bad, batch["removal"])
+    for name, largest in (("certified_share", 1.0), ("certified_friction", np.inf)):
+        values = batch[name]
+        bad = ~np.isnan(values) & ~((values >= 0.0) & (values <= largest))
+        yield from batch.broken(f"{name} must be 0..{largest:g} or NaN", bad, values)

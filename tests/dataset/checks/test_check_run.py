@@ -29,7 +29,8 @@ from helpers.datasets import (
 )
 
 from drakegrasp.config import load_config
-from drakegrasp.dataset.checks import context, data_file, object_files, trials_file
+from drakegrasp.dataset.assembly import decisions
+from drakegrasp.dataset.checks import attempts, data_file, object_files, trials_file
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.paths import model_path, plan_path
@@ -82,7 +83,8 @@ def test_two_processes_find_what_one_does(out: Path, monkeypatch: pytest.MonkeyP
     assert kinds.count((TRIALS, "/trials")) == 22  # 20 candidates, the number of more, an object
     assert {(OTO, "/test"), (OTM, "/test"), ("objects/1_box_a.npz", "")} <= set(kinds)
 
-    monkeypatch.setattr(trials_file, "TASK_ROWS", 7)
+    for module in (trials_file, decisions):
+        monkeypatch.setattr(module, "TASK_ROWS", 7)
     monkeypatch.setattr(data_file, "TASK_ROWS", 1)
     small = check_dataset(out)
     assert sorted(map(str, small)) == sorted(map(str, expected))
@@ -118,7 +120,7 @@ def test_meshes_and_files_are_let_go_with_each_task(
         alive.append(weakref.ref(model))
         return model
 
-    monkeypatch.setattr(context, "load_object", load)
+    monkeypatch.setattr(attempts, "load_object", load)
     gc.collect()
     gc.disable()
     try:
@@ -136,8 +138,21 @@ def test_files_of_other_shards_are_found(out: Path) -> None:
     slip = np.array(shard.trials["slip"])
     slip[np.isfinite(slip)] += 1e-3
     write_shard(out, replace(shard, trials={**shard.trials, "slip": slip}))
-    what = "the file must be made from the shards that are there"
+    what = "attribute shards must be that of the shards that are there"
     must_find(out, *((name, "", None, what) for name in (OTO, OTM, TRIALS)))
+
+
+@pytest.mark.parametrize("packing", [{"compression": "gzip", "compression_opts": 9}, {}])
+def test_images_that_are_packed_otherwise_are_compared_by_value(
+    out: Path, packing: dict[str, object]
+) -> None:
+    with h5py.File(out / OTO, "r+") as file:
+        values, attributes = file["train/images"][:], dict(file["train/images"].attrs)
+        del file["train/images"]
+        file.create_dataset("train/images", data=values, **packing).attrs.update(attributes)
+    must_find(out)
+    change(out, OTO, "train/images", 1, set_at(0, 0, 0, to=0.25))
+    must_find(out, (OTO, "/train", 1, "images must be what the shard holds"))
 
 
 def test_trials_without_sound_objects_are_not_compared(out: Path) -> None:
@@ -155,7 +170,7 @@ def test_file_with_a_link_hides_no_other_fault(out: Path) -> None:
     must_find(
         out,
         (OTM, "", None, "the file must hold its own values"),
-        (OTO, "/train", 0, "colours must be within 0..1"),
+        (OTO, "/train", 0, "images must be what the shard holds"),
     )
 
 
@@ -227,13 +242,13 @@ def test_files_are_of_the_manifests_configuration(out: Path) -> None:
     overrides = ["camera.size=32", "unit_candidates=2", "split.valid_fraction=0.34"]
     other = with_hand_defaults(load_config(overrides=overrides))
     write_manifest(replace(manifest, config=other), out)
-    what = "filters, split and limits must be those of manifest.json"
+    what = "attribute config must be that of manifest.json"
     must_find(out, *((name, "", None, what) for name in files))
     other = with_hand_defaults(load_config(overrides=[*overrides, "seed=1"]))
     write_manifest(replace(manifest, config=other), out)
     hits = {h for h in found(out) if not h[0].startswith("shards")}
     assert {h[0] for h in hits} == set(files)
-    assert all(h[3].startswith("configuration must be that of manifest.json") for h in hits)
+    assert all(h[3].startswith("attribute config must be that of manifest.json") for h in hits)
 
 
 def test_a_truncated_file_is_found_and_the_others_are_still_checked(out: Path) -> None:
@@ -243,7 +258,7 @@ def test_a_truncated_file_is_found_and_the_others_are_still_checked(out: Path) -
     must_find(
         out,
         (OTM, "", None, "the file must be there and readable"),
-        (OTO, "/train", 0, "colours must be within 0..1"),
+        (OTO, "/train", 0, "images must be what the shard holds"),
     )
     with pytest.raises(DataError, match="cannot be read"):
         check_dataset(out / OTM)
