@@ -29,10 +29,10 @@ from drakegrasp.errors import ConfigError, GraspError, MeshError, listed
 from drakegrasp.frames import as_numbers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import with_hand_defaults
-from drakegrasp.objects.builtin.catalog import builtin_sources, draw_builtin
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.runtime.executor import count_workers, run_here
 from drakegrasp.runtime.progress import progress_bar
+from drakegrasp.shapes.catalog import builtin_sources, draw_builtin
 from drakegrasp.simulation.drive import drive_of
 from drakegrasp.verification.batch import ResultCallback, ignore_result, verify_batch
 from drakegrasp.verification.placed_grasp import (

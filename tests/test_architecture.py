@@ -24,6 +24,7 @@ ORDER = (
     "runtime",
     "mesh",
     "objects",
+    "shapes",
     "hand",
     "vision",
     "simulation",

@@ -15,9 +15,9 @@ from drakegrasp.config import Config
 from drakegrasp.dataset.assembly.pack import TASK_ROWS
 from drakegrasp.errors import ConfigError
 from drakegrasp.hand.file_format import with_hand_defaults
-from drakegrasp.objects.builtin.classes import CLASSES
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.environment import available_cores
+from drakegrasp.shapes.classes import CLASSES
 
 #: Time that the scheduler and the client spend on a task, one after the other [s]; measured
 #: with distributed 2026.8 on two cores.

@@ -62,7 +62,7 @@ def objects() -> None:
 @objects.command("list")
 def list_objects() -> None:
     """Print every built-in class, with the parameters that are drawn."""
-    from drakegrasp.objects.builtin.classes import CLASSES
+    from drakegrasp.shapes.classes import CLASSES
 
     for item in CLASSES:
         sizes = ", ".join(f"{name} {span}" for name, span in item.parameters.items())
@@ -79,8 +79,8 @@ def export_objects(directory: Path, **options: Any) -> None:
     """
     from drakegrasp.build.request import BUILTIN
     from drakegrasp.config import load_config
-    from drakegrasp.objects.builtin.catalog import export_builtin
     from drakegrasp.runtime.progress import progress_bar
+    from drakegrasp.shapes.catalog import export_builtin
 
     config = load_config(overrides=chosen_settings({"objects": BUILTIN, **options}))
     with progress_bar("objects", "meshes") as progress:

@@ -16,9 +16,9 @@ from matplotlib.figure import Figure
 
 from drakegrasp.config import CameraConfig
 from drakegrasp.frames import Array, make_pose
-from drakegrasp.objects.builtin.catalog import BuiltinObject
-from drakegrasp.objects.builtin.classes import CLASSES
 from drakegrasp.objects.model import ObjectModel
+from drakegrasp.shapes.catalog import BuiltinObject
+from drakegrasp.shapes.classes import CLASSES
 from drakegrasp.vision.rendering import build_renderer, render
 from drakegrasp.visualization.style import INK, add_axes, hide_ticks, save_figure
 

@@ -19,8 +19,8 @@ from drakegrasp.config import load_config
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.prepared_objects import PreparedObject
 from drakegrasp.hand.file_format import with_hand_defaults
-from drakegrasp.objects.builtin.catalog import export_builtin
 from drakegrasp.objects.sources import find_meshes
+from drakegrasp.shapes.catalog import export_builtin
 from drakegrasp.simulation.candidates import sample_candidates
 from drakegrasp.visualization.figures.palm_poses import palm_poses_figure
 from drakegrasp.visualization.figures.samplers import METHODS, palm_rays

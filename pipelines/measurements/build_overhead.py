@@ -30,8 +30,8 @@ from drakegrasp.api import build_dataset
 from drakegrasp.cli.options import shared
 from drakegrasp.config import Config, load_config
 from drakegrasp.dataset.log import read_log
-from drakegrasp.objects.builtin.catalog import export_builtin
 from drakegrasp.objects.sources import find_meshes
+from drakegrasp.shapes.catalog import export_builtin
 
 #: Stages of a work unit that a plain loop without files would have as well.
 WORK = ("build", "try", "look")

@@ -25,11 +25,11 @@ from drakegrasp.config import Config, load_config, override_config
 from drakegrasp.dataset.filters import breaks_hold
 from drakegrasp.errors import MeshError
 from drakegrasp.hand.description import load_hand
-from drakegrasp.objects.builtin.catalog import builtin_sources
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.blas import one_thread
 from drakegrasp.runtime.progress import progress_bar
+from drakegrasp.shapes.catalog import builtin_sources
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 

@@ -27,7 +27,7 @@ from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.frames import make_pose
-from drakegrasp.objects.builtin.catalog import BuiltinObject
+from drakegrasp.shapes.catalog import BuiltinObject
 from drakegrasp.verification.prediction import FRAMES
 from drakegrasp.verification.verify import METHODS
 

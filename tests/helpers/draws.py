@@ -24,9 +24,9 @@ from drakegrasp.config import BuiltinConfig, SplitConfig, load_config
 from drakegrasp.dataset.assembly.split import split_samples
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import with_hand_defaults
-from drakegrasp.objects.builtin.catalog import export_builtin
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.seeding import Stream
+from drakegrasp.shapes.catalog import export_builtin
 from drakegrasp.simulation.candidates import (
     make_attempts,
     normal_candidates,

@@ -10,10 +10,10 @@ import trimesh
 
 from drakegrasp.config import ObjectConfig
 from drakegrasp.mesh.surfaces import Solid
-from drakegrasp.objects.builtin.catalog import wavefront
-from drakegrasp.objects.builtin.shapes import packaging, vessels
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource
+from drakegrasp.shapes import packaging, vessels
+from drakegrasp.shapes.catalog import wavefront
 
 G3DB = Path(__file__).resolve().parents[3] / "shared/meshes/g3db"
 

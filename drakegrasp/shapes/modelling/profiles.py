@@ -1,6 +1,6 @@
 """Curves in the plane: corners and sizes in metres come in, evenly spaced points go out.
 
-A curve is a polyline. It is a profile (r, z) that `drakegrasp.objects.builtin.modelling` turns
+A curve is a polyline. It is a profile (r, z) that `drakegrasp.shapes.modelling.solids` turns
 about z, or an outline (x, y) that it moves along a path.
 """
 

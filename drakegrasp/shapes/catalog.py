@@ -1,7 +1,7 @@
 """The built-in objects: everyday things of drawn sizes, so that a dataset needs no meshes.
 
 An object is a class, an index from 1 and a seed: its sizes are drawn from the ranges of
-`drakegrasp.objects.builtin.classes`. Its name is `<number>_<class>_<index>`. The same index and
+`drakegrasp.shapes.classes`. Its name is `<number>_<class>_<index>`. The same index and
 seed give the same object, however many others there are. `export_builtin` writes the meshes as
 Wavefront files, the same bytes every time.
 """
@@ -17,12 +17,12 @@ import trimesh
 
 from drakegrasp.config import BuiltinConfig
 from drakegrasp.errors import MeshError
-from drakegrasp.objects.builtin.classes import CLASSES, ObjectClass
-from drakegrasp.objects.builtin.modelling import DECIMALS
 from drakegrasp.objects.sources import MeshSource, find_mesh
 from drakegrasp.runtime.files import write_atomic
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.seeding import Stream, object_key
+from drakegrasp.shapes.classes import CLASSES, ObjectClass
+from drakegrasp.shapes.modelling.solids import DECIMALS
 
 #: Of the built-in objects, which are part of the package.
 LICENCE = "BSD-3-Clause"

@@ -1,7 +1,7 @@
 """Parameters of the built-in classes: a range comes in, a drawn value goes out.
 
 A value is a whole number of steps of its range, e.g. of 0.1 mm, so a draw is equal on every
-machine. Ranges are inert; `drakegrasp.objects.builtin.classes` has the table of them.
+machine. Ranges are inert; `drakegrasp.shapes.classes` has the table of them.
 """
 
 from __future__ import annotations

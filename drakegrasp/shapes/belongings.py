@@ -1,7 +1,7 @@
 """Things that people own, one function per class: sizes come in, watertight meshes go out.
 
 Every mesh stands or lies on the plane z = 0 as it would on a table, z up. All lengths are in [m]
-and all angles in [rad]; `drakegrasp.objects.builtin.classes` has the table of their ranges.
+and all angles in [rad]; `drakegrasp.shapes.classes` has the table of their ranges.
 """
 
 from __future__ import annotations
@@ -11,10 +11,9 @@ import trimesh
 
 from drakegrasp.arithmetic import sin_cos_deg
 from drakegrasp.frames import Array
-from drakegrasp.objects.builtin.booleans import cut, flat_base, fuse
-from drakegrasp.objects.builtin.modelling import bar, skin, sweep
-from drakegrasp.objects.builtin.primitives import ball, block, lathe, moved, pillar, rod, rotated
-from drakegrasp.objects.builtin.profiles import (
+from drakegrasp.shapes.modelling.booleans import cut, flat_base, fuse
+from drakegrasp.shapes.modelling.primitives import ball, block, lathe, moved, pillar, rod, rotated
+from drakegrasp.shapes.modelling.profiles import (
     BROAD,
     EDGE,
     LARGE,
@@ -23,6 +22,7 @@ from drakegrasp.objects.builtin.profiles import (
     resample,
     rounded_polygon,
 )
+from drakegrasp.shapes.modelling.solids import bar, skin, sweep
 
 
 def book(*, width: float, length: float, thickness: float, edge: float = 0.011) -> trimesh.Trimesh:

@@ -1,6 +1,6 @@
 """Parts of shapes: sizes and places in metres come in, watertight parts go out.
 
-A class of objects is a handful of these parts, made one by `drakegrasp.objects.builtin.modelling`.
+A class of objects is a handful of these parts, made one by `drakegrasp.shapes.modelling.solids`.
 Parts overlap where they are to be joined.
 """
 
@@ -12,8 +12,7 @@ import trimesh
 
 from drakegrasp.arithmetic import dot, multiply, norm, sin_cos_deg
 from drakegrasp.frames import Array
-from drakegrasp.objects.builtin.modelling import extrude, revolve, skin, solid
-from drakegrasp.objects.builtin.profiles import (
+from drakegrasp.shapes.modelling.profiles import (
     COARSE,
     EDGE,
     arc_length,
@@ -22,6 +21,7 @@ from drakegrasp.objects.builtin.profiles import (
     ring_size,
     rounded_rectangle,
 )
+from drakegrasp.shapes.modelling.solids import extrude, revolve, skin, solid
 
 #: Rings of a flat end, as shares of its outline: the triangles at the centre stay plump.
 FLAT_END = (0.0, 0.5, 0.93)

@@ -1,7 +1,7 @@
 """The table of built-in classes: 64 everyday things, and the ranges of their sizes.
 
 Each row of `CLASSES` is a function and, for each of its parameters, the range from which
-`drakegrasp.objects.builtin.catalog` draws. Nothing is drawn or built here.
+`drakegrasp.shapes.catalog` draws. Nothing is drawn or built here.
 
 Sizes are our own, chosen for a hand of the Barrett's size: it spans 0.24 m and its pads reach
 about 0.11 m ahead of the palm. A class that a smaller hand needs otherwise is a row to copy.
@@ -14,8 +14,7 @@ from dataclasses import dataclass
 
 import trimesh
 
-from drakegrasp.objects.builtin.parameters import Range, deg, mm, pieces
-from drakegrasp.objects.builtin.shapes import (
+from drakegrasp.shapes import (
     animals,
     belongings,
     clothing,
@@ -27,6 +26,7 @@ from drakegrasp.objects.builtin.shapes import (
     toys,
     vessels,
 )
+from drakegrasp.shapes.parameters import Range, deg, mm, pieces
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,7 +1,7 @@
 """Tools and things of a yard, one function per class: sizes come in, watertight meshes go out.
 
 Every mesh stands or lies on the plane z = 0 as it would on a table, z up. All lengths are in [m]
-and all angles in [rad]; `drakegrasp.objects.builtin.classes` has the table of their ranges.
+and all angles in [rad]; `drakegrasp.shapes.classes` has the table of their ranges.
 """
 
 from __future__ import annotations
@@ -11,9 +11,8 @@ import trimesh
 from scipy.interpolate import PchipInterpolator
 
 from drakegrasp.arithmetic import sin_cos_deg
-from drakegrasp.objects.builtin.booleans import cut, fuse, stand
-from drakegrasp.objects.builtin.modelling import bar, extrude, sweep
-from drakegrasp.objects.builtin.primitives import (
+from drakegrasp.shapes.modelling.booleans import cut, fuse, stand
+from drakegrasp.shapes.modelling.primitives import (
     ball,
     block,
     lathe,
@@ -24,7 +23,7 @@ from drakegrasp.objects.builtin.primitives import (
     scalloped,
     tube,
 )
-from drakegrasp.objects.builtin.profiles import (
+from drakegrasp.shapes.modelling.profiles import (
     BROAD,
     EDGE,
     LARGE,
@@ -34,7 +33,8 @@ from drakegrasp.objects.builtin.profiles import (
     smooth,
     spread_evenly,
 )
-from drakegrasp.objects.builtin.shapes.vessels import loop_handle, vessel
+from drakegrasp.shapes.modelling.solids import bar, extrude, sweep
+from drakegrasp.shapes.vessels import loop_handle, vessel
 
 
 def hammer(*, length: float, head_length: float, head_thickness: float) -> trimesh.Trimesh:

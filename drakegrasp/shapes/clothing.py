@@ -1,7 +1,7 @@
 """Clothing and a comb, one function per class: sizes come in, watertight meshes go out.
 
 Every mesh stands or lies on the plane z = 0 as it would on a table, z up. Shoes point towards +x.
-All lengths are in [m] and all angles in [rad]; `drakegrasp.objects.builtin.classes` has the table
+All lengths are in [m] and all angles in [rad]; `drakegrasp.shapes.classes` has the table
 of their ranges.
 """
 
@@ -13,10 +13,10 @@ from scipy.interpolate import PchipInterpolator
 
 from drakegrasp.arithmetic import sin_cos_deg
 from drakegrasp.frames import Array
-from drakegrasp.objects.builtin.booleans import cut, fuse
-from drakegrasp.objects.builtin.modelling import revolve, skin, solid
-from drakegrasp.objects.builtin.primitives import ball, block, moved, prism, rod, rotated, tube
-from drakegrasp.objects.builtin.profiles import EDGE, resample, smooth
+from drakegrasp.shapes.modelling.booleans import cut, fuse
+from drakegrasp.shapes.modelling.primitives import ball, block, moved, prism, rod, rotated, tube
+from drakegrasp.shapes.modelling.profiles import EDGE, resample, smooth
+from drakegrasp.shapes.modelling.solids import revolve, skin, solid
 
 #: Edge length of a hat [m].
 FELT = 1.2 * EDGE

@@ -1,7 +1,7 @@
 """Toy animals, one function per class: sizes come in, watertight meshes go out.
 
 Every mesh stands or lies on the plane z = 0 as it would on a table, z up. They look towards +x. All
-lengths are in [m] and all angles in [rad]; `drakegrasp.objects.builtin.classes` has the table of
+lengths are in [m] and all angles in [rad]; `drakegrasp.shapes.classes` has the table of
 their ranges.
 """
 
@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from drakegrasp.objects.builtin.booleans import flat_base, fuse
-from drakegrasp.objects.builtin.primitives import ball, moved, rod, rotated, tube
-from drakegrasp.objects.builtin.profiles import EDGE, ring_angles, smooth
+from drakegrasp.shapes.modelling.booleans import flat_base, fuse
+from drakegrasp.shapes.modelling.primitives import ball, moved, rod, rotated, tube
+from drakegrasp.shapes.modelling.profiles import EDGE, ring_angles, smooth
 
 #: Edge length of the animals: they have many parts [m].
 COAT = 1.25 * EDGE

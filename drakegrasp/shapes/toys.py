@@ -1,7 +1,7 @@
 """Toys and a prize, one function per class: sizes come in, watertight meshes go out.
 
 Every mesh stands or lies on the plane z = 0 as it would on a table, z up. All lengths are in [m]
-and all angles in [rad]; `drakegrasp.objects.builtin.classes` has the table of their ranges.
+and all angles in [rad]; `drakegrasp.shapes.classes` has the table of their ranges.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from itertools import product
 import numpy as np
 import trimesh
 
-from drakegrasp.objects.builtin.booleans import cut, fuse
-from drakegrasp.objects.builtin.primitives import ball, block, lathe, moved, pillar, rod, rotated
-from drakegrasp.objects.builtin.profiles import BROAD, EDGE, LARGE, resample, smooth
-from drakegrasp.objects.builtin.shapes.vessels import loop_handle, vessel
+from drakegrasp.shapes.modelling.booleans import cut, fuse
+from drakegrasp.shapes.modelling.primitives import ball, block, lathe, moved, pillar, rod, rotated
+from drakegrasp.shapes.modelling.profiles import BROAD, EDGE, LARGE, resample, smooth
+from drakegrasp.shapes.vessels import loop_handle, vessel
 
 
 def chess_pawn(*, base: float, head: float, height: float) -> trimesh.Trimesh:

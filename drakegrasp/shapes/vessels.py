@@ -2,7 +2,7 @@
 
 Every mesh stands or lies on the plane z = 0 as it would on a table, z up. `vessel` and
 `loop_handle` are for other families too. All lengths are in [m] and all angles in [rad];
-`drakegrasp.objects.builtin.classes` has the table of their ranges.
+`drakegrasp.shapes.classes` has the table of their ranges.
 """
 
 from __future__ import annotations
@@ -11,9 +11,8 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from drakegrasp.objects.builtin.booleans import cut, fuse
-from drakegrasp.objects.builtin.modelling import bar, revolve, solid, sweep
-from drakegrasp.objects.builtin.profiles import (
+from drakegrasp.shapes.modelling.booleans import cut, fuse
+from drakegrasp.shapes.modelling.profiles import (
     COARSE,
     EDGE,
     bevelled,
@@ -23,6 +22,7 @@ from drakegrasp.objects.builtin.profiles import (
     smooth,
     spread_evenly,
 )
+from drakegrasp.shapes.modelling.solids import bar, revolve, solid, sweep
 
 
 def mug(

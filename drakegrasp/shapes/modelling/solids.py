@@ -14,7 +14,7 @@ from scipy.interpolate import PchipInterpolator
 
 from drakegrasp.frames import Array
 from drakegrasp.mesh.surfaces import Faces
-from drakegrasp.objects.builtin.profiles import EDGE, arc_length, ring_angles, ring_size
+from drakegrasp.shapes.modelling.profiles import EDGE, arc_length, ring_angles, ring_size
 
 #: Vertices are rounded to this many decimals [m], in files too. This also hides the rounding
 #: errors by which machines differ.

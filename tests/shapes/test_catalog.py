@@ -16,17 +16,17 @@ from scipy.spatial import ConvexHull
 from drakegrasp.config import BuiltinConfig
 from drakegrasp.errors import MeshError
 from drakegrasp.mesh.surfaces import overlap_share
-from drakegrasp.objects.builtin.catalog import (
+from drakegrasp.seeding import Stream
+from drakegrasp.shapes import packaging, vessels
+from drakegrasp.shapes.catalog import (
     BuiltinObject,
     builtin_object,
     builtin_sources,
     draw_builtin,
     export_builtin,
 )
-from drakegrasp.objects.builtin.classes import CLASSES, ObjectClass
-from drakegrasp.objects.builtin.parameters import Range, deg, mm, pieces
-from drakegrasp.objects.builtin.shapes import packaging, vessels
-from drakegrasp.seeding import Stream
+from drakegrasp.shapes.classes import CLASSES, ObjectClass
+from drakegrasp.shapes.parameters import Range, deg, mm, pieces
 
 #: What lies lower than this bears on the table [m].
 CONTACT_HEIGHT = 0.001
@@ -218,7 +218,7 @@ def test_export_round_trip(tmp_path: Path) -> None:
 def test_another_process_writes_the_same_bytes(tmp_path: Path) -> None:
     here = export_builtin(tmp_path / "here", SOME)
     script = (
-        "import sys; from drakegrasp.objects.builtin.catalog import export_builtin; "
+        "import sys; from drakegrasp.shapes.catalog import export_builtin; "
         "export_builtin(sys.argv[1], sys.argv[2:])"
     )
     command = [sys.executable, "-c", script, str(tmp_path / "there"), *SOME]

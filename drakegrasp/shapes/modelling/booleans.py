@@ -13,7 +13,7 @@ import trimesh
 from drakegrasp.arithmetic import dot, norm
 from drakegrasp.frames import Array
 from drakegrasp.mesh.surfaces import Faces
-from drakegrasp.objects.builtin.modelling import ON_AXIS, grid_box, solid
+from drakegrasp.shapes.modelling.solids import ON_AXIS, grid_box, solid
 
 #: Triangles lower than this [m] are removed after a Boolean operation: their normals mean little.
 SLIVER = 0.0005

@@ -1,7 +1,7 @@
 """Things of a kitchen, one function per class: sizes come in, watertight meshes go out.
 
 Every mesh stands or lies on the plane z = 0 as it would on a table, z up. All lengths are in [m]
-and all angles in [rad]; `drakegrasp.objects.builtin.classes` has the table of their ranges.
+and all angles in [rad]; `drakegrasp.shapes.classes` has the table of their ranges.
 """
 
 from __future__ import annotations
@@ -9,9 +9,8 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from drakegrasp.objects.builtin.booleans import cut, fuse
-from drakegrasp.objects.builtin.modelling import extrude, revolve, sweep
-from drakegrasp.objects.builtin.primitives import (
+from drakegrasp.shapes.modelling.booleans import cut, fuse
+from drakegrasp.shapes.modelling.primitives import (
     ball,
     block,
     lathe,
@@ -22,7 +21,7 @@ from drakegrasp.objects.builtin.primitives import (
     scalloped,
     tube,
 )
-from drakegrasp.objects.builtin.profiles import (
+from drakegrasp.shapes.modelling.profiles import (
     BROAD,
     EDGE,
     LARGE,
@@ -30,7 +29,8 @@ from drakegrasp.objects.builtin.profiles import (
     rounded_rectangle,
     smooth,
 )
-from drakegrasp.objects.builtin.shapes.vessels import loop_handle
+from drakegrasp.shapes.modelling.solids import extrude, revolve, sweep
+from drakegrasp.shapes.vessels import loop_handle
 
 
 def toaster(*, length: float, width: float, height: float) -> trimesh.Trimesh:

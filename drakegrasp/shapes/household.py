@@ -1,7 +1,7 @@
 """Things of a household, one function per class: sizes come in, watertight meshes go out.
 
 Every mesh stands or lies on the plane z = 0 as it would on a table, z up. All lengths are in [m]
-and all angles in [rad]; `drakegrasp.objects.builtin.classes` has the table of their ranges.
+and all angles in [rad]; `drakegrasp.shapes.classes` has the table of their ranges.
 """
 
 from __future__ import annotations
@@ -10,10 +10,17 @@ import numpy as np
 import trimesh
 
 from drakegrasp.arithmetic import sin_cos_deg
-from drakegrasp.objects.builtin.booleans import fuse
-from drakegrasp.objects.builtin.modelling import revolve
-from drakegrasp.objects.builtin.primitives import ball, lathe, prism, rod, tube
-from drakegrasp.objects.builtin.profiles import BROAD, COARSE, EDGE, resample, smooth, spread_evenly
+from drakegrasp.shapes.modelling.booleans import fuse
+from drakegrasp.shapes.modelling.primitives import ball, lathe, prism, rod, tube
+from drakegrasp.shapes.modelling.profiles import (
+    BROAD,
+    COARSE,
+    EDGE,
+    resample,
+    smooth,
+    spread_evenly,
+)
+from drakegrasp.shapes.modelling.solids import revolve
 
 
 def watertap(*, base: float, pipe: float, height: float, reach: float) -> trimesh.Trimesh:

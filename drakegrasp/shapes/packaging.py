@@ -1,7 +1,7 @@
 """Things that are bought packed, one function per class: sizes come in, watertight meshes go out.
 
 Every mesh stands or lies on the plane z = 0 as it would on a table, z up. All lengths are in [m]
-and all angles in [rad]; `drakegrasp.objects.builtin.classes` has the table of their ranges.
+and all angles in [rad]; `drakegrasp.shapes.classes` has the table of their ranges.
 """
 
 from __future__ import annotations
@@ -9,10 +9,9 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from drakegrasp.objects.builtin.booleans import cut, fuse
-from drakegrasp.objects.builtin.modelling import bar, extrude, grid_box, revolve, sweep
-from drakegrasp.objects.builtin.primitives import block, lathe, moved, pillar, rod, rotated, tube
-from drakegrasp.objects.builtin.profiles import (
+from drakegrasp.shapes.modelling.booleans import cut, fuse
+from drakegrasp.shapes.modelling.primitives import block, lathe, moved, pillar, rod, rotated, tube
+from drakegrasp.shapes.modelling.profiles import (
     BROAD,
     EDGE,
     LARGE,
@@ -22,6 +21,7 @@ from drakegrasp.objects.builtin.profiles import (
     smooth,
     spread_evenly,
 )
+from drakegrasp.shapes.modelling.solids import bar, extrude, grid_box, revolve, sweep
 
 
 def box(*, width: float, depth: float, height: float, edge: float = 1.2 * EDGE) -> trimesh.Trimesh:

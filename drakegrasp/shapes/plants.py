@@ -1,7 +1,7 @@
 """Fruit and plants, one function per class: sizes come in, watertight meshes go out.
 
 Every mesh stands or lies on the plane z = 0 as it would on a table, z up. All lengths are in [m]
-and all angles in [rad]; `drakegrasp.objects.builtin.classes` has the table of their ranges.
+and all angles in [rad]; `drakegrasp.shapes.classes` has the table of their ranges.
 """
 
 from __future__ import annotations
@@ -11,10 +11,9 @@ import trimesh
 from scipy.interpolate import PchipInterpolator
 
 from drakegrasp.arithmetic import sin_cos_deg
-from drakegrasp.objects.builtin.booleans import flat_base, fuse, stand
-from drakegrasp.objects.builtin.modelling import bar, extrude, revolve, sweep
-from drakegrasp.objects.builtin.primitives import ball, lathe, moved, scalloped, tube
-from drakegrasp.objects.builtin.profiles import (
+from drakegrasp.shapes.modelling.booleans import flat_base, fuse, stand
+from drakegrasp.shapes.modelling.primitives import ball, lathe, moved, scalloped, tube
+from drakegrasp.shapes.modelling.profiles import (
     EDGE,
     LARGE,
     ellipse,
@@ -22,6 +21,7 @@ from drakegrasp.objects.builtin.profiles import (
     rounded_polygon,
     smooth,
 )
+from drakegrasp.shapes.modelling.solids import bar, extrude, revolve, sweep
 
 
 def apple(*, radius: float, height: float) -> trimesh.Trimesh:

@@ -1,1 +1,0 @@
-"""The built-in objects, made of parametric shapes."""

@@ -1,0 +1,1 @@
+"""The built-in objects: 64 classes of parametric shapes."""

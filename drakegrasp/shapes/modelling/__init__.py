@@ -1,0 +1,1 @@
+"""How the shapes are made: curves, solids, parts and booleans."""
