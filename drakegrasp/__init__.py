@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from drakegrasp.api import build_dataset, verify_grasp, verify_grasps
     from drakegrasp.build.pipeline import BuildReport
     from drakegrasp.build.replay import Replay, replay_trial
-    from drakegrasp.config import Config, load_config
+    from drakegrasp.config import Config
     from drakegrasp.dataset.checks.findings import Violation
     from drakegrasp.dataset.checks.run import check_dataset
     from drakegrasp.dataset.reader import GraspDataset, Sample
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from drakegrasp.errors import DrakegraspError
     from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp
     from drakegrasp.hand.description import Hand, load_hand
+    from drakegrasp.hand.settings import load_config
     from drakegrasp.outcomes import Outcome
     from drakegrasp.simulation.placement import PlacedObject, place_object
     from drakegrasp.verification.result import Verification
@@ -43,7 +44,7 @@ _HOMES = {
     "Violation": "dataset.checks.findings",
     "build_dataset": "api",
     "check_dataset": "dataset.checks.run",
-    "load_config": "config",
+    "load_config": "hand.settings",
     "load_hand": "hand.description",
     "pack_grasp": "grasp",
     "place_object": "simulation.placement",

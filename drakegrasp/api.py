@@ -20,7 +20,7 @@ from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.certificates import security_of
 from drakegrasp.cluster.connect import connect, dashboard_line, has_dashboard
 from drakegrasp.cluster.executor import RESUBMISSIONS, DaskExecutor
-from drakegrasp.config import Config, load_config
+from drakegrasp.config import Config
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import claim_directory
 from drakegrasp.dataset.paths import BUILTIN_FOLDER
@@ -28,7 +28,7 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import ConfigError, GraspError, MeshError, listed
 from drakegrasp.frames import as_numbers
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.file_format import with_hand_defaults
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.runtime.executor import count_workers, run_here
 from drakegrasp.runtime.progress import progress_bar
@@ -154,7 +154,6 @@ def build_on(
     refuse_two_ends(config)
     known = draw_builtin(config.builtin) if sources is None else sources
     _refuse_unknown(only, [each.name for each in known])
-    config = with_hand_defaults(config)
     with build_lock(out) as dead, ExitStack() as stack:
         # A directory that cannot be used is refused before workers start.
         claim_directory(out, config)

@@ -2,16 +2,15 @@
 
 The defaults are the paper's numbers, but for the split: `paper` states that of the paper. A preset
 or a user's YAML file states only what differs. Angles are in degrees here, where YAML is read, and
-have `_deg` in their names; everywhere else they are in radians. Use `load_config` to get a
-configuration.
+have `_deg` in their names; everywhere else they are in radians. Use
+`drakegrasp.hand.settings.load_config` to get a configuration.
 """
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path, PurePath
 from typing import Annotated, Any, Literal
@@ -174,29 +173,17 @@ class CandidateConfig(_Section):
     local_y_deg: Angles = tuple(range(0, 360, 20))
     local_z_deg: Angles = tuple(range(0, 360, 45))
     jitter_deg: NonNegative = 0.0  # each angle gets a whole number of degrees below this
-    # [m] of the palm from the surface, an attempt each; None: the hand's own (paper)
-    standoffs: Annotated[tuple[Positive, ...], Field(min_length=1)] | None = None
-    # One is drawn per attempt; None: the hand's own (released code).
-    spreads_deg: (
-        Annotated[tuple[Annotated[float, Field(ge=0.0, le=180.0)], ...], Field(min_length=1)] | None
-    ) = None
+    # [m] of the palm from the surface, an attempt each (paper); not given: the hand's own.
+    standoffs: Annotated[tuple[Positive, ...], Field(min_length=1)]
+    # One is drawn per attempt (released code); not given: the hand's own.
+    spreads_deg: Annotated[
+        tuple[Annotated[float, Field(ge=0.0, le=180.0)], ...], Field(min_length=1)
+    ]
 
     @property
     def methods(self) -> tuple[str, ...]:
         """The samplers that take turns."""
         return (self.method,) if isinstance(self.method, str) else self.method
-
-    @property
-    def drawn_standoffs(self) -> tuple[float, ...]:
-        """The stand-offs, which `hand.file_format.with_hand_defaults` has filled in."""
-        assert self.standoffs is not None
-        return self.standoffs
-
-    @property
-    def drawn_spreads_deg(self) -> tuple[float, ...]:
-        """The spreads, which `hand.file_format.with_hand_defaults` has filled in."""
-        assert self.spreads_deg is not None
-        return self.spreads_deg
 
 
 class RefineConfig(_Section):
@@ -402,10 +389,14 @@ POSTPROCESSING_KEYS = (
 )
 
 
+#: A hand of the package.
+DEFAULT_HAND = "barrett"
+
+
 class Config(_Section):
     """Everything that decides what is in a dataset, except the meshes."""
 
-    hand: str = "barrett"  # a hand in drakegrasp/models, or a path to a hand's YAML
+    hand: str = DEFAULT_HAND  # a hand in drakegrasp/models, or a path to a hand's YAML
     seed: Seed = 0
     # Candidates in a work unit; None: 50, growing up to 400.
     unit_candidates: Count | None = None
@@ -414,7 +405,7 @@ class Config(_Section):
     builtin: BuiltinConfig = BuiltinConfig()
     physics: PhysicsConfig = PhysicsConfig()
     settle: SettleConfig = SettleConfig()
-    candidates: CandidateConfig = CandidateConfig()
+    candidates: CandidateConfig
     refine: RefineConfig = RefineConfig()
     screen: ScreenConfig = ScreenConfig()
     close: CloseConfig = CloseConfig()
@@ -518,82 +509,12 @@ def preset_names() -> list[str]:
     )
 
 
-def load_config(
-    source: str | Path | None = None,
-    overrides: Sequence[str] = (),
-    **values: Any,
-) -> Config:
-    """Return the configuration of a preset or YAML file, with overrides applied.
-
-    Args:
-        source: A preset's name, or a path to a YAML file; None: the defaults.
-        overrides: `"a.b=c"` strings, c read as YAML; later ones win.
-        values: Top-level fields, e.g. `seed=1`; they win over the overrides.
-
-    Raises:
-        ConfigError: If a key is unknown, or a value is of the wrong type or impossible;
-            one line with the key's path, what it must be, and what it was.
-    """
-    tree = {} if source is None else _read_source(source)
-    own = copy.deepcopy(tree)
-    for text in overrides:
-        _apply_override(tree, text)
-    tree.update({key: value for key, value in values.items() if value is not None})
-    try:
-        return parse_config(_with_absolute_hand(tree))
-    except ConfigError:
-        # If the file alone is invalid, name it in the error.
-        if source is not None:
-            _refuse_mistakes(own, str(source))
-        raise
-
-
-def _refuse_mistakes(tree: dict[str, Any], name: str) -> None:
-    """Refuse a preset or a file that is invalid before overrides are applied.
-
-    Raises:
-        ConfigError: If it cannot be used, with its name.
-    """
-    try:
-        parse_config(tree)
-    except ConfigError as error:
-        raise ConfigError(f"{name}: {error}") from None
-
-
-def override_config(config: Config, overrides: Sequence[str]) -> Config:
-    """Return a configuration with `"a.b=c"` strings applied, see `load_config`.
-
-    Raises:
-        ConfigError: See `load_config`.
-    """
-    tree = config.to_dict()
-    for text in overrides:
-        _apply_override(tree, text)
-    return parse_config(_with_absolute_hand(tree) if tree["hand"] != config.hand else tree)
-
-
 def with_whole_lifts(config: Config) -> Config:
     """Return a configuration that lifts each closed hand until it is certain whether it holds."""
     lift = config.lift.model_copy(
         update={"stop_when": "never", "least_chance": 0.0, "least_depth_variance": 0.0}
     )
     return config.model_copy(update={"lift": lift})
-
-
-def absolute_hand(name_or_yaml: str | Path) -> str:
-    """Return the absolute path of a hand's file; the name of a hand of the package as it is.
-
-    What is stored must name the same file in whatever directory it is read.
-    """
-    name, folder = str(name_or_yaml), resources.files("drakegrasp") / "models"
-    own = (folder / f"{name}_hand.yaml").is_file()
-    return name if own or not Path(name).is_file() else str(Path(name).absolute())
-
-
-def _with_absolute_hand(tree: dict[str, Any]) -> dict[str, Any]:
-    """Return a tree of values whose hand, if it is a file, is an absolute path."""
-    hand = tree.get("hand")
-    return {**tree, "hand": absolute_hand(hand)} if isinstance(hand, str) and hand else tree
 
 
 def parse_config(tree: dict[str, Any]) -> Config:
@@ -631,8 +552,12 @@ def parse_stored(tree: Any) -> Config:
     return parse_config(tree)
 
 
-def _read_source(source: str | Path) -> dict[str, Any]:
-    """Return the tree of values in a preset or a YAML file."""
+def read_settings(source: str | Path) -> dict[str, Any]:
+    """Return the tree of values in a preset or a YAML file.
+
+    Raises:
+        ConfigError: If there is no such preset or file, or it holds no mapping.
+    """
     # A preset's name, or a path.
     preset = resources.files("drakegrasp") / "presets" / f"{source}.yaml"
     if isinstance(source, str) and source in preset_names():
@@ -671,7 +596,16 @@ def _is_section(key: str) -> bool:
     return isinstance(annotation, type) and issubclass(annotation, BaseModel)
 
 
-def _apply_override(tree: dict[str, Any], text: str) -> None:
+def apply_override(tree: dict[str, Any], text: str) -> None:
+    """Set a value in a tree.
+
+    Args:
+        tree: Is changed.
+        text: `"a.b=c"`, c read as YAML.
+
+    Raises:
+        ConfigError: If the text is of another form, or a section of the path is a value.
+    """
     path, separator, value = text.partition("=")
     keys = path.strip().split(".")
     if not separator or not all(keys):

@@ -14,9 +14,9 @@ from pathlib import Path
 from drakegrasp.api import build_dataset
 from drakegrasp.cli.build import print_stats
 from drakegrasp.cli.tables import make_console
-from drakegrasp.config import load_config
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.errors import DrakegraspError
+from drakegrasp.hand.settings import load_config
 from drakegrasp.shapes.catalog import draw_builtin, export_builtin
 from drakegrasp.visualization.contact_sheet import contact_sheet
 

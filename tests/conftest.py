@@ -11,7 +11,8 @@ from helpers.meshes import G3DB, SMALL, write_fixed
 from hypothesis import settings
 
 from drakegrasp.build.pipeline import build
-from drakegrasp.config import Config, load_config
+from drakegrasp.config import Config
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.executor import run_here
 

@@ -15,10 +15,10 @@ from distributed import Client
 
 from drakegrasp.api import build_on, verify_grasp, verify_grasps
 from drakegrasp.cluster.connect import connect
-from drakegrasp.config import Config, load_config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import ConfigError, GraspError, MeshError
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.progress import silent
@@ -210,7 +210,7 @@ def test_unknown_object_is_refused_before_anything_starts(
 ) -> None:
     sources = find_meshes(small_meshes) if objects else None
     with pytest.raises(MeshError, match=r"only must be names of objects \(.*\), got '9_cup'"):
-        build_on(_never(), sources, tmp_path / "out", Config(), only=["9_cup"])
+        build_on(_never(), sources, tmp_path / "out", load_config(), only=["9_cup"])
     assert not (tmp_path / "out").exists()
 
 

@@ -19,9 +19,9 @@ from helpers.datasets import BOXES, make_dataset
 from helpers.meshes import write_fixed
 
 from drakegrasp.cli.main import main
-from drakegrasp.config import load_config
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.rejections import Decisions, write_decisions
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 
 ROOT = Path(__file__).resolve().parents[1]

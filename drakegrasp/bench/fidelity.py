@@ -15,9 +15,10 @@ import numpy as np
 import trimesh
 
 from drakegrasp.build.attempts import TrialSetup, predict_attempts, try_attempt
-from drakegrasp.config import Config, override_config, with_whole_lifts
+from drakegrasp.config import Config, with_whole_lifts
 from drakegrasp.errors import ConfigError
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.settings import override_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.simulation.candidates import Attempt

@@ -23,7 +23,6 @@ from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.contact_fit import ContactFit, fit_contacts
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
@@ -109,7 +108,7 @@ def _load(out: Path, name: str, mesh_sha256: str, config: Config) -> PreparedObj
 
 def list_attempts(prepared: PreparedObject, indices: range, config: Config) -> list[Attempt]:
     """Return the attempts of a range of an object's candidates, with their conditions."""
-    model, rules, seed = prepared.model, with_hand_defaults(config).candidates, config.seed
+    model, rules, seed = prepared.model, config.candidates, config.seed
     made = make_attempts(prepared.candidates, indices, rules, name=model.name, seed=seed)
     return [_with_conditions(attempt, model, config) for attempt in made]
 

@@ -50,7 +50,7 @@ class Counts:
 
         # Progress: attempts of the first round, all by outcome, and those that were there before.
         self._pool, self._report = pool, report
-        standoffs = len(manifest.config.candidates.drawn_standoffs)
+        standoffs = len(manifest.config.candidates.standoffs)
         self._total = standoffs * sum(entry.candidates for entry in manifest.objects)
         self._standoffs, self._done, self._samples = standoffs, 0, 0
         self._wanted = manifest.config.samples

@@ -14,7 +14,6 @@ from drakegrasp.build.stage_times import MEASURED, StageTimes
 from drakegrasp.config import Config
 from drakegrasp.dataset.assembly.pack import TASK_ROWS
 from drakegrasp.errors import ConfigError
-from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.environment import available_cores
 from drakegrasp.shapes.classes import CLASSES
@@ -80,7 +79,6 @@ def plan_build(objects: int, config: Config, workers: int, times: StageTimes) ->
 
     Raises:
         ConfigError: If there is no object or no worker.
-        HandError: If the hand's file cannot be read.
     """
     for name, count in (("objects", objects), ("workers", workers)):
         if count < 1:
@@ -91,7 +89,7 @@ def plan_build(objects: int, config: Config, workers: int, times: StageTimes) ->
     # How much there is to do.
     ranges = tuple(config.unit_ranges(config.candidates.max))
     units = objects * len(ranges)
-    standoffs = len(with_hand_defaults(config).candidates.drawn_standoffs)
+    standoffs = len(config.candidates.standoffs)
     attempts = objects * config.candidates.max * standoffs
     successes = attempts * times.successes
     samples = successes * times.samples

@@ -40,7 +40,6 @@ from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import is_assembled
 from drakegrasp.errors import DataError, DrakegraspError, listed
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.sources import MeshSource, source_sha256
 from drakegrasp.runtime.executor import Executor, WorkerPool
 from drakegrasp.runtime.files import disk_full_named, sweep_temporary
@@ -121,7 +120,6 @@ def build(
         MachineError: If the workers cannot do the work.
     """
     refuse_two_ends(config)
-    config = with_hand_defaults(config)
     drive_of(load_hand(config.hand), config.lift)
     with build_lock(out) as dead:
         return build_locked(sources, out, config, execute, dead=dead, pool=pool, show=show)
@@ -142,7 +140,7 @@ def build_locked(
     Args:
         sources: The meshes.
         out: Directory; new, empty, or of this configuration.
-        config: All the rules, with the stand-offs and spreads of the hand filled in.
+        config: All the rules.
         execute: Does the work.
         dead: Who held the lock before and died, as `build_lock` yields it.
         pool: The executor's processes, as for `build`.

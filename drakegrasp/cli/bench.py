@@ -99,7 +99,7 @@ def _measure(
 
     from drakegrasp.bench import measure as measuring
     from drakegrasp.cli import tables
-    from drakegrasp.config import load_config
+    from drakegrasp.hand.settings import load_config
     from drakegrasp.objects.sources import find_meshes
     from drakegrasp.runtime.progress import progress_bar
     from drakegrasp.shapes.catalog import builtin_sources

@@ -78,7 +78,7 @@ def export_objects(directory: Path, **options: Any) -> None:
     Equal options write equal bytes on every machine.
     """
     from drakegrasp.build.request import BUILTIN
-    from drakegrasp.config import load_config
+    from drakegrasp.hand.settings import load_config
     from drakegrasp.runtime.progress import progress_bar
     from drakegrasp.shapes.catalog import export_builtin
 

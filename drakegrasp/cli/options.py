@@ -211,13 +211,12 @@ def parse_request(options: Mapping[str, Any]) -> BuildRequest:
         HandError: If the hand's file cannot be read.
     """
     # Loading pydantic takes a while, and `--help` must answer at once.
-    from drakegrasp.config import load_config
-    from drakegrasp.hand.file_format import with_hand_defaults
+    from drakegrasp.hand.settings import load_config
 
     return BuildRequest(
         objects=options["objects"],
         out=options["out"].absolute(),
-        config=with_hand_defaults(load_config(options["config"], chosen_settings(options))),
+        config=load_config(options["config"], chosen_settings(options)),
         units=options["units"],
         manifest=options["manifest"],
         only=options["only"],

@@ -9,12 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from drakegrasp.config import Config, load_config
+from drakegrasp.config import Config
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError, GraspError
 from drakegrasp.frames import Array
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file
+from drakegrasp.hand.settings import load_config
 from drakegrasp.verification.placed_grasp import (
     dataset_config,
     mesh_config,

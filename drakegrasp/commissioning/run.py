@@ -12,9 +12,10 @@ from pathlib import Path
 from drakegrasp.commissioning import model_checks, motion_checks
 from drakegrasp.commissioning.finding import Finding
 from drakegrasp.commissioning.trial_grasps import check_grasp
-from drakegrasp.config import Config, load_config
+from drakegrasp.config import Config
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.settings import load_config
 from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.runtime.blas import one_thread
 

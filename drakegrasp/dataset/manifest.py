@@ -30,7 +30,6 @@ from drakegrasp.config import (
     Positive,
     Seed,
     Share,
-    override_config,
     parse_stored,
 )
 from drakegrasp.dataset import lock, log
@@ -50,6 +49,7 @@ from drakegrasp.errors import ConfigError, DataError, GraspError
 from drakegrasp.frames import read_pose, unpack_pose
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_digest, hand_file
+from drakegrasp.hand.settings import override_config
 from drakegrasp.runtime.file_set import refuse_half_replaced
 from drakegrasp.runtime.files import probe_folder, write_atomic
 

@@ -25,10 +25,9 @@ from pydantic import (
     with_config,
 )
 
-from drakegrasp.config import Config, describe_mistake
+from drakegrasp.config import describe_mistake
 from drakegrasp.errors import HandError, one_line
 from drakegrasp.frames import Array
-from drakegrasp.hand.files import hand_file
 from drakegrasp.yaml_text import parse_yaml
 
 #: Version of the keys that this module reads.
@@ -273,20 +272,3 @@ def read_hand_file(path: Path) -> HandFile:
             for mistake in error.errors()
         ]
         raise HandError(f"{path}: {'; '.join(lines)}") from None
-
-
-def with_hand_defaults(config: Config) -> Config:
-    """Return a configuration whose stand-offs and spreads are numbers: its own, or the hand's.
-
-    Raises:
-        HandError: If the hand's file cannot be read.
-    """
-    candidates = config.candidates
-    if candidates.standoffs is not None and candidates.spreads_deg is not None:
-        return config
-    described = read_hand_file(hand_file(config.hand))
-    changes = {
-        "standoffs": candidates.standoffs or described.standoffs,
-        "spreads_deg": candidates.spreads_deg or described.spreads_deg,
-    }
-    return config.model_copy(update={"candidates": candidates.model_copy(update=changes)})

@@ -125,7 +125,7 @@ def _parts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[dict[str, An
 def _facts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[tuple[str, str]]:
     """Return further numbers of an attempt as names and texts."""
     key = snapshot.key(i)
-    standoffs = snapshot.config.candidates.drawn_standoffs
+    standoffs = snapshot.config.candidates.standoffs
     s = key.standoff_index
     standoff = f"{1e3 * standoffs[s]:.0f} mm" if s < len(standoffs) else str(s)
     in_parts = {part.name for part in PARTS}

@@ -329,11 +329,11 @@ def make_attempts(
     Args:
         candidates: Of the object.
         indices: The range.
-        config: Stand-offs and spreads, see `hand.file_format.with_hand_defaults`.
+        config: Stand-offs and spreads.
         name: The object's name.
         seed: Of the dataset; with name and candidate it decides the spreads.
     """
-    spreads, standoffs = np.deg2rad(config.drawn_spreads_deg), config.drawn_standoffs
+    spreads, standoffs = np.deg2rad(config.spreads_deg), config.standoffs
     for i in indices:
         # Each candidate has its own stream, so ranges do not depend on each other.
         stream = Stream(seed, object_key(name), i)

@@ -17,9 +17,10 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from drakegrasp.config import Config, load_config
+from drakegrasp.config import Config
 from drakegrasp.errors import ConfigError, GraspError, MeshError
 from drakegrasp.frames import Array, make_pose, read_pose, transform_points
+from drakegrasp.hand.settings import load_config
 from drakegrasp.mesh.loading import clean_triangles
 from drakegrasp.objects.model import ObjectModel, make_object, prepare_object
 from drakegrasp.objects.sources import UNITS, find_mesh

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from drakegrasp.config import Config, RandomizeConfig, absolute_hand, override_config, parse_config
+from drakegrasp.config import Config, RandomizeConfig
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.reader import GraspDataset
@@ -24,6 +24,7 @@ from drakegrasp.errors import GraspError, HandError
 from drakegrasp.frames import Array, read_pose, unpack_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.files import hand_digest
+from drakegrasp.hand.settings import override_config
 from drakegrasp.simulation.placement import (
     Placed,
     PlacedObject,
@@ -165,9 +166,7 @@ def dataset_config(
 
 
 def _with_hand(config: Config, hand: str | Path | None) -> Config:
-    if hand is None:
-        return config
-    return parse_config({**config.to_dict(), "hand": absolute_hand(hand)})
+    return config if hand is None else override_config(config, [], hand=str(hand))
 
 
 def _refuse_other_hand(dataset: GraspDataset, hand: str) -> None:

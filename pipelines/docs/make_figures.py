@@ -15,10 +15,9 @@ from doc_figures import frames_figure, hero_figure
 from trial_pictures import frames_panels, render_trial
 
 from drakegrasp.build.prepare import prepare
-from drakegrasp.config import load_config
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.prepared_objects import PreparedObject
-from drakegrasp.hand.file_format import with_hand_defaults
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.shapes.catalog import export_builtin
 from drakegrasp.simulation.candidates import sample_candidates
@@ -62,11 +61,11 @@ def draw_candidates(prepared: PreparedObject, rays: int, png: Path) -> None:
     drawn = {}
     for method, title in METHODS.items():
         overrides = [f"candidates.method={method}", f"candidates.max={10 * rays}"]
-        config = with_hand_defaults(load_config(None, overrides))
+        config = load_config(None, overrides)
         candidates = sample_candidates(
             prepared.model, prepared.X_TO, config.candidates, config.seed
         )
-        drawn[title] = palm_rays(candidates, max(config.candidates.drawn_standoffs), rays)
+        drawn[title] = palm_rays(candidates, max(config.candidates.standoffs), rays)
     model = prepared.model
     save_figure(palm_poses_figure(model.visual_vertices, model.visual_faces, drawn), png, dpi=130)
 

@@ -27,12 +27,13 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.build.prepare import prepare
-from drakegrasp.config import FilterConfig, override_config
+from drakegrasp.config import FilterConfig
 from drakegrasp.dataset.filters import breaks_hold
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.frames import unpack_pose
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.settings import override_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.blas import one_thread

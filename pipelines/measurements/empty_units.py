@@ -19,8 +19,8 @@ import click
 from drakegrasp.build.work_unit import UnitSummary, WorkUnit
 from drakegrasp.cluster.connect import connect
 from drakegrasp.cluster.executor import DaskExecutor
-from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry
+from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
 
 #: Units that run first, so that Dask has allocated what it allocates once.
@@ -37,7 +37,7 @@ def run_nothing(unit: WorkUnit) -> UnitSummary:
 
 def units(count: int) -> Iterator[WorkUnit]:
     """Yield the work units of a dataset of objects with 10,000 palm poses each."""
-    config = Config()
+    config = load_config()
     per_object = len(tuple(config.unit_ranges(config.candidates.max)))
     objects = tuple(
         ObjectEntry(

@@ -21,10 +21,11 @@ from tempfile import TemporaryDirectory
 
 from drakegrasp.build.attempts import TrialSetup, list_attempts, predict_attempts
 from drakegrasp.build.prepare import prepare
-from drakegrasp.config import Config, load_config, override_config
+from drakegrasp.config import BuiltinConfig, Config
 from drakegrasp.dataset.filters import breaks_hold
 from drakegrasp.errors import MeshError
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.blas import one_thread
@@ -37,7 +38,7 @@ from drakegrasp.simulation.trial import TrialRecord, run_attempt
 def sources_of(objects: str, units: str, every: int, folder: Path) -> list[MeshSource]:
     """Return every n-th mesh of a directory, or of the built-in objects."""
     if objects == "builtin":
-        found = builtin_sources(folder, Config().builtin)
+        found = builtin_sources(folder, BuiltinConfig())
     else:
         found = find_meshes(Path(objects), units=units)
     return list(found)[::every]

@@ -12,9 +12,9 @@ from pathlib import Path
 
 from drakegrasp.build.attempts import TrialSetup, predict_attempts, try_attempt
 from drakegrasp.build.prepare import prepare
-from drakegrasp.config import Config, load_config
+from drakegrasp.config import Config
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.file_format import with_hand_defaults
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import make_attempts
@@ -35,8 +35,7 @@ def main() -> None:
     parser.add_argument("--units", default="m")
     arguments = parser.parse_args()
 
-    rules = load_config(overrides=[f"candidates.max={arguments.candidates}"], seed=arguments.seed)
-    config = with_hand_defaults(rules)
+    config = load_config(overrides=[f"candidates.max={arguments.candidates}"], seed=arguments.seed)
     for source in find_meshes(arguments.meshes, units=arguments.units):
         if not arguments.names or source.name in arguments.names:
             start = time.monotonic()

@@ -23,11 +23,12 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.build.attempts import find_attempt
-from drakegrasp.config import Config, override_config
+from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import TRIALS_FILE
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.settings import override_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.progress import Report, progress_bar
 from drakegrasp.simulation.construction import build_scene

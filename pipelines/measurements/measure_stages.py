@@ -26,13 +26,13 @@ from drakegrasp.build.prepare import prepare_one
 from drakegrasp.build.stage_times import StageTimes
 from drakegrasp.build.work_unit import UnitSummary
 from drakegrasp.cli.options import shared
-from drakegrasp.config import load_config
 from drakegrasp.dataset.assembly.pack import pack_rows
 from drakegrasp.dataset.assembly.survey import survey_object
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
 from drakegrasp.dataset.statistics import count_splits
 from drakegrasp.errors import DataError
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 

@@ -6,8 +6,8 @@ import sys
 
 import numpy as np
 
-from drakegrasp.config import load_config
 from drakegrasp.errors import MeshError
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import prepare_object
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.simulation.settle import settle

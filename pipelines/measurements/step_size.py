@@ -15,10 +15,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from drakegrasp.build.attempts import list_attempts
-from drakegrasp.config import Config, override_config
+from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.settings import override_config
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.construction import build_scene

@@ -18,11 +18,11 @@ from pathlib import Path
 import click
 import numpy as np
 
-from drakegrasp.config import override_config
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry, read_manifest, write_manifest
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared, save_prepared
 from drakegrasp.dataset.shards import Shard, ShardHeader, read_shard, write_shard
+from drakegrasp.hand.settings import override_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.simulation.randomization.draws import draw_conditions

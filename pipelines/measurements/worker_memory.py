@@ -27,7 +27,7 @@ from drakegrasp.build.work_unit import UnitSummary, WorkUnit
 from drakegrasp.cli.options import shared
 from drakegrasp.cluster.connect import connect
 from drakegrasp.cluster.executor import DaskExecutor
-from drakegrasp.config import load_config
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 

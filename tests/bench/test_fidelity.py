@@ -10,8 +10,8 @@ from helpers.objects import CUBE, box_model
 
 from drakegrasp.bench import fidelity
 from drakegrasp.build.attempts import TrialSetup
-from drakegrasp.config import load_config
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.settings import load_config
 from drakegrasp.mesh.surfaces import signed_volume
 from drakegrasp.outcomes import Outcome
 

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from helpers.objects import CUBE, box_model, from_above, standing
 
-from drakegrasp.config import Config, load_config, override_config
+from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, make_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import PAD_BAND
 from drakegrasp.hand.kinematics import fingertip_poses
+from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.randomization.conditions import usual_conditions

@@ -15,9 +15,9 @@ import mujoco
 
 from drakegrasp.bench.mujoco_drive import FingerDrive
 from drakegrasp.bench.mujoco_scene import build_mujoco_scene
-from drakegrasp.config import load_config
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.file_format import Drive
+from drakegrasp.hand.settings import load_config
 
 pytestmark = pytest.mark.sim
 

@@ -10,10 +10,10 @@ pytest.importorskip("coacd")
 
 from drakegrasp.bench.mujoco_baseline import MujocoBaseline  # noqa: E402
 from drakegrasp.commissioning.trial_grasps import trial_grasps  # noqa: E402
-from drakegrasp.config import load_config  # noqa: E402
 from drakegrasp.frames import invert_pose, make_pose  # noqa: E402
 from drakegrasp.hand.description import load_hand  # noqa: E402
 from drakegrasp.hand.kinematics import fingertip_poses, joint_positions  # noqa: E402
+from drakegrasp.hand.settings import load_config  # noqa: E402
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from drakegrasp.build.estimate import CERTIFY_SECONDS, START_SECONDS, plan_build, plan_lines
 from drakegrasp.build.stage_times import MEASURED, logged_times, read_times
-from drakegrasp.config import load_config, override_config
 from drakegrasp.dataset.log import BuildLog
 from drakegrasp.dataset.statistics import count_funnel
 from drakegrasp.errors import ConfigError, DataError
+from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.outcomes import Removal
 
 EVEN = replace(

@@ -22,11 +22,12 @@ from helpers.builds import FAST, finish, start_build, wait_for_shards, workers_o
 from drakegrasp.build import attempts
 from drakegrasp.build.pipeline import build
 from drakegrasp.build.work_unit import WorkUnit, run_unit
-from drakegrasp.config import Config, load_config
+from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import PreparedObject
 from drakegrasp.dataset.statistics import count_funnel
 from drakegrasp.errors import BlankImageError, DiskFullError, MachineError
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here

@@ -14,9 +14,10 @@ import trimesh
 from drakegrasp.build.pipeline import build
 from drakegrasp.build.prepare import PrepareTask, prepare_one
 from drakegrasp.build.work_unit import WorkUnit, run_unit
-from drakegrasp.config import Config, load_config
+from drakegrasp.config import Config
 from drakegrasp.dataset.manifest import ObjectEntry, RefusedMesh, read_manifest
 from drakegrasp.errors import MachineError
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes, source_sha256
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.runtime.fault_injection import VARIABLE

@@ -19,7 +19,6 @@ from helpers.meshes import write_fixed
 from drakegrasp.build.merge import merge
 from drakegrasp.build.pipeline import build
 from drakegrasp.build.replay import replay_trial
-from drakegrasp.config import load_config
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import claim_directory, read_manifest, write_manifest
@@ -27,6 +26,7 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.rejections import AttemptKey
 from drakegrasp.errors import DataError
 from drakegrasp.hand.files import MODELS
+from drakegrasp.hand.settings import load_config
 from drakegrasp.inspection.catalog import Catalog
 from drakegrasp.inspection.rows import read_look
 from drakegrasp.objects.sources import find_meshes

@@ -11,8 +11,8 @@ from helpers.meshes import SMALL
 
 from drakegrasp.build.pipeline import BuildReport, build
 from drakegrasp.build.replay import replay_trial
-from drakegrasp.config import load_config
 from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.hand.settings import load_config
 from drakegrasp.inspection.catalog import Catalog
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Removal

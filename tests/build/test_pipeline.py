@@ -19,7 +19,7 @@ from drakegrasp.build.pipeline import BuildReport, build
 from drakegrasp.build.prepare import prepare_one
 from drakegrasp.build.replay import replay_trial
 from drakegrasp.build.work_unit import run_unit
-from drakegrasp.config import Config, load_config, override_config
+from drakegrasp.config import Config
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.log import read_log
@@ -28,6 +28,7 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.shards import read_shard, trial_columns, write_shard
 from drakegrasp.dataset.statistics import count_funnel
 from drakegrasp.errors import ConfigError, DataError, MachineError, MeshError
+from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.runtime.executor import Executor, run_here

@@ -9,8 +9,8 @@ import pytest
 import trimesh
 
 from drakegrasp.build.prepare import PrepareTask, prepare_one
-from drakegrasp.config import load_config
 from drakegrasp.dataset.manifest import ObjectEntry, RefusedMesh
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes, source_sha256
 
 pytestmark = pytest.mark.sim

@@ -14,10 +14,11 @@ from helpers.meshes import SMALL
 from drakegrasp.api import verify_grasps
 from drakegrasp.build.pipeline import build
 from drakegrasp.build.replay import record_trial, replay_trial
-from drakegrasp.config import Config, load_config
+from drakegrasp.config import Config
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import CONDITION_FIELDS
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here

@@ -18,7 +18,7 @@ from drakegrasp.build import attempts
 from drakegrasp.build.pipeline import build
 from drakegrasp.build.replay import record_trial, replay_trial
 from drakegrasp.build.work_unit import WorkUnit, run_unit
-from drakegrasp.config import Config, load_config, override_config
+from drakegrasp.config import Config
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.assembly.split import rank_in_split, split_samples
 from drakegrasp.dataset.checks.run import check_dataset
@@ -33,6 +33,7 @@ from drakegrasp.dataset.rejections import (
 from drakegrasp.dataset.statistics import count_funnel, count_splits
 from drakegrasp.errors import MachineError
 from drakegrasp.frames import unpack_pose
+from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.inspection.catalog import Catalog
 from drakegrasp.inspection.query import Query, select
 from drakegrasp.objects.sources import MeshSource, find_meshes

@@ -9,8 +9,9 @@ import pytest
 from helpers.hands import write_pincer
 
 from drakegrasp.build.warnings import nothing_trains, too_heavy
-from drakegrasp.config import SplitConfig, load_config
+from drakegrasp.config import SplitConfig
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource
 
 

@@ -10,11 +10,11 @@ from helpers.datasets import OTO, make_dataset
 from helpers.hands import write_with_optional_fingers
 
 from drakegrasp.cli.verify_request import VerifyRequest, place_requested
-from drakegrasp.config import load_config
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.settings import load_config
 
 DRAWN = [
     "randomize.friction_hand=[0.7, 1.3]",

@@ -10,8 +10,8 @@ from distributed import Worker
 
 from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.connect import connect
-from drakegrasp.config import load_config
 from drakegrasp.errors import MachineError
+from drakegrasp.hand.settings import load_config
 
 pytestmark = [pytest.mark.cluster, pytest.mark.slow]
 

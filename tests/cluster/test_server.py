@@ -25,7 +25,7 @@ from drakegrasp.cluster import launch
 from drakegrasp.cluster.admission import worker_environment
 from drakegrasp.cluster.launch import start_cluster
 from drakegrasp.cluster.request import ClusterRequest
-from drakegrasp.config import load_config
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.executor import run_here
 

@@ -32,8 +32,8 @@ from drakegrasp.cluster.certificates import make_certificates, private_directory
 from drakegrasp.cluster.connect import connect, dask_settings
 from drakegrasp.cluster.launch import _exports, start_cluster
 from drakegrasp.cluster.request import ClusterRequest, walltime_seconds
-from drakegrasp.config import load_config
 from drakegrasp.errors import ConfigError, MachineError
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.executor import run_here
 

@@ -8,8 +8,8 @@ from helpers.hands import write_slider
 
 from drakegrasp.commissioning.pinch import find_opposition, find_pinch, reach
 from drakegrasp.commissioning.trial_grasps import check_grasp, trial_grasps
-from drakegrasp.config import load_config
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.scene import hand_positions

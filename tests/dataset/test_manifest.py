@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from drakegrasp.config import load_config
 from drakegrasp.dataset.manifest import (
     Manifest,
     ObjectEntry,
@@ -22,6 +21,7 @@ from drakegrasp.dataset.manifest import (
 )
 from drakegrasp.dataset.paths import FILE_NAME
 from drakegrasp.errors import DataError
+from drakegrasp.hand.settings import load_config
 
 #: The end of a manifest as builds have always written it.
 ENTRIES = """ "objects": [

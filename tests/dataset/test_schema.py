@@ -16,7 +16,6 @@ from helpers.datasets import OTM, OTO, TRIALS, edit_file, make_dataset
 
 from drakegrasp.build.columns import TrialRow
 from drakegrasp.build.replay import replay_trial
-from drakegrasp.config import Config
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import claim_directory
@@ -33,6 +32,7 @@ from drakegrasp.dataset.schema import (
 from drakegrasp.dataset.shards import ASSEMBLED_FIELDS
 from drakegrasp.dataset.statistics import count_funnel, count_splits, count_unfinished
 from drakegrasp.errors import DataError
+from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Stage
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.verification.result import Verification
@@ -145,7 +145,7 @@ def old(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (count_unfinished, TRIALS),
         (count_funnel, TRIALS),
         (count_splits, OTO),
-        (partial(claim_directory, config=Config()), FILE_NAME),
+        (partial(claim_directory, config=load_config()), FILE_NAME),
         (partial(replay_trial, trial_id=0), FILE_NAME),
     ],
 )

@@ -17,10 +17,8 @@ from helpers.hands import (
 )
 from pydrake.multibody.plant import MultibodyPlant
 
-from drakegrasp.config import load_config
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import SLIDE, load_hand
-from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.hand.files import MODELS, hand_digest
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses, joint_positions
 from drakegrasp.hand.parsing import add_model
@@ -97,17 +95,6 @@ def test_the_worlds_joint_is_refused(tmp_path: Path) -> None:
     )
     with pytest.raises(HandError, match=r"joint 'fixed' must join two links of the hand"):
         load_hand(write_pincer(tmp_path, sdf))
-
-
-def test_stand_offs_and_spreads_are_the_hands_own_unless_they_are_set(tmp_path: Path) -> None:
-    paper = with_hand_defaults(load_config()).candidates
-    assert paper.standoffs == (0.06, 0.09, 0.12)
-    assert paper.spreads_deg == (0.0, 11.25, 22.5)
-    gripper = with_hand_defaults(load_config(hand=str(write_pincer(tmp_path)))).candidates
-    assert (gripper.standoffs, gripper.spreads_deg) == ((0.03, 0.05), (0.0,))
-    config = load_config(overrides=["candidates.standoffs=[0.01]"], hand="franka")
-    assert with_hand_defaults(config).candidates.standoffs == (0.01,)
-    assert with_hand_defaults(with_hand_defaults(config)) == with_hand_defaults(config)
 
 
 def test_a_preshape_fixes_joints_at_their_positions(tmp_path: Path) -> None:

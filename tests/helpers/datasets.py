@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 import trimesh
 
-from drakegrasp.config import CameraConfig, Config, load_config
+from drakegrasp.config import CameraConfig, Config
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.manifest import Manifest, installed_versions, write_manifest
@@ -21,8 +21,8 @@ from drakegrasp.dataset.prepared_objects import PreparedObject, save_prepared
 from drakegrasp.dataset.schema import LOOK_FIELDS, TRIAL_FIELDS, sizes
 from drakegrasp.dataset.shards import Shard, ShardHeader, trial_columns, write_shard
 from drakegrasp.frames import Array, invert_pose, make_pose, pack_pose, rotation_about, unpack_pose
-from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.hand.lift_chance import GRASP_CONTACTS, ClosedGrasp, read_lift_chance
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.outcomes import Outcome, Stage
@@ -241,16 +241,14 @@ def _made(overrides: tuple[str, ...], names: tuple[str, ...]) -> tuple[Path, Pat
 
 
 def _make(out: Path, meshes: Path, overrides: tuple[str, ...]) -> Path:
-    config = with_hand_defaults(
-        load_config(
-            overrides=[
-                "camera.size=32",
-                "unit_candidates=2",
-                "filters.min_depth_variance=0",
-                "split.valid_fraction=0.34",
-                *overrides,
-            ]
-        )
+    config = load_config(
+        overrides=[
+            "camera.size=32",
+            "unit_candidates=2",
+            "filters.min_depth_variance=0",
+            "split.valid_fraction=0.34",
+            *overrides,
+        ]
     )
     models, entries = [], []
     (out / "objects").mkdir(parents=True)

@@ -20,10 +20,10 @@ import trimesh
 from threadpoolctl import threadpool_info
 
 from drakegrasp.build.prepare import prepare
-from drakegrasp.config import BuiltinConfig, SplitConfig, load_config
+from drakegrasp.config import BuiltinConfig, SplitConfig
 from drakegrasp.dataset.assembly.split import split_samples
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.file_format import with_hand_defaults
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.seeding import Stream
 from drakegrasp.shapes.catalog import export_builtin
@@ -65,7 +65,7 @@ def objects(folder: Path, meshes: Path | None) -> Iterator[MeshSource]:
 
 def object_draws(source: MeshSource) -> Iterator[tuple[str, str]]:
     """Yield the draws of one object under the preset `paper`."""
-    config = with_hand_defaults(load_config(overrides=["candidates.max=1000"]))
+    config = load_config(overrides=["candidates.max=1000"])
     hand = load_hand(config.hand)
     prepared = prepare(source, config)
     model, candidates = prepared.model, prepared.candidates

@@ -11,7 +11,6 @@ import trimesh
 
 from drakegrasp.config import Config
 from drakegrasp.frames import make_pose
-from drakegrasp.hand.file_format import with_hand_defaults
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.simulation.candidates import (
@@ -51,8 +50,7 @@ def drawn_attempts(
     """Yield all attempts that a build draws for an object: a test takes as many as it needs."""
     candidates = sample_candidates(model, X_TO, config.candidates, seed)
     every = range(len(candidates))
-    rules = with_hand_defaults(config).candidates
-    return make_attempts(candidates, every, rules, name=model.name, seed=seed)
+    return make_attempts(candidates, every, config.candidates, name=model.name, seed=seed)
 
 
 def from_above(model: ObjectModel, standoff: float, *, spread: float = 0.0) -> Attempt:

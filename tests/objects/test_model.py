@@ -9,8 +9,8 @@ from helpers.meshes import BOX, assert_sound, box, box_inertia, open_box, prepar
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drakegrasp.config import load_config
 from drakegrasp.errors import MeshError
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import load_object, prepare_object, save_object
 from drakegrasp.objects.sources import MeshSource
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 from helpers.objects import CUBE, box_model
 
-from drakegrasp.config import Config, load_config
+from drakegrasp.config import Config
 from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.scene import Scene

@@ -16,9 +16,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
-from drakegrasp.config import CandidateConfig, Config, RefineConfig, load_config
+from drakegrasp.config import CandidateConfig, RefineConfig
 from drakegrasp.frames import Array, make_pose
-from drakegrasp.hand.file_format import with_hand_defaults
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.seeding import Stream, object_key
@@ -43,14 +43,19 @@ BOXES = {
     "39_beerbottle": ((0.05897712, 0.05885956, 0.23366707), 75_776, 16_296),
 }
 
+DEFAULTS = load_config().candidates
+NORMALS = DEFAULTS.model_copy(update={"method": "normals", "max": 400})
+
 #: A few hundred poses instead of ten thousand.
-COARSE = CandidateConfig(
-    global_x_deg=(0, 60, 120),
-    global_y_deg=(0, 90, 180, 270),
-    global_z_deg=(0, 45),
-    local_x_deg=(0, 20, 160, 180),
-    local_y_deg=(0, 20, 180, 340),
-    local_z_deg=(0, 45, 180),
+COARSE = DEFAULTS.model_copy(
+    update={
+        "global_x_deg": (0, 60, 120),
+        "global_y_deg": (0, 90, 180, 270),
+        "global_z_deg": (0, 45),
+        "local_x_deg": (0, 20, 160, 180),
+        "local_y_deg": (0, 20, 180, 340),
+        "local_z_deg": (0, 45, 180),
+    }
 )
 
 
@@ -133,9 +138,7 @@ def coordinates(R: Array, p: Array, half: Array) -> Array:
 @pytest.fixture(scope="module", params=BOXES)
 def reference(request: pytest.FixtureRequest) -> Reference:
     half = np.array(BOXES[request.param][0]) / 2.0
-    poses, combinations, valid = rotation_candidates(
-        half, standing(half), CandidateConfig(), Stream(0)
-    )
+    poses, combinations, valid = rotation_candidates(half, standing(half), DEFAULTS, Stream(0))
     every = coordinates(*every_valid_pose(half), half)
     return Reference(request.param, half, poses, combinations, valid, every)
 
@@ -219,7 +222,7 @@ def test_first_pose_looks_down_from_above() -> None:
     poses, combinations, valid = rotation_candidates(
         [0.02, 0.03, 0.06],
         standing(np.array([0.02, 0.03, 0.06])),
-        CandidateConfig(**zero),
+        DEFAULTS.model_copy(update=zero),
         stream(),
     )
     assert (combinations, valid) == (1, 1)
@@ -281,7 +284,7 @@ def test_ray_and_unit_box_in_the_cases_that_divide_by_zero(
     assert ray_meets_box(np.array([p], dtype=float), direction, np.ones(3)).tolist() == [meets]
 
 
-@pytest.mark.parametrize("axes", [CandidateConfig(), COARSE])
+@pytest.mark.parametrize("axes", [DEFAULTS, COARSE])
 def test_distinct_rotations_are_what_every_combination_gives(axes: CandidateConfig) -> None:
     """To the bit: a jitter of whole degrees below one adds nothing, and looks at each of them."""
     each = axes.model_copy(update={"jitter_deg": 1.0})
@@ -307,7 +310,9 @@ def test_jitter_keeps_the_number_of_combinations() -> None:
 def test_jitter_moves_every_angle_by_whole_degrees_below_its_bound() -> None:
     """At the zero pose the palm leans by no more than four tilts of three degrees each."""
     axes = {f"{w}_{a}_deg": (0,) for w in ("global", "local") for a in "xyz"}
-    still = CandidateConfig(**{**axes, "local_z_deg": tuple(range(360))}, jitter_deg=1)
+    still = DEFAULTS.model_copy(
+        update={**axes, "local_z_deg": tuple(range(360)), "jitter_deg": 1.0}
+    )
     moved = still.model_copy(update={"jitter_deg": 4.0})
     half = np.full(3, 0.05)
     # Whole degrees below one are zero.
@@ -479,7 +484,7 @@ def test_palm_ray_to_a_box_in_closed_form(box: ObjectModel) -> None:
 
 def test_normals_approach_the_faces_of_a_box_squarely(box: ObjectModel) -> None:
     """Gz is minus a face's normal, and the palm ray ends on that face."""
-    config = CandidateConfig(method="normals", max=400)
+    config = NORMALS
     drawn = sample_candidates(box, BOX_X_TO, config, 0)
     z = drawn.X_OG[:, :3, 2]
     np.testing.assert_allclose(np.abs(z).max(axis=1), 1.0, atol=1e-12)
@@ -510,7 +515,7 @@ def test_normals_spread_over_the_area_and_roll_freely(box: ObjectModel) -> None:
 
 
 def test_normals_that_start_under_the_table_are_dropped(box: ObjectModel) -> None:
-    drawn = sample_candidates(box, BOX_X_TO, CandidateConfig(method="normals", max=400), 0)
+    drawn = sample_candidates(box, BOX_X_TO, NORMALS, 0)
     assert len(drawn) == drawn.valid == drawn.distinct == 400
     # The bottom's share of the area is 0.0048 / 0.0376.
     assert 400 < drawn.combinations < 400 / 0.75
@@ -542,7 +547,7 @@ def some_candidates(n: int = 30) -> Candidates:
 
 
 def attempts(indices: range, *, name: str = "thing", seed: int = 0) -> list[Attempt]:
-    config = with_hand_defaults(Config()).candidates
+    config = load_config().candidates
     return list(make_attempts(some_candidates(), indices, config, name=name, seed=seed))
 
 

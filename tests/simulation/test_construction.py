@@ -11,9 +11,10 @@ from helpers.objects import from_above, model_of, standing
 from pydrake.multibody.plant import DiscreteContactApproximation
 from pydrake.multibody.tree import BodyIndex, RigidBody
 
-from drakegrasp.config import Config, override_config
+from drakegrasp.config import Config
 from drakegrasp.frames import X_WT
 from drakegrasp.hand.description import Hand
+from drakegrasp.hand.settings import override_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.construction import (
     build_object_scene,

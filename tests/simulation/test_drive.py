@@ -12,10 +12,11 @@ from helpers.objects import STANDOFF, box_model, from_above, standing
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import ExternallyAppliedSpatialForce
 
-from drakegrasp.config import Config, load_config, override_config
+from drakegrasp.config import Config
 from drakegrasp.errors import ConfigError
 from drakegrasp.frames import X_WT, make_pose
 from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation import drive as drive_module

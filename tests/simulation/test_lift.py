@@ -10,8 +10,8 @@ import pytest
 from helpers.objects import CUBE, STANDOFF, from_above, standing
 from pydrake.math import RigidTransform
 
-from drakegrasp.config import load_config, override_config
 from drakegrasp.frames import X_WT, make_pose, rotation_about
+from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation import lift as lifting

@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from drakegrasp.config import load_config
 from drakegrasp.errors import GraspError, MeshError
 from drakegrasp.frames import Array, make_pose, pack_pose
+from drakegrasp.hand.settings import load_config
 from drakegrasp.simulation.placement import (
     MAX_GAP,
     Placed,

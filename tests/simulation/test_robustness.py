@@ -10,8 +10,9 @@ import pytest
 from helpers.objects import STANDOFF, from_above, standing
 from scipy.spatial.transform import Rotation
 
-from drakegrasp.config import Config, load_config, override_config
+from drakegrasp.config import Config
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.robustness import Certificate, certify, least_friction

@@ -19,10 +19,11 @@ from helpers.objects import (
     standing,
 )
 
-from drakegrasp.config import ScreenConfig, load_config
+from drakegrasp.config import ScreenConfig
 from drakegrasp.frames import make_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.finger_sweep import GAP_STRIDE, hand_paths
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation import screen

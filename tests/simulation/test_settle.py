@@ -16,9 +16,10 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from drakegrasp.arithmetic import norm
-from drakegrasp.config import Config, load_config, override_config
+from drakegrasp.config import Config
 from drakegrasp.errors import MeshError
 from drakegrasp.frames import X_WT, make_pose
+from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.mesh.surfaces import half_edges, signed_volume
 from drakegrasp.objects.model import ObjectModel, make_object, prepare_object
 from drakegrasp.objects.sources import find_meshes

@@ -7,9 +7,9 @@ import pytest
 from helpers.objects import CUBE, standing
 from scipy.spatial.transform import Rotation
 
-from drakegrasp.config import load_config
 from drakegrasp.frames import X_WT, make_pose
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.settings import load_config
 from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.simulation.trajectory import LiftPath, carrying_force, lift_path
 from drakegrasp.verification.forces.contact_forces import hand_contacts

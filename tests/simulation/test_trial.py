@@ -18,10 +18,10 @@ from helpers.objects import (
     standing,
 )
 
-from drakegrasp.config import load_config, override_config
 from drakegrasp.errors import BlankImageError
 from drakegrasp.frames import X_WT, invert_pose, make_pose
 from drakegrasp.hand.file_format import PAD_BAND
+from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.model import prepare_object
 from drakegrasp.objects.sources import MeshSource
 from drakegrasp.outcomes import Outcome, Stage

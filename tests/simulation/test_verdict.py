@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from drakegrasp.config import load_config
+from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.verdict import (
     STABLE_SLIP,

@@ -15,9 +15,10 @@ from helpers.objects import CUBE, box_model, from_above, standing
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from drakegrasp.config import Config, load_config
+from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, make_pose
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.construction import build_scene

@@ -10,8 +10,8 @@ import trimesh
 from helpers.objects import standing
 from helpers.verdicts import some_contacts, some_trial
 
-from drakegrasp.config import load_config
 from drakegrasp.frames import make_pose
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import make_object
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.placement import PlacedObject

@@ -16,10 +16,10 @@ import trimesh
 from helpers.objects import standing
 from helpers.verdicts import some_contacts, some_trial
 
-from drakegrasp.config import load_config
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, VERIFICATION_FIELDS, sizes
 from drakegrasp.errors import DataError
 from drakegrasp.frames import make_pose, pack_pose
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import make_object
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Pregrasp

@@ -13,10 +13,11 @@ from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
 import drakegrasp as dg
-from drakegrasp.config import Config, load_config, override_config
+from drakegrasp.config import Config
 from drakegrasp.errors import GraspError, OffSurfaceError
 from drakegrasp.frames import X_WT, invert_pose, make_pose
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.construction import build_scene

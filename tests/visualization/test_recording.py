@@ -19,8 +19,9 @@ import pytest
 from helpers.objects import CUBE, box_model, from_above, standing
 
 from drakegrasp.build.replay import record_trial
-from drakegrasp.config import Config, load_config
+from drakegrasp.config import Config
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Attempt

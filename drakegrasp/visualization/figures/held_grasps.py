@@ -105,7 +105,7 @@ def read_approaches(out: Path, name: str, config: Config) -> ObjectApproaches:
     won, approached = outcome == Outcome.SUCCESS, outcome != Outcome.RAY_MISS
     X_TO = prepared.resting_poses[pose]
     directions = approach_directions(X_TO, X_OG)
-    reach = np.array(config.candidates.drawn_standoffs)[standoff[won]]
+    reach = np.array(config.candidates.standoffs)[standoff[won]]
     p_OG, z_O = X_OG[won, :3, 3], X_OG[won, :3, 2]
     return ObjectApproaches(
         name=name,

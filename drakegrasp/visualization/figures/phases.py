@@ -57,7 +57,7 @@ def phases_figure(out: Path, trial_id: int) -> Figure:
     camera = trial.config.camera
     X_TG = multiply(invert_pose(X_WT), trial.place.X_WG)
     X_WC = multiply(X_WT, camera_pose_oto(X_TG, camera, unpack_pose(trial.row["X_C0C"])))
-    standoff = trial.config.candidates.drawn_standoffs[int(trial.row["standoff_index"])]
+    standoff = trial.config.candidates.standoffs[int(trial.row["standoff_index"])]
     end = X_WC[:3, 3] + (camera.distance + standoff) * X_WC[:3, 2]
     strokes = {
         SIGHT: [np.vstack([X_WC[:3, 3], end])],

@@ -98,7 +98,7 @@ def compare_samplers(out: Path, other: Path | None = None) -> SamplerComparison:
     return SamplerComparison(
         shown=shown,
         candidates=candidates,
-        standoff=max(config.candidates.drawn_standoffs),
+        standoff=max(config.candidates.standoffs),
         numbers={
             "what": "palm_rays: palm rays that meet the object; coverage: share of the directions "
             f"of the half sphere over the table that lie within {NEAR_DEG:g} deg of one of them, "

@@ -28,7 +28,6 @@ from helpers.datasets import (
     set_at,
 )
 
-from drakegrasp.config import load_config
 from drakegrasp.dataset.assembly import decisions
 from drakegrasp.dataset.checks import attempts, data_file, object_files, trials_file
 from drakegrasp.dataset.checks.run import check_dataset
@@ -36,7 +35,7 @@ from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.dataset.paths import model_path, plan_path
 from drakegrasp.dataset.shards import read_shard, write_shard
 from drakegrasp.errors import DataError
-from drakegrasp.hand.file_format import with_hand_defaults
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel, load_object, save_object
 from drakegrasp.runtime.executor import processes
 
@@ -240,11 +239,11 @@ def test_files_are_of_the_manifests_configuration(out: Path) -> None:
     manifest = read_manifest(out)
     files = (OTO, OTM, TRIALS)
     overrides = ["camera.size=32", "unit_candidates=2", "split.valid_fraction=0.34"]
-    other = with_hand_defaults(load_config(overrides=overrides))
+    other = load_config(overrides=overrides)
     write_manifest(replace(manifest, config=other), out)
     what = "attribute config must be that of manifest.json"
     must_find(out, *((name, "", None, what) for name in files))
-    other = with_hand_defaults(load_config(overrides=[*overrides, "seed=1"]))
+    other = load_config(overrides=[*overrides, "seed=1"])
     write_manifest(replace(manifest, config=other), out)
     hits = {h for h in found(out) if not h[0].startswith("shards")}
     assert {h[0] for h in hits} == set(files)

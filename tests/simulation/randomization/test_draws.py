@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drakegrasp.config import Config, load_config
+from drakegrasp.config import Config
 from drakegrasp.frames import rotation_angle
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.randomization.conditions import Conditions, usual_conditions
 from drakegrasp.simulation.randomization.draws import WORDS, draw_conditions

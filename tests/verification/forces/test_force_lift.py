@@ -10,9 +10,10 @@ import pytest
 from helpers.objects import CUBE, box_model, standing
 from scipy.spatial.transform import Rotation
 
-from drakegrasp.config import Config, load_config, override_config
+from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.construction import build_object_scene

@@ -49,7 +49,7 @@ def test_approaches_are_of_one_object(boxes: Path, tmp_path: Path) -> None:
         palms = file["trials/X_OG"][12:24][[1, 2, 4, 5, 6, 8, 9, 10]].reshape(-1, 3, 4)
     np.testing.assert_allclose(found.directions, -palms[:, :, 2], atol=1e-9)
     with h5py.File(boxes / TRIALS, "r") as file:
-        standoffs = np.array(config.candidates.drawn_standoffs)
+        standoffs = np.array(config.candidates.standoffs)
         rows = file["trials/standoff_index"][12:24][[0, 3, 11]]
     lengths = np.linalg.norm(found.rays[:, 1] - found.rays[:, 0], axis=1)
     np.testing.assert_allclose(lengths, standoffs[rows])

@@ -1,0 +1,112 @@
+"""Loads a configuration: what it leaves open, the hand's file says. Does not import Drake.
+
+In: a preset or a YAML file, and what overrides it. Out: a complete `Config`, whose stand-offs and
+spreads are numbers.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from drakegrasp.config import DEFAULT_HAND, Config, apply_override, parse_config, read_settings
+from drakegrasp.errors import ConfigError
+from drakegrasp.hand.file_format import read_hand_file
+from drakegrasp.hand.files import hand_file, hand_names
+
+#: Keys of `candidates` that are the hand's own where they are not given, or null.
+HAND_KEYS = ("standoffs", "spreads_deg")
+
+
+def load_config(
+    source: str | Path | None = None,
+    overrides: Sequence[str] = (),
+    **values: Any,
+) -> Config:
+    """Return the configuration of a preset or YAML file, with overrides applied.
+
+    Stand-offs and spreads that nobody gives are those of the hand's file.
+
+    Args:
+        source: A preset's name, or a path to a YAML file; None: the defaults.
+        overrides: `"a.b=c"` strings, c read as YAML; later ones win.
+        values: Top-level fields, e.g. `seed=1`; they win over the overrides.
+
+    Raises:
+        ConfigError: If a key is unknown, or a value is of the wrong type or impossible;
+            one line with the key's path, what it must be, and what it was.
+        HandError: If the hand's file is needed and cannot be read.
+    """
+    tree = {} if source is None else read_settings(source)
+    own = copy.deepcopy(tree)
+    for text in overrides:
+        apply_override(tree, text)
+    tree.update({key: value for key, value in values.items() if value is not None})
+    try:
+        return _completed(_with_absolute_hand(tree))
+    except ConfigError:
+        # If the file alone is invalid, name it in the error.
+        if source is not None:
+            _refuse_mistakes(own, str(source))
+        raise
+
+
+def override_config(config: Config, overrides: Sequence[str], **values: Any) -> Config:
+    """Return a configuration with overrides applied, see `load_config`.
+
+    Another hand brings its own stand-offs and spreads, unless they are overridden, too.
+
+    Raises:
+        ConfigError, HandError: See `load_config`.
+    """
+    tree, known = config.to_dict(), config.to_dict()
+    for text in overrides:
+        apply_override(tree, text)
+    tree.update({key: value for key, value in values.items() if value is not None})
+    if tree["hand"] != config.hand:
+        tree = _with_absolute_hand(tree)
+
+    candidates = tree["candidates"]
+    if tree["hand"] != config.hand and isinstance(candidates, dict):
+        same = [key for key in HAND_KEYS if candidates.get(key) == known["candidates"][key]]
+        tree["candidates"] = {**candidates, **dict.fromkeys(same)}
+    return _completed(tree)
+
+
+def _with_absolute_hand(tree: dict[str, Any]) -> dict[str, Any]:
+    """Return a tree of values whose hand, if it is a file, is an absolute path.
+
+    What is stored must name the same file in whatever directory it is read.
+    """
+    hand = tree.get("hand")
+    if isinstance(hand, str) and hand and hand not in hand_names() and Path(hand).is_file():
+        return {**tree, "hand": str(Path(hand).absolute())}
+    return tree
+
+
+def _completed(tree: dict[str, Any]) -> Config:
+    """Return the configuration of a tree of values, where those of the hand may be missing."""
+    hand, candidates = tree.get("hand", DEFAULT_HAND), tree.get("candidates", {})
+    if not isinstance(candidates, dict):
+        return parse_config(tree)  # which refuses it
+    missing = [key for key in HAND_KEYS if candidates.get(key) is None]
+    if missing:
+        # A hand that is no text is refused by `parse_config`, too.
+        described = read_hand_file(hand_file(hand if isinstance(hand, str) else DEFAULT_HAND))
+        filled = {key: getattr(described, key) for key in missing}
+        tree = {**tree, "candidates": {**candidates, **filled}}
+    return parse_config(tree)
+
+
+def _refuse_mistakes(tree: dict[str, Any], name: str) -> None:
+    """Refuse what a preset or a file says by itself.
+
+    Raises:
+        ConfigError: If it cannot be used, with its name.
+    """
+    try:
+        _completed(tree)
+    except ConfigError as error:
+        raise ConfigError(f"{name}: {error}") from None
