@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy.typing as npt
 
-from drakegrasp.build.pipeline import BuildReport, build_locked
+from drakegrasp.build.pipeline import BuildReport, build_locked, refuse_unusable
 from drakegrasp.build.request import BUILTIN
-from drakegrasp.build.target import refuse_two_ends
 from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.certificates import security_of
 from drakegrasp.cluster.connect import connect, dashboard_line, has_dashboard
@@ -145,13 +144,13 @@ def build_on(
         show: Whether to show progress on standard error.
 
     Raises:
-        ConfigError: If the configuration states a number of grasps and of samples to stop at.
+        ConfigError: As `refuse_unusable` of `build.pipeline`.
         DataError: If `out` cannot be used, another process builds there, or no mesh can be
             simulated.
         MeshError: If `only` names no object.
         MachineError: If a worker would give other results than this machine.
     """
-    refuse_two_ends(config)
+    refuse_unusable(config)
     known = draw_builtin(config.builtin) if sources is None else sources
     _refuse_unknown(only, [each.name for each in known])
     with build_lock(out) as dead, ExitStack() as stack:

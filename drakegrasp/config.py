@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from importlib import resources
 from pathlib import Path, PurePath
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import yaml
 from pydantic import (
@@ -22,6 +23,7 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    PrivateAttr,
     ValidationError,
     field_validator,
     model_validator,
@@ -147,23 +149,58 @@ class SettleConfig(_Section):
     )
 
 
-#: Names of the samplers of palm poses.
+#: Name and digest of a class of the user's own, as `drakegrasp.runtime.user_code` makes them.
+_OWN_CLASS = re.compile(r"[^/\\:]+\.py:[A-Za-z_]\w*@[0-9a-f]{16}")
+
+
+def is_own_class(name: object) -> bool:
+    """Return whether a value of a setting names a class of the user's own, with its digest."""
+    return isinstance(name, str) and _OWN_CLASS.fullmatch(name) is not None
+
+
+class _ExtensibleSection(_Section):
+    """A section that may name classes of the user's own."""
+
+    _code: dict[str, str] = PrivateAttr(default_factory=dict)
+
+    @property
+    def code(self) -> Mapping[str, str]:
+        """Text of their files by their names; it is written nowhere and read from no dataset."""
+        return self._code
+
+    def with_code(self, code: Mapping[str, str]) -> Self:
+        """Return the section with the texts of classes."""
+        section = self.model_copy()
+        section._code = dict(code)
+        return section
+
+
+#: Names of the package's samplers of palm poses.
 SAMPLER_NAMES = ("rotations", "normals")
 
 
 def _samplers(value: Any) -> str | tuple[str, ...]:
     """Return the name of a sampler, or the names of those that take turns."""
     names = value if isinstance(value, list | tuple) else [value]
-    if not names or any(name not in SAMPLER_NAMES for name in names):
+    if not names or any(name not in SAMPLER_NAMES and not is_own_class(name) for name in names):
         known = ", ".join(SAMPLER_NAMES)
-        raise ValueError(f"must be one of {known}, or a list of them, got {value!r}")
+        raise ValueError(f"must be one of {known}, FILE.py:NAME, or a list of them, got {value!r}")
     return tuple(names) if names is value else str(value)
 
 
-class CandidateConfig(_Section):
+def _own_filters(value: Any) -> tuple[str, ...]:
+    """Return the names of the user's own filters; none for null."""
+    names = value if isinstance(value, list | tuple) else [] if value is None else [value]
+    if not all(map(is_own_class, names)):
+        raise ValueError(f"must be FILE.py:NAME, or a list of them, got {value!r}")
+    return tuple(names)
+
+
+class CandidateConfig(_ExtensibleSection):
     """The palm poses that are tried."""
 
-    # Sampler, or a list of samplers that take turns; one that is named twice has two turns.
+    # Sampler, or a list of samplers that take turns; one that is named twice has two turns. One of
+    # the user's own is `file.py:Name`.
     method: Annotated[str | tuple[str, ...], BeforeValidator(_samplers)] = "rotations"
     max: Count = 10_000  # per object; more are thinned at random, by the seed (paper)
     global_x_deg: Angles = tuple(range(0, 181, 30))  # paper, Table II
@@ -313,7 +350,7 @@ class RandomizeConfig(_Section):
     mass: Range | None = None  # factor of the object's mass and inertia
 
 
-class FilterConfig(_Section):
+class FilterConfig(_ExtensibleSection):
     """Which successes become samples, decided when the files are assembled.
 
     Null switches a limit off. Limits of the hold are own choices; docs/reference/outcomes.md.
@@ -337,6 +374,8 @@ class FilterConfig(_Section):
     max_penetration: Positive | None = None  # [m], of the object in a fingertip
     max_imbalance: Positive | None = None  # of the fingertips' forces, as a share of the weight
     max_normal_sum: Positive | None = None  # of the contact normals, per finger: 0 balanced, 1 not
+    # Filters of the user's own, `file.py:Name` each.
+    own: Annotated[tuple[str, ...], BeforeValidator(_own_filters)] = ()
 
 
 class SplitConfig(_Section):
@@ -452,8 +491,28 @@ class Config(_Section):
         return self
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the resolved values as plain JSON types."""
-        return self.model_dump(mode="json")
+        """Return the resolved values as plain JSON types.
+
+        `filters.own` leaves no trace where there is none.
+        """
+        tree = self.model_dump(mode="json")
+        if not self.filters.own:
+            del tree["filters"]["own"]
+        return tree
+
+    @property
+    def code(self) -> Mapping[str, str]:
+        """Text of the files of the user's own classes, by their names."""
+        return {**self.candidates.code, **self.filters.code}
+
+    def with_code(self, code: Mapping[str, str]) -> Config:
+        """Return the configuration with the texts of classes; each section keeps its own."""
+        named = (("candidates", self.candidates.methods), ("filters", self.filters.own))
+        update = {
+            key: getattr(self, key).with_code({n: code[n] for n in names if n in code})
+            for key, names in named
+        }
+        return self.model_copy(update=update)
 
     def unit_ranges(self, candidates: int) -> Iterator[range]:
         """Yield the work units of an object, as ranges of its candidates.

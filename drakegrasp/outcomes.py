@@ -83,6 +83,7 @@ class Removal(IntEnum):
     SUSPICIOUS = 12  # the suspicion score or a part of it is too high; before OUTLIER
     MISSING_FINGER = 13  # a fingertip that is not required does not touch; the first of all
     REFINED_TEST = 14  # a refined palm pose whose split is test; after the split is drawn
+    OWN = 15  # a filter of the user's own does not keep it; before OUTLIER
 
     @property
     def label(self) -> str:

@@ -144,6 +144,7 @@ filters:
   max_penetration: 0.004
   max_imbalance: 0.1
   max_normal_sum: 0.5
+  own: ["my_filter.py:Wide@0123456789abcdef"]
 split:
   valid_fraction: 0.2
   by: class
@@ -262,7 +263,7 @@ def test_one_of_everything_misses_no_field() -> None:
 
 
 def test_one_of_everything_has_no_default() -> None:
-    same = [key for key, value in EVERYTHING.items() if value == DEFAULT_VALUES[key]]
+    same = [key for key, value in EVERYTHING.items() if value == DEFAULT_VALUES.get(key)]
     assert same == ["lift.stop_when"]
 
 

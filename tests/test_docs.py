@@ -15,6 +15,7 @@ import pytest
 from helpers.scripts import load_script
 
 from drakegrasp.cli.main import main
+from drakegrasp.config import Config
 from drakegrasp.dataset.schema import (
     DATA_FIELDS,
     LOOK_FIELDS,
@@ -23,7 +24,6 @@ from drakegrasp.dataset.schema import (
     TRIAL_FIELDS,
     VERIFICATION_FIELDS,
 )
-from drakegrasp.hand.settings import load_config
 from drakegrasp.outcomes import Outcome
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -215,8 +215,9 @@ def test_the_configuration_page_has_every_setting() -> None:
         elif heading != "Presets":
             on_page.add(key if "." in key else f"{heading.strip()}.{key}")
     settings = set()
-    for name, value in load_config().to_dict().items():
-        settings |= {f"{name}.{key}" for key in value} if isinstance(value, dict) else {name}
+    for name, field in Config.model_fields.items():
+        keys = getattr(field.annotation, "model_fields", None)
+        settings |= {name} if keys is None else {f"{name}.{key}" for key in keys}
     assert on_page == settings
 
 

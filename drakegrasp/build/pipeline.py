@@ -19,11 +19,12 @@ from drakegrasp.build.prepare import PrepareTask, prepare_one
 from drakegrasp.build.target import Target, refuse_two_ends, target_of
 from drakegrasp.build.warnings import nothing_trains, too_heavy
 from drakegrasp.build.work_unit import WorkUnit, run_unit
-from drakegrasp.config import Config
+from drakegrasp.config import Config, is_own_class
 from drakegrasp.dataset.assemble import Assembly, assemble_locked, summarise
 from drakegrasp.dataset.assembly.split import rank_in_split
 from drakegrasp.dataset.assembly.survey import headers_by_object
 from drakegrasp.dataset.card.text import write_card
+from drakegrasp.dataset.filters import own_filters
 from drakegrasp.dataset.lock import Holder, build_lock
 from drakegrasp.dataset.manifest import (
     Manifest,
@@ -45,6 +46,7 @@ from drakegrasp.runtime.executor import Executor, WorkerPool
 from drakegrasp.runtime.files import disk_full_named, sweep_temporary
 from drakegrasp.runtime.progress import Report, progress_bar
 from drakegrasp.simulation.drive import drive_of
+from drakegrasp.simulation.sampling.own import own_sampler
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,17 +114,30 @@ def build(
         show: Whether to show progress on standard error.
 
     Raises:
-        ConfigError: If it states both a number of grasps and of samples to stop at.
+        ConfigError: As `refuse_unusable`.
         DataError: If the directory cannot be used, another process builds there, or no mesh
             can be simulated.
         HandError: If the hand cannot be used.
         DiskFullError: If there is no room; the same call goes on when there is.
         MachineError: If the workers cannot do the work.
     """
-    refuse_two_ends(config)
+    refuse_unusable(config)
     drive_of(load_hand(config.hand), config.lift)
     with build_lock(out) as dead:
         return build_locked(sources, out, config, execute, dead=dead, pool=pool, show=show)
+
+
+def refuse_unusable(config: Config) -> None:
+    """Refuse at once what would stop a build later.
+
+    Raises:
+        ConfigError: If it states both a number of grasps and of samples to stop at, or a class of
+            the user's own cannot be used.
+    """
+    refuse_two_ends(config)
+    for name in filter(is_own_class, config.candidates.methods):
+        own_sampler(name, config.candidates.code)
+    own_filters(config.filters)
 
 
 def build_locked(

@@ -9,13 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import FilterConfig
+from drakegrasp.errors import ConfigError
 from drakegrasp.frames import Array
 from drakegrasp.outcomes import Removal
+from drakegrasp.runtime.user_code import own_class, run_own
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,7 +75,10 @@ class Successes:
 
 
 def judge_successes(
-    successes: Successes, config: FilterConfig, rejected: Sequence[int] = ()
+    successes: Successes,
+    config: FilterConfig,
+    rejected: Sequence[int] = (),
+    removed_by_own: npt.NDArray[np.bool_] | None = None,
 ) -> npt.NDArray[np.uint8]:
     """Return the `Removal` (n,) of each success.
 
@@ -80,7 +86,14 @@ def judge_successes(
         successes: The n successes.
         config: Limits of the filters.
         rejected: Ids of trials that an inspection rejects.
+        removed_by_own: (n,), which the user's own filters remove; None: the filters are run.
+
+    Raises:
+        ConfigError: If a filter of the user's own cannot be run, or returns something else.
     """
+    if removed_by_own is None:
+        removed_by_own = _removed_by_own(config, successes)
+
     # Filters that judge a grasp alone.
     removal = np.full(len(successes.trial_id), Removal.KEPT, dtype=np.uint8)
     for reason, bad in (
@@ -96,6 +109,7 @@ def judge_successes(
         (Removal.OFF_SURFACE, ~np.isfinite(successes.held_O).all(axis=1)),
         *breaks_surface(config, successes.surface_distance, successes.normal_angle),
         *((Removal.SUSPICIOUS, bad) for bad in _breaks_suspicion(config, successes)),
+        (Removal.OWN, removed_by_own),
     ):
         removal[bad & (removal == Removal.KEPT)] = reason
 
@@ -160,6 +174,34 @@ def _breaks_suspicion(config: FilterConfig, successes: Successes) -> list[npt.ND
         (successes.normal_sum, config.max_normal_sum),
     )
     return [~(values <= limit) for values, limit in rules if limit is not None]
+
+
+def own_filters(config: FilterConfig) -> list[type[Any]]:
+    """Return the classes of the user's own filters.
+
+    Raises:
+        ConfigError: If one cannot be imported, or is of another signature.
+    """
+    return [
+        own_class(name, config.code, method="keep", takes=("successes",)) for name in config.own
+    ]
+
+
+def _removed_by_own(config: FilterConfig, successes: Successes) -> npt.NDArray[np.bool_]:
+    """Return which successes (n,) a filter of the user's own does not keep."""
+    due = successes.trial_id.shape
+    removed = np.zeros(due, dtype=np.bool_)
+    if due == (0,):
+        return removed
+    for name, found in zip(config.own, own_filters(config), strict=True):
+        kept = np.asarray(run_own(name, lambda found=found: found().keep(successes)))
+        if kept.dtype != np.bool_ or kept.shape != due:
+            raise ConfigError(
+                f"{name.partition('@')[0]}: keep must return {due} of bool, "
+                f"got {kept.shape} of {kept.dtype}"
+            )
+        removed |= ~kept
+    return removed
 
 
 def is_outlier(values: Array, sigma: float) -> npt.NDArray[np.bool_]:

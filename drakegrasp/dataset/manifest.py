@@ -521,8 +521,8 @@ def differences(
 ) -> str:
     """Return the values that differ, in words; by default those that change the simulation."""
     a, b = _flatten(theirs.to_dict()), _flatten(ours.to_dict())
-    keys = [k for k in a if a[k] != b[k] and k.partition(".")[0] not in ignored]
-    return ", ".join(f"{k} ({a[k]} there, {b[k]} here)" for k in keys)
+    keys = [k for k in a | b if a.get(k) != b.get(k) and k.partition(".")[0] not in ignored]
+    return ", ".join(f"{k} ({a.get(k)} there, {b.get(k)} here)" for k in keys)
 
 
 def _flatten(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

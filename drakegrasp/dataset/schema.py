@@ -270,7 +270,7 @@ _LIFTED = _contacts("lifted", "trial.lift", "after the lift")
 _LINEAGE = _new(
     Field("resting", "", "uint8", "-", "-", "index of the object's resting pose"),
     Field("source", "", "uint8", "-", "-",
-          "sampler of the palm pose: 0 rotations, 1 normals, 2 refine"),
+          "sampler of the palm pose: 0 rotations, 1 normals, 2 refine, 3 own"),
     Field("generation", "", "uint8", "-", "-",
           "0: first round; else the number of refined palm poses up to this one"),
     Field("child", "", "int32", "-", "-",

@@ -7,17 +7,27 @@ spreads are numbers.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from drakegrasp.config import DEFAULT_HAND, Config, apply_override, parse_config, read_settings
+from drakegrasp.config import (
+    DEFAULT_HAND,
+    Config,
+    apply_override,
+    is_own_class,
+    parse_config,
+    read_settings,
+)
 from drakegrasp.errors import ConfigError
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file, hand_names
+from drakegrasp.runtime.user_code import read_class
 
 #: Keys of `candidates` that are the hand's own where they are not given, or null.
 HAND_KEYS = ("standoffs", "spreads_deg")
+#: Sections and keys that may name classes of the user's own.
+CLASS_KEYS = (("candidates", "method"), ("filters", "own"))
 
 
 def load_config(
@@ -27,7 +37,8 @@ def load_config(
 ) -> Config:
     """Return the configuration of a preset or YAML file, with overrides applied.
 
-    Stand-offs and spreads that nobody gives are those of the hand's file.
+    Stand-offs and spreads that nobody gives are those of the hand's file. Classes of the user's
+    own, `file.py:Name`, are imported: that runs the file.
 
     Args:
         source: A preset's name, or a path to a YAML file; None: the defaults.
@@ -36,7 +47,8 @@ def load_config(
 
     Raises:
         ConfigError: If a key is unknown, or a value is of the wrong type or impossible;
-            one line with the key's path, what it must be, and what it was.
+            one line with the key's path, what it must be, and what it was. Also if a class of the
+            user's own cannot be imported.
         HandError: If the hand's file is needed and cannot be read.
     """
     tree = {} if source is None else read_settings(source)
@@ -72,7 +84,7 @@ def override_config(config: Config, overrides: Sequence[str], **values: Any) -> 
     if tree["hand"] != config.hand and isinstance(candidates, dict):
         same = [key for key in HAND_KEYS if candidates.get(key) == known["candidates"][key]]
         tree["candidates"] = {**candidates, **dict.fromkeys(same)}
-    return _completed(tree)
+    return _completed(tree, config.code)
 
 
 def _with_absolute_hand(tree: dict[str, Any]) -> dict[str, Any]:
@@ -86,8 +98,42 @@ def _with_absolute_hand(tree: dict[str, Any]) -> dict[str, Any]:
     return tree
 
 
-def _completed(tree: dict[str, Any]) -> Config:
-    """Return the configuration of a tree of values, where those of the hand may be missing."""
+def _read_classes(tree: dict[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Replace each `path/file.py:Name` of a tree by name and digest; return the files' texts too.
+
+    Raises:
+        ConfigError: If one cannot be imported, with its key.
+    """
+    code: dict[str, str] = {}
+
+    def read(key: str, value: object) -> object:
+        if not isinstance(value, str) or ".py:" not in value or is_own_class(value):
+            return value
+        try:
+            name, text = read_class(value)
+        except ConfigError as error:
+            raise ConfigError(f"{key}: {error}") from None
+        code[name] = text
+        return name
+
+    for section, key in CLASS_KEYS:
+        values = tree.get(section)
+        if isinstance(values, dict) and key in values:
+            given, place = values[key], f"{section}.{key}"
+            several = isinstance(given, list | tuple)
+            found = [read(place, v) for v in given] if several else read(place, given)
+            tree = {**tree, section: {**values, key: found}}
+    return tree, code
+
+
+def _completed(tree: dict[str, Any], known: Mapping[str, str] | None = None) -> Config:
+    """Return the configuration of a tree of values, where those of the hand may be missing.
+
+    Args:
+        tree: The values.
+        known: Text of the files of classes that the tree names with their digests.
+    """
+    tree, code = _read_classes(tree)
     hand, candidates = tree.get("hand", DEFAULT_HAND), tree.get("candidates", {})
     if not isinstance(candidates, dict):
         return parse_config(tree)  # which refuses it
@@ -97,7 +143,7 @@ def _completed(tree: dict[str, Any]) -> Config:
         described = read_hand_file(hand_file(hand if isinstance(hand, str) else DEFAULT_HAND))
         filled = {key: getattr(described, key) for key in missing}
         tree = {**tree, "candidates": {**candidates, **filled}}
-    return parse_config(tree)
+    return parse_config(tree).with_code({**(known or {}), **code})
 
 
 def _refuse_mistakes(tree: dict[str, Any], name: str) -> None:

@@ -5,7 +5,8 @@ and, for each, its resting pose and the distance along its palm ray to the objec
 `SAMPLERS` gives a sequence of poses at a resting pose; resting poses and samplers take turns. The
 first n poses are the same for every `candidates.max` of at least n, so a dataset can grow. The
 paper's method (`rotations`) multiplies a first palm pose with global and local rotations; `normals`
-is the baseline of its Figure 2. `children` draws poses about that of a grasp that holds.
+is the baseline of its Figure 2; a class of the user's own may be another sampler. `children` draws
+poses about that of a grasp that holds.
 
 Nothing here needs Drake. Poses are the same bits on every machine: sums, products and square roots
 have a stated order (`arithmetic`), limits are inclusive by more than rounding, poses are compared
@@ -19,6 +20,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -33,6 +35,7 @@ from drakegrasp.mesh.surfaces import on_faces
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.seeding import Stream, object_key
 from drakegrasp.simulation.randomization.conditions import Conditions
+from drakegrasp.simulation.sampling.own import OwnPoses
 from drakegrasp.simulation.sampling.rotations import above_table, make_poses, rotation_candidates
 
 #: Surface points that `normals` draws together; another number is another draw.
@@ -52,6 +55,7 @@ class Source(IntEnum):
     ROTATIONS = 0
     NORMALS = 1
     REFINE = 2
+    OWN = 3  # one of the user's own
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -207,7 +211,7 @@ class Normals:
         return int(self._numbers[count - 1]) + 1 if count else 0, count, count
 
 
-#: The samplers by the names that a configuration has for them.
+#: The package's samplers by the names that a configuration has for them.
 SAMPLERS: Mapping[str, Callable[[ObjectModel, Array, CandidateConfig, Stream], Sampler]] = {
     "rotations": Rotations,
     "normals": Normals,
@@ -229,7 +233,7 @@ def sample_candidates(
     resting = np.asarray(X_TO, dtype=float).reshape(-1, 4, 4)
     places = [(k, method) for method in config.methods for k in range(len(resting))]
     samplers = {
-        (k, method): SAMPLERS[method](
+        (k, method): _sampler(method)(
             model, resting[k], config, _sampler_stream(model.name, seed, k, method)
         )
         for k, method in dict.fromkeys(places)
@@ -246,7 +250,7 @@ def sample_candidates(
         X_OG=poses,
         distance=palm_ray_distance(model.collision, poses),
         resting=np.array([k for (k, _), _ in turns], dtype=np.int64),
-        source=np.array([Source[method.upper()] for (_, method), _ in turns], dtype=np.int64),
+        source=np.array([_source(method) for (_, method), _ in turns], dtype=np.int64),
         log_density=np.array([samplers[place].log_density for place, _ in turns], dtype=float),
         combinations=combinations,
         valid=valid,
@@ -254,12 +258,26 @@ def sample_candidates(
     )
 
 
+def _sampler(method: str) -> Callable[[ObjectModel, Array, CandidateConfig, Stream], Sampler]:
+    """Return the sampler of a name: one of the package, or of the user's own."""
+    return SAMPLERS[method] if method in SAMPLERS else partial(OwnPoses, method)
+
+
+def _source(method: str) -> Source:
+    """Return what is stored of a sampler."""
+    return Source[method.upper()] if method in SAMPLERS else Source.OWN
+
+
 def _sampler_stream(name: str, seed: int, resting: int, method: str) -> Stream:
     """Return the random numbers of a sampler at a resting pose of an object."""
     # The paper's draw has the object's own stream.
     if (resting, method) == (0, "rotations"):
         return Stream(seed, object_key(name))
-    return Stream(seed, object_key(name), resting, Source[method.upper()], _SAMPLER)
+    place = (resting, _source(method), _SAMPLER)
+    if method in SAMPLERS:
+        return Stream(seed, object_key(name), *place)
+    # Two samplers of the user's own do not share their numbers, and a new digest changes none.
+    return Stream(seed, object_key(name), *place, object_key(method.partition("@")[0]))
 
 
 def _turns(

@@ -7,9 +7,9 @@ from itertools import pairwise
 import pytest
 
 from drakegrasp.build.target import Target, refuse_two_ends
-from drakegrasp.config import Config
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.errors import ConfigError
+from drakegrasp.hand.settings import load_config
 
 
 def units(name: str, count: int) -> list[ShardHeader]:
@@ -129,6 +129,6 @@ def test_shortfall_tells_how_many_there_are_of_a_total() -> None:
 
 
 def test_grasps_and_samples_are_not_both_an_end() -> None:
-    refuse_two_ends(Config(max_grasps=3))
+    refuse_two_ends(load_config(max_grasps=3))
     with pytest.raises(ConfigError, match="max_grasps must be null with samples"):
-        refuse_two_ends(Config(max_grasps=3, samples_per_object=2))
+        refuse_two_ends(load_config(max_grasps=3, samples_per_object=2))

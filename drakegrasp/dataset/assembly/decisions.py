@@ -113,17 +113,22 @@ def keys_of(manifest: Manifest, successes: Successes) -> dict[AttemptKey, int]:
     return {AttemptKey(manifest.objects[i].name, *key): t for i, *key, t in rows}
 
 
-def decide(manifest: Manifest, successes: Successes) -> Decisions:
+def decide(
+    manifest: Manifest,
+    successes: Successes,
+    removed_by_own: npt.NDArray[np.bool_] | None = None,
+) -> Decisions:
     """Decide which successes are samples, in which split, and what each weighs.
 
     Args:
         manifest: Of the dataset: its filters and its split; what it rejects becomes no sample.
         successes: All successes of the dataset.
+        removed_by_own: As for `judge_successes`.
     """
     # The filters.
     known = keys_of(manifest, successes)
     rejected = [known[key] for key in manifest.rejected if key in known]
-    removal = judge_successes(successes, manifest.config.filters, rejected)
+    removal = judge_successes(successes, manifest.config.filters, rejected, removed_by_own)
 
     # Only first-round attempts are tested: the others are drawn about held ones.
     splits = _split_successes(manifest, successes, removal)

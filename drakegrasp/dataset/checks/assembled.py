@@ -8,6 +8,7 @@ by the functions that write them; stored images are compared byte for byte.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -32,6 +33,7 @@ from drakegrasp.dataset.checks.rows import AnyArray, Batch, CheckedFile, Rule
 from drakegrasp.dataset.hdf5 import unpacked_chunk
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import FILE_NAME
+from drakegrasp.outcomes import Removal
 
 #: Attributes that say of what a file was assembled, the cause of others first.
 ORIGIN = ("config", "split_by", "versions", "fingers", "shards", "signature")
@@ -54,10 +56,23 @@ class Again:
     decisions: Decisions
 
     @classmethod
-    def of(cls, out: Path, manifest: Manifest, surveys: Sequence[Survey]) -> Again:
-        """Decide again which successes are samples, given the surveys of all objects."""
+    def of(
+        cls, out: Path, manifest: Manifest, surveys: Sequence[Survey], trials: CheckedFile | None
+    ) -> Again:
+        """Decide again which successes are samples, given the surveys of all objects.
+
+        Code of a dataset is never imported: what the user's own filters removed is read from
+        `trials`, if these can be read.
+        """
         shards = number_rows(surveys, manifest)
-        decisions = decide(manifest, shards.successes)
+        removed = np.zeros(0, dtype=np.int64)
+        if manifest.config.filters.own and trials is not None and "successes" in trials.counts:
+            # Columns that cannot be read are a finding later.
+            with suppress(OSError), trials.opened() as file:
+                ids, reasons = (file["successes"][name][:] for name in ("trial_id", "removal"))
+            removed = ids[reasons == Removal.OWN]
+        own = np.isin(shards.successes.trial_id, removed)
+        decisions = decide(manifest, shards.successes, own)
         return cls(out=out, manifest=manifest, shards=shards, decisions=decisions)
 
     def counts(self, camera: str) -> dict[str, int]:

@@ -102,7 +102,7 @@ def _check_directory(out: Path, check: Check) -> None:
     dataset = Dataset(out=out, manifest=manifest, readable=frozenset(objects))
     sound = len(surveys) == sum(entry.candidates > 0 for entry in manifest.objects)
     sound &= len(surveys) > 0 and len(objects) == len(manifest.objects)
-    again = Again.of(out, manifest, surveys) if sound else None
+    again = Again.of(out, manifest, surveys, files.get("")) if sound else None
 
     # Files of another state are not compared row by row.
     compared = set()

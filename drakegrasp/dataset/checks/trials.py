@@ -78,8 +78,8 @@ def numbers(
     refined = child > 0
     what = "generation must be 0 for the first of a family and positive for others"
     yield from batch.broken(what, (batch["generation"] > 0) != refined, batch["generation"])
-    what = "source must be 2 (refine) for a refined palm pose, and 0 or 1 for another"
-    bad = np.where(refined, source != Source.REFINE, source >= Source.REFINE)
+    what = "source must be 2 (refine) for a refined palm pose, and 0, 1 or 3 for another"
+    bad = ((source == Source.REFINE) != refined) | (source > max(Source))
     yield from batch.broken(what, bad, source)
     if children is not None:
         parent = np.where(refined, (child - 1) // max(children, 1), 0)

@@ -63,9 +63,13 @@ def compare_samplers(out: Path, other: Path | None = None) -> SamplerComparison:
     # The datasets by method.
     manifest = read_manifest(out)
     config = manifest.config
-    if isinstance(config.candidates.method, tuple) or config.objects.resting_poses > 1:
-        raise DataError(f"{out}: must be of one sampler and one resting pose, got several")
-    datasets: dict[str, Path] = {config.candidates.method: out}
+    method = config.candidates.method
+    if isinstance(method, tuple) or method not in METHODS or config.objects.resting_poses > 1:
+        raise DataError(
+            f"{out}: must be of one sampler ({' or '.join(METHODS)}) "
+            "and one resting pose, got others"
+        )
+    datasets: dict[str, Path] = {method: out}
     if other is not None:
         datasets[_other_method(config)] = other
         _refuse_other_configuration(other, config)
@@ -73,7 +77,7 @@ def compare_samplers(out: Path, other: Path | None = None) -> SamplerComparison:
     # The objects that all have, and the one with the most successes.
     funnels = {method: count_funnel(path) for method, path in datasets.items()}
     names = _common_objects(datasets, funnels)
-    own = funnels[config.candidates.method]
+    own = funnels[method]
     wins = {name: int(own.outcomes[own.names.index(name), Outcome.SUCCESS]) for name in names}
     name = max(names, key=lambda name: wins[name])
     own_config = manifest.config_of(name)

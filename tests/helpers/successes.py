@@ -1,0 +1,39 @@
+"""Made-up successes for filters."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drakegrasp.dataset.filters import Successes
+
+
+def good(count: int) -> Successes:
+    """Successes that every filter keeps."""
+    rng = np.random.default_rng(0)
+    return Successes(
+        trial_id=np.arange(count, dtype=np.int64) * 3,
+        object=np.zeros(count, dtype=np.int32),
+        candidate=np.arange(count, dtype=np.int32),
+        standoff_index=np.zeros(count, dtype=np.uint8),
+        child=np.zeros(count, dtype=np.int32),
+        resting=np.zeros(count, dtype=np.uint8),
+        X_OG=np.tile(np.eye(4), (count, 1, 1)),
+        grasp_T=rng.normal(size=(count, 18)),
+        held_O=rng.normal(size=(count, 18)),
+        complete=np.ones(count, dtype=bool),
+        other_links=np.zeros(count, dtype=np.uint8),
+        slip=np.full(count, 0.010),
+        turn=np.full(count, np.deg2rad(9.9)),
+        seen=np.ones(count, dtype=bool),
+        in_view=np.ones(count, dtype=bool),
+        camera_height=np.full(count, 0.3),
+        depth_variance=np.full(count, 0.01),
+        surface_distance=np.full(count, 1e-4),
+        normal_angle=np.full(count, np.deg2rad(29.0)),
+        suspicion=np.full(count, 1.0),
+        penetration=np.full(count, 1e-3),
+        imbalance=np.full(count, 0.01),
+        normal_sum=np.full(count, 0.3),
+        certified_share=np.full(count, np.nan),
+        certified_friction=np.full(count, np.nan),
+    )
