@@ -182,7 +182,7 @@ def test_successes_and_removals_are_checked(out: Path) -> None:
     change(out, TRIALS, "successes/removal", 2, lambda _: 77)
     must_find(
         out / TRIALS,
-        (TRIALS, "/successes", 2, "removal must be 0..14"),
+        (TRIALS, "/successes", 2, "removal must be 0..15"),
     )
     change(out, TRIALS, "successes/trial_id", 0, lambda i: i + 1)
     assert (TRIALS, "/successes", None, "trial_id must list the successes of /trials") in found(
