@@ -7,7 +7,6 @@ Concepts: object, palm pose, attempt, outcome, sample.
 
 from collections import Counter
 
-import h5py
 import matplotlib.pyplot as plt
 import numpy as np
 
@@ -27,8 +26,7 @@ def main() -> None:
     dg.build_dataset("builtin", "example/dataset", config=config, only=OBJECTS, workers=2)
 
     # Every attempt has a row, whether it succeeded or not.
-    with h5py.File("example/dataset/trials.hdf5") as file:
-        outcomes = Counter(file["trials/outcome"][:].tolist())
+    outcomes = Counter(dg.Trials("example/dataset")["outcome"].tolist())
     for value, count in outcomes.most_common():
         print(f"{count:4d} {dg.Outcome(value).label}")
 

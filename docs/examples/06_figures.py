@@ -33,7 +33,7 @@ def main() -> None:
     axes.set(xlabel="sum of fingertip forces [N]", ylabel="slip in the hand [mm]", ylim=(0, None))
     axes.legend()
     figure.tight_layout()
-    figure.savefig("example/04_figures.png")
+    figure.savefig("example/06_figures.png")
 
 
 if __name__ == "__main__":
