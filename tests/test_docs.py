@@ -143,6 +143,15 @@ def test_files_that_the_docs_name_exist(page: Path) -> None:
     assert not missing
 
 
+def test_each_stop_of_a_walk_is_a_function_of_its_module() -> None:
+    page = read(ROOT / "docs" / "explanation" / "architecture.md")
+    stops = re.findall(r"^\| \d+ \| `([\w/]+\.py)` `(\w+)` \|", page, re.MULTILINE)
+    assert len(stops) > 20
+    for module, name in stops:
+        source = read(ROOT / "drakegrasp" / module)
+        assert re.search(rf"^(def|class) {name}\b", source, re.MULTILINE), f"{module} {name}"
+
+
 def _bases(page: Path, name: str) -> list[Path]:
     """Return the folders in which a file that the docs name may lie."""
     package = ROOT / "drakegrasp"
