@@ -160,7 +160,13 @@ def trial_row(model: ObjectModel, number: int, X_TO: Array, config: Config) -> d
         row |= {"time_lift": 1.0, "lifted_object_on_table": after_lift}
         row |= {"X_TO_lifted": pack_pose(X_TO), "surface_distance": np.zeros(3)}
         row |= {"normal_angle": np.zeros(3), **hold(row)}
-    return row
+    # A quantity that has no story here is 1, from its stage on.
+    told = {
+        f.name: 1.0
+        for f in trial_columns()
+        if f.dtype == "float64" and f.stage <= stage and not f.some
+    }
+    return {**told, **row} if stage > Stage.PLACED else row
 
 
 def chance_of(model: ObjectModel, row: dict[str, Any]) -> float:
