@@ -201,7 +201,7 @@ def test_files_of_two_states_are_a_finding(out: Path) -> None:
     (out / OTM).write_bytes(old)
     result = run("check", out)
     assert result.exit_code == 1
-    assert "the three files must be of one assembly" in result.stdout
+    assert f"{OTM}: attribute config must be that of manifest.json" in result.stdout
 
 
 def _crash(*arguments: object) -> TrialRecord:

@@ -101,4 +101,3 @@ def test_a_hand_of_the_package_keeps_its_name(
     (tmp_path / "franka").write_text("a file of that name")
     monkeypatch.chdir(tmp_path)
     assert load_config(hand="franka").hand == "franka"
-    assert load_config(hand="missing.yaml").hand == "missing.yaml"
