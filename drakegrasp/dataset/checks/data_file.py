@@ -20,7 +20,8 @@ from drakegrasp.dataset.checks.findings import Findings, Violation, of_file
 from drakegrasp.dataset.checks.images import Lens
 from drakegrasp.dataset.checks.rows import Batch, CheckedFile
 from drakegrasp.dataset.manifest import ObjectEntry
-from drakegrasp.dataset.schema import SPLITS
+from drakegrasp.dataset.schema import DATA_FIELDS, SPLITS
+from drakegrasp.outcomes import Outcome
 
 #: Samples in a batch: some 20 MB of images.
 SAMPLE_ROWS = 64
@@ -37,6 +38,7 @@ class SamplesTask:
         split: Name of the split.
         start, stop: Rows of the split.
         dataset: The dataset around the file, if there is one.
+        trials: trials.hdf5, where the samples are to be compared with it; their shards tell more.
     """
 
     files: Mapping[str, CheckedFile]
@@ -44,6 +46,7 @@ class SamplesTask:
     start: int
     stop: int
     dataset: Dataset | None
+    trials: CheckedFile | None
 
     @property
     def size(self) -> int:
@@ -77,6 +80,9 @@ class SamplesTask:
                     partial(image_rules.image_frames, lens=lens),
                 )
 
+                if self.trials is not None:
+                    own = data.judge(own, findings, partial(_copies_trial, trials=self.trials))
+
                 # What the images show, which needs right frames.
                 own = image_rules.without_noise(own, lens, config.camera)
                 own = data.judge(
@@ -87,6 +93,27 @@ class SamplesTask:
                 )
                 if load is not None:
                     _judge_by_mesh(data, own, lens, load, findings)
+
+
+def _copies_trial(batch: Batch, trials: CheckedFile) -> Iterator[Violation]:
+    """A sample is of a success, and repeats its numbers."""
+    ids = batch["trial_id"]
+    unknown = (ids < 0) | (ids >= trials.counts["trials"])
+    yield from batch.broken("trial_id must be a row of /trials", unknown, ids)
+
+    # Trials that break a rule are a finding already.
+    known = batch.where(~unknown & ~np.isin(ids, trials.bad_rows("trials")))
+    rows, position = np.unique(known["trial_id"], return_inverse=True)
+    if not len(rows):
+        return
+    copied = {field.name: field.of for field in DATA_FIELDS if field.of}
+    with trials.opened() as file:
+        own = trials.read(file, "trials", rows, ["outcome", *copied.values()])
+    failed = own["outcome"][position] != Outcome.SUCCESS
+    yield from known.broken("trial_id must be that of a success", failed, known["trial_id"])
+    known, position = known.where(~failed), position[~failed]
+    for name, of in copied.items():
+        yield from known.follows(name, own[of][position], "its trial")
 
 
 def _judge_by_mesh(
@@ -110,8 +137,17 @@ def _judge_by_mesh(
         )
 
 
-def samples_tasks(data: CheckedFile, camera: str, dataset: Dataset | None) -> Iterator[SamplesTask]:
-    """Yield the tasks that judge all samples of a file; none if its lens is not known."""
+def samples_tasks(
+    data: CheckedFile, camera: str, dataset: Dataset | None, trials: CheckedFile | None
+) -> Iterator[SamplesTask]:
+    """Yield the tasks that judge all samples of a file; none if its lens is not known.
+
+    Args:
+        data: The file.
+        camera: `oto` or `otm`.
+        dataset: As of a task.
+        trials: As of a task.
+    """
     for split, count in data.counts.items() if data.config is not None else ():
         for start in range(0, count, TASK_ROWS):
             stop = min(start + TASK_ROWS, count)
@@ -121,6 +157,7 @@ def samples_tasks(data: CheckedFile, camera: str, dataset: Dataset | None) -> It
                 start=start,
                 stop=stop,
                 dataset=dataset,
+                trials=trials,
             )
 
 

@@ -105,18 +105,18 @@ def _check_directory(out: Path, check: Check) -> None:
     again = Again.of(out, manifest, surveys, files.get("")) if sound else None
 
     # Files of another state are not compared row by row.
-    compared = set()
+    current = set()
     for camera, file in files.items():
         other = [*origin(file, manifest, again.shards.seals if again else "", camera)]
         other += row_counts(file, again, camera) if again and not other else []
         check.findings.add(other)
-        if again is not None and file.config is not None and not other:
-            compared.add(camera)
+        if file.config is not None and not other:
+            current.add(camera)
     if (trials := files.get("")) is not None:
-        decided = again if "" in compared else None
+        decided = again if "" in current else None
         with check.readable(trials):
             objects_and_successes(trials, manifest, decided, check.findings)
-    _check_rows(files, check, dataset, again, frozenset(compared))
+    _check_rows(files, check, dataset, again, frozenset(current))
     if not check.findings:
         _check_card(out, check.findings)  # else it would differ for the same cause
 
@@ -126,7 +126,7 @@ def _check_rows(
     check: Check,
     dataset: Dataset | None = None,
     again: Again | None = None,
-    compared: frozenset[str] = frozenset(),
+    current: frozenset[str] = frozenset(),
 ) -> None:
     """Judge all rows of some files, by camera: first the attempts, then what the samples show.
 
@@ -135,8 +135,10 @@ def _check_rows(
         check: Runs the tasks, and takes the violations.
         dataset: The dataset around the files, if there is one.
         again: The dataset assembled again, if its shards are sound.
-        compared: Cameras of the files that are compared with it; "" for the trials.
+        current: Cameras of the files that are of the dataset's manifest and shards, "" for the
+            trials. They are compared with what is assembled again, or else with each other.
     """
+    compared = frozenset() if again is None else current
     check.judge(trials_tasks(files, dataset, again, compared), files)
     for camera, file in files.items():
         # What is compared follows from the shards; other files are judged by themselves.
@@ -146,7 +148,9 @@ def _check_rows(
                 known = {entry.name: entry for entry in entries}
                 check.findings.add(splits(file, known) if camera else successes(file))
         if camera:
-            check.judge(samples_tasks(file, camera, dataset), files)
+            both = {"", camera} <= current - compared and "trials" in files[""].counts
+            trials = files[""] if both else None
+            check.judge(samples_tasks(file, camera, dataset, trials), files)
 
 
 def _look_at_files(out: Path, findings: Findings) -> dict[str, CheckedFile]:

@@ -232,3 +232,15 @@ def test_a_trial_whose_contacts_are_said_to_be_off_the_surface_is_found(
         number = int(file["train/trial_id"][1])
     change(out, TRIALS, f"trials/{name}", number, set_at(2, to=0.6))
     must_find(out, (TRIALS, "/trials", number, f"{name} must follow from its shard"))
+
+
+def test_samples_without_shards_are_compared_with_their_trials(out: Path) -> None:
+    change(out, OTM, "train/grasp_props/slip", 1, lambda slip: slip + 1e-4)
+    change(out, OTO, "train/trial_id", 0, lambda _: 1)
+    change(out, OTO, "test/trial_id", 2, lambda _: 36)
+    must_find_without_shards(
+        out,
+        (OTM, "/train", 1, "grasp_props/slip must follow from its trial"),
+        (OTO, "/train", 0, "trial_id must be that of a success"),
+        (OTO, "/test", 2, "trial_id must be a row of /trials"),
+    )
