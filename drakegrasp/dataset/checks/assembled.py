@@ -130,7 +130,7 @@ def objects_and_successes(
             count = len(next(iter(columns.values())))
             if trials.counts.get(group) != count:
                 continue  # a finding already, or no group
-            for batch in trials.batches(file, group, np.arange(count), count, findings):
+            for batch in trials.batches(file, group, np.arange(count), max(count, 1), findings):
                 trials.judge(batch, findings, *_rules(columns, batch, of))
 
 
