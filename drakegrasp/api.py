@@ -162,7 +162,7 @@ def build_on(
         # The built-in objects become mesh files of the dataset.
         if sources is None:
             with progress_bar("objects", "meshes", show=show) as report:
-                sources = builtin_sources(out / BUILTIN_FOLDER, config.builtin, report)
+                sources = builtin_sources(out / BUILTIN_FOLDER, config.builtin, report, only)
         sources = [source for source in sources if not only or source.name in only]
 
         execute = DaskExecutor(client, resubmissions=RESUBMISSIONS)

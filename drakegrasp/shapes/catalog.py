@@ -9,7 +9,7 @@ Wavefront files, the same bytes every time.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -126,10 +126,21 @@ def export_builtin(
 
 
 def builtin_sources(
-    folder: str | os.PathLike[str], config: BuiltinConfig, progress: Report = silent
+    folder: str | os.PathLike[str],
+    config: BuiltinConfig,
+    progress: Report = silent,
+    only: Collection[str] = (),
 ) -> list[MeshSource]:
-    """Return the built-in objects as meshes in a folder, which is made, sorted by name."""
-    paths = export_builtin(folder, config=config, progress=progress)
+    """Return the built-in objects as meshes in a folder, which is made, sorted by name.
+
+    Args:
+        folder: The folder.
+        config: How many of each class, and the seed of their sizes.
+        progress: Is told how many meshes there are.
+        only: Names of the objects; all of the configuration if empty.
+    """
+    names = sorted(set(only)) or None
+    paths = export_builtin(folder, names, config=config, progress=progress)
     sources = [replace(find_mesh(path), licence=LICENCE) for path in paths]
     return sorted(sources, key=lambda source: source.name)
 

@@ -249,3 +249,9 @@ def test_unknown_name_is_refused_with_the_classes_there_are(tmp_path: Path, name
     with pytest.raises(MeshError, match=rf"got '{name}'; the classes: 1_mug, 2_bottle, "):
         export_builtin(tmp_path / "out", ["1_mug_1", name])
     assert not (tmp_path / "out").exists()
+
+
+def test_only_the_meshes_that_are_asked_for_are_made(tmp_path: Path) -> None:
+    sources = builtin_sources(tmp_path, BuiltinConfig(), only=["24_carton_1"])
+    assert [source.name for source in sources] == ["24_carton_1"]
+    assert [path.name for path in tmp_path.iterdir()] == ["24_carton_1.obj"]
