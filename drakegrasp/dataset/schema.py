@@ -407,11 +407,6 @@ DATA_FIELDS: tuple[Field, ...] = (
     Field("object_props/frame_world2work", "12", "float32", "m, -", "W", "X_WT, the table top"),
 )
 
-#: The fields of samples that are the same in both data files, whatever their camera.
-SHARED_FIELDS: tuple[Field, ...] = tuple(
-    field for field in DATA_FIELDS if not field.sample and field.frame != "C"
-)
-
 #: A row per attempt, whatever its outcome, in `/trials` of trials.hdf5 and of every shard.
 TRIAL_FIELDS: tuple[Field, ...] = (
     Field("trial_id", "", "int64", "-", "-", "the row's own number"),

@@ -28,7 +28,7 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import model_path
 from drakegrasp.exchange.closed_grasps import ClosedGrasp, read_closed_grasps
-from drakegrasp.frames import Array, invert_pose, make_pose
+from drakegrasp.frames import Array, invert_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import load_object
@@ -94,9 +94,3 @@ def pose_vector(X_AB: npt.ArrayLike) -> Array:
     X = np.asarray(X_AB, dtype=float)
     x, y, z, w = Rotation.from_matrix(X[:3, :3]).as_quat(canonical=True)
     return np.array([*X[:3, 3], w, x, y, z])
-
-
-def pose_of_vector(vector: npt.ArrayLike) -> Array:
-    """Return the pose (4, 4) of `pose_vector`."""
-    px, py, pz, w, x, y, z = np.asarray(vector, dtype=float)
-    return make_pose(Rotation.from_quat([x, y, z, w]).as_matrix(), [px, py, pz])

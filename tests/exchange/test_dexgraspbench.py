@@ -11,9 +11,17 @@ import pytest
 import trimesh
 
 from drakegrasp.exchange.closed_grasps import ClosedGrasp
-from drakegrasp.exchange.dexgraspbench import SQUEEZE, grasp_dictionary, pose_of_vector
+from drakegrasp.exchange.dexgraspbench import SQUEEZE, grasp_dictionary
+from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
 from drakegrasp.visualization.still_scene import StillScene
+
+
+def pose_of(vector: Array) -> Array:
+    """Return the pose (4, 4) of a position and a quaternion w, x, y, z, as other tools read it."""
+    X = trimesh.transformations.quaternion_matrix(vector[3:])
+    X[:3, 3] = vector[:3]
+    return X
 
 
 @pytest.fixture(scope="module")
@@ -27,9 +35,9 @@ def test_poses_and_joints_come_back(folder: Path, grasps: list[ClosedGrasp]) -> 
     for grasp in grasps:
         path = folder / "grasps" / grasp.object_name / f"{grasp.trial_id}.npy"
         content = np.load(path, allow_pickle=True).item()
-        assert pose_of_vector(content["obj_pose"]) == pytest.approx(grasp.X_TO, abs=1e-9)
+        assert pose_of(content["obj_pose"]) == pytest.approx(grasp.X_TO, abs=1e-9)
         for key in ("pregrasp_qpos", "grasp_qpos", "squeeze_qpos"):
-            X_TG = pose_of_vector(content[key][:7]) @ hand.X_BG
+            X_TG = pose_of(content[key][:7]) @ hand.X_BG
             assert pytest.approx(grasp.X_TG, abs=1e-9) == X_TG
         assert (content["grasp_qpos"][7:] == grasp.q).all()
         assert content["joint_names"] == list(StillScene(hand).joints)
