@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.reader import FIELDS
+from drakegrasp.dataset.schema import DATA_FIELDS
 
 if TYPE_CHECKING:
     from drakegrasp.dataset.reader import GraspDataset
@@ -30,8 +30,10 @@ except ModuleNotFoundError:
     Dataset = object
     default_collate_fn_map = {}
 
+#: Fields of a sample by name.
+_FIELDS = {field.name: field for field in DATA_FIELDS}
 #: Fields that are read when a sample is asked for; the others fit into memory.
-_IMAGES = frozenset(name for name, field in FIELDS.items() if field.sample)
+_IMAGES = frozenset(name for name, field in _FIELDS.items() if field.sample)
 
 
 class TorchSamples(Dataset):
@@ -83,11 +85,11 @@ class TorchSamples(Dataset):
     def _tensors(self, name: str, rows: Sequence[int]) -> torch.Tensor | list[str]:
         """Return a field of some samples; tensors are new, and shared if a worker makes them."""
         # Text is a list, as torch collates it.
-        if FIELDS[name].dtype == "str":
+        if _FIELDS[name].dtype == "str":
             return [str(text) for text in self._column(name)[rows]]
 
         # Only a worker hands its tensors to another process.
-        field, size = FIELDS[name], {"S": self.data.image_size}
+        field, size = _FIELDS[name], {"S": self.data.image_size}
         shape = field.row_shape(size) if name in _IMAGES else self._column(name).shape[1:]
         values = torch.from_numpy(np.empty((len(rows), *shape), dtype=field.dtype))
         if get_worker_info() is not None:
