@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from drakegrasp.build.counts import Counts
@@ -430,14 +431,14 @@ def _count_done(
 ) -> set[ShardHeader]:
     """Return the work units that are done; count them, and the damage."""
     done = set[ShardHeader]()
-    for found in job.execute(find_units, find_tasks(job.out, manifest)):
-        samples = found.samples or (None,) * len(found.done)
-        for (header, outcomes), number in zip(found.done, samples, strict=True):
+    find = partial(find_units, manifest.config)
+    for found in job.execute(find, find_tasks(job.out, manifest)):
+        for header, outcomes, samples in found.done:
             done.add(header)
             counts.reused += 1
-            counts.add(header, outcomes, reused=True, samples=number)
-            if target is not None and number is not None:
-                target.add(header, number)
+            counts.add(header, outcomes, reused=True, samples=samples)
+            if target is not None and samples is not None:
+                target.add(header, samples)
         for path, reason in found.damaged:
             counts.add_damaged(path)
             job.events.damaged_shard(reason)

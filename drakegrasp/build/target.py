@@ -25,16 +25,12 @@ class Target:
     """The units of a target, and what is known of them.
 
     Attributes:
-        samples: Number of samples of the dataset; None: no limit.
-        per_object: Number of samples of each object; None: no limit.
-        patience: Palm poses in a row without a sample after which an object is given up.
+        config: Its `samples`, `samples_per_object` and `samples_patience` state the target.
         units: Work units of each object, by its name, in their order.
         found: Number of samples of each unit that is done.
     """
 
-    samples: int | None
-    per_object: int | None
-    patience: int
+    config: Config
     units: Mapping[str, Sequence[ShardHeader]]
     found: dict[ShardHeader, int] = field(default_factory=dict)
 
@@ -91,17 +87,19 @@ class Target:
         """Return what a target that has been run could not give, in words; empty if it is met."""
         taken, counts, _ = self.plan()
         total, lines = sum(counts.values()), list[str]()
-        if self.samples is not None and total >= self.samples:
+        wanted, per_object = self.config.samples, self.config.samples_per_object
+        patience = self.config.samples_patience
+        if wanted is not None and total >= wanted:
             return lines
-        if self.samples is not None and self.per_object is None:
-            lines.append(f"{total:,} samples were found of {self.samples:,}")
+        if wanted is not None and per_object is None:
+            lines.append(f"{total:,} samples were found of {wanted:,}")
 
         # Each object ended at its last palm pose, or after many in vain.
-        short = [n for n in self.units if self.per_object is None or counts[n] < self.per_object]
-        vain = [n for n in short if self._in_vain(self.units[n][: taken[n]]) >= self.patience]
+        short = [n for n in self.units if per_object is None or counts[n] < per_object]
+        vain = [n for n in short if self._in_vain(self.units[n][: taken[n]]) >= patience]
         spent = [n for n in short if n not in vain and taken[n] == len(self.units[n])]
         for names, why in (
-            (vain, f"given up after {self.patience} palm poses without a sample"),
+            (vain, f"given up after {patience} palm poses without a sample"),
             (spent, "all palm poses were tried, --candidates allows more"),
         ):
             if names:
@@ -114,7 +112,8 @@ class Target:
         left = [
             name
             for name, units in self.units.items()
-            if taken[name] < len(units) and self._in_vain(units[: taken[name]]) < self.patience
+            if taken[name] < len(units)
+            and self._in_vain(units[: taken[name]]) < self.config.samples_patience
         ]
         level = self._level([counts[name] for name in left], sum(counts.values()))
         return [name for name in left if level is None or counts[name] < level]
@@ -126,13 +125,13 @@ class Target:
 
     def _level(self, counts: Sequence[int], total: int) -> int | None:
         """Return the number of samples below which an object takes part; None: any number."""
-        level = self.per_object
-        if self.samples is None:
+        level, wanted = self.config.samples_per_object, self.config.samples
+        if wanted is None:
             return level
-        if total >= self.samples:
+        if total >= wanted:
             return 0
         # Fill up the objects with the fewest first.
-        rest, ordered = self.samples - total, sorted(counts)
+        rest, ordered = wanted - total, sorted(counts)
         for k, count in enumerate(ordered, start=1):
             above = ordered[k] if k < len(ordered) else None
             room = None if above is None else k * (above - count)
@@ -159,17 +158,5 @@ def refuse_two_ends(config: Config) -> None:
 
 
 def target_of(config: Config, units: Mapping[str, Sequence[ShardHeader]]) -> Target | None:
-    """Return the target that a configuration states, or None.
-
-    Args:
-        config: `samples` and `samples_per_object`.
-        units: Work units of each object, by its name, in their order.
-    """
-    if not has_target(config):
-        return None
-    return Target(
-        samples=config.samples,
-        per_object=config.samples_per_object,
-        patience=config.samples_patience,
-        units=units,
-    )
+    """Return the target that a configuration states, or None; `units` as in `Target`."""
+    return Target(config=config, units=units) if has_target(config) else None

@@ -69,11 +69,6 @@ def server_options(security: Security | None) -> dict[str, Any]:
     """Return the options of a Dask server on another machine, as JSON types."""
     if security is None:
         return {}
-    files = {
-        "tls_ca_file": security.tls_ca_file,
-        "tls_scheduler_cert": security.tls_scheduler_cert,
-        "tls_scheduler_key": security.tls_scheduler_key,
-        "tls_worker_cert": security.tls_worker_cert,
-        "tls_worker_key": security.tls_worker_key,
-    }
+    names = ("ca_file", "scheduler_cert", "scheduler_key", "worker_cert", "worker_key")
+    files = {f"tls_{name}": getattr(security, f"tls_{name}") for name in names}
     return {"protocol": "tls://", "security": {"require_encryption": True, **files}}

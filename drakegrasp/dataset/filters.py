@@ -107,8 +107,14 @@ def judge_successes(
         # The mean normal of opposed patches has length zero: normalised it is NaN.
         (Removal.OFF_SURFACE, ~np.isfinite(successes.grasp_T).all(axis=1)),
         (Removal.OFF_SURFACE, ~np.isfinite(successes.held_O).all(axis=1)),
-        *breaks_surface(config, successes.surface_distance, successes.normal_angle),
-        *((Removal.SUSPICIOUS, bad) for bad in _breaks_suspicion(config, successes)),
+        *_beyond(
+            (Removal.OFF_SURFACE, successes.surface_distance, config.max_surface_distance),
+            (Removal.NORMAL_OFF, np.degrees(successes.normal_angle), config.max_normal_angle_deg),
+            (Removal.SUSPICIOUS, successes.suspicion, config.max_suspicion),
+            (Removal.SUSPICIOUS, successes.penetration, config.max_penetration),
+            (Removal.SUSPICIOUS, successes.imbalance, config.max_imbalance),
+            (Removal.SUSPICIOUS, successes.normal_sum, config.max_normal_sum),
+        ),
         (Removal.OWN, removed_by_own),
     ):
         removal[bad & (removal == Removal.KEPT)] = reason
@@ -140,40 +146,18 @@ def breaks_hold(
     """
     if config.require == "held":
         return []
-    rules = (
+    return _beyond(
         (Removal.OTHER_LINKS, np.asarray(other_links), config.other_links),
         (Removal.SLID, np.asarray(slip), config.max_slip),
         (Removal.TURNED, np.degrees(turn), config.max_turn_deg),
     )
-    return [(reason, ~(values <= limit)) for reason, values, limit in rules if limit is not None]
 
 
-def breaks_surface(
-    config: FilterConfig, surface_distance: npt.ArrayLike, normal_angle: npt.ArrayLike
+def _beyond(
+    *rules: tuple[Removal, npt.NDArray[Any], float | None],
 ) -> list[tuple[Removal, npt.NDArray[np.bool_]]]:
-    """Return which successes (n,) break each limit of the contacts that is on.
-
-    Args:
-        config: The limits.
-        surface_distance: (n,), largest of the contacts' distances from the surface [m].
-        normal_angle: (n,), largest angle of the contacts' normals from those of the surface [rad].
-    """
-    rules = (
-        (Removal.OFF_SURFACE, np.asarray(surface_distance), config.max_surface_distance),
-        (Removal.NORMAL_OFF, np.degrees(normal_angle), config.max_normal_angle_deg),
-    )
+    """Return which values (n,) are not within each limit that is on; NaN is within none."""
     return [(reason, ~(values <= limit)) for reason, values, limit in rules if limit is not None]
-
-
-def _breaks_suspicion(config: FilterConfig, successes: Successes) -> list[npt.NDArray[np.bool_]]:
-    """Return which successes (n,) break each limit of the suspicion that is on."""
-    rules = (
-        (successes.suspicion, config.max_suspicion),
-        (successes.penetration, config.max_penetration),
-        (successes.imbalance, config.max_imbalance),
-        (successes.normal_sum, config.max_normal_sum),
-    )
-    return [~(values <= limit) for values, limit in rules if limit is not None]
 
 
 def own_filters(config: FilterConfig) -> list[type[Any]]:

@@ -76,7 +76,7 @@ def build_lock(out: Path) -> Iterator[Holder | None]:
         made = not out.exists()
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise _unwritable(out, error) from None
+        raise unwritable(out, error) from None
 
     # First among the threads of this process, then among all processes.
     key = _claim(out)
@@ -144,7 +144,8 @@ def _refuse_linked_folders(out: Path) -> None:
             raise DataError(f"{folder}: must be a folder in the dataset, got a link")
 
 
-def _unwritable(out: Path, error: OSError) -> DataError:
+def unwritable(out: Path, error: OSError) -> DataError:
+    """Return the refusal of a directory that cannot be written."""
     return DataError(f"{out}: must be a directory that can be written, got: {error.strerror}")
 
 
@@ -158,7 +159,7 @@ def _take(path: Path) -> tuple[FileIO, Holder | None]:
         try:
             file = FileIO(open_own(path, os.O_RDWR | os.O_CREAT), "r+")
         except OSError as error:
-            raise _unwritable(path.parent, error) from None
+            raise unwritable(path.parent, error) from None
         try:
             # The kernel decides, or on a file system without locks (None) the file's content.
             locked = lock_file(file)

@@ -12,7 +12,7 @@ import json
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
@@ -338,12 +338,7 @@ def read_manifest(out: Path) -> Manifest:
 
     manifest = Manifest(
         config=config,
-        objects=stored.objects,
-        refused=stored.refused,
-        rejected=stored.rejected,
-        versions=stored.versions,
-        fingers=stored.fingers,
-        schema_version=stored.schema_version,
+        **{f.name: getattr(stored, f.name) for f in fields(Manifest) if f.name != "config"},
     )
     if (mistake := next(_contradictions(stored, manifest), None)) is not None:
         raise DataError(f"{path}: {mistake}")
@@ -439,9 +434,7 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
         out.mkdir(parents=True, exist_ok=True)
         probe_folder(out)
     except OSError as error:
-        raise DataError(
-            f"{out}: must be a directory that can be written, got: {error.strerror}"
-        ) from None
+        raise lock.unwritable(out, error) from None
 
     # Without a manifest it must be empty, but for what an interrupted build may leave.
     if not (out / FILE_NAME).exists():

@@ -18,11 +18,11 @@ from drakegrasp.dataset.hdf5 import AnyArray, read_column, write_fixed
 from drakegrasp.dataset.layout.attributes import COUNT, TEXT
 from drakegrasp.dataset.layout.opening import (
     opened,
+    refuse_first,
     refuse_other_attributes,
     refuse_other_codes,
-    refuse_other_structure,
 )
-from drakegrasp.dataset.layout.structure import Tables
+from drakegrasp.dataset.layout.structure import Tables, differences
 from drakegrasp.dataset.paths import shards_folder
 from drakegrasp.dataset.schema import LOOK_FIELDS, SCHEMA_VERSION, TRIAL_FIELDS, Field
 from drakegrasp.errors import DataError
@@ -208,7 +208,7 @@ def open_shard(
         # Its columns.
         if not again:
             every = {"trials": trial_columns(), "looks": LOOK_FIELDS}
-            refuse_other_structure(path, file, every if tables is None else tables)
+            refuse_first(path, differences(file, every if tables is None else tables))
         if not again and tables is None:
             outcomes = read_column(file["trials"], "outcome")
             refuse_other_codes(path, "/trials/outcome", outcomes, list(Outcome))

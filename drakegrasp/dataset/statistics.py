@@ -122,16 +122,11 @@ def is_assembled(out: Path, *, verify_shards: bool = False, execute: Executor = 
     try:
         for name in ASSEMBLED_FILES:
             with open_hdf5(out / name) as file:
-                attrs = {key: file.attrs[key] for key in expected}
-                if any(not _same(attrs[key], value) for key, value in expected.items()):
+                if any(str(file.attrs[key]) != value for key, value in expected.items()):
                     return False
     except (OSError, KeyError):
         return False
     return True
-
-
-def _same(found: object, text: str) -> bool:
-    return isinstance(found, str) and found == text
 
 
 def _refuse_broken_files(out: Path) -> None:

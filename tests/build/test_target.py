@@ -30,7 +30,8 @@ YIELDS = {
 
 def make_target(samples: int | None, per_object: int | None = None, patience: int = 1000) -> Target:
     by_object = {name: units(name, len(found)) for name, found in YIELDS.items()}
-    return Target(samples=samples, per_object=per_object, patience=patience, units=by_object)
+    config = load_config(samples=samples, samples_per_object=per_object, samples_patience=patience)
+    return Target(config=config, units=by_object)
 
 
 def run(target: Target, workers: int = 1) -> tuple[dict[str, int], dict[str, int]]:

@@ -131,10 +131,8 @@ def sample_values(
         "work2com": transform_points(X_TO, model.p_OOcm[None])[0],
         "work2inertia": trial["mass"] / model.mass * I_OOcm_T,
         "frame_cam2img_otm": look["X_CI_otm"],
-        "frame_cam2work_otm": pack_pose(invert_pose(X_TC["otm"])),
-        "frame_cam2work_oto": pack_pose(invert_pose(X_TC["oto"])),
-        "frame_work2cam_otm": pack_pose(X_TC["otm"]),
-        "frame_work2cam_oto": pack_pose(X_TC["oto"]),
+        **{f"frame_cam2work_{c}": pack_pose(invert_pose(X)) for c, X in X_TC.items()},
+        **{f"frame_work2cam_{c}": pack_pose(X) for c, X in X_TC.items()},
         "frame_world2obj": pack_pose(multiply(X_WT, X_TO)),
         "frame_world2work": pack_pose(X_WT),
     }

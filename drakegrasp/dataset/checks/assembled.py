@@ -23,9 +23,8 @@ from drakegrasp.dataset.assembly.decisions import (
     file_attributes,
     number_rows,
     object_columns,
-    pack_tasks,
 )
-from drakegrasp.dataset.assembly.pack import PackTask, SplitSamples
+from drakegrasp.dataset.assembly.pack import SplitSamples
 from drakegrasp.dataset.assembly.samples import IMAGES
 from drakegrasp.dataset.assembly.survey import Survey
 from drakegrasp.dataset.checks.findings import Findings, Violation, of_file
@@ -132,11 +131,6 @@ def objects_and_successes(
                 continue  # a finding already, or no group
             for batch in trials.batches(file, group, np.arange(count), max(count, 1), findings):
                 trials.judge(batch, findings, *_rules(columns, batch, of))
-
-
-def range_tasks(again: Again) -> Iterator[PackTask]:
-    """Yield the tasks that derive the rows of /trials, and the samples among them, in order."""
-    return pack_tasks(again.out, again.shards, again.decisions)
 
 
 def compare_trials(

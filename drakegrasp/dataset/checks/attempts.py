@@ -121,7 +121,7 @@ def chances(
     for _, known, rows in _by_object(batch, manifest, model):
         own = rows[lifts[rows]]
         if chance is not None and len(own):
-            due[own] = _chance(chance, batch.where(_mask(own, len(batch))), known)
+            due[own] = _chance(chance, batch.where(np.isin(np.arange(len(batch)), own)), known)
     yield from batch.follows("chance", due, "the contacts after closing", CHANCE_TOLERANCE)
 
 
@@ -146,9 +146,3 @@ def _by_object(
         known = model(name)
         if known is not None:
             yield name, known, np.flatnonzero(batch["object"] == index)
-
-
-def _mask(indices: AnyArray, count: int) -> AnyArray:
-    mask = np.zeros(count, dtype=bool)
-    mask[indices] = True
-    return mask

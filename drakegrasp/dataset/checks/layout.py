@@ -45,12 +45,11 @@ def look_at(name: str, file: h5py.File, camera: str, findings: Findings) -> Chec
         findings.add([of_file(name, what, f"{version}; {OTHER_SCHEMA}")])
     else:
         # Its attributes: those that break no rule of their own are compared.
-        mistakes = {m.key: m for m in attribute_mistakes(file, OF_CAMERA if camera else ORIGIN)}
+        mistakes = attribute_mistakes(file, OF_CAMERA if camera else ORIGIN)
         attributes = {key: value for key, value in file.attrs.items() if key not in mistakes}
         for key, mistake in mistakes.items():
             if key != "config":  # `_read_config` says it
-                what = f"attribute {key} must be {mistake.must}"
-                findings.add([of_file(name, what, mistake.got)])
+                findings.add([of_file(name, mistake.what, mistake.got)])
         config = _read_config(name, file, findings)
         findings.add(_attributes(name, attributes, config, camera))
 

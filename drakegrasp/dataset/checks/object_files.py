@@ -41,25 +41,6 @@ class ObjectTask:
     shards: SurveyTask | None
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ObjectFound:
-    """What is wrong with the files of an object, and what its shards hold.
-
-    Attributes:
-        name: Name of the object.
-        candidates: Number of its palm poses.
-        readable: Whether its meshes can be read.
-        findings: The violations.
-        survey: None where a shard is missing or broken, or there is none.
-    """
-
-    name: str
-    candidates: int
-    readable: bool
-    findings: Findings
-    survey: Survey | None
-
-
 def object_tasks(out: Path, manifest: Manifest) -> Iterator[ObjectTask]:
     """Yield the task of each object."""
     surveys = {task.object: task for task in survey_tasks(out, manifest)}
@@ -67,8 +48,13 @@ def object_tasks(out: Path, manifest: Manifest) -> Iterator[ObjectTask]:
         yield ObjectTask(out=out, entry=entry, shards=surveys.get(i))
 
 
-def check_object(task: ObjectTask) -> ObjectFound:
-    """Verify the files of an object."""
+def check_object(task: ObjectTask) -> tuple[Findings, bool, Survey | None]:
+    """Verify the files of an object.
+
+    Returns:
+        The violations, whether its meshes can be read, and the survey of its shards; None where
+        one is missing or broken, or there is none.
+    """
     findings, survey = Findings(), None
     readable = not findings.add(_meshes(task.out, task.entry)) and not findings
     findings.add(_as_written(task.out, task.entry.name))
@@ -77,13 +63,7 @@ def check_object(task: ObjectTask) -> ObjectFound:
             survey = survey_object(task.shards)
         except DataError:
             findings.add(_broken_shards(task.shards))
-    return ObjectFound(
-        name=task.entry.name,
-        candidates=task.entry.candidates,
-        readable=readable,
-        findings=findings,
-        survey=survey,
-    )
+    return findings, readable, survey
 
 
 def _meshes(out: Path, entry: ObjectEntry) -> Iterator[Violation]:

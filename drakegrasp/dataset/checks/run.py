@@ -92,13 +92,14 @@ def _check_directory(out: Path, check: Check) -> None:
 
     # The files that all others follow from.
     objects, surveys = set[str](), []
-    for found in in_order(check.execute)(check_object, object_tasks(out, manifest)):
-        check.findings.merge(found.findings)
-        check.advance(found.candidates)
-        if found.readable:
-            objects.add(found.name)
-        if found.survey is not None:
-            surveys.append(found.survey)
+    results = in_order(check.execute)(check_object, object_tasks(out, manifest))
+    for entry, (found, readable, survey) in zip(manifest.objects, results, strict=True):
+        check.findings.merge(found)
+        check.advance(entry.candidates)
+        if readable:
+            objects.add(entry.name)
+        if survey is not None:
+            surveys.append(survey)
     dataset = Dataset(out=out, manifest=manifest, readable=frozenset(objects))
     sound = len(surveys) == sum(entry.candidates > 0 for entry in manifest.objects)
     sound &= len(surveys) > 0 and len(objects) == len(manifest.objects)

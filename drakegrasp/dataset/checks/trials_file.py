@@ -8,21 +8,21 @@ among them in the data files, before any other rule.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import zip_longest
 
 import numpy as np
 
-from drakegrasp.dataset.assembly.decisions import sample_texts
+from drakegrasp.dataset.assembly.decisions import pack_tasks, sample_texts
 from drakegrasp.dataset.assembly.pack import TASK_ROWS, PackTask, read_rows
 from drakegrasp.dataset.checks import attempts as attempt_rules
 from drakegrasp.dataset.checks import trials as trial_rules
-from drakegrasp.dataset.checks.assembled import Again, compare_samples, compare_trials, range_tasks
+from drakegrasp.dataset.checks.assembled import Again, compare_samples, compare_trials
 from drakegrasp.dataset.checks.attempts import Dataset
 from drakegrasp.dataset.checks.findings import Findings, Violation, of_file
-from drakegrasp.dataset.checks.rows import Batch, CheckedFile, Rule
+from drakegrasp.dataset.checks.rows import CheckedFile, Rule
 from drakegrasp.dataset.schema import CAMERAS, SPLITS
 from drakegrasp.outcomes import Outcome, Removal
 
@@ -61,7 +61,7 @@ class TrialsTask:
         columns, samples = ({}, {}) if self.again is None else read_rows(self.again)
         if "" in self.files and self.size:
             trials = self.files[""]
-            rules = _Rules.of(trials, self.dataset)
+            groups = _rules(trials, self.dataset)
             with trials.opened() as file:
                 if "" in self.compared and columns:
                     batches = compare_trials(
@@ -71,7 +71,8 @@ class TrialsTask:
                     rows = np.arange(self.start, self.stop)
                     batches = trials.batches(file, "trials", rows, TRIAL_ROWS, findings)
                 for batch in batches:
-                    rules.judge(batch, trials, findings)
+                    for rules in groups:
+                        batch = trials.judge(batch, findings, *rules)
 
         if self.dataset is None:
             return
@@ -83,60 +84,42 @@ class TrialsTask:
                     compare_samples(self.files[camera], camera, split, first, own, texts, findings)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Rules:
-    """The rules of attempts by what they rely on.
+def _rules(trials: CheckedFile, dataset: Dataset | None) -> list[list[Rule]]:
+    """Return the rules for a file and the dataset around it, if there is one.
 
-    Attributes:
-        first: For any values.
-        last: For finite values of known objects.
-        sound: For sound poses and contacts.
+    Each group relies on those before it: the first is for any values, stages need a legal outcome,
+    the third is for finite values of known objects, the last for sound poses and contacts.
     """
+    # What is known of the objects and the hand.
+    config, count = trials.config, trials.counts["objects"]
+    objects = dataset.manifest.objects if dataset else None
+    fingers = json.loads(trials.attributes.get("fingers", "{}"))
+    required = list(fingers.values()) or [True]
+    numbers = partial(
+        trial_rules.numbers,
+        objects=count,
+        candidates=None if objects is None else [entry.candidates for entry in objects],
+        standoffs=None if config is None else len(config.candidates.standoffs),
+        children=None if config is None else config.refine.children,
+    )
 
-    first: tuple[Rule, ...]
-    last: tuple[Rule, ...]
-    sound: tuple[Rule, ...]
-
-    @classmethod
-    def of(cls, trials: CheckedFile, dataset: Dataset | None) -> _Rules:
-        """Return the rules for a file and the dataset around it, if there is one."""
-        # What is known of the objects and the hand.
-        config, count = trials.config, trials.counts["objects"]
-        objects = dataset.manifest.objects if dataset else None
-        fingers = json.loads(trials.attributes.get("fingers", "{}"))
-        required = list(fingers.values()) or [True]
-
-        # What follows from the dataset needs all of its objects.
-        last: list[Rule] = [
-            partial(trial_rules.verdicts, required=required, rules=config.lift if config else None),
-            trial_rules.contacts,
-            trial_rules.poses,
+    # What follows from the dataset needs all of its objects.
+    finite: list[Rule] = [
+        partial(trial_rules.verdicts, required=required, rules=config.lift if config else None),
+        trial_rules.contacts,
+        trial_rules.poses,
+    ]
+    sound: list[Rule] = [trial_rules.motion]
+    if dataset is not None and count == len(dataset.manifest.objects):
+        model, manifest = dataset.loader(), dataset.manifest
+        finite += [
+            partial(attempt_rules.resting_poses, manifest=manifest),
+            partial(attempt_rules.conditions, manifest=manifest, model=model),
         ]
-        sound: list[Rule] = [trial_rules.motion]
-        if dataset is not None and count == len(dataset.manifest.objects):
-            model, manifest = dataset.loader(), dataset.manifest
-            last += [
-                partial(attempt_rules.resting_poses, manifest=manifest),
-                partial(attempt_rules.conditions, manifest=manifest, model=model),
-            ]
-            sound.append(
-                partial(attempt_rules.chances, required=required, manifest=manifest, model=model)
-            )
-
-        standoffs = config.candidates.standoffs if config else None
-        numbers = partial(
-            trial_rules.numbers,
-            objects=count,
-            candidates=None if objects is None else [entry.candidates for entry in objects],
-            standoffs=None if standoffs is None else len(standoffs),
-            children=config.refine.children if config else None,
+        sound.append(
+            partial(attempt_rules.chances, required=required, manifest=manifest, model=model)
         )
-        return cls(first=(numbers,), last=tuple(last), sound=tuple(sound))
-
-    def judge(self, batch: Batch, trials: CheckedFile, findings: Findings) -> None:
-        """Apply the rules; stages need a legal outcome."""
-        for rules in (self.first, (trial_rules.stages,), self.last, self.sound):
-            batch = trials.judge(batch, findings, *rules)
+    return [[numbers], [trial_rules.stages], finite, sound]
 
 
 def trials_tasks(
@@ -157,7 +140,11 @@ def trials_tasks(
     trials = files.get("")
     sound = trials is not None and {"objects", "trials"} <= set(trials.counts)
     count = trials.counts["trials"] if trials is not None and sound else 0
-    packs = range_tasks(again) if again is not None and compared else iter(())
+
+    # What follows from the shards comes along, range by range.
+    packs: Iterable[PackTask] = ()
+    if again is not None and compared:
+        packs = pack_tasks(again.out, again.shards, again.decisions)
     firsts = dict.fromkeys(SPLITS, 0)
     for start, pack in zip_longest(range(0, count, TASK_ROWS), packs):
         first = pack.start if start is None else start

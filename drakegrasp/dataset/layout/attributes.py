@@ -1,18 +1,18 @@
 """Rules of the attributes of a file: which there are, and of what kind.
 
-In: an open HDF5 file. Out: every `Mistake`. Whether they agree with the configuration
+In: an open HDF5 file. Out: every `Difference` from them. Whether they agree with the configuration
 is for `checks.layout`: that needs more than NumPy and h5py.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import h5py
 import numpy as np
 
+from drakegrasp.dataset.layout.structure import Difference
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import printable
 from drakegrasp.runtime.json_text import parse_json
@@ -80,33 +80,19 @@ OF_CAMERA: Mapping[str, Rule] = {
 }
 
 
-@dataclass(frozen=True)
-class Mistake:
-    """An attribute that breaks its rule: what it must be, and what it is."""
-
-    key: str
-    must: str
-    got: str
-
-    def __str__(self) -> str:
-        return f"attribute {self.key} must be {self.must}, got {self.got}"
-
-
-def attribute_mistakes(file: h5py.File, rules: Mapping[str, Rule]) -> Iterator[Mistake]:
-    """Yield the attributes that are missing or break their rules.
+def attribute_mistakes(file: h5py.File, rules: Mapping[str, Rule]) -> dict[str, Difference]:
+    """Return by their names the attributes that are missing or break their rules.
 
     Args:
         file: The file.
         rules: By the attributes' names.
     """
+    mistakes = {}
     for key, (must, obeys) in rules.items():
-        if key in file.attrs:
-            value = file.attrs[key]
-            if not obeys(value):
-                yield Mistake(key, must, _shown(value))
-        elif key not in _YOUNG:
-            yield Mistake(key, must, "none")
-
-
-def _shown(value: Any) -> str:
-    return printable(" ".join(repr(value).split())[:60])
+        value = file.attrs.get(key)
+        if key not in file.attrs and key not in _YOUNG:
+            mistakes[key] = Difference(what=f"attribute {key} must be {must}", got="none")
+        elif key in file.attrs and not obeys(value):
+            got = printable(" ".join(repr(value).split())[:60])
+            mistakes[key] = Difference(what=f"attribute {key} must be {must}", got=got)
+    return mistakes

@@ -7,7 +7,7 @@ do not exist. `drakegrasp check` lists all that is wrong with a file, and does n
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.layout.attributes import OF_CAMERA, ORIGIN, Rule, attribute_mistakes
-from drakegrasp.dataset.layout.structure import DATA_TABLES, TRIAL_TABLES, Tables, differences
+from drakegrasp.dataset.layout.structure import DATA_TABLES, TRIAL_TABLES, differences
 from drakegrasp.dataset.schema import refuse_other_schema
 from drakegrasp.errors import DataError, first_line, printable
 
@@ -32,7 +32,7 @@ def open_samples(path: Path) -> Iterator[h5py.File]:
     """
     with opened(path, "a data file of drakegrasp") as file:
         refuse_other_attributes(path, file, OF_CAMERA)
-        refuse_other_structure(path, file, DATA_TABLES)
+        refuse_first(path, differences(file, DATA_TABLES))
         yield file
 
 
@@ -45,7 +45,7 @@ def open_trials(path: Path) -> Iterator[h5py.File]:
     """
     with opened(path, "the trials of a dataset") as file:
         refuse_other_attributes(path, file, ORIGIN)
-        refuse_other_structure(path, file, TRIAL_TABLES)
+        refuse_first(path, differences(file, TRIAL_TABLES))
         yield file
 
 
@@ -83,30 +83,16 @@ def refuse_other_attributes(path: Path, file: h5py.File, rules: Mapping[str, Rul
     if "schema_version" not in file.attrs:
         raise DataError(f"{path}: must be a data file of drakegrasp, got another HDF5 file")
     refuse_other_schema(path, file.attrs["schema_version"])
-    refuse_first(path, attribute_mistakes(file, rules))
+    refuse_first(path, attribute_mistakes(file, rules).values())
 
 
-def refuse_other_structure(path: Path, file: h5py.File, tables: Tables) -> None:
-    """Refuse a file whose groups and datasets differ from the schema.
-
-    Args:
-        path: Of the file, for the message.
-        file: The file.
-        tables: Fields of each group.
-
-    Raises:
-        DataError: If they do; the first difference is told.
-    """
-    refuse_first(path, differences(file, tables))
-
-
-def refuse_first(path: Path, mistakes: Iterator[object]) -> None:
+def refuse_first(path: Path, mistakes: Iterable[object]) -> None:
     """Refuse a file with any mistake; the first is told.
 
     Raises:
         DataError: If there is one.
     """
-    if (first := next(mistakes, None)) is not None:
+    if (first := next(iter(mistakes), None)) is not None:
         raise DataError(f"{path}: {printable(str(first))}")
 
 

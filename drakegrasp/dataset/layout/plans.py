@@ -35,7 +35,7 @@ def refuse_other_plan(path: Path, file: h5py.File) -> None:
     Raises:
         DataError: If it is none; the first difference is told.
     """
-    refuse_first(path, attribute_mistakes(file, _ATTRIBUTES))
+    refuse_first(path, attribute_mistakes(file, _ATTRIBUTES).values())
     refuse_first(path, _other_arrays(file))
 
 
