@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 import pytest
 from helpers.assertions import arrays_of, assert_same_arrays
-from helpers.datasets import BOTH, BOXES, OTO, TRIALS, make_dataset
+from helpers.datasets import BOTH, BOXES, OTO, TRIALS, change, make_dataset, must_find
 from helpers.meshes import write_fixed
 
 from drakegrasp.build.merge import merge
@@ -89,6 +89,13 @@ def test_halves_by_objects_are_the_whole(sound: Path, tmp_path: Path) -> None:
     # Those that it is made of are as before, and share its shards.
     assert (files_of(first), files_of(second)) == before
     assert {path.stat().st_nlink for path in (tmp_path / "into/shards").rglob("*.h5")} == {2}
+
+
+def test_a_dataset_of_one_object_is_compared_with_its_shards(sound: Path, tmp_path: Path) -> None:
+    out = half(sound, tmp_path / "one", slice(2, 3))
+    assert check_dataset(out) == []
+    change(out, TRIALS, "trials/spread", 0, lambda spread: spread + 0.01)
+    must_find(out, (TRIALS, "/trials", 0, "spread must follow from its shard"))
 
 
 def test_where_files_cannot_be_linked_they_are_copied(

@@ -34,6 +34,7 @@ from drakegrasp.dataset.checks.rows import Batch
 from drakegrasp.dataset.paths import model_path
 from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS
 from drakegrasp.frames import invert_pose, make_pose, pack_pose, rotation_about, unpack_pose
+from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import load_object
 
 
@@ -284,3 +285,17 @@ def test_pixels_become_points() -> None:
     X_AC = make_pose(rotation_about([0.0, 0.0, 1.0], np.pi / 2.0), [1.0, 2.0, 3.0])
     found = image_rules._points(X_AC, LENS, depth, chosen)
     np.testing.assert_allclose(found, [[1.0 - 0.08, 2.0 - 0.08, 3.32]], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("settings", "loses"),
+    [
+        ([], False),
+        (["randomize.depth_noise=[0.001,0.002]"], True),
+        (["randomize.depth_baseline=0.02"], True),
+    ],
+)
+def test_pixels_lose_their_depth_only_where_errors_are_drawn(
+    settings: list[str], loses: bool
+) -> None:
+    assert Lens.of("oto", load_config(overrides=settings)).loses is loses
