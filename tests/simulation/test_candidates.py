@@ -414,6 +414,7 @@ def test_one_attempt_in_ten_is_audited_whatever_is_tried_with_it() -> None:
         made += [each.audited for each in first]
         born += [children(each, rules, name="thing", seed=seed)[0].audited for each in first]
     assert [each.audited for each in attempts(range(10, 20))] == made[30:60]
+    assert np.flatnonzero(made[:65]).tolist() == [5, 7, 22, 59, 64]  # draws are for ever
     for audited, share in ((made, 0.1), (born, 0.1), (np.array(made) & born, 0.01)):
         assert np.mean(audited) == pytest.approx(share, abs=4 * np.sqrt(share / len(made)))
 

@@ -244,6 +244,13 @@ def test_what_tips_over_is_noted(config: Config):
     assert resting.notes == ("it tipped over by 61 degrees when it was dropped",)
 
 
+@pytest.mark.parametrize(("degrees", "noted"), [(4.9, False), (5.1, True)])
+def test_a_tilt_of_five_degrees_is_noted(degrees: float, noted: bool) -> None:
+    X_TO = trimesh.transformations.rotation_matrix(np.deg2rad(degrees), [1, 0, 0])
+    resting = Resting(X_TO=X_TO, seconds=1.0, table_force=9.81, sink=0.0, stopped=False)
+    assert bool(resting.notes) is noted
+
+
 def test_what_rolls_is_stopped_and_noted(config: Config, monkeypatch: pytest.MonkeyPatch):
     """A cube that is said to move until 60 % of the longest time are over."""
     quick, measured = override_config(config, ["settle.max_time=2"]), settle_module._speeds
