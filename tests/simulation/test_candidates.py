@@ -9,9 +9,6 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
@@ -21,7 +18,7 @@ from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel, prepare_object
 from drakegrasp.objects.sources import MeshSource
-from drakegrasp.seeding import Stream, object_key
+from drakegrasp.seeding import Stream
 from drakegrasp.simulation.candidates import (
     Attempt,
     Candidates,
@@ -185,48 +182,17 @@ def test_valid_poses_are_as_many_as_a_brute_force_finds(reference: Reference) ->
 
 
 def test_distinct_poses_are_counted_right(reference: Reference) -> None:
-    """No two of ours are one pose, and none is missing: so there are exactly this many."""
+    """No two of ours are one pose, and none is missing: so there are exactly this many.
+
+    And each of ours is one of those that the brute force allows: above the table, around the box.
+    """
     ours = coordinates(reference.poses[:, :3, :3], reference.poses[:, :3, 3], reference.half)
     tree = cKDTree(ours)
     assert not tree.query_pairs(1e-6)
     nearest, index = tree.query(reference.every_valid)
     assert nearest.max() < 1e-9
     assert len(np.unique(index)) == len(ours) == BOXES[reference.name][2]
-
-
-def test_palms_are_above_the_table_on_the_corners_sphere(reference: Reference) -> None:
-    p_OG = reference.poses[:, :3, 3]
-    assert (p_OG[:, 2] > -reference.half[2]).all()
-    radius = np.sqrt(np.sum(reference.half**2))
-    np.testing.assert_allclose(np.linalg.norm(p_OG, axis=1), radius, rtol=1e-12)
-
-
-def test_palms_look_at_the_box(reference: Reference) -> None:
-    origins, directions = reference.poses[:, :3, 3], reference.poses[:, :3, 2]
-    # Larger by more than what lies on the edge counts as inside.
-    mesh = trimesh.creation.box(2.0 * reference.half * (1.0 + 1e-5))
-    assert mesh.ray.intersects_any(origins, directions).all()
-
-
-def test_palms_rotations_are_proper(reference: Reference) -> None:
-    R = reference.poses[:, :3, :3]
-    products = R @ np.swapaxes(R, 1, 2)
-    np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), R.shape), atol=1e-14)
-    np.testing.assert_allclose(np.linalg.det(R), 1.0, atol=1e-14)
-    np.testing.assert_array_equal(reference.poses[:, 3], np.broadcast_to([0, 0, 0, 1], (len(R), 4)))
-
-
-def test_first_pose_looks_down_from_above() -> None:
-    """With all angles zero: d on +Oz, Gz = -Oz, Gx = Ox (equation 1 of the paper)."""
-    zero = {f"{w}_{a}_deg": (0,) for w in ("global", "local") for a in "xyz"}
-    poses, combinations, valid = rotation_candidates(
-        [0.02, 0.03, 0.06],
-        standing(np.array([0.02, 0.03, 0.06])),
-        DEFAULTS.model_copy(update=zero),
-        stream(),
-    )
-    assert (combinations, valid) == (1, 1)
-    np.testing.assert_allclose(poses, [make_pose(np.diag([1, -1, -1]), [0, 0, 0.07])], atol=1e-16)
+    np.testing.assert_array_equal(reference.poses[:, 3] - [0, 0, 0, 1], 0.0)
 
 
 def test_table_cuts_what_lies_below_it_in_world_axes() -> None:
@@ -239,25 +205,6 @@ def test_table_cuts_what_lies_below_it_in_world_axes() -> None:
     assert up[:, 2, 3].min() > -0.05 < 0.05 < up[:, 2, 3].max()
     assert down[:, 2, 3].max() < 0.05
     assert down[:, 2, 3].min() < -0.05
-
-
-@settings(max_examples=300)
-@given(
-    arrays(np.float64, 3, elements=st.floats(-2.0, 2.0)),
-    arrays(np.float64, 3, elements=st.floats(-1.0, 1.0)).filter(lambda z: z @ z > 1e-4),
-    arrays(np.float64, 3, elements=st.floats(0.05, 0.5)),
-)
-def test_slab_test_agrees_with_the_nearest_approach(p: Array, z: Array, half: Array) -> None:
-    """Ray and box meet if the convex function max_i(|p_i + t z_i| - h_i) has a minimum <= 0."""
-    z = z / np.linalg.norm(z)
-    low, high = 0.0, 10.0
-    for _ in range(120):
-        a, b = low + (high - low) / 3.0, high - (high - low) / 3.0
-        outside = [np.max(np.abs(p + t * z) - half) for t in (a, b)]
-        low, high = (low, b) if outside[0] <= outside[1] else (a, high)
-    gap = np.max(np.abs(p + low * z) - half)
-    if abs(gap) > 1e-9:  # a grazing ray may fall to either side
-        assert ray_meets_box(p[None], z[None], half)[0] == (gap < 0.0)
 
 
 @pytest.mark.parametrize(
@@ -324,14 +271,6 @@ def test_jitter_moves_every_angle_by_whole_degrees_below_its_bound() -> None:
     assert 4.0 < lean.max() < 12.0
     # Global X and Y alone move the palm; of their 4 x 4 pairs of degrees all come up.
     assert len(np.unique(np.round(poses[:, :3, 3], 9), axis=0)) == 16
-
-
-def test_same_seed_draws_the_same(box: ObjectModel) -> None:
-    for method in ("rotations", "normals"):
-        config = COARSE.model_copy(update={"method": method, "max": 200})
-        one, two = (sample_candidates(box, BOX_X_TO, config, 3) for _ in range(2))
-        np.testing.assert_array_equal(one.X_OG, two.X_OG)
-        np.testing.assert_array_equal(one.distance, two.distance)
 
 
 @pytest.mark.parametrize("method", ["rotations", "normals"])
@@ -437,31 +376,6 @@ def test_enough_room_keeps_every_distinct_pose(box: ObjectModel) -> None:
     assert (drawn.combinations, drawn.valid, drawn.distinct) == (combinations, valid, len(poses))
     assert 0 < len(drawn) == drawn.distinct < drawn.valid < drawn.combinations
     assert {X.tobytes() for X in drawn.X_OG} == {X.tobytes() for X in poses}
-
-
-def test_object_key_is_frozen_and_of_the_name_alone() -> None:
-    """It decides which grasps an object gets: a change would make every dataset another.
-
-    The number is the first four bytes that `printf 24_mug_final | sha256sum` prints.
-    """
-    assert object_key("24_mug_final") == 0x2B63C3F3
-    assert object_key("24_mug_final") != object_key("24_mug_final ")
-    assert 0 <= object_key("é") < 2**32
-
-
-@given(arrays(np.float64, 3, elements=st.floats(-1.0, 1.0)).filter(lambda v: v @ v > 1e-2))
-@settings(max_examples=50)
-def test_palm_ray_meets_a_sphere_at_its_radius(v: Array) -> None:
-    """From 0.5 m to the centre of a sphere of 0.1 m: 0.4 m, and a facet's sagitta at most."""
-    z = -v / np.linalg.norm(v)
-    x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
-    x /= np.linalg.norm(x)
-    X_OG = make_pose(np.column_stack([x, np.cross(z, x), z]), -0.5 * z)
-    (distance,) = palm_ray_distance(SPHERE, X_OG[None])
-    assert 0.4 - 1e-6 <= distance <= 0.4 + 0.001
-
-
-SPHERE = trimesh.creation.icosphere(subdivisions=4, radius=0.1)
 
 
 def test_palm_ray_to_a_box_in_closed_form(box: ObjectModel) -> None:

@@ -74,13 +74,6 @@ def test_contacts_around_a_cylinder_share_its_weight_by_friction(k):
     assert np.allclose(forces.f_Q_O[:, 2], WEIGHT / k, atol=1e-5)
 
 
-def test_finger_that_opposes_two_presses_as_hard_as_both():
-    """Its friction carries half of the weight: N = m g / (2 mu)."""
-    forces = smallest_forces(*PINCH, ORIGIN, CARRY, MU)
-    assert forces.largest_normal == pytest.approx(WEIGHT / (2.0 * MU), rel=1e-6)
-    assert forces.f_Q_O[2, 1] == pytest.approx(WEIGHT / (2.0 * MU), rel=1e-5)
-
-
 def test_finger_below_the_centre_of_mass_carries_it_without_friction():
     forces = smallest_forces([[0.0, 0.0, -0.03]], [[0.0, 0.0, -1.0]], ORIGIN, CARRY, 0.0)
     assert forces.feasible
