@@ -194,15 +194,6 @@ def weak(monkeypatch: pytest.MonkeyPatch, **changes: object) -> None:
     monkeypatch.setattr(mujoco_baseline, "load_hand", lambda name: replace(hand, fingers=fingers))
 
 
-def test_worm_yields_beyond_its_strength(
-    pinched: ObjectModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Two fingers load the opposing one with 4 N m in all."""
-    weak(monkeypatch, torque_limit=2.0, holding_torque=2.0)
-    trial = peer(pinched, "lift.drive=worm").run(from_above(pinched, STANDOFF))
-    assert trial.slip > 5e-3
-
-
 def test_contact_beside_the_pad_and_its_band_is_of_another_link(
     cube: ObjectModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 import trimesh
 from helpers.objects import box_model, standing
@@ -15,7 +14,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from drakegrasp.errors import GraspError, MeshError
-from drakegrasp.frames import Array, make_pose, pack_pose
+from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.settings import load_config
 from drakegrasp.simulation.placement import (
     MAX_GAP,
@@ -114,8 +113,6 @@ MISTAKES: dict[str, tuple[Any, str, str]] = {
     "broken file": (broken_file, "m", "a.obj: must"),
     "units of a file": (lambda f: write(f / "a.obj", box()), "inch", "units must be one of m, cm"),
     "units of a mesh": (lambda _: box(), "inch", "units must be one of m, cm, mm, got 'inch'"),
-    "nothing": (lambda _: None, "m", "a trimesh.Trimesh or a placed object, got NoneType"),
-    "number": (lambda _: 3, "m", "a trimesh.Trimesh or a placed object, got int"),
     "scene": (lambda _: box().scene(), "m", "a trimesh.Trimesh or a placed object, got Scene"),
     "empty": (lambda _: trimesh.Trimesh(), "m", "mesh: must hold triangles, got no faces"),
     "nan": (not_finite, "m", "mesh: vertices must be finite, got NaN or inf"),
@@ -182,12 +179,6 @@ def test_anything_with_a_model_and_a_pose_is_an_object(tmp_path: Path) -> None:
 # Poses
 
 
-@pytest.mark.parametrize("written", [X_TO, X_TO[:3], pack_pose(X_TO), X_TO.tolist()])
-def test_pose_may_be_given_as_files_hold_it(written: npt.ArrayLike) -> None:
-    placed = place_object(box(), X_TO=np.asarray(written, dtype=np.float32))
-    np.testing.assert_allclose(placed.X_TO, X_TO, atol=1e-7)
-
-
 def lifted(height: float) -> Array:
     return make_pose(np.eye(3), [0.0, 0.0, 0.05 + height])
 
@@ -209,12 +200,8 @@ def test_pose_may_be_off_the_table_by_a_little() -> None:
             make_pose(Rotation.from_euler("x", 90, True).as_matrix(), [0.0, 0.0, 0.05]),
             "got one at 10 mm",
         ),
-        (np.diag([1.0, 1.0, -1.0, 1.0]), "X_TO must hold a rotation"),
         (np.full((4, 4), np.nan), "X_TO must be finite"),
-        (np.eye(3), "X_TO must be a pose, 4 x 4 numbers, got an array of shape (3, 3)"),
         (np.tile(X_TO, (2, 1, 1)), "X_TO must be one pose, got an array of shape (2, 4, 4)"),
-        ("upright", "X_TO must be a pose, 4 x 4 numbers, got text"),
-        (X_TO.T, "X_TO must have 0 0 0 1 as its last row"),
     ],
 )
 def test_pose_that_does_not_stand_on_the_table_is_refused(pose: Any, message: str) -> None:
@@ -257,13 +244,6 @@ def assert_keeps_up_and_height(X: Array) -> None:
     R = rest[:3, :3]
     np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-12)
     assert np.linalg.det(R) == pytest.approx(1.0)
-
-
-@given(angles, st.floats(0.0, np.pi), angles, st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
-def test_canonical_pose_keeps_up_and_height_and_forgets_the_rest(
-    yaw: float, tilt: float, about: float, x: float, y: float
-) -> None:
-    assert_keeps_up_and_height(pose_of(yaw, tilt, about, x, y))
 
 
 # Nearly upside down every small tilt has its own direction, so rounding decides.

@@ -46,7 +46,6 @@ from drakegrasp.simulation.screen import Prediction
 from drakegrasp.simulation.settle import settle
 from drakegrasp.simulation.trajectory import lift_duration
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
-from drakegrasp.vision.camera import camera_pose_oto
 
 pytestmark = pytest.mark.sim
 
@@ -184,29 +183,6 @@ def test_object_rises_with_the_palm_to_the_target(held, config):
     assert risen == pytest.approx(0.60 - CUBE - STANDOFF, abs=1e-3)
 
 
-def test_slippery_cube_is_lost(cube, hand):
-    slippery = load_config(overrides=["physics.friction_hand=0.05"])
-    scene = build_scene(cube, slippery.physics, hand)
-    record = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), slippery)
-    assert record.outcome in (Outcome.SLIPPED, Outcome.DROPPED)
-    assert record.closed.contacts.touching.all()
-
-
-def test_attempt_in_the_air_misses(scene, cube, config):
-    everything = override_config(config, ["screen.mode=off"])
-    record = run_attempt(scene, standing(cube), from_above(cube, 0.25), everything)
-    assert record.outcome is Outcome.MISSING_FINGERTIP
-    assert not record.closed.contacts.touching.any()
-    assert np.isnan(record.closed.contacts.p_OQ).all()
-    assert record.lift is None
-
-
-def test_open_hand_that_meets_the_object_collides(scene, cube, config):
-    record = run_attempt(scene, standing(cube), from_above(cube, 0.001), config)
-    assert record.outcome is Outcome.START_COLLISION
-    assert record.closed is None
-
-
 @pytest.mark.parametrize("mode", ["on", "off"])
 def test_hand_wholly_inside_of_an_object_collides(tmp_path, config, hand, mode):
     """No surfaces cross there: only the inside test can see it, that of the screen or the scene."""
@@ -272,13 +248,6 @@ def test_error_within_drake_is_an_outcome(scene, cube, config, monkeypatch, erro
     assert record.outcome is Outcome.SOLVER_ERROR
     assert record.message == str(error).splitlines()[0]
     assert record.outcome.stage is Stage.PLACED
-
-
-def test_attempt_that_takes_too_long_is_a_timeout(scene, cube):
-    hurried = load_config(overrides=["attempt_seconds=1e-6"])
-    record = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), hurried)
-    assert record.outcome is Outcome.TIMEOUT
-    assert record.closed is None
 
 
 def test_exploded_state_is_no_verdict_on_the_grasp(scene, cube, hand):
@@ -369,12 +338,6 @@ def test_table_friction_stops_a_sliding_block(tmp_path):
         speeds.append((start, scene.pose(scene.object)[0, 3] - before))
     for start, distance in speeds:
         assert distance == pytest.approx(start**2 / (2.0 * 0.5 * GRAVITY), rel=0.05)
-
-
-def test_camera_stands_behind_the_palm(cube, config):
-    X_TG = standing(cube) @ from_above(cube, STANDOFF).X_OG
-    X_GC = invert_pose(X_TG) @ camera_pose_oto(X_TG, config.camera)
-    assert np.allclose(X_GC, make_pose(np.eye(3), [0.0, 0.0, -0.25]))
 
 
 @pytest.mark.slow
@@ -539,6 +502,8 @@ def test_closing_ends_where_a_fingertip_has_passed_the_object(scene, cube, confi
     assert record.outcome is Outcome.MISSING_FINGERTIP
     end = last + np.deg2rad(2.0)
     look = config.close.check_period * max(hand.closing_speed)
+    assert np.isnan(record.closed.contacts.p_OQ).all()
+    assert record.lift is None
     closed = record.closed.q[[1, 4, 6]]
     assert end < closed.max() < end + 1.1 * look
 
