@@ -125,14 +125,6 @@ def test_worm_lets_no_finger_open(
 
 
 @pytest.mark.sim
-def test_force_opens_fingers_without_a_worm(scene: Scene, cube: ObjectModel) -> None:
-    _closed_on(scene, cube)
-    engage(scene, "torque")
-    angles = _pushed(scene, FORCE, steps=20)
-    assert (angles[-1] - angles[0]).min() < np.deg2rad(-1.0)
-
-
-@pytest.mark.sim
 def test_locked_fingers_keep_their_angles(scene: Scene, cube: ObjectModel) -> None:
     _closed_on(scene, cube)
     engage(scene, "locked")

@@ -43,7 +43,6 @@ from drakegrasp.simulation.scene import (
     reset_object,
 )
 from drakegrasp.simulation.screen import Prediction
-from drakegrasp.simulation.settle import settle
 from drakegrasp.simulation.trajectory import lift_duration
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 
@@ -114,25 +113,6 @@ def test_hand_without_weights_lifts_all_that_it_may(scene, cube, held):
     record = run_attempt(bare, standing(cube), from_above(cube, STANDOFF), rules)
     assert record.outcome is Outcome.SUCCESS
     assert np.isnan(record.chance)
-
-
-def test_resting_cube_presses_on_the_table_with_its_weight(cube, config):
-    resting = settle(cube, config)
-    assert resting.table_force == pytest.approx(cube.mass * GRAVITY, rel=0.01)
-    assert not resting.stopped
-    assert resting.X_TO[2, 3] == pytest.approx(CUBE / 2.0, abs=2e-4)
-    assert np.all(resting.X_TO[:2, 3] == 0.0)
-
-
-def test_dropped_plank_falls_flat_from_its_edge(tmp_path, config):
-    """A plank that stands on its long thin edge at a tilt ends on its largest face."""
-    plank = trimesh.creation.box([0.10, 0.02, 0.08]).subdivide()
-    plank.apply_transform(trimesh.transformations.rotation_matrix(0.5, [1, 0, 0]))
-    model = model_of(plank, tmp_path)
-    resting = settle(model, config)
-    lowest = (model.visual_vertices @ resting.X_TO[:3, :3].T + resting.X_TO[:3, 3])[:, 2]
-    assert lowest.max() == pytest.approx(0.02, abs=1e-3)
-    assert lowest.min() == pytest.approx(0.0, abs=1e-3)
 
 
 def test_cube_grasped_across_its_faces_is_lifted(held):
