@@ -23,21 +23,16 @@ from drakegrasp.errors import DataError
 from drakegrasp.outcomes import Outcome, Removal
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    return make_dataset(tmp_path_factory.mktemp("out") / "data", tmp_path_factory.mktemp("meshes"))
-
-
 def names(file):
     return [name.decode() for name in file["objects/name"][:]]
 
 
-def test_drawn_lifts_are_what_the_dataset_says(dataset):
-    lifts = draw_lifts(dataset, 1000)
+def test_drawn_lifts_are_what_the_dataset_says(sound):
+    lifts = draw_lifts(sound, 1000)
     # Per object three successes, and three lifts that were lost: slipped, dropped, on the table.
     assert len(lifts) == 6 * len(BOXES)
     assert len({lift.trial_id for lift in lifts}) == len(lifts)
-    with h5py.File(dataset / TRIALS) as file:
+    with h5py.File(sound / TRIALS) as file:
         removals = dict(zip(file["successes/trial_id"], file["successes/removal"], strict=True))
         for lift in lifts:
             row = lift.trial_id
@@ -64,22 +59,20 @@ def test_drawn_lifts_have_their_own_friction_and_mass(tmp_path):
     assert len({lift.materials for lift in lifts}) == len(lifts)
 
 
-def test_hand_on_the_table_after_closing_is_no_lift(dataset):
-    drawn = {lift.trial_id for lift in draw_lifts(dataset, 1000)}
+def test_hand_on_the_table_after_closing_is_no_lift(sound):
+    drawn = {lift.trial_id for lift in draw_lifts(sound, 1000)}
     on_table = [i for i, outcome in enumerate(OUTCOMES) if outcome is Outcome.TABLE_CONTACT]
     assert drawn & set(on_table) == {AFTER_LIFT}
 
 
-def test_lift_without_a_verdict_is_no_lost_one(dataset, tmp_path):
-    out = make_dataset(tmp_path / "data", tmp_path)
+def test_lift_without_a_verdict_is_no_lost_one(sound, out):
     change(out, TRIALS, "trials/outcome", SLIPPED, lambda _: Outcome.MOVED)
-    drawn = [{lift.trial_id for lift in draw_lifts(each, 1000)} for each in (dataset, out)]
+    drawn = [{lift.trial_id for lift in draw_lifts(each, 1000)} for each in (sound, out)]
     assert drawn[0] - drawn[1] == {SLIPPED}
 
 
-def test_groups_and_objects_take_turns(dataset, tmp_path):
+def test_groups_and_objects_take_turns(out):
     """With every second success removed, each group has lifts of each object."""
-    out = make_dataset(tmp_path / "data", tmp_path)
     with h5py.File(out / TRIALS, "r+") as file:
         file["successes/removal"][::3] = Removal.OUTLIER
     lifts = draw_lifts(out, 9)
@@ -91,30 +84,28 @@ def test_groups_and_objects_take_turns(dataset, tmp_path):
     assert Counter(lift.group for lift in draw_lifts(out, 9)) == {"removed": 5, "lost": 4}
 
 
-def test_draw_depends_on_the_seed_alone(dataset, tmp_path):
+def test_draw_depends_on_the_seed_alone(sound, tmp_path):
     def drawn(out):
         return [lift.trial_id for lift in draw_lifts(out, 8)]
 
-    assert drawn(dataset) == drawn(dataset)
+    assert drawn(sound) == drawn(sound)
     other = make_dataset(tmp_path / "data", tmp_path, "seed=5")
-    assert drawn(other) != drawn(dataset)
+    assert drawn(other) != drawn(sound)
 
 
-def test_fewer_lifts_are_the_first_of_more(dataset):
-    few, more = ([lift.trial_id for lift in draw_lifts(dataset, n)] for n in (5, 11))
+def test_fewer_lifts_are_the_first_of_more(sound):
+    few, more = ([lift.trial_id for lift in draw_lifts(sound, n)] for n in (5, 11))
     assert more[:5] == few
 
 
-def test_dataset_without_lifts_is_refused(dataset, tmp_path):
-    out = make_dataset(tmp_path / "data", tmp_path)
+def test_dataset_without_lifts_is_refused(out):
     with h5py.File(out / TRIALS, "r+") as file:
         file["trials/outcome"][:] = Outcome.RAY_MISS
     with pytest.raises(DataError, match="got one in which nothing was lifted"):
         draw_lifts(out, 5)
 
 
-def test_dataset_without_trials_is_refused(dataset, tmp_path):
-    out = make_dataset(tmp_path / "data", tmp_path)
+def test_dataset_without_trials_is_refused(out, tmp_path):
     (out / TRIALS).unlink()
     with pytest.raises(DataError, match=r"trials.hdf5: must be the trials of a dataset, got none"):
         draw_lifts(out, 5)
@@ -161,16 +152,16 @@ def test_interval_of_a_share(hits, count, low, high):
 
 
 @pytest.mark.sim
-def test_command_prints_the_agreement(dataset, tmp_path):
+def test_command_prints_the_agreement(sound, tmp_path):
     pytest.importorskip("mujoco")
     pytest.importorskip("coacd")
     path = tmp_path / "report.json"
-    arguments = ["bench", "--cross-check", str(dataset), "6", "--out", str(path), "--quiet"]
+    arguments = ["bench", "--cross-check", str(sound), "6", "--out", str(path), "--quiet"]
     result = run(*arguments)
     assert result.exit_code == 0, result.output
     report = json.loads(path.read_text())
     assert [row["trial_id"] for row in report["lifts"]] == sorted(
-        lift.trial_id for lift in draw_lifts(dataset, 6)
+        lift.trial_id for lift in draw_lifts(sound, 6)
     )
     assert sum(counts["drawn"] for counts in report["groups"].values()) == 6
     assert report["drive"] == "worm"

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.objects import CUBE, box_model, from_above, standing
+from helpers.objects import box_model, from_above, standing
 
 from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, make_pose
@@ -36,16 +36,6 @@ from drakegrasp.bench.mujoco_scene import (
 pytestmark = pytest.mark.sim
 
 STANDOFF = 0.06
-
-
-@pytest.fixture(scope="module")
-def cube(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
-    return box_model(tmp_path_factory.mktemp("cube"), [CUBE, CUBE, CUBE])
-
-
-@pytest.fixture(scope="module")
-def config() -> Config:
-    return load_config()
 
 
 @pytest.fixture(scope="module")

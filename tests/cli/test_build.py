@@ -20,7 +20,7 @@ from distributed.security import Security
 from helpers.bad_inputs.array_kinds import LINE
 from helpers.builds import start_build, workers_of
 from helpers.commands import run
-from helpers.datasets import OTM, OTO, SLIP, TRIALS, make_dataset
+from helpers.datasets import OTM, OTO, SLIP, TRIALS
 
 from drakegrasp.build.counts import Counts
 from drakegrasp.build.pipeline import build
@@ -50,19 +50,6 @@ SLIPPED = ("--set", f"filters.max_slip={SLIP / 2}")
 def state(out: Path) -> dict[str, bytes]:
     """Return the files of a dataset's directory by their names, and of no folder."""
     return {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()}
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Read only: copy it to change it."""
-    folder = tmp_path_factory.mktemp("whole")
-    (folder / "meshes").mkdir()
-    return make_dataset(folder / "out", folder / "meshes")
-
-
-@pytest.fixture
-def out(whole: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(whole, tmp_path / "out"))
 
 
 def _cut_shard(out: Path) -> None:
@@ -151,10 +138,10 @@ for left, copy in enumerate(copies):
 
 
 @pytest.fixture(scope="module")
-def killed(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def killed(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """A dataset whose assembling was killed at each of its renames."""
     folder = tmp_path_factory.mktemp("killed")
-    copies = [Path(shutil.copytree(whole, folder / str(k))) for k in range(RENAMES)]
+    copies = [Path(shutil.copytree(sound, folder / str(k))) for k in range(RENAMES)]
     command = [sys.executable, "-c", DIE, SLIPPED[1], *map(str, copies)]
     subprocess.run(command, check=True, capture_output=True)
     return copies
@@ -190,8 +177,8 @@ def test_files_appear_together_whenever_assembling_is_killed(
     # The next command leaves files of one state, and nothing else.
     assert run(command, out).exit_code == 0
     assert samples(out) == ([0] * 4 if rename >= LISTED else [9] * 4)
-    whole = ["manifest.json", "objects", "shards", *FILES, *CARD_FILES]
-    assert sorted(os.listdir(out)) == sorted(whole)
+    expected = ["manifest.json", "objects", "shards", *FILES, *CARD_FILES]
+    assert sorted(os.listdir(out)) == sorted(expected)
 
 
 def test_files_of_two_states_are_a_finding(out: Path) -> None:
@@ -230,9 +217,9 @@ def test_crashes_that_no_physics_explains_end_the_build_with_an_error(
         assert line in result.stderr
 
 
-def test_few_crashes_are_no_error(whole: Path) -> None:
-    counts = Counts(read_manifest(whole), None, silent)
-    header = next(read_manifest(whole).headers())
+def test_few_crashes_are_no_error(sound: Path) -> None:
+    counts = Counts(read_manifest(sound), None, silent)
+    header = next(read_manifest(sound).headers())
     for crashed, said in ((9, 0), (1, 1)):
         counts.add(header, {Outcome.SUCCESS: 100, Outcome.CRASHED: crashed})
         assert len(counts.unexplained()) == said

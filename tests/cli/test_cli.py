@@ -18,7 +18,6 @@ import pytest
 import trimesh
 from helpers.assertions import arrays_of
 from helpers.commands import error_line, run
-from helpers.datasets import make_dataset
 from matplotlib.image import imread
 
 from drakegrasp.cli.main import main
@@ -247,9 +246,7 @@ def test_stats_say_that_the_files_are_of_another_state(small_dataset: Path, tmp_
     assert f"{out}: all work units are done, but the files are missing" in run("stats", out).stdout
 
 
-def test_stats_say_that_nothing_trains(tmp_path: Path) -> None:
-    (tmp_path / "meshes").mkdir()
-    out = make_dataset(tmp_path / "out", tmp_path / "meshes")
+def test_stats_say_that_nothing_trains(out: Path) -> None:
     said = run("stats", out).stdout
     assert "no sample is for training" not in said
     assert "split by class: 3 objects with samples, 2 of them test\n" in said

@@ -7,32 +7,24 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from helpers.datasets import make_dataset
 
 from drakegrasp.exchange.closed_grasps import ClosedGrasp, read_closed_grasps
 from drakegrasp.exchange.export import Format, export_dataset
 
 
 @pytest.fixture(scope="session")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("exchange")
-    (folder / "meshes").mkdir()
-    return make_dataset(folder / "out", folder / "meshes")
+def grasps(sound: Path) -> list[ClosedGrasp]:
+    return list(read_closed_grasps(sound))
 
 
 @pytest.fixture(scope="session")
-def grasps(dataset: Path) -> list[ClosedGrasp]:
-    return list(read_closed_grasps(dataset))
-
-
-@pytest.fixture(scope="session")
-def exported(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[Format], Path]:
+def exported(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[Format], Path]:
     """Returns the folder of a format. Read only."""
 
     @cache
     def export(form: Format) -> Path:
         to = tmp_path_factory.mktemp(form) / "to"
-        export_dataset(dataset, to, form, licence="cc-by-4.0")
+        export_dataset(sound, to, form, licence="cc-by-4.0")
         return to
 
     return export

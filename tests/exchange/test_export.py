@@ -18,10 +18,10 @@ from drakegrasp.exchange.export import FORMATS, Format, export_dataset
 
 
 def test_closed_grasps_are_the_samples_of_all_splits(
-    dataset: Path, grasps: list[ClosedGrasp]
+    sound: Path, grasps: list[ClosedGrasp]
 ) -> None:
     for split in ("train", "valid", "test"):
-        data = GraspDataset(dataset / "grasping_oto.hdf5", split=split)
+        data = GraspDataset(sound / "grasping_oto.hdf5", split=split)
         here = {grasp.trial_id: grasp.object_name for grasp in grasps if grasp.split == split}
         names = data.column("object_props/object_name").tolist()
         assert here == dict(zip(data.column("trial_id").tolist(), names, strict=True))
@@ -34,18 +34,18 @@ def test_help_names_every_format() -> None:
     assert all(f"\n  {form} " in text for form in FORMATS)
 
 
-def test_command_says_how_many(dataset: Path, grasps: list[ClosedGrasp], tmp_path: Path) -> None:
+def test_command_says_how_many(sound: Path, grasps: list[ClosedGrasp], tmp_path: Path) -> None:
     to = tmp_path / "new" / "folder"
-    done = run("export", str(dataset), str(to), "--to", "dexgraspbench")
+    done = run("export", str(sound), str(to), "--to", "dexgraspbench")
     assert done.exit_code == 0, done.output
     assert f"{len(grasps)} samples in {to}" in done.output
     assert len(list(to.rglob("*.npy"))) == len(grasps)
 
 
-def test_folder_that_holds_files_is_refused(dataset: Path, tmp_path: Path) -> None:
+def test_folder_that_holds_files_is_refused(sound: Path, tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(DataError, match="must be a new or empty directory"):
-        export_dataset(dataset, tmp_path, "original")
+        export_dataset(sound, tmp_path, "original")
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
@@ -56,28 +56,28 @@ def test_missing_dataset_is_refused_before_anything_is_written(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_dataset_without_samples_is_refused(dataset: Path, tmp_path: Path, form: Format) -> None:
-    out = Path(shutil.copytree(dataset, tmp_path / "out"))
+def test_dataset_without_samples_is_refused(sound: Path, tmp_path: Path, form: Format) -> None:
+    out = Path(shutil.copytree(sound, tmp_path / "out"))
     assemble(out, overrides=["filters.max_slip=1e-9"])
     with pytest.raises(DataError, match="must have samples to export, got none"):
         export_dataset(out, tmp_path / "to", form)
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-def test_samples_go_into_the_dataset_by_default(dataset: Path, tmp_path: Path) -> None:
-    out = Path(shutil.copytree(dataset, tmp_path / "out"))
+def test_samples_go_into_the_dataset_by_default(sound: Path, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(sound, tmp_path / "out"))
     done = run("export", str(out), "--to", "original")
     assert done.exit_code == 0
     assert (out / "export_original" / "grasping_oto.hdf5").is_file()
 
 
 def test_export_that_fails_leaves_nothing(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(dexgraspbench, "grasp_dictionary", fail)
     with pytest.raises(OSError, match="No space left"):
-        export_dataset(dataset, tmp_path / "to", "dexgraspbench")
+        export_dataset(sound, tmp_path / "to", "dexgraspbench")
     assert not list(tmp_path.iterdir())

@@ -57,7 +57,7 @@ def folder(exported: Callable[[str], Path]) -> Path:
 
 @pytest.mark.slow
 def test_official_loaders_read_what_the_dataset_holds(
-    dataset: Path, folder: Path, tmp_path: Path
+    sound: Path, folder: Path, tmp_path: Path
 ) -> None:
     pytest.importorskip("datasets")
     pytest.importorskip("mlcroissant")
@@ -72,7 +72,7 @@ def test_official_loaders_read_what_the_dataset_holds(
     found = json.loads(run.stdout.splitlines()[-1])
     for camera in ("oto", "otm"):
         for split in SPLITS:
-            data = GraspDataset(dataset / f"grasping_{camera}.hdf5", split=split)
+            data = GraspDataset(sound / f"grasping_{camera}.hdf5", split=split)
             rows = found["rows"][f"{camera}/{split}"]
             assert [row["trial_id"] for row in rows] == data.column("trial_id").tolist()
             assert found["croissant"][f"{camera}/{split}-00000-of-00001"] == len(data) > 0
@@ -87,13 +87,13 @@ def test_official_loaders_read_what_the_dataset_holds(
                 assert (np.array(row["mask"]) == 255 * sample.mask).all()
 
 
-def test_every_column_is_that_of_the_data_file(dataset: Path, folder: Path) -> None:
+def test_every_column_is_that_of_the_data_file(sound: Path, folder: Path) -> None:
     """Contacts, poses, joints, forces and all else that is no image, bit for bit."""
     import pyarrow.parquet as pq
 
     for camera in ("oto", "otm"):
         for split in SPLITS:
-            data = GraspDataset(dataset / f"grasping_{camera}.hdf5", split=split)
+            data = GraspDataset(sound / f"grasping_{camera}.hdf5", split=split)
             (path,) = (folder / camera).glob(f"{split}-*.parquet")
             table = pq.read_table(path)
             assert set(table.column_names) == set(hub.columns())
@@ -102,7 +102,7 @@ def test_every_column_is_that_of_the_data_file(dataset: Path, folder: Path) -> N
                     assert table[name].to_pylist() == data.column(field.name).tolist(), name
 
 
-def test_card_names_licence_files_and_counts(dataset: Path, folder: Path) -> None:
+def test_card_names_licence_files_and_counts(sound: Path, folder: Path) -> None:
     head, text = (folder / "README.md").read_text(encoding="utf-8").split("---\n")[1:]
     described = yaml.safe_load(head)
     assert described["license"] == "cc-by-4.0"
@@ -110,19 +110,19 @@ def test_card_names_licence_files_and_counts(dataset: Path, folder: Path) -> Non
         for entry in config["data_files"]:
             assert list(folder.glob(entry["path"]))
     # What the dataset's own card says of how it was made, word for word.
-    own = (dataset / "DATACARD.md").read_text(encoding="utf-8")
+    own = (sound / "DATACARD.md").read_text(encoding="utf-8")
     assert own[own.index("## How it was made") :] in text
     for split in SPLITS:
-        count = len(GraspDataset(dataset / "grasping_oto.hdf5", split=split))
+        count = len(GraspDataset(sound / "grasping_oto.hdf5", split=split))
         assert f"| {split} | {count} | {count} |" in text
 
 
-def test_card_says_what_the_folder_holds_and_nothing_else(dataset: Path, folder: Path) -> None:
+def test_card_says_what_the_folder_holds_and_nothing_else(sound: Path, folder: Path) -> None:
     text = (folder / "README.md").read_text(encoding="utf-8")
     for absent in ("trials.hdf5", "manifest.json", "grasping_o", "in 0..1", "objects/"):
         assert absent not in text.partition("## Columns")[0]
     assert "| `oto/, otm/` |" in text
-    data = GraspDataset(dataset / "grasping_oto.hdf5")
+    data = GraspDataset(sound / "grasping_oto.hdf5")
     assert f"focal lengths {data.K[0, 0]:.6f} and {data.K[1, 1]:.6f}" in text
     assert f"centre at ({data.K[0, 2]:g}, {data.K[1, 2]:g}) [px]" in text
     assert "the depth is 0.75 m" in text
@@ -133,14 +133,14 @@ def test_card_says_what_the_folder_holds_and_nothing_else(dataset: Path, folder:
 
 
 def test_long_splits_are_cut_into_files(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import pyarrow.parquet as pq
 
     monkeypatch.setattr(hub, "FILE_ROWS", 2)
     monkeypatch.setattr(hub, "GROUP_ROWS", 1)
-    export_dataset(dataset, tmp_path / "to", "hf")
-    data = GraspDataset(dataset / "grasping_oto.hdf5", split="test")
+    export_dataset(sound, tmp_path / "to", "hf")
+    data = GraspDataset(sound / "grasping_oto.hdf5", split="test")
     files = sorted((tmp_path / "to" / "oto").glob("test-*.parquet"))
     ids = [i for file in files for i in pq.read_table(file)["trial_id"].to_pylist()]
     assert len(files) == -(-len(data) // 2) > 1
@@ -148,9 +148,9 @@ def test_long_splits_are_cut_into_files(
 
 
 def test_missing_pyarrow_is_one_line(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(MachineError, match=r"needs pyarrow, got none: pip install"):
-        export_dataset(dataset, tmp_path / "to", "hf")
+        export_dataset(sound, tmp_path / "to", "hf")
     assert not list(tmp_path.iterdir())

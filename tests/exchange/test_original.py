@@ -23,9 +23,9 @@ def folder(exported: Callable[[str], Path]) -> Path:
 @pytest.mark.parametrize("camera", ["oto", "otm"])
 @pytest.mark.parametrize("split", SPLITS)
 def test_images_and_properties_are_those_of_the_dataset(
-    dataset: Path, folder: Path, camera: str, split: str
+    sound: Path, folder: Path, camera: str, split: str
 ) -> None:
-    data = GraspDataset(dataset / f"grasping_{camera}.hdf5", split=split)
+    data = GraspDataset(sound / f"grasping_{camera}.hdf5", split=split)
     with h5py.File(folder / f"grasping_{camera}.hdf5") as file:
         group = file[split]
         images, ours = group["images"][:], data.column("images")
@@ -43,9 +43,9 @@ def test_images_and_properties_are_those_of_the_dataset(
 @pytest.mark.parametrize("camera", ["oto", "otm"])
 @pytest.mark.parametrize("split", SPLITS)
 def test_grasps_are_at_the_same_place_over_the_table(
-    dataset: Path, folder: Path, camera: str, split: str
+    sound: Path, folder: Path, camera: str, split: str
 ) -> None:
-    data = GraspDataset(dataset / f"grasping_{camera}.hdf5", split=split)
+    data = GraspDataset(sound / f"grasping_{camera}.hdf5", split=split)
     assert len(data) > 0
     with h5py.File(folder / f"grasping_{camera}.hdf5") as file:
         vectors = file[f"{split}/grasps"][:].reshape(len(data), 3, 3, 3)
@@ -74,8 +74,8 @@ def test_grasps_are_at_the_same_place_over_the_table(
         )
 
 
-def test_image_frame_stays_where_it_is(dataset: Path, folder: Path) -> None:
-    data = GraspDataset(dataset / "grasping_otm.hdf5", split="train")
+def test_image_frame_stays_where_it_is(sound: Path, folder: Path) -> None:
+    data = GraspDataset(sound / "grasping_otm.hdf5", split="train")
     with h5py.File(folder / "grasping_otm.hdf5") as file:
         props = file["train/object_props"]
         X_TV = unpack_pose(props["frame_work2cam_otm"][:])

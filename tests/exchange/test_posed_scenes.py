@@ -54,10 +54,10 @@ def test_up_is_y(folder: Path, grasps: list[ClosedGrasp]) -> None:
 
 
 @pytest.mark.parametrize("name", ["scene", "palm"])
-def test_an_object_may_have_any_name(dataset: Path, grasps: list[ClosedGrasp], name: str) -> None:
+def test_an_object_may_have_any_name(sound: Path, grasps: list[ClosedGrasp], name: str) -> None:
     hand = load_hand()
     links = link_meshes(hand)
-    model = load_object(model_path(dataset, grasps[0].object_name))
+    model = load_object(model_path(sound, grasps[0].object_name))
     named = replace(model, name=hand.palm_link if name == "palm" else name)
     scene = posed_scene(named, StillScene(hand), links, grasps[0])
     assert len(scene.graph.nodes_geometry) == len(links) + 1

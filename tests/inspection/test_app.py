@@ -345,9 +345,9 @@ def test_undo_of_a_page_is_its_own(client: TestClient, out: Path) -> None:
 
 
 @pytest.mark.parametrize("path", ["/", "/grasp/0-0-0"])
-def test_pages_say_how_to_take_rejected_grasps_out(boxes: Path, tmp_path: Path, path: str) -> None:
+def test_pages_say_how_to_take_rejected_grasps_out(sound: Path, tmp_path: Path, path: str) -> None:
     """The command can be pasted into a shell, whatever the directory is called."""
-    out = Path(shutil.copytree(boxes, tmp_path / "my data;x"))
+    out = Path(shutil.copytree(sound, tmp_path / "my data;x"))
     with TestClient(make_app(Inspection(out)), base_url="http://localhost") as client:
         hidden = [a for _, a in Tags(get(client, path).text).tags if a.get("id") == "nextstep"]
         assert "hidden" in hidden[0]

@@ -80,9 +80,9 @@ def _is_ours(url: str) -> bool:
 
 
 @pytest.fixture
-def state(boxes: Path) -> Snapshot:
+def state(sound: Path) -> Snapshot:
     """Of the dataset that is shown: objects have codes in addresses."""
-    return Catalog(boxes).current()
+    return Catalog(sound).current()
 
 
 @pytest.fixture
@@ -358,9 +358,9 @@ def test_a_name_that_is_a_script_stays_text(page: Page, hostile: Path) -> None:
 
 
 def test_files_open_without_a_server(
-    page: Page, boxes: Path, tmp_path: Path, state: Snapshot
+    page: Page, sound: Path, tmp_path: Path, state: Snapshot
 ) -> None:
-    write_site(boxes, tmp_path / "site")
+    write_site(sound, tmp_path / "site")
     page.goto((tmp_path / "site" / "index.html").as_uri())
     page.wait_for_selector("#pages button")
     assert len(labels(page, state)) == 9

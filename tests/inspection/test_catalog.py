@@ -31,10 +31,10 @@ def build_again(out: Path) -> None:
         (out / name).unlink()
 
 
-def test_table_is_what_the_files_say(boxes: Path) -> None:
-    snapshot = Catalog(boxes).current()
+def test_table_is_what_the_files_say(sound: Path) -> None:
+    snapshot = Catalog(sound).current()
     table = snapshot.table
-    with h5py.File(boxes / TRIALS) as file, h5py.File(boxes / OTO) as data:
+    with h5py.File(sound / TRIALS) as file, h5py.File(sound / OTO) as data:
         for name in ("outcome", "object", "candidate", "standoff_index", "precision", "stable"):
             np.testing.assert_array_equal(getattr(table, name), file["trials"][name][:])
         hits = file["successes/trial_id"][:]
@@ -53,8 +53,8 @@ def test_table_is_what_the_files_say(boxes: Path) -> None:
     assert np.isfinite(table.feature("force")[table.closed]).all()
 
 
-def test_attempts_are_found_by_their_label(boxes: Path) -> None:
-    snapshot = Catalog(boxes).current()
+def test_attempts_are_found_by_their_label(sound: Path) -> None:
+    snapshot = Catalog(sound).current()
     assert numbered(snapshot, snapshot.label(3)) == "0-1-0"
     assert snapshot.find(coded(snapshot, "0-1-0")) == 3
     assert str(snapshot.key(3)) == "1_box_a, palm pose 1, stand-off 0"
@@ -167,8 +167,8 @@ def test_a_label_stays_that_of_its_attempt_when_objects_are_added(
         assert after.key(place) == key
 
 
-def test_a_label_of_another_mesh_or_configuration_is_another(boxes: Path) -> None:
-    snapshot = Catalog(boxes).current()
+def test_a_label_of_another_mesh_or_configuration_is_another(sound: Path) -> None:
+    snapshot = Catalog(sound).current()
     label = snapshot.label(0)
     for other in (
         replace(snapshot, meshes=("0" * 64, *snapshot.meshes[1:])),

@@ -21,8 +21,8 @@ NOTHING = Decisions()
 
 
 @pytest.fixture
-def snapshot(boxes: Path) -> Snapshot:
-    return Catalog(boxes).current()
+def snapshot(sound: Path) -> Snapshot:
+    return Catalog(sound).current()
 
 
 def chosen(snapshot: Snapshot, text: str, decisions: Decisions = NOTHING) -> list[str]:

@@ -19,16 +19,16 @@ from drakegrasp.inspection.static_site import Site, write_site
 
 
 @pytest.fixture(scope="module")
-def site(boxes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def site(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site") / "pages"
-    assert write_site(boxes, folder) == Site(grasps=9, successes=9)
+    assert write_site(sound, folder) == Site(grasps=9, successes=9)
     return folder
 
 
 @pytest.fixture(scope="module")
-def first(boxes: Path) -> str:
+def first(sound: Path) -> str:
     """The label of the first attempt."""
-    return coded(Catalog(boxes).current(), "0-0-0")
+    return coded(Catalog(sound).current(), "0-0-0")
 
 
 def test_every_address_is_a_file_of_the_folder(site: Path) -> None:
@@ -76,10 +76,10 @@ def test_files_cannot_decide_but_show_decisions(out: Path, tmp_path: Path) -> No
 
 
 def test_what_is_left_out_is_told(
-    boxes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(static_site, "MAX_GRASPS", 4)
-    result = CliRunner().invoke(main, ["inspect", str(boxes), "--static", str(tmp_path / "site")])
+    result = CliRunner().invoke(main, ["inspect", str(sound), "--static", str(tmp_path / "site")])
     assert result.exit_code == 0, result.stderr
     assert "4 grasps in " in result.stdout
     assert "the most suspicious of 9" in result.stdout
@@ -115,8 +115,8 @@ def test_names_stay_text(hostile: Path, tmp_path: Path) -> None:
     assert ATTACK in Tags((tmp_path / "site" / "index.html").read_text(encoding="utf-8")).text
 
 
-def test_a_folder_with_files_is_refused_and_left_alone(boxes: Path, tmp_path: Path) -> None:
+def test_a_folder_with_files_is_refused_and_left_alone(sound: Path, tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(DataError, match="--static must be a new or empty directory"):
-        write_site(boxes, tmp_path)
+        write_site(sound, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]

@@ -88,13 +88,3 @@ def test_margin_of_a_pinched_cube_is_its_closed_form(cube):
     assert load > cube.mass * GRAVITY
     assert margin.smallest_friction == pytest.approx(load / (2.0 * limit), abs=2e-4)
     assert margin.epsilon > 0.0
-
-
-@pytest.mark.parametrize(
-    ("p", "n"), [(np.abs(P), np.abs(N)), (P, N * [[-1.0], [-1.0], [1.0]]), (P * np.nan, N)]
-)
-def test_contacts_that_cannot_hold_have_no_margin(cube, p, n):
-    config = load_config()
-    margin = force_margin(cube, standing(cube), hand_contacts(cube, p, n, config), config)
-    assert margin.epsilon == 0.0
-    assert margin.smallest_friction == np.inf

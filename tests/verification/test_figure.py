@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers.hands import write_tongs
 from helpers.machine import needs_egl
-from helpers.objects import CUBE, box_model, from_above, standing
+from helpers.objects import CUBE, from_above, standing
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
@@ -35,16 +35,6 @@ pytestmark = pytest.mark.sim
 #: Contacts on the cube's front, back and underside.
 NHAT_Q_O = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
 P_OQ = CUBE / 2.0 * NHAT_Q_O
-
-
-@pytest.fixture(scope="module")
-def config() -> Config:
-    return load_config()
-
-
-@pytest.fixture(scope="module")
-def cube(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
-    return box_model(tmp_path_factory.mktemp("cube"), [CUBE] * 3)
 
 
 @pytest.fixture(scope="module")

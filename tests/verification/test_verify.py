@@ -31,6 +31,9 @@ pytestmark = pytest.mark.sim
 
 CONFIG = load_config()
 
+#: Points and outward normals, p_OQ and nhat_Q_O.
+Contacts = tuple[np.ndarray, np.ndarray]
+
 
 @pytest.fixture(scope="module")
 def cube(tmp_path_factory: pytest.TempPathFactory) -> PlacedObject:
@@ -39,7 +42,7 @@ def cube(tmp_path_factory: pytest.TempPathFactory) -> PlacedObject:
 
 
 @pytest.fixture(scope="module")
-def grasp(cube: PlacedObject) -> tuple[np.ndarray, np.ndarray]:
+def grasp(cube: PlacedObject) -> Contacts:
     """Contacts of a simulated grasp that held, across two faces of the cube, from above."""
     scene = build_scene(cube.model, CONFIG.physics, load_hand(CONFIG.hand))
     pregrasp = Pregrasp(X_OG=make_pose(R_OG0, [0.0, 0.0, CUBE / 2.0 + 0.06]), spread=0.0)
@@ -61,7 +64,7 @@ def verify(
 
 
 @pytest.fixture(scope="module")
-def held(cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]) -> dg.Verification:
+def held(cube: PlacedObject, grasp: Contacts) -> dg.Verification:
     return verify(cube, *grasp)
 
 
@@ -77,7 +80,7 @@ def test_a_grasp_that_held_is_found_again_and_holds(held: dg.Verification) -> No
     assert held.explain().startswith("The grasp of 1_cube_a holds")
 
 
-def test_forces_alone_hold_it_too(cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]) -> None:
+def test_forces_alone_hold_it_too(cube: PlacedObject, grasp: Contacts) -> None:
     found = verify(cube, *grasp, "forces")
     assert found.success and found.fit is None and found.trial is None
     assert found.lift is not None and found.lift.applied_force < 20.0
@@ -86,7 +89,7 @@ def test_forces_alone_hold_it_too(cube: PlacedObject, grasp: tuple[np.ndarray, n
 
 
 def test_the_same_grasp_gives_the_same_bits(
-    held: dg.Verification, cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
+    held: dg.Verification, cube: PlacedObject, grasp: Contacts
 ) -> None:
     p, n = grasp
     verify(cube, p + np.array([0.0, 0.0, 0.003]), n)  # something else in between
@@ -100,7 +103,7 @@ def test_the_same_grasp_gives_the_same_bits(
 
 @pytest.mark.parametrize("yaw", [0.7, -2.9])
 def test_moving_object_and_grasp_together_changes_nothing(
-    held: dg.Verification, cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray], yaw: float
+    held: dg.Verification, cube: PlacedObject, grasp: Contacts, yaw: float
 ) -> None:
     Z = make_pose(Rotation.from_euler("z", yaw).as_matrix(), [0.2, -0.1, 0.0])
     X_TO = Z @ cube.X_TO
@@ -114,7 +117,7 @@ def test_moving_object_and_grasp_together_changes_nothing(
 
 
 def test_the_camera_frame_is_the_one_of_its_pose(
-    held: dg.Verification, cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
+    held: dg.Verification, cube: PlacedObject, grasp: Contacts
 ) -> None:
     X_TC = make_pose(Rotation.from_euler("xyz", [2.0, 0.4, -1.0]).as_matrix(), [0.1, 0.3, 0.4])
     X_CO = invert_pose(X_TC) @ cube.X_TO
@@ -126,7 +129,7 @@ def test_the_camera_frame_is_the_one_of_its_pose(
 
 @pytest.mark.parametrize("method", ["hand", "forces"])
 def test_contacts_off_the_surface_are_no_grasp(
-    cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray], method: str
+    cube: PlacedObject, grasp: Contacts, method: str
 ) -> None:
     p, n = grasp
     found = verify(cube, p + 0.03 * n, n, method)
@@ -138,7 +141,7 @@ def test_contacts_off_the_surface_are_no_grasp(
 
 @pytest.mark.parametrize("method", ["hand", "forces"])
 def test_normals_that_point_inwards_are_no_grasp(
-    cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray], method: str
+    cube: PlacedObject, grasp: Contacts, method: str
 ) -> None:
     p, n = grasp
     found = verify(cube, p, n * [[-1.0], [-1.0], [1.0]], method)
@@ -166,7 +169,7 @@ def test_contacts_that_no_hand_spans_are_unreachable(tmp_path: Path) -> None:
 
 
 def test_a_finger_that_touches_elsewhere_does_not_make_the_grasp(
-    held: dg.Verification, cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
+    held: dg.Verification, cube: PlacedObject, grasp: Contacts
 ) -> None:
     strict = override_config(CONFIG, ["verify.max_contact_error=1e-5"])
     p, n = grasp
@@ -195,9 +198,7 @@ def test_the_others_count_where_a_fingertip_that_is_not_required_misses(
     assert far.reason.startswith("fingertip 1 closes on the object")
 
 
-def test_at_little_friction_neither_method_holds(
-    cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
-) -> None:
+def test_at_little_friction_neither_method_holds(cube: PlacedObject, grasp: Contacts) -> None:
     slippery = override_config(CONFIG, ["physics.friction_hand=0.05"])
     for method in ("hand", "forces"):
         found = verify(cube, *grasp, method, slippery)
@@ -205,10 +206,7 @@ def test_at_little_friction_neither_method_holds(
 
 
 def test_a_drake_error_is_a_value_and_the_next_grasp_is_untouched(
-    held: dg.Verification,
-    cube: PlacedObject,
-    grasp: tuple[np.ndarray, np.ndarray],
-    monkeypatch: pytest.MonkeyPatch,
+    held: dg.Verification, cube: PlacedObject, grasp: Contacts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     p, n = grasp
     with monkeypatch.context() as patch:
@@ -222,7 +220,7 @@ def test_a_drake_error_is_a_value_and_the_next_grasp_is_untouched(
 
 
 def test_without_a_verdict_on_one_try_there_is_none(
-    cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
+    cube: PlacedObject, grasp: Contacts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A palm pose that timed out might have held."""
     outcomes = iter([Outcome.SLIPPED, Outcome.TIMEOUT, *[Outcome.DROPPED] * 3])
@@ -239,10 +237,7 @@ def test_without_a_verdict_on_one_try_there_is_none(
 
 
 def test_palm_poses_that_collide_at_the_start_do_not_count(
-    held: dg.Verification,
-    cube: PlacedObject,
-    grasp: tuple[np.ndarray, np.ndarray],
-    monkeypatch: pytest.MonkeyPatch,
+    held: dg.Verification, cube: PlacedObject, grasp: Contacts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert held.trial is not None
     hits = replace(held.trial, outcome=Outcome.START_COLLISION, closed=None, lift=None)
@@ -255,18 +250,14 @@ def test_palm_poses_that_collide_at_the_start_do_not_count(
     assert found.tries == len(trials)
 
 
-def test_lift_by_forces_has_a_wall_clock_limit(
-    cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
-) -> None:
+def test_lift_by_forces_has_a_wall_clock_limit(cube: PlacedObject, grasp: Contacts) -> None:
     hasty = override_config(CONFIG, ["attempt_seconds=1e-3"])
     found = verify(cube, *grasp, "forces", hasty)
     assert found.outcome is Outcome.TIMEOUT
     assert "says nothing about the grasp" in found.reason
 
 
-def test_number_of_threads_changes_no_bit(
-    cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
-) -> None:
+def test_number_of_threads_changes_no_bit(cube: PlacedObject, grasp: Contacts) -> None:
     """Workers have one thread for linear algebra; a caller's own process has many."""
     fits = []
     for threads in (1, 4):
@@ -339,9 +330,7 @@ def test_contacts_beyond_the_limit_are_another_grasp(held: dg.Verification) -> N
     assert far.reason.startswith(f"fingertip {finger} closes on the object")
 
 
-def test_distance_from_the_surface_has_a_limit(
-    cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
-) -> None:
+def test_distance_from_the_surface_has_a_limit(cube: PlacedObject, grasp: Contacts) -> None:
     """Points that are moved outwards by 1 mm."""
     p, n = grasp
     for limit, off in ((0.9e-3, True), (1.2e-3, False)):
@@ -351,10 +340,7 @@ def test_distance_from_the_surface_has_a_limit(
 
 
 def test_as_many_palm_poses_are_tried_as_may_be(
-    held: dg.Verification,
-    cube: PlacedObject,
-    grasp: tuple[np.ndarray, np.ndarray],
-    monkeypatch: pytest.MonkeyPatch,
+    held: dg.Verification, cube: PlacedObject, grasp: Contacts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And of different failures the one that got furthest is told."""
     assert held.trial is not None
@@ -370,7 +356,7 @@ def test_as_many_palm_poses_are_tried_as_may_be(
 
 
 def test_verdict_is_that_of_a_whole_lift(
-    held: dg.Verification, cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
+    held: dg.Verification, cube: PlacedObject, grasp: Contacts
 ) -> None:
     """Whatever moves in the hand ends the lifts of the dataset's configuration at once."""
     limits = ["lift.stop_slip=1e-9", "filters.max_slip=1e-9"]

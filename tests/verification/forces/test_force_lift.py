@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 import pytest
-from helpers.objects import CUBE, box_model, standing
+from helpers.objects import CUBE, standing
 from scipy.spatial.transform import Rotation
 
 from drakegrasp.config import Config
@@ -15,7 +15,6 @@ from drakegrasp.frames import X_WT, make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.hand.strength import fingertip_forces
-from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.construction import build_object_scene
 from drakegrasp.simulation.scene import ObjectScene, advance, reset_object
 from drakegrasp.simulation.trajectory import PEAK_ACCELERATION, lift_duration, lift_path
@@ -35,16 +34,6 @@ HALF = CUBE / 2.0
 #: Two contacts on one face of the cube, one in the middle of the opposite face.
 P = np.array([[0.02, HALF, 0.0], [-0.02, HALF, 0.0], [0.0, -HALF, 0.0]])
 N = np.array([[0.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
-
-
-@pytest.fixture(scope="module")
-def config() -> Config:
-    return load_config()
-
-
-@pytest.fixture(scope="module")
-def cube(tmp_path_factory) -> ObjectModel:
-    return box_model(tmp_path_factory.mktemp("cube"), [CUBE] * 3)
 
 
 @pytest.fixture(scope="module")

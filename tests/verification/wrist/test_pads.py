@@ -212,11 +212,6 @@ def test_pads_of_the_barrett_hand_are_in_their_region() -> None:
 # The shapes of links
 
 
-@pytest.fixture(scope="module")
-def hand() -> Hand:
-    return load_hand()
-
-
 def test_barretts_pad_points_are_on_their_fingertips(hand: Hand) -> None:
     """The median of contacts on a rounded pad is a little below its surface."""
     corners = [np.concatenate(link_shapes(hand)[link]) for link in hand.fingertip_links]
