@@ -581,22 +581,27 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
         *_SLIP,
     ),
     *_measured(
-        "lift",
+        "forces",
         Field("planned_force", "", "float64", "N", "-",
               "method forces: normal force of the finger that is loaded hardest for its strength; "
               "inf if no forces carry the object"),
         Field("planned_share", "", "float64", "-", "-",
               "method forces: share of that finger's strength, as small as the lift allows; above "
               "1 it fails"),
-        *_since(
-            Stage.LIFTED,
-            Field("applied_force", "", "float64", "N", "-",
-                  "method forces: largest normal force that was applied"),
-            Field("position_error", "", "float64", "m", "-",
-                  "method forces: distance of the object from its path at the end"),
-            Field("angle_error", "", "float64", "rad", "-",
-                  "method forces: angle of the object from its path at the end"),
-        ),
     ),
+    Field("points_share", "", "float64", "-", "-",
+          "method forces: that share where each contact is a point", of="forces.points.share"),
+    Field("patches_share", "", "float64", "-", "-",
+          "method forces: that share where each contact is a patch", of="forces.patches.share"),
+    Field("selected_p_OQ", "k 3", "float64", "m", "O",
+          "method forces: points of the surface that the predicted contacts select",
+          of="forces.contacts.p_OQ"),
+    Field("selected_nhat_Q_O", "k 3", "float64", "-", "O",
+          "method forces: the surface's own normals there", of="forces.contacts.nhat_Q_O"),
+    Field("selected_distance", "k", "float64", "m", "-",
+          "method forces: distance of the predicted points from them",
+          of="forces.contacts.distance"),
+    Field("selected_angle", "k", "float64", "rad", "-",
+          "method forces: angle of the predicted normals from them", of="forces.contacts.angle"),
 )
 # fmt: on

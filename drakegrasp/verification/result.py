@@ -16,8 +16,7 @@ from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.lift import Lift
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.trial import TrialRecord
-from drakegrasp.simulation.verdict import is_stable
-from drakegrasp.verification.forces.lift import ForceLift
+from drakegrasp.verification.forces.verdict import ForceVerdict
 from drakegrasp.verification.wrist.solver import WristFit
 
 if TYPE_CHECKING:
@@ -42,7 +41,7 @@ class Verification:
         trial: What happened in the simulator.
         contact_error: (k,), distance of each contact after closing from its prediction [m]; NaN
             for a fingertip that does not touch and need not.
-        lift: What happened to the object under forces alone.
+        forces: What forces at the contacts alone can do, with method `forces`.
         epsilon: Ferrari-Canny measure of the predicted contacts; 0 without force closure.
         smallest_friction: Smallest friction coefficient at which forces within the hand's limit
             hold the object at the predicted contacts; inf if none does.
@@ -62,7 +61,7 @@ class Verification:
     pregrasp: Pregrasp | None = None
     trial: TrialRecord | None = None
     contact_error: Array | None = None
-    lift: ForceLift | None = None
+    forces: ForceVerdict | None = None
     epsilon: float = np.nan
     smallest_friction: float = np.nan
     seconds: dict[str, float] = field(default_factory=dict)
@@ -86,12 +85,9 @@ class Verification:
     def stable(self) -> bool:
         """Whether it is a precision grasp that moved less than 5 mm and 5 degrees in the hand.
 
-        With method `forces`: from its path.
+        With method `forces` nothing moves: what is held is stable.
         """
-        if self.lift is not None:
-            moved = (self.lift.position_error, self.lift.angle_error)
-            return bool(is_stable(self.outcome, 0, *moved))
-        return self.held and self.trial is not None and self.trial.stable
+        return self.held and (self.trial is None or self.trial.stable)
 
     @property
     def words(self) -> str:
@@ -115,9 +111,7 @@ class Verification:
 
     @property
     def X_TO_lifted(self) -> Array | None:
-        """Pose (4, 4) of the object after the lift, by the hand or by forces alone."""
-        if self.lift is not None:
-            return self.lift.X_TO_lifted
+        """Pose (4, 4) of the object after the lift."""
         return self.trial.lift.X_TO if self.trial is not None and self.trial.lift else None
 
     @property

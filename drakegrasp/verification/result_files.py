@@ -139,7 +139,7 @@ def as_dict(index: int, result: Verification) -> dict[str, Any]:
         index: Of the grasp.
         result: Its verdict.
     """
-    fit, trial, lift = result.fit, result.trial, result.lift
+    fit, trial, forces = result.fit, result.trial, result.forces
     values = {field.name: field.value_of(result) for field in VERIFICATION_FIELDS}
 
     def fields(*names: str) -> dict[str, Any]:
@@ -169,11 +169,12 @@ def as_dict(index: int, result: Verification) -> dict[str, Any]:
         if math.isnan(result.smallest_friction)
         else math.isfinite(result.smallest_friction),
         "forces": None
-        if lift is None
+        if forces is None
         else {
-            **_attributes(lift, "end", "planned_force", "planned_share", "applied_force"),
-            "position_error": lift.position_error,
-            "angle_error_deg": math.degrees(lift.angle_error),
+            **fields("planned_force", "planned_share", "points_share", "patches_share"),
+            **fields("selected_p_OQ", "selected_nhat_Q_O", "selected_distance"),
+            "selected_inside": forces.contacts.inside,
+            "selected_angle_deg": np.rad2deg(forces.contacts.angle),
         },
         "seconds": result.seconds,
     }

@@ -2,8 +2,8 @@
 
 In: a `PlacedGrasp`. Out: a `Verification`. Method
 `hand` finds palm poses that bring the fingertips to the points and runs a trial from each, as a
-build does. Method `forces` lifts the object by forces at the contacts alone. A wrong prediction, a
-failed solver and a lost object are outcomes, not exceptions.
+build does. Method `forces` asks whether forces at the surface's own contacts can lift the object. A
+wrong prediction, a failed solver and a lost object are outcomes, not exceptions.
 """
 
 from __future__ import annotations
@@ -22,12 +22,11 @@ from drakegrasp.runtime.blas import one_thread
 from drakegrasp.runtime.timing import timed
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.simulation.scene_cache import cached_object_scene, cached_scene, forget_scenes
+from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.verification.contact_surface import face_distances, points_outward
-from drakegrasp.verification.forces.contact_forces import hand_contacts
-from drakegrasp.verification.forces.lift import LiftEnd, lift_by_forces
 from drakegrasp.verification.forces.quality import force_margin
+from drakegrasp.verification.forces.verdict import hand_contacts, judge_forces
 from drakegrasp.verification.result import Verification, in_mm
 from drakegrasp.verification.wrist.solver import WristFit, fit_wrist
 
@@ -52,15 +51,6 @@ _REASONS = {
     Outcome.SLIPPED: "a fingertip loses contact during the lift",
     Outcome.SOLVER_ERROR: "the simulation failed, which says nothing about the grasp",
     Outcome.TIMEOUT: "the limit of computing time passed, which says nothing about the grasp",
-}
-#: The verdict by the end of a lift by forces.
-_ENDS = {
-    LiftEnd.HELD: Outcome.SUCCESS,
-    LiftEnd.INFEASIBLE: Outcome.DROPPED,
-    LiftEnd.OVER_LIMIT: Outcome.DROPPED,
-    LiftEnd.STRAYED: Outcome.SLIPPED,
-    LiftEnd.ERROR: Outcome.SOLVER_ERROR,
-    LiftEnd.TIMEOUT: Outcome.TIMEOUT,
 }
 #: Outcomes by how far an attempt got. If a grasp's attempts fail differently, the one that got
 #: furthest is reported.
@@ -195,28 +185,14 @@ def _lift_by_hand(base: Verification, config: Config) -> Verification:
 
 
 def _lift_by_forces(base: Verification, config: Config) -> Verification:
-    """Lift the object by forces at the contacts, without a hand."""
+    """Ask whether forces at the surface's own contacts can lift the object, without a hand."""
     placed = base.placed
-    with timed(base.seconds, "simulate"):
-        contacts = hand_contacts(placed.model, base.p_OQ, base.nhat_Q_O, config)
-        scene = cached_object_scene(placed.model, config.physics)
-        lift = lift_by_forces(scene, placed.X_TO_simulated, contacts, config)
-    if _ENDS[lift.end].inconclusive:
-        forget_scenes()
-
-    # The verdict, and why.
-    moved = f"{in_mm(lift.position_error)} and {np.rad2deg(lift.angle_error):.1f}°"
-    reasons = {
-        LiftEnd.HELD: f"normal forces of at most {lift.applied_force:.1f} N carry it, and it "
-        f"arrives within {moved} of its target",
-        LiftEnd.INFEASIBLE: "no forces within the friction cones carry it",
-        LiftEnd.OVER_LIMIT: f"it takes a normal force of {lift.planned_force:.1f} N, more than the "
-        f"{lift.planned_force / lift.planned_share:.1f} N that the fingertip carries",
-        LiftEnd.STRAYED: f"the forces do not keep it on its path: it is off by {moved}",
-        LiftEnd.ERROR: f"{_REASONS[Outcome.SOLVER_ERROR]}: {lift.message}",
-        LiftEnd.TIMEOUT: _REASONS[Outcome.TIMEOUT],
-    }
-    return replace(base, outcome=_ENDS[lift.end], reason=reasons[lift.end], lift=lift)
+    with timed(base.seconds, "forces"):
+        forces = judge_forces(placed.model, placed.X_TO_simulated, base.p_OQ, base.nhat_Q_O, config)
+    outcome = Outcome.SUCCESS if forces.held else Outcome.DROPPED
+    if not forces.on_surface:
+        outcome = Outcome.OFF_SURFACE
+    return replace(base, outcome=outcome, reason=forces.reason, forces=forces)
 
 
 def _misfit(fit: WristFit, config: Config) -> str:

@@ -1,7 +1,7 @@
 """The views of a verified grasp: pictures, and the contacts to draw over them.
 
 In: a verification. Out: the object from two sides with its contacts, then the last state that was
-reached, with the hand, or without it if forces lifted the object. `figure` draws them.
+reached, with the hand. `figure` draws them.
 
 The pictures come from `visualization.still_scene`, so they need OpenGL and a single thread.
 """
@@ -122,25 +122,16 @@ def render_views(verified: Verification) -> list[View]:
     return [
         _object_view(scene, "contacts", X_WO, marks, _camera(model, X_WO, marks, first)),
         _object_view(scene, "from another side", X_WO, marks, _camera(model, X_WO, marks, second)),
-        *_last_view(scene, verified, marks, first),
+        *_last_view(scene, verified, marks),
     ]
 
 
-def _last_view(
-    scene: StillScene, verified: Verification, marks: Sequence[Marks], azimuth: float
-) -> list[View]:
-    """Return the view of the last state that was reached; no view if nothing was tried.
-
-    The azimuth [rad] is that of the camera where the object is shown alone.
-    """
+def _last_view(scene: StillScene, verified: Verification, marks: Sequence[Marks]) -> list[View]:
+    """Return the view of the last state that was reached; no view if no hand was tried."""
     X_WO = X_WT @ verified.placed.X_TO_simulated
-    trial, lift, fit = verified.trial, verified.lift, verified.fit
+    trial, fit = verified.trial, verified.fit
 
-    # After the lift, by forces or by the hand.
-    if lift is not None and lift.X_TO_lifted is not None:
-        X_WO = X_WT @ lift.X_TO_lifted
-        X_WC = _camera(verified.placed.model, X_WO, marks, azimuth)
-        return [_object_view(scene, "end of the lift", X_WO, marks, X_WC)]
+    # After the lift.
     if trial is not None and trial.lift is not None:
         X_WO = X_WT @ trial.lift.X_TO
         reached = _reached(verified.lifted, _force_scale(verified), kind="lifted", colour=LIFTED)

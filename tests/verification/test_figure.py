@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from drakegrasp.verification.forces.lift import ForceLift, LiftEnd
 from helpers.hands import write_tongs
 from helpers.machine import needs_egl
 from helpers.objects import CUBE, box_model, from_above, standing
@@ -26,7 +27,6 @@ from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.scene import Scene, palm_pose
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.verification.figure import verification_figure
-from drakegrasp.verification.forces.lift import ForceLift, LiftEnd
 from drakegrasp.verification.result import Verification
 from drakegrasp.visualization.style import save_figure
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from drakegrasp.verification.forces.lift import ForceLift, LiftEnd
 from helpers.objects import standing
 from helpers.verdicts import some_contacts, some_trial
 
@@ -15,7 +16,6 @@ from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import make_object
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.verification.forces.lift import ForceLift, LiftEnd
 from drakegrasp.verification.result import Verification
 
 CONFIG = load_config()

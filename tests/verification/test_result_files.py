@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
+from drakegrasp.verification.forces.lift import ForceLift, LiftEnd
 from helpers.objects import standing
 from helpers.verdicts import some_contacts, some_trial
 
@@ -25,7 +26,6 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.verification.forces.lift import ForceLift, LiftEnd
 from drakegrasp.verification.result import Verification
 from drakegrasp.verification.result_files import (
     json_lines,

@@ -16,6 +16,7 @@ import h5py
 import msgpack
 import numpy as np
 import pytest
+from drakegrasp.verification.forces.lift import LiftEnd, lift_by_forces
 from helpers.objects import CUBE, box_model, from_above, standing
 
 from drakegrasp.build.replay import record_trial
@@ -28,7 +29,6 @@ from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.construction import MESHCAT_RATE, build_object_scene, build_scene
 from drakegrasp.simulation.trial import run_attempt
 from drakegrasp.verification.forces.contact_forces import hand_contacts
-from drakegrasp.verification.forces.lift import LiftEnd, lift_by_forces
 from drakegrasp.verification.recording import record_lift, record_verification
 from drakegrasp.visualization import recording
 from drakegrasp.visualization.recording import record_attempt

@@ -1,9 +1,8 @@
 """Grasp quality: the epsilon of Ferrari and Canny, and the least friction that holds an object.
 
 In: contact points, outward normals, a friction coefficient. Out: measures of what forces at the
-contacts can do; nothing is simulated. Contacts are points with Coulomb friction: a finger pushes
-along the inward normal and along the surface, but neither pulls nor twists. For a hand with two
-fingertips they are patches, which twist, see `contact_forces`.
+contacts can do; nothing is simulated. Contacts are points with Coulomb friction, or patches of
+several, see `contact_forces`.
 
 A wrench here is [torque about Ocm; force], (6,), in axes of {O} [N m, N], in the order of
 Drake's spatial forces.
@@ -18,13 +17,11 @@ import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 
 from drakegrasp.config import Config
-from drakegrasp.frames import Array
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.trajectory import lift_path
 from drakegrasp.verification.forces.contact_forces import (
     ForceProgram,
     GraspContacts,
-    contact_axes,
     grasp_map,
     hardest_forces,
 )
@@ -32,15 +29,6 @@ from drakegrasp.verification.forces.contact_forces import (
 #: Edges of the pyramid that approximates a friction cone from inside. With 16, epsilon is about
 #: 2 % too small and varies by as much with the frame; the hull takes 15 ms.
 FRICTION_EDGES = 16
-#: Latitudes of the points that approximate the ellipsoid of a patch from inside, and their number
-#: on each: tangential forces alone (as for a point), both, torsional moments alone.
-PATCH_RINGS = (
-    (0.0, FRICTION_EDGES),
-    (np.pi / 4.0, 8),
-    (-np.pi / 4.0, 8),
-    (np.pi / 2.0, 1),
-    (-np.pi / 2.0, 1),
-)
 #: An epsilon below this is rounding: the origin is on the surface of the hull.
 ROUNDING = 1e-9
 #: Largest friction coefficient that is tried, and the tolerance of the smallest one.
@@ -67,11 +55,10 @@ def ferrari_canny(contacts: GraspContacts, *, friction: float, length: float) ->
     The L1 version of C. Ferrari and J. Canny, "Planning optimal grasps", ICRA 1992: the
     distance of the origin from the surface of the convex hull of all contacts' friction
     cones with unit normal forces, that is, for normal forces that sum to one. Each cone is
-    approximated by a pyramid of `FRICTION_EDGES` edges. Edge e of contact i, with the inward normal
-    n_i, the tangents t, the arm p_i, the length L and the torsion radius r, has the wrench
+    approximated by a pyramid of `FRICTION_EDGES` edges. Edge e of point i, with the inward normal
+    n_i, the tangents t, the arm p_i and the length L, has the wrench
 
-        w_ie = [(p_i × f_ie + μ r sin(β_e) n_i) / L; f_ie],
-        f_ie = n_i + μ cos(β_e) (cos(α_e) t_i1 + sin(α_e) t_i2),   β_e = 0 for points,
+        w_ie = [p_i × f_ie / L; f_ie],   f_ie = n_i + μ (cos(α_e) t_i1 + sin(α_e) t_i2),
 
     and, with the origin inside their hull, ε = min over |u| = 1 of max over i, e of u·w_ie.
 
@@ -84,18 +71,14 @@ def ferrari_canny(contacts: GraspContacts, *, friction: float, length: float) ->
         Epsilon, without unit; 0 if the origin is not inside the hull, the hull is flat, or a
         number is not finite.
     """
-    # Directions of the edges of a contact's cone: tangential forces, and torsional moments.
-    radius = contacts.torsion_radius
-    edges = _edges(patch=radius > 0.0)
-    tangential, torsional = friction * edges[:, :2], friction * radius * edges[:, 2]
-
-    # Their wrenches, for a normal force of one.
-    axes = contact_axes(contacts.nhat_Q_O)
-    forces = axes @ np.column_stack([np.ones(len(edges)), tangential]).T  # (k, 3, edges)
+    # Wrenches of the edges of all cones, for a normal force of one.
+    angles = 2.0 * np.pi * np.arange(FRICTION_EDGES) / FRICTION_EDGES
+    edges = np.stack(
+        [np.ones(FRICTION_EDGES), friction * np.cos(angles), friction * np.sin(angles)]
+    )
+    forces = contacts.axes @ edges  # (n, 3, edges)
     blocks = grasp_map(contacts.p_OcmQ).reshape(6, -1, 3)
-    wrenches = np.einsum("wki,kie->kew", blocks, forces)
-    wrenches[..., :3] += axes[:, None, :, 0] * torsional[:, None]
-    wrenches = wrenches.reshape(-1, 6)
+    wrenches = np.einsum("wni,nie->new", blocks, forces).reshape(-1, 6)
     wrenches[:, :3] /= length
     if not np.isfinite(wrenches).all():
         return 0.0
@@ -108,17 +91,6 @@ def ferrari_canny(contacts: GraspContacts, *, friction: float, length: float) ->
     # A row is a unit outward normal and an offset, which is negative if the origin is inside.
     epsilon = -float(hull.equations[:, -1].max())
     return epsilon if epsilon > ROUNDING else 0.0
-
-
-def _edges(*, patch: bool) -> Array:
-    """Return unit vectors (n, 3): shares of two tangential forces and of the torsional moment."""
-    rings = PATCH_RINGS if patch else PATCH_RINGS[:1]
-    edges = []
-    for latitude, count in rings:
-        angles = 2.0 * np.pi * np.arange(count) / count
-        along, across = np.cos(latitude), np.full(count, np.sin(latitude))
-        edges.append(np.column_stack([along * np.cos(angles), along * np.sin(angles), across]))
-    return np.concatenate(edges)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,7 +112,7 @@ class ForceMargin:
 def force_margin(
     model: ObjectModel, X_TO: npt.ArrayLike, contacts: GraspContacts, config: Config
 ) -> ForceMargin:
-    """Return the margin of a grasp for the lift of `lift.lift_by_forces`.
+    """Return the margin of a grasp for the lift of the object.
 
     Args:
         model: The object.

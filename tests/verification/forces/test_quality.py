@@ -169,20 +169,12 @@ def test_grasp_that_some_wrench_breaks_at_once_has_epsilon_zero(p, n):
     assert ferrari_canny(GraspContacts(p, n, np.zeros(3)), friction=0.5, length=1.0) == 0.0
 
 
-def test_epsilon_of_two_patches_is_what_they_resist_by_torsion():
+def test_epsilon_of_two_rings_is_what_they_resist_by_twisting():
     """The weakest wrench is the torque mu r about the line between them; points have none."""
     p, n = CUBE[[0, 3]], CUBE[[0, 3]]
     assert ferrari_canny(GraspContacts(p, n, np.zeros(3)), friction=0.5, length=1.0) == 0.0
-    epsilon = ferrari_canny(
-        GraspContacts(p, n, np.zeros(3), torsion_radius=0.02), friction=0.5, length=1.0
-    )
-    assert epsilon == pytest.approx(0.5 * 0.02, rel=1e-4)
-
-
-def test_patches_resist_no_less_than_points():
-    p, n, p_OOcm = some_grasp(3)
-    points = ferrari_canny(GraspContacts(p, n, p_OOcm), friction=0.6, length=0.06)
-    patches = ferrari_canny(
-        GraspContacts(p, n, p_OOcm, torsion_radius=0.003), friction=0.6, length=0.06
-    )
-    assert points < patches < 1.2 * points
+    angles = 2.0 * np.pi * np.arange(8) / 8
+    ring = 0.02 * np.column_stack([np.zeros(8), np.cos(angles), np.sin(angles)])
+    rings = GraspContacts(p[:, None] + ring, np.broadcast_to(n[:, None], (2, 8, 3)), np.zeros(3))
+    epsilon = ferrari_canny(rings, friction=0.5, length=1.0)
+    assert epsilon == pytest.approx(0.5 * 0.02, rel=0.02)

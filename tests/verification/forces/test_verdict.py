@@ -1,0 +1,153 @@
+"""Holding by forces alone: closed forms, refusals with their reason, and predictions that lie."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from helpers.objects import CUBE, box_model, standing
+from scipy.spatial.transform import Rotation
+
+from drakegrasp.config import Config
+from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.settings import load_config
+from drakegrasp.hand.strength import fingertip_forces
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.simulation.trajectory import PEAK_ACCELERATION, lift_duration
+from drakegrasp.verification.forces.quality import force_margin
+from drakegrasp.verification.forces.surface_contacts import TORSION_RADIUS
+from drakegrasp.verification.forces.verdict import ForceVerdict, hand_contacts, judge_forces
+
+GRAVITY, HALF = 9.81, CUBE / 2.0
+#: Two contacts on one face of the cube, one in the middle of the opposite face.
+P = np.array([[0.02, HALF, 0.0], [-0.02, HALF, 0.0], [0.0, -HALF, 0.0]])
+N = np.array([[0.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+@pytest.fixture(scope="module")
+def config() -> Config:
+    return load_config()
+
+
+@pytest.fixture(scope="module")
+def box(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
+    return box_model(tmp_path_factory.mktemp("box"), [CUBE] * 3)
+
+
+def judged(
+    box: ObjectModel,
+    config: Config,
+    p: npt.ArrayLike = P,
+    n: npt.ArrayLike = N,
+    X_TO: np.ndarray | None = None,
+) -> ForceVerdict:
+    return judge_forces(box, standing(box) if X_TO is None else X_TO, p, n, config)
+
+
+def heaviest(config: Config) -> float:
+    """Return the force that carries the cube [N] where it is accelerated upwards the most."""
+    distance = config.lift.p_TG[2] - HALF
+    return GRAVITY + PEAK_ACCELERATION * distance / lift_duration(distance, config) ** 2
+
+
+def slippery(friction: float) -> Config:
+    return load_config(overrides=[f"physics.friction_hand={friction}"])
+
+
+def test_finger_that_opposes_two_carries_half_of_the_load(box: ObjectModel, config: Config) -> None:
+    found = judged(box, config)
+    force = heaviest(config) / (2.0 * config.physics.friction_hand)
+    assert found.held and found.deciding is found.points
+    assert found.planned_force == pytest.approx(force, rel=1e-6)
+    limit = fingertip_forces(load_hand(), "worm")[2]
+    assert found.planned_share == pytest.approx(force / limit, rel=1e-6)
+    assert found.reason.startswith(f"normal forces of at most {force:.1f} N carry it: ")
+
+
+def test_more_friction_than_the_smallest_holds_and_less_does_not(
+    box: ObjectModel, config: Config
+) -> None:
+    contacts = hand_contacts(box, P, N, config)
+    smallest = force_margin(box, standing(box), contacts, config).smallest_friction
+    assert judged(box, slippery(1.001 * smallest)).held
+    found = judged(box, slippery(0.999 * smallest))
+    assert not found.held and found.on_surface
+    assert "more than the 34.5 N that the fingertip carries" in found.reason
+
+
+def test_friction_of_the_object_wins_over_the_configured_one(
+    box: ObjectModel, config: Config
+) -> None:
+    found = judged(replace(box, friction=0.05), config)
+    assert found.planned_force == pytest.approx(heaviest(config) / 0.1, rel=1e-6)
+
+
+def test_turned_cube_is_held_as_well(box: ObjectModel, config: Config) -> None:
+    X_TO = standing(box)
+    X_TO[:3, :3] = Rotation.from_rotvec([0.0, 0.0, 0.7]).as_matrix()
+    turned = judged(box, config, X_TO=X_TO)
+    assert turned.planned_force == pytest.approx(judged(box, config).planned_force, rel=1e-6)
+
+
+def test_finger_below_the_object_as_it_lies_carries_it_almost_without_friction(
+    box: ObjectModel,
+) -> None:
+    """The face of the single finger is the lower one of the lying cube."""
+    X_TO, config = standing(box), slippery(1e-3)
+    X_TO[:3, :3] = Rotation.from_rotvec([np.pi / 2.0, 0.0, 0.0]).as_matrix()
+    found = judged(box, config, X_TO=X_TO)
+    assert found.held and not judged(box, config).held
+    assert found.planned_force == pytest.approx(heaviest(config), rel=1e-4)
+
+
+@pytest.mark.parametrize("p", [np.abs(P), [[0.01, HALF, 0.0]] * 3])
+def test_contacts_on_one_face_hold_nothing(
+    box: ObjectModel, config: Config, p: npt.ArrayLike
+) -> None:
+    found = judged(box, config, p, np.abs(N))
+    assert found.on_surface and not found.held
+    assert found.planned_force == np.inf
+    assert found.reason.startswith("no forces within the surface's friction cones carry it")
+
+
+# Predictions that lie
+
+
+def test_normals_that_lean_upwards_carry_no_more_than_the_surfaces_own(
+    box: ObjectModel,
+) -> None:
+    """At little friction they would point the forces up: the surface does not let them."""
+    leaning = N - [0.0, 0.0, 0.8]
+    leaning /= np.linalg.norm(leaning, axis=1, keepdims=True)
+    found = judged(box, slippery(0.05), P, leaning)
+    assert found.on_surface and not found.held
+    assert np.array_equal(found.points.normal, judged(box, slippery(0.05)).points.normal)
+
+
+@pytest.mark.parametrize(("away", "side"), [(0.009, "outside"), (-0.009, "inside")])
+def test_points_off_the_surface_fail_by_their_distance(
+    box: ObjectModel, config: Config, away: float, side: str
+) -> None:
+    found = judged(box, config, P + away * N * [[0.0], [1.0], [0.0]], N)
+    assert not found.held and not found.on_surface
+    assert found.reason == f"contact 2 is 9.0 mm {side} the object's surface, more than 5 mm"
+
+
+def test_normals_off_the_surfaces_own_fail_by_their_angle(box: ObjectModel, config: Config) -> None:
+    found = judged(box, config, P, N * [[1.0], [1.0], [-1.0]])
+    assert not found.held and not found.on_surface
+    assert found.reason == "normal 3 is 180° off the surface's own, more than 45°"
+
+
+# Two fingertips
+
+
+def test_two_fingertips_hold_by_patches_what_points_let_swing(box: ObjectModel) -> None:
+    """Beside the centre of mass, by less than the radius of a patch."""
+    config = load_config(hand="franka")
+    p = np.array([[TORSION_RADIUS / 2.0, HALF, 0.0], [TORSION_RADIUS / 2.0, -HALF, 0.0]])
+    found = judged(box, config, p, N[[0, 2]])
+    assert found.deciding is found.patches
+    assert found.points.share == np.inf and np.isfinite(found.patches.share)
