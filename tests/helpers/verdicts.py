@@ -1,4 +1,4 @@
-"""A made-up trial, for tests of what is said and written about verdicts."""
+"""A made-up trial and forces, for tests of what is said and written about verdicts."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.lift import Lift
 from drakegrasp.simulation.trial import Closed, TrialRecord
+from drakegrasp.verification.forces.contact_forces import ContactForces
+from drakegrasp.verification.forces.surface_contacts import SurfaceContacts
+from drakegrasp.verification.forces.verdict import ForceVerdict
 
 
 def some_contacts(**values: Any) -> Contacts:
@@ -43,3 +46,24 @@ def some_trial(
     )
     closing = Closed(contacts=closed, q=rng.random(8), duration=1.5)
     return TrialRecord(outcome=outcome, X_TO=X_TO, X_OG=X_OG, closed=closing, lift=lift)
+
+
+def some_forces(*, points: float = 0.5, patches: float = 0.25) -> ForceVerdict:
+    """Return what forces of three fingertips of 10 N do that take these shares of it."""
+    contacts = SurfaceContacts(
+        p_OQ=np.full((3, 3), 0.01),
+        nhat_Q_O=np.eye(3),
+        distance=np.array([0.001, 0.002, 0.0]),
+        inside=np.array([False, True, False]),
+        angle=np.deg2rad([1.0, 2.0, 3.0]),
+    )
+    forces = [
+        ContactForces(
+            feasible=bool(np.isfinite(share)),
+            f_Q_O=np.eye(3),
+            normal=np.full(3, 10.0 * share),
+            shares=np.full(3, share),
+        )
+        for share in (points, patches)
+    ]
+    return ForceVerdict(contacts=contacts, points=forces[0], patches=forces[1])

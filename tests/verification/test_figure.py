@@ -9,15 +9,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from drakegrasp.verification.forces.lift import ForceLift, LiftEnd
 from helpers.hands import write_tongs
 from helpers.machine import needs_egl
 from helpers.objects import CUBE, box_model, from_above, standing
+from helpers.verdicts import some_forces
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from drakegrasp.config import Config
-from drakegrasp.frames import X_WT, make_pose
+from drakegrasp.frames import X_WT
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel
@@ -172,19 +172,13 @@ def test_last_panel_shows_the_last_instant(
 ) -> None:
     closed = replace(held, lift=None)
     fit = SimpleNamespace(X_OG=held.X_OG, spread=0.0, closing=np.full(3, 1.0))
-    X_TO_lifted = make_pose(np.eye(3), [0.0, 0.0, 0.6])
-    lift = ForceLift(
-        end=LiftEnd.HELD, planned_force=1.0, planned_share=0.1, X_TO_lifted=X_TO_lifted
-    )
     for values, title in (
         ({"trial": closed, "fit": fit}, "after closing"),
         ({"fit": fit}, "the hand where it comes closest"),
-        ({"lift": lift}, "end of the lift"),
     ):
         figure = verification_figure(verified(**values))
         assert figure.axes[2].get_title(loc="left") == title
-    refused = ForceLift(end=LiftEnd.INFEASIBLE, planned_force=np.inf, planned_share=np.inf)
-    assert len(verification_figure(verified(lift=refused)).axes) == 2
+    assert len(verification_figure(verified(forces=some_forces())).axes) == 2
 
 
 @pytest.mark.parametrize("friction", [0.71, 0.1])

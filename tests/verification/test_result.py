@@ -7,11 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from drakegrasp.verification.forces.lift import ForceLift, LiftEnd
 from helpers.objects import standing
-from helpers.verdicts import some_contacts, some_trial
+from helpers.verdicts import some_contacts, some_forces, some_trial
 
-from drakegrasp.frames import make_pose
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import make_object
 from drakegrasp.outcomes import Outcome
@@ -109,20 +107,12 @@ def test_explanation_of_a_lost_object_gives_no_mark() -> None:
     assert text.endswith("no other link of the hand touches it.")
 
 
-@pytest.mark.parametrize(("error_mm", "words"), [(1.0, "held, precision, stable"),
-                                                 (8.0, "held, precision")])  # fmt: skip
-def test_forces_alone_are_a_precision_grasp_that_is_stable_on_its_path(
-    error_mm: float, words: str
-) -> None:
-    lift = ForceLift(
-        end=LiftEnd.HELD,
-        planned_force=5.0,
-        planned_share=0.1,
-        position_error=1e-3 * error_mm,
-        angle_error=0.01,
-        X_TO_lifted=make_pose(np.eye(3), [0.0, 0.0, 0.6]),
-    )
+def test_what_forces_alone_hold_is_a_precision_grasp_that_is_stable() -> None:
+    """Nothing moves where forces balance."""
     verdict = replace(
-        lifted(slip_mm=90.0, turn_deg=0.0, links=0), trial=None, method="forces", lift=lift
+        lifted(slip_mm=90.0, turn_deg=0.0, links=0),
+        trial=None,
+        method="forces",
+        forces=some_forces(),
     )
-    assert verdict.words == words
+    assert verdict.words == "held, precision, stable"

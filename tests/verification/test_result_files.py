@@ -13,9 +13,8 @@ import h5py
 import numpy as np
 import pytest
 import trimesh
-from drakegrasp.verification.forces.lift import ForceLift, LiftEnd
 from helpers.objects import standing
-from helpers.verdicts import some_contacts, some_trial
+from helpers.verdicts import some_contacts, some_forces, some_trial
 
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, VERIFICATION_FIELDS, sizes
 from drakegrasp.errors import DataError
@@ -90,16 +89,6 @@ def results() -> list[Verification]:
     trial = some_trial(
         placed.X_TO, contacts(), contacts(), outcome=Outcome.SUCCESS, slip=0.002, turn=0.01
     )
-    lift = ForceLift(
-        end=LiftEnd.HELD,
-        planned_force=5.0,
-        planned_share=0.125,
-        applied_force=6.0,
-        position_error=0.001,
-        angle_error=np.deg2rad(2.0),
-        X_TO_lifted=make_pose(np.eye(3), [0.0, 0.0, 0.6]),
-        steps=300,
-    )
     judged = replace(off, epsilon=0.1, smallest_friction=0.5)
     unreachable = replace(judged, outcome=Outcome.UNREACHABLE, smallest_friction=np.inf, fit=fit)
     held = replace(
@@ -112,7 +101,7 @@ def results() -> list[Verification]:
         trial=trial,
         contact_error=np.array([0.001, 0.002, 0.003]),
     )
-    by_forces = replace(judged, method="forces", outcome=Outcome.SUCCESS, lift=lift)
+    by_forces = replace(judged, method="forces", outcome=Outcome.SUCCESS, forces=some_forces())
     return [held, by_forces, unreachable, off]
 
 
@@ -148,11 +137,14 @@ def test_a_line_says_all_of_a_grasp_in_strict_json(found: list[Verification]) ->
     assert held["closed"]["p_OQ"][1] == [None, None, None]
     assert held["closed"]["other_links"] == 2
     assert len(held["lifted"]["q"]) == 8
-    assert by_forces["forces"]["end"] == "held"
+    assert by_forces["forces"]["planned_force"] == pytest.approx(5.0)
+    assert by_forces["forces"]["points_share"] == 0.5
+    assert by_forces["forces"]["patches_share"] == 0.25
+    assert by_forces["forces"]["selected_inside"] == [False, True, False]
     assert held["solver"]["iterations"] == 12
     assert held["slip"] == 0.002
     assert held["forces"] is None
-    assert by_forces["forces"]["angle_error_deg"] == pytest.approx(2.0)
+    assert by_forces["forces"]["selected_angle_deg"] == pytest.approx([1.0, 2.0, 3.0])
     assert by_forces["closed"] is None
     assert unreachable["normal_error_deg"] == pytest.approx([1.0, 2.0, 60.0])
     assert unreachable["smallest_friction"] is None
@@ -194,8 +186,10 @@ def test_every_field_is_written_and_reads_back(found: list[Verification], tmp_pa
     assert np.array_equal(columns["closed_p_OQ"][0], held.closed.p_OQ, equal_nan=True)
     assert np.array_equal(columns["closing_start"][0], [0.1, 0.2, 0.3])
     assert columns["solver_status"].tolist() == [0, -1, 0, -1]
-    assert columns["X_TO_lifted"][:2, 11].tolist() == [0.5, 0.6]
-    assert np.isnan(columns["X_TO_lifted"][2:]).all()
+    assert columns["X_TO_lifted"][0, 11] == 0.5
+    assert np.isnan(columns["X_TO_lifted"][1:]).all()
+    assert columns["planned_share"][1] == 0.5
+    assert np.isnan(columns["planned_share"][[0, 2, 3]]).all()
     assert np.isnan(columns["slip"][1:]).all()
     assert math.isinf(columns["smallest_friction"][2])
 

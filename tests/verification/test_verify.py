@@ -80,7 +80,7 @@ def test_a_grasp_that_held_is_found_again_and_holds(held: dg.Verification) -> No
 def test_forces_alone_hold_it_too(cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]) -> None:
     found = verify(cube, *grasp, "forces")
     assert found.success and found.fit is None and found.trial is None
-    assert found.lift is not None and found.lift.applied_force < 20.0
+    assert found.forces is not None and found.forces.planned_force < 20.0
     assert 0.0 < found.smallest_friction < CONFIG.physics.friction_hand
     assert "carry it" in found.explain()
 
@@ -253,15 +253,6 @@ def test_palm_poses_that_collide_at_the_start_do_not_count(
     found = verify(cube, *grasp)
     assert found.success
     assert found.tries == len(trials)
-
-
-def test_lift_by_forces_has_a_wall_clock_limit(
-    cube: PlacedObject, grasp: tuple[np.ndarray, np.ndarray]
-) -> None:
-    hasty = override_config(CONFIG, ["attempt_seconds=1e-3"])
-    found = verify(cube, *grasp, "forces", hasty)
-    assert found.outcome is Outcome.TIMEOUT
-    assert "says nothing about the grasp" in found.reason
 
 
 def test_number_of_threads_changes_no_bit(

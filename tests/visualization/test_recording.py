@@ -16,7 +16,6 @@ import h5py
 import msgpack
 import numpy as np
 import pytest
-from drakegrasp.verification.forces.lift import LiftEnd, lift_by_forces
 from helpers.objects import CUBE, box_model, from_above, standing
 
 from drakegrasp.build.replay import record_trial
@@ -26,10 +25,9 @@ from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Attempt
-from drakegrasp.simulation.construction import MESHCAT_RATE, build_object_scene, build_scene
+from drakegrasp.simulation.construction import MESHCAT_RATE, build_scene
 from drakegrasp.simulation.trial import run_attempt
-from drakegrasp.verification.forces.contact_forces import hand_contacts
-from drakegrasp.verification.recording import record_lift, record_verification
+from drakegrasp.verification.recording import record_verification
 from drakegrasp.visualization import recording
 from drakegrasp.visualization.recording import record_attempt
 
@@ -78,7 +76,7 @@ def not_simulated(cube: ObjectModel, config: Config, fit: object = None) -> Simp
     """Return a verification that ended before its simulation."""
     placed = SimpleNamespace(model=cube, X_TO_simulated=standing(cube))
     return SimpleNamespace(
-        placed=placed, p_OQ=P_OQ, nhat_Q_O=NHAT_Q_O, fit=fit, pregrasp=None, lift=None,
+        placed=placed, p_OQ=P_OQ, nhat_Q_O=NHAT_Q_O, fit=fit, pregrasp=None,
         config=config,
     )  # fmt: skip
 
@@ -111,22 +109,6 @@ def test_recording_a_trial_changes_no_bit_of_it(
     assert b"finger" in keys
     assert b"predicted" not in keys
     assert not list(path.parent.glob("*tmp*"))
-
-
-def test_recording_a_lift_changes_no_bit_of_it(
-    cube: ObjectModel, config: Config, tmp_path: Path
-) -> None:
-    contacts = hand_contacts(cube, P_OQ, NHAT_Q_O, config)
-    scene = build_object_scene(cube, config.physics)
-    plain = lift_by_forces(scene, standing(cube), contacts, config)
-    path = tmp_path / "lift.html"
-    recorded = record_lift(not_simulated(cube, config), path)
-    assert plain.end is recorded.end is LiftEnd.HELD
-    assert np.array_equal(plain.X_TO_lifted, recorded.X_TO_lifted)
-    assert plain.applied_force == recorded.applied_force
-    keys = keys_of(path)
-    assert all(part in keys for part in (OBJECT, b"forces/1", b"forces/3", b"scale"))
-    assert HAND not in b"".join(commands_of(path))
 
 
 def test_attempt_that_is_not_simulated_is_shown_all_the_same(
@@ -173,7 +155,7 @@ def test_only_this_machine_is_served_and_only_meanwhile(
     monkeypatch.setattr(recording, "_make_meshcat", spy)
     missed = replace(attempt, ray_hits=False)
     record_attempt(cube, standing(cube), missed, config, tmp_path / "a.html")
-    record_lift(not_simulated(cube, config), tmp_path / "b.html")
+    record_verification(not_simulated(cube, config), tmp_path / "b.html")
     assert os.environ["DRAKE_ALLOW_NETWORK"] == "none"
     assert [url.hostname for url in urls] == ["localhost"] * 2
     for url in urls:
