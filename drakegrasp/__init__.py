@@ -10,7 +10,14 @@ from importlib import import_module, metadata
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from drakegrasp.api import build_dataset, verify_grasp, verify_grasps
+    from drakegrasp.api import (
+        PlacedObject,
+        build_dataset,
+        place_object,
+        verify_grasp,
+        verify_grasps,
+        verify_rows,
+    )
     from drakegrasp.build.pipeline import BuildReport
     from drakegrasp.build.replay import Replay, replay_trial
     from drakegrasp.config import Config
@@ -23,8 +30,7 @@ if TYPE_CHECKING:
     from drakegrasp.hand.description import Hand, load_hand
     from drakegrasp.hand.settings import load_config
     from drakegrasp.outcomes import Outcome
-    from drakegrasp.simulation.placement import PlacedObject, place_object
-    from drakegrasp.verification.result import Verification
+    from drakegrasp.verification.result import PoseTrial, Verification
 
 __version__ = metadata.version("drakegrasp")
 
@@ -36,7 +42,8 @@ _HOMES = {
     "GraspDataset": "dataset.reader",
     "Hand": "hand.description",
     "Outcome": "outcomes",
-    "PlacedObject": "simulation.placement",
+    "PlacedObject": "api",
+    "PoseTrial": "verification.result",
     "Replay": "build.replay",
     "Sample": "dataset.reader",
     "Trials": "dataset.trials",
@@ -47,12 +54,13 @@ _HOMES = {
     "load_config": "hand.settings",
     "load_hand": "hand.description",
     "pack_grasp": "grasp",
-    "place_object": "simulation.placement",
+    "place_object": "api",
     "replay_trial": "build.replay",
     "transform_grasp": "grasp",
     "unpack_grasp": "grasp",
     "verify_grasp": "api",
     "verify_grasps": "api",
+    "verify_rows": "api",
 }
 
 __all__ = [
@@ -63,6 +71,7 @@ __all__ = [
     "Hand",
     "Outcome",
     "PlacedObject",
+    "PoseTrial",
     "Replay",
     "Sample",
     "Trials",
@@ -79,6 +88,7 @@ __all__ = [
     "unpack_grasp",
     "verify_grasp",
     "verify_grasps",
+    "verify_rows",
 ]
 
 

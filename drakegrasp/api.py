@@ -1,17 +1,23 @@
 """Building a dataset and verifying grasps, on Dask workers or in this process.
 
+Grasps are verified through two doors: `place_object(...).verify(...)` for those of one object, and
+`verify_rows` for those of a dataset's rows.
+
 These are the functions that `drakegrasp` exports and the command line calls.
 """
 
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy.typing as npt
+import trimesh
 
 from drakegrasp.build.pipeline import BuildReport, build_locked, refuse_unusable
 from drakegrasp.build.request import BUILTIN
@@ -27,27 +33,31 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import ConfigError, GraspError, MeshError, listed
 from drakegrasp.frames import as_numbers
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.settings import load_config
+from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.runtime.executor import count_workers, run_here
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.shapes.catalog import builtin_sources, draw_builtin
 from drakegrasp.simulation.drive import drive_of
+from drakegrasp.simulation.placement import Placed, config_for
+from drakegrasp.simulation.placement import PlacedObject as ObjectOnTable
+from drakegrasp.simulation.placement import place_object as put_on_table
 from drakegrasp.verification.batch import ResultCallback, ignore_result, verify_batch
-from drakegrasp.verification.placed_grasp import (
-    Mesh,
-    mesh_config,
-    place_on_mesh,
-    place_on_rows,
-)
+from drakegrasp.verification.placed_grasp import place_on_object, place_on_rows
 from drakegrasp.verification.result import Verification
-from drakegrasp.verification.verify import PlacedGrasp, refuse_off_surface
+from drakegrasp.verification.verify import PlacedGrasp
 
 if TYPE_CHECKING:
     from distributed import Client
 
+#: What an object on the table is made of: a mesh file, a mesh, or an object that was placed before.
+ObjectMesh: TypeAlias = str | Path | trimesh.Trimesh | Placed
+
 #: Up to this many grasps are verified in this process: starting workers would take longer.
 FEW_GRASPS = 4
+#: Grasps of one object are verified together, at most so many, as long as each worker has some
+#: tasks, so that none is idle in the end.
+MOST_TOGETHER, TASKS_PER_WORKER = 16, 4
 
 
 def build_dataset(
@@ -181,155 +191,194 @@ def _refuse_unknown(only: Sequence[str], names: Sequence[str]) -> None:
         raise MeshError(f"only must be names of objects ({known}), got {unknown[0]!r}")
 
 
-def verify_grasp(
-    grasp: npt.ArrayLike,
-    mesh: Mesh | None = None,
-    *,
-    frame: str | None = None,
-    X_TC: npt.ArrayLike | None = None,
-    X_TO: npt.ArrayLike | None = None,
-    units: str | None = None,
-    hand: str | Path | None = None,
-    method: str = "hand",
-    config: Config | None = None,
-    dataset: GraspDataset | None = None,
-    row: int | None = None,
-) -> Verification:
-    """Return whether a predicted grasp holds an object in the simulator, why not, and how.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlacedObject(ObjectOnTable):
+    """An object on the table, on which grasps can be verified; made by `place_object`."""
 
-    A grasp is 6k numbers for a hand of k fingers (18 for the Barrett Hand): k contact points
-    [m], then k unit normals out of the object, in the finger order of the hand file.
+    def verify(
+        self,
+        grasps: npt.ArrayLike,
+        *,
+        frame: str = "object",
+        X_TC: npt.ArrayLike | None = None,
+        method: str = "hand",
+        snap_points: bool = False,
+        client: Client | None = None,
+        show: bool = False,
+    ) -> list[Verification]:
+        """Return whether predicted grasps hold the object in the simulator, why not, and how.
+
+        A grasp is 6k numbers for a hand of k fingers (18 for the Barrett Hand): k contact points
+        [m], then k unit normals out of the object, in the finger order of the hand file. A row of
+        numbers that is no grasp has the outcome `invalid`, and spoils no other.
+
+        Args:
+            grasps: (n, 6k), or (6k,) for one.
+            frame: The frame of the grasps: "object" {O}, whose origin is the centre of the
+                bounding box, "camera" {C} or "workspace" {T}.
+            X_TC: With frame "camera": pose of the camera in the table-top frame, (4, 4), or one
+                per grasp (n, 4, 4).
+            method: "hand" closes a simulated hand on the contacts and lifts; "forces" lifts by
+                forces at the contacts alone.
+            snap_points: Whether to move the points, not the normals, to the nearest ones of the
+                object's surface first.
+            client: A Dask client whose workers share the work; this process does it if None.
+            show: Whether to show progress on standard error.
+
+        Returns:
+            The verdicts, in the order of the grasps.
+
+        Raises:
+            GraspError: If the whole array has another shape, or the frame, the camera's pose or
+                the method cannot be used.
+            MachineError: If a worker would give other results than this machine.
+        """
+        placed = place_on_object(
+            grasps, self, frame=frame, X_TC=X_TC, method=method, snap_points=snap_points
+        )
+        return _verify_on(client, placed, show=show)
+
+
+def place_object(
+    mesh: ObjectMesh,
+    *,
+    units: str | None = None,
+    X_TO: npt.ArrayLike | None = None,
+    hand: str | Path | None = None,
+    config: Config | None = None,
+) -> PlacedObject:
+    """Return an object on the table, prepared once for any number of grasps.
 
     Args:
-        grasp: (6k,).
-        mesh: Path of a mesh file, a trimesh, or the result of `place_object`, which prepares an
-            object once for many calls. {O} is at the centre of its bounding box.
-        frame: The frame of the grasp: "object" {O}, "camera" {C} or "workspace" {T}. The default
-            is "object" with a mesh, "camera" with a dataset.
-        X_TC: With a mesh and frame "camera": pose of the camera in the table-top frame, (4, 4).
+        mesh: Path of a mesh file, a mesh, or an object that was placed before. The origin
+            of {O} is the centre of its bounding box, not that of the file.
+        units: Unit of the mesh's lengths: m, cm or mm; metres if None. An `objects.yaml` beside
+            a file wins. Grasps are always in metres.
         X_TO: Pose of the object on the table, (4, 4); dropped as in a build if None.
-        units: Unit of the mesh's lengths: m, cm or mm; metres if None. The grasp is always in
-            metres.
         hand: Name or YAML file of the hand; the configuration's ("barrett") if None.
-        method: "hand" closes a simulated hand on the contacts and lifts; "forces" lifts by
-            forces at the contacts alone.
-        config: Physics, lift and limits; if None that of the dataset or of the placed object,
-            else the defaults.
-        dataset: Instead of a mesh: a data file of a dataset; its row defines the object, its
-            pose and the camera's.
-        row: The row of the dataset's split that the grasp is for.
+        config: Hand, physics, lift and rules; that of an object that was placed before, else the
+            defaults, if None.
 
     Raises:
-        GraspError: If the grasp, its frame or a pose cannot be used.
-        OffSurfaceError: If a contact is farther than `verify.max_surface_distance` from the
-            surface, or a normal points inwards. `verify_grasps` has an outcome for this.
-        MeshError: If the mesh cannot be simulated.
-        ConfigError, HandError, DataError: If configuration, hand or dataset cannot be used.
+        MeshError: If the mesh cannot be simulated or does not come to rest.
+        GraspError: If X_TO is no pose or does not stand on the table.
+        ConfigError: If config is none, or an object was placed before with other values.
+        HandError: If the hand cannot be used.
     """
-    # One grasp, for one object.
-    vector = as_numbers(grasp, "a grasp must be a vector of numbers")
-    if vector.ndim != 1:
-        raise GraspError(
-            f"one grasp must be a vector, got an array of shape {vector.shape}; "
-            "verify_grasps takes many"
-        )
-    if (row is None) != (dataset is None):
-        raise GraspError(f"row must be given with a dataset, and only then, got {row}")
-
-    (result,) = verify_grasps(
-        vector,
-        mesh,
-        frame=frame,
-        X_TC=X_TC,
-        X_TO=X_TO,
-        units=units,
-        hand=hand,
-        method=method,
-        config=config,
-        dataset=dataset,
-        rows=None if row is None else [row],
-    )
-    refuse_off_surface(result)
-    return result
+    used = config_for(mesh, config)
+    if hand is not None:
+        used = override_config(used, [], hand=str(hand))
+    placed = put_on_table(mesh, units=units, X_TO=X_TO, config=used)
+    return PlacedObject(model=placed.model, X_TO=placed.X_TO, config=placed.config)
 
 
-def verify_grasps(
-    grasps: npt.ArrayLike,
-    mesh: Mesh | None = None,
-    *,
-    frame: str | None = None,
-    X_TC: npt.ArrayLike | None = None,
-    X_TO: npt.ArrayLike | None = None,
-    units: str | None = None,
-    hand: str | Path | None = None,
-    method: str = "hand",
-    config: Config | None = None,
-    dataset: GraspDataset | None = None,
+def verify_rows(
+    data: GraspDataset,
+    predictions: npt.ArrayLike,
     rows: Sequence[int] | None = None,
+    *,
+    frame: str = "camera",
+    method: str = "hand",
+    snap_points: bool = False,
+    hand: str | Path | None = None,
+    config: Config | None = None,
     client: Client | None = None,
     show: bool = False,
 ) -> list[Verification]:
-    """Return the verdicts on many predicted grasps, in their order; see `verify_grasp`.
+    """Return the verdicts on grasps that were predicted for rows of a dataset, in their order.
 
-    A grasp whose contacts are not on the surface does not raise here: its outcome is
-    `off_surface`.
+    A row says which object it is, how it lies on the table, where the camera was, and what
+    friction and mass were drawn. See `PlacedObject.verify`.
 
     Args:
-        grasps: (n, 6k).
-        mesh: The object of all grasps, given as in `verify_grasp`.
-        frame: "object", "camera" or "workspace", as in `verify_grasp`.
-        X_TC: With a mesh and frame "camera": (4, 4), or one per grasp (n, 4, 4).
-        X_TO: Pose of the object on the table, (4, 4); dropped as in a build if None.
-        units: Unit of the mesh's lengths: m, cm or mm; metres if None.
-        hand: Name or YAML file of the hand; the configuration's if None.
+        data: A data file of a dataset, with its split.
+        predictions: (n, 6k), or (6k,) for one.
+        rows: The row of the split for each grasp; all rows, in order, if None.
+        frame: "camera" of this data file, "object" or "workspace".
         method: "hand" or "forces".
-        config: Physics, lift and limits; chosen as in `verify_grasp` if None.
-        dataset: Instead of a mesh: a data file of a dataset.
-        rows: The row of the dataset's split for each grasp; all rows, in order, if None.
+        snap_points: Whether to move the points to the object's surface first.
+        hand: Name or YAML file of the hand; the dataset's if None.
+        config: Physics, lift and rules instead of the dataset's, with what its rows drew.
         client: A Dask client whose workers share the work; this process does it if None.
         show: Whether to show progress on standard error.
 
     Raises:
-        GraspError, MeshError, ConfigError, HandError, DataError: As `verify_grasp`, before
-            anything is simulated.
+        GraspError: As `PlacedObject.verify`, or if rows do not exist or are not one per grasp.
+        ConfigError, HandError, DataError: If configuration, hand or dataset cannot be used.
         MachineError: If a worker would give other results than this machine.
     """
-    # Put each grasp on its object: on one of a dataset's, or all on the given mesh.
-    if dataset is not None:
-        _refuse_what_rows_define(dataset, mesh=mesh, X_TC=X_TC, X_TO=X_TO, units=units)
-        placed = place_on_rows(
-            grasps, dataset, rows, frame=frame, hand=hand, method=method, config=config
+    if not isinstance(data, GraspDataset):
+        raise GraspError(
+            "data must be a GraspDataset, which has a file and a split, "
+            f"got a {type(data).__name__}"
         )
-    elif mesh is None:
-        raise GraspError("a mesh or a dataset must be given, got neither")
-    elif rows is not None:
-        raise GraspError("rows must be None without a dataset, got rows")
-    else:
-        placed = place_on_mesh(
-            grasps,
-            mesh,
-            frame=frame,
-            X_TC=X_TC,
-            X_TO=X_TO,
-            units=units,
-            method=method,
-            config=mesh_config(mesh, config, hand),
-        )
-
-    # Try them there.
+    placed = place_on_rows(
+        predictions, data, rows, frame=frame, hand=hand, method=method, snap_points=snap_points,
+        config=config,
+    )  # fmt: skip
     return _verify_on(client, placed, show=show)
 
 
-def _refuse_what_rows_define(dataset: object, **values: object) -> None:
-    """Refuse what is no dataset, and values that the rows of a dataset define."""
-    if not isinstance(dataset, GraspDataset):
-        raise GraspError(
-            "dataset must be a GraspDataset, which has a file and a split, "
-            f"got a {type(dataset).__name__}"
-        )
-    for name, value in values.items():
-        if value is not None:
-            raise GraspError(f"{name} must be None with a dataset, which defines it, got a value")
+def verify_grasp(
+    grasp: npt.ArrayLike,
+    mesh: ObjectMesh | None = None,
+    *,
+    row: int | None = None,
+    **options: Any,
+) -> Verification:
+    """Return the verdict on one grasp: the call of version 0.2, see `verify_grasps`."""
+    vector = as_numbers(grasp, "a grasp must be a vector of numbers")
+    if vector.ndim != 1:
+        raise GraspError(f"one grasp must be a vector, got an array of shape {vector.shape}")
+    rows = None if row is None else [row]
+    (result,) = _verify_as_before("verify_grasp", vector, mesh, rows=rows, **options)
+    return result
+
+
+def verify_grasps(
+    grasps: npt.ArrayLike, mesh: ObjectMesh | None = None, **options: Any
+) -> list[Verification]:
+    """Return the verdicts on many grasps: the call of version 0.2, which the next one drops.
+
+    Use `place_object(mesh, units=…, X_TO=…, hand=…, config=…).verify(grasps, …)`, or
+    `verify_rows(dataset, grasps, rows, …)`; their arguments have the same names.
+    """
+    return _verify_as_before("verify_grasps", grasps, mesh, **options)
+
+
+def _verify_as_before(
+    name: str,
+    grasps: npt.ArrayLike,
+    mesh: ObjectMesh | None,
+    *,
+    dataset: GraspDataset | None = None,
+    rows: Sequence[int] | None = None,
+    frame: str | None = None,
+    X_TC: npt.ArrayLike | None = None,
+    **options: Any,
+) -> list[Verification]:
+    """Verify grasps by one of the two new calls, with a warning that says which."""
+    new = "place_object(mesh, ...).verify(grasps)" if dataset is None else "verify_rows"
+    warnings.warn(f"{name} will be gone in the next version, use {new}", FutureWarning, 3)
+
+    # Rows of a dataset define what the others name.
+    if dataset is not None:
+        names = ("units", "X_TO")
+        given = {"mesh": mesh, "X_TC": X_TC, **{n: options.pop(n, None) for n in names}}
+        for key, value in given.items():
+            if value is not None:
+                raise GraspError(
+                    f"{key} must be None with a dataset, which defines it, got a value"
+                )
+        return verify_rows(dataset, grasps, rows, frame=frame or "camera", **options)
+    if mesh is None:
+        raise GraspError("a mesh or a dataset must be given, got neither")
+    if rows is not None:
+        raise GraspError("rows must be None without a dataset, got rows")
+
+    names = ("units", "X_TO", "hand", "config")
+    placed = place_object(mesh, **{n: options.pop(n) for n in names if n in options})
+    return placed.verify(grasps, frame=frame or "object", X_TC=X_TC, **options)
 
 
 def run_verification(
@@ -378,7 +427,9 @@ def _verify_on(
         if client is None or not grasps:
             return verify_batch(grasps, run_here, report, on_result)
         with admitted_workers(client, grasps[0].config):
-            return verify_batch(grasps, DaskExecutor(client), report, on_result)
+            tasks = TASKS_PER_WORKER * max(len(client.nthreads()), 1)
+            together = min(max(len(grasps) // tasks, 1), MOST_TOGETHER)
+            return verify_batch(grasps, DaskExecutor(client), report, on_result, together=together)
 
 
 def _refuse_workers(

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import warnings
 from collections.abc import Iterator, Mapping
 from importlib import resources
 from pathlib import Path, PurePath
@@ -404,17 +405,31 @@ class SplitConfig(_Section):
         return self
 
 
-class VerifyConfig(_Section):
-    """Limits for a predicted grasp; see docs/how-to/verify-predictions.md."""
+#: Limits of verification in configurations of older versions: those that decided what is tried, and
+#: those of the lift that method `forces` simulated.
+OLD_LIMITS = (
+    *("max_surface_distance", "max_residual", "max_normal_error_deg"),
+    *("max_position_error", "max_angle_error_deg"),
+)
 
-    max_surface_distance: Positive = 0.01  # [m], of a predicted point from the object's surface
-    max_residual: Positive = 0.008  # [m], of a fingertip from its point before closing
-    max_normal_error_deg: Positive = 45.0  # between a pad's normal and the predicted one
-    max_contact_error: Positive = 0.01  # [m], of a contact after closing from its point
+
+class VerifyConfig(_Section):
+    """How predicted grasps are tried and judged; see docs/how-to/verify-predictions.md."""
+
+    max_contact_error: Positive = 0.02  # [m], of a success's contacts from those asked for
     open_margin_deg: Positive = 20.0  # by which fingers are opened first; 1 rad as 0.1 m of a slide
-    max_tries: Annotated[int, Field(ge=1, le=5)] = 5  # wrist poses simulated before it fails
-    max_position_error: Positive = 0.01  # [m], of an object lifted by forces alone
-    max_angle_error_deg: Positive = 5.0  # of an object lifted by forces alone
+    # Wrist poses that are simulated until one holds; 1: the best fit alone, which decides success.
+    max_tries: Annotated[int, Field(ge=1, le=5)] = 5
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_old_limits(cls, tree: Any) -> Any:
+        # Keys of one version ago.
+        old = [key for key in OLD_LIMITS if isinstance(tree, dict) and key in tree]
+        for key in old:
+            message = f"verify.{key} has no effect any more; leave it out"
+            warnings.warn(message, FutureWarning, stacklevel=2)
+        return {k: v for k, v in tree.items() if k not in old} if old else tree
 
 
 #: Palm poses in the first work unit of an object, and the most in one.
@@ -601,13 +616,17 @@ def parse_config(tree: dict[str, Any]) -> Config:
 def parse_stored(tree: Any) -> Config:
     """Return the configuration that a file of a dataset holds, as JSON.
 
-    Without `split.by` it was written when there was the split by class alone.
+    Without `split.by` it was written when there was the split by class alone. With one of
+    `OLD_LIMITS`, `verify.max_contact_error` decided what is tried, too, and does not count.
 
     Raises:
         ConfigError: See `load_config`.
     """
     if isinstance(tree, dict) and isinstance(split := tree.get("split"), dict):
         tree = {**tree, "split": {"by": "class", **split}}
+    if isinstance(tree, dict) and isinstance(verify := tree.get("verify"), dict):
+        old = {*OLD_LIMITS, "max_contact_error"} if verify.keys() & {*OLD_LIMITS} else set()
+        tree = {**tree, "verify": {k: v for k, v in verify.items() if k not in old}}
     return parse_config(tree)
 
 

@@ -6,7 +6,6 @@
   * HandError            a hand description (SDFormat and YAML) that cannot be used
   * DataError            a dataset, shard or manifest that is missing, foreign or broken
   * GraspError           a grasp vector, or its frame, that cannot be verified
-    * OffSurfaceError    a grasp whose contacts are not on the object
   * MachineError         something that the machine lacks (EGL, a usable Drake, workers)
     * DiskFullError      no space left to write; the same command continues later
     * BlankImageError    OpenGL rendered a blank image
@@ -49,10 +48,6 @@ class DataError(DrakegraspError, ValueError):
 
 class GraspError(DrakegraspError, ValueError):
     """A grasp vector, or its frame, that cannot be verified."""
-
-
-class OffSurfaceError(GraspError):
-    """A grasp whose contacts are not on the object's surface."""
 
 
 class MachineError(DrakegraspError, RuntimeError):

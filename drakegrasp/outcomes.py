@@ -29,14 +29,16 @@ class Outcome(IntEnum):
     SOLVER_ERROR = 10  # Drake failed or the state diverged; says nothing about the grasp
     TIMEOUT = 11  # the attempt's limit of computing time passed; says nothing about the grasp
     CRASHED = 12  # the attempt killed its process; says nothing about the grasp
-    UNREACHABLE = 13  # verification only: no wrist pose brings the fingertips to the contacts
-    OFF_SURFACE = 14  # verification only: a predicted contact is not on the object's surface
+    # Result files of older versions: no wrist pose brought the fingertips to the contacts.
+    UNREACHABLE = 13
+    OFF_SURFACE = 14  # verification by forces only: a contact, or its normal, is off the surface
     # The lift was ended early because the object moved more in the hand than a sample may: it is
     # no sample, but whether the hand would have held it is unknown.
     MOVED = 15
     # The closed hand might lift, but its chance of a sample was below `lift.least_chance`, or its
     # image is too flat for one: whether it would have held the object is unknown.
     NOT_LIFTED = 16
+    INVALID = 17  # verification only: the row of numbers is no grasp; it counts as a failure
 
     @property
     def label(self) -> str:
@@ -51,7 +53,7 @@ class Outcome(IntEnum):
     @property
     def verification_only(self) -> bool:
         """Whether only verification gives this outcome; no file of a dataset holds it."""
-        return self in (Outcome.UNREACHABLE, Outcome.OFF_SURFACE)
+        return self in (Outcome.UNREACHABLE, Outcome.OFF_SURFACE, Outcome.INVALID)
 
     @property
     def dataset_only(self) -> bool:
@@ -109,4 +111,5 @@ _STAGE = {
     Outcome.OFF_SURFACE: Stage.PLACED,
     Outcome.MOVED: Stage.LIFTED,
     Outcome.NOT_LIFTED: Stage.CLOSED,
+    Outcome.INVALID: Stage.PLACED,
 }

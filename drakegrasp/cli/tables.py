@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.box import SIMPLE
@@ -17,6 +17,9 @@ from drakegrasp.errors import printable
 from drakegrasp.objects.audit import AuditRow
 from drakegrasp.objects.memory import needed_limit
 from drakegrasp.outcomes import Outcome, Removal
+
+if TYPE_CHECKING:
+    from drakegrasp.verification.result import Verification
 
 #: Short heads of the outcomes, in the order of the funnel.
 _OUTCOME_HEADS = {
@@ -243,18 +246,36 @@ def memory_line(rows: Sequence[AuditRow]) -> str:
     )
 
 
-def verdict_table(outcomes: Sequence[Outcome]) -> Table:
-    """Return how many grasps had each outcome, and their share of those with a verdict."""
-    counts = Counter(outcomes)
+def verdict_table(results: Sequence[Verification]) -> Table:
+    """Return what became of grasps, with shares of those that the simulator could judge."""
+    # How the first trials ended.
+    counts = Counter(result.outcome for result in results)
     judged = sum(n for outcome, n in counts.items() if not outcome.inconclusive)
     table = _table("Verdicts", "outcome", "grasps", "share")
     others = sorted(counts.keys() - {Outcome.SUCCESS}, key=lambda o: (-counts[o], o))
     for outcome in (Outcome.SUCCESS, *others):
         share = "-" if outcome.inconclusive or not judged else f"{counts[outcome] / judged:.1%}"
-        table.add_row(outcome.label, f"{counts[outcome]:,}", share)
+        label = "held" if outcome is Outcome.SUCCESS else outcome.label
+        table.add_row(label, f"{counts[outcome]:,}", share)
     table.add_section()
-    table.add_row("all", f"{len(outcomes):,}", "")
+    table.add_row("all", f"{len(results):,}", "")
+
+    # What is more, and what is less than held.
+    table.add_section()
+    for name, words in _VERDICTS.items():
+        count = sum(getattr(result, name) for result in results)
+        table.add_row(words, f"{count:,}", f"{count / judged:.1%}" if judged else "-")
     return table
+
+
+#: Words of a verdict, as a table calls them.
+_VERDICTS = {
+    "success": "success: as asked for",
+    "precision": "precision",
+    "stable": "stable",
+    "sample": "sample, but for images",
+    "held_any": "held, with the best of the wrist poses",
+}
 
 
 def bench_table(report: Mapping[str, Any]) -> Table:

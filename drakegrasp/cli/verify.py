@@ -58,6 +58,11 @@ if TYPE_CHECKING:
     help="hand: close a simulated hand on the contacts and lift. forces: lift by forces at the "
     "contacts alone.",
 )
+@click.option(
+    "--snap-points",
+    is_flag=True,
+    help="Move the points, not the normals, to the surface of the object first.",
+)
 @click.option("--hand", metavar="NAME|YAML", help="The hand.  [default: that of the configuration]")
 @click.option(
     "--config",
@@ -96,12 +101,13 @@ def verify(
     command tries the grasps of that dataset.
 
     One line of JSON per grasp goes to standard output or NAME.jsonl, a table of the outcomes to
-    standard error. Exit code: 0 if every grasp was tried, whatever the outcomes; 2 for input
-    that cannot be used, such as a single grasp that is not on the object.
+    standard error. A row that is no grasp has the outcome `invalid`. Exit code: 0 if every grasp
+    has a verdict, whatever it is; 2 for input that cannot be used.
     """
     from drakegrasp.api import run_verification
     from drakegrasp.cli.tables import make_console, verdict_table
     from drakegrasp.cli.verify_request import VerifyRequest, place_requested
+    from drakegrasp.verification.hints import count_hints
     from drakegrasp.verification.result_files import (
         json_lines,
         part_path,
@@ -109,18 +115,12 @@ def verify(
         write_json_line,
         write_results,
     )
-    from drakegrasp.verification.verify import refuse_off_surface
 
     # All input is read and checked before anything is simulated.
     grasps, config = place_requested(VerifyRequest(**options, out=out))
 
     def print_line(index: int, result: Verification) -> None:
         write_json_line(index, result, sys.stdout)
-
-    def deliver(index: int, result: Verification) -> None:
-        if len(grasps) == 1:
-            refuse_off_surface(result)
-        write(index, result)
 
     # Lines are written as verdicts arrive, so an interrupted run leaves those that are done.
     try:
@@ -130,7 +130,7 @@ def verify(
                 workers=workers,
                 scheduler=scheduler,
                 scheduler_file=scheduler_file,
-                on_result=deliver,
+                on_result=write,
                 show=not quiet,
             )
             if out is not None:
@@ -143,4 +143,6 @@ def verify(
     for path in () if out is None else result_paths(out):
         say(str(path))
     if not quiet:
-        make_console(stderr=True).print(verdict_table([result.outcome for result in results]))
+        make_console(stderr=True).print(verdict_table(results))
+        for hint, count in count_hints(result.hints for result in results):
+            say(f"{count} of {len(results)} grasps would fit much better: {hint}", err=True)

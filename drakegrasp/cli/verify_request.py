@@ -15,13 +15,9 @@ from drakegrasp.errors import DataError, GraspError
 from drakegrasp.frames import Array
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file
-from drakegrasp.hand.settings import load_config
-from drakegrasp.verification.placed_grasp import (
-    dataset_config,
-    mesh_config,
-    place_on_mesh,
-    place_on_rows,
-)
+from drakegrasp.hand.settings import load_config, override_config
+from drakegrasp.simulation.placement import place_object
+from drakegrasp.verification.placed_grasp import dataset_config, place_on_object, place_on_rows
 from drakegrasp.verification.prediction import (
     HDF5_SUFFIXES,
     read_grasps,
@@ -47,6 +43,7 @@ class VerifyRequest:
     camera: Path | None = None
     units: str | None = None
     method: str = "hand"
+    snap_points: bool = False
     hand: str | None = None
     config: str | None = None
     overrides: tuple[str, ...] = ()
@@ -86,17 +83,16 @@ def _place(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
     if data is None:
         if predicted.rows is not None:
             raise GraspError("rows must be in a file of grasps for --dataset only, got rows")
-        assert request.mesh is not None
-        config = mesh_config(request.mesh, given, request.hand)
+        assert request.mesh is not None and given is not None
+        config = given if request.hand is None else override_config(given, [], hand=request.hand)
         _refuse_no_grasps(request.grasps, predicted.grasps, config)
-        placed = place_on_mesh(
+        placed = place_on_object(
             predicted.grasps,
-            request.mesh,
-            frame=request.frame,
+            place_object(request.mesh, units=request.units, config=config),
+            frame=request.frame or "object",
             X_TC=None if request.camera is None else read_numbers(request.camera),
-            units=request.units,
             method=request.method,
-            config=config,
+            snap_points=request.snap_points,
         )
         return placed, config
 
@@ -107,9 +103,10 @@ def _place(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
         predicted.grasps,
         data,
         None if predicted.rows is None else predicted.rows.tolist(),
-        frame=request.frame,
+        frame=request.frame or "camera",
         hand=request.hand,
         method=request.method,
+        snap_points=request.snap_points,
         config=given,
         overrides=overrides,
     )

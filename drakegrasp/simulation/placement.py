@@ -77,7 +77,7 @@ def place_object(
     X_TO: npt.ArrayLike | None = None,
     config: Config | None = None,
 ) -> PlacedObject:
-    """Return an object on the table, ready for many calls of `verify_grasp`.
+    """Return an object on the table.
 
     Args:
         mesh: Path of a mesh file, a mesh, or an object that was placed before. The origin

@@ -6,12 +6,14 @@ caller gave the grasps.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import TypeAlias
+from itertools import groupby, islice
+from typing import TypeAlias, cast
 
 from drakegrasp.runtime.executor import Executor
 from drakegrasp.runtime.progress import Report
+from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.verification.result import Verification
 from drakegrasp.verification.verify import PlacedGrasp, verify_placed
 
@@ -28,25 +30,29 @@ def verify_batch(
     execute: Executor,
     report: Report,
     on_result: ResultCallback = ignore_result,
+    *,
+    together: int = 1,
 ) -> list[Verification]:
     """Return the results of grasps in the caller's order.
 
     Args:
-        grasps: With indices 0 to n - 1, in any order.
+        grasps: With indices 0 to n - 1, in any order; those of one object stand together.
         execute: Runs the verifications.
-        report: Is told how many are done and how many hold.
+        report: Is told how many are done and how many succeed.
         on_result: Is called with each result in the caller's order, once all earlier ones exist.
+        together: Most grasps of one object that are one task: they share its meshes on the way to
+            a worker, and what a worker derives from them.
     """
     objects = {grasp.index: grasp.placed for grasp in grasps}
     results: dict[int, Verification] = {}
     delivered = holding = 0
     report(0, len(grasps), holding=holding)
-    for index, result in execute(_verify_indexed, grasps):
-        # A worker returns a copy of the object: keep the caller's.
-        results[index] = replace(result, placed=objects[index])
-        holding += result.success
+    for verdicts in execute(_verify_together, _tasks(grasps, together)):
+        for index, result in verdicts:
+            results[index] = replace(result, placed=objects[index])
+            holding += result.success
 
-        # Deliver this result, and later ones that were waiting for it.
+        # Deliver these results, and later ones that were waiting for them.
         while delivered in results:
             on_result(delivered, results[delivered])
             delivered += 1
@@ -54,6 +60,15 @@ def verify_batch(
     return [results[i] for i in range(len(grasps))]
 
 
-def _verify_indexed(grasp: PlacedGrasp) -> tuple[int, Verification]:
-    """Return a grasp's index with its result: executors return results in any order."""
-    return grasp.index, verify_placed(grasp)
+def _tasks(grasps: Sequence[PlacedGrasp], together: int) -> Iterator[list[PlacedGrasp]]:
+    """Yield the grasps in lists of at most so many, of one object each."""
+    for _, same in groupby(grasps, key=lambda grasp: id(grasp.placed)):
+        # `itertools.batched` is newer than Python 3.11.
+        while task := list(islice(same, together)):
+            yield task
+
+
+def _verify_together(grasps: Sequence[PlacedGrasp]) -> list[tuple[int, Verification]]:
+    """Return the indices of grasps with their results, without the object: the caller has it."""
+    nothing = cast(PlacedObject, None)
+    return [(g.index, replace(verify_placed(g), placed=nothing)) for g in grasps]

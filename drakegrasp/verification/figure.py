@@ -16,6 +16,7 @@ from matplotlib.patheffects import withStroke
 
 from drakegrasp.frames import Array, transform_points
 from drakegrasp.objects.model import ObjectModel
+from drakegrasp.outcomes import Outcome
 from drakegrasp.verification.views import Marks, View, is_seen, largest_force, render_views
 from drakegrasp.visualization.figures.panels import show_image
 from drakegrasp.visualization.style import INK, LIFTED, PREDICTED, REACHED, add_axes
@@ -29,7 +30,7 @@ EDGE = 3.3
 NUMBER = 7.0
 #: Shorter arrows are not drawn [px].
 SHORTEST = 8.0
-#: Colours of the verdict: stable, held but not stable, not held.
+#: Colours of the verdict: success and stable, held otherwise, not held.
 STABLE, HELD, FAILS = "#1B7F3B", "#8A5A00", "#B3261E"
 
 
@@ -48,7 +49,7 @@ def verification_figure(verified: Verification) -> Figure:
 def _draw_figure(verified: Verification, model: ObjectModel, views: Sequence[View]) -> Figure:
     """Draw the views side by side, with the verdict above and the legend below."""
     # The page [inch].
-    gap, margin, head, foot = 0.08, 0.12, 1.05, 0.4
+    gap, margin, head, foot = 0.08, 0.12, 1.25, 0.4
     width = len(views) * (EDGE + gap) - gap + 2.0 * margin
     figure = Figure(figsize=(width, EDGE + head + foot), facecolor="white")
 
@@ -62,15 +63,31 @@ def _draw_figure(verified: Verification, model: ObjectModel, views: Sequence[Vie
 
     # The verdict, its reason, and what happened in the hand.
     left, height = margin / width, EDGE + head + foot
-    colour = STABLE if verified.stable else HELD if verified.held else FAILS
+    firm = verified.success and verified.stable
+    colour = STABLE if firm else HELD if verified.held else FAILS
     figure.text(left, 1.0 - 0.1 / height, f"{model.name}  {verified.words}", fontsize=12.5,
                 va="top", weight="bold", color=colour)  # fmt: skip
-    lines = (verified.reason, _lift_line(verified))
+    lines = (verified.reason, _contact_line(verified), _lift_line(verified))
     figure.text(left, 1.0 - 0.36 / height, "\n".join(filter(None, lines)), fontsize=9.5, va="top",
                 color=INK, linespacing=1.35)  # fmt: skip
 
     _draw_legend(figure, verified, (left, 0.3 / height))
     return figure
+
+
+def _contact_line(verified: Verification) -> str:
+    """Return the line on how close the contacts are to those asked for, and on other poses."""
+    if verified.outcome is Outcome.INVALID or verified.first is None:
+        return ""
+    words = []
+    if np.isfinite(verified.farthest_contact):
+        limit = verified.config.verify.max_contact_error
+        words.append(f"contacts within {1e3 * verified.farthest_contact:.1f} mm of those asked for"
+                     f" (success: {1e3 * limit:g} mm)")  # fmt: skip
+    if verified.num_tries > 1:
+        by = "none" if verified.held_by is None else f"number {verified.held_by + 1}"
+        words.append(f"of {verified.num_tries} wrist poses {by} holds")
+    return "; ".join(words)
 
 
 def _lift_line(verified: Verification) -> str:

@@ -1,8 +1,8 @@
 """What a caller asks to be verified: each grasp in {O} of its object on the table.
 
-In: grasp vectors in one of three frames, with a mesh (`place_on_mesh`) or with rows of a dataset
-(`place_on_rows`). Out: a `PlacedGrasp` for each. Every mistake of the caller is found here, before
-anything is simulated.
+In: grasp vectors in one of three frames, with an object (`place_on_object`) or with rows of a
+dataset (`place_on_rows`). Out: a `PlacedGrasp` for each. Every mistake of the caller is found here,
+before anything is simulated; a row that is no grasp is none of them.
 """
 
 from __future__ import annotations
@@ -10,69 +10,56 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-import trimesh
 
 from drakegrasp.config import Config, RandomizeConfig
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import GraspError, HandError
-from drakegrasp.frames import Array, read_pose, unpack_pose
+from drakegrasp.frames import (
+    Array,
+    read_pose,
+    rotate_vectors,
+    transform_points,
+    unpack_pose,
+)
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.files import hand_digest
 from drakegrasp.hand.settings import override_config
 from drakegrasp.simulation.placement import (
-    Placed,
     PlacedObject,
-    config_for,
-    place_object,
     refuse_no_config,
     refuse_other_objects,
 )
-from drakegrasp.verification.prediction import (
-    read_grasps,
-    refuse_other_units,
-    to_object_frame,
-)
+from drakegrasp.verification.prediction import GraspRows, frame_poses, read_grasps
 from drakegrasp.verification.verify import METHODS, PlacedGrasp
 
-Mesh: TypeAlias = str | Path | trimesh.Trimesh | Placed
 
-
-def place_on_mesh(
+def place_on_object(
     grasps: npt.ArrayLike,
-    mesh: Mesh,
+    placed: PlacedObject,
     *,
-    frame: str | None = None,
+    frame: str = "object",
     X_TC: npt.ArrayLike | None = None,
-    X_TO: npt.ArrayLike | None = None,
-    units: str | None = None,
     method: str = "hand",
-    config: Config,
+    snap_points: bool = False,
 ) -> list[PlacedGrasp]:
-    """Return grasps in {O} of one object, in their order.
-
-    Arguments and errors are those of `api.verify_grasps`, but that the configuration is complete,
-    see `mesh_config`.
-    """
-    # Read all grasps before the mesh: a wrong number is reported at once.
-    points, normals = _read(grasps, method, config)
-    placed = place_object(mesh, units=units, X_TO=X_TO, config=config)
-    placed_grasps = _placed(
+    """Return grasps in {O} of one object, in their order; see `api.PlacedObject.verify`."""
+    rows = _read(grasps, method, placed.config)
+    return _placed(
         placed,
-        np.arange(len(points)),
-        (points, normals),
-        frame=frame or "object",
+        np.arange(len(rows.invalid)),
+        rows,
+        frame=frame,
         X_TC=None if X_TC is None else read_pose(X_TC, "X_TC"),
         method=method,
-        config=config,
+        snap_points=snap_points,
+        config=placed.config,
     )
-    _refuse_units(placed_grasps)
-    return placed_grasps
 
 
 def place_on_rows(
@@ -80,31 +67,36 @@ def place_on_rows(
     dataset: GraspDataset,
     rows: Sequence[int] | None = None,
     *,
-    frame: str | None = None,
+    frame: str = "camera",
     hand: str | Path | None = None,
     method: str = "hand",
+    snap_points: bool = False,
     config: Config | None = None,
     overrides: tuple[str, ...] = (),
 ) -> list[PlacedGrasp]:
     """Return grasps in {O} of the objects of a dataset's rows.
 
     Those of the same object stand together, so that its scene is built once. Arguments and errors
-    are those of `api.verify_grasps`, and of `dataset_config`. Where no configuration is given, each
+    are those of `api.verify_rows`, and of `dataset_config`. Where no configuration is given, each
     grasp has the friction and mass that were drawn for its row, but for what is overridden.
     """
     # Read all grasps before any object: a wrong number is reported at once.
     used = dataset_config(dataset, config, hand, overrides)
-    points, normals = _read(grasps, method, used)
-    chosen = _choose_rows(dataset, rows, len(points))
+    read = _read(grasps, method, used)
+    chosen = _choose_rows(dataset, rows, len(read.invalid))
 
-    # The object, its resting pose, and the camera of each row.
+    # The object, its resting pose, and the cameras of each row.
     names = dataset.column("object_props/object_name")[chosen]
     resting = dataset.column("grasp_props/resting")[chosen]
-    X_TC = unpack_pose(dataset.column(f"object_props/frame_work2cam_{dataset.camera}")[chosen])
+    X_TC = {
+        camera: unpack_pose(dataset.column(f"object_props/frame_work2cam_{camera}")[chosen])
+        for camera in CAMERAS
+    }
+    (other,) = set(CAMERAS) - {dataset.camera}
 
     # Each object in each resting pose once, with its grasps.
     manifest, placed_grasps = read_manifest(dataset.path.parent), list[PlacedGrasp]()
-    frame = frame or "camera"
+    in_camera = frame == "camera"
     for name, k in dict.fromkeys(zip(names.tolist(), resting.tolist(), strict=True)):
         prepared = load_prepared(dataset.path.parent, name, manifest.config_of(name))
         X_TO = prepared.resting_poses[k]
@@ -112,27 +104,19 @@ def place_on_rows(
         placed_grasps += _placed(
             PlacedObject(model=prepared.model, X_TO=X_TO, config=manifest.config_of(name)),
             indices,
-            (points[indices], normals[indices]),
+            read,
             frame=frame,
-            X_TC=read_pose(X_TC[indices], "the camera's pose") if frame == "camera" else None,
+            X_TC=_camera_poses(X_TC[dataset.camera][indices]) if in_camera else None,
+            X_TC_other=_camera_poses(X_TC[other][indices]) if in_camera else None,
             method=method,
+            snap_points=snap_points,
             config=used,
         )
-    _refuse_units(placed_grasps)
 
     if config is not None:
         return placed_grasps
     kept = {text.partition("=")[0].strip() for text in overrides}
     return _as_tried(placed_grasps, dataset, chosen, manifest.config.randomize, kept)
-
-
-def mesh_config(mesh: Mesh, config: Config | None, hand: str | Path | None = None) -> Config:
-    """Return the configuration for a mesh: the given one, else its own, with the given hand.
-
-    Raises:
-        ConfigError: If it is not a `Config`.
-    """
-    return _with_hand(config_for(mesh, config), hand)
 
 
 def dataset_config(
@@ -184,8 +168,12 @@ def _refuse_other_hand(dataset: GraspDataset, hand: str) -> None:
         )
 
 
-def _read(grasps: npt.ArrayLike, method: str, config: Config) -> tuple[Array, Array]:
-    """Return points and unit normals (n, k, 3) of the grasps of the configuration's hand."""
+def _camera_poses(X_TC: Array) -> Array:
+    return read_pose(X_TC, "the camera's pose")
+
+
+def _read(grasps: npt.ArrayLike, method: str, config: Config) -> GraspRows:
+    """Return the rows of numbers as grasps of the configuration's hand."""
     if method not in METHODS:
         raise GraspError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
     return read_grasps(grasps, load_hand(config.hand).num_fingers)
@@ -194,25 +182,36 @@ def _read(grasps: npt.ArrayLike, method: str, config: Config) -> tuple[Array, Ar
 def _placed(
     placed: PlacedObject,
     indices: npt.NDArray[np.int64],
-    contacts: tuple[Array, Array],
+    rows: GraspRows,
     *,
     frame: str,
     X_TC: Array | None,
+    X_TC_other: Array | None = None,
     method: str,
+    snap_points: bool,
     config: Config,
 ) -> list[PlacedGrasp]:
-    """Return the grasps of one object; contacts are points and normals (m, k, 3) in the frame."""
-    in_object = to_object_frame(*contacts, frame=frame, X_TC=X_TC, X_TO=placed.X_TO)
+    """Return the grasps of one object: those of the rows with the given indices."""
+    count = len(indices)
+    X_OA = frame_poses(frame=frame, X_TC=X_TC, X_TO=placed.X_TO, count=count)
+    X_OB = None
+    if X_TC_other is not None:
+        X_OB = frame_poses(frame=frame, X_TC=X_TC_other, X_TO=placed.X_TO, count=count)
     return [
         PlacedGrasp(
             index=int(index),
             placed=placed,
-            p_OQ=p_OQ,
-            nhat_Q_O=nhat_Q_O,
+            p_OQ=transform_points(X_OA[i], rows.points[index]),
+            nhat_Q_O=rotate_vectors(X_OA[i], rows.normals[index]),
             method=method,
             config=config,
+            invalid=rows.invalid[index],
+            normalised=bool(rows.normalised[index]),
+            snap_points=snap_points,
+            X_OA=X_OA[i],
+            X_OB=None if X_OB is None else X_OB[i],
         )
-        for index, p_OQ, nhat_Q_O in zip(indices, *in_object, strict=True)
+        for i, index in enumerate(indices)
     ]
 
 
@@ -290,8 +289,3 @@ def _choose_rows(
             f"got {wrong[0]}"
         )
     return chosen
-
-
-def _refuse_units(grasps: Sequence[PlacedGrasp]) -> None:
-    boxes = [grasp.placed.model.half_extents for grasp in grasps]
-    refuse_other_units([grasp.p_OQ for grasp in grasps], boxes)

@@ -1,16 +1,15 @@
 """Predicted grasps, from arrays or files, checked and expressed in {O}.
 
-In: grasp vectors in one of three frames. Out: contact points and unit normals in {O}, or an error
-that says in one line what is wrong. Whether the contacts are on the object is checked later
-(`contact_surface`).
+In: grasp vectors in one of three frames, as a network put them out. Out: contact points and unit
+normals in {O}; for a row that is no grasp the reason. An array that is none of grasps at all is an
+error that says in one line what is wrong.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import h5py
 import numpy as np
@@ -19,15 +18,17 @@ import numpy.typing as npt
 from drakegrasp.config import LARGEST
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.errors import GraspError, first_line
-from drakegrasp.frames import Array, as_numbers, invert_pose, rotate_vectors, transform_points
+from drakegrasp.frames import Array, as_numbers, invert_pose
 
 Frame = Literal["object", "camera", "workspace"]
 FRAMES: tuple[str, ...] = get_args(Frame)
 
-#: Most that the length of a predicted normal may differ from one; it is then normalised.
-NORMAL_TOLERANCE = 0.05
-#: Points outside this many times the bounding box are taken for another unit of length.
-UNIT_FACTOR = 3.0
+#: A normal whose length differs from one by more is said to have been normalised.
+NORMAL_TOLERANCE = 0.01
+#: A shorter normal has no direction.
+SHORTEST_NORMAL = 1e-6
+#: A point that is farther from the origin of its frame is none of any object [m].
+FARTHEST = 1e3
 #: Suffixes of files with grasps.
 HDF5_SUFFIXES = (".h5", ".hdf5")
 SUFFIXES = (".npy", ".csv", *HDF5_SUFFIXES)
@@ -35,19 +36,79 @@ SUFFIXES = (".npy", ".csv", *HDF5_SUFFIXES)
 GRASPS, ROWS = "grasps", "rows"
 
 
-def read_grasps(grasps: npt.ArrayLike, fingers: int) -> tuple[Array, Array]:
-    """Return points (n, k, 3) [m] and unit normals (n, k, 3) of grasp vectors (n, 6k).
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GraspRows:
+    """The grasps of n rows of numbers, in their frame.
+
+    Attributes:
+        points, normals: (n, k, 3), contact points [m] and unit normals; NaN in rows that are no
+            grasp.
+        normalised: (n,), whether a normal was not of unit length.
+        invalid: (n,), why each row is no grasp; empty where it is one.
+    """
+
+    points: Array
+    normals: Array
+    normalised: npt.NDArray[np.bool_]
+    invalid: tuple[str, ...]
+
+
+def read_grasps(grasps: npt.ArrayLike, fingers: int) -> GraspRows:
+    """Return the grasps of grasp vectors (n, 6k), each by itself: a bad row spoils no other.
 
     Args:
-        grasps: (n, 6k), or (6k,) for one: k points [m], then k outward normals.
+        grasps: (n, 6k), or (6k,) for one: k points [m], then k outward normals. A list of rows of
+            which some have another length, or are no numbers, is one with invalid rows.
         fingers: Number of fingers, k.
 
     Raises:
-        GraspError: If there are not 6k finite numbers per grasp, or a normal is not of length 1
-            within 5 %.
+        GraspError: If the array is none of such rows at all.
     """
-    # 6k numbers per grasp, all finite.
+    # 6k numbers in each row that has as many.
     size = 6 * fingers
+    array, invalid = _read_rows(grasps, size, fingers)
+
+    # Numbers that no contact has.
+    limit = np.r_[np.full(size // 2, FARTHEST), np.full(size // 2, LARGEST)]
+    usable = np.abs(array) <= limit  # false for NaN
+    for row, column in zip(*np.nonzero(~usable), strict=True):
+        value = array[row, column]
+        must = f"beyond {limit[column]:g}" if np.isfinite(value) else "not finite"
+        invalid[row] = invalid[row] or f"number {column + 1} is {value:g}, {must}"
+
+    # Normals without a direction.
+    points, normals = array.reshape(len(array), 2, fingers, 3).swapaxes(0, 1).copy()
+    length = np.linalg.norm(normals, axis=-1)
+    for row, finger in zip(*np.nonzero(length < SHORTEST_NORMAL), strict=True):
+        invalid[row] = invalid[row] or f"normal {finger + 1} is zero"
+
+    # Unit normals in the others.
+    bad = np.array([bool(reason) for reason in invalid], dtype=np.bool_)
+    points[bad], normals[bad], length[bad] = np.nan, np.nan, 1.0
+    return GraspRows(
+        points=points,
+        normals=normals / length[..., None],
+        normalised=np.abs(length - 1.0).max(axis=1, initial=0.0) > NORMAL_TOLERANCE,
+        invalid=tuple(invalid),
+    )
+
+
+def _read_rows(grasps: npt.ArrayLike, size: int, fingers: int) -> tuple[Array, list[str]]:
+    """Return rows (n, 6k), NaN where a row has another length, and the reasons."""
+    # Rows of different lengths come as a list, or as an array of objects.
+    rows: Any = grasps if isinstance(grasps, list | tuple) else np.asarray(grasps)
+    if isinstance(rows, list | tuple) or rows.dtype == object:
+        shapes = [_shape(row) for row in rows]
+        if len(set(shapes)) > 1 and any(shapes):
+            array, invalid = np.full((len(rows), size), np.nan), [""] * len(rows)
+            for i, (row, shape) in enumerate(zip(rows, shapes, strict=True)):
+                if shape == (size,):
+                    array[i] = as_numbers(row, f"a grasp must be {size} numbers")
+                else:
+                    numbers = 0 if shape is None else int(np.prod(shape))
+                    invalid[i] = f"the row has {numbers} numbers, not {size}"
+            return array, invalid
+
     array = as_numbers(grasps, f"a grasp must be {size} numbers")
     if array.ndim not in (1, 2) or array.shape[-1] != size:
         raise GraspError(
@@ -55,47 +116,29 @@ def read_grasps(grasps: npt.ArrayLike, fingers: int) -> tuple[Array, Array]:
             f"got an array of shape {array.shape}"
         )
     array = np.atleast_2d(array)
-    usable = np.abs(array) <= LARGEST  # false for NaN
-    if not usable.all():
-        row, number = np.argwhere(~usable)[0]
-        must = f"at most {LARGEST:g}" if np.isfinite(array[row, number]) else "finite"
-        raise GraspError(
-            f"{_of(array, row)}number {number + 1} must be {must}, got {array[row, number]}"
-        )
-
-    # Points and normals, of which the latter are unit vectors.
-    points, normals = array.reshape(len(array), 2, fingers, 3).swapaxes(0, 1)
-    length = np.linalg.norm(normals, axis=-1)
-    wrong = np.abs(length - 1.0) > NORMAL_TOLERANCE
-    if wrong.any():
-        row, finger = np.argwhere(wrong)[0]
-        raise GraspError(
-            f"{_of(array, row)}normal {finger + 1} must be of length 1 within "
-            f"{NORMAL_TOLERANCE:.0%}, got {length[row, finger]:.3g}"
-        )
-    return points, normals / length[..., None]
+    return array, [""] * len(array)
 
 
-def _of(rows: Array, row: int) -> str:
-    """Return the beginning of an error about one of several grasps; empty for a single one."""
-    return f"grasp {row}: " if len(rows) > 1 else ""
+def _shape(row: Any) -> tuple[int, ...] | None:
+    """Return the shape of a row of numbers; None if it is none, () for a single one."""
+    try:
+        return as_numbers(row, "").shape
+    except GraspError:
+        return None
 
 
-def to_object_frame(
-    points: Array, normals: Array, *, frame: str, X_TC: Array | None, X_TO: Array
-) -> tuple[Array, Array]:
-    """Return points and normals (n, k, 3), given in one of three frames, in {O} of the object.
+def frame_poses(*, frame: str, X_TC: Array | None, X_TO: Array, count: int) -> Array:
+    """Return the poses X_OA (n, 4, 4) of the frame {A} of n grasps in {O} of the object.
 
     Args:
-        points: (n, k, 3) [m].
-        normals: (n, k, 3), unit.
         frame: "object" {O}, "camera" {C} or "workspace" {T}.
         X_TC: With the frame "camera": pose of the camera, (4, 4), or one per grasp (n, 4, 4).
         X_TO: (4, 4), pose of the object.
+        count: Number of grasps, n.
 
     Raises:
         GraspError: If the frame is unknown, a camera's pose is missing, or one is given for
-            another frame.
+            another frame, or not one per grasp.
     """
     if frame not in FRAMES:
         raise GraspError(f"frame must be one of {', '.join(FRAMES)}, got {frame!r}")
@@ -107,48 +150,15 @@ def to_object_frame(
     if frame != "camera" and X_TC is not None:
         raise GraspError(f"X_TC must be None if frame is {frame}, got a pose")
     if frame == "object":
-        return points, normals
+        return np.tile(np.eye(4), (count, 1, 1))
 
-    # Pose of the grasps' frame {A} in {O}, one per grasp.
     X_OT = invert_pose(X_TO)
     X_OA = X_OT if X_TC is None else X_OT @ X_TC
     if X_OA.ndim == 2:
-        X_OA = np.broadcast_to(X_OA, (len(points), 4, 4))
-    if len(X_OA) != len(points):
-        raise GraspError(
-            f"X_TC must be one pose, or one per grasp ({len(points)}), got {len(X_OA)}"
-        )
-
-    # Without any grasp the shapes stay (0, k, 3).
-    moved = [transform_points(A, p) for A, p in zip(X_OA, points, strict=True)]
-    turned = [rotate_vectors(A, n) for A, n in zip(X_OA, normals, strict=True)]
-    return np.reshape(moved, points.shape), np.reshape(turned, normals.shape)
-
-
-def refuse_other_units(points: Sequence[Array], half_extents: Sequence[Array]) -> None:
-    """Refuse grasps that are all far from their objects: another unit of length, or another frame.
-
-    One grasp that is near is enough: the others are wrong predictions.
-
-    Args:
-        points: (k, 3) of each grasp, in {O} [m].
-        half_extents: (3,), of the bounding box of each grasp's object [m].
-
-    Raises:
-        GraspError: If every point is outside `UNIT_FACTOR` times the bounding box.
-    """
-    # How far out the nearest point of each grasp is, as a multiple of the box.
-    pairs = zip(points, half_extents, strict=True)
-    factors = [float(np.abs(p_OQ / half).max(axis=-1).min()) for p_OQ, half in pairs]
-    nearest = int(np.argmin(factors)) if factors else None
-    if nearest is None or not factors[nearest] > UNIT_FACTOR:
-        return
-    size = " x ".join(f"{edge:.3g}" for edge in 2.0 * half_extents[nearest])
-    raise GraspError(
-        f"contact points must lie on the object, whose box is {size} m, got points all "
-        f"outside {UNIT_FACTOR:g} times that (the nearest at {factors[nearest]:.3g} times); check "
-        "the units (grasps are in metres, meshes in units) and the frame"
-    )
+        X_OA = np.broadcast_to(X_OA, (count, 4, 4))
+    if len(X_OA) != count:
+        raise GraspError(f"X_TC must be one pose, or one per grasp ({count}), got {len(X_OA)}")
+    return X_OA
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

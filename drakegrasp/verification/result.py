@@ -10,13 +10,14 @@ import numpy as np
 
 from drakegrasp.config import Config
 from drakegrasp.frames import Array
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import Contacts
-from drakegrasp.simulation.lift import Lift
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.trial import TrialRecord
+from drakegrasp.verification.explanation import explain
 from drakegrasp.verification.forces.verdict import ForceVerdict
+from drakegrasp.verification.sample import unjudged
 from drakegrasp.verification.wrist.solver import WristFit
 
 if TYPE_CHECKING:
@@ -24,27 +25,57 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class PoseTrial:
+    """One wrist pose for a grasp of k contacts, and its trial.
+
+    Attributes:
+        fit: Palm pose and joints that bring the fingertips to the contacts.
+        pregrasp: Palm and opened fingers that the trial started from.
+        trial: What happened in the simulator.
+        contact_error: (k,), distance between the contact that was asked for and the one after
+            closing [m]; NaN for a fingertip that does not touch.
+        normal_error: (k,), angle between their normals [rad]; NaN likewise.
+        removal: The first filter of a dataset that would remove the grasp, `KEPT` if none does, see
+            `verification.sample`; None if it does not hold.
+    """
+
+    fit: WristFit
+    pregrasp: Pregrasp
+    trial: TrialRecord
+    contact_error: Array
+    normal_error: Array
+    removal: Removal | None = None
+
+    @property
+    def held(self) -> bool:
+        """Whether every fingertip touches the object at the end of the lift, clear of the table."""
+        return self.trial.outcome is Outcome.SUCCESS
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Verification:
     """The verdict on a grasp of k contacts. Stages that were not reached are None or NaN.
 
+    The grasp is judged by its first wrist pose, the one that fits the contacts best.
+
     Attributes:
         method: "hand" or "forces".
-        outcome: The verdict; as in a dataset, or `unreachable` or `off_surface`.
+        outcome: How the trial of the first wrist pose ended; as in a dataset, or `invalid`, or with
+            method `forces` `off_surface`.
         reason: Why, in one sentence without a full stop.
         placed: The object and its pose on the table.
-        config: Hand, physics, lift and limits of the verification.
-        p_OQ, nhat_Q_O: (k, 3), the predicted contact points [m] and unit normals in {O}.
-        surface_distance: (k,), of the points from the object's surface [m].
-        fit: Palm pose and joints of the reported trial, or of the best fit if none was simulated.
-        tries: Number of palm poses that were tried.
-        pregrasp: Palm and opened fingers that the trial started from.
-        trial: What happened in the simulator.
-        contact_error: (k,), distance of each contact after closing from its prediction [m]; NaN
-            for a fingertip that does not touch and need not.
+        config: Hand, physics, lift and rules of the verification.
+        p_OQ, nhat_Q_O: (k, 3), the contact points [m] and unit normals in {O} that were tried; NaN
+            where an invalid row has none.
+        surface_distance: (k,), of the predicted points from the object's surface [m].
+        normalised: Whether a predicted normal was not of unit length, and was normalised.
+        snapped: Whether the points were moved to the nearest points of the surface.
+        hints: What would make a grasp that fails fit much better, see `verification.hints`.
+        tries: The wrist poses that were simulated, in order.
         forces: What forces at the contacts alone can do, with method `forces`.
-        epsilon: Ferrari-Canny measure of the predicted contacts; 0 without force closure.
+        epsilon: Ferrari-Canny measure of the contacts; 0 without force closure.
         smallest_friction: Smallest friction coefficient at which forces within the hand's limit
-            hold the object at the predicted contacts; inf if none does.
+            hold the object at the contacts; inf if none does.
         seconds: Wall-clock time by stage [s].
     """
 
@@ -56,11 +87,10 @@ class Verification:
     p_OQ: Array
     nhat_Q_O: Array
     surface_distance: Array
-    fit: WristFit | None = None
-    tries: int = 0
-    pregrasp: Pregrasp | None = None
-    trial: TrialRecord | None = None
-    contact_error: Array | None = None
+    normalised: bool = False
+    snapped: bool = False
+    hints: tuple[str, ...] = ()
+    tries: tuple[PoseTrial, ...] = ()
     forces: ForceVerdict | None = None
     epsilon: float = np.nan
     smallest_friction: float = np.nan
@@ -68,13 +98,29 @@ class Verification:
 
     @property
     def success(self) -> bool:
-        """Whether the grasp holds; the same as `held`."""
-        return self.held
+        """Whether the first wrist pose holds, with every contact where it was asked for.
+
+        That is within `verify.max_contact_error`. With method `forces`: whether forces hold it.
+        """
+        return self.held and not self.farthest_contact > self.config.verify.max_contact_error
 
     @property
     def held(self) -> bool:
-        """Whether every fingertip touches the object at the end of the lift, clear of the table."""
+        """Whether the first wrist pose holds the object at the end of the lift, wherever."""
         return self.outcome is Outcome.SUCCESS
+
+    @property
+    def held_any(self) -> bool:
+        """Whether any of the wrist poses that were tried holds it; nobody knows which in advance.
+
+        The 18 numbers leave the wrist open: this is what an oracle that chooses it would reach.
+        """
+        return self.held or self.held_by is not None
+
+    @property
+    def held_by(self) -> int | None:
+        """Index of the first wrist pose that holds the object, None if none does."""
+        return next((i for i, each in enumerate(self.tries) if each.held), None)
 
     @property
     def precision(self) -> bool:
@@ -90,12 +136,71 @@ class Verification:
         return self.held and (self.trial is None or self.trial.stable)
 
     @property
+    def sample(self) -> bool:
+        """Whether the grasp passes the filters of a dataset, but for those in `unjudged`."""
+        return self.removal is Removal.KEPT
+
+    @property
+    def removal(self) -> Removal | None:
+        """The first filter that removes it, `KEPT` if none does; None if the hand lost it."""
+        return self.first.removal if self.first else None
+
+    @property
+    def unjudged(self) -> tuple[Removal, ...]:
+        """Filters about which a verdict knows nothing, e.g. those of images."""
+        return unjudged(self.config.filters)
+
+    @property
     def words(self) -> str:
-        """The verdict in words: those of held, precision and stable that apply, or the failure."""
+        """The verdict in words: those of held to sample that apply, or the failure."""
         if not self.held:
             return f"fails: {self.outcome.label.replace('_', ' ')}"
-        names = ("held", "precision", "stable")
-        return ", ".join(name for name in names if getattr(self, name))
+        names = ("held", "precision", "stable", "sample")
+        words = [name for name in names if getattr(self, name)]
+        return ", ".join([*words, *([] if self.success else ["not as asked"])])
+
+    @property
+    def first(self) -> PoseTrial | None:
+        """The first wrist pose and its trial; None with method `forces` or an invalid row."""
+        return self.tries[0] if self.tries else None
+
+    @property
+    def num_tries(self) -> int:
+        """Number of wrist poses that were simulated."""
+        return len(self.tries)
+
+    @property
+    def fit(self) -> WristFit | None:
+        """The first wrist pose, with its joints."""
+        return self.first.fit if self.first else None
+
+    @property
+    def pregrasp(self) -> Pregrasp | None:
+        """Palm and opened fingers that the first trial started from."""
+        return self.first.pregrasp if self.first else None
+
+    @property
+    def trial(self) -> TrialRecord | None:
+        """The first trial."""
+        return self.first.trial if self.first else None
+
+    @property
+    def contact_error(self) -> Array | None:
+        """(k,), distances [m] between contacts asked for and reached, of the first wrist pose."""
+        return self.first.contact_error if self.first else None
+
+    @property
+    def normal_error(self) -> Array | None:
+        """(k,), angles [rad] between their normals."""
+        return self.first.normal_error if self.first else None
+
+    @property
+    def farthest_contact(self) -> float:
+        """The largest `contact_error` [m]; NaN if no fingertip touches.
+
+        The share of grasps that hold within d, as a curve, is that of `held` ones with less.
+        """
+        return _largest(self.contact_error)
 
     @property
     def closed(self) -> Contacts | None:
@@ -118,6 +223,11 @@ class Verification:
     def solver_status(self) -> int:
         """Exit mode of SLSQP, 0 for success; -1 where it was not asked."""
         return -1 if self.fit is None else self.fit.status
+
+    @property
+    def hint_text(self) -> str:
+        """The hints in a line; empty if there are none."""
+        return "; ".join(self.hints)
 
     def save_html(self, path: str | Path) -> None:
         """Write an HTML file that plays the simulation in a browser, from any side.
@@ -142,70 +252,13 @@ class Verification:
 
     def explain(self) -> str:
         """Return the verdict, and why, in a few sentences."""
-        # The verdict.
-        verdict = "holds" if self.success else f"fails ({self.outcome.label})"
-        sentences = [f"The grasp of {self.placed.model.name} {verdict}: {self.reason}."]
-
-        # What happened in the hand.
-        if self.trial is not None and self.trial.lift is not None:
-            sentences.append(self._explain_lift(self.trial.lift))
-
-        # How well the hand makes the predicted contacts.
-        if self.fit is not None:
-            angle = np.rad2deg(self.fit.normal_error).max()
-            sentences.append(
-                f"Before closing, the fingertips are within "
-                f"{in_mm(self.fit.residual.max())} of the predicted points, and the pads within "
-                f"{angle:.0f}° of the predicted normals."
-            )
-        if self.contact_error is not None:
-            sentences.append(
-                "After closing, they touch the object within "
-                f"{in_mm(np.nanmax(self.contact_error))} of the predicted points."
-            )
-
-        # What forces at the contacts alone can do.
-        if not np.isnan(self.smallest_friction):
-            sentences.append(self._explain_margin())
-        return " ".join(sentences)
-
-    def _explain_lift(self, lift: Lift) -> str:
-        """Return the sentence on what moved in the hand, and what touched the object at the end."""
-        # What happened.
-        links = lift.contacts.other_links
-        touching = {0: "no other link of the hand touches it", 1: "another link touches it"}.get(
-            links, f"{links} other links touch it"
-        )
-        text = (
-            f"During the lift the object slips by {in_mm(lift.slip)} and turns by "
-            f"{np.rad2deg(lift.turn):.1f}° in the hand, and at the end {touching}"
-        )
-
-        # What that is called, if it is held at all.
-        if not self.held:
-            return f"{text}."
-        precision = "a precision grasp" if self.precision else "no precision grasp"
-        return f"{text}: {precision}, {'' if self.stable else 'not '}stable."
-
-    def _explain_margin(self) -> str:
-        """Return the sentence on the friction that the contacts alone need."""
-        simulated = self.placed.model.own_physics(self.config.physics).friction_hand
-        if np.isfinite(self.smallest_friction):
-            needed = f"need a friction coefficient of {self.smallest_friction:.2f}"
-        else:
-            needed = "are not enough at any friction"
-        text = f"Forces at these points alone {needed}; the simulation has {simulated:.2f}"
-        if self.held and self.method == "hand" and self.smallest_friction > simulated:
-            # A point does not resist twisting, an area of contact does; and what slips is held
-            # elsewhere.
-            text += ", but the hand's contacts are areas"
-            text += "" if self.stable else ", and the object is not held where they were"
-        return f"{text} (epsilon {self.epsilon:.3f})."
+        return explain(self)
 
     def __repr__(self) -> str:
         return f"Verification({self.method}, {self.words}: {self.reason})"
 
 
-def in_mm(length: float) -> str:
-    """Return a length [m] as text in millimetres."""
-    return f"{1e3 * length:.1f} mm"
+def _largest(values: Array | None) -> float:
+    """Return the largest number, NaN if there is none."""
+    there = np.zeros(0) if values is None else values[np.isfinite(values)]
+    return float(there.max()) if there.size else np.nan

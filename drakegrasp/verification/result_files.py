@@ -148,21 +148,25 @@ def as_dict(index: int, result: Verification) -> dict[str, Any]:
     # In the order in which a person reads them: verdict, contacts, hand, lift, margin.
     return {
         "index": index,
-        **fields("object", "method"),
-        "success": result.success,
-        **fields("precision", "stable"),
+        **fields("object", "method", "success", "held", "precision", "stable", "sample"),
+        "removal": None if result.removal is None else result.removal.label,
+        "unjudged": [] if result.removal is None else [each.label for each in result.unjudged],
         "outcome": result.outcome.label,
         "reason": result.reason,
         "explain": result.explain(),
-        **fields("X_TO", "p_OQ", "nhat_Q_O", "surface_distance"),
-        **fields("X_OG", "spread", "closing", "residual"),
-        "normal_error_deg": None if fit is None else np.rad2deg(fit.normal_error),
-        **fields("contact_error", "tries"),
+        "hints": list(result.hints),
+        **fields("held_any", "tries"),
+        "outcomes": [each.trial.outcome.label for each in result.tries],
+        **fields("X_TO", "p_OQ", "nhat_Q_O", "normalised", "snapped", "surface_distance"),
+        **fields("X_OG", "spread", "closing", "fit_residual"),
+        "fit_normal_error_deg": _degrees(values["fit_normal_error"]),
+        **fields("contact_error"),
+        "normal_error_deg": _degrees(values["normal_error"]),
         "solver": None if fit is None else _attributes(fit, "status", "message", "iterations"),
         "closed": None if trial is None else _end_as_dict(trial.closed),
         "lifted": None if trial is None else _end_as_dict(trial.lift),
         "slip": values["slip"],
-        "turn_deg": None if values["turn"] is None else math.degrees(values["turn"]),
+        "turn_deg": _degrees(values["turn"]),
         **fields("epsilon", "smallest_friction"),
         # A null above is either infinity or not computed; this tells which.
         "friction_can_hold": None
@@ -178,6 +182,10 @@ def as_dict(index: int, result: Verification) -> dict[str, Any]:
         },
         "seconds": result.seconds,
     }
+
+
+def _degrees(angles: AnyArray | float | None) -> Any:
+    return None if angles is None else np.rad2deg(angles)
 
 
 def _attributes(source: object, *names: str) -> dict[str, Any]:

@@ -1,19 +1,20 @@
 """The verdict on one grasp of one object, from its contacts in {O}.
 
-In: a `PlacedGrasp`. Out: a `Verification`. Method
-`hand` finds palm poses that bring the fingertips to the points and runs a trial from each, as a
-build does. Method `forces` asks whether forces at the surface's own contacts can lift the object. A
-wrong prediction, a failed solver and a lost object are outcomes, not exceptions.
+In: a `PlacedGrasp`. Out: a `Verification`. Method `hand` finds palm poses that bring the fingertips
+to the points, and runs a trial from the best, as a build does; if that does not hold, from the
+others, too. Method `forces` asks whether forces at the surface's own contacts can lift the object.
+Every row of numbers that has contacts is tried, however wrong they look: what is measured is judged
+afterwards. A wrong prediction, a failed solver and a lost object are outcomes, not exceptions.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from drakegrasp.config import Config, with_whole_lifts
-from drakegrasp.errors import OffSurfaceError
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import coordinate_limits
@@ -24,10 +25,12 @@ from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
-from drakegrasp.verification.contact_surface import face_distances, points_outward
+from drakegrasp.verification.contact_surface import fit_surface
 from drakegrasp.verification.forces.quality import force_margin
 from drakegrasp.verification.forces.verdict import hand_contacts, judge_forces
-from drakegrasp.verification.result import Verification, in_mm
+from drakegrasp.verification.hints import find_hints
+from drakegrasp.verification.result import PoseTrial, Verification
+from drakegrasp.verification.sample import judge_sample
 from drakegrasp.verification.wrist.solver import WristFit, fit_wrist
 
 METHODS = ("hand", "forces")
@@ -52,20 +55,6 @@ _REASONS = {
     Outcome.SOLVER_ERROR: "the simulation failed, which says nothing about the grasp",
     Outcome.TIMEOUT: "the limit of computing time passed, which says nothing about the grasp",
 }
-#: Outcomes by how far an attempt got. If a grasp's attempts fail differently, the one that got
-#: furthest is reported.
-_RANK = (
-    Outcome.TIMEOUT,
-    Outcome.SOLVER_ERROR,
-    Outcome.BELOW_TABLE,
-    Outcome.START_COLLISION,
-    Outcome.UNREACHABLE,
-    Outcome.MISSING_FINGERTIP,
-    Outcome.HAND_CONTACT,
-    Outcome.TABLE_CONTACT,
-    Outcome.DROPPED,
-    Outcome.SLIPPED,
-)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -75,11 +64,17 @@ class PlacedGrasp:
     Attributes:
         index: Its place among the caller's grasps.
         placed: The object on the table.
-        p_OQ, nhat_Q_O: (k, 3), contact points [m] and outward unit normals in {O}.
+        p_OQ, nhat_Q_O: (k, 3), contact points [m] and outward unit normals in {O}; NaN where the
+            row is invalid.
         method: "hand" or "forces".
-        config: Hand, physics, lift and limits. What ends or avoids lifts (`lift.stop_when`,
+        config: Hand, physics, lift and rules. What ends or avoids lifts (`lift.stop_when`,
             `lift.least_chance`, `lift.least_depth_variance`) is without effect: the verdict is that
             of a whole lift.
+        invalid: Why the row of numbers is no grasp; empty if it is one.
+        normalised: Whether a normal was not of unit length.
+        snap_points: Whether to move the points to the surface.
+        X_OA: (4, 4), pose of the frame in which the numbers were given.
+        X_OB: (4, 4), pose of the dataset's other camera; None if there is none.
     """
 
     index: int
@@ -88,132 +83,129 @@ class PlacedGrasp:
     nhat_Q_O: Array
     method: str
     config: Config
+    invalid: str = ""
+    normalised: bool = False
+    snap_points: bool = False
+    X_OA: Array | None = None
+    X_OB: Array | None = None
 
 
 @one_thread
 def verify_placed(grasp: PlacedGrasp) -> Verification:
     """Return whether a grasp holds its object; the contacts are rounded to 0.1 mm."""
-    # Round the contacts; adding zero turns -0.0 into 0.0.
-    placed, config = grasp.placed, with_whole_lifts(grasp.config)
-    rules, seconds = config.verify, dict[str, float]()
+    base = Verification(
+        method=grasp.method,
+        outcome=Outcome.INVALID,
+        reason=grasp.invalid,
+        placed=grasp.placed,
+        config=with_whole_lifts(grasp.config),
+        p_OQ=grasp.p_OQ,
+        nhat_Q_O=grasp.nhat_Q_O,
+        surface_distance=np.full(len(grasp.p_OQ), np.nan),
+        normalised=grasp.normalised,
+    )
+    if grasp.invalid:
+        return base
+
+    # How the contacts lie on the surface, and what forces at them alone can do.
+    base = _on_surface(base, grasp)
+    with timed(base.seconds, "margin"):
+        contacts = hand_contacts(base.placed.model, base.p_OQ, base.nhat_Q_O, base.config)
+        X_TO = base.placed.X_TO_simulated
+        margin = force_margin(base.placed.model, X_TO, contacts, base.config)
+    base = replace(base, epsilon=margin.epsilon, smallest_friction=margin.smallest_friction)
+
+    # The trial; where it fails, what may be wrong with the numbers.
+    result = _lift_by_hand(base) if grasp.method == "hand" else _lift_by_forces(base)
+    if result.success or result.outcome.inconclusive:
+        return result
+    with timed(base.seconds, "hints"):
+        X_OA = np.eye(4) if grasp.X_OA is None else grasp.X_OA
+        hints = find_hints(base.placed.model, load_hand(base.config.hand),
+                           grasp.p_OQ, base.nhat_Q_O, X_OA=X_OA, X_OB=grasp.X_OB)  # fmt: skip
+    return replace(result, hints=hints)
+
+
+def _on_surface(base: Verification, grasp: PlacedGrasp) -> Verification:
+    """Return the verdict with rounded contacts, on the surface if that is asked for."""
+    # Adding zero turns -0.0 into 0.0.
     p_OQ = np.round(grasp.p_OQ, POINT_DIGITS) + 0.0
     nhat_Q_O = np.round(grasp.nhat_Q_O, NORMAL_DIGITS) + 0.0
     nhat_Q_O /= np.linalg.norm(nhat_Q_O, axis=1, keepdims=True)
-
-    # Contacts off the surface, and normals that point inwards, are no grasp.
-    with timed(seconds, "surface"):
-        distance = face_distances(placed.model, p_OQ)
-        outward = points_outward(placed.model, distance, nhat_Q_O)
-    base = Verification(
-        method=grasp.method,
-        outcome=Outcome.OFF_SURFACE,
-        reason="",
-        placed=placed,
-        config=config,
-        p_OQ=p_OQ,
+    with timed(base.seconds, "surface"):
+        fit = fit_surface(base.placed.model, p_OQ, nhat_Q_O)
+    snapped = np.round(fit.nearest, POINT_DIGITS) + 0.0
+    return replace(
+        base,
+        p_OQ=snapped if grasp.snap_points else p_OQ,
         nhat_Q_O=nhat_Q_O,
-        surface_distance=distance.min(axis=1),
-        seconds=seconds,
+        surface_distance=fit.distance,
+        snapped=grasp.snap_points,
     )
-    farthest = int(np.argmax(base.surface_distance))
-    if base.surface_distance[farthest] > rules.max_surface_distance:
-        return replace(
-            base,
-            reason=f"contact {farthest + 1} is {in_mm(base.surface_distance[farthest])} from the "
-            f"object's surface, more than {in_mm(rules.max_surface_distance)}",
-        )
-    if not outward.all():
-        finger = int(np.argmin(outward))
-        return replace(base, reason=f"normal {finger + 1} points into the object")
-
-    # What forces at the contacts alone can do, whatever the method.
-    with timed(seconds, "margin"):
-        contacts = hand_contacts(placed.model, p_OQ, nhat_Q_O, config)
-        margin = force_margin(placed.model, placed.X_TO_simulated, contacts, config)
-    base = replace(base, epsilon=margin.epsilon, smallest_friction=margin.smallest_friction)
-
-    # The trial.
-    lift = _lift_by_hand if grasp.method == "hand" else _lift_by_forces
-    return lift(base, config)
 
 
-def refuse_off_surface(result: Verification) -> None:
-    """Raise an error if the contacts of a verified grasp are not on its object.
-
-    Raises:
-        OffSurfaceError: If so.
-    """
-    if result.outcome is Outcome.OFF_SURFACE:
-        raise OffSurfaceError(f"contacts must be on the object's surface, got: {result.reason}")
-
-
-def _lift_by_hand(base: Verification, config: Config) -> Verification:
-    """Find palm poses for the contacts and try them until one holds the object."""
+def _lift_by_hand(base: Verification) -> Verification:
+    """Find palm poses for the contacts, and try them until one holds the object."""
     # Palm poses that bring the fingertips to the contacts, the best first.
-    rules, X_TO = config.verify, base.placed.X_TO_simulated
+    config, X_TO = base.config, base.placed.X_TO_simulated
+    hand = load_hand(config.hand)
     with timed(base.seconds, "fit"):
-        fits = fit_wrist(
-            load_hand(config.hand),
-            base.p_OQ,
-            base.nhat_Q_O,
-            up_O=X_TO[2, :3],
-            height=float(X_TO[2, 3]),
-        )
-    near = [fit for fit in fits if not _misfit(fit, config)]
-    if not near:
-        reason = _misfit(fits[0], config)
-        return replace(base, outcome=Outcome.UNREACHABLE, reason=reason, fit=fits[0])
+        fits = fit_wrist(hand, base.p_OQ, base.nhat_Q_O, up_O=X_TO[2, :3], height=float(X_TO[2, 3]))
+    with timed(base.seconds, "simulate"):
+        # Two contacts leave the palm's turn about their line open, and most of these poses are
+        # within the object or the table: the first that is clear is the first pose.
+        tries = _try_poses(base, fits, pass_collisions=hand.num_fingers == 2)
 
-    # A trial from each, until one holds or enough were simulated; a collision at the start is
-    # geometry alone.
-    results: list[Verification] = []
-    simulated = 0
-    for fit in near:
-        with timed(base.seconds, "simulate"):
-            pregrasp, trial = _try(base.placed, X_TO, fit, config)
-        results.append(_judge(replace(base, fit=fit, pregrasp=pregrasp, trial=trial), config))
-        if results[-1].success:
-            return replace(results[-1], tries=len(results))
-        simulated += trial.outcome is not Outcome.START_COLLISION
-        if simulated == rules.max_tries:
+    # The first decides.
+    trial = tries[0].trial
+    reason = _REASONS[trial.outcome] + (f": {trial.message}" if trial.message else "")
+    return replace(base, outcome=trial.outcome, reason=reason, tries=tries)
+
+
+def _try_poses(
+    base: Verification, fits: Iterable[WristFit], *, pass_collisions: bool
+) -> tuple[PoseTrial, ...]:
+    """Return the trials of wrist poses until one holds or enough were tried; one at least.
+
+    Args:
+        base: What is asked for.
+        fits: The wrist poses.
+        pass_collisions: Whether poses that collide at the start do not count, unless all do.
+    """
+    tries, passed = list[PoseTrial](), list[PoseTrial]()
+    for fit in fits:
+        tried = _try(base, fit)
+        collides = pass_collisions and tried.trial.outcome is Outcome.START_COLLISION
+        (passed if collides else tries).append(tried)
+        if tried.held or len(tries) == base.config.verify.max_tries:
             break
-
-    # If one of them has no verdict, the grasp has none: that one might have held.
-    unknown = [result for result in results if result.outcome.inconclusive]
-    farthest = max(unknown or results, key=lambda result: _RANK.index(result.outcome))
-    return replace(farthest, tries=len(results))
+    return tuple(tries or passed[:1])
 
 
-def _lift_by_forces(base: Verification, config: Config) -> Verification:
-    """Ask whether forces at the surface's own contacts can lift the object, without a hand."""
-    placed = base.placed
-    with timed(base.seconds, "forces"):
-        forces = judge_forces(placed.model, placed.X_TO_simulated, base.p_OQ, base.nhat_Q_O, config)
-    outcome = Outcome.SUCCESS if forces.held else Outcome.DROPPED
-    if not forces.on_surface:
-        outcome = Outcome.OFF_SURFACE
-    return replace(base, outcome=outcome, reason=forces.reason, forces=forces)
+def _try(base: Verification, fit: WristFit) -> PoseTrial:
+    """Run the trial of a wrist pose, and measure how close its contacts are to those asked for."""
+    model = base.placed.model
+    pregrasp, trial = _run(base.placed, base.placed.X_TO_simulated, fit, base.config)
+
+    # Distances and angles of the fingertips that touch; patches that face each other have no
+    # normal.
+    contact_error, normal_error = np.full((2, len(base.p_OQ)), np.nan)
+    if trial.closed is not None:
+        closed = trial.closed.contacts
+        contact_error = np.linalg.norm(closed.p_OQ - base.p_OQ, axis=1)
+        cosine = np.sum(closed.nhat_Q_O * base.nhat_Q_O, axis=1)
+        normal_error = np.arccos(np.clip(cosine, -1.0, 1.0))
+    return PoseTrial(
+        fit=fit,
+        pregrasp=pregrasp,
+        trial=trial,
+        contact_error=contact_error,
+        normal_error=normal_error,
+        removal=judge_sample(model, trial, base.config),
+    )
 
 
-def _misfit(fit: WristFit, config: Config) -> str:
-    """Return why a palm pose does not make the grasp; empty if it does."""
-    rules, finger = config.verify, int(np.argmax(fit.residual))
-    if fit.residual[finger] > rules.max_residual:
-        return (
-            "no palm pose was found that brings all fingertips to their points: fingertip "
-            f"{finger + 1} stays {in_mm(fit.residual[finger])} away"
-        )
-    finger = int(np.argmax(fit.normal_error))
-    angle = np.rad2deg(fit.normal_error[finger])
-    if angle > rules.max_normal_error_deg:
-        return (
-            "no palm pose was found that brings all fingertips to their points and normals: pad "
-            f"{finger + 1} stays {angle:.0f}° from its normal"
-        )
-    return ""
-
-
-def _try(
+def _run(
     placed: PlacedObject, X_TO: Array, fit: WristFit, config: Config
 ) -> tuple[Pregrasp, TrialRecord]:
     """Open the fingers of a fit until the hand is clear, and run the trial from there.
@@ -238,26 +230,14 @@ def _try(
     return pregrasp, trial
 
 
-def _judge(result: Verification, config: Config) -> Verification:
-    """Return the result of a trial with its outcome and reason."""
-    # The verdict of the trial.
-    trial = result.trial
-    assert trial is not None
-    outcome, reason, error = trial.outcome, _REASONS[trial.outcome], None
-    if trial.message:
-        reason = f"{reason}: {trial.message}"
-
-    # A hand that closes on other points has not tried the predicted grasp. Fingertips that need
-    # not touch, and do not, have no point.
-    required = load_hand(config.hand).required
-    closed = result.closed
-    if closed is not None and closed.touching[required].all():
-        error = np.linalg.norm(closed.p_OQ - result.p_OQ, axis=1)
-        finger = int(np.argmax(np.nan_to_num(error)))
-        if error[finger] > config.verify.max_contact_error:
-            outcome = Outcome.UNREACHABLE
-            reason = (
-                f"fingertip {finger + 1} closes on the object {in_mm(error[finger])} from its "
-                f"point, more than {in_mm(config.verify.max_contact_error)}"
-            )
-    return replace(result, outcome=outcome, reason=reason, contact_error=error)
+def _lift_by_forces(base: Verification) -> Verification:
+    """Ask whether forces at the surface's own contacts can lift the object, without a hand."""
+    placed = base.placed
+    with timed(base.seconds, "forces"):
+        forces = judge_forces(
+            placed.model, placed.X_TO_simulated, base.p_OQ, base.nhat_Q_O, base.config
+        )
+    outcome = Outcome.SUCCESS if forces.held else Outcome.DROPPED
+    if not forces.on_surface:
+        outcome = Outcome.OFF_SURFACE
+    return replace(base, outcome=outcome, reason=forces.reason, forces=forces)

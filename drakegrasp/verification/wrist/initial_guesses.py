@@ -14,6 +14,7 @@ from functools import lru_cache
 from itertools import combinations
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import KDTree
 
 from drakegrasp.frames import Array, make_pose, rotation_about
@@ -106,10 +107,7 @@ def find_starts(postures: Postures, p_OQ: Array, nhat_Q_O: Array, count: int) ->
         nhat_Q_O: (k, 3), outward unit normals.
         count: Most starts to return.
     """
-    # The postures with the most similar features, aligned; pads face against the normals.
-    nearest = min(NEAREST, len(postures.coordinates))
-    _, rows = postures.tree.query(_features(p_OQ, -nhat_Q_O), k=np.arange(1, nearest + 1))
-    X_OG, misfit = _align(postures.p_GP[rows], postures.n_G[rows], p_OQ, -nhat_Q_O)
+    rows, X_OG, misfit = _nearest_postures(postures, p_OQ, nhat_Q_O)
 
     # The best of them that differ enough.
     starts: list[Start] = []
@@ -121,6 +119,28 @@ def find_starts(postures: Postures, p_OQ: Array, nhat_Q_O: Array, count: int) ->
         if len(starts) == count:
             break
     return starts
+
+
+def posture_misfit(postures: Postures, p_OQ: Array, nhat_Q_O: Array) -> float:
+    """Return how little contacts look like those of any posture: a sum of squares [m^2].
+
+    Args:
+        postures: Of the hand.
+        p_OQ: (k, 3), contact points [m].
+        nhat_Q_O: (k, 3), outward unit normals.
+    """
+    return float(_nearest_postures(postures, p_OQ, nhat_Q_O)[2].min())
+
+
+def _nearest_postures(
+    postures: Postures, p_OQ: Array, nhat_Q_O: Array
+) -> tuple[npt.NDArray[np.int64], Array, Array]:
+    """Return the rows of the postures with the most similar contacts, aligned, and the misfits."""
+    # Pads face against the normals.
+    nearest = min(NEAREST, len(postures.coordinates))
+    _, rows = postures.tree.query(_features(p_OQ, -nhat_Q_O), k=np.arange(1, nearest + 1))
+    X_OG, misfit = _align(postures.p_GP[rows], postures.n_G[rows], p_OQ, -nhat_Q_O)
+    return rows, X_OG, misfit
 
 
 def turned_starts(starts: Sequence[Start], p_OQ: Array, count: int) -> list[Start]:
