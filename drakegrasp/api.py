@@ -218,8 +218,8 @@ class PlacedObject(ObjectOnTable):
                 bounding box, "camera" {C} or "workspace" {T}.
             X_TC: With frame "camera": pose of the camera in the table-top frame, (4, 4), or one
                 per grasp (n, 4, 4).
-            method: "hand" closes a simulated hand on the contacts and lifts; "forces" lifts by
-                forces at the contacts alone.
+            method: "hand" closes a simulated hand on the contacts and lifts; "forces" asks whether
+                forces at the contacts of the surface that they select can lift the object.
             snap_points: Whether to move the points, not the normals, to the nearest ones of the
                 object's surface first.
             client: A Dask client whose workers share the work; this process does it if None.

@@ -55,8 +55,8 @@ if TYPE_CHECKING:
     type=click.Choice(["hand", "forces"]),
     default="hand",
     show_default=True,
-    help="hand: close a simulated hand on the contacts and lift. forces: lift by forces at the "
-    "contacts alone.",
+    help="hand: close a simulated hand on the contacts and lift. forces: ask "
+    "whether forces at the contacts that they select on the surface can lift the object.",
 )
 @click.option(
     "--snap-points",

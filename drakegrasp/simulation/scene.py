@@ -1,6 +1,6 @@
 """The state of a scene: one object, the table and one hand in a Drake diagram.
 
-An `ObjectScene` has no hand: objects settle in it, and forces alone lift them. A scene is built
+An `ObjectScene` has no hand: objects settle in it. A scene is built
 once per object (`construction`) and reset for each attempt: building costs more than simulating,
 and a reset context gives the same bits as a new one. A scene makes no decisions; `settle` and
 `trial` do.

@@ -22,18 +22,17 @@ import numpy.typing as npt
 from drakegrasp.config import CameraConfig, PhysicsConfig
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.simulation.construction import build_object_scene, build_scene
-from drakegrasp.simulation.scene import ObjectScene, Scene
+from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.scene import Scene
 from drakegrasp.vision.rendering import Renderer, build_renderer
 
-#: How many diagrams are kept: a build needs the scene and the renderer of two objects, verification
-#: the scenes of two objects with the hand and without.
+#: How many diagrams are kept: a build needs the scene and the renderer of two objects.
 KEPT = 4
 
-_Diagram = TypeVar("_Diagram", ObjectScene, Scene, Renderer)
+_Diagram = TypeVar("_Diagram", Scene, Renderer)
 
 #: The last in order is the last used.
-_kept: dict[Hashable, ObjectScene | Renderer] = {}
+_kept: dict[Hashable, Scene | Renderer] = {}
 _lock = threading.Lock()
 
 
@@ -44,13 +43,8 @@ def cached_scene(model: ObjectModel, physics: PhysicsConfig, hand_name: str) -> 
     return _cached((*_scene_key(model, physics), hand), lambda: build_scene(model, physics, hand))
 
 
-def cached_object_scene(model: ObjectModel, physics: PhysicsConfig) -> ObjectScene:
-    """Return the scene of an object without a hand."""
-    return _cached(_scene_key(model, physics), lambda: build_object_scene(model, physics))
-
-
 def _scene_key(model: ObjectModel, physics: PhysicsConfig) -> tuple[Hashable, ...]:
-    """Return what a scene without a hand is known by."""
+    """Return what a scene is known by, but for its hand."""
     shape = (model.collision_vertices, model.collision_faces, model.half_extents)
     mass = (model.p_OOcm, model.I_OOcm_O, np.float64(model.mass))
     return "scene", _digest(model.name, *shape, *mass), model.own_physics(physics)
@@ -65,7 +59,7 @@ def cached_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
 def forget_scenes() -> None:
     """Drop every scene: one in which Drake failed must not be used again."""
     with _lock:
-        for key in [key for key, diagram in _kept.items() if isinstance(diagram, ObjectScene)]:
+        for key in [key for key, diagram in _kept.items() if isinstance(diagram, Scene)]:
             del _kept[key]
         gc.collect()
 

@@ -36,6 +36,7 @@ from drakegrasp.verification.forces.contact_forces import (
     GraspContacts,
     hardest_forces,
 )
+from drakegrasp.verification.forces.surface_contacts import MAX_DISTANCE
 from drakegrasp.verification.forces.verdict import ForceVerdict, judge_forces
 
 #: Friction coefficients that are tried.
@@ -43,7 +44,7 @@ FRICTIONS = (0.05, 0.71)
 #: Distances of points in the air and inside, along the surface, and of contacts on one side [m].
 OFF, SLID, APART = 0.009, 0.02, 0.02
 #: Predictions near the grasp of which the best one counts, and how far they stray [m, rad].
-DRAWS, STRAY, TILT = 20, 0.005, np.deg2rad(40.0)
+DRAWS, STRAY, TILT = 30, 0.005, np.deg2rad(40.0)
 
 Array = npt.NDArray[np.float64]
 Contacts = tuple[Array, Array]
@@ -143,7 +144,7 @@ def summary(verdicts: list[ForceVerdict], honest: list[ForceVerdict]) -> dict[st
 def _cause(verdict: ForceVerdict) -> str:
     """Return why a grasp fails, in two words."""
     if not verdict.on_surface:
-        far = verdict.contacts.distance > 0.005
+        far = verdict.contacts.distance > MAX_DISTANCE
         return "point off" if far.any() else "normal off"
     return "no forces" if np.isinf(verdict.planned_share) else "too weak"
 
@@ -178,11 +179,11 @@ def slid(grasp: Grasp) -> Contacts:
 
 
 def on_one_side(grasp: Grasp) -> Contacts:
-    """All contacts beside the first, with the normals that they had."""
+    """All contacts beside the first, with the surface's normals there."""
     _, _, (_, along, across) = np.linalg.svd(grasp.n[:1])
     beside = grasp.p[0] + APART * np.array([0.0 * along, along, across])[: len(grasp.p)]
-    points, _, _ = grasp.model.collision.nearest.on_surface(beside)
-    return np.asarray(points), grasp.n
+    points, _, faces = grasp.model.collision.nearest.on_surface(beside)
+    return np.asarray(points), np.asarray(grasp.model.collision.face_normals[faces])
 
 
 SPOILT: dict[str, Callable[[Grasp], Contacts]] = {

@@ -13,8 +13,8 @@ from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation import scene_cache
 from drakegrasp.simulation.scene_cache import (
     KEPT,
-    cached_object_scene,
     cached_renderer,
+    cached_scene,
     forget_scenes,
 )
 
@@ -28,43 +28,43 @@ def empty(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def test_copy_of_an_object_shares_its_scene(cube: ObjectModel, config: Config) -> None:
-    scene = cached_object_scene(cube, config.physics)
+    scene = cached_scene(cube, config.physics, config.hand)
     copy = replace(cube, collision_vertices=cube.collision_vertices.copy())
-    assert cached_object_scene(copy, config.physics) is scene
+    assert cached_scene(copy, config.physics, config.hand) is scene
 
 
 def test_scene_of_another_mass_shape_or_physics_is_another(
     cube: ObjectModel, config: Config
 ) -> None:
-    scene = cached_object_scene(cube, config.physics)
+    scene = cached_scene(cube, config.physics, config.hand)
     heavy = replace(cube, mass=2.0 * cube.mass)
     large = replace(cube, collision_vertices=1.1 * cube.collision_vertices)
     slick = config.physics.model_copy(update={"friction_hand": 0.1})
     for other in (
-        cached_object_scene(heavy, config.physics),
-        cached_object_scene(large, config.physics),
-        cached_object_scene(cube, slick),
-        cached_object_scene(replace(cube, friction=0.1), config.physics),
+        cached_scene(heavy, config.physics, config.hand),
+        cached_scene(large, config.physics, config.hand),
+        cached_scene(cube, slick, config.hand),
+        cached_scene(replace(cube, friction=0.1), config.physics, config.hand),
     ):
         assert other is not scene
-    assert np.isclose(cached_object_scene(heavy, config.physics).model.mass, 2.0 * cube.mass)
+    assert np.isclose(cached_scene(heavy, config.physics, config.hand).model.mass, 2.0 * cube.mass)
 
 
 def test_least_recently_used_diagram_goes_first(cube: ObjectModel, config: Config) -> None:
     objects = [replace(cube, mass=mass) for mass in np.linspace(0.5, 1.5, KEPT + 1).tolist()]
-    first, second = (cached_object_scene(model, config.physics) for model in objects[:2])
+    first, second = (cached_scene(model, config.physics, config.hand) for model in objects[:2])
     for model in objects[2:KEPT]:
-        cached_object_scene(model, config.physics)
-    assert cached_object_scene(objects[0], config.physics) is first
-    cached_object_scene(objects[KEPT], config.physics)
-    assert cached_object_scene(objects[0], config.physics) is first
-    assert cached_object_scene(objects[1], config.physics) is not second
+        cached_scene(model, config.physics, config.hand)
+    assert cached_scene(objects[0], config.physics, config.hand) is first
+    cached_scene(objects[KEPT], config.physics, config.hand)
+    assert cached_scene(objects[0], config.physics, config.hand) is first
+    assert cached_scene(objects[1], config.physics, config.hand) is not second
 
 
 def test_scenes_are_forgotten_and_renderers_stay(cube: ObjectModel, config: Config) -> None:
-    scene = cached_object_scene(cube, config.physics)
+    scene = cached_scene(cube, config.physics, config.hand)
     renderer = cached_renderer(cube, CameraConfig())
     forget_scenes()
-    assert cached_object_scene(cube, config.physics) is not scene
+    assert cached_scene(cube, config.physics, config.hand) is not scene
     assert cached_renderer(cube, CameraConfig()) is renderer
     assert cached_renderer(cube, CameraConfig(size=64)) is not renderer
