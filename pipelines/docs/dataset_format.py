@@ -153,7 +153,8 @@ _LINES = """
 `null`. `index` is the grasp's place in the input, `success` whether it holds, `outcome` the label
 of the verdict, `explain` the verdict in sentences, `X_OG` a 4 x 4 matrix. `solver` (SLSQP's
 `status`, `message`, `iterations`), `closed` and `lifted` (contacts then) and `forces` (method
-`forces`: forces and shares, and the contacts of the surface that were selected) are objects, or `null` if they were not reached; `seconds` is the wall clock by stage.
+`forces`: shares, and the contacts of the surface that were selected) are objects, or `null` if they
+were not reached; `seconds` is the wall clock by stage.
 Angles that end in `_deg` are in degrees; all else is as in the table, in its units.
 """
 
