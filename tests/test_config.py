@@ -157,8 +157,6 @@ verify:
   max_contact_error: 0.015
   open_margin_deg: 10.0
   max_tries: 3
-  max_position_error: 0.02
-  max_angle_error_deg: 10.0
 """
 
 #: Where the released code differs from the paper (original_system.md, 2.1); its hand's
