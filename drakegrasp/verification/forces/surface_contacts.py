@@ -107,8 +107,8 @@ def patch_points(model: ObjectModel, contacts: SurfaceContacts) -> tuple[Array, 
 
     A patch is its contact and a ring of `RING_POINTS` points about it, each with the normal of its
     own face. They are the surface's nearest points to a circle of the radius `TORSION_RADIUS` in
-    the contact's tangent plane. Faces that look away from the contact's normal have no part in the
-    patch, and of equally near ones the most parallel counts: so a patch ends at a sharp edge.
+    the contact's tangent plane; of equally near faces the one most parallel to the contact's counts.
+    So a patch ends at an edge of 90 degrees or more, and bends around a blunter one.
 
     Args:
         model: The object.
@@ -127,7 +127,7 @@ def patch_points(model: ObjectModel, contacts: SurfaceContacts) -> tuple[Array, 
     points, normals = [], []
     for i, circle in enumerate(circles):
         cosine = face_normals @ contacts.nhat_Q_O[i]
-        faces = np.flatnonzero(near[i] & (cosine > 0.0))
+        faces = np.flatnonzero(near[i])
         feet = _feet(triangles[faces], circle)
         distance = np.linalg.norm(feet - circle[:, None], axis=2)
         chosen = _nearest(distance, np.broadcast_to(cosine[faces], distance.shape))
