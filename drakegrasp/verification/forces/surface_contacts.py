@@ -107,7 +107,7 @@ def patch_points(model: ObjectModel, contacts: SurfaceContacts) -> tuple[Array, 
 
     A patch is its contact and a ring of `RING_POINTS` points about it, each with the normal of its
     own face. They are the surface's nearest points to a circle of the radius `TORSION_RADIUS` in
-    the contact's tangent plane; of equally near faces the one most parallel to the contact's counts.
+    the contact's tangent plane; of equally near faces that most parallel to the contact's counts.
     So a patch ends at an edge of 90 degrees or more, and bends around a blunter one.
 
     Args:
