@@ -13,18 +13,26 @@ import pytest
 import trimesh
 from distributed import Client
 
-from drakegrasp.api import build_on, verify_grasp, verify_grasps
+from drakegrasp.api import (
+    PlacedObject,
+    build_on,
+    place_object,
+    verify_grasp,
+    verify_grasps,
+    verify_rows,
+)
 from drakegrasp.cluster.connect import connect
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import ConfigError, GraspError, MeshError
+from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.progress import silent
-from drakegrasp.simulation.placement import PlacedObject, place_object
 from drakegrasp.verification.batch import verify_batch
-from drakegrasp.verification.placed_grasp import mesh_config, place_on_mesh, place_on_rows
+from drakegrasp.verification.hints import find_hints
+from drakegrasp.verification.placed_grasp import place_on_object, place_on_rows
 from drakegrasp.verification.result_files import write_results
 from drakegrasp.verification.verify import PlacedGrasp
 
@@ -43,7 +51,7 @@ def cube() -> PlacedObject:
 
 
 def place(grasps: np.ndarray, cube: PlacedObject) -> list[PlacedGrasp]:
-    return place_on_mesh(grasps, cube, method="forces", config=cube.config)
+    return place_on_object(grasps, cube, method="forces")
 
 
 @pytest.fixture(scope="module")
@@ -63,9 +71,9 @@ def test_workers_change_nothing(test_split: GraspDataset, tmp_path: Path) -> Non
     rows = rows_of_two_objects(test_split)
     grasps = test_split.column("grasps")[rows].astype(float)
     config = read_manifest(test_split.path.parent).config
-    here = verify_grasps(grasps, dataset=test_split, rows=rows)
+    here = verify_rows(test_split, grasps, rows)
     with connect(2) as client:
-        there = verify_grasps(grasps, dataset=test_split, rows=rows, client=client)
+        there = verify_rows(test_split, grasps, rows, client=client)
     for name, results in (("here.h5", here), ("there.h5", there)):
         write_results(results, tmp_path / name, config)
     assert (tmp_path / "here.h5").read_bytes() == (tmp_path / "there.h5").read_bytes()
@@ -75,13 +83,13 @@ def test_workers_change_nothing(test_split: GraspDataset, tmp_path: Path) -> Non
 
 def test_results_come_in_the_order_of_the_grasps(cube: PlacedObject) -> None:
     off = GRASP.copy()
-    off[0, 0] += 0.02
+    off[0, 0] = np.nan
     order = [off, GRASP, off, GRASP]
-    results = verify_grasps([g.ravel() for g in order], cube, method="forces")
+    results = cube.verify([g.ravel() for g in order], method="forces")
     assert [v.outcome for v in results] == [
-        Outcome.OFF_SURFACE if g is off else Outcome.SUCCESS for g in order
+        Outcome.INVALID if g is off else Outcome.SUCCESS for g in order
     ]
-    assert [v.p_OQ[0, 0] for v in results] == [g[0, 0] for g in order]
+    np.testing.assert_array_equal([v.p_OQ[0, 0] for v in results], [g[0, 0] for g in order])
 
 
 def test_every_grasp_is_placed_once(cube: PlacedObject) -> None:
@@ -105,8 +113,11 @@ def test_grasps_of_one_object_stand_together(test_split: GraspDataset) -> None:
     assert sum(a != b for a, b in pairwise(of_objects)) == len(set(names)) - 1
 
 
-def test_results_are_delivered_in_order_from_any_executor(cube: PlacedObject) -> None:
-    """Workers finish in any order, and send copies of the object."""
+@pytest.mark.parametrize("together", [1, 2, 9])
+def test_results_are_delivered_in_order_from_any_executor(
+    cube: PlacedObject, together: int
+) -> None:
+    """Workers finish in any order, and never send the object back."""
 
     def backwards(function, items):
         return (function(pickle.loads(pickle.dumps(item))) for item in reversed(list(items)))
@@ -114,7 +125,9 @@ def test_results_are_delivered_in_order_from_any_executor(cube: PlacedObject) ->
     grasps = np.tile(GRASP.ravel(), (3, 1))
     grasps[:, 0] += 0.02 * np.arange(3)
     placed, delivered = place(grasps, cube), list[int]()
-    results = verify_batch(placed, backwards, silent, lambda index, result: delivered.append(index))
+    results = verify_batch(
+        placed, backwards, silent, lambda i, _: delivered.append(i), together=together
+    )
     assert delivered == [0, 1, 2]
     assert [r.p_OQ[0, 0] for r in results] == pytest.approx(grasps[:, 0], abs=1e-4)
     assert all(r.placed is placed[0].placed for r in results)
@@ -122,19 +135,48 @@ def test_results_are_delivered_in_order_from_any_executor(cube: PlacedObject) ->
 
 @pytest.mark.parametrize("where", [{}, {"frame": "camera", "X_TC": np.eye(4)}])
 def test_no_grasps_are_no_work(cube: PlacedObject, where: dict) -> None:
-    assert verify_grasps(np.zeros((0, 18)), cube, **where) == []
+    assert cube.verify(np.zeros((0, 18)), **where) == []
 
 
-def test_one_far_grasp_among_good_ones_is_a_result(test_split: GraspDataset) -> None:
-    """Also where it is the only grasp of its object; if all are far, the caller is told."""
-    rows = [*rows_of_two_objects(test_split)[:1], 0]
-    grasps = test_split.column("grasps")[rows].astype(float)
-    grasps[0, :9] += 5.0
-    placed = place_on_rows(grasps, test_split, rows)
-    assert sorted(grasp.index for grasp in placed) == [0, 1]
-    grasps[1, :9] += 5.0
-    with pytest.raises(GraspError, match="contact points must lie on the object"):
-        verify_grasps(grasps, dataset=test_split, rows=rows)
+def test_object_goes_to_a_worker_with_many_grasps_and_does_not_come_back(
+    cube: PlacedObject,
+) -> None:
+    sent, received = list[int](), list[int]()
+
+    def far_away(function, items):
+        for item in items:
+            there = pickle.dumps(item)
+            back = pickle.dumps(function(pickle.loads(there)))
+            sent.append(len(there))
+            received.append(len(back))
+            yield pickle.loads(back)
+
+    placed = place(np.tile(GRASP.ravel(), (20, 1)), cube)
+    verify_batch(placed, far_away, silent, together=16)
+    size = len(pickle.dumps(cube))
+    assert len(sent) == 2 and max(sent) < 2 * size + 20 * len(pickle.dumps(cube.config))
+    assert not any(b"visual_vertices" in pickle.dumps(each) for each in received)
+
+
+def test_row_knows_the_frames_of_both_cameras(test_split: GraspDataset) -> None:
+    """A grasp in the frame of the other camera is tried as it is, and gets a hint."""
+    other = GraspDataset(test_split.path.with_name("grasping_otm.hdf5"), split=test_split.split)
+    rows = list(range(len(test_split)))
+    placed = place_on_rows(other.column("grasps"), test_split, rows)
+    hints = [
+        find_hints(
+            g.placed.model, load_hand("barrett"), g.p_OQ, g.nhat_Q_O, X_OA=g.X_OA, X_OB=g.X_OB
+        )
+        for g in placed
+    ]
+    assert any("the frame of the dataset's other camera" in each for each in hints)
+    own = place_on_rows(test_split.column("grasps"), test_split, rows)
+    assert not any(
+        find_hints(
+            g.placed.model, load_hand("barrett"), g.p_OQ, g.nhat_Q_O, X_OA=g.X_OA, X_OB=g.X_OB
+        )
+        for g in own
+    )
 
 
 @pytest.mark.parametrize(
@@ -150,16 +192,17 @@ def test_one_far_grasp_among_good_ones_is_a_result(test_split: GraspDataset) -> 
 def test_wrong_rows_are_refused(test_split: GraspDataset, rows: list | None, words: str) -> None:
     grasps = test_split.column("grasps")[:1]
     with pytest.raises(GraspError, match=words):
-        verify_grasps(grasps, dataset=test_split, rows=rows)
+        verify_rows(test_split, grasps, rows)
 
 
+@pytest.mark.filterwarnings("ignore:verify_grasps will be gone")
 @pytest.mark.parametrize(
     ("options", "words"),
     [
         ({"units": "cm"}, "units must be None with a dataset"),
         ({"X_TC": np.eye(4)}, "X_TC must be None with a dataset"),
         ({"mesh": "cup.obj"}, "mesh must be None with a dataset"),
-        ({"dataset": "grasps.hdf5"}, "dataset must be a GraspDataset, .*, got a str"),
+        ({"dataset": "grasps.hdf5"}, "data must be a GraspDataset, .*, got a str"),
         ({"dataset": None}, "a mesh or a dataset must be given, got neither"),
         ({"dataset": None, "mesh": "cup.obj"}, "rows must be None without a dataset, got rows"),
         ({"config": "paper"}, "config must be a Config, see load_config, got a str"),
@@ -180,28 +223,36 @@ def test_what_does_not_go_together_is_refused(
         verify_grasps(test_split.column("grasps")[:1], **asked)
 
 
-@pytest.mark.parametrize(("with_dataset", "row"), [(True, None), (False, 3)])
-def test_row_is_that_of_a_dataset(
-    test_split: GraspDataset, with_dataset: bool, row: int | None
+def test_calls_of_the_version_before_give_the_same_with_a_warning(cube: PlacedObject) -> None:
+    (new,) = cube.verify(GRASP.ravel(), method="forces")
+    with pytest.warns(FutureWarning, match=r"use place_object\(mesh, ...\).verify\(grasps\)"):
+        (old,) = verify_grasps(GRASP.reshape(1, 18), cube, method="forces")
+    with pytest.warns(FutureWarning, match="verify_grasp will be gone"):
+        one = verify_grasp(GRASP.ravel(), cube, method="forces", frame="object")
+    assert new.lift.applied_force == old.lift.applied_force == one.lift.applied_force
+
+
+def test_row_of_a_dataset_may_be_given_to_the_call_of_the_version_before(
+    test_split: GraspDataset,
 ) -> None:
-    where = {"dataset": test_split} if with_dataset else {"mesh": "cup.obj"}
-    with pytest.raises(GraspError, match=f"row must be given with a dataset, .* got {row}"):
-        verify_grasp(test_split.column("grasps")[0], row=row, **where)
+    with pytest.warns(FutureWarning, match="use verify_rows"):
+        verdict = verify_grasp(np.full(18, np.nan), dataset=test_split, row=0)
+    assert verdict.outcome is Outcome.INVALID
 
 
 def test_object_keeps_the_rules_that_it_was_placed_by() -> None:
     heavy = load_config(overrides=["objects.mass=2", "physics.friction_hand=0.3"])
-    box = trimesh.creation.box([EDGE] * 3)
-    placed = place_object(box, config=heavy)
-    assert mesh_config(placed, None) == heavy
-    # Friction is no matter of the object, its mass is.
+    placed = place_object(trimesh.creation.box([EDGE] * 3), config=heavy)
+    assert placed.config == place_object(placed).config == heavy
+    # Friction and hand are no matter of the object, its mass is.
     slick = load_config(overrides=["objects.mass=2", "physics.friction_hand=0.1"])
-    (grasp,) = place_on_mesh(GRASP.ravel(), placed, config=slick)
+    (grasp,) = place_on_object(GRASP.ravel(), place_object(placed, config=slick))
     assert grasp.config == slick
+    assert place_object(placed, hand="franka").config.hand == "franka"
     with pytest.raises(ConfigError, match="objects must be as the object was placed with"):
-        verify_grasp(GRASP.ravel(), placed, config=load_config())
+        place_object(placed, config=load_config())
     with pytest.raises(MeshError, match="units must be None for a prepared object"):
-        verify_grasp(GRASP.ravel(), placed, units="cm")
+        place_object(placed, units="cm")
 
 
 @pytest.mark.parametrize("objects", [True, False], ids=["files", "builtin"])

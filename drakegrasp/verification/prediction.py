@@ -77,7 +77,8 @@ def read_grasps(grasps: npt.ArrayLike, fingers: int) -> GraspRows:
         invalid[row] = invalid[row] or f"number {column + 1} is {value:g}, {must}"
 
     # Normals without a direction.
-    points, normals = array.reshape(len(array), 2, fingers, 3).swapaxes(0, 1).copy()
+    known = np.where(usable, array, np.nan)
+    points, normals = known.reshape(len(array), 2, fingers, 3).swapaxes(0, 1).copy()
     length = np.linalg.norm(normals, axis=-1)
     for row, finger in zip(*np.nonzero(length < SHORTEST_NORMAL), strict=True):
         invalid[row] = invalid[row] or f"normal {finger + 1} is zero"
@@ -97,7 +98,7 @@ def _read_rows(grasps: npt.ArrayLike, size: int, fingers: int) -> tuple[Array, l
     """Return rows (n, 6k), NaN where a row has another length, and the reasons."""
     # Rows of different lengths come as a list, or as an array of objects.
     rows: Any = grasps if isinstance(grasps, list | tuple) else np.asarray(grasps)
-    if isinstance(rows, list | tuple) or rows.dtype == object:
+    if isinstance(rows, list | tuple) or (rows.dtype == object and rows.ndim == 1):
         shapes = [_shape(row) for row in rows]
         if len(set(shapes)) > 1 and any(shapes):
             array, invalid = np.full((len(rows), size), np.nan), [""] * len(rows)

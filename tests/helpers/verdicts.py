@@ -1,4 +1,4 @@
-"""A made-up trial and forces, for tests of what is said and written about verdicts."""
+"""A made-up trial, for tests of what is said and written about verdicts."""
 
 from __future__ import annotations
 
@@ -7,13 +7,16 @@ from typing import Any
 import numpy as np
 
 from drakegrasp.frames import Array, make_pose
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.lift import Lift
 from drakegrasp.simulation.trial import Closed, TrialRecord
 from drakegrasp.verification.forces.contact_forces import ContactForces
 from drakegrasp.verification.forces.surface_contacts import SurfaceContacts
 from drakegrasp.verification.forces.verdict import ForceVerdict
+from drakegrasp.verification.result import PoseTrial
+from drakegrasp.verification.wrist.solver import WristFit
 
 
 def some_contacts(**values: Any) -> Contacts:
@@ -46,6 +49,29 @@ def some_trial(
     )
     closing = Closed(contacts=closed, q=rng.random(8), duration=1.5)
     return TrialRecord(outcome=outcome, X_TO=X_TO, X_OG=X_OG, closed=closing, lift=lift)
+
+
+def some_fit(X_OG: Array, **values: Any) -> WristFit:
+    """Return a solution of the wrist problem, with other values where given."""
+    usual: dict[str, Any] = {
+        "spread": 0.25, "closing": np.array([0.5, 0.6, 0.7]), "objective": 1e-6,
+        "residual": np.array([0.0, 1e-3, 1 / 3]), "normal_error": np.deg2rad([1.0, 2.0, 60.0]),
+        "status": 0, "message": "Optimization terminated successfully", "iterations": 12,
+        "evaluations": 15,
+    }  # fmt: skip
+    return WristFit(X_OG=X_OG, **usual | values)
+
+
+def some_try(trial: TrialRecord, **values: Any) -> PoseTrial:
+    """Return the trial of a wrist pose whose contacts are a few millimetres off."""
+    held = trial.outcome is Outcome.SUCCESS
+    start = Pregrasp(X_OG=trial.X_OG, spread=0.25, closing=np.array([0.1, 0.2, 0.3]))
+    usual: dict[str, Any] = {
+        "fit": some_fit(trial.X_OG), "pregrasp": start, "trial": trial,
+        "contact_error": np.array([0.001, 0.002, 0.003]),
+        "normal_error": np.deg2rad([3.0, 4.0, 5.0]), "removal": Removal.KEPT if held else None,
+    }  # fmt: skip
+    return PoseTrial(**usual | values)
 
 
 def some_forces(*, points: float = 0.5, patches: float = 0.25) -> ForceVerdict:

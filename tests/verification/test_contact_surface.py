@@ -11,7 +11,7 @@ from helpers.objects import box_model, model_of
 
 from drakegrasp.frames import Array
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.verification.contact_surface import WALL, face_distances, points_outward
+from drakegrasp.verification.contact_surface import WALL, SurfaceFit, fit_surface
 
 EXTENTS = np.array([0.06, 0.08, 0.1])
 #: Outer and inner half edge of the open box below [m]: walls of 2 mm.
@@ -37,29 +37,20 @@ def random_points(n: int, seed: int = 0) -> Array:
     return np.random.default_rng(seed).uniform(-0.08, 0.08, (n, 3))
 
 
+def fit(model: ObjectModel, p: Array) -> SurfaceFit:
+    return fit_surface(model, p, np.tile([0.0, 0.0, 1.0], (len(p), 1)))
+
+
 @pytest.mark.parametrize("name", ["box", "pot"])
-def test_nearest_face_is_as_far_as_trimesh_says(name: str, request: pytest.FixtureRequest) -> None:
+def test_nearest_point_is_as_far_as_trimesh_says(name: str, request: pytest.FixtureRequest) -> None:
     model: ObjectModel = request.getfixturevalue(name)
     p = random_points(60)
-    distance = face_distances(model, p)
-    assert distance.shape == (60, len(model.collision_faces))
+    found = fit(model, p)
     expected = trimesh.proximity.closest_point(model.collision, p)[1]
     # Of faces that are almost equally near trimesh may return the second.
-    np.testing.assert_allclose(distance.min(axis=1), expected, atol=1e-6)
-    assert np.all(distance.min(axis=1) <= expected + 1e-9)
-
-
-def test_each_column_is_a_faces_own(pot: ObjectModel) -> None:
-    p = random_points(5, seed=1)
-    distance = face_distances(pot, p)
-    for face in range(0, len(pot.collision_faces), 7):
-        alone = trimesh.Trimesh(pot.collision.triangles[face], [[0, 1, 2]], process=False)
-        expected = trimesh.proximity.closest_point(alone, p)[1]
-        np.testing.assert_allclose(distance[:, face], expected, atol=1e-9)
-
-
-def test_no_points_have_no_distances(box: ObjectModel) -> None:
-    assert face_distances(box, np.zeros((0, 3))).shape == (0, len(box.collision_faces))
+    np.testing.assert_allclose(found.distance, expected, atol=1e-6)
+    assert np.all(found.distance <= expected + 1e-9)
+    np.testing.assert_allclose(np.linalg.norm(found.nearest - p, axis=1), found.distance)
 
 
 def test_distances_from_a_box_are_those_of_the_formula(box: ObjectModel) -> None:
@@ -67,15 +58,20 @@ def test_distances_from_a_box_are_those_of_the_formula(box: ObjectModel) -> None
     p = np.array(
         [[0.0, 0.0, half[2] + 0.01], half + np.array([3e-3, 4e-3, 0]), [0.0, 0.0, 0.0], half]
     )
-    nearest = face_distances(box, p).min(axis=1)
-    np.testing.assert_allclose(nearest, [0.01, 0.005, half.min(), 0.0], atol=1e-9)
+    found = fit(box, p)
+    np.testing.assert_allclose(found.distance, [0.01, 0.005, half.min(), 0.0], atol=1e-9)
+    np.testing.assert_allclose(found.nearest[:2], [[0.0, 0.0, half[2]], half], atol=1e-9)
 
 
 def outward(model: ObjectModel, p: Array, n: Array) -> list[bool]:
-    found = points_outward(model, face_distances(model, p), n)
-    assert found.shape == (len(p),)
-    assert found.dtype == bool
-    return [bool(each) for each in found]
+    """Return whether each normal points out of a face next to its point."""
+    return [bool(cosine > 0.1) for cosine in fit_surface(model, p, n).agreement]
+
+
+def test_agreement_is_the_cosine_to_the_face(box: ObjectModel) -> None:
+    p = np.tile([EXTENTS[0] / 2.0, 0.0, 0.0], (3, 1))
+    n = np.array([[1.0, 0.0, 0.0], [0.6, 0.8, 0.0], [-1.0, 0.0, 0.0]])
+    np.testing.assert_allclose(fit_surface(box, p, n).agreement, [1.0, 0.6, -1.0], atol=1e-12)
 
 
 @pytest.mark.parametrize("axis", range(3))

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.objects import standing
-from helpers.verdicts import some_contacts, some_forces, some_trial
+from helpers.verdicts import some_contacts, some_forces, some_trial, some_try
 
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import make_object
-from drakegrasp.outcomes import Outcome
+from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.verification.result import Verification
 
@@ -28,6 +28,8 @@ def lifted(
         box.vertices, box.faces, CONFIG.objects, name="vase", class_name="vase", mesh_sha256=""
     )
     contacts = some_contacts(other_links=links)
+    removal = Removal.OTHER_LINKS if links else Removal.KEPT
+    removal = removal if outcome is Outcome.SUCCESS else None
     trial = some_trial(
         standing(model),
         contacts,
@@ -45,17 +47,17 @@ def lifted(
         p_OQ=np.zeros((3, 3)),
         nhat_Q_O=np.eye(3),
         surface_distance=np.zeros(3),
-        trial=trial,
+        tries=(some_try(trial, removal=removal),),
     )
 
 
 @pytest.mark.parametrize(
     ("slip_mm", "turn_deg", "links", "words"),
     [
-        (0.2, 0.3, 0, "held, precision, stable"),
-        (4.9, 4.9, 0, "held, precision, stable"),
-        (5.1, 0.3, 0, "held, precision"),
-        (0.2, 5.1, 0, "held, precision"),
+        (0.2, 0.3, 0, "held, precision, stable, sample"),
+        (4.9, 4.9, 0, "held, precision, stable, sample"),
+        (5.1, 0.3, 0, "held, precision, sample"),
+        (0.2, 5.1, 0, "held, precision, sample"),
         (0.2, 0.3, 1, "held"),
         (73.0, 98.0, 1, "held"),
     ],
@@ -76,7 +78,7 @@ def test_grasp_that_fails_is_none_of_the_words() -> None:
     assert (verdict.held, verdict.precision, verdict.stable) == (False, False, False)
     assert verdict.words == "fails: slipped"
     # What was not lifted is nothing, either.
-    verdict = replace(verdict, trial=None, outcome=Outcome.UNREACHABLE)
+    verdict = replace(verdict, tries=(), outcome=Outcome.INVALID)
     assert (verdict.held, verdict.precision, verdict.stable) == (False, False, False)
     assert "slips" not in verdict.explain()
 
@@ -95,15 +97,13 @@ def test_explanation_tells_what_moved_and_what_touched(
 ) -> None:
     text = lifted(slip_mm=slip_mm, turn_deg=turn_deg, links=links).explain()
     moved = f"slips by {slip_mm:.1f} mm and turns by {turn_deg:.1f}° in the hand"
-    assert text == (
-        f"The grasp of vase holds: so it is. During the lift the object {moved}, "
-        f"and at the end {said}"
-    )
+    assert text.startswith("The grasp of vase holds: so it is. Before closing, the fingertips are ")
+    assert f" During the lift the object {moved}, and at the end {said} In a dataset" in text
 
 
 def test_explanation_of_a_lost_object_gives_no_mark() -> None:
     text = lifted(slip_mm=80.0, turn_deg=9.0, links=0, outcome=Outcome.DROPPED).explain()
-    assert text.startswith("The grasp of vase fails (dropped): so it is. During the lift")
+    assert text.startswith("The grasp of vase fails (dropped): so it is. ")
     assert text.endswith("no other link of the hand touches it.")
 
 
@@ -111,8 +111,42 @@ def test_what_forces_alone_hold_is_a_precision_grasp_that_is_stable() -> None:
     """Nothing moves where forces balance."""
     verdict = replace(
         lifted(slip_mm=90.0, turn_deg=0.0, links=0),
-        trial=None,
+        tries=(),
         method="forces",
         forces=some_forces(),
     )
     assert verdict.words == "held, precision, stable"
+
+
+@pytest.mark.parametrize(
+    ("removal", "said"),
+    [(Removal.KEPT, "it would be a sample;"), (Removal.SLID, "it would be no sample (slid);")],
+)
+def test_explanation_says_whether_it_is_a_sample_and_what_is_not_judged(
+    removal: Removal, said: str
+) -> None:
+    verdict = lifted(slip_mm=0.1, turn_deg=0.1, links=0)
+    verdict = replace(verdict, tries=(replace(verdict.tries[0], removal=removal),))
+    text = verdict.explain()
+    assert verdict.sample is (removal is Removal.KEPT)
+    assert f"In a dataset {said} not judged: not_seen, flat_depth, outlier." in text
+
+
+def test_hints_and_normalised_normals_are_told() -> None:
+    verdict = replace(
+        lifted(slip_mm=80.0, turn_deg=9.0, links=0, outcome=Outcome.DROPPED),
+        hints=("points in millimetres instead of metres",),
+        normalised=True,
+    )
+    text = verdict.explain()
+    assert "A predicted normal was not of unit length; it was normalised." in text
+    assert text.endswith("This would fit much better: points in millimetres instead of metres.")
+
+
+def test_held_within_a_distance_follows_from_the_farthest_contact() -> None:
+    verdict = lifted(slip_mm=0.1, turn_deg=0.1, links=0)
+    error = np.array([0.003, np.nan, 0.019])
+    near = replace(verdict, tries=(replace(verdict.tries[0], contact_error=error),))
+    assert near.farthest_contact == 0.019 and near.success
+    far = replace(verdict, tries=(replace(verdict.tries[0], contact_error=error + 0.002),))
+    assert far.held and not far.success and far.words.endswith("not as asked")

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.objects import standing
-from helpers.verdicts import some_contacts, some_forces, some_trial
+from helpers.verdicts import some_contacts, some_forces, some_trial, some_try
 
 from drakegrasp.dataset.schema import CONVENTIONS, SCHEMA_VERSION, VERIFICATION_FIELDS, sizes
 from drakegrasp.errors import DataError
@@ -22,7 +22,6 @@ from drakegrasp.frames import make_pose, pack_pose
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import make_object
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.candidates import Pregrasp
 from drakegrasp.simulation.contacts import Contacts
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.verification.result import Verification
@@ -34,7 +33,6 @@ from drakegrasp.verification.result_files import (
     write_json_line,
     write_results,
 )
-from drakegrasp.verification.wrist.solver import WristFit
 
 CONFIG = load_config()
 RNG = np.random.default_rng(0)
@@ -56,16 +54,16 @@ def contacts() -> Contacts:
 
 
 def results() -> list[Verification]:
-    """One of each kind: held by the hand, held by forces, out of reach, off the surface."""
+    """One of each kind: held by the hand, held by forces, missed by the hand, and no grasp."""
     box = trimesh.creation.box([0.06, 0.05, 0.12])
     model = make_object(
         box.vertices, box.faces, CONFIG.objects, name="чашка", class_name="cup", mesh_sha256=""
     )
     placed = PlacedObject(model=model, X_TO=standing(model))
-    off = Verification(
+    asked = Verification(
         method="hand",
-        outcome=Outcome.OFF_SURFACE,
-        reason="contact 1 is 20.0 mm from the object's surface",
+        outcome=Outcome.INVALID,
+        reason="number 1 is nan, not finite",
         placed=placed,
         config=CONFIG,
         p_OQ=RNG.normal(size=(3, 3)),
@@ -73,36 +71,30 @@ def results() -> list[Verification]:
         surface_distance=np.array([0.02, 0.0, 0.0]),
         seconds={"surface": 0.001},
     )
-    fit = WristFit(
-        X_OG=X_OG,
-        spread=0.25,
-        closing=np.array([0.5, 0.6, 0.7]),
-        objective=1e-6,
-        residual=np.array([0.0, 1e-3, 1 / 3]),
-        normal_error=np.deg2rad([1.0, 2.0, 60.0]),
-        status=0,
-        message="Optimization terminated successfully",
-        iterations=12,
-        evaluations=15,
-    )
-    pregrasp = Pregrasp(X_OG=X_OG, spread=0.25, closing=np.array([0.1, 0.2, 0.3]))
+    nothing = np.full((3, 3), np.nan)
+    invalid = replace(asked, p_OQ=nothing, nhat_Q_O=nothing, surface_distance=nothing[0])
     trial = some_trial(
         placed.X_TO, contacts(), contacts(), outcome=Outcome.SUCCESS, slip=0.002, turn=0.01
     )
-    judged = replace(off, epsilon=0.1, smallest_friction=0.5)
-    unreachable = replace(judged, outcome=Outcome.UNREACHABLE, smallest_friction=np.inf, fit=fit)
+    judged = replace(asked, epsilon=0.1, smallest_friction=0.5)
+    missing = replace(trial, outcome=Outcome.MISSING_FINGERTIP, closed=None, lift=None)
+    no_contacts = np.full(3, np.nan)
+    missed = replace(
+        judged,
+        outcome=Outcome.MISSING_FINGERTIP,
+        smallest_friction=np.inf,
+        hints=("points in millimetres instead of metres",),
+        tries=(some_try(missing, contact_error=no_contacts, normal_error=no_contacts),),
+    )
     held = replace(
         judged,
         outcome=Outcome.SUCCESS,
         reason="every fingertip holds it",
-        fit=fit,
-        tries=2,
-        pregrasp=pregrasp,
-        trial=trial,
-        contact_error=np.array([0.001, 0.002, 0.003]),
+        tries=(some_try(trial), some_try(missing)),
+        normalised=True,
     )
     by_forces = replace(judged, method="forces", outcome=Outcome.SUCCESS, forces=some_forces())
-    return [held, by_forces, unreachable, off]
+    return [held, by_forces, missed, invalid]
 
 
 @pytest.fixture(scope="module")
@@ -122,16 +114,24 @@ def lines_of(found: list[Verification]) -> list[dict[str, Any]]:
 
 
 def test_a_line_says_all_of_a_grasp_in_strict_json(found: list[Verification]) -> None:
-    held, by_forces, unreachable, off = lines_of(found)
-    assert [line["index"] for line in (held, by_forces, unreachable, off)] == [0, 1, 2, 3]
-    assert [line["outcome"] for line in (held, by_forces, unreachable, off)] == [
+    held, by_forces, missed, invalid = lines_of(found)
+    assert [line["index"] for line in (held, by_forces, missed, invalid)] == [0, 1, 2, 3]
+    assert [line["outcome"] for line in (held, by_forces, missed, invalid)] == [
         "success",
         "success",
-        "unreachable",
-        "off_surface",
+        "missing_fingertip",
+        "invalid",
     ]
     assert held["object"] == "чашка"
-    assert held["success"] is True
+    verdict = {name: held[name] for name in ("success", "held", "held_any", "sample")}
+    assert verdict == {"success": True, "held": True, "held_any": True, "sample": True}
+    assert (held["removal"], missed["removal"]) == ("kept", None)
+    assert held["unjudged"] == ["not_seen", "flat_depth", "outlier"]
+    assert (held["tries"], held["outcomes"]) == (2, ["success", "missing_fingertip"])
+    assert held["contact_error"] == [0.001, 0.002, 0.003]
+    assert held["normal_error_deg"] == pytest.approx([3.0, 4.0, 5.0])
+    assert (held["normalised"], missed["normalised"]) == (True, False)
+    assert missed["hints"] == ["points in millimetres instead of metres"]
     assert held["X_OG"] == X_OG.tolist()
     assert held["closed"]["touching"] == [True, False, True]
     assert held["closed"]["p_OQ"][1] == [None, None, None]
@@ -146,17 +146,21 @@ def test_a_line_says_all_of_a_grasp_in_strict_json(found: list[Verification]) ->
     assert held["forces"] is None
     assert by_forces["forces"]["selected_angle_deg"] == pytest.approx([1.0, 2.0, 3.0])
     assert by_forces["closed"] is None
-    assert unreachable["normal_error_deg"] == pytest.approx([1.0, 2.0, 60.0])
-    assert unreachable["smallest_friction"] is None
-    can_hold = [line["friction_can_hold"] for line in (held, unreachable, off)]
+    assert missed["fit_normal_error_deg"] == pytest.approx([1.0, 2.0, 60.0])
+    assert missed["contact_error"] == [None, None, None]
+    assert missed["smallest_friction"] is None
+    can_hold = [line["friction_can_hold"] for line in (held, missed, invalid)]
     assert can_hold == [True, False, None]
-    assert (off["X_OG"], off["spread"], off["epsilon"], off["slip"]) == (None, None, None, None)
-    assert off["seconds"] == {"surface": 0.001}
+    nothing = ("X_OG", "spread", "epsilon", "slip", "contact_error", "normal_error_deg")
+    assert [invalid[name] for name in nothing] == [None] * len(nothing)
+    assert invalid["p_OQ"] == [[None] * 3] * 3
+    assert invalid["reason"] == "number 1 is nan, not finite"
+    assert invalid["seconds"] == {"surface": 0.001}
 
 
 def test_numbers_are_short(found: list[Verification]) -> None:
     (held, *_) = lines_of(found)
-    assert held["residual"] == [0.0, 0.001, 0.333333]
+    assert held["fit_residual"] == [0.0, 0.001, 0.333333]
 
 
 def test_every_field_is_written_and_reads_back(found: list[Verification], tmp_path: Path) -> None:
@@ -171,14 +175,20 @@ def test_every_field_is_written_and_reads_back(found: list[Verification], tmp_pa
             assert field.dtype == "str" or dataset.dtype == np.dtype(field.dtype)
             assert dataset.attrs["unit"] == field.unit
         columns = {name: dataset[:] for name, dataset in group.items()}
+        group_texts = {"hints": group["hints"].asstr()[:].tolist()}
         assert group["object"].asstr()[0] == "чашка"
         assert file.attrs["schema_version"] == SCHEMA_VERSION
         assert {f"convention_{key}" for key in CONVENTIONS} <= set(file.attrs)
         assert json.loads(file.attrs["config"]) == CONFIG.to_dict()
         assert json.loads(file.attrs["versions"])["drake"]
     held = found[0]
-    assert columns["outcome"].tolist() == [0, 0, 13, 14]
-    for name in ("p_OQ", "nhat_Q_O", "surface_distance", "epsilon", "smallest_friction", "tries"):
+    assert columns["outcome"].tolist() == [0, 0, 5, 17]
+    assert columns["held_any"].tolist() == [True, True, False, False]
+    assert columns["tries"].tolist() == [2, 0, 1, 0]
+    assert group_texts["hints"] == ["", "", "points in millimetres instead of metres", ""]
+    assert columns["contact_error"][0].tolist() == [0.001, 0.002, 0.003]
+    assert np.isnan(columns["contact_error"][1:]).all()
+    for name in ("p_OQ", "nhat_Q_O", "surface_distance", "epsilon", "smallest_friction", "success"):
         assert np.array_equal(columns[name], [getattr(v, name) for v in found], equal_nan=True)
     assert np.array_equal(columns["X_OG"][0], pack_pose(X_OG))
     assert np.array_equal(columns["closed_q"][0], held.trial.closed.q)
