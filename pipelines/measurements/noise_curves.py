@@ -210,11 +210,13 @@ def draw(curves: dict[str, Any], path: Path) -> None:
     shades = plt.get_cmap("viridis")(np.linspace(0.0, 0.9, len(curves["raw"])))
     for point, colour in zip(curves["raw"], shades, strict=True):
         d = [*WITHIN[:-1], 60.0]
-        share = [count / point["grasps"] for count in point["held within d"].values()]
-        within.plot(d, share, "o-", markersize=3, color=colour, label=f"{point['noise']:g} mm")
+        each_d = [count / point["grasps"] for count in point["held within d"].values()]
+        within.plot(d, each_d, "o-", markersize=3, color=colour, label=f"{point['noise']:g} mm")
     within.set(xlabel="distance d of the contacts reached [mm]")
     within.set_xticks([5, 10, 20, 40, 60], ["5", "10", "20", "40", "any"])
-    within.legend(frameon=False, title="σ", fontsize=8, loc="lower right")
+    within.legend(
+        frameon=False, title="σ", fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5)
+    )
     for axes, title in (
         (points, "points"), (normals, "normals"), (within, "held within d, as predicted"),
     ):  # fmt: skip
