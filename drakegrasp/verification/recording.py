@@ -1,4 +1,4 @@
-"""Recordings of verifications: a trial, a lift by forces, or a grasp that was not simulated.
+"""Recordings of verifications: a trial, a lift by forces, or an object whose grasp is none.
 
 In: a `Verification`. Out: an HTML file, see `visualization.recording`.
 """
@@ -13,8 +13,7 @@ from pydrake.geometry import Cylinder, Meshcat, MeshcatCone
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
-from drakegrasp.hand.description import load_hand
-from drakegrasp.simulation.construction import build_object_scene, build_scene
+from drakegrasp.simulation.construction import build_object_scene
 from drakegrasp.simulation.scene import ObjectScene
 from drakegrasp.verification.forces.contact_forces import hand_contacts
 from drakegrasp.verification.forces.lift import ForceLift, lift_by_forces
@@ -28,7 +27,6 @@ from drakegrasp.visualization.recording import (
     record_html,
     rgba,
     show_object,
-    show_start,
 )
 from drakegrasp.visualization.style import REACHED
 
@@ -40,10 +38,9 @@ LARGEST_FORCE = 0.08
 
 
 def record_verification(verified: Verification, path: Path) -> None:
-    """Write a recording of a verification, which is simulated again for it.
+    """Write a recording of a verification, which is simulated again for it, with its explanation.
 
-    A grasp that was not simulated is shown at rest, with the hand at the palm pose that comes
-    closest to the contacts, if there is one.
+    The trial is that of the first wrist pose. A row that is no grasp shows the object at rest.
 
     Args:
         verified: The verdict.
@@ -55,7 +52,7 @@ def record_verification(verified: Verification, path: Path) -> None:
     if verified.lift is not None:
         record_lift(verified, path)
     elif verified.pregrasp is None:
-        _record_still(verified, path)
+        _record_object(verified, path)
     else:
         record_attempt(
             verified.placed.model,
@@ -65,6 +62,7 @@ def record_verification(verified: Verification, path: Path) -> None:
             path,
             p_OQ=verified.p_OQ,
             nhat_Q_O=verified.nhat_Q_O,
+            caption=verified.explain(),
         )
 
 
@@ -98,24 +96,18 @@ def record_lift(verified: Verification, path: Path) -> ForceLift:
         draw_predicted(meshcat, verified.p_OQ, verified.nhat_Q_O)
         return lift
 
-    return record_html(run, path)
+    return record_html(run, path, verified.explain())
 
 
-def _record_still(verified: Verification, path: Path) -> None:
-    """Write a recording of the object, the predicted contacts and the hand of a fit, at rest."""
-    model, X_TO = verified.placed.model, verified.placed.X_TO_simulated
-    config, fit = verified.config, verified.fit
+def _record_object(verified: Verification, path: Path) -> None:
+    """Write a recording of the object at rest."""
+    placed, config = verified.placed, verified.config
 
     def run(meshcat: Meshcat) -> None:
-        if fit is None:
-            alone = build_object_scene(model, config.physics, meshcat=meshcat)
-            show_object(meshcat, alone, X_TO, config)
-        else:
-            scene = build_scene(model, config.physics, load_hand(config.hand), meshcat=meshcat)
-            show_start(meshcat, scene, X_TO, config, fit.X_OG, fit.spread, fit.closing)
-        draw_predicted(meshcat, verified.p_OQ, verified.nhat_Q_O)
+        scene = build_object_scene(placed.model, config.physics, meshcat=meshcat)
+        show_object(meshcat, scene, placed.X_TO_simulated, config)
 
-    record_html(run, path)
+    record_html(run, path, verified.explain())
 
 
 class _ForceArrows:
