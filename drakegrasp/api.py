@@ -367,7 +367,9 @@ def _verify_as_before(
         given = {"mesh": mesh, "X_TC": X_TC, **{n: options.pop(n, None) for n in names}}
         for key, value in given.items():
             if value is not None:
-                raise GraspError(f"{key} must be None with a dataset, which defines it, got a value")
+                raise GraspError(
+                    f"{key} must be None with a dataset, which defines it, got a value"
+                )
         return verify_rows(dataset, grasps, rows, frame=frame or "camera", **options)
     if mesh is None:
         raise GraspError("a mesh or a dataset must be given, got neither")
@@ -427,9 +429,7 @@ def _verify_on(
         with admitted_workers(client, grasps[0].config):
             tasks = TASKS_PER_WORKER * max(len(client.nthreads()), 1)
             together = min(max(len(grasps) // tasks, 1), MOST_TOGETHER)
-            return verify_batch(
-                grasps, DaskExecutor(client), report, on_result, together=together
-            )
+            return verify_batch(grasps, DaskExecutor(client), report, on_result, together=together)
 
 
 def _refuse_workers(

@@ -160,19 +160,21 @@ def test_object_goes_to_a_worker_with_many_grasps_and_does_not_come_back(
 
 def test_row_knows_the_frames_of_both_cameras(test_split: GraspDataset) -> None:
     """A grasp in the frame of the other camera is tried as it is, and gets a hint."""
-    other = GraspDataset(
-        test_split.path.with_name("grasping_otm.hdf5"), split=test_split.split
-    )
+    other = GraspDataset(test_split.path.with_name("grasping_otm.hdf5"), split=test_split.split)
     rows = list(range(len(test_split)))
     placed = place_on_rows(other.column("grasps"), test_split, rows)
     hints = [
-        find_hints(g.placed.model, load_hand("barrett"), g.p_OQ, g.nhat_Q_O, X_OA=g.X_OA, X_OB=g.X_OB)
+        find_hints(
+            g.placed.model, load_hand("barrett"), g.p_OQ, g.nhat_Q_O, X_OA=g.X_OA, X_OB=g.X_OB
+        )
         for g in placed
     ]
     assert any("the frame of the dataset's other camera" in each for each in hints)
     own = place_on_rows(test_split.column("grasps"), test_split, rows)
     assert not any(
-        find_hints(g.placed.model, load_hand("barrett"), g.p_OQ, g.nhat_Q_O, X_OA=g.X_OA, X_OB=g.X_OB)
+        find_hints(
+            g.placed.model, load_hand("barrett"), g.p_OQ, g.nhat_Q_O, X_OA=g.X_OA, X_OB=g.X_OB
+        )
         for g in own
     )
 

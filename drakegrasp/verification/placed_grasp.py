@@ -38,6 +38,7 @@ from drakegrasp.simulation.placement import (
 from drakegrasp.verification.prediction import GraspRows, frame_poses, read_grasps
 from drakegrasp.verification.verify import METHODS, PlacedGrasp
 
+
 def place_on_object(
     grasps: npt.ArrayLike,
     placed: PlacedObject,

@@ -161,9 +161,7 @@ def _lift_by_hand(base: Verification) -> Verification:
     config, X_TO = base.config, base.placed.X_TO_simulated
     hand = load_hand(config.hand)
     with timed(base.seconds, "fit"):
-        fits = fit_wrist(
-            hand, base.p_OQ, base.nhat_Q_O, up_O=X_TO[2, :3], height=float(X_TO[2, 3])
-        )
+        fits = fit_wrist(hand, base.p_OQ, base.nhat_Q_O, up_O=X_TO[2, :3], height=float(X_TO[2, 3]))
     with timed(base.seconds, "simulate"):
         # Two contacts leave the palm's turn about their line open, and most of these poses are
         # within the object or the table: the first that is clear is the first pose.

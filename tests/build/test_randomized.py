@@ -103,9 +103,7 @@ def test_grasps_are_verified_with_their_own_friction_and_mass(randomized: Path) 
     data = GraspDataset(randomized / "grasping_oto.hdf5", split="train")
     rows = [0, 1]
     grasps = np.array([data[row].grasp for row in rows])
-    for row, verdict in zip(
-        rows, verify_rows(data, grasps, rows, method="forces"), strict=True
-    ):
+    for row, verdict in zip(rows, verify_rows(data, grasps, rows, method="forces"), strict=True):
         props, conditions = data[row].props, data[row].conditions
         assert verdict.placed.model.mass == pytest.approx(float(props["work2mass"][0]))
         physics = verdict.config.physics

@@ -189,7 +189,9 @@ def test_last_panel_shows_the_last_instant(
 @needs_egl
 def test_row_that_is_no_grasp_shows_the_object_alone(verified: Callable[..., Verification]) -> None:
     nothing = np.full((3, 3), np.nan)
-    row = verified(outcome=Outcome.INVALID, reason="number 1 is nan", p_OQ=nothing, nhat_Q_O=nothing)
+    row = verified(
+        outcome=Outcome.INVALID, reason="number 1 is nan", p_OQ=nothing, nhat_Q_O=nothing
+    )
     figure = verification_figure(row)
     assert texts_of(figure) == ["1_box_a  fails: invalid", "number 1 is nan"]
     assert [dots_of(figure, panel) for panel in (0, 1)] == [{}, {}]

@@ -13,7 +13,6 @@ from threadpoolctl import threadpool_limits
 
 import drakegrasp as dg
 from drakegrasp.config import Config
-from drakegrasp.errors import GraspError
 from drakegrasp.frames import X_WT, invert_pose, make_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config, override_config
