@@ -151,9 +151,6 @@ split:
   test_fraction: 0.2
   train_classes: [mug, bottle]
 verify:
-  max_surface_distance: 0.02
-  max_residual: 0.005
-  max_normal_error_deg: 30.0
   max_contact_error: 0.015
   open_margin_deg: 10.0
   max_tries: 3
@@ -563,3 +560,20 @@ def test_simulation_hash_is_that_of_the_value_not_of_its_spelling() -> None:
     two = load_config(overrides=["objects.mass=2.0", "candidates.standoffs=[1.0, 2e0]"])
     assert one.simulation_hash() == two.simulation_hash()
     assert re.fullmatch(r"[0-9a-f]{16}", one.simulation_hash())
+
+
+def test_limits_of_the_version_before_are_left_out_with_a_warning() -> None:
+    with pytest.warns(FutureWarning, match="verify.max_residual has no effect any more"):
+        config = load_config(overrides=["verify.max_residual=0.005"])
+    assert config == load_config()
+
+
+def test_limits_in_a_file_of_the_version_before_do_not_count() -> None:
+    """There, `max_contact_error` decided what is tried, too."""
+    tree = load_config().to_dict()
+    tree["verify"] |= {"max_residual": 0.008, "max_contact_error": 0.01, "max_tries": 3}
+    stored = parse_stored(tree)
+    assert stored.verify.max_contact_error == 0.02
+    assert stored.verify.max_tries == 3
+    tree["verify"].pop("max_residual")
+    assert parse_stored(tree).verify.max_contact_error == 0.01

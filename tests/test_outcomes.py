@@ -25,6 +25,7 @@ TABLE = [
     ("off_surface", 14, PLACED, False),
     ("moved", 15, LIFTED, False),
     ("not_lifted", 16, CLOSED, False),
+    ("invalid", 17, PLACED, False),
 ]
 
 
@@ -38,7 +39,11 @@ def test_stages_are_ordered_and_frozen() -> None:
 
 
 def test_no_file_of_a_dataset_holds_what_only_verification_tells() -> None:
-    assert {o.label for o in Outcome if o.verification_only} == {"unreachable", "off_surface"}
+    assert {o.label for o in Outcome if o.verification_only} == {
+        "unreachable",
+        "off_surface",
+        "invalid",
+    }
 
 
 def test_no_verification_ends_a_lift_early() -> None:

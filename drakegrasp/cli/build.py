@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from drakegrasp.cli.errors import say
+from drakegrasp.cli.errors import say, say_json
 from drakegrasp.cli.options import (
     FILE,
     PATH,
@@ -128,12 +128,18 @@ def merge(into: Path, outs: tuple[Path, ...], workers: int | None) -> None:
 
 @click.command()
 @dataset_argument()
-def stats(out: Path) -> None:
+@shared("--json")
+def stats(out: Path, as_json: bool) -> None:
     """Count outcomes, how well grasps hold, and samples.
 
     While a build runs, or after it was stopped, the command counts what is done so far.
     """
-    print_stats(out)
+    from drakegrasp.dataset.statistics import counts_as_dict
+
+    if as_json:
+        say_json(counts_as_dict(out))
+    else:
+        print_stats(out)
 
 
 def print_stats(out: Path) -> None:

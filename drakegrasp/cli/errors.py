@@ -7,10 +7,11 @@ What they print has no control characters, whatever names are in it.
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any, NoReturn
@@ -46,6 +47,11 @@ def say(text: str, *, err: bool = False) -> None:
         err: Whether to print to standard error.
     """
     click.echo("\n".join(map(printable, text.split("\n"))), err=err)
+
+
+def say_json(document: Mapping[str, Any]) -> None:
+    """Print a document of strict JSON on one line."""
+    click.echo(json.dumps(document, allow_nan=False))
 
 
 class OneCommand(click.Command):

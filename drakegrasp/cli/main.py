@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from drakegrasp import __version__
 from drakegrasp.cli.audit import audit
 from drakegrasp.cli.bench import bench
 from drakegrasp.cli.build import assemble, build, merge, stats
-from drakegrasp.cli.errors import Commands, say, say_finding
+from drakegrasp.cli.errors import Commands, say, say_finding, say_json
 from drakegrasp.cli.export import export
 from drakegrasp.cli.hand import hand
 from drakegrasp.cli.inspect import figures, inspect_
@@ -90,8 +91,8 @@ def export_objects(directory: Path, **options: Any) -> None:
 
 @click.command()
 @dataset_argument("path", "OUT|FILE")
-@shared("--workers")
-def check(path: Path, workers: int | None) -> None:
+@shared("--workers", "--json")
+def check(path: Path, workers: int | None, as_json: bool) -> None:
     """Check every invariant of a dataset.
 
     OUT is a dataset's directory; FILE is one of its three main files. Exit code 1 if an
@@ -103,9 +104,12 @@ def check(path: Path, workers: int | None) -> None:
 
     with processes(workers) as execute, progress_bar("check", "steps") as progress:
         violations = check_dataset(path, execute=execute, progress=progress)
-    for violation in violations:
-        say(str(violation))
-    say(f"{path}: {len(violations) or 'no'} broken invariants")
+    if as_json:
+        say_json({"path": str(path), "broken": [asdict(violation) for violation in violations]})
+    else:
+        for violation in violations:
+            say(str(violation))
+        say(f"{path}: {len(violations) or 'no'} broken invariants")
     if violations:
         sys.exit(1)
 

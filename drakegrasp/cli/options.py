@@ -124,7 +124,10 @@ _TABLE = {
         type=FILE,
     ),
     "--quiet": _row(None, "Show no progress.", is_flag=True),
+    "--json": _row(None, "Print one document of JSON, and nothing else.", is_flag=True),
 }
+#: Options whose parameters have other names.
+_PARAMETERS = {"--set": "overrides", "--json": "as_json"}
 #: The options of the table that stand for `--set KEY=VALUE`, and their keys.
 SETTINGS = {
     "--per-class": "builtin.per_class",
@@ -148,13 +151,13 @@ def shared(*names: str, **changes: Any) -> Callable[[F], F]:
     """Give a command options of the table, which its help lists in this order.
 
     Args:
-        names: Of the options; `--set` becomes the parameter `overrides`.
+        names: Of the options; their parameters have the same names but for `_PARAMETERS`.
         changes: What click shall know of them otherwise than the table says.
     """
 
     def give(command: F) -> F:
         for name in reversed(names):
-            words = (name, "overrides") if name == "--set" else (name,)
+            words = (name, _PARAMETERS[name]) if name in _PARAMETERS else (name,)
             command = click.option(*words, **(_TABLE[name] | changes))(command)
         return command
 

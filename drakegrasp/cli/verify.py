@@ -79,12 +79,14 @@ if TYPE_CHECKING:
 )
 @shared("--workers", "--scheduler", "--scheduler-file")
 @shared("--quiet", help="Show neither progress nor the table.")
+@shared("--json", help="Print the lines of JSON also with --out, and nothing else.")
 def verify(
     out: Path | None,
     workers: int | None,
     scheduler: str | None,
     scheduler_file: Path | None,
     quiet: bool,
+    as_json: bool,
     **options: Any,
 ) -> None:
     """Try predicted grasps in the simulator.
@@ -122,7 +124,13 @@ def verify(
     def print_line(index: int, result: Verification) -> None:
         write_json_line(index, result, sys.stdout)
 
+    def deliver(index: int, result: Verification) -> None:
+        write(index, result)
+        if as_json and out is not None:
+            print_line(index, result)
+
     # Lines are written as verdicts arrive, so an interrupted run leaves those that are done.
+    quiet = quiet or as_json
     try:
         with nullcontext(print_line) if out is None else json_lines(out) as write:
             results = run_verification(
@@ -130,7 +138,7 @@ def verify(
                 workers=workers,
                 scheduler=scheduler,
                 scheduler_file=scheduler_file,
-                on_result=write,
+                on_result=deliver,
                 show=not quiet,
             )
             if out is not None:
@@ -140,7 +148,7 @@ def verify(
             say(f"{part_path(out)}: the verdicts so far", err=True)
         raise
 
-    for path in () if out is None else result_paths(out):
+    for path in () if out is None or as_json else result_paths(out):
         say(str(path))
     if not quiet:
         make_console(stderr=True).print(verdict_table(results))

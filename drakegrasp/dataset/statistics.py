@@ -5,9 +5,10 @@ While a build runs, or after it was stopped, the funnel is counted from the shar
 
 from __future__ import annotations
 
+import math
 import os
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ import numpy.typing as npt
 
 from drakegrasp.dataset.assembly.survey import shards_sha256
 from drakegrasp.dataset.assembly.weights import effective_number
-from drakegrasp.dataset.hdf5 import open_hdf5, read_names
+from drakegrasp.dataset.hdf5 import AnyArray, open_hdf5, read_names
 from drakegrasp.dataset.layout.opening import open_samples, open_trials
 from drakegrasp.dataset.layout.trial_files import NONE, shard_part
 from drakegrasp.dataset.manifest import read_manifest, refuse_older
@@ -319,3 +320,36 @@ def splits_of(path: Path) -> list[SplitCount]:
 def _effective(group: h5py.Group) -> float:
     weights = group.get("grasp_props/weight")
     return np.nan if weights is None else effective_number(weights[:])
+
+
+def counts_as_dict(out: Path) -> dict[str, Any]:
+    """Return the counts of a dataset in types of JSON; labels without a count are left out.
+
+    Args:
+        out: Directory of the dataset; while it is built, the work units that are done count.
+
+    Raises:
+        DataError: If there is no dataset, or a file cannot be read.
+    """
+    unfinished = count_unfinished(out)
+    funnel = count_funnel(out) if unfinished is None else unfinished.funnel
+
+    def labelled(members: type[Outcome] | type[Removal], counts: AnyArray) -> dict[str, int]:
+        return {each.label: int(counts[each]) for each in members if counts[each]}
+
+    objects = [
+        {
+            "name": name,
+            "class": funnel.classes[i],
+            **{key: int(getattr(funnel, key)[i]) for key in ("candidates", "distinct", "valid")},
+            "outcomes": labelled(Outcome, funnel.outcomes[i]),
+            **{key: int(getattr(funnel, key)[i]) for key in ("precision", "stable")},
+            "removals": labelled(Removal, funnel.removals[i]),
+        }
+        for i, name in enumerate(funnel.names)
+    ]
+    splits = [] if unfinished else [asdict(split) for split in count_splits(out)]
+    for split in splits:
+        split["effective"] = split["effective"] if math.isfinite(split["effective"]) else None
+    units = {"done": unfinished.done, "total": unfinished.total} if unfinished else None
+    return {"path": str(out), "unfinished": units, "objects": objects, "splits": splits}

@@ -54,6 +54,7 @@ def _sentences(verified: Verification) -> Iterator[str]:
 
 def _contacts(verified: Verification) -> Iterator[str]:
     """Yield how well the hand makes the contacts that were asked for."""
+    # Before closing, as the fit leaves them.
     fit, limit = verified.fit, verified.config.verify.max_contact_error
     assert fit is not None and verified.contact_error is not None
     yield (
@@ -63,6 +64,8 @@ def _contacts(verified: Verification) -> Iterator[str]:
     )
     if np.isnan(verified.farthest_contact):
         return
+
+    # After closing, and whether that is a success.
     angle = np.rad2deg(np.nanmax(np.append(verified.normal_error, 0.0)))
     yield (
         f"After closing, they touch the object within {in_mm(verified.farthest_contact)} of the "

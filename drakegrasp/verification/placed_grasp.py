@@ -192,11 +192,13 @@ def _placed(
     config: Config,
 ) -> list[PlacedGrasp]:
     """Return the grasps of one object: those of the rows with the given indices."""
+    # The frame of the numbers in {O}, and that of the other camera.
     count = len(indices)
     X_OA = frame_poses(frame=frame, X_TC=X_TC, X_TO=placed.X_TO, count=count)
     X_OB = None
     if X_TC_other is not None:
         X_OB = frame_poses(frame=frame, X_TC=X_TC_other, X_TO=placed.X_TO, count=count)
+
     return [
         PlacedGrasp(
             index=int(index),

@@ -1,4 +1,4 @@
-"""Recordings of verifications: a trial, or a grasp that was not simulated.
+"""Recordings of verifications: a trial, or an object that no hand was tried on.
 
 In: a `Verification`. Out: an HTML file, see `visualization.recording`.
 """
@@ -10,14 +10,12 @@ from typing import TYPE_CHECKING
 
 from pydrake.geometry import Meshcat
 
-from drakegrasp.hand.description import load_hand
-from drakegrasp.simulation.construction import build_object_scene, build_scene
+from drakegrasp.simulation.construction import build_object_scene
 from drakegrasp.visualization.recording import (
     draw_predicted,
     record_attempt,
     record_html,
     show_object,
-    show_start,
 )
 
 if TYPE_CHECKING:
@@ -25,10 +23,9 @@ if TYPE_CHECKING:
 
 
 def record_verification(verified: Verification, path: Path) -> None:
-    """Write a recording of a verification, which is simulated again for it.
+    """Write a recording of a verification, which is simulated again for it, with its explanation.
 
-    A grasp that was not simulated is shown at rest, with the hand at the palm pose that comes
-    closest to the contacts, if there is one.
+    The trial is that of the first wrist pose. A row that is no grasp shows the object at rest.
 
     Args:
         verified: The verdict.
@@ -38,7 +35,7 @@ def record_verification(verified: Verification, path: Path) -> None:
         OSError: If the file cannot be written.
     """
     if verified.pregrasp is None:
-        _record_still(verified, path)
+        _record_object(verified, path)
     else:
         record_attempt(
             verified.placed.model,
@@ -48,21 +45,18 @@ def record_verification(verified: Verification, path: Path) -> None:
             path,
             p_OQ=verified.p_OQ,
             nhat_Q_O=verified.nhat_Q_O,
+            caption=verified.explain(),
         )
 
 
-def _record_still(verified: Verification, path: Path) -> None:
-    """Write a recording of the object, the predicted contacts and the hand of a fit, at rest."""
-    model, X_TO = verified.placed.model, verified.placed.X_TO_simulated
-    config, fit = verified.config, verified.fit
+def _record_object(verified: Verification, path: Path) -> None:
+    """Write a recording of the object at rest, with the contacts that forces were judged at."""
+    placed, config = verified.placed, verified.config
 
     def run(meshcat: Meshcat) -> None:
-        if fit is None:
-            alone = build_object_scene(model, config.physics, meshcat=meshcat)
-            show_object(meshcat, alone, X_TO, config)
-        else:
-            scene = build_scene(model, config.physics, load_hand(config.hand), meshcat=meshcat)
-            show_start(meshcat, scene, X_TO, config, fit.X_OG, fit.spread, fit.closing)
-        draw_predicted(meshcat, verified.p_OQ, verified.nhat_Q_O)
+        scene = build_object_scene(placed.model, config.physics, meshcat=meshcat)
+        show_object(meshcat, scene, placed.X_TO_simulated, config)
+        if verified.forces is not None:
+            draw_predicted(meshcat, verified.p_OQ, verified.nhat_Q_O)
 
-    record_html(run, path)
+    record_html(run, path, verified.explain())

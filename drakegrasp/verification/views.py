@@ -167,7 +167,9 @@ def _hand_view(
 
 def _predicted(verified: Verification) -> Marks:
     """Return the predicted contacts, with arrows along their normals."""
-    p, n = verified.p_OQ, verified.nhat_Q_O
+    # A row that is no grasp has none.
+    there = np.isfinite(verified.p_OQ).all(axis=1)
+    p, n = verified.p_OQ[there], verified.nhat_Q_O[there]
     return Marks(
         kind="predicted",
         colour=PREDICTED,

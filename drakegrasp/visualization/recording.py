@@ -10,6 +10,7 @@ from __future__ import annotations
 import gc
 import logging
 from collections.abc import Callable
+from html import escape
 from pathlib import Path
 from typing import TypeVar
 
@@ -36,6 +37,12 @@ Result = TypeVar("Result")
 OBJECT_PATH = "visualizer/object/object"
 #: Radius of a contact's dot, length and radius of the arrow along its normal [m].
 DOT, ARROW, SHAFT = 0.004, 0.03, 0.0012
+#: A text over the picture, in the lower left corner.
+CAPTION = (
+    '<p style="position:fixed;left:1em;bottom:4em;z-index:9;max-width:34em;margin:0;'
+    "padding:.6em .8em;font:14px/1.4 sans-serif;color:#222;background:#fffc;"
+    'border-radius:4px;pointer-events:none">{}</p>'
+)
 #: Length and radius of an arrow's head [m].
 HEAD, HEAD_RADIUS = 0.009, 0.0035
 #: Direction of the camera: azimuth from the palm's side, about the vertical, and elevation [rad].
@@ -55,6 +62,7 @@ def record_attempt(
     p_OQ: Array | None = None,
     nhat_Q_O: Array | None = None,
     is_visible: bool = True,
+    caption: str = "",
 ) -> TrialRecord:
     """Return the result of `trial.run_attempt`, and write a recording of it.
 
@@ -67,6 +75,7 @@ def record_attempt(
         p_OQ: (k, 3), predicted contacts to draw on the object, in {O} [m].
         nhat_Q_O: (k, 3), their outward unit normals in {O}.
         is_visible: Whether the images of the grasp would make a sample.
+        caption: Text in a corner.
 
     Raises:
         OSError: If the file cannot be written.
@@ -80,7 +89,7 @@ def record_attempt(
         draw_predicted(meshcat, p_OQ, nhat_Q_O)
         return record
 
-    return record_html(run, path)
+    return record_html(run, path, caption)
 
 
 def show_start(
@@ -128,12 +137,13 @@ def _aim_camera(
     meshcat.SetCameraPose(middle + DISTANCE * radius * towards, middle)
 
 
-def record_html(run: Callable[[Meshcat], Result], path: Path) -> Result:
+def record_html(run: Callable[[Meshcat], Result], path: Path, caption: str = "") -> Result:
     """Return the result of `run`, and write what it published; nothing is written if it raises.
 
     Args:
         run: Runs a simulation that publishes to the Meshcat it is given.
         path: The HTML file.
+        caption: Text in a corner.
 
     Raises:
         OSError: If the file cannot be written.
@@ -146,7 +156,10 @@ def record_html(run: Callable[[Meshcat], Result], path: Path) -> Result:
         result = run(meshcat)
         meshcat.StopRecording()
         meshcat.PublishRecording()
-        write_atomic(path, meshcat.StaticHtml().encode())
+        text = meshcat.StaticHtml()
+        if caption:
+            text = text.replace("<body>", f"<body>{CAPTION.format(escape(caption))}", 1)
+        write_atomic(path, text.encode())
     finally:
         # The diagram of `run` is in a reference cycle; Meshcat's port closes when it is collected.
         del meshcat

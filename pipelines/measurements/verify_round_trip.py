@@ -20,7 +20,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.api import verify_grasps
+from drakegrasp.api import verify_rows
 from drakegrasp.cluster.connect import connect
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE
@@ -51,9 +51,13 @@ def main(outs: tuple[Path, ...], workers: int, every: int) -> None:
     results: dict[str, dict[str, list[Verification]]] = {}
     with connect(workers) as client:
 
-        def verify(key: str, method: str, grasps: Array, **where: Any) -> None:
+        def verify(
+            key: str, method: str, grasps: Array, data: GraspDataset, rows: list[int], **where: Any
+        ) -> None:
             if len(grasps):
-                verdicts = verify_grasps(grasps, client=client, method=method, show=True, **where)
+                verdicts = verify_rows(
+                    data, grasps, rows, client=client, method=method, show=True, **where
+                )
                 results.setdefault(method, {}).setdefault(key, []).extend(verdicts)
 
         for out in outs:
@@ -66,12 +70,11 @@ def main(outs: tuple[Path, ...], workers: int, every: int) -> None:
                 for method in ("hand", "forces"):
                     for camera in CAMERAS:
                         grasps = data[camera].column("grasps")[rows].astype(float)
-                        verify(camera, method, grasps, dataset=data[camera], rows=rows)
+                        verify(camera, method, grasps, data[camera], rows)
                     held = data["oto"].column("grasps_held")[rows].astype(float)
-                    verify(HELD, method, held, dataset=data["oto"], rows=rows)
+                    verify(HELD, method, held, data["oto"], rows)
                     for key, grasps in spoilt.items():
-                        where = {"dataset": data["oto"], "rows": rows, "frame": "object"}
-                        verify(key, method, grasps, **where)
+                        verify(key, method, grasps, data["oto"], rows, frame="object")
     click.echo(json.dumps({m: figures(by_key) for m, by_key in results.items()}, indent=1))
 
 
@@ -122,16 +125,14 @@ def figures(by_key: dict[str, list[Verification]]) -> dict[str, Any]:
     return {
         "grasps": len(plain),
         "objects": len({v.placed.model.name for v in plain}),
-        "held": share(plain),
-        "held, precision, stable": [
-            float(np.mean([getattr(v, word) for v in plain]))
-            for word in ("held", "precision", "stable")
-        ],
+        "shares": {
+            word: float(np.mean([getattr(v, word) for v in plain]))
+            for word in ("success", "held", "precision", "stable", "sample", "held_any")
+        },
         "contacts at the end of the lift": {
-            "held": share(by_key[HELD]),
+            "success": share(by_key[HELD]),
             "outcomes": dict(Counter(v.outcome.label for v in by_key[HELD])),
         },
-        "held by the first wrist pose": float(np.mean([v.success and v.tries <= 1 for v in plain])),
         "same outcome in all frames": float(
             np.mean([len(set(o)) == 1 for o in zip(*frames, strict=True)])
         ),
@@ -145,7 +146,7 @@ def figures(by_key: dict[str, list[Verification]]) -> dict[str, Any]:
         "failures": [f"{v.placed.model.name}: {v.outcome.label}: {v.reason}" for v in failed],
         "spoilt": {
             key: {
-                "held": share(verdicts),
+                "success": share(verdicts),
                 "outcomes": dict(Counter(v.outcome.label for v in verdicts)),
             }
             for key, verdicts in by_key.items()
@@ -155,7 +156,7 @@ def figures(by_key: dict[str, list[Verification]]) -> dict[str, Any]:
 
 
 def share(verdicts: list[Verification]) -> float:
-    """Return the share of grasps that hold."""
+    """Return the share of successes."""
     return float(np.mean([v.success for v in verdicts]))
 
 

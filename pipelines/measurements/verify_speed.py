@@ -16,7 +16,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from drakegrasp.api import verify_grasps
+from drakegrasp.api import verify_rows
 from drakegrasp.cluster.connect import connect
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.reader import GraspDataset
@@ -36,10 +36,10 @@ def main(out: Path, grasps: int) -> None:
     for workers in (1, 2):
         with connect(workers) as client:
             # The first grasps of each worker also pay for imports and tables.
-            verify_grasps(vectors[:8], dataset=data, rows=rows[:8], client=client)
+            verify_rows(data, vectors[:8], rows[:8], client=client)
 
             start = time.perf_counter()
-            verdicts = verify_grasps(vectors, dataset=data, rows=rows, client=client, show=True)
+            verdicts = verify_rows(data, vectors, rows, client=client, show=True)
             seconds[workers] = time.perf_counter() - start
         if workers == 1:
             for stage in ("surface", "margin", "fit", "simulate"):

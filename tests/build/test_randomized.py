@@ -11,7 +11,7 @@ import pytest
 from helpers.assertions import assert_same_dataset
 from helpers.meshes import SMALL
 
-from drakegrasp.api import verify_grasps
+from drakegrasp.api import verify_rows
 from drakegrasp.build.pipeline import build
 from drakegrasp.build.replay import record_trial, replay_trial
 from drakegrasp.config import Config
@@ -103,9 +103,7 @@ def test_grasps_are_verified_with_their_own_friction_and_mass(randomized: Path) 
     data = GraspDataset(randomized / "grasping_oto.hdf5", split="train")
     rows = [0, 1]
     grasps = np.array([data[row].grasp for row in rows])
-    for row, verdict in zip(
-        rows, verify_grasps(grasps, dataset=data, rows=rows, method="forces"), strict=True
-    ):
+    for row, verdict in zip(rows, verify_rows(data, grasps, rows, method="forces"), strict=True):
         props, conditions = data[row].props, data[row].conditions
         assert verdict.placed.model.mass == pytest.approx(float(props["work2mass"][0]))
         physics = verdict.config.physics

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.hands import write_tongs
 from helpers.machine import needs_egl
 from helpers.objects import CUBE, box_model, from_above, standing
-from helpers.verdicts import some_forces
+from helpers.verdicts import some_fit, some_forces, some_try
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
@@ -61,9 +60,9 @@ def held(scene: Scene, cube: ObjectModel, config: Config) -> TrialRecord:
 def verified(cube: ObjectModel) -> Callable[..., Verification]:
     """Return a function that makes a result, of a grasp that was not tried unless told."""
 
-    def make(**values: object) -> SimpleNamespace:
+    def make(**values: object) -> Verification:
         result: dict[str, object] = {
-            "outcome": Outcome.OFF_SURFACE, "reason": "so it is",
+            "outcome": Outcome.DROPPED, "reason": "so it is",
             "placed": PlacedObject(model=cube, X_TO=standing(cube)),
             "method": "hand", "surface_distance": np.zeros(3),
             "p_OQ": P_OQ, "nhat_Q_O": NHAT_Q_O,
@@ -97,7 +96,7 @@ def test_contacts_on_opposite_sides_are_each_seen_once(
     # What the object stands on is seen from nowhere.
     assert not first["predicted 2"]
     assert not second["predicted 2"]
-    assert texts_of(figure) == ["1_box_a  fails: off surface", "so it is"]
+    assert texts_of(figure) == ["1_box_a  fails: dropped", "so it is"]
     save_figure(figure, tmp_path / "figure.png", dpi=50)
     assert imread(tmp_path / "figure.png").std() > 0.1
 
@@ -107,20 +106,17 @@ def test_hand_whose_link_is_called_palm_is_shown(
     verified: Callable[..., Verification], cube: ObjectModel, tmp_path: Path
 ) -> None:
     """The hand of the tutorial, over the cube."""
-    fit = SimpleNamespace(
-        X_OG=from_above(cube, 0.06).X_OG,
-        spread=0.0,
-        closing=np.full(2, 0.1),
-        residual=np.zeros(2),
-        normal_error=np.zeros(2),
-    )
+    X_OG = from_above(cube, 0.06).X_OG
+    trial = TrialRecord(outcome=Outcome.START_COLLISION, X_TO=standing(cube), X_OG=X_OG)
+    nothing = np.full(2, np.nan)
+    fit = some_fit(X_OG, spread=0.0, closing=np.full(2, 0.1), residual=np.zeros(2))
     result = verified(
         config=load_config(hand=str(write_tongs(tmp_path))),
-        outcome=Outcome.UNREACHABLE,
+        outcome=Outcome.START_COLLISION,
         surface_distance=np.zeros(2),
         p_OQ=P_OQ[:2],
         nhat_Q_O=NHAT_Q_O[:2],
-        fit=fit,
+        tries=(some_try(trial, fit=fit, contact_error=nothing, normal_error=nothing),),
     )
     figure = result.figure()
     assert [axes.get_title(loc="left") for axes in figure.axes][2].startswith("the hand where")
@@ -136,7 +132,7 @@ def test_dots_are_on_the_object_and_its_hand_is_shown(
     assert held.lift is not None
     result = verified(
         outcome=Outcome.SUCCESS,
-        trial=held,
+        tries=(some_try(held),),
         p_OQ=held.closed.contacts.p_OQ,
         nhat_Q_O=held.closed.contacts.nhat_Q_O,
     )
@@ -144,6 +140,8 @@ def test_dots_are_on_the_object_and_its_hand_is_shown(
     assert texts_of(figure)[0] == f"1_box_a  {result.words}"
     assert result.words.startswith("held")
     line = texts_of(figure)[1].splitlines()[1]
+    assert line == "contacts within 3.0 mm of those asked for (success: 20 mm)"
+    line = texts_of(figure)[1].splitlines()[2]
     assert f"slip {1e3 * held.lift.slip:.1f} mm, turn {np.rad2deg(held.lift.turn):.1f}°" in line
     assert line.endswith(f"other links at the end: {held.lift.contacts.other_links}")
     assert [axes.get_title(loc="left") for axes in figure.axes][2] == "end of the lift, with forces"
@@ -171,14 +169,25 @@ def test_last_panel_shows_the_last_instant(
     verified: Callable[..., Verification], held: TrialRecord, cube: ObjectModel, config: Config
 ) -> None:
     closed = replace(held, lift=None)
-    fit = SimpleNamespace(X_OG=held.X_OG, spread=0.0, closing=np.full(3, 1.0))
+    placed = replace(closed, outcome=Outcome.START_COLLISION, closed=None)
     for values, title in (
-        ({"trial": closed, "fit": fit}, "after closing"),
-        ({"fit": fit}, "the hand where it comes closest"),
+        ({"tries": (some_try(closed),)}, "after closing"),
+        ({"tries": (some_try(placed),)}, "the hand where it comes closest"),
     ):
         figure = verification_figure(verified(**values))
         assert figure.axes[2].get_title(loc="left") == title
     assert len(verification_figure(verified(forces=some_forces())).axes) == 2
+
+
+@needs_egl
+def test_row_that_is_no_grasp_shows_the_object_alone(verified: Callable[..., Verification]) -> None:
+    nothing = np.full((3, 3), np.nan)
+    row = verified(
+        outcome=Outcome.INVALID, reason="number 1 is nan", p_OQ=nothing, nhat_Q_O=nothing
+    )
+    figure = verification_figure(row)
+    assert texts_of(figure) == ["1_box_a  fails: invalid", "number 1 is nan"]
+    assert [dots_of(figure, panel) for panel in (0, 1)] == [{}, {}]
 
 
 @pytest.mark.parametrize("friction", [0.71, 0.1])

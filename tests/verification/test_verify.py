@@ -206,7 +206,7 @@ def test_fingertips_that_touch_count_where_another_need_not(held: dg.Verificatio
     error[2] = np.nan
     near = replace(held, tries=(replace(first, contact_error=error),))
     assert near.success
-    error = error + [0.03, 0.0, 0.0]
+    error[0] += 0.03
     far = replace(held, tries=(replace(first, contact_error=error),))
     assert far.held and not far.success
     assert "fingertip 1 is more than 20.0 mm from its point" in far.explain()

@@ -17,6 +17,7 @@ import msgpack
 import numpy as np
 import pytest
 from helpers.objects import CUBE, box_model, from_above, standing
+from helpers.verdicts import some_forces
 
 from drakegrasp.build.replay import record_trial
 from drakegrasp.config import Config
@@ -72,12 +73,12 @@ def keys_of(path: Path) -> bytes:
     return animation
 
 
-def not_simulated(cube: ObjectModel, config: Config, fit: object = None) -> SimpleNamespace:
-    """Return a verification that ended before its simulation."""
+def not_simulated(cube: ObjectModel, config: Config, *, forces: object = None) -> SimpleNamespace:
+    """Return a verification that ended without a trial."""
     placed = SimpleNamespace(model=cube, X_TO_simulated=standing(cube))
     return SimpleNamespace(
-        placed=placed, p_OQ=P_OQ, nhat_Q_O=NHAT_Q_O, fit=fit, pregrasp=None,
-        config=config,
+        placed=placed, p_OQ=P_OQ, nhat_Q_O=NHAT_Q_O, pregrasp=None, forces=forces, config=config,
+        explain=lambda: "It was not simulated.",
     )  # fmt: skip
 
 
@@ -123,16 +124,15 @@ def test_attempt_that_is_not_simulated_is_shown_all_the_same(
     assert b"predicted" not in everything
 
 
-@pytest.mark.parametrize("fitted", [False, True])
-def test_verification_without_a_trial_shows_what_there_is(
-    cube: ObjectModel, config: Config, tmp_path: Path, fitted: bool
+@pytest.mark.parametrize("judged", [False, True])
+def test_verification_without_a_trial_shows_the_object_and_contacts_that_forces_judged(
+    cube: ObjectModel, config: Config, tmp_path: Path, judged: bool
 ) -> None:
-    X_OG = from_above(cube, 0.06).X_OG
-    fit = SimpleNamespace(X_OG=X_OG, spread=0.3, closing=np.full(3, 0.8)) if fitted else None
-    record_verification(not_simulated(cube, config, fit), tmp_path / "still.html")
+    verified = not_simulated(cube, config, forces=some_forces() if judged else None)
+    record_verification(verified, tmp_path / "still.html")
     everything = b"".join(commands_of(tmp_path / "still.html"))
-    assert b"predicted/1" in everything
-    assert (HAND in everything) == fitted
+    assert OBJECT in everything and HAND not in everything
+    assert (b"predicted/1" in everything) == judged
 
 
 def test_only_this_machine_is_served_and_only_meanwhile(
