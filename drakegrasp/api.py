@@ -376,8 +376,8 @@ def _verify_as_before(
     if rows is not None:
         raise GraspError("rows must be None without a dataset, got rows")
 
-    names = ("units", "X_TO", "hand", "config")
-    placed = place_object(mesh, **{n: options.pop(n) for n in names if n in options})
+    of_object = {"units", "X_TO", "hand", "config"} & options.keys()
+    placed = place_object(mesh, **{n: options.pop(n) for n in of_object})
     return placed.verify(grasps, frame=frame or "object", X_TC=X_TC, **options)
 
 

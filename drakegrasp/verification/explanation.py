@@ -56,7 +56,8 @@ def _contacts(verified: Verification) -> Iterator[str]:
     """Yield how well the hand makes the contacts that were asked for."""
     # Before closing, as the fit leaves them.
     fit, limit = verified.fit, verified.config.verify.max_contact_error
-    assert fit is not None and verified.contact_error is not None
+    errors = verified.contact_error, verified.normal_error
+    assert fit is not None and errors[0] is not None and errors[1] is not None
     yield (
         f"Before closing, the fingertips are within {in_mm(fit.residual.max())} of the predicted "
         f"points, and the pads within {np.rad2deg(fit.normal_error).max():.0f}° of the predicted "
@@ -66,13 +67,13 @@ def _contacts(verified: Verification) -> Iterator[str]:
         return
 
     # After closing, and whether that is a success.
-    angle = np.rad2deg(np.nanmax(np.append(verified.normal_error, 0.0)))
+    angle = np.rad2deg(np.nanmax(np.append(errors[1], 0.0)))
     yield (
         f"After closing, they touch the object within {in_mm(verified.farthest_contact)} of the "
         f"predicted points, and within {angle:.0f}° of the predicted normals."
     )
     if verified.held and not verified.success:
-        finger = int(np.nanargmax(verified.contact_error)) + 1
+        finger = int(np.nanargmax(errors[0])) + 1
         yield (
             f"It is no success: fingertip {finger} is more than {in_mm(limit)} from its point, so "
             "another grasp holds than the one asked for."

@@ -28,7 +28,7 @@ from drakegrasp.simulation.trial import TrialRecord, run_attempt
 from drakegrasp.verification.contact_surface import fit_surface
 from drakegrasp.verification.forces.quality import force_margin
 from drakegrasp.verification.forces.verdict import hand_contacts, judge_forces
-from drakegrasp.verification.hints import find_hints
+from drakegrasp.verification.hints import FAR, find_hints
 from drakegrasp.verification.result import PoseTrial, Verification
 from drakegrasp.verification.sample import judge_sample
 from drakegrasp.verification.wrist.solver import WristFit, fit_wrist
@@ -115,9 +115,10 @@ def verify_placed(grasp: PlacedGrasp) -> Verification:
         margin = force_margin(base.placed.model, X_TO, contacts, base.config)
     base = replace(base, epsilon=margin.epsilon, smallest_friction=margin.smallest_friction)
 
-    # The trial; where it fails, what may be wrong with the numbers.
+    # The trial; where it fails, or the points are far away, what may be wrong with the numbers.
     result = _lift_by_hand(base) if grasp.method == "hand" else _lift_by_forces(base)
-    if result.success or result.outcome.inconclusive:
+    fits = result.success and base.surface_distance.mean() < FAR
+    if fits or result.outcome.inconclusive:
         return result
     with timed(base.seconds, "hints"):
         X_OA = np.eye(4) if grasp.X_OA is None else grasp.X_OA

@@ -253,6 +253,24 @@ def test_check_stats_and_replay_speak_of_a_dataset(small_dataset: Path, tmp_path
     assert run("replay", small_dataset, "--trial", "100000").exit_code == 1
 
 
+def test_stats_and_check_print_one_document_of_json(tmp_path: Path) -> None:
+    out = make_dataset(tmp_path / "out", tmp_path)
+    result = run("stats", out, "--json")
+    (stats,) = map(json.loads, result.stdout.splitlines())
+    assert stats["unfinished"] is None
+    assert [split["split"] for split in stats["splits"]] == list(SPLITS)
+    successes = sum(each["outcomes"].get("success", 0) for each in stats["objects"])
+    assert successes == sum(sum(each["removals"].values()) for each in stats["objects"]) > 0
+    assert "kept" in stats["objects"][0]["removals"]
+
+    with h5py.File(out / "grasping_oto.hdf5", "r+") as file:
+        file["test/grasps"][0, 9:12] *= np.float32(2.0)
+    result = run("check", out, "--json", "--workers", "1")
+    (checked,) = map(json.loads, result.stdout.splitlines())
+    assert result.exit_code == 1 and checked["path"] == str(out)
+    assert "grasping_oto.hdf5" in {broken["file"] for broken in checked["broken"]}
+
+
 @pytest.mark.sim
 @pytest.mark.slow
 def test_stats_of_a_build_that_runs_count_what_is_done(small_dataset: Path, tmp_path: Path) -> None:
