@@ -56,6 +56,7 @@ class Source(IntEnum):
     NORMALS = 1
     REFINE = 2
     OWN = 3  # one of the user's own
+    POSTURES = 4  # none: the posture comes from outside
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -88,6 +89,24 @@ class Candidates:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class JointPath:
+    """Positions (j,) of all joints [rad or m], in the plant's order, that a trial goes through.
+
+    Attributes:
+        start: Where the trial begins.
+        grasp: Where the fingers hold the object.
+        squeeze: Where motors of their own go on to, and press.
+        own_motors: Whether each joint has a motor of its own; else the hand file's close the
+            fingers until they stop, and what they do not move keeps its place.
+    """
+
+    start: Array
+    grasp: Array
+    squeeze: Array
+    own_motors: bool
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Pregrasp:
     """Palm pose and joint angles before the fingers close: the start of a trial.
 
@@ -99,6 +118,7 @@ class Pregrasp:
         ray_hits: Whether the palm ray meets the object; true if no ray places the palm.
         conditions: Friction, mass, looks and cameras; None are the usual ones.
         audited: Whether the closed hand is lifted in any case, whatever its chance and its image.
+        path: Of a posture that spread and closing cannot say: the positions of all joints.
     """
 
     X_OG: Array
@@ -107,6 +127,7 @@ class Pregrasp:
     ray_hits: bool = True
     conditions: Conditions | None = None
     audited: bool = False
+    path: JointPath | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
