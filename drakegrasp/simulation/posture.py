@@ -36,6 +36,8 @@ OPENED = np.deg2rad(20.0)
 #: Where a posture has no squeeze, the joint that moved most from the pregrasp to the grasp goes on
 #: by so much, and the others in proportion; 1 rad as 0.1 m of a slide.
 SQUEEZED = np.deg2rad(20.0)
+#: A rotation that is off by less is exact but for rounding.
+EXACT = 1e-12
 #: A closing joint this near to zero is that of the open hand [rad or m].
 OPEN = 1e-6
 
@@ -132,7 +134,9 @@ def _one_pose(X: npt.ArrayLike, name: str) -> Array:
     pose = read_pose(X, name)
     if pose.shape != (4, 4):
         raise GraspError(f"{name} must be one pose, got an array of shape {pose.shape}")
-    return pose
+    # A rotation that is exact keeps its bits.
+    given = np.asarray(X, dtype=float)
+    return given if given.shape == (4, 4) and np.abs(pose - given).max() < EXACT else pose
 
 
 def joint_order(hand: Hand) -> tuple[str, ...]:
@@ -177,6 +181,7 @@ def start_of(posture: Posture, hand: Hand) -> Pregrasp:
     index = {name: i for i, name in enumerate(joint_order(hand))}
     spreads = [posture.q_grasp[index[name]] for name in hand.spread.joints]
     closing = np.array([start[index[finger.closing_joint]] for finger in hand.fingers])
+    closing = np.clip(closing, *coordinate_limits(hand)[1:].T)
 
     # A posture that the hand file can say is an attempt like any other.
     still = [abs(posture.q_grasp[index[n]] - at) <= OPEN for n, at in hand.preshape.items()]
@@ -191,13 +196,17 @@ def start_of(posture: Posture, hand: Hand) -> Pregrasp:
     start = start.copy()
     for name in hand.spread.joints if own_motors else hand.locked_joints:
         start[index[name]] = posture.q_grasp[index[name]]
-    squeeze = posture.q_squeeze
-    squeeze = squeezed(start, posture.q_grasp, hand) if squeeze is None else squeeze
+    # No hand is beyond its limits.
+    limits = dict(zip(hand.joint_names, hand.joint_limits, strict=True))
+    lower, upper = np.array([limits[name] for name in index]).T
+    start, grasp = np.clip(start, lower, upper), np.clip(posture.q_grasp, lower, upper)
+    squeeze = squeezed(start, grasp, hand) if posture.q_squeeze is None else posture.q_squeeze
+    squeeze = np.clip(squeeze, lower, upper)
     return Pregrasp(
         X_OG=posture.X_OG,
         spread=float(spreads[0]) if spreads and np.ptp(spreads) <= COUPLED else np.nan,
         closing=closing,
-        path=JointPath(start=start, grasp=posture.q_grasp, squeeze=squeeze, own_motors=own_motors),
+        path=JointPath(start=start, grasp=grasp, squeeze=squeeze, own_motors=own_motors),
     )
 
 
@@ -235,12 +244,9 @@ def opened(q_grasp: Array, hand: Hand) -> Array:
 
 
 def squeezed(start: Array, grasp: Array, hand: Hand) -> Array:
-    """Return the joint positions (j,) as far beyond a grasp as `SQUEEZED` says, within limits."""
+    """Return the joint positions (j,) as far beyond a grasp as `SQUEEZED` says."""
     order = joint_order(hand)
     slides = np.array([hand.joint_units[name] == "m" for name in order])
     units = np.where(slides, 0.1, 1.0)
     most = float((np.abs(grasp - start) / units).max())
-    beyond = grasp if most == 0.0 else grasp + (grasp - start) * (SQUEEZED / most)
-    limits = dict(zip(hand.joint_names, hand.joint_limits, strict=True))
-    lower, upper = np.array([limits[name] for name in order]).T
-    return np.clip(beyond, np.minimum(lower, grasp), np.maximum(upper, grasp))
+    return grasp if most == 0.0 else grasp + (grasp - start) * (SQUEEZED / most)
