@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from drakegrasp.hand.settings import load_config
     from drakegrasp.outcomes import Outcome
     from drakegrasp.simulation.placement import PlacedObject, place_object
+    from drakegrasp.simulation.posture import Posture, make_posture
+    from drakegrasp.simulation.posture_trial import run_trial
     from drakegrasp.verification.result import Verification
 
 __version__ = metadata.version("drakegrasp")
@@ -36,6 +38,7 @@ _HOMES = {
     "GraspDataset": "dataset.reader",
     "Hand": "hand.description",
     "Outcome": "outcomes",
+    "Posture": "simulation.posture",
     "PlacedObject": "simulation.placement",
     "Replay": "build.replay",
     "Sample": "dataset.reader",
@@ -46,9 +49,11 @@ _HOMES = {
     "check_dataset": "dataset.checks.run",
     "load_config": "hand.settings",
     "load_hand": "hand.description",
+    "make_posture": "simulation.posture",
     "pack_grasp": "grasp",
     "place_object": "simulation.placement",
     "replay_trial": "build.replay",
+    "run_trial": "simulation.posture_trial",
     "transform_grasp": "grasp",
     "unpack_grasp": "grasp",
     "verify_grasp": "api",
@@ -63,6 +68,7 @@ __all__ = [
     "Hand",
     "Outcome",
     "PlacedObject",
+    "Posture",
     "Replay",
     "Sample",
     "Trials",
@@ -72,9 +78,11 @@ __all__ = [
     "check_dataset",
     "load_config",
     "load_hand",
+    "make_posture",
     "pack_grasp",
     "place_object",
     "replay_trial",
+    "run_trial",
     "transform_grasp",
     "unpack_grasp",
     "verify_grasp",

@@ -60,6 +60,24 @@ class Source(IntEnum):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class GivenPostures:
+    """Joint positions (n, j) [rad or m] of postures from outside, in the plant's order.
+
+    Attributes:
+        q_grasp: When the fingers hold the object.
+        q_pregrasp, q_squeeze: Where the trial begins, and where motors press to; NaN: not given.
+        row: (n,), row of each in its file.
+        said: Where each comes from, in words; may be empty.
+    """
+
+    q_grasp: Array
+    q_pregrasp: Array
+    q_squeeze: Array
+    row: npt.NDArray[np.int64]
+    said: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Candidates:
     """Palm poses of one object.
 
@@ -73,6 +91,7 @@ class Candidates:
         combinations: Number of combinations of rotations, or of surface points drawn.
         valid: Number of those above the table whose palm ray meets the bounding box.
         distinct: Number of different poses among the valid ones.
+        postures: Joints of each, where they come from outside and not from samplers.
     """
 
     X_OG: Array
@@ -83,6 +102,7 @@ class Candidates:
     combinations: int
     valid: int
     distinct: int
+    postures: GivenPostures | None = None
 
     def __len__(self) -> int:
         return len(self.X_OG)
@@ -148,6 +168,7 @@ class Attempt(Pregrasp):
         log_density: Logarithm of the density of the draw, see the schema.
         child, parent: Its number in its family, and that of its parent; 0 for the first.
         generation: Number of parents before it.
+        posture_row: Row of a posture in its file; NaN for a palm pose of a sampler.
     """
 
     candidate: int
@@ -160,6 +181,12 @@ class Attempt(Pregrasp):
     child: int = 0
     parent: int = 0
     generation: int = 0
+    posture_row: float = np.nan
+
+    @property
+    def own_motors(self) -> bool:
+        """Whether each joint has a motor of its own, see `JointPath`."""
+        return self.path is not None and self.path.own_motors
 
 
 class Sampler(Protocol):
@@ -395,7 +422,7 @@ def make_attempts(
                 resting=int(candidates.resting[i]),
                 source=Source(candidates.source[i]),
                 log_density=float(candidates.log_density[i]),
-                audited=_is_audited(seed, object_key(name), i, j, 0),
+                audited=is_audited(seed, object_key(name), i, j, 0),
             )
 
 
@@ -447,11 +474,11 @@ def _child(parent: Attempt, number: int, config: RefineConfig, *, name: str, see
         child=number,
         parent=parent.child,
         generation=parent.generation + 1,
-        audited=_is_audited(seed, object_key(name), *place),
+        audited=is_audited(seed, object_key(name), *place),
     )
 
 
-def _is_audited(seed: int, *place: int) -> bool:
+def is_audited(seed: int, *place: int) -> bool:
     """Return whether an attempt is audited: object, candidate, stand-off and child decide."""
     return int(Stream(seed, *place, _AUDIT).integers(AUDIT, 1)[0]) == 0
 

@@ -104,7 +104,7 @@ def make_posture(
         q[name] = vector if order is None else vector[order]
 
     X_OF = _frame_in_object(frame, X_TO, X_TC)
-    X_OG = multiply(X_OF, _one_pose(X_FG, "the palm's pose"))
+    X_OG = multiply(X_OF, exact_pose(X_FG, "the palm's pose"))
     assert q["q_grasp"] is not None
     return Posture(X_OG, q["q_grasp"], q["q_pregrasp"], q["q_squeeze"])
 
@@ -122,15 +122,15 @@ def _frame_in_object(
         return np.eye(4)
     if X_TO is None:
         raise GraspError(f"X_TO must be given with the frame {frame}, got None")
-    X_OT = invert_pose(_one_pose(X_TO, "X_TO"))
+    X_OT = invert_pose(exact_pose(X_TO, "X_TO"))
     if frame == "table":
         return X_OT
     if frame == "world":
         return multiply(X_OT, invert_pose(X_WT))
-    return multiply(X_OT, _one_pose(X_TC, "X_TC"))  # type: ignore[arg-type]
+    return multiply(X_OT, exact_pose(X_TC, "X_TC"))  # type: ignore[arg-type]
 
 
-def _one_pose(X: npt.ArrayLike, name: str) -> Array:
+def exact_pose(X: npt.ArrayLike, name: str) -> Array:
     pose = read_pose(X, name)
     if pose.shape != (4, 4):
         raise GraspError(f"{name} must be one pose, got an array of shape {pose.shape}")
@@ -179,7 +179,8 @@ def start_of(posture: Posture, hand: Hand) -> Pregrasp:
     start = opened(posture.q_grasp, hand) if posture.q_pregrasp is None else posture.q_pregrasp
     own_motors = not all(follows_couplings(q, hand) for q in given)
     index = {name: i for i, name in enumerate(joint_order(hand))}
-    spreads = [posture.q_grasp[index[name]] for name in hand.spread.joints]
+    # Of spread joints that differ, the first.
+    spread = float(posture.q_grasp[index[hand.spread.joints[0]]]) if hand.spread.joints else 0.0
     closing = np.array([start[index[finger.closing_joint]] for finger in hand.fingers])
     closing = np.clip(closing, *coordinate_limits(hand)[1:].T)
 
@@ -188,7 +189,7 @@ def start_of(posture: Posture, hand: Hand) -> Pregrasp:
     if not own_motors and all(still):
         return Pregrasp(
             X_OG=posture.X_OG,
-            spread=float(spreads[0]) if spreads else 0.0,
+            spread=spread,
             closing=None if np.abs(closing).max() <= OPEN else closing,
         )
 
@@ -204,7 +205,7 @@ def start_of(posture: Posture, hand: Hand) -> Pregrasp:
     squeeze = np.clip(squeeze, lower, upper)
     return Pregrasp(
         X_OG=posture.X_OG,
-        spread=float(spreads[0]) if spreads and np.ptp(spreads) <= COUPLED else np.nan,
+        spread=spread,
         closing=closing,
         path=JointPath(start=start, grasp=grasp, squeeze=squeeze, own_motors=own_motors),
     )
