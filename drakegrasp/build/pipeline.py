@@ -40,7 +40,7 @@ from drakegrasp.dataset.manifest import (
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import is_assembled
-from drakegrasp.errors import DataError, DrakegraspError, listed
+from drakegrasp.errors import ConfigError, DataError, DrakegraspError, listed
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.sources import MeshSource, source_sha256
 from drakegrasp.runtime.executor import Executor, WorkerPool
