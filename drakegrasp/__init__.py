@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from drakegrasp.hand.settings import load_config
     from drakegrasp.outcomes import Outcome
     from drakegrasp.simulation.placement import PlacedObject, place_object
-    from drakegrasp.simulation.posture import Posture, make_posture
-    from drakegrasp.simulation.posture_trial import run_trial
+    from drakegrasp.simulation.postures.posture import Posture, make_posture
+    from drakegrasp.simulation.postures.trial import run_trial
     from drakegrasp.verification.result import Verification
 
 __version__ = metadata.version("drakegrasp")
@@ -38,7 +38,7 @@ _HOMES = {
     "GraspDataset": "dataset.reader",
     "Hand": "hand.description",
     "Outcome": "outcomes",
-    "Posture": "simulation.posture",
+    "Posture": "simulation.postures.posture",
     "PlacedObject": "simulation.placement",
     "Replay": "build.replay",
     "Sample": "dataset.reader",
@@ -49,11 +49,11 @@ _HOMES = {
     "check_dataset": "dataset.checks.run",
     "load_config": "hand.settings",
     "load_hand": "hand.description",
-    "make_posture": "simulation.posture",
+    "make_posture": "simulation.postures.posture",
     "pack_grasp": "grasp",
     "place_object": "simulation.placement",
     "replay_trial": "build.replay",
-    "run_trial": "simulation.posture_trial",
+    "run_trial": "simulation.postures.trial",
     "transform_grasp": "grasp",
     "unpack_grasp": "grasp",
     "verify_grasp": "api",

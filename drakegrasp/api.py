@@ -39,7 +39,7 @@ from drakegrasp.runtime.executor import count_workers, run_here
 from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.shapes.catalog import builtin_sources, draw_builtin
 from drakegrasp.simulation.drive import drive_of
-from drakegrasp.simulation.posture_table import PostureTable, refuse_unknown_objects
+from drakegrasp.simulation.postures.table import PostureTable, refuse_unknown_objects
 from drakegrasp.verification.batch import ResultCallback, ignore_result, verify_batch
 from drakegrasp.verification.placed_grasp import (
     Mesh,

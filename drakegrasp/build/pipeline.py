@@ -47,7 +47,7 @@ from drakegrasp.runtime.executor import Executor, WorkerPool
 from drakegrasp.runtime.files import disk_full_named, sweep_temporary
 from drakegrasp.runtime.progress import Report, progress_bar
 from drakegrasp.simulation.drive import drive_of
-from drakegrasp.simulation.posture_table import PostureTable
+from drakegrasp.simulation.postures.table import PostureTable
 from drakegrasp.simulation.sampling.own import own_sampler
 
 
@@ -193,9 +193,7 @@ def build_locked(
         DataError, DiskFullError, MachineError: As for `build`.
     """
     events = BuildEvents(out, pool, show=show)
-    job = _Job(
-        out=out, execute=execute, pool=pool, events=events, postures=postures, show=show
-    )
+    job = _Job(out=out, execute=execute, pool=pool, events=events, postures=postures, show=show)
     with disk_full_named(out):
         # The directory must be ours, and the dataset in it must be of these meshes.
         known = claim_directory(out, config)

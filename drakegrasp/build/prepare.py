@@ -24,7 +24,7 @@ from drakegrasp.runtime.fault_injection import inject_fault
 from drakegrasp.runtime.files import disk_full_named
 from drakegrasp.runtime.journal import GIVE_UP_DEATHS, PREPARE, Journal, Verdict, open_journal
 from drakegrasp.simulation.candidates import sample_candidates
-from drakegrasp.simulation.posture_table import PostureTable, given_candidates
+from drakegrasp.simulation.postures.table import PostureTable, given_candidates
 from drakegrasp.simulation.settle import find_resting_poses
 
 #: Computing time after which preparing a mesh hangs [s].

@@ -47,8 +47,9 @@ def read_dexgraspbench(path: Path, hand: Hand) -> Rows:
         if key not in content:
             got = ", ".join(map(str, content))
             raise GraspError(f"{path}: {key} must be in the dictionary, got {got}")
-    qpos = {stage: _vectors(path, content[key], key) for stage, key in QPOS.items()
-            if key in content}
+    qpos = {
+        stage: _vectors(path, content[key], key) for stage, key in QPOS.items() if key in content
+    }
     grasp = qpos["grasp"]
 
     # The root of the hand in the object's frame, in metres.
@@ -58,8 +59,9 @@ def read_dexgraspbench(path: Path, hand: Hand) -> Rows:
     X_WM = quaternion_poses(pose[:, :3], pose[:, 3:])
     X_WL = quaternion_poses(grasp[:, :3], grasp[:, 3:7])
     try:
-        scale = np.broadcast_to(np.asarray(content.get("obj_scale", np.nan), dtype=float).ravel(),
-                                (count,))
+        scale = np.broadcast_to(
+            np.asarray(content.get("obj_scale", np.nan), dtype=float).ravel(), (count,)
+        )
     except (TypeError, ValueError):
         raise GraspError(f"{path}: obj_scale must be one number, got something else") from None
     own = "joint_units" in content
@@ -108,9 +110,7 @@ def read_isaac_grasp(path: Path, hand: Hand) -> Rows:
     if not isinstance(tree, dict) or tree.get("format") != "isaac_grasp":
         raise GraspError(f"{path}: format must be isaac_grasp, got another file")
     if str(tree.get("format_version")) not in ("1.0", "1"):
-        raise GraspError(
-            f"{path}: format_version must be 1.0, got {tree.get('format_version')!r}"
-        )
+        raise GraspError(f"{path}: format_version must be 1.0, got {tree.get('format_version')!r}")
     grasps = tree.get("grasps")
     if not isinstance(grasps, dict) or not grasps:
         raise GraspError(f"{path}: grasps must be there, got none")

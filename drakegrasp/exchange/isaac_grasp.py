@@ -24,7 +24,7 @@ from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import load_object
 from drakegrasp.runtime.progress import Report
-from drakegrasp.simulation.posture import joint_order
+from drakegrasp.simulation.postures.posture import joint_order
 
 
 def write_isaac_grasp(out: Path, folder: Path, progress: Report) -> int:

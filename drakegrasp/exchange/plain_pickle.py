@@ -17,8 +17,11 @@ from drakegrasp.errors import GraspError, one_line
 
 #: All that a pickle of NumPy arrays, of NumPy 1 or 2, needs by name.
 _ALLOWED = {
-    *((f"numpy.{core}.multiarray", name) for core in ("core", "_core")
-      for name in ("_reconstruct", "scalar")),
+    *(
+        (f"numpy.{core}.multiarray", name)
+        for core in ("core", "_core")
+        for name in ("_reconstruct", "scalar")
+    ),
     *((f"numpy.{core}.numeric", "_frombuffer") for core in ("core", "_core")),
     ("numpy", "ndarray"),
     ("numpy", "dtype"),

@@ -21,7 +21,7 @@ from drakegrasp.exchange.foreign_postures import read_dexgraspbench, read_isaac_
 from drakegrasp.exchange.posture_rows import Rows, quaternion_poses, table_of
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.hand.description import Hand
-from drakegrasp.simulation.posture_table import PostureTable
+from drakegrasp.simulation.postures.table import PostureTable
 
 #: Suffixes of the layouts.
 ARRAYS, TABLES, YAMLS = (".npz", ".h5", ".hdf5"), (".csv", ".parquet"), (".yaml", ".yml")
@@ -116,8 +116,11 @@ def _of_arrays(arrays: Mapping[str, Any]) -> Rows:
         X_FL=X_FG,
         link=_only(texts.get("link"), "link"),
         frame=_only(texts.get("frame"), "frame") or "object",
-        q={name: arrays[f"q_{name}"] for name in ("grasp", "pregrasp", "squeeze")
-           if f"q_{name}" in arrays},
+        q={
+            name: arrays[f"q_{name}"]
+            for name in ("grasp", "pregrasp", "squeeze")
+            if f"q_{name}" in arrays
+        },
         joints=texts.get("joints"),
         X_TC=None if "X_TC" not in arrays else _stacked(arrays["X_TC"], "X_TC"),
         numbers={n: arrays[n] for n in ("resting", "log_density", "scale") if n in arrays},
@@ -173,8 +176,10 @@ def _read_columns(path: Path) -> dict[str, list[Any]]:
     try:
         with path.open(encoding="utf-8", newline="") as file:
             header, *rows = csv.reader(file)
-            return {name: list(column) for name, column in zip(header, _columns(header, rows),
-                                                               strict=True)}
+            return {
+                name: list(column)
+                for name, column in zip(header, _columns(header, rows), strict=True)
+            }
     except (OSError, ValueError, csv.Error) as error:
         raise GraspError(f"must be a table with a header, got: {one_line(error)}") from None
 
@@ -210,8 +215,9 @@ def _of_columns(columns: Mapping[str, list[Any]]) -> Rows:
         frame=_only(columns.get("frame"), "frame") or "object",
         q=q,
         joints=joints,
-        numbers={n: _floats(columns, n) for n in ("resting", "log_density", "scale")
-                 if n in columns},
+        numbers={
+            n: _floats(columns, n) for n in ("resting", "log_density", "scale") if n in columns
+        },
         said=None if "source" not in columns else [str(text) for text in columns["source"]],
     )
 

@@ -18,8 +18,8 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.errors import GraspError, listed, one_line
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.description import Hand
-from drakegrasp.simulation.posture import joint_order
-from drakegrasp.simulation.posture_table import PostureTable, make_table
+from drakegrasp.simulation.postures.posture import joint_order
+from drakegrasp.simulation.postures.table import PostureTable, make_table
 
 #: How far the length of a quaternion may be from one.
 UNIT_TOLERANCE = 1e-3
@@ -82,14 +82,21 @@ def table_of(hand: Hand, parts: Sequence[Rows]) -> PostureTable:
             joined([each["grasp"] for each in q]),
             q_pregrasp=joined([each.get("pregrasp") for each in q], joints),
             q_squeeze=joined([each.get("squeeze") for each in q], joints),
-            resting=joined([part.numbers.get("resting", np.zeros(n))
-                            for n, part in zip(counts, parts, strict=True)]),
+            resting=joined(
+                [
+                    part.numbers.get("resting", np.zeros(n))
+                    for n, part in zip(counts, parts, strict=True)
+                ]
+            ),
             frame=frames.pop(),
             X_TC=None if parts[0].X_TC is None else joined([part.X_TC for part in parts]),
             scale=joined([part.numbers.get("scale") for part in parts]),
             log_density=joined([part.numbers.get("log_density") for part in parts]),
-            said=[text for n, part in zip(counts, parts, strict=True)
-                  for text in (part.said or [""] * n)],
+            said=[
+                text
+                for n, part in zip(counts, parts, strict=True)
+                for text in (part.said or [""] * n)
+            ],
         )
     except (TypeError, ValueError) as error:
         raise GraspError(one_line(error)) from None

@@ -8,8 +8,8 @@ A failure of the physics is an outcome, not an exception, and so is an error wit
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import pairwise
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt

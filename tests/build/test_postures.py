@@ -30,8 +30,8 @@ from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
 from drakegrasp.simulation.candidates import Source
 from drakegrasp.simulation.construction import build_scene
-from drakegrasp.simulation.posture import joint_order
-from drakegrasp.simulation.posture_table import (
+from drakegrasp.simulation.postures.posture import joint_order
+from drakegrasp.simulation.postures.table import (
     PostureTable,
     make_table,
     refuse_unknown_objects,

@@ -17,8 +17,8 @@ from drakegrasp.errors import GraspError
 from drakegrasp.exchange.posture_files import read_postures
 from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
-from drakegrasp.simulation.posture import joint_order
-from drakegrasp.simulation.posture_table import PostureTable
+from drakegrasp.simulation.postures.posture import joint_order
+from drakegrasp.simulation.postures.table import PostureTable
 
 HAND = load_hand("allegro")
 ORDER = joint_order(HAND)
@@ -234,7 +234,9 @@ def test_pickles_of_every_protocol_are_read(tmp_path):
                 file, {"descr": "|O", "fortran_order": False, "shape": ()}
             )
             pickle.dump(array, file, protocol=protocol)
-    np.testing.assert_array_equal(read_postures(tmp_path, HAND).q_grasp, GRASP[[0] * (protocol + 1)])
+    np.testing.assert_array_equal(
+        read_postures(tmp_path, HAND).q_grasp, GRASP[[0] * (protocol + 1)]
+    )
 
 
 @pytest.mark.parametrize(

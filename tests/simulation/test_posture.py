@@ -15,7 +15,7 @@ from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.placement import PlacedObject
-from drakegrasp.simulation.posture import (
+from drakegrasp.simulation.postures.posture import (
     OPENED,
     Posture,
     joint_order,
@@ -23,7 +23,7 @@ from drakegrasp.simulation.posture import (
     opened,
     start_of,
 )
-from drakegrasp.simulation.posture_trial import run_trial
+from drakegrasp.simulation.postures.trial import run_trial
 from drakegrasp.simulation.scene import hand_joint_names
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 

@@ -109,9 +109,7 @@ def make_posture(
     return Posture(X_OG, q["q_grasp"], q["q_pregrasp"], q["q_squeeze"])
 
 
-def _frame_in_object(
-    frame: str, X_TO: npt.ArrayLike | None, X_TC: npt.ArrayLike | None
-) -> Array:
+def _frame_in_object(frame: str, X_TO: npt.ArrayLike | None, X_TC: npt.ArrayLike | None) -> Array:
     """Return the pose (4, 4) of a frame in {O}."""
     if frame not in FRAMES:
         raise GraspError(f"frame must be one of {', '.join(FRAMES)}, got {frame!r}")
@@ -131,10 +129,14 @@ def _frame_in_object(
 
 
 def exact_pose(X: npt.ArrayLike, name: str) -> Array:
+    """Return one pose (4, 4) with an exact rotation; one that has it already keeps its bits.
+
+    Raises:
+        GraspError: If it is none.
+    """
     pose = read_pose(X, name)
     if pose.shape != (4, 4):
         raise GraspError(f"{name} must be one pose, got an array of shape {pose.shape}")
-    # A rotation that is exact keeps its bits.
     given = np.asarray(X, dtype=float)
     return given if given.shape == (4, 4) and np.abs(pose - given).max() < EXACT else pose
 

@@ -30,7 +30,7 @@ from drakegrasp.simulation.candidates import (
     Source,
     is_audited,
 )
-from drakegrasp.simulation.posture import Posture, exact_pose, start_of
+from drakegrasp.simulation.postures.posture import Posture, exact_pose, start_of
 
 #: Frames of a table: those of a posture, and {M}, the axes and the origin of the mesh file.
 TableFrame = Literal["object", "table", "camera", "world", "mesh"]

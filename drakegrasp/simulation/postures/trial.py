@@ -10,15 +10,13 @@ from drakegrasp.errors import GraspError
 from drakegrasp.hand.description import load_hand
 from drakegrasp.runtime.blas import one_thread
 from drakegrasp.simulation.placement import PlacedObject, config_for, refuse_other_objects
-from drakegrasp.simulation.posture import Posture, make_posture, start_of
+from drakegrasp.simulation.postures.posture import Posture, make_posture, start_of
 from drakegrasp.simulation.scene_cache import cached_scene, forget_scenes
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 
 
 @one_thread
-def run_trial(
-    placed: PlacedObject, posture: Posture, config: Config | None = None
-) -> TrialRecord:
+def run_trial(placed: PlacedObject, posture: Posture, config: Config | None = None) -> TrialRecord:
     """Close a simulated hand by a posture, lift the object, and return what happened.
 
     The object is simulated at `PlacedObject.X_TO_simulated`. A closed hand that may lift always
