@@ -456,7 +456,8 @@ def _add_own_motors(
     Returns:
         The attributes of `Scene` that say of the motors.
     """
-    motors, fingers, units = [], [], []
+    motors: list[JointActuator] = []
+    fingers, units = list[Finger](), list[float]()
     for i, (finger, chain) in enumerate(zip(hand.fingers, hand.chains, strict=True)):
         for name, slides in zip(chain.joints, chain.slides.tolist(), strict=True):
             joint = plant.GetJointByName(name, instance)
