@@ -38,17 +38,18 @@ def write_isaac_grasp(out: Path, folder: Path, progress: Report) -> int:
         text = obj_text(model.visual_vertices, model.visual_faces, normals=False)
         (folder / "meshes" / f"{name}.obj").write_text(text, encoding="utf-8")
 
+        entries = {f"trial_{grasp.trial_id}": grasp_entry(hand, grasp) for grasp in same}
         tree = {
             "format": "isaac_grasp",
             "format_version": 1.0,
             "created_with": CREATED_WITH,
             "object_frame": "centre of the bounding box, as in meshes/",
             "gripper_frame": hand.palm_link,
-            "grasps": {f"trial_{grasp.trial_id}": grasp_entry(hand, grasp) for grasp in same},
+            "grasps": entries,
         }
         text = yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=1000)
         (folder / f"{name}.yaml").write_text(text, encoding="utf-8")
-        done += len(tree["grasps"])
+        done += len(entries)
         progress(done, len(grasps))
     return done
 

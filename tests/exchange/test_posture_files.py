@@ -301,3 +301,17 @@ def test_what_is_not_there_is_refused(tmp_path):
         read_postures(tmp_path / "none.npz", HAND)
     with pytest.raises(GraspError, match=r"must hold \.npy or \.yaml files"):
         read_postures(tmp_path, HAND)
+
+
+def test_samples_that_were_exported_come_back(exported, grasps):
+    hand = load_hand()
+    for form in ("isaac_grasp", "dexgraspbench"):
+        table = read_postures(exported(form), hand)
+        assert table.frame == "object"
+        assert sorted(table.objects) == sorted(grasp.object_name for grasp in grasps)
+        for X_OG, q, name in zip(table.X_FG, table.q_grasp, table.objects, strict=True):
+            assert any(
+                np.allclose(grasp.X_TO @ X_OG, grasp.X_TG, atol=1e-9) and (grasp.q == q).all()
+                for grasp in grasps
+                if grasp.object_name == name
+            )

@@ -11,7 +11,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -74,7 +74,7 @@ class PostureTable:
     def of_object(self, name: str) -> PostureTable:
         """Return the rows of an object, in their order."""
         rows = [i for i, each in enumerate(self.objects) if each == name]
-        chosen = {
+        chosen: dict[str, Any] = {
             f.name: tuple(value[i] for i in rows) if isinstance(value, tuple) else value[rows]
             for f in fields(self)
             if (value := getattr(self, f.name)) is not None and f.name != "frame"
