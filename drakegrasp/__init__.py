@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from drakegrasp.hand.description import Hand, load_hand
     from drakegrasp.hand.settings import load_config
     from drakegrasp.outcomes import Outcome
+    from drakegrasp.simulation.postures.posture import Posture, make_posture
+    from drakegrasp.simulation.postures.trial import run_trial
     from drakegrasp.verification.result import PoseTrial, Verification
 
 __version__ = metadata.version("drakegrasp")
@@ -44,6 +46,7 @@ _HOMES = {
     "Outcome": "outcomes",
     "PlacedObject": "api",
     "PoseTrial": "verification.result",
+    "Posture": "simulation.postures.posture",
     "Replay": "build.replay",
     "Sample": "dataset.reader",
     "Trials": "dataset.trials",
@@ -53,9 +56,11 @@ _HOMES = {
     "check_dataset": "dataset.checks.run",
     "load_config": "hand.settings",
     "load_hand": "hand.description",
+    "make_posture": "simulation.postures.posture",
     "pack_grasp": "grasp",
     "place_object": "api",
     "replay_trial": "build.replay",
+    "run_trial": "simulation.postures.trial",
     "transform_grasp": "grasp",
     "unpack_grasp": "grasp",
     "verify_grasp": "api",
@@ -72,6 +77,7 @@ __all__ = [
     "Outcome",
     "PlacedObject",
     "PoseTrial",
+    "Posture",
     "Replay",
     "Sample",
     "Trials",
@@ -81,9 +87,11 @@ __all__ = [
     "check_dataset",
     "load_config",
     "load_hand",
+    "make_posture",
     "pack_grasp",
     "place_object",
     "replay_trial",
+    "run_trial",
     "transform_grasp",
     "unpack_grasp",
     "verify_grasp",

@@ -19,7 +19,12 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy.typing as npt
 import trimesh
 
-from drakegrasp.build.pipeline import BuildReport, build_locked, refuse_unusable
+from drakegrasp.build.pipeline import (
+    BuildReport,
+    build_locked,
+    posture_config,
+    refuse_unusable,
+)
 from drakegrasp.build.request import BUILTIN
 from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.certificates import security_of
@@ -31,6 +36,7 @@ from drakegrasp.dataset.manifest import claim_directory
 from drakegrasp.dataset.paths import BUILTIN_FOLDER
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import ConfigError, GraspError, MeshError, listed
+from drakegrasp.exchange.posture_files import read_postures
 from drakegrasp.frames import as_numbers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config, override_config
@@ -42,6 +48,7 @@ from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.placement import Placed, config_for
 from drakegrasp.simulation.placement import PlacedObject as ObjectOnTable
 from drakegrasp.simulation.placement import place_object as put_on_table
+from drakegrasp.simulation.postures.table import PostureTable, refuse_unknown_objects
 from drakegrasp.verification.batch import ResultCallback, ignore_result, verify_batch
 from drakegrasp.verification.placed_grasp import place_on_object, place_on_rows
 from drakegrasp.verification.result import Verification
@@ -68,6 +75,7 @@ def build_dataset(
     units: str = "m",
     manifest: str | Path | None = None,
     only: Sequence[str] = (),
+    postures: str | Path | PostureTable | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
     scheduler_file: str | Path | None = None,
@@ -86,6 +94,8 @@ def build_dataset(
         units: Unit of length of the meshes: m, cm or mm.
         manifest: YAML file with units and classes per mesh, if it is not beside the meshes.
         only: Names of the objects to build; all if empty.
+        postures: Instead of drawn palm poses: a file of postures, or a table of them. Only the
+            objects that it names are built.
         workers: Processes on this machine; one per core if None.
         scheduler: Address of a running Dask scheduler to use instead.
         scheduler_file: Its JSON file, instead of the address.
@@ -94,6 +104,7 @@ def build_dataset(
 
     Raises:
         MeshError: If there is no mesh.
+        GraspError: If a row of the postures is none, or of an object that is not there.
         ConfigError: If both workers and a scheduler are given, or the address is empty.
         DataError: If `out` cannot be used, another process builds there, or no mesh can be
             simulated.
@@ -102,11 +113,14 @@ def build_dataset(
     """
     _refuse_workers(workers, scheduler, scheduler_file)
     out, config = Path(out).absolute(), config or load_config()
-    drive_of(load_hand(config.hand), config.lift)
+    hand = load_hand(config.hand)
+    drive_of(hand, config.lift)
+    if isinstance(postures, str | Path):
+        postures = read_postures(Path(postures), hand)
     sources = find_sources(objects, units, manifest)
     security = None if tls_files is None else security_of(tls_files)
     cluster = _announced(connect(workers, scheduler, scheduler_file, security=security), show)
-    return build_on(cluster, sources, out, config, only=only, show=show)
+    return build_on(cluster, sources, out, config, only=only, postures=postures, show=show)
 
 
 @contextmanager
@@ -138,6 +152,7 @@ def build_on(
     config: Config,
     *,
     only: Sequence[str] = (),
+    postures: PostureTable | None = None,
     show: bool = True,
 ) -> BuildReport:
     """Build a dataset on the workers of a cluster; see `build_dataset`.
@@ -151,6 +166,7 @@ def build_on(
         out: Directory of the dataset, absolute.
         config: All the rules.
         only: As for `build_dataset`.
+        postures: As for `build_dataset`.
         show: Whether to show progress on standard error.
 
     Raises:
@@ -161,8 +177,14 @@ def build_on(
         MachineError: If a worker would give other results than this machine.
     """
     refuse_unusable(config)
+    config = posture_config(config, postures)
     known = draw_builtin(config.builtin) if sources is None else sources
     _refuse_unknown(only, [each.name for each in known])
+    if postures is not None:
+        refuse_unknown_objects(postures, [each.name for each in known])
+        only = [name for name in dict.fromkeys(postures.objects) if not only or name in only]
+        if not only:
+            raise GraspError("postures must be of an object that is built, got none of them")
     with build_lock(out) as dead, ExitStack() as stack:
         # A directory that cannot be used is refused before workers start.
         claim_directory(out, config)
@@ -176,7 +198,16 @@ def build_on(
         sources = [source for source in sources if not only or source.name in only]
 
         execute = DaskExecutor(client, resubmissions=RESUBMISSIONS)
-        return build_locked(sources, out, config, execute, dead=dead, pool=execute.pool, show=show)
+        return build_locked(
+            sources,
+            out,
+            config,
+            execute,
+            dead=dead,
+            postures=postures,
+            pool=execute.pool,
+            show=show,
+        )
 
 
 def _refuse_unknown(only: Sequence[str], names: Sequence[str]) -> None:

@@ -211,6 +211,8 @@ class CandidateConfig(_ExtensibleSection):
     local_y_deg: Angles = tuple(range(0, 360, 20))
     local_z_deg: Angles = tuple(range(0, 360, 45))
     jitter_deg: NonNegative = 0.0  # each angle gets a whole number of degrees below this
+    # Digest of the postures that are tried instead of palm poses of samplers; `--postures` sets it.
+    postures: Annotated[str, Field(pattern="^[0-9a-f]{16}$")] | None = None
     # [m] of the palm from the surface, an attempt each (paper); not given: the hand's own.
     standoffs: Annotated[tuple[Positive, ...], Field(min_length=1)]
     # One is drawn per attempt (released code); not given: the hand's own.
@@ -508,11 +510,13 @@ class Config(_Section):
     def to_dict(self) -> dict[str, Any]:
         """Return the resolved values as plain JSON types.
 
-        `filters.own` leaves no trace where there is none.
+        `filters.own` and `candidates.postures` leave no trace where there are none.
         """
         tree = self.model_dump(mode="json")
         if not self.filters.own:
             del tree["filters"]["own"]
+        if self.candidates.postures is None:
+            del tree["candidates"]["postures"]
         return tree
 
     @property

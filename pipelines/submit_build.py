@@ -29,6 +29,8 @@ from drakegrasp.cli.options import build_options, parse_request, shared, tls_fil
 from drakegrasp.cluster.connect import dashboard_line
 from drakegrasp.cluster.launch import start_cluster
 from drakegrasp.cluster.request import KINDS, ClusterRequest, describe, worker_count
+from drakegrasp.exchange.posture_files import read_postures
+from drakegrasp.hand.description import load_hand
 
 
 @click.command(
@@ -93,14 +95,24 @@ def main(
 
     # Say what will run before anything starts.
     click.echo("\n".join(describe(cluster)))
-    print_plan(request, _count(cluster, request.out), times)
+    if request.postures is None:
+        print_plan(request, _count(cluster, request.out), times)
     if dry_run:
         return
 
     sources = find_sources(request.objects, request.units, request.manifest)
     running = _present(start_cluster(cluster, request.out), request.show)
+    postures = None
+    if request.postures is not None:
+        postures = read_postures(request.postures, load_hand(request.config.hand))
     report = build_on(
-        running, sources, request.out, request.config, only=request.only, show=request.show
+        running,
+        sources,
+        request.out,
+        request.config,
+        only=request.only,
+        postures=postures,
+        show=request.show,
     )
     print_report(report)
 

@@ -191,7 +191,8 @@ def _read_lifts(out: Path) -> list[StoredLift]:
     """Return all lifts of a dataset, in the order of its rows: objects are together."""
     # Only what was lifted has the time of a lift.
     trials = Trials(out).where(outcome=[Outcome.SUCCESS, *LOST])
-    trials = trials[np.isfinite(trials["time_lift"])]
+    # A hand with a motor for each joint is not in MuJoCo.
+    trials = trials[np.isfinite(trials["time_lift"]) & ~trials["own_motors"]]
     names = [field.name for field in fields(Materials)]
     columns = ("outcome", "object_name", "removal", "X_OG", "spread", "resting", *names)
 

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +29,7 @@ from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import release_memory
 from drakegrasp.simulation.candidates import Attempt, children, family_member, make_attempts
+from drakegrasp.simulation.postures.table import posture_attempts
 from drakegrasp.simulation.randomization.conditions import usual_conditions
 from drakegrasp.simulation.randomization.draws import draw_conditions
 from drakegrasp.simulation.scene import Scene
@@ -108,8 +110,12 @@ def _load(out: Path, name: str, mesh_sha256: str, config: Config) -> PreparedObj
 
 def list_attempts(prepared: PreparedObject, indices: range, config: Config) -> list[Attempt]:
     """Return the attempts of a range of an object's candidates, with their conditions."""
-    model, rules, seed = prepared.model, config.candidates, config.seed
-    made = make_attempts(prepared.candidates, indices, rules, name=model.name, seed=seed)
+    model, drawn = prepared.model, prepared.candidates
+    place: Any = {"name": model.name, "seed": config.seed}
+    if drawn.postures is None:
+        made = make_attempts(drawn, indices, config.candidates, **place)
+    else:
+        made = posture_attempts(drawn, indices, load_hand(config.hand), **place)
     return [_with_conditions(attempt, model, config) for attempt in made]
 
 

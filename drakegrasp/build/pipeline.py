@@ -40,13 +40,14 @@ from drakegrasp.dataset.manifest import (
 from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import is_assembled
-from drakegrasp.errors import DataError, DrakegraspError, listed
+from drakegrasp.errors import ConfigError, DataError, DrakegraspError, listed
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.sources import MeshSource, source_sha256
 from drakegrasp.runtime.executor import Executor, WorkerPool
 from drakegrasp.runtime.files import disk_full_named, sweep_temporary
 from drakegrasp.runtime.progress import Report, progress_bar
 from drakegrasp.simulation.drive import drive_of
+from drakegrasp.simulation.postures.table import PostureTable
 from drakegrasp.simulation.sampling.own import own_sampler
 
 
@@ -88,6 +89,7 @@ class _Job:
     execute: Executor
     pool: WorkerPool | None
     events: BuildEvents
+    postures: PostureTable | None
     show: bool
 
 
@@ -97,6 +99,7 @@ def build(
     config: Config,
     execute: Executor,
     *,
+    postures: PostureTable | None = None,
     pool: WorkerPool | None = None,
     show: bool = True,
 ) -> BuildReport:
@@ -110,6 +113,7 @@ def build(
         out: Directory; new, empty, or of this configuration.
         config: All the rules.
         execute: Does the work.
+        postures: See `build_locked`.
         pool: The executor's processes, if they are started again when they die: then a crash or
             a hang costs one attempt. Without, crashes propagate to the caller.
         show: Whether to show progress on standard error.
@@ -125,7 +129,27 @@ def build(
     refuse_unusable(config)
     drive_of(load_hand(config.hand), config.lift)
     with build_lock(out) as dead:
-        return build_locked(sources, out, config, execute, dead=dead, pool=pool, show=show)
+        return build_locked(
+            sources, out, config, execute, dead=dead, postures=postures, pool=pool, show=show
+        )
+
+
+def posture_config(config: Config, postures: PostureTable | None) -> Config:
+    """Return the configuration of a build that tries postures instead of palm poses of samplers.
+
+    Raises:
+        ConfigError: If it names other postures than are given.
+    """
+    digest, named = None if postures is None else postures.digest(), config.candidates.postures
+    if named not in (None, digest):
+        must = "left out; the postures that are given decide" if digest else "given with postures"
+        raise ConfigError(f"candidates.postures must be {must}, got {named!r}")
+    if digest is None:
+        return config
+    # A posture has no stand-off: there is one attempt of each.
+    rules = config.candidates
+    changed = {"postures": digest, "standoffs": rules.standoffs[:1]}
+    return config.model_copy(update={"candidates": rules.model_copy(update=changed)})
 
 
 def refuse_unusable(config: Config) -> None:
@@ -148,6 +172,7 @@ def build_locked(
     execute: Executor,
     *,
     dead: Holder | None,
+    postures: PostureTable | None = None,
     pool: WorkerPool | None = None,
     show: bool = True,
 ) -> BuildReport:
@@ -159,6 +184,8 @@ def build_locked(
         config: All the rules.
         execute: Does the work.
         dead: Who held the lock before and died, as `build_lock` yields it.
+        postures: What is tried instead of palm poses of samplers; the configuration knows it by
+            its digest, see `posture_config`.
         pool: The executor's processes, as for `build`.
         show: Whether to show progress on standard error.
 
@@ -166,7 +193,7 @@ def build_locked(
         DataError, DiskFullError, MachineError: As for `build`.
     """
     events = BuildEvents(out, pool, show=show)
-    job = _Job(out=out, execute=execute, pool=pool, events=events, show=show)
+    job = _Job(out=out, execute=execute, pool=pool, events=events, postures=postures, show=show)
     with disk_full_named(out):
         # The directory must be ours, and the dataset in it must be of these meshes.
         known = claim_directory(out, config)
@@ -291,6 +318,7 @@ def _prepare_all(
                     mesh_sha256=digest,
                     out=out,
                     config=config,
+                    postures=job.postures and job.postures.of_object(source.name),
                     restartable=job.pool is not None,
                 )
             )

@@ -17,13 +17,14 @@ from drakegrasp.dataset.paths import model_path
 from drakegrasp.dataset.prepared_objects import PreparedObject, load_prepared, save_prepared
 from drakegrasp.errors import DrakegraspError, MachineError, MeshError
 from drakegrasp.objects.model import prepare_object
-from drakegrasp.objects.sources import MeshSource
+from drakegrasp.objects.sources import MeshSource, file_frame
 from drakegrasp.runtime.blas import one_thread
 from drakegrasp.runtime.environment import release_memory
 from drakegrasp.runtime.fault_injection import inject_fault
 from drakegrasp.runtime.files import disk_full_named
 from drakegrasp.runtime.journal import GIVE_UP_DEATHS, PREPARE, Journal, Verdict, open_journal
 from drakegrasp.simulation.candidates import sample_candidates
+from drakegrasp.simulation.postures.table import PostureTable, given_candidates
 from drakegrasp.simulation.settle import find_resting_poses
 
 #: Computing time after which preparing a mesh hangs [s].
@@ -39,6 +40,7 @@ class PrepareTask:
         mesh_sha256: Its digest, `source_sha256`.
         out: Directory of the dataset, visible to every worker.
         config: All the rules.
+        postures: What is tried of it instead of palm poses of samplers; None: these.
         restartable: Whether the process that runs it is started again when it dies. If so, a
             crash or a hang costs only the mesh; if not, it propagates to the caller.
     """
@@ -47,6 +49,7 @@ class PrepareTask:
     mesh_sha256: str
     out: Path
     config: Config
+    postures: PostureTable | None = None
     restartable: bool
 
 
@@ -112,7 +115,7 @@ def _prepared_or_refused(task: PrepareTask, journal: Journal) -> ObjectEntry | R
 
 def _prepared_entry(task: PrepareTask) -> ObjectEntry | RefusedMesh:
     try:
-        prepared = prepare(task.source, task.config)
+        prepared = prepare(task.source, task.config, task.postures)
     except MeshError as error:
         # The entry has the name already.
         return _refused(task, str(error).removeprefix(f"{task.source.path.name}: "))
@@ -129,10 +132,18 @@ def _refused(task: PrepareTask, reason: str, *, again: bool = False) -> RefusedM
     return RefusedMesh(name=name, mesh_sha256=digest, reason=reason, again=again)
 
 
-def prepare(source: MeshSource, config: Config) -> PreparedObject:
+def prepare(
+    source: MeshSource, config: Config, postures: PostureTable | None = None
+) -> PreparedObject:
     """Return a mesh as an object at rest on the table, with its palm poses.
 
+    Args:
+        source: The mesh.
+        config: All the rules.
+        postures: What is tried of it instead of palm poses of samplers.
+
     Raises:
+        GraspError: If a posture is for a resting pose or a scale that the object does not have.
         MeshError: If the mesh cannot be repaired, its size is implausible, or the object does
             not come to rest.
     """
@@ -145,11 +156,16 @@ def prepare(source: MeshSource, config: Config) -> PreparedObject:
         inject_fault(source.name, "distances")
         _ = model.field
     poses = np.array([pose.X_TO for pose in resting])
+    if postures is None:
+        candidates = sample_candidates(model, poses, config.candidates, config.seed)
+    else:
+        X_OM = file_frame(source) if postures.frame == "mesh" else np.eye(4)
+        candidates = given_candidates(model, poses, postures, X_OM, config)
     return PreparedObject(
         model=replace(model, notes=(*model.notes, *resting[0].notes)),
         resting_poses=poses,
         probability=np.array([pose.probability for pose in resting]),
         table_force=np.array([pose.table_force for pose in resting]),
         stopped=np.array([pose.stopped for pose in resting]),
-        candidates=sample_candidates(model, poses, config.candidates, config.seed),
+        candidates=candidates,
     )

@@ -25,6 +25,7 @@ class BuildRequest:
         units: Unit of length of the meshes.
         manifest: YAML file with units and classes by mesh.
         only: Names of the objects to build; all if empty.
+        postures: File of postures that are tried instead of drawn palm poses.
         show: Whether to show progress on standard error.
     """
 
@@ -34,4 +35,5 @@ class BuildRequest:
     units: str
     manifest: Path | None
     only: tuple[str, ...]
+    postures: Path | None
     show: bool

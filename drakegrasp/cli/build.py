@@ -49,6 +49,8 @@ def build(
 
     files = tls_files(options)
     request = parse_request(options)
+    if plan and request.postures is not None:
+        raise click.UsageError("--plan must be used without --postures: a row is an attempt")
     if plan:
         print_plan(request, workers, times)
         return
@@ -59,6 +61,7 @@ def build(
         units=request.units,
         manifest=request.manifest,
         only=request.only,
+        postures=request.postures,
         workers=workers,
         scheduler=scheduler,
         scheduler_file=scheduler_file,

@@ -64,6 +64,12 @@ _TABLE = {
         "YAML file with units and classes by mesh.  [default: objects.yaml beside the meshes]",
         type=PATH,
     ),
+    "--postures": _row(
+        "FILE|DIR",
+        "Try these postures (wrist and joints) instead of drawn palm poses, on the objects that "
+        "they name: .npz, .hdf5, .csv, .parquet, DexGraspBench .npy or isaac_grasp .yaml.",
+        type=PathType(path_type=Path, exists=True),
+    ),
     "--only": _row("NAME", "Build this object only; may be given several times.", multiple=True),
     "--out": _row(
         "DIR",
@@ -141,8 +147,8 @@ SETTINGS = {
 }
 _BUILD = (
     *("--objects", "--per-class", "--objects-seed", "--out", "--config", "--set", "--candidates"),
-    *("--max-grasps", "--samples", "--samples-per-object", "--only", "--certify", "--seed"),
-    *("--units", "--manifest", "--quiet"),
+    *("--max-grasps", "--samples", "--samples-per-object", "--postures", "--only", "--certify"),
+    *("--seed", "--units", "--manifest", "--quiet"),
 )
 _TLS = ("--tls-ca-file", "--tls-cert", "--tls-key")
 
@@ -223,6 +229,7 @@ def parse_request(options: Mapping[str, Any]) -> BuildRequest:
         units=options["units"],
         manifest=options["manifest"],
         only=options["only"],
+        postures=options["postures"],
         show=not options["quiet"],
     )
 

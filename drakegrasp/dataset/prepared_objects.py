@@ -7,6 +7,7 @@ units, `check` and `replay` read these two files and do not need the mesh file.
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,8 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.config import Config
+from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.layout.opening import opened
-from drakegrasp.dataset.layout.plans import ARRAYS
+from drakegrasp.dataset.layout.plans import ARRAYS, POSTURE_ARRAYS
 from drakegrasp.dataset.manifest import ObjectEntry, RestingEntry, read_manifest, refuse_older
 from drakegrasp.dataset.paths import (
     FILE_NAME,
@@ -25,11 +27,11 @@ from drakegrasp.dataset.paths import (
     recorded_model,
     refuse_changed_model,
 )
-from drakegrasp.errors import DataError
+from drakegrasp.errors import DataError, one_line
 from drakegrasp.frames import Array
 from drakegrasp.objects.model import ObjectModel, load_object, save_object
 from drakegrasp.runtime.files import atomic_hdf5
-from drakegrasp.simulation.candidates import Candidates
+from drakegrasp.simulation.candidates import Candidates, GivenPostures
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -106,6 +108,11 @@ def save_prepared(prepared: PreparedObject, out: Path, config: Config) -> None:
         arrays = {**vars(candidates), **vars(prepared), "X_TO": prepared.resting_poses}
         for name, (dtype, _) in ARRAYS.items():
             file.create_dataset(name, data=arrays[name], dtype=dtype)
+        if candidates.postures is not None:
+            said = json.dumps(candidates.postures.said).encode()
+            given = {**vars(candidates.postures), "said": np.frombuffer(said, dtype=np.uint8)}
+            for name, (dtype, _) in POSTURE_ARRAYS.items():
+                file.create_dataset(name, data=given[name], dtype=dtype)
 
 
 def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
@@ -124,6 +131,7 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
         with opened(path, "the plan of an object") as file:
             attributes = dict(file.attrs)
             arrays = {key: file[key][:] for key in ARRAYS}
+            given = {key: file[key][:] for key in POSTURE_ARRAYS if key in file}
     except DataError:
         if (out / FILE_NAME).exists():
             refuse_older(read_manifest(out), out)
@@ -154,5 +162,17 @@ def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
             combinations=int(attributes["combinations"]),
             valid=int(attributes["valid"]),
             distinct=int(attributes["distinct"]),
+            postures=_given_postures(given, path),
         ),
     )
+
+
+def _given_postures(arrays: dict[str, AnyArray], path: Path) -> GivenPostures | None:
+    """Return the postures of a plan, or None if its palm poses come from samplers."""
+    if not arrays:
+        return None
+    try:
+        said = json.loads(arrays.pop("said").tobytes())
+        return GivenPostures(**arrays, said=tuple(map(str, said)))
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{path}: must hold postures, got none: {one_line(error)}") from None

@@ -110,6 +110,7 @@ class Field:
         sample: Whether it is an image, stored in one chunk per row.
         some: Whether rows that reached the stage may lack a value.
         since: First version of the schema that has it.
+        optional: Whether files of this version may lack it: then it reads as without a value.
         of: Where its value is measured, as a path of attributes: from the row of `build.columns`
             for a trial, from a `Verification` for a verdict. For a number of a sample, the column
             of its trial that it copies. Empty if it is computed otherwise.
@@ -127,6 +128,7 @@ class Field:
     sample: bool = False
     some: bool = False
     since: int = 3
+    optional: bool = False
     of: str = ""
     shown: Shown | None = None
 
@@ -270,7 +272,8 @@ _LIFTED = _contacts("lifted", "trial.lift", "after the lift")
 _LINEAGE = _new(
     Field("resting", "", "uint8", "-", "-", "index of the object's resting pose"),
     Field("source", "", "uint8", "-", "-",
-          "sampler of the palm pose: 0 rotations, 1 normals, 2 refine, 3 own"),
+          "sampler of the palm pose: 0 rotations, 1 normals, 2 refine, 3 own; 4 a posture that "
+          "was given"),
     Field("generation", "", "uint8", "-", "-",
           "0: first round; else the number of refined palm poses up to this one"),
     Field("child", "", "int32", "-", "-",
@@ -280,7 +283,8 @@ _LINEAGE = _new(
           "number of the parent in the family, of the same candidate and stand-off"),
     Field("log_density", "", "float64", "-", "-",
           "logarithm of the density of the palm pose's draw: among the different rotations; per "
-          "m^2 of surface and rad of roll; per m^3 rad^3 about the parent's"),
+          "m^2 of surface and rad of roll; per m^3 rad^3 about the parent's; of a posture what its "
+          "file says, NaN if nothing", some=True),
 )
 # Fields of several tables.
 _SPREAD = Field("spread", "", "float64", "rad", "-", "angle of the spread joints",
@@ -414,6 +418,12 @@ TRIAL_FIELDS: tuple[Field, ...] = (
         Field("standoff_index", "", "uint8", "-", "-",
               "index into the configuration's candidates.standoffs"),
         *_LINEAGE,
+        Field("posture_row", "", "float64", "-", "-",
+              "row of the posture in its file; NaN for a palm pose of a sampler", some=True,
+              optional=True),
+        Field("own_motors", "", "bool", "-", "-",
+              "whether each joint had a motor of its own, because the posture does not follow the "
+              "couplings of the hand file", optional=True),
         _SPREAD,
         Field("seed", "", "uint64", "-", "-",
               "state of the candidate's random stream, from which the spread was drawn, or of the "

@@ -104,6 +104,17 @@ def trial_columns() -> tuple[Field, ...]:
     return tuple(f for f in TRIAL_FIELDS if f.name not in ASSEMBLED_FIELDS)
 
 
+def read_field(trials: h5py.Group, field: Field) -> AnyArray:
+    """Return a column of a shard's `/trials`; an optional one that is missing has no value.
+
+    Raises:
+        OSError: If it is missing or cannot be read.
+    """
+    if field.optional and field.name not in trials:
+        return field.empty(len(trials["outcome"]), {})
+    return read_column(trials, field.name)
+
+
 def write_shard(out: Path, shard: Shard) -> Path:
     """Write a shard into a dataset's directory and return its path."""
     path = shard.header.path(out)
@@ -133,7 +144,7 @@ def read_shard(path: Path, header: ShardHeader | None = None, *, verify_seal: bo
     with open_shard(path, header, verify_seal=verify_seal) as (file, own_header):
         return Shard(
             header=own_header,
-            trials={f.name: read_column(file["trials"], f.name) for f in trial_columns()},
+            trials={f.name: read_field(file["trials"], f) for f in trial_columns()},
             looks={f.name: read_column(file["looks"], f.name) for f in LOOK_FIELDS},
         )
 

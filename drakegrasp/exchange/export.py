@@ -19,7 +19,7 @@ from drakegrasp.runtime.files import atomic_folder
 from drakegrasp.runtime.progress import Report, silent
 
 #: `hf` needs the extra `[hub]`.
-Format = Literal["hf", "original", "dexgraspbench", "glb"]
+Format = Literal["hf", "original", "dexgraspbench", "isaac_grasp", "glb"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 
 
@@ -75,6 +75,10 @@ def _writer(form: Format, licence: str) -> Callable[[Path, Path, Report], int]:
         from drakegrasp.exchange.dexgraspbench import write_dexgraspbench
 
         return write_dexgraspbench
+    if form == "isaac_grasp":
+        from drakegrasp.exchange.isaac_grasp import write_isaac_grasp
+
+        return write_isaac_grasp
     from drakegrasp.exchange.posed_scenes import write_glb
 
     return write_glb

@@ -38,7 +38,7 @@ import yaml
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Licence, Positive, describe_mistake
 from drakegrasp.errors import MeshError, one_line
-from drakegrasp.frames import Array
+from drakegrasp.frames import Array, make_pose
 from drakegrasp.mesh.loading import MANY_FACES, SUFFIXES, clean_triangles, parse_mesh, read_bytes
 from drakegrasp.runtime.environment import release_memory
 from drakegrasp.runtime.names import NAME_RULE, is_name
@@ -297,6 +297,20 @@ def upright_vertices(mesh: trimesh.Trimesh, source: MeshSource) -> Array:
     """Return the vertices (n, 3) of a file [m], turned so that its axis `up` is +z."""
     vertices = np.asarray(mesh.vertices) * source.scale
     return vertices if source.up == "+z" else multiply(vertices, np.transpose(UPRIGHT[source.up]))
+
+
+def file_frame(source: MeshSource) -> Array:
+    """Return the pose X_OM (4, 4) in {O} of a file's frame M, whose lengths are in metres.
+
+    The origin of {O} is the centre of the bounding box of all that the file holds.
+
+    Raises:
+        MeshError: If the file cannot be read.
+    """
+    mesh, _ = load_source(source)
+    vertices = upright_vertices(mesh, source)
+    centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
+    return make_pose(UPRIGHT[source.up], -centre)
 
 
 def _sha256(content: bytes, source: MeshSource) -> str:

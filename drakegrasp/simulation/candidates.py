@@ -56,6 +56,25 @@ class Source(IntEnum):
     NORMALS = 1
     REFINE = 2
     OWN = 3  # one of the user's own
+    POSTURES = 4  # none: the posture comes from outside
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GivenPostures:
+    """Joint positions (n, j) [rad or m] of postures from outside, in the plant's order.
+
+    Attributes:
+        q_grasp: When the fingers hold the object.
+        q_pregrasp, q_squeeze: Where the trial begins, and where motors press to; NaN: not given.
+        row: (n,), row of each in its file.
+        said: Where each comes from, in words; may be empty.
+    """
+
+    q_grasp: Array
+    q_pregrasp: Array
+    q_squeeze: Array
+    row: npt.NDArray[np.int64]
+    said: tuple[str, ...]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,6 +91,7 @@ class Candidates:
         combinations: Number of combinations of rotations, or of surface points drawn.
         valid: Number of those above the table whose palm ray meets the bounding box.
         distinct: Number of different poses among the valid ones.
+        postures: Joints of each, where they come from outside and not from samplers.
     """
 
     X_OG: Array
@@ -82,9 +102,28 @@ class Candidates:
     combinations: int
     valid: int
     distinct: int
+    postures: GivenPostures | None = None
 
     def __len__(self) -> int:
         return len(self.X_OG)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JointPath:
+    """Positions (j,) of all joints [rad or m], in the plant's order, that a trial goes through.
+
+    Attributes:
+        start: Where the trial begins.
+        grasp: Where the fingers hold the object.
+        squeeze: Where motors of their own go on to, and press.
+        own_motors: Whether each joint has a motor of its own; else the hand file's close the
+            fingers until they stop, and what they do not move keeps its place.
+    """
+
+    start: Array
+    grasp: Array
+    squeeze: Array
+    own_motors: bool
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,6 +138,7 @@ class Pregrasp:
         ray_hits: Whether the palm ray meets the object; true if no ray places the palm.
         conditions: Friction, mass, looks and cameras; None are the usual ones.
         audited: Whether the closed hand is lifted in any case, whatever its chance and its image.
+        path: Of a posture that spread and closing cannot say: the positions of all joints.
     """
 
     X_OG: Array
@@ -107,6 +147,7 @@ class Pregrasp:
     ray_hits: bool = True
     conditions: Conditions | None = None
     audited: bool = False
+    path: JointPath | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -127,6 +168,7 @@ class Attempt(Pregrasp):
         log_density: Logarithm of the density of the draw, see the schema.
         child, parent: Its number in its family, and that of its parent; 0 for the first.
         generation: Number of parents before it.
+        posture_row: Row of a posture in its file; NaN for a palm pose of a sampler.
     """
 
     candidate: int
@@ -139,6 +181,12 @@ class Attempt(Pregrasp):
     child: int = 0
     parent: int = 0
     generation: int = 0
+    posture_row: float = np.nan
+
+    @property
+    def own_motors(self) -> bool:
+        """Whether each joint has a motor of its own, see `JointPath`."""
+        return self.path is not None and self.path.own_motors
 
 
 class Sampler(Protocol):
@@ -374,7 +422,7 @@ def make_attempts(
                 resting=int(candidates.resting[i]),
                 source=Source(candidates.source[i]),
                 log_density=float(candidates.log_density[i]),
-                audited=_is_audited(seed, object_key(name), i, j, 0),
+                audited=is_audited(seed, object_key(name), i, j, 0),
             )
 
 
@@ -426,11 +474,11 @@ def _child(parent: Attempt, number: int, config: RefineConfig, *, name: str, see
         child=number,
         parent=parent.child,
         generation=parent.generation + 1,
-        audited=_is_audited(seed, object_key(name), *place),
+        audited=is_audited(seed, object_key(name), *place),
     )
 
 
-def _is_audited(seed: int, *place: int) -> bool:
+def is_audited(seed: int, *place: int) -> bool:
     """Return whether an attempt is audited: object, candidate, stand-off and child decide."""
     return int(Stream(seed, *place, _AUDIT).integers(AUDIT, 1)[0]) == 0
 

@@ -46,6 +46,7 @@ from pydrake.multibody.plant import (
 )
 from pydrake.multibody.tree import (
     FixedOffsetFrame,
+    JointActuator,
     ModelInstanceIndex,
     PdControllerGains,
     PrismaticJoint,
@@ -61,6 +62,7 @@ from pydrake.trajectories import PiecewisePolynomial
 from drakegrasp.config import PhysicsConfig
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.description import Hand
+from drakegrasp.hand.file_format import Finger
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.parsing import add_model, make_parser
 from drakegrasp.hand.shapes import hull_corners
@@ -78,6 +80,9 @@ WRIST_STIFFNESS, WRIST_DAMPING = 1e6, 1e4
 FINGER_DAMPING = 20.0
 #: Drake requires a positive stiffness [N m/rad]; this one adds less than a millionth of the torque.
 FINGER_STIFFNESS = 1e-6
+#: A motor of its own that is this far from its path [rad, or 0.1 m] gives all its torque, and its
+#: damping is its stiffness times this time [s]; own choices.
+SOFT, LAG = 0.1, 0.1
 #: Distance above the table at which the solver knows of a contact before it has a force [m]: a flat
 #: base on a stiff table jitters without it (RobotLocomotion/drake#21514). An edge or a tip sinks in
 #: by about twice as much.
@@ -98,7 +103,8 @@ def build_scene(
     table a surface that carries well. The table and every part of the hand are compliant, so that
     each contact with the object is hydroelastic.
 
-    `Scene.coarse_scene` builds the scene with coarse steps when it is first called.
+    `Scene.coarse_scene` builds the scene with coarse steps when it is first called,
+    `Scene.own_motors` that with a motor for each joint of the fingers.
 
     Args:
         model: The object; its own friction, if it has one, wins.
@@ -107,12 +113,26 @@ def build_scene(
         meshcat: Where to show the scene while it is simulated; the results are the same bits.
     """
     physics = model.own_physics(physics)
-    scene = _build(model, physics, hand, meshcat)
+    own = cache(partial(_with_coarse, model, physics, hand, meshcat, own_motors=True))
+    return replace(_with_coarse(model, physics, hand, meshcat), own_motors=own)
+
+
+def _with_coarse(
+    model: ObjectModel,
+    physics: PhysicsConfig,
+    hand: Hand,
+    meshcat: Meshcat | None,
+    *,
+    own_motors: bool = False,
+) -> Scene:
+    """Return a scene that knows how to build the one with coarse steps."""
+    build = partial(_build, model, hand=hand, meshcat=meshcat, own_motors=own_motors)
+    scene = build(physics=physics)
     if physics.coarse_steps == 1:
         return scene
     time_step = physics.coarse_steps * physics.time_step
     coarse = physics.model_copy(update={"time_step": time_step})
-    return replace(scene, coarse_scene=cache(partial(_build, model, coarse, hand, meshcat)))
+    return replace(scene, coarse_scene=cache(partial(build, physics=coarse)))
 
 
 def build_object_scene(
@@ -196,7 +216,11 @@ def _draft(
 
 
 def _build(
-    model: ObjectModel, physics: PhysicsConfig, hand: Hand, meshcat: Meshcat | None
+    model: ObjectModel,
+    physics: PhysicsConfig,
+    hand: Hand,
+    meshcat: Meshcat | None,
+    own_motors: bool,
 ) -> Scene:
     # The object on the table, and the hand on its wrist, which follows a trajectory.
     draft = _draft(model, physics, model.resting_surface, meshcat)
@@ -204,7 +228,7 @@ def _build(
     trajectory = draft.builder.AddSystem(
         TrajectorySource(PiecewisePolynomial(np.zeros((3, 1))), output_derivative_order=1)
     )
-    parts_of_hand = _add_hand(plant, scene_graph, hand)
+    parts_of_hand = _add_hand(plant, scene_graph, hand, own_motors)
     instance, fingertips = parts_of_hand["instance"], parts_of_hand["fingertips"]
     _make_compliant_hand(plant, scene_graph, instance, fingertips, physics)
     plant.Finalize()
@@ -217,10 +241,17 @@ def _build(
         plant.get_desired_state_input_port(parts_of_hand["wrist_instance"]),
     )
 
-    # The fingers' command never changes.
-    scene = Scene(**draft.scene_fields(), **parts_of_hand, wrist_trajectory=trajectory)
-    command = plant.get_desired_state_input_port(instance)
-    command.FixValue(scene.context, _closing_command(hand))
+    # Motors of their own follow a path; the command of the hand file's never changes.
+    command, path = plant.get_desired_state_input_port(instance), None
+    if own_motors:
+        still = PiecewisePolynomial(np.zeros((len(parts_of_hand["motors"]), 1)))
+        path = draft.builder.AddSystem(TrajectorySource(still, output_derivative_order=1))
+        draft.builder.Connect(path.get_output_port(), command)
+    scene = Scene(
+        **draft.scene_fields(), **parts_of_hand, wrist_trajectory=trajectory, joint_trajectory=path
+    )
+    if not own_motors:
+        command.FixValue(scene.context, _closing_command(hand))
     return scene
 
 
@@ -316,7 +347,9 @@ def _assign_proximity(
         scene_graph.AssignRole(plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
 
 
-def _add_hand(plant: MultibodyPlant, scene_graph: SceneGraph, hand: Hand) -> dict[str, Any]:
+def _add_hand(
+    plant: MultibodyPlant, scene_graph: SceneGraph, hand: Hand, own_motors: bool
+) -> dict[str, Any]:
     """Add the hand on its wrist, and return the attributes of `Scene` that are parts of them."""
     # Weld the palm to the wrist by frames whose poses are parameters of the context.
     wrist_instance = plant.AddModelInstance("wrist")
@@ -331,29 +364,19 @@ def _add_hand(plant: MultibodyPlant, scene_graph: SceneGraph, hand: Hand) -> dic
     wrist_frame = plant.AddFrame(FixedOffsetFrame("wrist", carrier, RigidTransform()))
     plant.WeldFrames(wrist_frame, palm, RigidTransform())
 
-    _add_actuation(plant, hand, instance)
+    motors = (_add_own_motors if own_motors else _add_actuation)(plant, hand, instance)
     # The arm, which is not simulated, carries the weight of the hand.
     for weightless in (instance, wrist_instance):
         plant.set_gravity_enabled(weightless, False)
 
-    # The fingers.
-    joints = [plant.GetJointByName(f.closing_joint, instance) for f in hand.fingers]
-    followers = [
-        {plant.GetJointByName(c.joint, instance): c.ratio for c in f.coupled} for f in hand.fingers
-    ]
     return {
+        **motors,
         "hand": hand,
         "instance": instance,
         "wrist_instance": wrist_instance,
         "wrist_joints": wrist_joints,
         "wrist_frame": wrist_frame,
         "fingertips": tuple(plant.GetBodyByName(f.fingertip, instance) for f in hand.fingers),
-        "closing_joints": tuple(joints),
-        "closing_limits": tuple(joint_limits(joint) for joint in joints),
-        "driven": tuple(
-            {joint: 1.0, **coupled} for joint, coupled in zip(joints, followers, strict=True)
-        ),
-        "motors": tuple(plant.GetJointActuatorByName(f.name, instance) for f in hand.fingers),
         "parts": _points_inside(plant, scene_graph, instance),
     }
 
@@ -387,7 +410,9 @@ def _add_wrist(plant: MultibodyPlant, instance: ModelInstanceIndex) -> tuple[Pri
     return tuple(joints)
 
 
-def _add_actuation(plant: MultibodyPlant, hand: Hand, instance: ModelInstanceIndex) -> None:
+def _add_actuation(
+    plant: MultibodyPlant, hand: Hand, instance: ModelInstanceIndex
+) -> dict[str, Any]:
     """Add each finger's motor, and couple the joints that follow its closing joint.
 
     With the closing joint's position q and the speed ω at which the hand closes, a motor gives
@@ -398,17 +423,86 @@ def _add_actuation(plant: MultibodyPlant, hand: Hand, instance: ModelInstanceInd
     where u = 1 rad, or the slide that counts as 1 rad (`Hand.closing_unit`). A rotor of inertia I
     behind a gear of ratio n adds n² I to the joint. A coupled joint is at r q + q₀, with the ratio
     and the offset of the hand file.
+
+    Returns:
+        The attributes of `Scene` that say of the motors.
     """
+    motors, driven = [], []
     for finger, unit in zip(hand.fingers, hand.closing_unit.tolist(), strict=True):
         joint = plant.GetJointByName(finger.closing_joint, instance)
-        actuator = plant.AddJointActuator(finger.name, joint, finger.effort_limit)
-        actuator.set_default_rotor_inertia(finger.rotor_inertia)
-        actuator.set_default_gear_ratio(finger.gear_ratio)
         gains = PdControllerGains(p=FINGER_STIFFNESS / unit**2, d=FINGER_DAMPING / unit**2)
-        actuator.set_controller_gains(gains)
+        motors.append(_add_motor(plant, finger.name, joint, finger, gains))
+        driven.append({joint: 1.0})
         for coupling in finger.coupled:
             follower = plant.GetJointByName(coupling.joint, instance)
             plant.AddCouplerConstraint(follower, joint, coupling.ratio, coupling.offset)
+            driven[-1][follower] = coupling.ratio
+    return _of_motors(motors, driven, hand.fingers, hand.closing_unit, hand.locked_joints)
+
+
+def _add_own_motors(
+    plant: MultibodyPlant, hand: Hand, instance: ModelInstanceIndex
+) -> dict[str, Any]:
+    """Add a motor for every joint from the palm to a fingertip but those of the spread.
+
+    With the position q of the joint and the position q_d and speed of its path, a motor gives
+
+        τ = K (q_d − q) + D (dq_d/dt − dq/dt), cut off at ± the effort limit τ_max,
+        K = τ_max / (`SOFT` u), D = K `LAG`,
+
+    with effort limit, holding effort, rotor and gear of the finger's closing joint. A joint that
+    slides where this one turns, or turns where it slides, has no motor.
+
+    Returns:
+        The attributes of `Scene` that say of the motors.
+    """
+    motors: list[JointActuator] = []
+    fingers, units = list[Finger](), list[float]()
+    for i, (finger, chain) in enumerate(zip(hand.fingers, hand.chains, strict=True)):
+        for name, slides in zip(chain.joints, chain.slides.tolist(), strict=True):
+            joint = plant.GetJointByName(name, instance)
+            taken = any(motor.joint() is joint for motor in motors)
+            if taken or name in hand.spread.joints or slides != finger.slides:
+                continue
+            p = finger.effort_limit / (SOFT * hand.closing_unit[i])
+            gains = PdControllerGains(p=p, d=LAG * p)
+            motors.append(_add_motor(plant, f"{finger.name}/{name}", joint, finger, gains))
+            fingers.append(finger)
+            units.append(hand.closing_unit[i])
+    moved = {motor.joint().name() for motor in motors}
+    still = tuple(name for name in hand.joint_names if name not in moved)
+    driven = [{motor.joint(): 1.0} for motor in motors]
+    return _of_motors(motors, driven, fingers, np.array(units), still)
+
+
+def _add_motor(
+    plant: MultibodyPlant, name: str, joint: Any, finger: Finger, gains: PdControllerGains
+) -> JointActuator:
+    actuator = plant.AddJointActuator(name, joint, finger.effort_limit)
+    actuator.set_default_rotor_inertia(finger.rotor_inertia)
+    actuator.set_default_gear_ratio(finger.gear_ratio)
+    actuator.set_controller_gains(gains)
+    return actuator
+
+
+def _of_motors(
+    motors: Sequence[JointActuator],
+    driven: Sequence[dict[Any, float]],
+    fingers: Sequence[Finger],
+    units: Array,
+    still: tuple[str, ...],
+) -> dict[str, Any]:
+    joints = tuple(motor.joint() for motor in motors)
+    return {
+        "motors": tuple(motors),
+        "closing_joints": joints,
+        "closing_limits": tuple(joint_limits(joint) for joint in joints),
+        "closing_units": units,
+        "effort_limits": np.array([finger.effort_limit for finger in fingers]),
+        "holding_efforts": tuple(finger.holding_effort for finger in fingers),
+        "driven": tuple(driven),
+        "still_joints": still,
+    }
 
 
 def _closing_command(hand: Hand) -> Array:

@@ -9,7 +9,8 @@ with each of them:
   against that torque, until it stands or closes again.
 * `locked`: the joint keeps its angle, whatever the load.
 
-Of a closing joint that slides, angles are lengths [m] and torques are forces [N].
+Of a closing joint that slides, angles are lengths [m] and torques are forces [N]. A joint with a
+motor of its own closes towards the position to which it is commanded.
 
 Limits of joints and actuators belong to the plant, not to its context: `disengage` restores them
 after a lift, and `hand_over` carries them to the scene that continues one.
@@ -32,6 +33,7 @@ from drakegrasp.simulation.scene import (
     Scene,
     closing_angles,
     closing_rates,
+    commanded_joints,
     joint_limits,
 )
 
@@ -65,12 +67,14 @@ def engage(scene: Scene, drive: Drive) -> None:
     """
     if drive == "torque":
         return
-    for joint, angle, (_, upper) in zip(
-        scene.closing_joints, closing_angles(scene), scene.closing_limits, strict=True
+    signs, angles = _closing_signs(scene), closing_angles(scene)
+    for joint, sign, angle, limits in zip(
+        scene.closing_joints, signs, signs * angles, scene.closing_limits, strict=True
     ):
         # A joint that closed up to its limit may be a little beyond.
+        _, upper = _signed(limits, sign)
         least = angle if drive == "locked" else min(angle, upper)
-        _set_limits(joint, least, angle if drive == "locked" else upper)
+        _set_limits(joint, *_signed((least, angle if drive == "locked" else upper), sign))
     if drive == "worm":
         _start_worms(scene)
 
@@ -80,7 +84,7 @@ def disengage(scene: Scene) -> None:
     scene.simulator.clear_monitor()
     for i, joint in enumerate(scene.closing_joints):
         _set_limits(joint, *scene.closing_limits[i])
-        scene.motors[i].set_effort_limit(scene.hand.fingers[i].effort_limit)
+        scene.motors[i].set_effort_limit(scene.effort_limits[i])
 
 
 def hand_over(scene: Scene, before: Scene) -> None:
@@ -101,7 +105,7 @@ def hand_over(scene: Scene, before: Scene) -> None:
 
 
 def opening_torques(scene: Scene) -> Array:
-    """Return the torque (k,) [N m or N] by which contacts push each closing joint open now.
+    """Return the torque (m,) [N m or N] by which contacts push each closing joint open now.
 
     Contacts act on joint j of the hand with the torque τ_j = Σ J_jᵀ f, the sum over all contact
     forces f, where J_j dq_j/dt is the velocity that the joint gives to a force's point. Where motor
@@ -116,12 +120,29 @@ def opening_torques(scene: Scene) -> Array:
     plant.SetVelocitiesInArray(scene.instance, port.Eval(scene.context), torques)
 
     # A motor moves its joints at fixed ratios, so it carries their torques by the same ratios.
-    return np.array(
+    return _closing_signs(scene) * np.array(
         [
             -sum(ratio * torques[joint.velocity_start()] for joint, ratio in driven.items())
             for driven in scene.driven
         ]
     )
+
+
+def _closing_signs(scene: Scene) -> Array:
+    """Return (m,), 1 where a larger position of a joint is closer, else -1.
+
+    A motor of its own pushes towards the position to which it is commanded. A joint that passes it
+    is held from both sides.
+    """
+    if scene.joint_trajectory is None:
+        return np.ones(len(scene.closing_joints))
+    return np.where(commanded_joints(scene) >= closing_angles(scene), 1.0, -1.0)
+
+
+def _signed(limits: tuple[float, float], sign: float) -> tuple[float, float]:
+    """Return limits as they are, or with -1 those of the negative position; both ways alike."""
+    lower, upper = limits
+    return (lower, upper) if sign > 0.0 else (-upper, -lower)
 
 
 def _start_worms(scene: Scene) -> None:
@@ -139,31 +160,33 @@ def _turn_worms(scene: Scene, _: Context) -> EventStatus:
         it yields:  l ← that of the hand's files, and the motor gives up to τ_hold;
                     it holds again, with l ← q, once dq/dt ≥ −`STANDING` u
 
-    where τ_hold is the finger's `holding_effort` and u its `Hand.closing_unit`.
+    where τ_hold is the finger's `holding_effort` and u its `Hand.closing_unit`. Of a joint that
+    closes towards smaller positions, q, l and dq/dt have the other sign.
     """
-    angles, rates = closing_angles(scene), closing_rates(scene)
+    signs = _closing_signs(scene)
+    angles, rates = signs * closing_angles(scene), signs * closing_rates(scene)
 
     # Set the limits before loads are read: Drake solves this state once, for the loads and for the
     # step that follows.
-    for i, finger in enumerate(scene.hand.fingers):
+    for i, effort_limit in enumerate(scene.effort_limits.tolist()):
         joint, motor = scene.closing_joints[i], scene.motors[i]
-        lower, upper = joint_limits(joint)
-        yields = motor.effort_limit() > finger.effort_limit
+        lower, upper = _signed(joint_limits(joint), signs[i])
+        yields = motor.effort_limit() > effort_limit
         if yields and rates[i] >= -STANDING:
             # A finger that yielded stands again: from now on the worm holds it here.
-            motor.set_effort_limit(finger.effort_limit)
-            _set_limits(joint, min(angles[i], upper), upper)
+            motor.set_effort_limit(effort_limit)
+            _set_limits(joint, *_signed((min(angles[i], upper), upper), signs[i]))
         elif not yields and angles[i] > lower:
-            _set_limits(joint, min(angles[i], upper), upper)
+            _set_limits(joint, *_signed((min(angles[i], upper), upper), signs[i]))
 
     # A finger whose load exceeds what its worm holds opens against just that torque.
     loads, overloaded = opening_torques(scene), False
-    for i, finger in enumerate(scene.hand.fingers):
-        assert finger.holding_effort is not None
+    for i, holding_effort in enumerate(scene.holding_efforts):
+        assert holding_effort is not None
         motor = scene.motors[i]
-        if loads[i] > finger.holding_effort and motor.effort_limit() <= finger.effort_limit:
+        if loads[i] > holding_effort and motor.effort_limit() <= scene.effort_limits[i]:
             _set_limits(scene.closing_joints[i], *scene.closing_limits[i])
-            motor.set_effort_limit(finger.holding_effort)
+            motor.set_effort_limit(holding_effort)
             overloaded = True
 
     # What Drake has solved for this state is void then: a new state makes it solve again.

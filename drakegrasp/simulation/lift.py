@@ -189,7 +189,7 @@ class _Monitor:
         tips = zip(scene.fingertips, scene.hand.required, strict=True)
         self._tips = {body.index() for body, required in tips if required}
         self._X_GO, self._angles = _object_in_hand(scene), closing_angles(scene)
-        self._unit = scene.hand.closing_unit
+        self._unit = scene.closing_units
         # Whether all fingertips touched the object at a check since which nothing moved: then
         # contacts need not be computed again.
         self._held = False

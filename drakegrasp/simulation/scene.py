@@ -8,7 +8,7 @@ and a reset context gives the same bits as a new one. A scene makes no decisions
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -94,12 +94,20 @@ class Scene(ObjectScene):
         wrist_frame: Its rotation in the context is the palm's orientation.
         wrist_trajectory: The path that the wrist follows.
         fingertips: The k links.
-        closing_joints, motors: Each finger's closing joint, and what drives it.
+        closing_joints, motors: The joints that a motor drives, and the motors: the closing joint of
+            each finger, or every joint of the fingers, see `own_motors`.
         closing_limits: Of the closing joints [rad or m].
+        closing_units: (m,), how far each moves for what counts as a radian [rad or m].
+        effort_limits: (m,), largest torque or force of each motor [N m or N].
+        holding_efforts: Torque or force that each motor's worm holds; None if it is not known.
         driven: The joints that each motor moves, with their ratios.
+        still_joints: Names of the joints that no motor moves.
+        joint_trajectory: The path that motors of their own follow; None for those of the hand file.
         parts: Each shape of the hand with a point inside it, (3,) in the shape's frame [m].
         coarse_scene: Returns the scene whose step is `physics.coarse_steps` times as long; every
             call returns the same one. None where there is no such scene.
+        own_motors: Returns the scene in which each joint of the fingers has a motor of its own;
+            every call returns the same one. None where this is that scene.
     """
 
     hand: Hand
@@ -111,10 +119,16 @@ class Scene(ObjectScene):
     fingertips: tuple[RigidBody, ...]
     closing_joints: tuple[ClosingJoint, ...]
     closing_limits: tuple[tuple[float, float], ...]
+    closing_units: Array
+    effort_limits: Array
+    holding_efforts: tuple[float | None, ...]
     driven: tuple[dict[ClosingJoint, float], ...]
     motors: tuple[JointActuator, ...]
+    still_joints: tuple[str, ...]
     parts: tuple[tuple[GeometryId, Array], ...]
+    joint_trajectory: TrajectorySource | None = None
     coarse_scene: Callable[[], Scene] | None = None
+    own_motors: Callable[[], Scene] | None = None
 
     @property
     def links(self) -> list[RigidBody]:
@@ -138,6 +152,7 @@ def reset_attempt(
     *,
     spread: float,
     closing: npt.ArrayLike | None = None,
+    q: Array | None = None,
 ) -> None:
     """Put hand and object at the start of an attempt; only the fingers are not locked.
 
@@ -147,6 +162,7 @@ def reset_attempt(
         X_WG: Pose of the palm (4, 4).
         spread: Angle of the spread joints [rad].
         closing: Position of each finger's closing joint (k,) [rad or m]; None is the open hand.
+        q: Positions of all joints of the hand (j,), in the plant's order, instead of both.
     """
     # Unlock the wrist before positions are set, then place the object.
     context, plant = scene.context, scene.plant
@@ -159,7 +175,11 @@ def reset_attempt(
     R_WG = RotationMatrix(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]))
     scene.wrist_frame.SetPoseInParentFrame(context, RigidTransform(R_WG, np.zeros(3)))
     angles = np.zeros(scene.hand.num_fingers) if closing is None else closing
-    for name, position in joint_positions(scene.hand, spread, angles).items():
+    if q is None:
+        positions = joint_positions(scene.hand, spread, angles)
+    else:
+        positions = dict(zip(hand_joint_names(scene), q.tolist(), strict=True))
+    for name, position in positions.items():
         joint = plant.GetJointByName(name, scene.instance)
         slides = isinstance(joint, PrismaticJoint)
         (joint.set_translation if slides else joint.set_angle)(context, position)
@@ -175,7 +195,26 @@ def reset_attempt(
     scene.object.Lock(context)
     _let_object_meet_table(scene, False)
     scene.wrist_trajectory.UpdateTrajectory(PiecewisePolynomial(X[:3, 3:4]))
+    if scene.joint_trajectory is not None:
+        command_joints(scene, [0.0], [closing_angles(scene)])
     scene.simulator.Initialize()
+
+
+def command_joints(scene: Scene, times: Sequence[float], positions: Sequence[Array]) -> None:
+    """Command motors of their own to positions (m,) [rad or m] at times [s], on straight ways."""
+    assert scene.joint_trajectory is not None
+    points = np.column_stack(positions)
+    straight = PiecewisePolynomial.FirstOrderHold
+    path = straight(times, points) if len(times) > 1 else PiecewisePolynomial(points)
+    scene.joint_trajectory.UpdateTrajectory(path)
+
+
+def commanded_joints(scene: Scene) -> Array:
+    """Return the positions (m,) [rad or m] to which motors of their own are commanded now."""
+    source = scene.joint_trajectory
+    assert source is not None
+    context = source.GetMyContextFromRoot(scene.simulator.get_context())
+    return np.asarray(source.get_output_port().Eval(context)[: len(scene.motors)])
 
 
 def release(scene: Scene) -> None:
@@ -204,7 +243,7 @@ def _let_object_meet_table(scene: ObjectScene, meet: bool) -> None:
 
 
 def _lock_still_joints(scene: Scene) -> None:
-    for name in scene.hand.locked_joints:
+    for name in scene.still_joints:
         scene.plant.GetJointByName(name, scene.instance).Lock(scene.context)
 
 
@@ -276,6 +315,10 @@ def transfer_state(scene: Scene, before: Scene, time: float, motion: WristMotion
     state = before.plant.GetPositionsAndVelocities(before.context)
     scene.plant.SetPositionsAndVelocities(scene.context, state)
 
+    # Motors of their own press on to the same positions.
+    if scene.joint_trajectory is not None:
+        command_joints(scene, [0.0], [commanded_joints(before)])
+
     # Lock spread and preshape, and follow the same path of the wrist.
     _lock_still_joints(scene)
     _follow(scene, motion)
@@ -288,12 +331,12 @@ def advance(scene: ObjectScene, duration: float) -> None:
 
 
 def closing_rates(scene: Scene) -> Array:
-    """Return the speed of each finger's closing joint (k,), in its unit [1/s]; positive closes.
+    """Return the speed of each closing joint (m,), in its unit [1/s].
 
-    The unit is `Hand.closing_unit`: one speed limit serves joints that turn and joints that slide.
+    By the unit (`Scene.closing_units`) one speed limit serves joints that turn and that slide.
     """
     rates = [joint.GetOneVelocity(scene.context) for joint in scene.closing_joints]
-    return np.array(rates) / scene.hand.closing_unit
+    return np.array(rates) / scene.closing_units
 
 
 def finger_speed(scene: Scene) -> float:
@@ -302,7 +345,7 @@ def finger_speed(scene: Scene) -> float:
 
 
 def closing_angles(scene: Scene) -> Array:
-    """Return the position of each finger's closing joint (k,) [rad or m]."""
+    """Return the position of each closing joint (m,) [rad or m]."""
     return np.array([joint.GetOnePosition(scene.context) for joint in scene.closing_joints])
 
 

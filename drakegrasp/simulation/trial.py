@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +20,7 @@ from drakegrasp.errors import MachineError, first_line
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.lift_chance import GRASP_CONTACTS, ClosedGrasp
 from drakegrasp.outcomes import Outcome
-from drakegrasp.simulation.candidates import Pregrasp
+from drakegrasp.simulation.candidates import JointPath, Pregrasp
 from drakegrasp.simulation.contacts import Contacts, open_hand_collides, read_contacts
 from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.lift import Lift, lift
@@ -28,7 +29,9 @@ from drakegrasp.simulation.randomization.materials import set_materials
 from drakegrasp.simulation.scene import (
     Scene,
     closing_angles,
+    command_joints,
     finger_speed,
+    hand_joint_names,
     hand_positions,
     reset_attempt,
 )
@@ -124,6 +127,9 @@ def run_attempt(
         OSError: If a file of the hand cannot be read.
     """
     drive_of(scene.hand, config.lift)
+    path = attempt.path
+    if path is not None and path.own_motors and scene.own_motors is not None:
+        scene = scene.own_motors()
     required = scene.hand.required
     X_TO = np.asarray(X_TO, dtype=float)
     start = TrialRecord(outcome=Outcome.RAY_MISS, X_TO=X_TO, X_OG=attempt.X_OG)
@@ -146,7 +152,8 @@ def run_attempt(
         # Place: object and palm stand still, the fingers are where the attempt starts them.
         limits = start_limits(config)
         set_materials(scene, _materials(scene, attempt))
-        reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=attempt.closing)
+        q = None if path is None else path.start
+        reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=attempt.closing, q=q)
         if open_hand_collides(scene):
             return replace(start, outcome=Outcome.START_COLLISION)
         if screened is not None:
@@ -155,7 +162,10 @@ def run_attempt(
         # Close: from just before the fingers meet something, where geometry knows that.
         if prediction is not None:
             reset_attempt(scene, X_WO, X_WG, spread=attempt.spread, closing=prediction.closing)
-        _close(scene, limits, config, prediction)
+        if path is not None and path.own_motors:
+            _follow_path(scene, limits, config, path)
+        else:
+            _close(scene, limits, config, prediction)
         contacts = read_contacts(scene)
         closed = Closed(contacts=contacts, q=hand_positions(scene), duration=scene.time)
         record = replace(start, closed=closed)
@@ -237,4 +247,27 @@ def _close(
         limits.advance(scene, min(config.close.check_period, end - scene.time))
         stopped = finger_speed(scene) < config.close.stop_speed
         if stopped or np.any(closing_angles(scene) > last):
+            break
+
+
+def _follow_path(scene: Scene, limits: TrialLimits, config: Config, path: JointPath) -> None:
+    """Move each joint by its own motor to the grasp and on to the squeeze, until all have stopped.
+
+    The joints move in step: that with the longest way moves at the hand's closing speed.
+    """
+    # The way of the driven joints, in the order of their motors.
+    names = hand_joint_names(scene)
+    moved = [names.index(joint.name()) for joint in scene.closing_joints]
+    places = [q[moved] for q in (path.start, path.grasp, path.squeeze)]
+    speed = scene.closing_units * float((scene.hand.closing_speed / scene.hand.closing_unit).min())
+    lasts = [float((np.abs(b - a) / speed).max()) for a, b in pairwise(places)]
+    stages = [i for i, seconds in enumerate(lasts) if seconds > 0.0]
+    times = np.cumsum([0.0, *(lasts[i] for i in stages)])
+    command_joints(scene, times.tolist(), [places[0], *(places[i + 1] for i in stages)])
+
+    # They stop when they press on the object, or are at their targets.
+    end = float(times[-1]) + config.close.max_time
+    while end - scene.time > ROUNDING:
+        limits.advance(scene, min(config.close.check_period, end - scene.time))
+        if scene.time > times[-1] and finger_speed(scene) < config.close.stop_speed:
             break

@@ -84,7 +84,9 @@ def record_attempt(
     def run(meshcat: Meshcat) -> TrialRecord:
         scene = build_scene(model, config.physics, load_hand(config.hand), meshcat=meshcat)
         # An attempt that fails before it is simulated is shown at its start.
-        show_start(meshcat, scene, X_TO, config, attempt.X_OG, attempt.spread, attempt.closing)
+        q = None if attempt.path is None else attempt.path.start
+        pose = attempt.X_OG, attempt.spread, attempt.closing
+        show_start(meshcat, scene, X_TO, config, *pose, q=q)
         record = run_attempt(scene, X_TO, attempt, config, is_visible=lambda: is_visible)
         draw_predicted(meshcat, p_OQ, nhat_Q_O)
         return record
@@ -100,6 +102,7 @@ def show_start(
     X_OG: Array,
     spread: float,
     closing: Array | None,
+    q: Array | None = None,
 ) -> None:
     """Show object and hand at the start, and aim the camera.
 
@@ -111,9 +114,10 @@ def show_start(
         X_OG: (4, 4), pose of the palm.
         spread: Angle of the spread joints [rad].
         closing: (k,), closing positions [rad or m]; the open hand if None.
+        q: (j,), positions of all joints, instead of both.
     """
     X_WO = X_WT @ np.asarray(X_TO, dtype=float)
-    reset_attempt(scene, X_WO, X_WO @ X_OG, spread=spread, closing=closing)
+    reset_attempt(scene, X_WO, X_WO @ X_OG, spread=spread, closing=closing, q=q)
     _aim_camera(meshcat, scene, X_WO, config, side_W=X_WO[:3, :3] @ X_OG[:3, 3])
 
 

@@ -21,7 +21,7 @@ from drakegrasp.dataset.assembly.samples import IMAGES, SampleRows, record_type,
 from drakegrasp.dataset.hdf5 import COLUMN_CHUNK, AnyArray, packed_chunk, read_column
 from drakegrasp.dataset.paths import model_path
 from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS, SPLITS, TRIAL_FIELDS
-from drakegrasp.dataset.shards import ShardHeader, open_shard, trial_columns
+from drakegrasp.dataset.shards import ShardHeader, open_shard, read_field, trial_columns
 from drakegrasp.frames import Array
 from drakegrasp.objects.model import ObjectModel, load_object
 from drakegrasp.runtime.files import disk_full_named, temporary_name
@@ -149,7 +149,7 @@ def read_rows(task: PackTask) -> tuple[dict[str, AnyArray], dict[str, SplitSampl
     for piece in task.slices:
         path = piece.header.path(Path(task.out))
         with open_shard(path, piece.header, verify_seal=False, again=True) as (file, _):
-            trials = {f.name: read_column(file["trials"], f.name) for f in trial_columns()}
+            trials = {f.name: read_field(file["trials"], f) for f in trial_columns()}
             _fill_rows(columns, trials, piece, task)
             _add_samples(samples, trials, file["looks"], piece, task, load)
     return columns, samples

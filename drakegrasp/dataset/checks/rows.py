@@ -219,11 +219,14 @@ class CheckedFile:
             OSError, UnicodeDecodeError: If the file is damaged there.
         """
         fields = [f for f in self.fields[group] if names is None or f.name in names]
+        absent = [f for f in fields if f.optional and f.name not in file[group]]
         # HDF5 reads a slice far faster than the same rows as a list.
         dense = len(rows) > 0 and rows[-1] - rows[0] + 1 == len(rows)
         choice = slice(int(rows[0]), int(rows[-1]) + 1) if dense else rows
-        own, columns = file[group], {}
+        own, columns = file[group], {f.name: f.empty(len(rows), {}) for f in absent}
         for f in fields:
+            if f in absent:
+                continue
             dataset = own[f.name]
             columns[f.name] = (dataset.asstr() if f.dtype == "str" else dataset)[choice]
         return Batch(file=self.name, group=f"/{group}", rows=rows, columns=columns)

@@ -78,9 +78,13 @@ def numbers(
     refined = child > 0
     what = "generation must be 0 for the first of a family and positive for others"
     yield from batch.broken(what, (batch["generation"] > 0) != refined, batch["generation"])
-    what = "source must be 2 (refine) for a refined palm pose, and 0, 1 or 3 for another"
+    what = "source must be 2 (refine) for a refined palm pose, and 0, 1, 3 or 4 for another"
     bad = ((source == Source.REFINE) != refined) | (source > max(Source))
     yield from batch.broken(what, bad, source)
+
+    # Only of a posture from outside may the density be unknown.
+    what, density = "log_density must be finite but for postures", batch["log_density"]
+    yield from batch.broken(what, ~np.isfinite(density) & (source != Source.POSTURES), density)
     if children is not None:
         parent = np.where(refined, (child - 1) // max(children, 1), 0)
         yield from batch.follows("parent", parent, "child")

@@ -23,6 +23,13 @@ ARRAYS: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "source": ("int64", ("n",)),
     "log_density": ("float64", ("n",)),
 }
+#: Those of a plan of postures from outside, in addition; `j` stands for the number of joints, and
+#: `said` is a list of texts as JSON.
+POSTURE_ARRAYS: dict[str, tuple[str, tuple[int | str, ...]]] = {
+    **{name: ("float64", ("n", "j")) for name in ("q_grasp", "q_pregrasp", "q_squeeze")},
+    "row": ("int64", ("n",)),
+    "said": ("uint8", ("m",)),
+}
 _ATTRIBUTES = {
     **dict.fromkeys(("model_sha256", "config_hash", "mesh_sha256"), TEXT),
     **dict.fromkeys(("combinations", "valid", "distinct", "max"), COUNT),
@@ -40,9 +47,10 @@ def refuse_other_plan(path: Path, file: h5py.File) -> None:
 
 
 def _other_arrays(file: h5py.File) -> Iterator[str]:
-    """Yield how the arrays of a plan differ from `ARRAYS`."""
+    """Yield how the arrays of a plan differ from `ARRAYS`, and from those of postures."""
     lengths: dict[str, int] = {}
-    for name, (dtype, axes) in ARRAYS.items():
+    postures = POSTURE_ARRAYS if "q_grasp" in file else {}
+    for name, (dtype, axes) in (ARRAYS | postures).items():
         dataset = file.get(name)
         if not isinstance(dataset, h5py.Dataset):
             yield f"/{name}: the dataset must be there, got none"
@@ -51,8 +59,9 @@ def _other_arrays(file: h5py.File) -> Iterator[str]:
             yield f"/{name}: type must be {dtype}, got {dataset.dtype}"
         # The first array with a letter tells its length.
         stored = dataset.shape or ()
-        if isinstance(axes[0], str) and stored:
-            lengths.setdefault(axes[0], stored[0])
+        for axis, length in zip(axes, stored, strict=False):
+            if isinstance(axis, str):
+                lengths.setdefault(axis, length)
         shape = tuple(lengths.get(a, 0) if isinstance(a, str) else a for a in axes)
         if stored != shape:
             yield f"/{name}: shape must be {shape}, got {dataset.shape}"

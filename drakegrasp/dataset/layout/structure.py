@@ -173,7 +173,8 @@ def _of_field(
         lengths: Of the letters in the shapes, where they are known.
     """
     if dataset is None:
-        yield Difference(path=path, what="the dataset must be there", got="none")
+        if not field.optional:
+            yield Difference(path=path, what="the dataset must be there", got="none")
         return
 
     dtype, stored = dataset.dtype, dataset.shape

@@ -1,0 +1,69 @@
+"""The format isaac_grasp 1.0 (nvidia-isaac-ros.github.io, "Isaac Grasp File"): a YAML per object.
+
+In: a dataset. Out: `<object>.yaml`, with the pose of the palm link in {O} of each sample, the
+joints after closing and those of the open hand, and `meshes/<object>.obj`, the object in {O} [m].
+"""
+
+from __future__ import annotations
+
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from drakegrasp.arithmetic import multiply
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.paths import model_path
+from drakegrasp.exchange.closed_grasps import ClosedGrasp, read_closed_grasps
+from drakegrasp.exchange.dexgraspbench import pose_vector
+from drakegrasp.exchange.foreign_postures import CREATED_WITH
+from drakegrasp.frames import invert_pose
+from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.kinematics import joint_positions
+from drakegrasp.mesh.wavefront import obj_text
+from drakegrasp.objects.model import load_object
+from drakegrasp.runtime.progress import Report
+from drakegrasp.simulation.postures.posture import joint_order
+
+
+def write_isaac_grasp(out: Path, folder: Path, progress: Report) -> int:
+    """Write the samples of a dataset and return their number; see `export.export_dataset`."""
+    hand = load_hand(read_manifest(out).config.hand)
+    grasps = list(read_closed_grasps(out))
+    (folder / "meshes").mkdir()
+    done = 0
+    for name, same in groupby(grasps, key=lambda grasp: grasp.object_name):
+        model = load_object(model_path(out, name))
+        text = obj_text(model.visual_vertices, model.visual_faces, normals=False)
+        (folder / "meshes" / f"{name}.obj").write_text(text, encoding="utf-8")
+
+        entries = {f"trial_{grasp.trial_id}": grasp_entry(hand, grasp) for grasp in same}
+        tree = {
+            "format": "isaac_grasp",
+            "format_version": 1.0,
+            "created_with": CREATED_WITH,
+            "object_frame": "centre of the bounding box, as in meshes/",
+            "gripper_frame": hand.palm_link,
+            "grasps": entries,
+        }
+        text = yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=1000)
+        (folder / f"{name}.yaml").write_text(text, encoding="utf-8")
+        done += len(entries)
+        progress(done, len(grasps))
+    return done
+
+
+def grasp_entry(hand: Hand, grasp: ClosedGrasp) -> dict[str, Any]:
+    """Return what the file says of a sample, which held."""
+    order = joint_order(hand)
+    X_OB = multiply(multiply(invert_pose(grasp.X_TO), grasp.X_TG), invert_pose(hand.X_BG))
+    x, y, z, w, *xyz = pose_vector(X_OB).tolist()
+    opened = joint_positions(hand, grasp.spread, [0.0] * hand.num_fingers)
+    return {
+        "confidence": 1.0,
+        "position": [x, y, z],
+        "orientation": {"w": w, "xyz": xyz},
+        "cspace_position": dict(zip(order, grasp.q.tolist(), strict=True)),
+        "pregrasp_cspace_position": {name: opened[name] for name in order},
+    }

@@ -1,0 +1,233 @@
+"""Files of postures, of our own layouts and of others.
+
+In: a file, or a folder of files, and the hand that they are for. Out: a `PostureTable`, or an error
+in one line that names the file and what is wrong. docs/how-to/postures.md lists the layouts.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.dataset.hdf5 import open_hdf5
+from drakegrasp.errors import DataError, GraspError, MachineError, listed, one_line
+from drakegrasp.exchange.foreign_postures import read_dexgraspbench, read_isaac_grasp
+from drakegrasp.exchange.posture_rows import Rows, quaternion_poses, table_of
+from drakegrasp.frames import Array, unpack_pose
+from drakegrasp.hand.description import Hand
+from drakegrasp.simulation.postures.table import PostureTable
+
+#: Suffixes of the layouts.
+ARRAYS, TABLES, YAMLS = (".npz", ".h5", ".hdf5"), (".csv", ".parquet"), (".yaml", ".yml")
+#: The arrays of our own layout that are neither poses nor joints.
+_TEXTS = ("object", "joints", "source", "frame", "link")
+_KNOWN = (
+    *_TEXTS,
+    *("X_FG", "position", "quaternion", "q_grasp", "q_pregrasp", "q_squeeze", "resting"),
+    *("log_density", "X_TC", "scale"),
+)
+
+
+def read_postures(path: Path, hand: Hand) -> PostureTable:
+    """Return the postures of a file, or of all files of a folder.
+
+    Raises:
+        GraspError: If it is no file of postures of this hand.
+        MachineError: If a package is missing that the format needs.
+    """
+    suffix = path.suffix.lower()
+    if path.is_dir():
+        return _of_folder(path, hand)
+    if not path.is_file():
+        raise GraspError(f"postures must be a file or a folder of files, got {str(path)!r}")
+    try:
+        if suffix in ARRAYS:
+            return table_of(hand, [_of_arrays(_read_arrays(path))])
+        if suffix in TABLES:
+            return table_of(hand, [_of_columns(_read_columns(path))])
+        if suffix == ".npy":
+            return table_of(hand, [read_dexgraspbench(path, hand)])
+        if suffix in YAMLS:
+            return table_of(hand, [read_isaac_grasp(path, hand)])
+    except GraspError as error:
+        text = str(error)
+        raise GraspError(text if text.startswith(str(path)) else f"{path}: {text}") from None
+    known = ", ".join((*ARRAYS, *TABLES, ".npy", *YAMLS))
+    raise GraspError(f"{path}: must be a file of postures ({known}), got another")
+
+
+def _of_folder(folder: Path, hand: Hand) -> PostureTable:
+    """Return the postures of all files of one foreign layout in a folder and those below."""
+    for pattern, read in (("*.npy", read_dexgraspbench), ("*.y*ml", read_isaac_grasp)):
+        paths = sorted(folder.rglob(pattern))
+        if paths:
+            try:
+                return table_of(hand, [read(path, hand) for path in paths])
+            except GraspError as error:
+                text = str(error)
+                raise GraspError(
+                    text if text.startswith(str(folder)) else f"{folder}: {text}"
+                ) from None
+    raise GraspError(f"{folder}: must hold .npy or .yaml files of grasps, got none")
+
+
+# Arrays
+
+
+def _read_arrays(path: Path) -> dict[str, Any]:
+    try:
+        if path.suffix.lower() == ".npz":
+            with np.load(path, allow_pickle=False) as file:
+                return {name: file[name] for name in file.files}
+        with open_hdf5(path) as file:
+            return {name: _dataset(file[name]) for name in file}
+    except (OSError, ValueError, KeyError, DataError) as error:
+        raise GraspError(f"must be a readable file of arrays, got: {one_line(error)}") from None
+
+
+def _dataset(item: h5py.Dataset | h5py.Group) -> Any:
+    if not isinstance(item, h5py.Dataset):
+        raise GraspError(f"{item.name} must be a dataset, got a group")
+    return item.asstr()[()] if h5py.check_string_dtype(item.dtype) else item[()]
+
+
+def _of_arrays(arrays: Mapping[str, Any]) -> Rows:
+    """Return the rows of our own layout."""
+    if unknown := [name for name in arrays if name not in _KNOWN]:
+        raise GraspError(f"arrays must be some of {', '.join(_KNOWN)}, got {unknown[0]!r}")
+    for name in ("object", "q_grasp"):
+        if name not in arrays:
+            raise GraspError(f"{name} must be there, got only {listed(sorted(arrays))}")
+    texts = {name: _texts(arrays[name], name) for name in _TEXTS if name in arrays}
+    if "X_FG" in arrays:
+        X_FG = _stacked(arrays["X_FG"], "X_FG")
+    elif {"position", "quaternion"} <= set(arrays):
+        X_FG = quaternion_poses(arrays["position"], arrays["quaternion"])
+    else:
+        raise GraspError("X_FG, or position and quaternion, must be there, got none")
+    return Rows(
+        objects=texts["object"],
+        X_FL=X_FG,
+        link=_only(texts.get("link"), "link"),
+        frame=_only(texts.get("frame"), "frame") or "object",
+        q={
+            name: arrays[f"q_{name}"]
+            for name in ("grasp", "pregrasp", "squeeze")
+            if f"q_{name}" in arrays
+        },
+        joints=texts.get("joints"),
+        X_TC=None if "X_TC" not in arrays else _stacked(arrays["X_TC"], "X_TC"),
+        numbers={n: arrays[n] for n in ("resting", "log_density", "scale") if n in arrays},
+        said=texts.get("source"),
+    )
+
+
+def _texts(value: Any, name: str) -> list[str]:
+    array = np.atleast_1d(np.asarray(value))
+    if array.dtype.kind == "S":
+        array = np.char.decode(array, "utf-8", "replace")
+    if array.ndim != 1 or array.dtype.kind not in "UO":
+        raise GraspError(f"{name} must be texts, got {array.dtype} of shape {array.shape}")
+    return [str(each) for each in array.tolist()]
+
+
+def _only(values: Sequence[str] | None, name: str) -> str | None:
+    """Return the one text of a column, or None if there is none."""
+    different = set(values or ())
+    if len(different) > 1:
+        raise GraspError(f"{name} must be the same in all rows, got {', '.join(sorted(different))}")
+    return different.pop() if different else None
+
+
+def _stacked(value: Any, name: str) -> Array:
+    """Return poses (n, 4, 4) of numbers (n, 4, 4), (n, 3, 4) or (n, 12)."""
+    try:
+        X = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        raise GraspError(f"{name} must be poses, 4 x 4 numbers each, got something else") from None
+    if X.ndim == 3 and X.shape[1:] == (3, 4):
+        X = X.reshape(len(X), 12)
+    if X.ndim == 2 and X.shape[1] == 12:
+        X = unpack_pose(X)
+    if X.ndim != 3 or X.shape[1:] != (4, 4):
+        raise GraspError(f"{name} must be of shape (n, 4, 4), got {X.shape}")
+    return X
+
+
+# Tables
+
+
+def _read_columns(path: Path) -> dict[str, list[Any]]:
+    if path.suffix.lower() == ".parquet":
+        try:
+            from pyarrow import parquet
+        except ImportError:
+            raise MachineError("Parquet needs pyarrow: pip install 'drakegrasp[hub]'") from None
+        try:
+            return dict(parquet.read_table(path).to_pydict())
+        except (OSError, ValueError) as error:
+            raise GraspError(f"must be a Parquet file, got: {one_line(error)}") from None
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            header, *rows = csv.reader(file)
+            return {
+                name: list(column)
+                for name, column in zip(header, _columns(header, rows), strict=True)
+            }
+    except (OSError, ValueError, csv.Error) as error:
+        raise GraspError(f"must be a table with a header, got: {one_line(error)}") from None
+
+
+def _columns(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[Sequence[str]]:
+    for i, row in enumerate(rows):
+        if len(row) != len(header):
+            raise ValueError(f"row {i} of {len(row)} values under a header of {len(header)}")
+    yield from zip(*rows, strict=True) if rows else ([] for _ in header)
+
+
+def _of_columns(columns: Mapping[str, list[Any]]) -> Rows:
+    """Return the rows of a plain table, with a column for each number."""
+    place = [*("x", "y", "z"), *("qw", "qx", "qy", "qz")]
+    if missing := [name for name in ("object", *place) if name not in columns]:
+        raise GraspError(f"columns must include {missing[0]}, got {listed(list(columns))}")
+    q: dict[str, Any] = {}
+    joints: list[str] | None = None
+    for stage in ("grasp", "pregrasp", "squeeze"):
+        names = [n.removeprefix(f"{stage}_") for n in columns if n.startswith(f"{stage}_")]
+        if names:
+            joints = joints or names
+            if set(names) != set(joints):
+                raise GraspError(f"{stage}_ columns must be of the joints of grasp_, got others")
+            q[stage] = np.column_stack([_floats(columns, f"{stage}_{n}") for n in joints])
+    if "grasp" not in q:
+        raise GraspError("columns must include one grasp_JOINT for each joint, got none")
+    numbers = np.column_stack([_floats(columns, name) for name in place])
+    return Rows(
+        objects=[str(name) for name in columns["object"]],
+        X_FL=quaternion_poses(numbers[:, :3], numbers[:, 3:]),
+        link=_only(columns.get("link"), "link"),
+        frame=_only(columns.get("frame"), "frame") or "object",
+        q=q,
+        joints=joints,
+        numbers={
+            n: _floats(columns, n) for n in ("resting", "log_density", "scale") if n in columns
+        },
+        said=None if "source" not in columns else [str(text) for text in columns["source"]],
+    )
+
+
+def _floats(columns: Mapping[str, list[Any]], name: str) -> npt.NDArray[np.float64]:
+    """Return a column as numbers; an empty cell is NaN."""
+    values = []
+    for i, cell in enumerate(columns[name]):
+        try:
+            values.append(np.nan if cell in (None, "") else float(cell))
+        except (TypeError, ValueError):
+            raise GraspError(f"row {i}: {name} must be a number, got {cell!r}") from None
+    return np.array(values)

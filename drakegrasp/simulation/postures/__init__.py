@@ -1,0 +1,1 @@
+"""Wrists with joints from outside, and how they are tried."""

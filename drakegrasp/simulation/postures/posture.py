@@ -1,0 +1,255 @@
+"""Postures: a wrist pose with the positions of all joints, and the trial that follows from one.
+
+In: what a network or another tool says of a grasp. Out: a `Posture`, checked and held in {O}, and
+from it the `Pregrasp` of a trial. Where the posture follows the couplings of the hand file, the
+hand's own motors close it, as they close every attempt. Where it does not, each joint has a motor
+of its own, which goes from the pregrasp to the grasp and on to the squeeze.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+from pydrake.multibody.plant import MultibodyPlant
+
+from drakegrasp.arithmetic import multiply
+from drakegrasp.errors import GraspError
+from drakegrasp.frames import X_WT, Array, as_numbers, invert_pose, read_pose
+from drakegrasp.hand.description import Hand
+from drakegrasp.hand.kinematics import coordinate_limits
+from drakegrasp.hand.parsing import ModelFile, add_model
+from drakegrasp.simulation.candidates import JointPath, Pregrasp
+
+Frame = Literal["object", "table", "camera", "world"]
+FRAMES: tuple[str, ...] = get_args(Frame)
+
+#: A coupled joint this far from where the hand file has it, and a spread joint this far from
+#: another, is still as the hand file says, in the unit of its finger.
+COUPLED = np.deg2rad(1.0)
+#: By so much fingers are opened where a posture has no pregrasp, in the unit of a closing joint.
+OPENED = np.deg2rad(20.0)
+#: Where a posture has no squeeze, the joint that moved most from the pregrasp to the grasp goes on
+#: by so much, and the others in proportion; 1 rad as 0.1 m of a slide.
+SQUEEZED = np.deg2rad(20.0)
+#: A rotation that is off by less is exact but for rounding.
+EXACT = 1e-12
+#: A closing joint this near to zero is that of the open hand [rad or m].
+OPEN = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Posture:
+    """A wrist pose and joint positions of a hand of j joints, in the plant's order.
+
+    The order is that of the stored `closed_q`: `joint_order` names the joints.
+
+    Attributes:
+        X_OG: Pose of the palm (4, 4).
+        q_grasp: (j,), when the fingers hold the object [rad or m].
+        q_pregrasp: (j,), where the trial begins; None: the grasp, opened by 20 degrees.
+        q_squeeze: (j,), the target of motors that press; None: beyond the grasp.
+    """
+
+    X_OG: Array
+    q_grasp: Array
+    q_pregrasp: Array | None = None
+    q_squeeze: Array | None = None
+
+
+def make_posture(
+    hand: Hand,
+    X_FG: npt.ArrayLike,
+    q_grasp: npt.ArrayLike,
+    q_pregrasp: npt.ArrayLike | None = None,
+    q_squeeze: npt.ArrayLike | None = None,
+    *,
+    frame: str = "object",
+    X_TO: npt.ArrayLike | None = None,
+    X_TC: npt.ArrayLike | None = None,
+    joints: Sequence[str] | None = None,
+) -> Posture:
+    """Return a posture whose palm pose is given in one of four frames.
+
+    Args:
+        hand: The hand.
+        X_FG: Pose of the palm (4, 4) in the frame; (3, 4) or (12,) will do.
+        q_grasp: (j,), joint positions of the grasp [rad or m].
+        q_pregrasp: (j,), where the trial begins.
+        q_squeeze: (j,), where the motors press to.
+        frame: "object" {O}, "table" {T}, "camera" {C} or "world" {W}.
+        X_TO: Pose of the object on the table, (4, 4), for any frame but "object".
+        X_TC: Pose of the camera in the table-top frame, (4, 4), for the frame "camera".
+        joints: Names of the joints in the order of the vectors; the plant's order if None.
+
+    Raises:
+        GraspError: If a pose is none, a vector has another length or is not finite, a joint is
+            missing, or the frame is unknown or lacks its pose.
+    """
+    vectors = {"q_grasp": q_grasp, "q_pregrasp": q_pregrasp, "q_squeeze": q_squeeze}
+    order = None if joints is None else _places(joint_order(hand), joints)
+    size = len(hand.joint_names) if joints is None else len(joints)
+    q: dict[str, Array | None] = dict.fromkeys(vectors)
+    for name, value in vectors.items():
+        if value is None and name != "q_grasp":
+            continue
+        vector = as_numbers(value, f"{name} must be {size} joint positions")  # type: ignore[arg-type]
+        if vector.shape != (size,) or not np.isfinite(vector).all():
+            got = "numbers that are not" if vector.shape == (size,) else f"shape {vector.shape}"
+            raise GraspError(f"{name} must be {size} finite joint positions, got {got}")
+        q[name] = vector if order is None else vector[order]
+
+    X_OF = _frame_in_object(frame, X_TO, X_TC)
+    X_OG = multiply(X_OF, exact_pose(X_FG, "the palm's pose"))
+    assert q["q_grasp"] is not None
+    return Posture(X_OG, q["q_grasp"], q["q_pregrasp"], q["q_squeeze"])
+
+
+def _frame_in_object(frame: str, X_TO: npt.ArrayLike | None, X_TC: npt.ArrayLike | None) -> Array:
+    """Return the pose (4, 4) of a frame in {O}."""
+    if frame not in FRAMES:
+        raise GraspError(f"frame must be one of {', '.join(FRAMES)}, got {frame!r}")
+    if (X_TC is None) == (frame == "camera"):
+        got = "none" if X_TC is None else f"a pose with frame {frame!r}"
+        raise GraspError(f"X_TC must be given with the frame camera, and only then, got {got}")
+    if frame == "object":
+        return np.eye(4)
+    if X_TO is None:
+        raise GraspError(f"X_TO must be given with the frame {frame}, got None")
+    X_OT = invert_pose(exact_pose(X_TO, "X_TO"))
+    if frame == "table":
+        return X_OT
+    if frame == "world":
+        return multiply(X_OT, invert_pose(X_WT))
+    return multiply(X_OT, exact_pose(X_TC, "X_TC"))  # type: ignore[arg-type]
+
+
+def exact_pose(X: npt.ArrayLike, name: str) -> Array:
+    """Return one pose (4, 4) with an exact rotation; one that has it already keeps its bits.
+
+    Raises:
+        GraspError: If it is none.
+    """
+    pose = read_pose(X, name)
+    if pose.shape != (4, 4):
+        raise GraspError(f"{name} must be one pose, got an array of shape {pose.shape}")
+    given = np.asarray(X, dtype=float)
+    return given if given.shape == (4, 4) and np.abs(pose - given).max() < EXACT else pose
+
+
+def joint_order(hand: Hand) -> tuple[str, ...]:
+    """Return the names of a hand's joints in the plant's order, that of the stored `closed_q`."""
+    return _joint_order(hand.model, hand.palm_link)
+
+
+@lru_cache
+def _joint_order(model: ModelFile, palm_link: str) -> tuple[str, ...]:
+    plant = MultibodyPlant(0.0)
+    instance = add_model(plant, model)
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(palm_link, instance))
+    plant.Finalize()
+    return tuple(plant.GetPositionNames(instance, False, False))
+
+
+def _places(order: Sequence[str], joints: Sequence[str]) -> list[int]:
+    """Return where each of the hand's joints is among given names, each of which may be once."""
+    given = list(joints)
+    for joint in order:
+        if given.count(joint) != 1:
+            raise GraspError(
+                f"joints must name each joint of the hand once ({', '.join(order)}), "
+                f"got {joint!r} {given.count(joint)} times"
+            )
+    return [given.index(joint) for joint in order]
+
+
+# The trial of a posture
+
+
+def start_of(posture: Posture, hand: Hand) -> Pregrasp:
+    """Return what the trial of a posture starts from.
+
+    The rule: the hand file's motors close the fingers if in every given vector each coupled joint
+    is where its finger's closing joint puts it, and all spread joints agree, within 1 degree. Else
+    each joint has a motor of its own.
+    """
+    given = [q for q in (posture.q_pregrasp, posture.q_grasp, posture.q_squeeze) if q is not None]
+    start = opened(posture.q_grasp, hand) if posture.q_pregrasp is None else posture.q_pregrasp
+    own_motors = not all(follows_couplings(q, hand) for q in given)
+    index = {name: i for i, name in enumerate(joint_order(hand))}
+    # Of spread joints that differ, the first.
+    spread = float(posture.q_grasp[index[hand.spread.joints[0]]]) if hand.spread.joints else 0.0
+    closing = np.array([start[index[finger.closing_joint]] for finger in hand.fingers])
+    closing = np.clip(closing, *coordinate_limits(hand)[1:].T)
+
+    # A posture that the hand file can say is an attempt like any other.
+    still = [abs(posture.q_grasp[index[n]] - at) <= OPEN for n, at in hand.preshape.items()]
+    if not own_motors and all(still):
+        return Pregrasp(
+            X_OG=posture.X_OG,
+            spread=spread,
+            closing=None if np.abs(closing).max() <= OPEN else closing,
+        )
+
+    # Joints that no motor moves are locked where the grasp has them.
+    start = start.copy()
+    for name in hand.spread.joints if own_motors else hand.locked_joints:
+        start[index[name]] = posture.q_grasp[index[name]]
+    # No hand is beyond its limits.
+    limits = dict(zip(hand.joint_names, hand.joint_limits, strict=True))
+    lower, upper = np.array([limits[name] for name in index]).T
+    start, grasp = np.clip(start, lower, upper), np.clip(posture.q_grasp, lower, upper)
+    squeeze = squeezed(start, grasp, hand) if posture.q_squeeze is None else posture.q_squeeze
+    squeeze = np.clip(squeeze, lower, upper)
+    return Pregrasp(
+        X_OG=posture.X_OG,
+        spread=spread,
+        closing=closing,
+        path=JointPath(start=start, grasp=grasp, squeeze=squeeze, own_motors=own_motors),
+    )
+
+
+def follows_couplings(q: Array, hand: Hand) -> bool:
+    """Return whether joint positions (j,) are such that the hand file's motors can reach them."""
+    index = {name: i for i, name in enumerate(joint_order(hand))}
+    spreads = [q[index[name]] for name in hand.spread.joints]
+    if spreads and np.ptp(spreads) > COUPLED:
+        return False
+    for finger, unit in zip(hand.fingers, hand.closing_unit.tolist(), strict=True):
+        closing = q[index[finger.closing_joint]]
+        for c in finger.coupled:
+            if abs(q[index[c.joint]] - (c.ratio * closing + c.offset)) > COUPLED * unit:
+                return False
+    return True
+
+
+def opened(q_grasp: Array, hand: Hand) -> Array:
+    """Return the joint positions (j,) of a grasp whose fingers are opened by `OPENED`.
+
+    A closing joint opens by it, coupled joints by their ratios; none beyond its limits.
+    """
+    order, q = joint_order(hand), q_grasp.copy()
+    least = coordinate_limits(hand)[1:, 0]
+    limits = dict(zip(hand.joint_names, hand.joint_limits, strict=True))
+    for i, finger in enumerate(hand.fingers):
+        at = order.index(finger.closing_joint)
+        margin = OPENED * hand.closing_unit[i]
+        q[at] = min(max(q[at] - margin, least[i]), q[at])
+        moved = q_grasp[at] - q[at]
+        for c in finger.coupled:
+            at = order.index(c.joint)
+            q[at] = np.clip(q[at] - c.ratio * moved, *limits[c.joint])
+    return q
+
+
+def squeezed(start: Array, grasp: Array, hand: Hand) -> Array:
+    """Return the joint positions (j,) as far beyond a grasp as `SQUEEZED` says."""
+    order = joint_order(hand)
+    slides = np.array([hand.joint_units[name] == "m" for name in order])
+    units = np.where(slides, 0.1, 1.0)
+    most = float((np.abs(grasp - start) / units).max())
+    return grasp if most == 0.0 else grasp + (grasp - start) * (SQUEEZED / most)

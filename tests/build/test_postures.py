@@ -1,0 +1,185 @@
+"""A build of postures from outside: attempts, samples, replay, resume; and what is refused."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from helpers.assertions import assert_same_arrays
+from helpers.objects import CUBE, STANDOFF, box_model, from_above, standing
+
+from drakegrasp.build.pipeline import build, posture_config
+from drakegrasp.build.prepare import prepare
+from drakegrasp.build.replay import replay_trial
+from drakegrasp.config import Config
+from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.dataset.trials import Trials
+from drakegrasp.errors import ConfigError, DataError, GraspError
+from drakegrasp.frames import make_pose
+from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.kinematics import joint_positions
+from drakegrasp.hand.settings import load_config
+from drakegrasp.mesh.wavefront import obj_text
+from drakegrasp.objects.sources import find_meshes
+from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.executor import run_here
+from drakegrasp.simulation.candidates import Source
+from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.postures.posture import joint_order
+from drakegrasp.simulation.postures.table import (
+    PostureTable,
+    make_table,
+    refuse_unknown_objects,
+)
+from drakegrasp.simulation.trial import run_attempt
+
+pytestmark = pytest.mark.sim
+
+NAME = "1_box_a"
+HAND = load_hand()
+
+
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("meshes")
+    box_model(folder, [CUBE] * 3, NAME)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory: pytest.TempPathFactory) -> PostureTable:
+    """Rows of the cube: held by the hand's motors, held by own ones, inside it, below the table."""
+    model = box_model(tmp_path_factory.mktemp("cube"), [CUBE] * 3, NAME)
+    config, attempt = load_config(), from_above(model, STANDOFF)
+    scene = build_scene(model, config.physics, HAND)
+    held = run_attempt(scene, standing(model), attempt, config)
+    start = joint_positions(HAND, 0.0, np.zeros(3))
+    opened = np.array([start[name] for name in joint_order(HAND)])
+
+    coupled, bent = held.closed.q, held.closed.q.copy()
+    for finger in HAND.fingers:
+        bent[joint_order(HAND).index(finger.coupled[0].joint)] += 0.1
+        bent[joint_order(HAND).index(finger.closing_joint)] -= 0.04
+    inside = attempt.X_OG @ make_pose(np.eye(3), [0.0, 0.0, 0.05])
+    below = make_pose(np.eye(3), [0.0, 0.0, -0.2])
+    nothing = np.full(8, np.nan)
+    return make_table(
+        HAND,
+        [NAME] * 4,
+        [attempt.X_OG, attempt.X_OG, inside, below],
+        [coupled, bent, coupled, coupled],
+        q_pregrasp=[opened, bent - 0.3 * (bent - opened), nothing, nothing],
+        log_density=[-2.0, np.nan, np.nan, np.nan],
+        said=["mine", "", "", ""],
+    )
+
+
+def built(meshes: Path, out: Path, table: PostureTable, config: Config | None = None) -> Path:
+    config = posture_config(config or load_config(), table)
+    build(find_meshes(meshes), out, config, run_here, postures=table, show=False)
+    return out
+
+
+@pytest.fixture(scope="module")
+def dataset(meshes: Path, table: PostureTable, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return built(meshes, tmp_path_factory.mktemp("built") / "out", table)
+
+
+def test_each_row_is_an_attempt_with_its_outcome(dataset):
+    trials = Trials(dataset)
+    names = ("outcome", "candidate", "standoff_index", "posture_row", "own_motors", "source")
+    rows = zip(*(trials[name].tolist() for name in names), strict=True)
+    assert list(rows) == [
+        (Outcome.SUCCESS, 0, 0, 0.0, False, Source.POSTURES),
+        (Outcome.SUCCESS, 1, 0, 1.0, True, Source.POSTURES),
+        (Outcome.START_COLLISION, 2, 0, 2.0, False, Source.POSTURES),
+        (Outcome.BELOW_TABLE, 3, 0, 3.0, False, Source.POSTURES),
+    ]
+    np.testing.assert_array_equal(trials["log_density"], [-2.0, np.nan, np.nan, np.nan])
+
+
+def test_dataset_is_sound(dataset):
+    assert check_dataset(dataset) == []
+
+
+@pytest.mark.parametrize("row", range(4))
+def test_trial_of_a_posture_is_replayed_from_the_dataset_alone(dataset, row):
+    assert replay_trial(dataset, row).same
+
+
+def test_plan_keeps_what_the_file_said(dataset, table):
+    config = posture_config(load_config(), table)
+    kept = load_prepared(dataset, NAME, config).candidates.postures
+    np.testing.assert_array_equal(kept.q_pregrasp, table.q_pregrasp)
+    assert kept.said == ("mine", "", "", "")
+
+
+def test_dataset_without_the_columns_reads_as_one_of_samplers(dataset, tmp_path):
+    shutil.copy(dataset / "trials.hdf5", tmp_path)
+    with h5py.File(tmp_path / "trials.hdf5", "r+") as file:
+        del file["trials/own_motors"], file["trials/posture_row"]
+    older = Trials(tmp_path / "trials.hdf5")
+    assert not older["own_motors"].any()
+    assert np.isnan(older["posture_row"]).all()
+
+
+def test_more_rows_complete_the_dataset_of_fewer(meshes, table, dataset, tmp_path):
+    fewer = load_config(overrides=["candidates.max=2"])
+    out = built(meshes, tmp_path / "out", table, fewer)
+    assert len(Trials(out)) == 2
+    assert_same_arrays(built(meshes, out, table) / "trials.hdf5", dataset / "trials.hdf5")
+
+
+def test_dataset_of_other_postures_is_not_continued(meshes, table, dataset, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(dataset, out)
+    other = replace(table, q_grasp=table.q_grasp + 1e-9)
+    with pytest.raises(DataError, match=r"differs in candidates\.postures"):
+        built(meshes, out, other)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"resting": np.array([0, 0, 0, 1])}, r"row 3 \(1_box_a\): resting pose must be 0, the"),
+        ({"scale": np.array([1.0, 0.1, 1.0, 1.0])}, r"row 1 \(1_box_a\): scale must be that of"),
+    ],
+)
+def test_row_of_another_pose_or_scale_is_refused(meshes, table, tmp_path, changes, words):
+    with pytest.raises(GraspError, match=words):
+        built(meshes, tmp_path / "out", replace(table, **changes))
+
+
+def test_row_of_an_unknown_object_is_refused(table):
+    with pytest.raises(GraspError, match="row 0: object must be one of cup, got '1_box_a'"):
+        refuse_unknown_objects(table, ["cup"])
+
+
+def test_settings_that_name_other_postures_are_refused(table):
+    config = load_config(overrides=["candidates.postures='0123456789abcdef'"])
+    with pytest.raises(ConfigError, match=r"candidates\.postures must be given with postures"):
+        posture_config(config, None)
+    with pytest.raises(ConfigError, match="must be left out; the postures that are given decide"):
+        posture_config(config, table)
+
+
+def test_ordinary_configuration_does_not_know_of_postures():
+    assert "postures" not in load_config().to_dict()["candidates"]
+
+
+def test_postures_in_the_frame_of_the_mesh_file_are_moved_to_the_object(tmp_path, table):
+    # The file's origin is a corner of the cube, its unit a centimetre.
+    box = box_model(tmp_path, [CUBE] * 3, NAME)
+    vertices = 100.0 * (box.visual_vertices + CUBE / 2.0)
+    (tmp_path / f"{NAME}.obj").write_text(obj_text(vertices, box.visual_faces, normals=False))
+    (source,) = find_meshes(tmp_path, units="cm")
+    there = table.X_FG.copy()
+    there[:, :3, 3] += CUBE / 2.0
+    moved = replace(table, X_FG=there, frame="mesh")
+    prepared = prepare(source, posture_config(load_config(), moved), moved)
+    np.testing.assert_allclose(prepared.candidates.X_OG, table.X_FG, atol=1e-9)

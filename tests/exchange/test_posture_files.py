@@ -1,0 +1,317 @@
+"""Files of postures become one table, whoever wrote them; what is none is refused in a line."""
+
+from __future__ import annotations
+
+import os
+import pickle
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+
+from drakegrasp.errors import GraspError
+from drakegrasp.exchange.posture_files import read_postures
+from drakegrasp.frames import make_pose, rotation_about
+from drakegrasp.hand.description import load_hand
+from drakegrasp.simulation.postures.posture import joint_order
+from drakegrasp.simulation.postures.table import PostureTable
+
+HAND = load_hand("allegro")
+ORDER = joint_order(HAND)
+POSES = np.array([make_pose(rotation_about([0.0, 0.6, 0.8], a), [a, 0.1, 0.2]) for a in (0.3, 2.0)])
+GRASP = np.arange(32.0).reshape(2, 16) / 100.0
+PREGRASP, SQUEEZE = GRASP - 0.05, GRASP + 0.05
+OBJECTS = ["mug", "can"]
+
+
+def quaternion(X: np.ndarray) -> np.ndarray:
+    return Rotation.from_matrix(X[:3, :3]).as_quat(scalar_first=True)
+
+
+def arrays() -> dict[str, Any]:
+    """Our own layout, with the joints in another order."""
+    return {
+        "object": np.array(OBJECTS),
+        "X_FG": POSES,
+        "q_grasp": GRASP[:, ::-1],
+        "q_pregrasp": PREGRASP[:, ::-1],
+        "q_squeeze": SQUEEZE[:, ::-1],
+        "joints": np.array(ORDER[::-1]),
+        "resting": np.array([0, 2]),
+        "log_density": np.array([-1.0, np.nan]),
+        "source": np.array(["net 7", ""]),
+    }
+
+
+def write_npz(folder: Path) -> Path:
+    np.savez(folder / "p.npz", **arrays())
+    return folder / "p.npz"
+
+
+def write_hdf5(folder: Path) -> Path:
+    with h5py.File(folder / "p.h5", "w") as file:
+        for name, value in arrays().items():
+            text = value.dtype.kind == "U"
+            file.create_dataset(name, data=value.astype(object) if text else value)
+    return folder / "p.h5"
+
+
+def columns() -> dict[str, list[Any]]:
+    table: dict[str, list[Any]] = {"object": list(OBJECTS)}
+    for name, values in zip("xyz", POSES[:, :3, 3].T, strict=True):
+        table[name] = values.tolist()
+    for k, name in enumerate(("qw", "qx", "qy", "qz")):
+        table[name] = [float(quaternion(X)[k]) for X in POSES]
+    for stage, q in (("grasp", GRASP), ("pregrasp", PREGRASP), ("squeeze", SQUEEZE)):
+        for joint, values in zip(ORDER, q.T, strict=True):
+            table[f"{stage}_{joint}"] = values.tolist()
+    return table | {"resting": [0, 2], "log_density": [-1.0, None], "source": ["net 7", ""]}
+
+
+def write_csv(folder: Path) -> Path:
+    table = columns()
+    lines = [",".join(table)]
+    for i in range(2):
+        cells = ["" if v[i] is None else v[i] for v in table.values()]
+        lines.append(",".join(c if isinstance(c, str) else repr(c) for c in cells))
+    (folder / "p.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return folder / "p.csv"
+
+
+def write_parquet(folder: Path) -> Path:
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    parquet.write_table(pyarrow.table(columns()), folder / "p.parquet")
+    return folder / "p.parquet"
+
+
+@pytest.mark.parametrize("write", [write_npz, write_hdf5, write_csv, write_parquet])
+def test_own_layouts_say_the_same(tmp_path, write):
+    table = read_postures(write(tmp_path), HAND)
+    assert table.objects == tuple(OBJECTS)
+    assert (table.frame, table.resting.tolist(), table.said) == ("object", [0, 2], ("net 7", ""))
+    np.testing.assert_allclose(table.X_FG, POSES, atol=1e-12)
+    np.testing.assert_array_equal(table.q_grasp, GRASP)
+    np.testing.assert_array_equal(table.q_pregrasp, PREGRASP)
+    np.testing.assert_array_equal(table.q_squeeze, SQUEEZE)
+    np.testing.assert_array_equal(table.log_density, [-1.0, np.nan])
+
+
+def test_pose_of_the_palm_link_becomes_that_of_the_palm(tmp_path):
+    np.savez(tmp_path / "p.npz", **arrays(), link=np.array(HAND.palm_link))
+    table = read_postures(tmp_path / "p.npz", HAND)
+    np.testing.assert_allclose(table.X_FG, POSES @ HAND.X_BG, atol=1e-12)
+
+
+def test_joints_that_the_hand_file_moves_may_be_left_out(tmp_path):
+    named = ("index_mcp_joint", "middle_mcp_joint", "thumb_mcp_joint")
+    np.savez(
+        tmp_path / "p.npz",
+        object=np.array(["mug"]),
+        X_FG=POSES[:1],
+        q_grasp=np.array([[0.5, 0.6, 0.7]]),
+        joints=np.array(named),
+    )
+    q = dict(zip(ORDER, read_postures(tmp_path / "p.npz", HAND).q_grasp[0], strict=True))
+    assert q["index_pip_joint"] == pytest.approx(0.7)
+    assert q["thumb_ip_joint"] == pytest.approx(0.175)
+    assert q["thumb_opposition_joint"] == HAND.preshape["thumb_opposition_joint"]
+
+
+# Formats of others
+
+
+def dexgraspbench(i: int = 0, **changes: Any) -> dict[str, Any]:
+    """A grasp over a table, as BODex and Dexonomy write one: the object is turned and moved."""
+    X_WM = make_pose(rotation_about([0.0, 0.0, 1.0], 0.5), [0.3, 0.2, 0.1])
+    X_WB = X_WM @ POSES[i] @ np.linalg.inv(HAND.X_BG)
+    place = [*X_WB[:3, 3], *quaternion(X_WB)]
+    return {
+        "obj_pose": np.array([*X_WM[:3, 3], *quaternion(X_WM)]),
+        "obj_scale": 0.08,
+        "obj_path": f"assets/object/{OBJECTS[i]}",
+        "pregrasp_qpos": np.array([*place, *PREGRASP[i]]),
+        "grasp_qpos": np.array([*place, *GRASP[i]]),
+        "squeeze_qpos": np.array([*place, *SQUEEZE[i]]),
+        **changes,
+    }
+
+
+def write_dictionary(path: Path, content: Any) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    array = np.empty((), dtype=object)
+    array[()] = content
+    np.save(path, array, allow_pickle=True)
+    return path
+
+
+def assert_both(table: PostureTable) -> None:
+    assert (table.objects, table.frame) == (tuple(OBJECTS), "mesh")
+    np.testing.assert_allclose(table.X_FG, POSES, atol=1e-9)
+    np.testing.assert_array_equal(table.q_grasp, GRASP)
+    np.testing.assert_array_equal(table.q_pregrasp, PREGRASP)
+
+
+def test_folder_of_dexgraspbench_is_a_table(tmp_path):
+    for i, name in enumerate(("a", "b")):
+        write_dictionary(tmp_path / name / "0.npy", dexgraspbench(i))
+    table = read_postures(tmp_path, HAND)
+    assert_both(table)
+    np.testing.assert_array_equal(table.q_squeeze, SQUEEZE)
+    assert table.scale.tolist() == [0.08, 0.08]
+
+
+def test_several_grasps_of_one_dictionary_are_rows(tmp_path):
+    one = dexgraspbench()
+    keys = ("pregrasp_qpos", "grasp_qpos", "squeeze_qpos")
+    many = {**one, **{key: np.stack([one[key]] * 3) for key in keys}}
+    many |= {"joint_names": list(ORDER)}
+    table = read_postures(write_dictionary(tmp_path / "0.npy", many), HAND)
+    assert table.objects == ("mug",) * 3
+    np.testing.assert_allclose(table.X_FG, POSES[[0, 0, 0]], atol=1e-9)
+
+
+def test_isaac_grasp_is_of_the_object_that_its_file_is_named_after(tmp_path):
+    for i, name in enumerate(OBJECTS):
+        X = POSES[i] @ np.linalg.inv(HAND.X_BG)
+        w, *xyz = quaternion(X).tolist()
+        grasp = {
+            "confidence": 0.5,
+            "position": X[:3, 3].tolist(),
+            "orientation": {"w": w, "xyz": xyz},
+            "cspace_position": dict(zip(ORDER, GRASP[i].tolist(), strict=True)),
+            "pregrasp_cspace_position": dict(zip(ORDER, PREGRASP[i].tolist(), strict=True)),
+        }
+        tree = {"format": "isaac_grasp", "format_version": 1.0, "grasps": {"grasp_0": grasp}}
+        # Names in another order of files than of objects.
+        (tmp_path / f"{i}").mkdir()
+        (tmp_path / f"{i}" / f"{name}.yaml").write_text(yaml.safe_dump(tree), encoding="utf-8")
+    table = read_postures(tmp_path, HAND)
+    assert_both(table)
+    assert table.said[0] == "grasp_0, confidence 0.5"
+
+
+# Refusals
+
+
+class Evil:
+    """Runs a command where it is unpickled without care."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (str(self.mark),)
+
+
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+def test_pickle_that_runs_something_is_refused_and_not_run(tmp_path, protocol):
+    array = np.empty((), dtype=object)
+    array[()] = dexgraspbench(obj_scale=Evil(tmp_path / "ran"))
+    path = tmp_path / "0.npy"
+    with path.open("wb") as file:
+        np.lib.format.write_array_header_1_0(
+            file, {"descr": "|O", "fortran_order": False, "shape": ()}
+        )
+        pickle.dump(array, file, protocol=protocol)
+    with pytest.raises(GraspError, match=r"got \w+\.mkdir; nothing of it was run"):
+        read_postures(path, HAND)
+    assert not (tmp_path / "ran").exists()
+
+
+def test_pickles_of_every_protocol_are_read(tmp_path):
+    for protocol in range(pickle.HIGHEST_PROTOCOL + 1):
+        array = np.empty((), dtype=object)
+        array[()] = dexgraspbench()
+        path = tmp_path / f"{protocol}.npy"
+        with path.open("wb") as file:
+            np.lib.format.write_array_header_1_0(
+                file, {"descr": "|O", "fortran_order": False, "shape": ()}
+            )
+            pickle.dump(array, file, protocol=protocol)
+    np.testing.assert_array_equal(
+        read_postures(tmp_path, HAND).q_grasp, GRASP[[0] * (protocol + 1)]
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"q_grasp": GRASP * np.nan}, "row 0: q_grasp must be finite numbers"),
+        ({"q_grasp": GRASP[:, :3]}, r"grasp joints must be of shape \(n, 16\), got \(2, 3\)"),
+        ({"X_FG": POSES[:1]}, r"must be of shape \(2, 4, 4\)"),
+        ({"X_FG": 2.0 * POSES}, "row 0: the palm's pose must have 0 0 0 1"),
+        ({"resting": np.array([0.5, 0])}, "resting must be indices"),
+        ({"frame": np.array("palm")}, "frame must be one of object, table, camera, world, mesh"),
+        ({"frame": np.array("camera")}, "X_TC must be given with the frame camera"),
+        ({"link": np.array("wrist")}, "link must be 'palm' for the palm frame, or 'base'"),
+        ({"joints": np.array(["a"] * 16)}, "joints must be those of the hand"),
+        ({"magic": np.zeros(2)}, "arrays must be some of .*, got 'magic'"),
+        ({"object": np.zeros(2)}, "object must be texts"),
+    ],
+)
+def test_arrays_that_are_no_postures_are_refused_in_a_line(tmp_path, changes, words):
+    np.savez(tmp_path / "p.npz", **{**arrays(), **changes})
+    with pytest.raises(GraspError, match=words) as caught:
+        read_postures(tmp_path / "p.npz", HAND)
+    assert str(caught.value).startswith(str(tmp_path / "p.npz"))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"grasp_qpos": "a"}, "grasp_qpos must be numbers"),
+        ({"grasp_qpos": np.zeros(23)}, "row 0: position and quaternion"),
+        ({"joint_names": [1, 2]}, "joint_names must be a list of texts"),
+        ({"obj_pose": np.zeros(3)}, "obj_pose must be rows of a pose"),
+    ],
+)
+def test_dictionaries_that_are_no_grasps_are_refused_in_a_line(tmp_path, changes, words):
+    path = write_dictionary(tmp_path / "0.npy", dexgraspbench(**changes))
+    with pytest.raises(GraspError, match=words):
+        read_postures(path, HAND)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.csv", "x,y\n1,2\n", "columns must include object, got x, y"),
+        ("a.csv", "object,x\nmug\n", "row 0 of 1 values under a header of 2"),
+        ("a.npz", "junk", "must be a readable file of arrays"),
+        ("a.npy", "junk", r"must be a \.npy file"),
+        ("a.yaml", "format: other", "format must be isaac_grasp"),
+        ("a.yaml", "format: isaac_grasp\nformat_version: 2.0", "format_version must be 1.0"),
+        ("a.txt", "", r"must be a file of postures \(\.npz"),
+    ],
+)
+def test_other_files_are_refused_in_a_line(tmp_path, name, content, words):
+    (tmp_path / name).write_text(content, encoding="utf-8")
+    with pytest.raises(GraspError, match=words):
+        read_postures(tmp_path / name, HAND)
+
+
+def test_what_is_not_there_is_refused(tmp_path):
+    with pytest.raises(GraspError, match="postures must be a file or a folder"):
+        read_postures(tmp_path / "none.npz", HAND)
+    with pytest.raises(GraspError, match=r"must hold \.npy or \.yaml files"):
+        read_postures(tmp_path, HAND)
+
+
+def test_samples_that_were_exported_come_back(exported, grasps):
+    hand = load_hand()
+    for form in ("isaac_grasp", "dexgraspbench"):
+        table = read_postures(exported(form), hand)
+        assert table.frame == "object"
+        assert sorted(table.objects) == sorted(grasp.object_name for grasp in grasps)
+        for X_OG, q, name in zip(table.X_FG, table.q_grasp, table.objects, strict=True):
+            assert any(
+                np.allclose(grasp.X_TO @ X_OG, grasp.X_TG, atol=1e-9) and (grasp.q == q).all()
+                for grasp in grasps
+                if grasp.object_name == name
+            )

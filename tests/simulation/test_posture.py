@@ -1,0 +1,212 @@
+"""A posture starts the trial that it says: by the hand's own motors, or with one for each joint."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+from helpers.assertions import refused
+from helpers.objects import STANDOFF, from_above, standing
+
+from drakegrasp.errors import GraspError
+from drakegrasp.frames import X_WT, make_pose, rotation_about
+from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.kinematics import joint_positions
+from drakegrasp.outcomes import Outcome
+from drakegrasp.simulation.placement import PlacedObject
+from drakegrasp.simulation.postures.posture import (
+    OPENED,
+    Posture,
+    joint_order,
+    make_posture,
+    opened,
+    start_of,
+)
+from drakegrasp.simulation.postures.trial import run_trial
+from drakegrasp.simulation.scene import hand_joint_names
+from drakegrasp.simulation.trial import TrialRecord, run_attempt
+
+#: A pose that no frame has.
+X = make_pose(rotation_about([0.0, 0.6, 0.8], 0.7), [0.1, -0.2, 0.3])
+
+
+def posture_of(hand, spread: float, closing: list[float], **other: np.ndarray) -> Posture:
+    named = joint_positions(hand, spread, closing)
+    return Posture(X, np.array([named[name] for name in joint_order(hand)]), **other)
+
+
+@pytest.mark.parametrize("frame", ["object", "table", "camera", "world"])
+def test_pose_in_any_frame_is_held_in_the_object(frame):
+    hand = load_hand()
+    X_TO, X_TC = make_pose(np.eye(3), [0.0, 0.0, 0.05]) @ X, X @ X
+    in_table = {"object": X_TO, "table": np.eye(4), "camera": X_TC, "world": np.linalg.inv(X_WT)}
+    X_FG = np.linalg.inv(in_table[frame]) @ X_TO @ X
+    camera = X_TC if frame == "camera" else None
+    made = make_posture(hand, X_FG, np.zeros(8), frame=frame, X_TO=X_TO, X_TC=camera)
+    np.testing.assert_allclose(made.X_OG, X, atol=1e-12)
+
+
+def test_exact_pose_keeps_its_bits():
+    np.testing.assert_array_equal(make_posture(load_hand(), X, np.zeros(8)).X_OG, X)
+
+
+def test_joints_in_another_order_are_told_by_their_names():
+    hand = load_hand("allegro")
+    order, q = joint_order(hand), np.arange(16.0) / 100.0
+    made = make_posture(hand, X, q[::-1], q[::-1], joints=order[::-1])
+    np.testing.assert_array_equal(made.q_grasp, q)
+    np.testing.assert_array_equal(made.q_pregrasp, q)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"q_grasp": np.zeros(7)}, r"q_grasp must be 8 finite .*shape \(7,\)"),
+        ({"q_grasp": np.full(8, np.nan)}, "q_grasp must be 8 finite joint positions"),
+        ({"q_squeeze": ["a"] * 8}, "q_squeeze must be 8 joint positions, got text"),
+        ({"X_FG": np.zeros((4, 4))}, "the palm's pose must have 0 0 0 1"),
+        ({"frame": "mesh"}, "frame must be one of object, table, camera, world, got 'mesh'"),
+        ({"frame": "table"}, "X_TO must be given with the frame table, got None"),
+        ({"frame": "camera", "X_TO": X}, "X_TC must be given with the frame camera"),
+        ({"X_TC": X}, "X_TC must be given with the frame camera, and only then"),
+        ({"joints": ["finger1_spread_joint"] * 8}, "joints must name each joint of the hand once"),
+    ],
+)
+def test_what_is_no_posture_is_refused_in_a_line(options, words):
+    arguments = {"X_FG": X, "q_grasp": np.zeros(8), **options}
+    with pytest.raises(GraspError, match=words):
+        make_posture(load_hand(), **arguments)
+
+
+# The rule of the two ways
+
+
+def test_posture_of_the_couplings_is_an_attempt_of_spread_and_closing():
+    hand = load_hand()
+    start = start_of(posture_of(hand, 0.2, [1.0, 0.1, 0.9]), hand)
+    assert (start.path, start.spread) == (None, pytest.approx(0.2))
+    np.testing.assert_allclose(start.closing, [1.0 - OPENED, 0.0, 0.9 - OPENED])
+
+
+def test_pregrasp_of_the_open_hand_starts_there():
+    hand = load_hand()
+    there = posture_of(hand, 0.2, [0.0, 0.0, 0.0]).q_grasp
+    assert start_of(posture_of(hand, 0.2, [1.0] * 3, q_pregrasp=there), hand).closing is None
+
+
+@pytest.mark.parametrize(("off_deg", "own"), [(0.9, False), (1.1, True)])
+@pytest.mark.parametrize("joint", ["finger1_distal_joint", "finger2_spread_joint"])
+@pytest.mark.parametrize("stage", ["q_grasp", "q_pregrasp", "q_squeeze"])
+def test_joint_off_its_coupling_by_more_than_a_degree_has_a_motor(joint, off_deg, own, stage):
+    hand = load_hand()
+    good = posture_of(hand, 0.2, [1.0, 1.0, 1.0]).q_grasp
+    q = {name: good.copy() for name in ("q_grasp", "q_pregrasp", "q_squeeze")}
+    q[stage][joint_order(hand).index(joint)] += np.deg2rad(off_deg)
+    start = start_of(Posture(X, **q), hand)
+    assert (start.path is not None and start.path.own_motors) == own
+
+
+def test_joint_of_the_preshape_is_locked_where_the_grasp_has_it():
+    hand = load_hand("allegro")
+    posture = posture_of(hand, 0.0, [0.5, 0.5, 0.5])
+    at = joint_order(hand).index("thumb_roll_joint")
+    posture.q_grasp[at] += 0.1
+    path = start_of(posture, hand).path
+    assert path is not None
+    assert not path.own_motors
+    assert path.start[at] == posture.q_grasp[at]
+
+
+def test_joints_beyond_their_limits_are_brought_within():
+    hand = load_hand("allegro")
+    path = start_of(Posture(X, np.full(16, 3.0)), hand).path
+    assert path is not None
+    upper = dict(zip(hand.joint_names, hand.joint_limits[:, 1], strict=True))
+    np.testing.assert_array_equal(path.grasp, [upper[name] for name in joint_order(hand)])
+    assert (opened(path.grasp, hand) <= path.grasp).all()
+
+
+# The trial
+
+
+@pytest.fixture(scope="module")
+def held(scene, cube, config) -> TrialRecord:
+    return run_attempt(scene, standing(cube), from_above(cube, STANDOFF), config)
+
+
+@pytest.fixture(scope="module")
+def given(scene, held) -> Posture:
+    hand = scene.hand
+    named = joint_positions(hand, 0.0, np.zeros(3))
+    start = np.array([named[name] for name in joint_order(hand)])
+    return Posture(held.X_OG, held.closed.q, start)
+
+
+@pytest.fixture(scope="module")
+def uncoupled(given, scene) -> Posture:
+    """The held posture with its fingertips bent by 6 degrees more, and its first links by less."""
+    q, order = given.q_grasp.copy(), joint_order(scene.hand)
+    for finger in scene.hand.fingers:
+        q[order.index(finger.coupled[0].joint)] += 0.1
+        q[order.index(finger.closing_joint)] -= 0.04
+    return Posture(given.X_OG, q, q - (q - given.q_pregrasp) * 0.3)
+
+
+@pytest.mark.sim
+def test_plant_has_the_joints_in_the_order_of_postures(scene):
+    assert tuple(hand_joint_names(scene)) == joint_order(scene.hand)
+
+
+@pytest.mark.sim
+def test_closed_hand_given_back_is_the_same_trial(scene, cube, config, held, given):
+    start = start_of(given, scene.hand)
+    again = run_attempt(scene, standing(cube), start, config)
+    assert held.outcome is Outcome.SUCCESS
+    assert pickle.dumps(again) == pickle.dumps(held)
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("drive", ["worm", "torque", "locked"])
+def test_joints_with_motors_of_their_own_hold_the_cube(scene, cube, config, held, uncoupled, drive):
+    start = start_of(uncoupled, scene.hand)
+    assert start.path.own_motors
+    rules = config.model_copy(update={"lift": config.lift.model_copy(update={"drive": drive})})
+    record = run_attempt(scene, standing(cube), start, rules)
+    assert record.outcome is Outcome.SUCCESS
+    assert record.stable
+    # They stop on the object near the grasp, and the fingertips are still off their coupling.
+    off = record.closed.q - uncoupled.q_grasp
+    assert np.abs(off).max() < 0.15
+    assert not np.allclose(record.closed.q, held.closed.q, atol=0.02)
+
+    # The same bits again, and none of it is left in the scene of the hand's own motors.
+    assert pickle.dumps(run_attempt(scene, standing(cube), start, rules)) == pickle.dumps(record)
+    usual = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), config)
+    assert pickle.dumps(usual) == pickle.dumps(held)
+
+
+@pytest.mark.sim
+def test_hand_that_stays_short_of_the_object_touches_nothing(scene, cube, config, given):
+    q = given.q_grasp.copy()
+    q[joint_order(scene.hand).index("finger1_distal_joint")] += 0.1
+    short = given.q_pregrasp + 0.5 * (q - given.q_pregrasp)
+    start = start_of(Posture(given.X_OG, short, given.q_pregrasp, short), scene.hand)
+    record = run_attempt(scene, standing(cube), start, config)
+    assert record.outcome is Outcome.MISSING_FINGERTIP
+    np.testing.assert_allclose(record.closed.q, start.path.squeeze, atol=0.01)
+
+
+@pytest.mark.sim
+def test_public_trial_is_that_of_the_posture(cube, config, given):
+    placed = PlacedObject(model=cube, X_TO=standing(cube), config=config)
+    trial = run_trial(placed, given)
+    assert trial.outcome is Outcome.SUCCESS
+    assert trial.stable
+
+
+def test_public_trial_refuses_what_is_no_posture(cube, config):
+    placed = PlacedObject(model=cube, X_TO=standing(cube), config=config)
+    assert "posture must be a Posture" in refused(run_trial, placed, np.zeros(18))
+    assert "placed must be of place_object" in refused(run_trial, cube, Posture(X, np.zeros(8)))
+    assert "q_grasp must be 8 finite" in refused(run_trial, placed, Posture(X, np.zeros(5)))
