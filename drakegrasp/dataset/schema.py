@@ -599,4 +599,10 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
         ),
     ),
 )
+
+#: A row per predicted grasp, in `/rows` of the results for rows of a dataset.
+PREDICTED_ROW_FIELDS: tuple[Field, ...] = (
+    Field("row", "", "int64", "-", "-", "row of the dataset's split that the grasp is for"),
+    Field("trial_id", "", "int64", "-", "-", "row of trials.hdf5 of the same sample"),
+)
 # fmt: on
