@@ -150,9 +150,7 @@ def address_of(
     return urlencode({k: v for k, v in all_values.items() if v != "" and v != default.get(k)})
 
 
-def refuse_other_choices(
-    params: Mapping[str, str], choices: Mapping[str, Sequence[str]]
-) -> None:
+def refuse_other_choices(params: Mapping[str, str], choices: Mapping[str, Sequence[str]]) -> None:
     """Refuse a value of an address that is none of those that can be asked for.
 
     Raises:

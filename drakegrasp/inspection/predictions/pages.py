@@ -16,11 +16,15 @@ from drakegrasp.inspection.pages import number_text, render, words_of
 from drakegrasp.inspection.predictions.query import (
     RANGES,
     SORTS,
-    VERDICTS,
     PredictionQuery,
     order_values,
 )
-from drakegrasp.inspection.predictions.results import QUANTITIES, WORDS, Predictions
+from drakegrasp.inspection.predictions.results import (
+    QUANTITIES,
+    VERDICTS,
+    WORDS,
+    Predictions,
+)
 from drakegrasp.inspection.predictions.scene import prediction_scene
 from drakegrasp.inspection.query import PAGE
 from drakegrasp.inspection.rows import THUMBNAIL, Dot, Look, contact_dots, read_look, read_rows
@@ -44,9 +48,11 @@ _BOTH = {
 #: Numbers of a verdict alone, of the fingers the largest.
 _OWN = {
     "contact_error": Shown("asked to reached", "mm"),
+    "normal_error": Shown("asked to reached normal", "°"),
     "surface_distance": Shown("asked to surface", "mm"),
-    "residual": Shown("asked to fingertip of the fit", "mm"),
-    "normal_error": Shown("asked normal to pad of the fit", "°"),
+    "fit_residual": Shown("asked to fingertip of the fit", "mm"),
+    "fit_normal_error": Shown("asked normal to pad of the fit", "°"),
+    "tries": Shown("wrist poses tried", digits=0),
     "smallest_friction": Shown("least friction at the asked contacts", digits=2),
     "epsilon": Shown("epsilon of the asked contacts", digits=3),
 }
@@ -144,7 +150,8 @@ def prediction_page(
         token="",
         **_identity(predictions, i),
         verdict=_verdict(predictions, i),
-        reason=verdict["reason"] or "",
+        reason=verdict.get("reason") or "",
+        hints=verdict.get("hints") or "",
         row_words=[_outcome(row["outcome"]), *words_of(snapshot, at)],
         row_page=links.grasp(snapshot.label(at)) if row_link else "",
         position=position,
@@ -153,7 +160,7 @@ def prediction_page(
         gallery=links.predictions(query.params()),
         views=views,
         size=snapshot.config.camera.size,
-        numbers=_numbers(verdict, row),
+        numbers=_numbers(predictions, i, verdict, row),
         fingers=_fingers(verdict, row),
         scene=scene,
         meshes={
@@ -179,11 +186,11 @@ def _identity(predictions: Predictions, i: int) -> dict[str, Any]:
 
 def _verdict(predictions: Predictions, i: int) -> list[tuple[str, str]]:
     """Return the words of a verdict, each with the name of its look."""
-    outcome = Outcome(int(predictions.outcome[i]))
-    if outcome is not Outcome.SUCCESS:
-        return [("failed", _outcome(outcome))]
-    return [("held", word) for word in WORDS if word in predictions.words
-            and predictions.words[word][i]]  # fmt: skip
+    words = {word for word, those in predictions.words.items() if those[i]}
+    if "held" in words:
+        return [("held", word) for word in WORDS if word in words]
+    by_another = [("", "held by another wrist pose")] if "held_any" in words else []
+    return [("failed", _outcome(predictions.outcome[i])), *by_another]
 
 
 def _outcome(outcome: int) -> str:
@@ -242,9 +249,7 @@ def _cards(
             "object": snapshot.names[snapshot.table.object[at]],
             "class": snapshot.classes[snapshot.table.object[at]],
             "outcome": Outcome(int(predictions.outcome[i])).label,
-            "verdict": " ".join(word for _, word in _verdict(predictions, i))
-            if predictions.words["held"][i]
-            else "fails",
+            "verdict": " ".join(word for word, those in predictions.words.items() if those[i]),
             **{n: f"{v * QUANTITIES[n].factor:.6g}" for n, v in numbers.items()},
             "worst": f"{order[i]:.9g}",
             "row": f"{predictions.rows.row[i]}",
@@ -272,16 +277,19 @@ def _cards(
 
 
 def _numbers(
-    verdict: Mapping[str, Any], row: Mapping[str, Any]
+    predictions: Predictions, i: int, verdict: Mapping[str, Any], row: Mapping[str, Any]
 ) -> list[tuple[str, str, str | None]]:
     """Return lines of title, the prediction's value and the row's own; None for no such value."""
-    lines: list[tuple[str, str, str | None]] = []
+    true = QUANTITIES["true_error"]
+    lines: list[tuple[str, str, str | None]] = [
+        (true.title, true.text(float(predictions.features["true_error"][i])), None)
+    ]
     for name, shown in _OWN.items():
-        lines.append((shown.title, shown.text(_largest(verdict[name])), None))
+        lines.append((shown.title, shown.text(_largest(verdict.get(name))), None))
     for name, shown in _BOTH.items():
-        lines.append((shown.title, shown.text(_largest(verdict[name])), shown.text(row[name])))
+        lines.append((shown.title, shown.text(_largest(verdict.get(name))), shown.text(row[name])))
     force = Shown("largest force after closing", "N")
-    forces = [_lengths(source["closed_f_Q_O"]) for source in (verdict, row)]
+    forces = [_lengths(source.get("closed_f_Q_O")) for source in (verdict, row)]
     own, other = (force.text(_largest(values)) for values in forces)
     return [*lines, (force.title, own, other)]
 
@@ -313,7 +321,7 @@ def _largest(value: Any) -> float:
 
 def _form(predictions: Predictions, query: PredictionQuery) -> dict[str, Any]:
     """Return the fields of the form of filters and order."""
-    verdicts = [v for v in VERDICTS if v == "fails" or v in predictions.words]
+    verdicts = [verdict for verdict in VERDICTS if verdict in predictions.words]
     outcomes = [Outcome(int(n)).label for n in np.unique(predictions.outcome)]
     titles = {name: q.title for name, q in QUANTITIES.items()}
     titles |= {"worst": "worst verdict", "row": "row of the dataset"}

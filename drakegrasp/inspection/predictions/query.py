@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.inspection.predictions.results import QUANTITIES, WORDS, Predictions
+from drakegrasp.inspection.predictions.results import QUANTITIES, VERDICTS, Predictions
 from drakegrasp.inspection.query import (
     Limits,
     address_of,
@@ -24,9 +24,8 @@ from drakegrasp.inspection.query import (
 )
 from drakegrasp.outcomes import Outcome
 
-VERDICTS = ("fails", *WORDS)
 #: Quantities with a range among the filters.
-RANGES = ("error", "true_error", "surface", "slip", "turn")
+RANGES = ("error", "normal_error", "true_error", "surface", "slip", "turn")
 #: Orders by name.
 SORTS = ("worst", *QUANTITIES, "row")
 
@@ -91,9 +90,7 @@ def parse_prediction_query(params: Mapping[str, str]) -> PredictionQuery:
     )
 
 
-def select_predictions(
-    predictions: Predictions, query: PredictionQuery
-) -> npt.NDArray[np.int32]:
+def select_predictions(predictions: Predictions, query: PredictionQuery) -> npt.NDArray[np.int32]:
     """Return the numbers of the predictions that a query asks for, in its order.
 
     Those without a value of what is sorted by come last; ties are in the order of the file.
@@ -104,9 +101,7 @@ def select_predictions(
     chosen &= of_objects(snapshot, query.object_name, query.class_name)[predictions.objects]
     if query.outcome:
         chosen &= predictions.outcome == Outcome[query.outcome.upper()]
-    if query.verdict == "fails":
-        chosen &= ~predictions.words["held"]
-    elif query.verdict:
+    if query.verdict:
         chosen &= predictions.words.get(query.verdict, np.zeros(len(predictions), dtype=bool))
 
     # The order.

@@ -42,14 +42,16 @@ NEEDED = ("object", "outcome", "p_OQ", "nhat_Q_O")
 #: contacts the largest.
 QUANTITIES = {
     "error": Shown("asked to reached", "mm"),
+    "normal_error": Shown("asked to reached normal", "°"),
     "true_error": Shown("asked to true", "mm"),
     "surface": Shown("asked to surface", "mm"),
     "slip": Shown("slip", "mm"),
     "turn": Shown("turn", "°"),
     "friction": Shown("least friction", digits=2),
 }
-#: Words of a verdict, from the weakest.
-WORDS = ("held", "success", "precision", "stable")
+#: Words of a verdict on a grasp that is held; and all, to filter by.
+WORDS = ("held", "success", "precision", "stable", "sample")
+VERDICTS = ("fails", *WORDS, "held_any")
 Bools = npt.NDArray[np.bool_]
 Array = npt.NDArray[np.float64]
 
@@ -64,7 +66,7 @@ class Predictions:
         snapshot: State of the dataset.
         rows: The rows that they are for.
         outcome: (n,) uint8, `Outcome`.
-        words: By the names of WORDS, (n,) bool; those that the file tells.
+        words: By the names of VERDICTS, (n,) bool; those that the file tells.
         features: By the names of QUANTITIES, (n,), in SI; NaN where a verdict has none.
     """
 
@@ -156,14 +158,16 @@ def _read_predictions(path: Path, read_at: Stamp, snapshot: Snapshot) -> Predict
         outcome = read_codes(group["outcome"], list(Outcome))
 
         # What the words and numbers are made of.
-        names = ("success", "precision", "stable", "p_OQ", "contact_error", "surface_distance")
-        names = (*names, "slip", "turn", "smallest_friction")
+        told = [name for name in VERDICTS if name in group and name != "held"]
+        words = {name: group[name][:] for name in told}
+        names = ("p_OQ", "contact_error", "normal_error", "surface_distance", "slip", "turn")
+        names = (*names, "smallest_friction")
         values = {n: group[n][:] if n in group else None for n in names}
     held = outcome == Outcome.SUCCESS
-    words = {"held": held, **{n: values[n] for n in WORDS if values.get(n) is not None}}
     true = snapshot.trials[rows.trial_id.tolist()]["closed_p_OQ"]
     features = {
         "error": _largest(values["contact_error"], count),
+        "normal_error": _largest(values["normal_error"], count),
         # Another hand may have another number of fingers.
         "true_error": _largest(
             norm(values["p_OQ"] - true) if values["p_OQ"].shape == true.shape else None, count
@@ -179,7 +183,7 @@ def _read_predictions(path: Path, read_at: Stamp, snapshot: Snapshot) -> Predict
         snapshot=snapshot,
         rows=rows,
         outcome=outcome,
-        words=words,
+        words={"fails": ~held, "held": held, **words},
         features=features,
     )
 

@@ -12,6 +12,15 @@
     return new URLSearchParams([...new FormData(form)].filter(([, value]) => value.trim() !== ""));
   }
 
+  // A range must be of numbers; what is wrong with it is said.
+  function isReadable() {
+    const wrong = [...form.elements].filter((field) => field.inputMode === "decimal" && Number.isNaN(Number(field.value)));
+    message.hidden = !wrong.length;
+    message.className = "bad";
+    message.textContent = wrong.map((field) => `${field.getAttribute("aria-label")} must be a number, got ${field.value}`).join("; ");
+    return !wrong.length;
+  }
+
   function fill(params) {
     for (const field of form.elements) {
       if (!field.name) continue;
@@ -25,7 +34,7 @@
     let timer = 0, last = chosen().toString();
     const act = () => {
       clearTimeout(timer);
-      if (chosen().toString() === last) return;
+      if (!isReadable() || chosen().toString() === last) return;
       last = chosen().toString();
       apply();
     };
