@@ -57,6 +57,7 @@ def attempt_form(snapshot: Snapshot, query: Query, *, failures: bool) -> dict[st
         "ranges": range_fields(RANGES, QUANTITIES, query.ranges),
         "sorts": [(name, titles[name], name == query.sort) for name in SORTS],
         "ascending": query.ascending,
+        "outcome": Query().outcome,
     }
 
 

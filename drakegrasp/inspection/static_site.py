@@ -1,9 +1,9 @@
 """The pages as files that a browser opens without a server.
 
-In: a dataset. Out: a folder with `index.html`, a page per success, their images and meshes; with a
-result file also `predictions.html` and a page per prediction. A page
-of a file may load no other file but scripts, styles and pictures, so each mesh is a script that
-holds its JSON. Decisions are shown and cannot be changed.
+In: a dataset, and results of predictions for its rows. Out: a folder with `index.html`, a page per
+success, their images and meshes; `predictions.html` and a page per prediction. A page of a file may
+load no other file but scripts, styles and pictures, so each mesh is a script that holds its JSON.
+Decisions are shown and cannot be changed.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from drakegrasp.runtime.files import atomic_folder
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.visualization.thumbnails import strip_png
 
-#: Grasps that are written at most, the most suspicious: a browser must show all cards at once.
+#: Grasps, and predictions, that are written at most: a browser must hold all cards at once.
 MAX_GRASPS = 2000
 
 

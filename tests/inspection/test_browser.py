@@ -25,7 +25,13 @@ from matplotlib.image import imread
 
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
-from drakegrasp.dataset.rejections import AttemptKey, read_decisions, read_rejected
+from drakegrasp.dataset.rejections import (
+    AttemptKey,
+    Decisions,
+    read_decisions,
+    read_rejected,
+    write_decisions,
+)
 from drakegrasp.inspection.app import Inspection, make_app
 from drakegrasp.inspection.catalog import Catalog, Snapshot
 from drakegrasp.inspection.serve import listen
@@ -471,28 +477,23 @@ CONTRAST = """() => {
 }"""
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
 def test_text_stands_out_in_both_themes(
-    page: Page, out: Path, tmp_path: Path, state: Snapshot, theme: str
+    page: Page, out: Path, tmp_path: Path, state: Snapshot
 ) -> None:
-    page.emulate_media(color_scheme=theme)
     results = write_predictions(out, tmp_path / "run.h5")
+    decisions = Decisions(
+        rejected=frozenset([AttemptKey("1_box_a", 0, 0)]),
+        kept=frozenset([AttemptKey("2_box_b", 1, 0)]),
+    )
+    write_decisions(out / "reject.json", decisions)
     for address in serve(out, results):
-        page.goto(address)
-        page.click(coded(state, "[data-label='0-0-0'] [data-decide=rejected]"))
-        page.click(coded(state, "[data-label='1-1-0'] [data-decide=kept]"))
-        page.wait_for_selector(".card.kept")
-        for name, path in (
-            ("gallery", "/"),
-            ("grasp", coded(state, "/grasp/0-0-0")),
-            ("predictions", "/predictions"),
-            ("prediction", "/prediction/0"),
-            ("plots", "/plots"),
-        ):
-            page.goto(address + path)
+        for path in ("/", "/grasp/0-0-0", "/predictions", "/prediction/0", "/plots"):
+            page.goto(address + coded(state, path))
             page.keyboard.press("?")
-            contrast, text = page.evaluate(CONTRAST)
-            assert contrast >= 4.5, f"{name}: {text!r} has {contrast:.2f}"
+            for theme in ("light", "dark"):
+                page.select_option("#theme", theme, force=True)
+                contrast, text = page.evaluate(CONTRAST)
+                assert contrast >= 4.5, f"{theme} {path}: {text!r} has {contrast:.2f}"
 
 
 def test_the_theme_that_is_chosen_is_remembered(page: Page, address: str, state: Snapshot) -> None:
@@ -503,8 +504,8 @@ def test_the_theme_that_is_chosen_is_remembered(page: Page, address: str, state:
     wait_for_view(page)
     light, view = background(), page.locator("#view3d").screenshot()
     page.emulate_media(color_scheme="dark")
+    wait_until(page, lambda: background() != light)
     dark = background()
-    assert dark != light
     # The 3D view follows.
     assert page.locator("#view3d").screenshot() != view
     page.select_option("#theme", "light")
@@ -530,9 +531,9 @@ def test_predictions_filter_and_open(page: Page, out: Path, tmp_path: Path) -> N
         wait_for_view(page)
         assert "2 of 2" in page.inner_text(".position")
         shots = {page.locator("#view3d").screenshot()}
-        for key in ("a", "c", "t", "2"):
+        for key in ("a", "c", "t"):
             page.keyboard.press(key)
             shots.add(page.locator("#view3d").screenshot())
-        assert len(shots) == 5
+        assert len(shots) == 4
         page.keyboard.press("g")
         page.wait_for_url("**/predictions?verdict=fails")

@@ -334,4 +334,5 @@ def _form(predictions: Predictions, query: PredictionQuery) -> dict[str, Any]:
         "ranges": range_fields(RANGES, QUANTITIES, query.ranges),
         "sorts": [(name, titles[name], name == query.sort) for name in SORTS],
         "ascending": query.ascending,
+        "outcome": "",
     }

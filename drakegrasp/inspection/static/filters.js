@@ -24,7 +24,7 @@
   function fill(params) {
     for (const field of form.elements) {
       if (!field.name) continue;
-      field.value = params.get(field.name) ?? "";
+      field.value = params.get(field.name) ?? field.dataset.default ?? "";
       if (field.tagName === "SELECT" && field.selectedIndex < 0) field.selectedIndex = 0;
     }
   }

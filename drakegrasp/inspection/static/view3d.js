@@ -121,7 +121,7 @@
       const f = new THREE.Vector3(...contact.f).multiplyScalar(PER_NEWTON);
       arrow(forces, p.clone().sub(f), f, colour, 0.0016);
     }
-    for (const button of document.querySelectorAll("[data-state]")) button.classList.toggle("on", button.dataset.state === name);
+    for (const button of document.querySelectorAll("button[data-state]")) button.classList.toggle("on", button.dataset.state === name);
     box.dataset.state = name;
     draw();
   }
@@ -197,7 +197,7 @@
   });
 
   document.addEventListener("click", (event) => {
-    const button = event.target.closest("[data-state]");
+    const button = event.target.closest("button[data-state]");
     if (button) show(button.dataset.state);
   });
   const boxes = [...document.querySelectorAll("[data-layer]")];
@@ -226,7 +226,7 @@
     if (event.ctrlKey || event.altKey || event.metaKey || !box.dataset.ready) return;
     if (document.querySelector("dialog[open]") || event.target.closest("input:not([type=checkbox]), select")) return;
     const check = boxes.find((each) => each.dataset.key === event.key.toLowerCase());
-    const state = document.querySelectorAll("[data-state]")[Number.parseInt(event.key, 10) - 1];
+    const state = document.querySelectorAll("button[data-state]")[Number.parseInt(event.key, 10) - 1];
     if (event.shiftKey && event.key in turns) move(...turns[event.key], 1);
     else if (event.key in zooms) move(0, 0, zooms[event.key]);
     else if (event.key === "0") { aim(); draw(); }
