@@ -16,6 +16,9 @@ from helpers.pages import Tags
 from helpers.predictions import write_predictions
 from starlette.testclient import TestClient
 
+from drakegrasp.cli.verify_request import VerifyRequest, requested_rows
+from drakegrasp.dataset.layout.predicted_rows import read_predicted_rows
+from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError
 from drakegrasp.inspection.app import Inspection, make_app
 from drakegrasp.inspection.static_site import write_site
@@ -185,3 +188,25 @@ def test_files_hold_the_predictions_too(out: Path, results: Path, tmp_path: Path
     for _, attributes in Tags(page).tags:
         address = attributes.get("src") or attributes.get("href") or ""
         assert not address or (tmp_path / "site" / "prediction" / address).is_file(), address
+
+
+def test_results_say_which_rows_were_asked_for(out: Path, tmp_path: Path) -> None:
+    """As `verify` finds them: those in the file of predictions, else all of the split."""
+    data = GraspDataset(out / "grasping_oto.hdf5", split="train")
+    rows = np.array([2, 0, 2])
+    with h5py.File(tmp_path / "p.h5", "w") as file:
+        file["grasps"], file["rows"] = data.column("grasps")[rows], rows
+    for path, split, wanted in (
+        (tmp_path / "p.h5", "train", rows),
+        (data.path, "train", np.arange(len(data))),
+    ):
+        request = VerifyRequest(grasps=path, dataset=data.path, split=split)
+        asked = requested_rows(request, len(wanted))
+        assert asked is not None
+        with h5py.File(tmp_path / "r.h5", "w") as file:
+            asked.write(file)
+            read = read_predicted_rows(file)
+        assert read is not None
+        assert (read.split, read.camera, read.row.tolist()) == ("train", "oto", wanted.tolist())
+        assert read.trial_id.tolist() == data.column("trial_id")[wanted].tolist()
+    assert requested_rows(VerifyRequest(grasps=tmp_path / "p.h5", mesh=Path("a.obj")), 3) is None
