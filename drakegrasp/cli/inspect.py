@@ -16,6 +16,14 @@ PORT = 8321
 @click.command("inspect")
 @dataset_argument()
 @click.option(
+    "--predictions",
+    "results",
+    type=PATH,
+    metavar="RESULTS",
+    help="Show predictions beside the rows that they are for: the file that verify --dataset ... "
+    "--out has written.",
+)
+@click.option(
     "--port",
     type=click.IntRange(0, 65535),
     default=PORT,
@@ -31,7 +39,9 @@ PORT = 8321
     help="Write the pages to DIR as files that open without a server, and end.",
 )
 @click.option("--no-browser", is_flag=True, help="Only print the address.")
-def inspect_(out: Path, port: int, folder: Path | None, no_browser: bool) -> None:
+def inspect_(
+    out: Path, results: Path | None, port: int, folder: Path | None, no_browser: bool
+) -> None:
     """Look at grasps in a browser, and reject them.
 
     The page shows every attempt in OUT with images, contacts, forces and a 3D view, the most
@@ -53,12 +63,12 @@ def inspect_(out: Path, port: int, folder: Path | None, no_browser: bool) -> Non
         ) from None
 
     if folder is None:
-        serve(out, port=port, browser=not no_browser, announce=say)
+        serve(out, results=results, port=port, browser=not no_browser, announce=say)
         return
     from drakegrasp.runtime.progress import progress_bar
 
     with progress_bar("inspect", "grasps") as progress:
-        site = write_site(out, folder, progress=progress)
+        site = write_site(out, folder, results=results, progress=progress)
     rest = "" if site.grasps == site.successes else f", the most suspicious of {site.successes:,}"
     say(f"{site.grasps:,} grasps in {folder / 'index.html'}{rest}")
 

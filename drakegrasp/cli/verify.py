@@ -108,7 +108,7 @@ def verify(
     """
     from drakegrasp.api import run_verification
     from drakegrasp.cli.tables import make_console, verdict_table
-    from drakegrasp.cli.verify_request import VerifyRequest, place_requested
+    from drakegrasp.cli.verify_request import VerifyRequest, place_requested, requested_rows
     from drakegrasp.verification.hints import count_hints
     from drakegrasp.verification.result_files import (
         json_lines,
@@ -119,7 +119,9 @@ def verify(
     )
 
     # All input is read and checked before anything is simulated.
-    grasps, config = place_requested(VerifyRequest(**options, out=out))
+    request = VerifyRequest(**options, out=out)
+    grasps, config = place_requested(request)
+    rows = None if out is None else requested_rows(request, len(grasps))
 
     def print_line(index: int, result: Verification) -> None:
         write_json_line(index, result, sys.stdout)
@@ -142,7 +144,7 @@ def verify(
                 show=not quiet,
             )
             if out is not None:
-                write_results(results, result_paths(out)[1], config)
+                write_results(results, result_paths(out)[1], config, rows)
     except BaseException:
         if out is not None and part_path(out).exists():
             say(f"{part_path(out)}: the verdicts so far", err=True)

@@ -9,7 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from drakegrasp.config import Config
+from drakegrasp.dataset.layout.predicted_rows import PredictedRows
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError, GraspError
 from drakegrasp.frames import Array
@@ -62,6 +65,21 @@ def place_requested(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
         return _place(request)
     except DataError as error:
         raise GraspError(str(error)) from None
+
+
+def requested_rows(request: VerifyRequest, count: int) -> PredictedRows | None:
+    """Return the rows of the dataset that the grasps of a request are for, as the files say.
+
+    Args:
+        request: That `place_requested` has accepted.
+        count: Number of its grasps.
+    """
+    path = _dataset_path(request)
+    if path is None:
+        return None
+    split = request.split or DEFAULT_SPLIT
+    rows = read_predictions(request.grasps, split=split).rows
+    return PredictedRows.of(path, split, np.arange(count) if rows is None else rows.ravel())
 
 
 def _place(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:

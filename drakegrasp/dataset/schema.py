@@ -639,4 +639,10 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
     Field("selected_angle", "k", "float64", "rad", "-",
           "method forces: angle of the predicted normals from them", of="forces.contacts.angle"),
 )
+
+#: A row per predicted grasp, in `/rows` of the results for rows of a dataset.
+PREDICTED_ROW_FIELDS: tuple[Field, ...] = (
+    Field("row", "", "int64", "-", "-", "row of the dataset's split that the grasp is for"),
+    Field("trial_id", "", "int64", "-", "-", "row of trials.hdf5 of the same sample"),
+)
 # fmt: on

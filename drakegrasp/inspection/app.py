@@ -37,6 +37,9 @@ from drakegrasp.inspection.grasp_page import grasp_page
 from drakegrasp.inspection.links import ServerLinks
 from drakegrasp.inspection.pages import gallery_page, render
 from drakegrasp.inspection.plots import plot_svg, plots_values
+from drakegrasp.inspection.predictions.pages import prediction_page, predictions_page
+from drakegrasp.inspection.predictions.query import parse_prediction_query, select_predictions
+from drakegrasp.inspection.predictions.results import Predictions, ResultFile
 from drakegrasp.inspection.query import Query, count_decisions, parse_query, select
 from drakegrasp.inspection.recording import Recordings
 from drakegrasp.inspection.rows import read_look, read_rows
@@ -75,18 +78,23 @@ class Inspection:
 
     Args:
         out: Directory of the dataset.
+        results: File of the verdicts on predictions for its rows, if there is one.
 
     Raises:
-        DataError: If the directory holds no dataset, or its `reject.json` cannot be read.
+        DataError: If the directory holds no dataset, its `reject.json` or the verdicts cannot be
+            read, or the verdicts are not of this dataset.
     """
 
-    def __init__(self, out: Path) -> None:
+    def __init__(self, out: Path, results: Path | None = None) -> None:
         self.catalog = Catalog(out)
+        self.results = None if results is None else ResultFile(results)
+        if self.results is not None:
+            self.results.current(self.catalog.current())
         self.decisions = DecisionFile(out)
         self.hand = HandView(self.catalog.current().config)
         self.recordings = Recordings(out)
         self.token = secrets.token_urlsafe(24)
-        self.links = ServerLinks()
+        self.links = ServerLinks(predicted=results is not None)
         self._lock = threading.Lock()
         self._selections: OrderedDict[Any, npt.NDArray[np.int32]] = OrderedDict()
         self._selected_from: Snapshot | None = None
@@ -147,6 +155,8 @@ def make_app(inspection: Inspection) -> Starlette:
             route("/grasp/{label}", _grasp),
             route("/strip/{label}-{camera:str}.png", _strip),
             route("/mesh/{kind}-{name}.json", _mesh),
+            route("/predictions", _predictions),
+            route("/prediction/{label}", _prediction),
             route("/plots", _plots),
             route("/plot/{name}.svg", _plot),
             route("/recording/{label}.html", _recording),
@@ -225,6 +235,30 @@ def _plots(inspection: Inspection, request: Request) -> Response:
     snapshot = inspection.catalog.current()
     values = plots_values(snapshot)
     return HTMLResponse(render("plots.html", inspection.links, token="", **values))
+
+
+def _predictions(inspection: Inspection, request: Request) -> Response:
+    predictions = _predicted(inspection)
+    query = parse_prediction_query(request.query_params)
+    chosen = select_predictions(predictions, query)
+    return HTMLResponse(predictions_page(predictions, query, chosen, inspection.links))
+
+
+def _prediction(inspection: Inspection, request: Request) -> Response:
+    predictions = _predicted(inspection)
+    i = predictions.find(request.path_params["label"])
+    if i is None:
+        raise HTTPException(404, "there is no such prediction")
+    query = parse_prediction_query(request.query_params)
+    chosen = select_predictions(predictions, query)
+    page = prediction_page(predictions, query, chosen, i, inspection.hand, inspection.links)
+    return HTMLResponse(page)
+
+
+def _predicted(inspection: Inspection) -> Predictions:
+    if inspection.results is None:
+        raise HTTPException(404, "there are no predictions; give drakegrasp inspect --predictions")
+    return inspection.results.current(inspection.catalog.current())
 
 
 # Pictures and meshes

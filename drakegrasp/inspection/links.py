@@ -22,6 +22,16 @@ class Links(Protocol):
     def grasp(self, label: str, params: str = "") -> str:
         """Return that of an attempt's page, with the query that next and previous go through."""
 
+    @property
+    def predicted(self) -> bool:
+        """Whether there are pages of predictions."""
+
+    def predictions(self, params: str = "") -> str:
+        """Return that of the gallery of predictions, with a query."""
+
+    def prediction(self, label: str, params: str = "") -> str:
+        """Return that of a prediction's page, with the query that next and previous go through."""
+
     def strip(self, label: str, camera: str) -> str:
         """Return that of an attempt's images."""
 
@@ -37,8 +47,13 @@ class Links(Protocol):
 
 @dataclass(frozen=True)
 class ServerLinks:
-    """Addresses of the server."""
+    """Addresses of the server.
 
+    Attributes:
+        predicted: See `Links`.
+    """
+
+    predicted: bool = False
     static: bool = False
 
     def asset(self, name: str) -> str:
@@ -52,6 +67,14 @@ class ServerLinks:
     def grasp(self, label: str, params: str = "") -> str:
         """See `Links`."""
         return f"/grasp/{label}" + f"?{params}" * bool(params)
+
+    def predictions(self, params: str = "") -> str:
+        """See `Links`."""
+        return "/predictions" + f"?{params}" * bool(params)
+
+    def prediction(self, label: str, params: str = "") -> str:
+        """See `Links`."""
+        return f"/prediction/{label}" + f"?{params}" * bool(params)
 
     def strip(self, label: str, camera: str) -> str:
         """See `Links`."""
@@ -76,9 +99,11 @@ class FileLinks:
 
     Attributes:
         up: From the page to the folder of all: empty, or "../".
+        predicted: See `Links`.
     """
 
     up: str = ""
+    predicted: bool = False
     static: bool = True
 
     def asset(self, name: str) -> str:
@@ -92,6 +117,14 @@ class FileLinks:
     def grasp(self, label: str, params: str = "") -> str:
         """See `Links`; without a server next and previous go through the order of the files."""
         return f"{self.up}grasp/{label}.html"
+
+    def predictions(self, params: str = "") -> str:
+        """See `Links`; without a server a query has no effect."""
+        return f"{self.up}predictions.html"
+
+    def prediction(self, label: str, params: str = "") -> str:
+        """See `Links`."""
+        return f"{self.up}prediction/{label}.html"
 
     def strip(self, label: str, camera: str) -> str:
         """See `Links`."""

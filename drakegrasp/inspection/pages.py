@@ -7,7 +7,6 @@ or a style of its own, so the strictest content security policy fits.
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,27 +19,16 @@ from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.dataset.suspicion import PARTS
 from drakegrasp.errors import printable
 from drakegrasp.inspection.catalog import Snapshot
+from drakegrasp.inspection.forms import attempt_form
 from drakegrasp.inspection.links import Links
-from drakegrasp.inspection.query import (
-    DECISIONS,
-    HOLDS,
-    PAGE,
-    QUANTITIES,
-    RANGES,
-    SORTS,
-    SPLIT_CHOICES,
-    Query,
-    count_decisions,
-)
+from drakegrasp.inspection.query import PAGE, QUANTITIES, Query, count_decisions
 from drakegrasp.inspection.rows import THUMBNAIL, contact_dots, read_rows
 from drakegrasp.outcomes import Outcome, Removal
-from drakegrasp.visualization.style import FINGER_COLOURS
+from drakegrasp.visualization.style import FINGER_COLOURS, PREDICTED, REACHED, TRUE
 
 Places = npt.NDArray[np.int32]
 #: Reasons of suspicion that a card names, and the share from which on it names one.
 REASONS, REASON_SHARE = 2, 0.75
-#: Choices of the split that say more than their values.
-SPLIT_NAMES = {"samples": "any sample", "none": "no sample"}
 
 
 def _shown(value: Any) -> Any:
@@ -56,11 +44,14 @@ TEMPLATES = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
+#: Colours of fingers, and of kinds of contacts in the order in which they are drawn.
+TEMPLATES.globals["colours"] = FINGER_COLOURS
+TEMPLATES.globals["kinds"] = {"true": TRUE, "asked": PREDICTED, "reached": REACHED}
 
 
 def render(name: str, links: Links, **values: Any) -> str:
     """Return a page of a template."""
-    return TEMPLATES.get_template(name).render(links=links, colours=FINGER_COLOURS, **values)
+    return TEMPLATES.get_template(name).render(links=links, **values)
 
 
 def gallery_page(
@@ -103,8 +94,8 @@ def gallery_page(
         pages=pages,
         previous=links.gallery(query.params(page=page - 1)) if page > 1 else "",
         next=links.gallery(query.params(page=page + 1)) if page < pages else "",
-        query=query,
-        form=_form(snapshot, query, failures=not links.static),
+        address=links.gallery(query.params()),
+        form=attempt_form(snapshot, query, failures=not links.static),
     )
 
 
@@ -208,62 +199,3 @@ def _plain_values(snapshot: Snapshot, i: int) -> dict[str, str]:
         "removal": Removal(int(table.removal[i])).label if table.removal[i] != NONE else "",
         "row": str(i),
     }
-
-
-def _form(snapshot: Snapshot, query: Query, *, failures: bool) -> dict[str, Any]:
-    """Return the fields of the form of filters.
-
-    Args:
-        snapshot: State of the files.
-        query: What is asked for.
-        failures: Whether failed attempts can be asked for.
-    """
-
-    def options(values: Sequence[str], chosen: str, any_: str = "any") -> list[Any]:
-        """Return value, text and whether it is chosen."""
-        named = [(value, value.replace("_", " "), value == chosen) for value in values]
-        return [("", any_, not chosen), *named]
-
-    # Outcomes and reasons that occur; names as they are.
-    table = snapshot.table
-    outcomes = [Outcome(int(n)).label for n in np.unique(table.outcome)]
-    removals = [Removal(int(n)) for n in np.unique(table.removal) if n != NONE]
-    reasons = [removal.label for removal in removals if removal is not Removal.KEPT]
-    named = [(name, name, name == query.object_name) for name in snapshot.names]
-    classes = sorted(set(snapshot.classes))
-    selects = [
-        ("class", "class", [("", "any", not query.class_name),
-                            *((c, c, c == query.class_name) for c in classes)]),
-        ("object", "object", [("", "any", not query.object_name), *named]),
-        ("outcome", "outcome", [("any", "any", not query.outcome),
-                                *options(outcomes, query.outcome)[1:]]),
-        ("split", "split", _named(SPLIT_NAMES, options(SPLIT_CHOICES, query.split))),
-        ("hold", "how it holds", options(HOLDS, query.hold)),
-        ("removal", "removed by", options(reasons, query.removal)),
-        ("decision", "decision", options(DECISIONS, query.decision)),
-    ]  # fmt: skip
-
-    if not failures:
-        selects = [select for select in selects if select[0] != "outcome"]
-
-    def text(value: float | None) -> str:
-        return "" if value is None else f"{value:g}"
-
-    ranges = [
-        {
-            "name": name,
-            "title": QUANTITIES[name].title,
-            "unit": QUANTITIES[name].unit,
-            "min": text(query.ranges.get(name, (None, None))[0]),
-            "max": text(query.ranges.get(name, (None, None))[1]),
-        }
-        for name in RANGES
-    ]
-    titles = {name: q.title for name, q in QUANTITIES.items()} | {"row": "row of the dataset"}
-    sorts = [(name, titles[name], name == query.sort) for name in SORTS]
-    return {"selects": selects, "ranges": ranges, "sorts": sorts, "ascending": query.ascending}
-
-
-def _named(names: Mapping[str, str], options: Sequence[Any]) -> list[Any]:
-    """Return options with other texts for some values."""
-    return [(value, names.get(value, text), chosen) for value, text, chosen in options]

@@ -5,8 +5,9 @@ In: the parameters of an address. Out: a `Query`, and the places of the attempts
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any, TypeAlias
 from urllib.parse import urlencode
 
 import numpy as np
@@ -20,6 +21,8 @@ from drakegrasp.errors import DataError
 from drakegrasp.inspection.catalog import Snapshot
 from drakegrasp.outcomes import Outcome, Removal
 
+#: Least and largest value; None for no limit.
+Limits: TypeAlias = tuple[float | None, float | None]
 #: Features of an attempt that can be filtered and sorted by, as people read them.
 QUANTITIES = {
     "suspicion": Shown("suspicion", digits=2),
@@ -57,7 +60,7 @@ class Query:
     hold: str = ""
     removal: str = ""
     decision: str = ""
-    ranges: Mapping[str, tuple[float | None, float | None]] = field(default_factory=dict)
+    ranges: Mapping[str, Limits] = field(default_factory=dict)
     sort: str = "suspicion"
     ascending: bool = False
     page: int = 1
@@ -80,12 +83,8 @@ class Query:
             "order": "up" if self.ascending else "",
             "page": self.page,
         }
-        for name, limits in self.ranges.items():
-            for bound, value in zip(("min", "max"), limits, strict=True):
-                values[f"{bound}_{name}"] = "" if value is None else f"{value:g}"
-        values |= changes
         default = {"outcome": "success", "sort": "suspicion", "page": 1}
-        return urlencode({k: v for k, v in values.items() if v != "" and v != default.get(k)})
+        return address_of(values, self.ranges, changes, default)
 
     @property
     def identity(self) -> str:
@@ -109,19 +108,8 @@ def parse_query(params: Mapping[str, str]) -> Query:
         "sort": SORTS,
         "order": ("up", "down"),
     }
-    for name, allowed in choices.items():
-        if params.get(name, "") not in ("", *allowed):
-            raise DataError(f"{name} must be one of {', '.join(allowed)}, got {params[name]!r}")
-
-    ranges = {}
-    for name in RANGES:
-        limits = (_number(params, f"min_{name}"), _number(params, f"max_{name}"))
-        if limits != (None, None):
-            ranges[name] = limits
+    refuse_other_choices(params, choices)
     outcome = params.get("outcome", "") or "success"
-    page = params.get("page", "") or "1"
-    if not (page.isascii() and page.isdecimal() and len(page) < 9):
-        raise DataError(f"page must be a number, got {page!r}")
     return Query(
         object_name=params.get("object", ""),
         class_name=params.get("class", ""),
@@ -130,11 +118,70 @@ def parse_query(params: Mapping[str, str]) -> Query:
         hold=params.get("hold", ""),
         removal=params.get("removal", ""),
         decision=params.get("decision", ""),
-        ranges=ranges,
+        ranges=read_ranges(params, RANGES),
         sort=params.get("sort", "") or "suspicion",
         ascending=params.get("order", "") == "up",
-        page=max(1, int(page)),
+        page=read_page(params),
     )
+
+
+# What the queries of all galleries share.
+
+
+def address_of(
+    values: Mapping[str, object],
+    ranges: Mapping[str, Limits],
+    changes: Mapping[str, object],
+    default: Mapping[str, object],
+) -> str:
+    """Return a query as part of an address; empty values and defaults are left out.
+
+    Args:
+        values: By the names of the parameters.
+        ranges: Least and largest value of quantities.
+        changes: Values in place of others.
+        default: Values that need not be said.
+    """
+    all_values = dict(values)
+    for name, limits in ranges.items():
+        for bound, value in zip(("min", "max"), limits, strict=True):
+            all_values[f"{bound}_{name}"] = "" if value is None else f"{value:g}"
+    all_values |= changes
+    return urlencode({k: v for k, v in all_values.items() if v != "" and v != default.get(k)})
+
+
+def refuse_other_choices(params: Mapping[str, str], choices: Mapping[str, Sequence[str]]) -> None:
+    """Refuse a value of an address that is none of those that can be asked for.
+
+    Raises:
+        DataError: If there is one.
+    """
+    for name, allowed in choices.items():
+        if params.get(name, "") not in ("", *allowed):
+            raise DataError(f"{name} must be one of {', '.join(allowed)}, got {params[name]!r}")
+
+
+def read_ranges(params: Mapping[str, str], names: Sequence[str]) -> dict[str, Limits]:
+    """Return the least and largest values of quantities that an address asks for.
+
+    Raises:
+        DataError: If one of them is no number.
+    """
+    ranges = {name: (_number(params, f"min_{name}"), _number(params, f"max_{name}"))
+              for name in names}  # fmt: skip
+    return {name: limits for name, limits in ranges.items() if limits != (None, None)}
+
+
+def read_page(params: Mapping[str, str]) -> int:
+    """Return the number of the gallery's page, from 1.
+
+    Raises:
+        DataError: If it is no number.
+    """
+    page = params.get("page", "") or "1"
+    if not (page.isascii() and page.isdecimal() and len(page) < 9):
+        raise DataError(f"page must be a number, got {page!r}")
+    return max(1, int(page))
 
 
 def _number(params: Mapping[str, str], name: str) -> float | None:
@@ -148,6 +195,40 @@ def _number(params: Mapping[str, str], name: str) -> float | None:
     if not np.isfinite(value):
         raise DataError(f"{name} must be a number, got {text!r}")
     return value
+
+
+def in_ranges(
+    ranges: Mapping[str, Limits],
+    quantities: Mapping[str, Shown],
+    feature: Callable[[str], npt.NDArray[Any]],
+    count: int,
+) -> npt.NDArray[np.bool_]:
+    """Return which of `count` things are in all ranges; one without a value is in none.
+
+    Args:
+        ranges: Least and largest value of quantities, in the units that are shown.
+        quantities: By name.
+        feature: Returns the values (n,) of a quantity in SI.
+        count: n.
+    """
+    chosen = np.ones(count, dtype=bool)
+    for name, (least, largest) in ranges.items():
+        values = feature(name) * quantities[name].factor
+        if least is not None:
+            chosen &= values >= least
+        if largest is not None:
+            chosen &= values <= largest
+    return chosen
+
+
+def of_objects(snapshot: Snapshot, object_name: str, class_name: str) -> npt.NDArray[np.bool_]:
+    """Return which objects (m,) have a name and a class; an empty text is any."""
+    named = zip(snapshot.names, snapshot.classes, strict=True)
+    wanted = [object_name in ("", name) and class_name in ("", of) for name, of in named]
+    return np.array(wanted, dtype=bool)
+
+
+# Attempts
 
 
 def select(snapshot: Snapshot, query: Query, decisions: Decisions) -> npt.NDArray[np.int32]:
@@ -173,13 +254,7 @@ def _matches(snapshot: Snapshot, query: Query) -> npt.NDArray[np.bool_]:
     """Return which attempts (n,) the filters let through, but for that of decisions."""
     # Names first: a class is all of its objects.
     table = snapshot.table
-    wanted = np.array(
-        [
-            query.object_name in ("", name) and query.class_name in ("", class_name)
-            for name, class_name in zip(snapshot.names, snapshot.classes, strict=True)
-        ],
-        dtype=bool,
-    )
+    wanted = of_objects(snapshot, query.object_name, query.class_name)
     chosen = wanted[table.object] if len(wanted) else np.zeros(len(table), dtype=bool)
 
     # Verdicts.
@@ -196,14 +271,7 @@ def _matches(snapshot: Snapshot, query: Query) -> npt.NDArray[np.bool_]:
     if query.removal:
         chosen &= table.removal == Removal[query.removal.upper()]
 
-    # Numbers; an attempt without one is in no range.
-    for name, (least, largest) in query.ranges.items():
-        values = table.feature(name) * QUANTITIES[name].factor
-        if least is not None:
-            chosen &= values >= least
-        if largest is not None:
-            chosen &= values <= largest
-    return chosen
+    return chosen & in_ranges(query.ranges, QUANTITIES, table.feature, len(table))
 
 
 def count_decisions(snapshot: Snapshot, decisions: Decisions) -> dict[str, int]:

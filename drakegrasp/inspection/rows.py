@@ -17,7 +17,7 @@ from drakegrasp.dataset.layout.trial_files import NONE
 from drakegrasp.dataset.paths import DATA_FILES, shards_folder
 from drakegrasp.dataset.schema import CERTIFICATE_FIELDS, SPLITS
 from drakegrasp.dataset.shards import trial_columns
-from drakegrasp.frames import invert_pose, rotate_vectors, transform_points, unpack_pose
+from drakegrasp.frames import Array, invert_pose, rotate_vectors, transform_points, unpack_pose
 from drakegrasp.inspection.catalog import Snapshot
 from drakegrasp.vision.camera import camera_pose_otm, camera_pose_oto, intrinsics, project
 from drakegrasp.visualization.style import HIDDEN
@@ -144,23 +144,30 @@ def _shard_path(snapshot: Snapshot, i: int) -> Path:
 
 
 def contact_dots(
-    snapshot: Snapshot, row: dict[str, Any], camera: str, look: Look | None = None
+    snapshot: Snapshot,
+    row: dict[str, Any],
+    camera: str,
+    look: Look | None = None,
+    *,
+    contacts: tuple[Array, Array] | None = None,
 ) -> list[Dot]:
-    """Return where a camera sees the contacts after closing; those behind it are left out.
+    """Return where a camera sees contacts; those behind it are left out.
 
     Args:
         snapshot: With the configuration of the cameras.
         row: With the columns THUMBNAIL.
         camera: `oto` or `otm`.
         look: Its images, which tell what the object hides; without them nothing is hidden.
+        contacts: Points and normals (k, 3) in {O}; those of the row after closing if None.
     """
     # The contacts and the tips of their normals in {C}.
+    p_OQ, nhat_Q_O = contacts or (row["closed_p_OQ"], row["closed_nhat_Q_O"])
     config = snapshot.config.camera
     X_TO, X_OG = unpack_pose(row["X_TO"]), unpack_pose(row["X_OG"])
     X_TC = _CAMERA_POSES[camera](multiply(X_TO, X_OG), config, unpack_pose(row["X_C0C"]))
     X_CO = multiply(invert_pose(X_TC), X_TO)
-    p_CQ = transform_points(X_CO, row["closed_p_OQ"])
-    p_CE = p_CQ + ARROW * np.nan_to_num(rotate_vectors(X_CO, row["closed_nhat_Q_O"]))
+    p_CQ = transform_points(X_CO, p_OQ)
+    p_CE = p_CQ + ARROW * np.nan_to_num(rotate_vectors(X_CO, nhat_Q_O))
 
     K, dots = intrinsics(config), []
     for finger, (point, tip) in enumerate(zip(p_CQ, p_CE, strict=True)):

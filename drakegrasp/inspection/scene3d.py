@@ -20,7 +20,6 @@ from drakegrasp.config import Config
 from drakegrasp.errors import DrakegraspError
 from drakegrasp.frames import Array, rotate_vectors, transform_points, unpack_pose
 from drakegrasp.inspection.catalog import Snapshot, find_model
-from drakegrasp.outcomes import Outcome
 
 #: Object meshes that are kept in memory.
 KEPT_MESHES = 32
@@ -117,22 +116,40 @@ def scene_of(snapshot: Snapshot, i: int, row: Mapping[str, Any], hand: HandView)
         links = hand.poses(X_TG_held, row["lifted_q"], spread)
         states["lifted"] = {"links": links, "contacts": _contacts(row, "lifted", X_TO)}
 
-    name = snapshot.names[snapshot.table.object[i]]
+    return make_scene(snapshot, int(snapshot.table.object[i]), X_TO, states, hand)
+
+
+def make_scene(
+    snapshot: Snapshot, number: int, X_TO: Array, states: dict[str, Any], hand: HandView
+) -> dict[str, Any]:
+    """Return a 3D view as JSON types.
+
+    Args:
+        snapshot: State of the files.
+        number: Of the object.
+        X_TO: (4, 4), its pose.
+        states: By their names, each with the poses of the links and the contacts.
+        hand: Of the dataset.
+    """
     return {
         "object": _columns(X_TO),
-        "objectCode": snapshot.codes[snapshot.table.object[i]],
-        "hasObject": find_model(snapshot.out, name) is not None,
+        "objectCode": snapshot.codes[number],
+        "hasObject": find_model(snapshot.out, snapshot.names[number]) is not None,
         "links": len(hand.links),
         "states": states,
-        "success": bool(snapshot.table.outcome[i] == Outcome.SUCCESS),
     }
 
 
 def _contacts(row: Mapping[str, Any], when: str, X_TO: Array) -> list[dict[str, Any]]:
-    """Return the contacts of one instant in {T}; a finger that does not touch has none."""
-    p_TQ = transform_points(X_TO, row[f"{when}_p_OQ"])
-    nhat_T = rotate_vectors(X_TO, row[f"{when}_nhat_Q_O"])
-    f_T = rotate_vectors(X_TO, row[f"{when}_f_Q_O"])
+    """Return the contacts of one instant in {T}."""
+    names = ("p_OQ", "nhat_Q_O", "f_Q_O")
+    return contacts_in_table(*(row[f"{when}_{name}"] for name in names), X_TO)
+
+
+def contacts_in_table(p_OQ: Array, nhat_Q_O: Array, f_Q_O: Array, X_TO: Array) -> list[Any]:
+    """Return contacts (k, 3) in {T} as JSON types; a finger that does not touch has none."""
+    p_TQ = transform_points(X_TO, p_OQ)
+    nhat_T, f_T = (rotate_vectors(X_TO, vectors) for vectors in (nhat_Q_O, f_Q_O))
     return [
         {"finger": k, "p": p.tolist(), "n": np.nan_to_num(n).tolist(), "f": f.tolist()}
         for k, (p, n, f) in enumerate(zip(p_TQ, nhat_T, f_T, strict=True))

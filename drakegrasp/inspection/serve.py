@@ -18,24 +18,33 @@ from drakegrasp.inspection.app import Inspection, make_app
 LOOPBACK = "127.0.0.1"
 
 
-def serve(out: Path, *, port: int, browser: bool, announce: Callable[[str], None]) -> None:
+def serve(
+    out: Path,
+    *,
+    results: Path | None = None,
+    port: int,
+    browser: bool,
+    announce: Callable[[str], None],
+) -> None:
     """Serve the pages of a dataset until Ctrl-C.
 
     Args:
         out: Directory of the dataset.
+        results: File of the verdicts on predictions for its rows, if there is one.
         port: TCP port; 0 takes any that is free.
         browser: Whether to open a browser.
         announce: Is given the address as soon as it answers.
 
     Raises:
-        DataError: If there is no dataset, or the port is taken.
+        DataError: If there is no dataset, the verdicts are not of it, or the port is taken.
     """
     # First what can be refused; the page must be quick from its first request on.
-    inspection = Inspection(out)
+    inspection = Inspection(out, results)
     listener = listen(port)
     inspection.warm_up()
 
-    address = f"http://{LOOPBACK}:{listener.getsockname()[1]}/"
+    page = "" if results is None else "predictions"
+    address = f"http://{LOOPBACK}:{listener.getsockname()[1]}/{page}"
     config = uvicorn.Config(make_app(inspection), log_level="warning", access_log=False)
     announce(address)
     if browser and has_screen():

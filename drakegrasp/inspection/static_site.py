@@ -1,13 +1,15 @@
 """The pages as files that a browser opens without a server.
 
-In: a dataset. Out: a folder with `index.html`, a page per success, their images and meshes. A page
-of a file may load no other file but scripts, styles and pictures, so each mesh is a script that
-holds its JSON. Decisions are shown and cannot be changed.
+In: a dataset, and results of predictions for its rows. Out: a folder with `index.html`, a page per
+success, their images and meshes; `predictions.html` and a page per prediction. A page of a file may
+load no other file but scripts, styles and pictures, so each mesh is a script that holds its JSON.
+Decisions are shown and cannot be changed.
 """
 
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,6 +24,9 @@ from drakegrasp.inspection.grasp_page import grasp_page
 from drakegrasp.inspection.links import FileLinks
 from drakegrasp.inspection.pages import Places, gallery_page, render
 from drakegrasp.inspection.plots import PLOTS, plot_svg, plots_values
+from drakegrasp.inspection.predictions.pages import prediction_page, predictions_page
+from drakegrasp.inspection.predictions.query import PredictionQuery, select_predictions
+from drakegrasp.inspection.predictions.results import Predictions, ResultFile
 from drakegrasp.inspection.query import Query, select
 from drakegrasp.inspection.rows import read_look, read_rows
 from drakegrasp.inspection.scene3d import HandView, object_surface, scene_of
@@ -29,7 +34,7 @@ from drakegrasp.runtime.files import atomic_folder
 from drakegrasp.runtime.progress import Report, silent
 from drakegrasp.visualization.thumbnails import strip_png
 
-#: Grasps that are written at most, the most suspicious: a browser must show all cards at once.
+#: Grasps, and predictions, that are written at most: a browser must hold all cards at once.
 MAX_GRASPS = 2000
 
 
@@ -46,17 +51,20 @@ class Site:
     successes: int
 
 
-def write_site(out: Path, folder: Path, *, progress: Report = silent) -> Site:
-    """Write the pages of a dataset's successes as files.
+def write_site(
+    out: Path, folder: Path, *, results: Path | None = None, progress: Report = silent
+) -> Site:
+    """Write the pages of a dataset's successes, and of predictions, as files.
 
     Args:
         out: Directory of the dataset.
         folder: Where to write; it must be new or empty, and appears when it is complete.
-        progress: Called with the number of grasps written and to write.
+        results: File of the verdicts on predictions for its rows, if there is one.
+        progress: Called with the number of pages written and to write.
 
     Raises:
-        DataError: If there is no dataset, it has no success, the folder holds other files, or the
-            dataset is assembled anew meanwhile.
+        DataError: If there is no dataset, it has no success, the verdicts are not of it, the folder
+            holds other files, or the dataset is assembled anew meanwhile.
     """
     # Refuse what cannot be done before anything is written.
     decisions = read_decisions(out / FILE_NAME)
@@ -68,62 +76,101 @@ def write_site(out: Path, folder: Path, *, progress: Report = silent) -> Site:
         raise DataError(f"{out}: must hold at least one success to show, got none")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise DataError(f"--static must be a new or empty directory, got {folder}")
+    predictions = None if results is None else ResultFile(results).current(snapshot)
     if len(places) < len(successes):
         cut = f"Only the {len(places):,} most suspicious of {len(successes):,} successes are here."
         snapshot = replace(snapshot, missing=(cut, *snapshot.missing))
 
     with atomic_folder(folder) as unfinished:
-        _write_pages(snapshot, decisions, query, places, unfinished, progress)
+        site = _Writer(snapshot, unfinished, predictions)
+        total = len(places) + len(site.worst)
+        site.write_grasps(decisions, query, places, lambda done: progress(done, total))
+        if predictions is not None:
+            site.write_predictions(predictions, lambda done: progress(len(places) + done, total))
         snapshot.refuse_replaced()
     return Site(grasps=len(places), successes=len(successes))
 
 
-def _write_pages(
-    snapshot: Snapshot,
-    decisions: Decisions,
-    query: Query,
-    places: Places,
-    folder: Path,
-    progress: Report,
-) -> None:
-    """Write the pages of attempts, and all that they need, into an empty folder."""
-    # What all pages share.
-    hand = HandView(snapshot.config)
-    shutil.copytree(ASSETS, folder / "static", ignore=shutil.ignore_patterns("__pycache__"))
-    _write_meshes(snapshot, folder, hand, places)
-    for name in PLOTS:
-        _write(folder / "plot" / f"{name}.svg", plot_svg(snapshot, name) or b"")
-    plots = render("plots.html", FileLinks(), token="", **plots_values(snapshot))
-    _write_text(folder / "plots.html", plots)
+class _Writer:
+    """Writes pages, and all that they need, into an empty folder.
 
-    # The pages of the grasps with their images, and the gallery last.
-    links = FileLinks("../")
-    for done, i in enumerate(places.tolist(), start=1):
-        label = snapshot.label(i)
-        (row,) = read_rows(snapshot, [i])
-        scene = scene_of(snapshot, i, row, hand)
-        page = grasp_page(
-            snapshot, decisions, query, places, i, scene, hand.problem, links, token=""
-        )
-        _write_text(folder / "grasp" / f"{label}.html", page)
-        for camera in CAMERAS:
-            look = read_look(snapshot, i, camera)
-            if look is not None:
-                png = strip_png(look.image, look.mask, far=snapshot.config.camera.far)
-                _write(folder / "strip" / f"{label}-{camera}.png", png)
-        progress(done, len(places))
-    gallery = gallery_page(snapshot, decisions, query, places, FileLinks(), token="")
-    _write_text(folder / "index.html", gallery)
+    Args:
+        snapshot: State of the files.
+        folder: Where to write.
+        predictions: Beside its rows, if there are any.
+    """
 
+    def __init__(self, snapshot: Snapshot, folder: Path, predictions: Predictions | None) -> None:
+        self._snapshot, self._folder = snapshot, folder
+        self._there = predictions is not None
+        self._hand = HandView(snapshot.config)
+        self._seen: set[int] = set()
+        self._meshes: set[int] = set()
+        #: The predictions that are written, in their order.
+        self.worst = np.zeros(0, dtype=np.int32)
+        if predictions is not None:
+            self.worst = select_predictions(predictions, PredictionQuery())[:MAX_GRASPS]
 
-def _write_meshes(snapshot: Snapshot, folder: Path, hand: HandView, places: Places) -> None:
-    """Write the meshes of the hand's links and of the objects of attempts, each as a script."""
-    for number in range(len(hand.links)):
-        _write_mesh(folder, f"link-{number}", hand.surface(number))
-    for number in np.unique(snapshot.table.object[places]).tolist():
-        surface = object_surface(snapshot, number)
-        if surface is not None:
-            _write_mesh(folder, f"object-{snapshot.codes[number]}", surface)
+        # What all pages share.
+        shutil.copytree(ASSETS, folder / "static", ignore=shutil.ignore_patterns("__pycache__"))
+        for number in range(len(self._hand.links)):
+            _write_mesh(folder, f"link-{number}", self._hand.surface(number))
+        for name in PLOTS:
+            _write(folder / "plot" / f"{name}.svg", plot_svg(snapshot, name) or b"")
+        plots = render("plots.html", self._links(), token="", **plots_values(snapshot))
+        _write_text(folder / "plots.html", plots)
+
+    def write_grasps(
+        self, decisions: Decisions, query: Query, places: Places, wrote: Callable[[int], None]
+    ) -> None:
+        """Write the pages of attempts with their images, and the gallery last."""
+        snapshot, links = self._snapshot, self._links("../")
+        for done, i in enumerate(places.tolist(), start=1):
+            (row,) = read_rows(snapshot, [i])
+            scene = scene_of(snapshot, i, row, self._hand)
+            page = grasp_page(
+                *(snapshot, decisions, query, places, i, scene, self._hand.problem, links),
+                token="",
+            )
+            _write_text(self._folder / "grasp" / f"{snapshot.label(i)}.html", page)
+            self._write_look(i)
+            wrote(done)
+        gallery = gallery_page(snapshot, decisions, query, places, self._links(), token="")
+        _write_text(self._folder / "index.html", gallery)
+
+    def write_predictions(self, predictions: Predictions, wrote: Callable[[int], None]) -> None:
+        """Write the pages of predictions with the images of their rows, and their gallery last."""
+        query, links = PredictionQuery(), self._links("../")
+        with_pages = frozenset(self._seen)
+        for done, i in enumerate(self.worst.tolist(), start=1):
+            at = int(predictions.places[i])
+            page = prediction_page(
+                *(predictions, query, self.worst, i, self._hand, links), row_link=at in with_pages
+            )
+            _write_text(self._folder / "prediction" / f"{predictions.label(i)}.html", page)
+            self._write_look(at)
+            wrote(done)
+        gallery = predictions_page(predictions, query, self.worst, self._links())
+        _write_text(self._folder / "predictions.html", gallery)
+
+    def _links(self, up: str = "") -> FileLinks:
+        return FileLinks(up, predicted=self._there)
+
+    def _write_look(self, i: int) -> None:
+        """Write the images of an attempt and the mesh of its object, once."""
+        snapshot, number = self._snapshot, int(self._snapshot.table.object[i])
+        if i not in self._seen:
+            for camera in CAMERAS:
+                look = read_look(snapshot, i, camera)
+                if look is not None:
+                    png = strip_png(look.image, look.mask, far=snapshot.config.camera.far)
+                    _write(self._folder / "strip" / f"{snapshot.label(i)}-{camera}.png", png)
+        if number not in self._meshes:
+            surface = object_surface(snapshot, number)
+            if surface is not None:
+                _write_mesh(self._folder, f"object-{snapshot.codes[number]}", surface)
+        self._seen.add(i)
+        self._meshes.add(number)
 
 
 def _write_mesh(folder: Path, name: str, surface: bytes) -> None:

@@ -19,6 +19,7 @@ import numpy as np
 
 from drakegrasp.config import Config
 from drakegrasp.dataset.hdf5 import AnyArray, write_field
+from drakegrasp.dataset.layout.predicted_rows import PredictedRows
 from drakegrasp.dataset.manifest import finger_names, installed_versions, origin_attributes
 from drakegrasp.dataset.schema import VERIFICATION_FIELDS, Field, sizes
 from drakegrasp.errors import DataError
@@ -217,13 +218,19 @@ def _plain(value: Any) -> Any:
 # HDF5
 
 
-def write_results(results: Sequence[Verification], path: Path, config: Config) -> None:
+def write_results(
+    results: Sequence[Verification],
+    path: Path,
+    config: Config,
+    rows: PredictedRows | None = None,
+) -> None:
     """Write results to an HDF5 file, which appears whole or not at all.
 
     Args:
         results: In the order of the grasps.
         path: The file.
         config: Configuration of the verification.
+        rows: Of the dataset that the grasps are for, in the same order; None without one.
 
     Raises:
         OSError: If the disk is full or the folder cannot be written.
@@ -236,6 +243,8 @@ def write_results(results: Sequence[Verification], path: Path, config: Config) -
         group = file.create_group(GROUP)
         for field in VERIFICATION_FIELDS:
             write_field(group, field, _column(field, results, shape))
+        if rows is not None:
+            rows.write(file)
 
 
 def _column(field: Field, results: Sequence[Verification], shape: dict[str, int]) -> AnyArray:

@@ -24,9 +24,9 @@ from drakegrasp.frames import Array
 from drakegrasp.grasp import unpack_grasp
 from drakegrasp.vision.camera import project
 
-#: Colours of contacts: predicted, after closing, after the lift (Okabe and Ito: safe for the
-#: colour-blind).
-PREDICTED, REACHED, LIFTED = "#0072B2", "#D55E00", "#009E73"
+#: Colours of contacts: predicted, after closing, after the lift, those of the dataset's own grasp
+#: (Okabe and Ito: safe for the colour-blind).
+PREDICTED, REACHED, LIFTED, TRUE = "#0072B2", "#D55E00", "#009E73", "#009E73"
 #: Colours of the fingers in grasp order (Okabe and Ito: safe for the colour-blind).
 FINGER_COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00")
 #: Length of the arrows along the normals [m].

@@ -12,10 +12,11 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.image import imsave
 
-#: Colours of depths, as in `style`; of pixels without depth; of the mask's object and the rest.
+#: Colours of depths, as in `style`; of pixels without depth; of the mask's background and object.
+#: What is nothing is transparent, and the object neither dark nor light: it is seen on any page.
 DEPTHS = "viridis_r"
-NO_DEPTH = np.array([0xE3, 0xE6, 0xEA], dtype=np.uint8)
-MASK = np.array([[0x2B, 0x2E, 0x33], [0xF2, 0xF3, 0xF5]], dtype=np.uint8)
+NO_DEPTH = np.array([0, 0, 0, 0], dtype=np.uint8)
+MASK = np.array([[0, 0, 0, 0], [0x7D, 0x88, 0x96, 0xFF]], dtype=np.uint8)
 #: Least range of the depth colours [m].
 MIN_RANGE = 0.05
 
@@ -35,12 +36,13 @@ def strip_png(image: npt.NDArray[np.float32], mask: npt.NDArray[np.uint8], *, fa
     seen = depth < far
     near, end = (depth[seen].min(), depth[seen].max()) if seen.any() else (0.0, far)
     share = (depth - near) / max(end - near, MIN_RANGE)
-    table = np.rint(255.0 * mpl.colormaps[DEPTHS](np.arange(256))[:, :3]).astype(np.uint8)
+    table = np.rint(255.0 * mpl.colormaps[DEPTHS](np.arange(256))).astype(np.uint8)
     depths = np.where(
         seen[..., None], table[np.rint(255.0 * share.clip(0, 1)).astype(int)], NO_DEPTH
     )
 
     colours = np.rint(255.0 * np.moveaxis(image[:3], 0, 2).clip(0.0, 1.0)).astype(np.uint8)
+    colours = np.dstack([colours, np.full(colours.shape[:2], 255, dtype=np.uint8)])
     strip = np.concatenate([colours, depths, MASK[(mask > 0).astype(int)]], axis=1)
     buffer = io.BytesIO()
     imsave(buffer, strip, format="png")

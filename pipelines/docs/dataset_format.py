@@ -15,6 +15,7 @@ from drakegrasp.dataset.schema import (
     DATA_FIELDS,
     LOOK_FIELDS,
     OBJECT_FIELDS,
+    PREDICTED_ROW_FIELDS,
     SCHEMA_VERSION,
     SUCCESS_FIELDS,
     TRIAL_FIELDS,
@@ -148,6 +149,11 @@ the input. `NAME.h5` has the attributes `convention_*`, `schema_version`, `confi
 false or empty; "from" says with which stage a value begins. Equal input gives equal bytes.
 """
 
+_ROWS = """
+Where the grasps are for rows of a dataset, a group `/rows` beside it says which, with the
+attributes `split`, `camera` and `shards` of the data file:
+"""
+
 _LINES = """
 `NAME.jsonl`, or standard output without `--out`, has a JSON object per line; NaN and inf are
 `null`. `index` is the grasp's place in the input, `success` whether it holds, `outcome` the label
@@ -185,6 +191,8 @@ def format_page() -> str:
             _fields(LOOK_FIELDS),
             _VERIFICATION,
             _fields(VERIFICATION_FIELDS, stages=True),
+            _ROWS,
+            _fields(PREDICTED_ROW_FIELDS),
             _LINES,
             "\n" + _CONTRACT,
         ]

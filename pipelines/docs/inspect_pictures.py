@@ -1,7 +1,8 @@
-"""Take the pictures of the inspection page for the docs: the gallery, and the page of a grasp.
+"""Take the pictures of the inspection page for the docs: galleries, a grasp, and a prediction.
 
-In: a dataset's directory. Out: inspect_gallery.png and inspect_grasp.png. Needs Playwright and the
-system's Chromium (`make test-browser` installs it).
+In: a dataset's directory, and the results of `drakegrasp verify` for rows of it. Out: one picture
+of each page, `inspect_NAME.png`. Needs Playwright and the system's Chromium (`make test-browser`
+installs it).
 """
 
 from __future__ import annotations
@@ -30,29 +31,38 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Run the script."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path, help="directory of a dataset")
+    parser.add_argument("results", type=Path, help="file that verify --out has written")
     parser.add_argument("pictures", type=Path, help="directory that the pictures go to")
     arguments = parser.parse_args(argv)
 
     # Serve the dataset from a thread.
     listener = listen(0)
-    server = uvicorn.Server(uvicorn.Config(make_app(Inspection(arguments.out)), log_level="error"))
+    inspection = Inspection(arguments.out, arguments.results)
+    server = uvicorn.Server(uvicorn.Config(make_app(inspection), log_level="error"))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
     thread.start()
     address = f"http://127.0.0.1:{listener.getsockname()[1]}"
 
-    # Look at it: the gallery, the first grasp, and what is closed on it opened.
+    # Look at it: both galleries, the first grasp, and one of the farthest predictions that hold, in
+    # the dark theme.
     program = shutil.which("chromium") or shutil.which("chromium-browser")
     with sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=program, args=list(OPTIONS))
         page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
         page.set_default_timeout(PATIENCE)
-        page.goto(f"{address}/?split=samples")
-        page.wait_for_load_state("networkidle")
-        page.screenshot(path=arguments.pictures / "inspect_gallery.png")
-        page.click("#cards a")
-        page.wait_for_selector("#view3d[data-ready]")
-        page.wait_for_load_state("networkidle")
-        page.screenshot(path=arguments.pictures / "inspect_grasp.png")
+        for gallery, grasp, path in (
+            ("gallery", "grasp", "/?split=samples"),
+            ("predictions", "prediction", "/predictions?verdict=held&sort=true_error"),
+        ):
+            page.goto(f"{address}{path}")
+            page.wait_for_load_state("networkidle")
+            page.screenshot(path=arguments.pictures / f"inspect_{gallery}.png")
+            if grasp == "prediction":
+                page.select_option("#theme", "dark")
+            page.click("#cards a")
+            page.wait_for_selector("#view3d[data-ready]")
+            page.wait_for_load_state("networkidle")
+            page.screenshot(path=arguments.pictures / f"inspect_{grasp}.png")
         browser.close()
     server.should_exit = True
     thread.join()

@@ -10,7 +10,7 @@ import os
 import shutil
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from io import BytesIO
@@ -20,11 +20,18 @@ import numpy as np
 import pytest
 import uvicorn
 from helpers.pages import ATTACK, coded, numbered
+from helpers.predictions import write_predictions
 from matplotlib.image import imread
 
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.manifest import read_manifest, write_manifest
-from drakegrasp.dataset.rejections import AttemptKey, read_decisions, read_rejected
+from drakegrasp.dataset.rejections import (
+    AttemptKey,
+    Decisions,
+    read_decisions,
+    read_rejected,
+    write_decisions,
+)
 from drakegrasp.inspection.app import Inspection, make_app
 from drakegrasp.inspection.catalog import Catalog, Snapshot
 from drakegrasp.inspection.serve import listen
@@ -90,10 +97,10 @@ def address(out: Path) -> Iterator[str]:
     yield from serve(out)
 
 
-def serve(out: Path) -> Iterator[str]:
-    """Serve a dataset from a thread; yield its address."""
+def serve(out: Path, results: Path | None = None) -> Iterator[str]:
+    """Serve a dataset from a thread, with results of predictions; yield its address."""
     listener = listen(0)
-    config = uvicorn.Config(make_app(Inspection(out)), log_level="error")
+    config = uvicorn.Config(make_app(Inspection(out, results)), log_level="error")
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
     thread.start()
@@ -134,24 +141,52 @@ def wait_for_decision(out: Path, key: AttemptKey, decision: str) -> None:
         time.sleep(0.05)
 
 
-def test_gallery_filters_and_sorts(page: Page, address: str, state: Snapshot) -> None:
+def wait_until(page: Page, is_so: Callable[[], bool]) -> None:
+    """Wait until something is so; the policy of the pages forbids Playwright's own way."""
+    end = time.monotonic() + PATIENCE / 1e3
+    while not is_so():
+        assert time.monotonic() < end
+        page.wait_for_timeout(20)
+
+
+def wait_for_labels(page: Page, state: Snapshot, wanted: list[str]) -> None:
+    """Wait until the gallery shows these attempts, in this order."""
+    wait_until(page, lambda: labels(page, state) == wanted)
+
+
+def wait_for_cards(page: Page, count: int) -> None:
+    wait_until(page, lambda: page.locator("#cards li").count() == count)
+
+
+IN_ORDER = ["1-0-0", "1-1-0", "1-3-2"]
+
+
+def test_filters_act_when_chosen(page: Page, address: str, state: Snapshot) -> None:
     page.goto(address)
     assert len(labels(page, state)) == 9
+    page.evaluate("window.same = true")
     page.select_option("select[name=object]", "2_box_b")
     page.select_option("select[name=sort]", "row")
-    page.select_option("select[name=order]", "up")
-    page.click("form button")
-    page.wait_for_url("**object=2_box_b**")
-    assert labels(page, state) == ["1-0-0", "1-1-0", "1-3-2"]
-    # What was chosen stays chosen, and empty fields are not in the address.
-    assert page.input_value("select[name=object]") == "2_box_b"
-    assert "min_slip" not in page.url
+    page.focus("select[name=order]")
+    page.keyboard.press("ArrowDown")
+    wait_for_labels(page, state, IN_ORDER)
+    # The page was not loaded again, the keyboard stays where it was, and the number is told.
+    assert page.evaluate("window.same") and page.evaluate("document.activeElement.name") == "order"
+    page.wait_for_selector("#told:has-text('3 of 36 attempts')", state="attached")
+    # The address has what was chosen, without empty fields.
+    assert "object=2_box_b" in page.url and "min_slip" not in page.url
+
+    # What is typed acts without a button; back is as before.
     page.fill("input[name=min_slip]", "3")
-    page.click("form button")
     page.wait_for_selector(".empty")
+    page.fill("input[name=min_slip]", "3x")
+    page.wait_for_selector("#message:has-text('least slip must be a number, got 3x')")
+    page.go_back()
+    wait_for_labels(page, state, IN_ORDER)
+    assert page.input_value("input[name=min_slip]") == ""
     page.click("text=Reset")
-    page.wait_for_selector("#cards")
-    assert len(labels(page, state)) == 9
+    wait_for_cards(page, 9)
+    assert page.input_value("select[name=object]") == ""
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -185,8 +220,32 @@ def test_3d_view_draws_each_state(page: Page, address: str, state: Snapshot) -> 
         page.click(f"[data-state={state}]")
         shots.add(page.locator("#view3d").screenshot())
     assert len(shots) == 3
-    page.uncheck("#showhand")
+    page.uncheck("[data-layer=hand]")
     assert page.locator("#view3d").screenshot() not in shots
+
+
+def test_keys_move_the_3d_view(page: Page, address: str, state: Snapshot) -> None:
+    page.goto(coded(state, f"{address}/grasp/0-0-0"))
+    wait_for_view(page)
+    first = page.locator("#view3d").screenshot()
+    shots = {first}
+    for key in ("Shift+ArrowLeft", "Shift+ArrowUp", "+", "h", "f", "3"):
+        page.keyboard.press(key)
+        shots.add(page.locator("#view3d").screenshot())
+    assert len(shots) == 7
+    assert not page.is_checked("[data-layer=hand]")
+    for key in ("h", "f", "2", "0"):
+        page.keyboard.press(key)
+    assert page.locator("#view3d").screenshot() == first
+    # The list of keys; while it is open they do nothing.
+    page.keyboard.press("?")
+    assert "turn the 3D view" in page.inner_text("dialog#keys")
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("h")
+    page.keyboard.press("Escape")
+    assert not page.is_visible("dialog#keys") and page.is_checked("[data-layer=hand]")
+    page.keyboard.press("ArrowRight")
+    page.wait_for_url(coded(state, "**/grasp/*"))
 
 
 def test_keyboard_moves_rejects_keeps_and_undoes(
@@ -226,7 +285,7 @@ def test_keys_work_after_a_click_on_a_checkbox(
 ) -> None:
     page.goto(coded(state, f"{address}/grasp/0-0-0?sort=row&order=up"))
     wait_for_view(page)
-    page.click("#showforces")
+    page.click("[data-layer=forces]")
     page.keyboard.press("r")
     page.wait_for_url(coded(state, "**/grasp/0-1-0?sort=row&order=up"))
     assert read_decisions(out / "reject.json").rejected == {AttemptKey("1_box_a", 0, 0)}
@@ -367,14 +426,16 @@ def test_files_open_without_a_server(
     page.select_option("select[name=object]", "2_box_b")
     page.select_option("select[name=sort]", "row")
     page.select_option("select[name=order]", "up")
-    page.click("form button")
-    assert labels(page, state) == ["1-0-0", "1-1-0", "1-3-2"]
+    wait_for_labels(page, state, IN_ORDER)
     assert page.inner_text("#count") == "3"
+    # The address keeps it.
+    page.reload()
+    wait_for_labels(page, state, IN_ORDER)
+    assert page.input_value("select[name=object]") == "2_box_b"
     page.fill("input[name=max_slip]", "1")
-    page.click("form button")
-    assert labels(page, state) == []
+    wait_for_labels(page, state, [])
     page.click("text=Reset")
-    page.wait_for_selector("#cards li")
+    wait_for_cards(page, 9)
     page.locator(coded(state, "[data-label='0-0-0'] a")).click()
     wait_for_view(page)
     assert page.get_attribute("#view3d", "data-ready") == "yes"
@@ -383,3 +444,96 @@ def test_files_open_without_a_server(
     page.wait_for_url(coded(state, "**/grasp/0-1-0.html"))
     page.goto((tmp_path / "site" / "plots.html").as_uri())
     page.wait_for_load_state("networkidle")
+
+
+#: The smallest contrast of a text to what is behind it, with that text. Disabled things and text in
+#: pictures are not counted.
+CONTRAST = """() => {
+  const numbers = (text) => text.match(/[0-9.]+/g).map(Number);
+  const linear = (x) => x <= 0.03928 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4;
+  const light = ([r, g, b]) =>
+    0.2126 * linear(r / 255) + 0.7152 * linear(g / 255) + 0.0722 * linear(b / 255);
+  const behind = (element) => {
+    for (let e = element; e; e = e.parentElement) {
+      const colour = numbers(getComputedStyle(e).backgroundColor);
+      if (colour.length === 3 || colour[3] === 1) return colour;
+    }
+    return [255, 255, 255];
+  };
+  let worst = [99, ""];
+  const judge = (element, text, part) => {
+    const colour = numbers(getComputedStyle(element, part).color);
+    const [a, b] = [light(colour), light(behind(element))].sort((x, y) => y - x);
+    if ((a + 0.05) / (b + 0.05) < worst[0]) worst = [(a + 0.05) / (b + 0.05), text];
+  };
+  for (const element of document.querySelectorAll("body *")) {
+    if (!element.checkVisibility() || element.closest("svg") || element.disabled) continue;
+    const texts = [...element.childNodes].filter((node) => node.nodeType === 3);
+    const own = texts.map((node) => node.textContent.trim()).join("");
+    if (own || element.tagName === "SELECT") judge(element, own || element.name);
+    if (element.placeholder) judge(element, element.placeholder, "::placeholder");
+  }
+  return worst;
+}"""
+
+
+def test_text_stands_out_in_both_themes(
+    page: Page, out: Path, tmp_path: Path, state: Snapshot
+) -> None:
+    results = write_predictions(out, tmp_path / "run.h5")
+    decisions = Decisions(
+        rejected=frozenset([AttemptKey("1_box_a", 0, 0)]),
+        kept=frozenset([AttemptKey("2_box_b", 1, 0)]),
+    )
+    write_decisions(out / "reject.json", decisions)
+    for address in serve(out, results):
+        for path in ("/", "/grasp/0-0-0", "/predictions", "/prediction/0", "/plots"):
+            page.goto(address + coded(state, path))
+            page.keyboard.press("?")
+            for theme in ("light", "dark"):
+                page.select_option("#theme", theme, force=True)
+                contrast, text = page.evaluate(CONTRAST)
+                assert contrast >= 4.5, f"{theme} {path}: {text!r} has {contrast:.2f}"
+
+
+def test_the_theme_that_is_chosen_is_remembered(page: Page, address: str, state: Snapshot) -> None:
+    def background() -> str:
+        return str(page.evaluate("getComputedStyle(document.body).backgroundColor"))
+
+    page.goto(coded(state, f"{address}/grasp/0-0-0"))
+    wait_for_view(page)
+    light, view = background(), page.locator("#view3d").screenshot()
+    page.emulate_media(color_scheme="dark")
+    wait_until(page, lambda: background() != light)
+    dark = background()
+    # The 3D view follows.
+    assert page.locator("#view3d").screenshot() != view
+    page.select_option("#theme", "light")
+    assert background() == light
+    page.goto(address)
+    assert background() == light
+    page.select_option("#theme", "")
+    assert background() == dark
+
+
+def test_predictions_filter_and_open(page: Page, out: Path, tmp_path: Path) -> None:
+    results = write_predictions(out, tmp_path / "run.h5")
+    for address in serve(out, results):
+        for width, height in SIZES.values():
+            page.set_viewport_size({"width": width, "height": height})
+            page.goto(f"{address}/predictions")
+            page.wait_for_load_state("networkidle")
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+        page.set_viewport_size({"width": 1280, "height": 900})
+        page.select_option("select[name=verdict]", "fails")
+        wait_for_cards(page, 2)
+        page.click("#cards li:nth-child(2) a")
+        wait_for_view(page)
+        assert "2 of 2" in page.inner_text(".position")
+        shots = {page.locator("#view3d").screenshot()}
+        for key in ("a", "c", "t"):
+            page.keyboard.press(key)
+            shots.add(page.locator("#view3d").screenshot())
+        assert len(shots) == 4
+        page.keyboard.press("g")
+        page.wait_for_url("**/predictions?verdict=fails")

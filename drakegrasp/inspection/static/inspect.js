@@ -1,4 +1,4 @@
-// Decisions and keys. Names come from the server as text and never become HTML here.
+// Decisions, keys and the list of keys. Names come from the server as text and never become HTML here.
 "use strict";
 (() => {
   const token = document.querySelector("meta[name=token]").content;
@@ -107,7 +107,7 @@
 
   function go(id) {
     const link = document.getElementById(id);
-    if (link) location.href = link.href;
+    if (link) link.click();
   }
 
   document.addEventListener("click", (event) => {
@@ -116,16 +116,19 @@
     const element = button.closest("[data-label]");
     if (button.dataset.decide) decide(element, button.dataset.decide, false);
     else if ("undo" in button.dataset) undo();
+    else if ("keys" in button.dataset) list.showModal();
     else if ("record" in button.dataset) record(button);
   });
 
+  const list = document.getElementById("keys");
   document.addEventListener("keydown", (event) => {
+    if (list.open || (event.shiftKey && event.key.startsWith("Arrow"))) return;
     if (event.ctrlKey || event.altKey || event.metaKey || event.target.closest("input:not([type=checkbox]), select, textarea")) return;
     const decidable = grasp && grasp.querySelector("[data-decide]");
     const keys = {
       ArrowRight: () => go("next"), n: () => go("next"),
       ArrowLeft: () => go("previous"), p: () => go("previous"),
-      g: () => go("gallery"), u: () => undo(),
+      g: () => go("gallery"), u: () => undo(), "?": () => list.showModal(),
       r: () => decidable && decide(grasp, "rejected", true),
       k: () => decidable && decide(grasp, "kept", true),
     };
@@ -134,14 +137,5 @@
     if (!action) return;
     event.preventDefault();
     action();
-  });
-
-  // Empty fields make a long address; leave them out.
-  const form = document.getElementById("filters");
-  if (form && token) form.addEventListener("submit", () => {
-    for (const field of form.elements) if (field.name && field.value === "") field.disabled = true;
-  });
-  addEventListener("pageshow", () => {
-    if (form) for (const field of form.elements) field.disabled = false;
   });
 })();

@@ -3,8 +3,8 @@
 (() => {
   const box = document.getElementById("view3d");
   const note = box.querySelector(".loading");
-  const { scene: data, meshes, colours } = JSON.parse(document.getElementById("scene").textContent);
-  const NORMAL = 0.03, PER_NEWTON = 0.001, DOT = 0.003;
+  const { scene: data, meshes, colours, kinds } = JSON.parse(document.getElementById("scene").textContent);
+  const NORMAL = 0.03, PER_NEWTON = 0.001, DOT = kinds ? 0.004 : 0.003;
 
   let renderer;
   try {
@@ -21,8 +21,8 @@
   // Z is up, as on the table.
   THREE.Object3D.DefaultUp.set(0, 0, 1);
   const scene = new THREE.Scene();
-  scene.background = new THREE.Color("#eef1f4");
-  scene.add(new THREE.HemisphereLight("#ffffff", "#9aa0a8", 0.9));
+  const sky = new THREE.HemisphereLight("#ffffff", "#9aa0a8", 0.9);
+  scene.add(sky);
   const sun = new THREE.DirectionalLight("#ffffff", 0.75);
   sun.position.set(0.6, -0.8, 1.4);
   scene.add(sun);
@@ -40,7 +40,9 @@
   const hand = new THREE.Group();
   const contacts = new THREE.Group();
   const forces = new THREE.Group();
-  scene.add(object, hand, contacts, forces);
+  const layers = { hand, object, contacts, forces };
+  for (const kind of Object.keys(kinds || {})) layers[kind] = new THREE.Group();
+  scene.add(...Object.values(layers));
   const place = (group, columns) => {
     group.matrixAutoUpdate = false;
     group.matrix.fromArray(columns);
@@ -51,6 +53,14 @@
 
   function draw() {
     renderer.render(scene, camera);
+  }
+
+  // The page says the colours of its theme.
+  function paint() {
+    const style = getComputedStyle(box);
+    scene.background = new THREE.Color(style.getPropertyValue("--sky").trim());
+    table.material.color.set(style.getPropertyValue("--table").trim());
+    draw();
   }
 
   function resize() {
@@ -83,25 +93,35 @@
     group.add(whole);
   }
 
+  // As on the images: a ring that lies on the surface, a dot, a square.
+  function shape(kind) {
+    if (kind === "asked") return new THREE.TorusGeometry(1.6 * DOT, 0.3 * DOT, 12, 32);
+    if (kind === "true") return new THREE.BoxGeometry(1.9 * DOT, 1.9 * DOT, 0.6 * DOT);
+    return new THREE.SphereGeometry(DOT, 24, 16);
+  }
+
   function show(name) {
     const state = data.states[name];
     state.links.forEach((columns, i) => place(links[i], columns));
     links.forEach((link, i) => { link.visible = i < state.links.length; });
-    contacts.clear();
-    forces.clear();
+    for (const name of ["contacts", "forces", ...Object.keys(kinds || {})]) layers[name].clear();
     for (const contact of state.contacts) {
-      const colour = colours[contact.finger % colours.length];
+      const colour = kinds ? kinds[contact.kind] || "#555b63" : colours[contact.finger % colours.length];
+      const group = kinds ? layers[contact.kind] : contacts;
       const p = new THREE.Vector3(...contact.p), n = new THREE.Vector3(...contact.n);
-      const dot = new THREE.Mesh(new THREE.SphereGeometry(DOT, 24, 16), mark(colour));
-      dot.position.copy(p);
-      dot.renderOrder = 3;
-      contacts.add(dot);
-      arrow(contacts, p, n.multiplyScalar(NORMAL), colour, 0.0006);
+      if (group) {
+        const dot = new THREE.Mesh(shape(contact.kind), mark(colour));
+        dot.position.copy(p);
+        dot.quaternion.setFromUnitVectors(new THREE.Vector3(0, 0, 1), n.lengthSq() ? n.clone().normalize() : new THREE.Vector3(0, 0, 1));
+        dot.renderOrder = 3;
+        group.add(dot);
+        arrow(group, p, n.multiplyScalar(NORMAL), colour, 0.0006);
+      }
       // A force pushes into the object: its arrow ends at the contact.
       const f = new THREE.Vector3(...contact.f).multiplyScalar(PER_NEWTON);
       arrow(forces, p.clone().sub(f), f, colour, 0.0016);
     }
-    for (const button of document.querySelectorAll("[data-state]")) button.classList.toggle("on", button.dataset.state === name);
+    for (const button of document.querySelectorAll("button[data-state]")) button.classList.toggle("on", button.dataset.state === name);
     box.dataset.state = name;
     draw();
   }
@@ -168,20 +188,51 @@
     show(first);
     scene.updateMatrixWorld(true);
     aim();
+    paint();
     resize();
+    addEventListener("theme", paint);
     controls.addEventListener("change", draw);
     new ResizeObserver(resize).observe(box);
     box.dataset.ready = failed ? "partly" : "yes";
   });
 
   document.addEventListener("click", (event) => {
-    const button = event.target.closest("[data-state]");
+    const button = event.target.closest("button[data-state]");
     if (button) show(button.dataset.state);
   });
-  for (const [id, group] of [["showhand", hand], ["showforces", forces]]) {
-    document.getElementById(id).addEventListener("change", (event) => {
-      group.visible = event.target.checked;
+  const boxes = [...document.querySelectorAll("[data-layer]")];
+  for (const check of boxes) {
+    check.addEventListener("change", () => {
+      layers[check.dataset.layer].visible = check.checked;
       draw();
     });
   }
+
+  // By keys: angles in radians about the vertical and above the table, a factor of the distance.
+  const UP = new THREE.Vector3(0, 0, 1), STEP = Math.PI / 18;
+  function move(turn, rise, factor) {
+    const offset = camera.position.clone().sub(controls.target);
+    const height = Math.PI / 2 - offset.angleTo(UP);
+    const risen = Math.min(Math.max(height + rise, -1.5), 1.5) - height;
+    offset.applyAxisAngle(new THREE.Vector3().crossVectors(offset, UP).normalize(), risen);
+    offset.applyAxisAngle(UP, turn).multiplyScalar(factor);
+    camera.position.copy(controls.target).add(offset);
+    controls.update();
+    draw();
+  }
+  const turns = { ArrowLeft: [-STEP, 0], ArrowRight: [STEP, 0], ArrowUp: [0, STEP], ArrowDown: [0, -STEP] };
+  const zooms = { "+": 0.85, "=": 0.85, "-": 1 / 0.85 };
+  document.addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.altKey || event.metaKey || !box.dataset.ready) return;
+    if (document.querySelector("dialog[open]") || event.target.closest("input:not([type=checkbox]), select")) return;
+    const check = boxes.find((each) => each.dataset.key === event.key.toLowerCase());
+    const state = document.querySelectorAll("button[data-state]")[Number.parseInt(event.key, 10) - 1];
+    if (event.shiftKey && event.key in turns) move(...turns[event.key], 1);
+    else if (event.key in zooms) move(0, 0, zooms[event.key]);
+    else if (event.key === "0") { aim(); draw(); }
+    else if (state) show(state.dataset.state);
+    else if (check) check.click();
+    else return;
+    event.preventDefault();
+  });
 })();
