@@ -99,7 +99,7 @@ def _content(path: Path) -> dict[str, Any]:
         content = _Unpickler(stream).load() if dtype.hasobject else None
     except DataError:
         raise
-    except Exception as error:  # noqa: BLE001  (a pickle may raise anything)
+    except Exception as error:
         raise DataError(f"must be a .npy file of a grasp, got {one_line(error)}") from None
     if isinstance(content, np.ndarray) and content.shape == () and content.dtype == object:
         content = content.item()

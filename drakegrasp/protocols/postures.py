@@ -136,9 +136,7 @@ def _protocol(trials: PostureTrials) -> MujocoProtocol:
     return found
 
 
-def _scene(
-    trials: PostureTrials, path: Path, scale: float
-) -> tuple[ProtocolScene, dict[str, str]]:
+def _scene(trials: PostureTrials, path: Path, scale: float) -> tuple[ProtocolScene, dict[str, str]]:
     """Return the scene of an object, and the digests of hand and object."""
     key = json.dumps(dict(trials.code), sort_keys=True)
     return _kept_scene(trials.protocol, key, trials.hand, trials.objects / path, scale)
@@ -178,9 +176,13 @@ def json_line(index: int, result: PostureResult, trials: PostureTrials) -> str:
     """Return a result as a line of strict JSON; what was not measured is null."""
     verdict = {k: _plain(v) for k, v in asdict(result.verdict).items()}
     line = {
-        **{"index": index, "file": str(result.file), **verdict},
+        "index": index,
+        "file": str(result.file),
+        **verdict,
         **describe(_protocol(trials), trials.protocol),
-        **{"simulator": "mujoco", "versions": versions(), "digests": dict(result.digests)},
+        "simulator": "mujoco",
+        "versions": versions(),
+        "digests": dict(result.digests),
     }
     return json.dumps(line, allow_nan=False)
 

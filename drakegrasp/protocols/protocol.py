@@ -158,7 +158,9 @@ class MujocoProtocol:
             verdict = self.judge_lift(scene, motion, goal)
         return replace(verdict, penetration=penetration)
 
-    def judge_pushes(self, scene: ProtocolScene, motion: GraspMotion, goal: Array) -> PostureVerdict:
+    def judge_pushes(
+        self, scene: ProtocolScene, motion: GraspMotion, goal: Array
+    ) -> PostureVerdict:
         """Return the verdict on an object that each push finds as the trial began."""
         verdict = PostureVerdict(success=False)
         for number, direction in enumerate(self.directions):

@@ -24,9 +24,7 @@ HAND = "hand-"
 #: Impedance of the weld that moves the hand, and where the scale of its torques is in its data.
 _WELD, _TORQUE_SCALE = (0.9, 0.95, 0.001, 0.5, 2.0), 10
 #: Settings of the solver that a protocol has.
-_SETTINGS = (
-    *("timestep", "integrator", "disableflags", "cone", "noslip_iterations", "impratio"),
-)
+_SETTINGS = (*("timestep", "integrator", "disableflags", "cone", "noslip_iterations", "impratio"),)
 #: Half extents of the table's plane, which has no edge, and the spacing of its grid.
 _PLANE = (0.0, 0.0, 1.0)
 
