@@ -35,8 +35,7 @@ from drakegrasp.dataset.paths import model_path
 from drakegrasp.exchange.closed_grasps import ClosedGrasp, read_closed_grasps
 from drakegrasp.frames import Array, invert_pose
 from drakegrasp.hand.description import Hand, load_hand
-from drakegrasp.hand.shapes import hull_triangles
-from drakegrasp.mesh.wavefront import obj_text
+from drakegrasp.mesh.wavefront import hull_text
 from drakegrasp.objects.model import load_object
 from drakegrasp.runtime.progress import Report
 from drakegrasp.visualization.still_scene import StillScene
@@ -102,11 +101,8 @@ def write_object(folder: Path, parts: Sequence[Array]) -> None:
     """
     (folder / "urdf" / "meshes").mkdir(parents=True)
     for number, corners in enumerate(parts):
-        triangles = hull_triangles(corners)
-        vertices, index = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
-        text = obj_text(vertices, index.reshape(-1, 3), normals=False)
         path = folder / "urdf" / "meshes" / f"convex_piece_{number:03d}.obj"
-        path.write_text(text, encoding="utf-8")
+        path.write_text(hull_text(corners), encoding="utf-8")
     volume = float(sum(ConvexHull(corners).volume for corners in parts))
     (folder / "info").mkdir()
     info = json.dumps({"scale": 1.0, "density": 1.0, "mass": volume})

@@ -13,10 +13,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from drakegrasp.frames import Array
 from drakegrasp.hand.description import SLIDE, Hand
-from drakegrasp.hand.shapes import hull_triangles
-from drakegrasp.mesh.wavefront import obj_text
+from drakegrasp.mesh.wavefront import hull_text
 from drakegrasp.mjcf.links import Collides, add_couplings, add_links
 
 #: Gain [N m/rad] and largest torque [N m] of each motor, damping [N m s/rad] and inertia of rotors
@@ -76,7 +74,7 @@ def make_hand_model(hand: Hand, friction: float = _FRICTION) -> HandModel:
     meshes = {}
     for number, mesh in enumerate(spec.meshes):
         name = f"link_{number}.obj"
-        meshes[name] = _hull_text(np.array(mesh.uservert).reshape(-1, 3))
+        meshes[name] = hull_text(np.array(mesh.uservert).reshape(-1, 3))
         mesh.uservert, mesh.file = [], name
     model = _compile(spec, meshes)
     joints = tuple(model.joint(i).name for i in range(model.njnt))
@@ -98,10 +96,3 @@ def _compile(spec: mujoco.MjSpec, meshes: dict[str, str]) -> mujoco.MjModel:
     """Compile a specification whose mesh files are texts in memory."""
     spec.assets = {name: text.encode() for name, text in meshes.items()}
     return spec.compile()
-
-
-def _hull_text(corners: Array) -> str:
-    """Return the convex hull of corners (n, 3) as Wavefront text."""
-    triangles = hull_triangles(corners)
-    vertices, index = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
-    return obj_text(vertices, index.reshape(-1, 3), normals=False)

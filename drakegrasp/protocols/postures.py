@@ -10,17 +10,18 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
-from importlib import import_module, metadata
+from importlib import metadata
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drakegrasp import __version__
-from drakegrasp.errors import ConfigError, DataError, MachineError, first_line
+from drakegrasp.errors import ConfigError, DataError
 from drakegrasp.protocols.catalog import Protocol, find_protocol
 from drakegrasp.protocols.grasp_file import read_grasp_file
 from drakegrasp.protocols.object_folder import read_object_folder
 from drakegrasp.protocols.protocol import MujocoProtocol, PostureVerdict
+from drakegrasp.runtime.environment import require_mujoco
 from drakegrasp.runtime.executor import Executor, in_order, run_here
 from drakegrasp.runtime.user_code import read_class, run_own
 
@@ -98,7 +99,10 @@ def prepare_trials(name: str, hand: Path, objects: Path) -> PostureTrials:
     protocol, stored = find_protocol(name)
     if not isinstance(protocol, MujocoProtocol):
         raise ConfigError(f"protocol must be one that runs in mujoco, got {stored}")
-    _scene_module().hand_digest(hand)
+    require_mujoco("mujoco")
+    from drakegrasp.protocols.scene import hand_digest
+
+    hand_digest(hand)
     code = {} if stored == name else {stored: read_class(name)[1]}
     return PostureTrials(protocol=stored, code=code, hand=hand, objects=objects)
 
@@ -146,25 +150,13 @@ def _scene(trials: PostureTrials, path: Path, scale: float) -> tuple[ProtocolSce
 def _kept_scene(
     name: str, code: str, hand: Path, folder: Path, scale: float
 ) -> tuple[ProtocolScene, dict[str, str]]:
-    module = _scene_module()
+    from drakegrasp.protocols.scene import ProtocolScene, hand_digest
+
     protocol, _ = find_protocol(name, json.loads(code))
+    assert isinstance(protocol, MujocoProtocol)
     thing = read_object_folder(folder, scale)
-    scene = module.ProtocolScene(protocol, hand, thing)
-    return scene, {"hand": module.hand_digest(hand), "object": thing.digest}
-
-
-def _scene_module() -> Any:
-    """Return the module that needs MuJoCo.
-
-    Raises:
-        MachineError: If it is missing.
-    """
-    try:
-        return import_module("drakegrasp.protocols.scene")
-    except ImportError as error:
-        raise MachineError(
-            f"MuJoCo must be installed: pip install 'drakegrasp[peer]', got {first_line(error)}"
-        ) from None
+    scene = ProtocolScene(protocol, hand, thing)
+    return scene, {"hand": hand_digest(hand), "object": thing.digest}
 
 
 def describe(protocol: Protocol, stored: str) -> dict[str, Any]:
