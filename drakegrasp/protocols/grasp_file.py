@@ -63,7 +63,7 @@ def read_grasp_file(path: Path) -> StoredGrasp:
     Raises:
         DataError: If the file is none of a grasp, or its numbers cannot be a grasp's.
     """
-    content = _content(path)
+    content = read_dictionary(path)
     missing = [k for k in (*POSTURES, "obj_pose", "obj_scale", "obj_path") if k not in content]
     if missing:
         raise DataError(f"must have {missing[0]}, got none")
@@ -85,8 +85,12 @@ def read_grasp_file(path: Path) -> StoredGrasp:
     )
 
 
-def _content(path: Path) -> dict[str, Any]:
-    """Return the dictionary of a file."""
+def read_dictionary(path: Path) -> dict[str, Any]:
+    """Return the dictionary of a file.
+
+    Raises:
+        DataError: If the file has none, or other things than arrays, numbers and texts.
+    """
     try:
         with path.open("rb") as file:
             data = file.read(MOST_BYTES + 1)
