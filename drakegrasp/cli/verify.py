@@ -76,8 +76,8 @@ class PostureRequest:
     metavar="NAME|FILE.py:NAME",
     default="lift",
     show_default=True,
-    help="The rule of the verdict: lift, dexgraspbench, dexgraspbench-tabletop, dexonomy-hard, or a "
-    "class of your own. All but lift take GRASPS as files of DexGraspBench, and --hand as MJCF.",
+    help="The rule of the verdict: lift, dexgraspbench, dexgraspbench-tabletop, dexonomy-hard, or "
+    "a class of your own. All but lift take GRASPS as files of DexGraspBench, and --hand as MJCF.",
 )
 @click.option(
     "--simulator",

@@ -22,8 +22,8 @@ from drakegrasp.exchange.closed_grasps import ClosedGrasp, read_closed_grasps
 from drakegrasp.exchange.dexgraspbench import pose_vector
 from drakegrasp.frames import invert_pose
 from drakegrasp.hand.description import Hand, load_hand
-from drakegrasp.mjcf.convex_parts import convex_parts
 from drakegrasp.mesh.wavefront import hull_text
+from drakegrasp.mjcf.convex_parts import convex_parts
 from drakegrasp.mjcf.hand_model import HandModel, make_hand_model
 from drakegrasp.mjcf.links import pair_friction, set_inertia
 from drakegrasp.objects.model import ObjectModel, load_object, object_colour
@@ -67,6 +67,7 @@ class ObjectScenes:
             config: Friction of hand and table.
             folder: To which `meshes/` is written.
         """
+        # The table.
         physics = thing.own_physics(config.physics)
         self._hand, self._meshes = hand, folder / MESHES
         self._spec = mujoco.MjSpec()
@@ -82,6 +83,8 @@ class ObjectScenes:
             condim=4,
             priority=1,
         )
+
+        # The hand, whose palm each grasp moves, and the object.
         model = make_hand_model(hand, physics.friction_hand)
         self._joints = model.joints
         self._frame = self._attach(model)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import pickle
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -158,7 +159,9 @@ def test_file_of_a_stranger_runs_no_code(tmp_path: Path) -> None:
 
     content: Any = {"grasp_qpos": Harm()}
     np.save(tmp_path / "evil.npy", content)
-    with pytest.raises(DataError, match="must be a .npy file of a grasp, got pathlib.*is no array"):
+    with pytest.raises(
+        DataError, match=r"must be a \.npy file of a grasp, got pathlib.*is no array"
+    ):
         read_grasp_file(tmp_path / "evil.npy")
     assert not (tmp_path / "harm").exists()
 
@@ -198,6 +201,21 @@ def test_own_protocol_decides_and_its_digest_is_in_the_result(
     own.unlink()
     (again,) = verify_postures([write()], pickle.loads(pickle.dumps(trials)))
     assert again.verdict == result.verdict
+
+
+def test_example_of_the_docs_decides(
+    tmp_path: Path, hand: Path, assets: Path, write: Write
+) -> None:
+    """DRO-Grasp's rule: 0.016 N, so hardly any grip is enough, but 0.5 N/kg move a loose box."""
+    page = Path(__file__).parents[2] / "docs/how-to/protocols.md"
+    (code,) = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+    (tmp_path / "dro.py").write_text(code)
+    trials = prepare_trials(f"{tmp_path / 'dro.py'}:Dro", hand, assets)
+    apart = np.array([*HERE, -0.03, -0.03])
+    loose = write("1.npy", grasp_qpos=apart, squeeze_qpos=apart)
+    held, lost = verify_postures([write(), loose], trials)
+    assert held.verdict.success
+    assert lost.verdict.reason == "moved"
 
 
 @pytest.mark.parametrize(
@@ -258,7 +276,7 @@ def test_bad_part_of_an_object_is_one_line(
     trials: PostureTrials, write: Write, assets: Path
 ) -> None:
     (assets / "box/urdf/meshes/convex_piece_000.obj").write_text("v 0 0 0\n")
-    with pytest.raises(MeshError, match="convex_piece_000.obj: must be a convex part") as raised:
+    with pytest.raises(MeshError, match=r"convex_piece_000\.obj: must be a convex part") as raised:
         list(verify_postures([write()], trials))
     assert "\n" not in str(raised.value)
 
