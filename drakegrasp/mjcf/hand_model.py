@@ -67,7 +67,10 @@ def make_hand_model(hand: Hand, friction: float = _FRICTION) -> HandModel:
                 forcelimited=True,
                 forcerange=[-TORQUE / unit, TORQUE / unit],
             )
-            motor.set_to_position(kp=GAIN / unit**2)
+            # As numbers: the word `position` of a newer MuJoCo is none to the benchmark's.
+            gain = GAIN / unit**2
+            motor.biastype = mujoco.mjtBias.mjBIAS_AFFINE
+            motor.gainprm[0], motor.biasprm[1] = gain, -gain
     add_couplings(spec, hand)
 
     # Corners become mesh files, which other tools can read.

@@ -126,7 +126,7 @@ def _as_benchmark(grasp: dict[str, Any], path: str) -> dict[str, Any]:
 
 def main() -> None:
     """Print the table, or convert grasps."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])  # type: ignore[union-attr]
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("bench", type=Path, help="folder of DexGraspBench")
     parser.add_argument("results", type=Path, nargs="*", help="JSON lines of verify --protocol")
     parser.add_argument("--dexgraspnet", type=Path, help="folder of DexGraspNet")
