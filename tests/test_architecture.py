@@ -28,6 +28,7 @@ ORDER = (
     "hand",
     "vision",
     "simulation",
+    "mjcf",
     "dataset",
     "visualization",
     "commissioning",
@@ -35,6 +36,7 @@ ORDER = (
     "inspection",
     "cluster",
     "verification",
+    "protocols",
     "exchange",
     "bench",
     "api",
@@ -57,8 +59,10 @@ WALLS = {
     "matplotlib": ("visualization", "verification.figure"),
     "pydrake": (
         *("hand", "vision", "simulation", "visualization", "commissioning", "verification"),
-        "bench",
+        *("bench", "mjcf"),
     ),
+    "mujoco": ("mjcf", "protocols.scene", "bench", "exchange.mujoco_scenes"),
+    "coacd": ("mjcf.convex_parts",),
     "pyarrow": ("exchange",),
     "torch": ("dataset.loaders.torch_samples",),
 }

@@ -42,6 +42,7 @@ NOT_RUN = {
     "drakegrasp figures OUT --compare ": "wants two datasets; tests/visualization/figures",
     "drakegrasp merge ": "wants two datasets; tests/build/test_merge.py",
     "drakegrasp hand check ": "tests/commissioning/test_tutorial_hand.py runs it",
+    "drakegrasp verify GRASPS --protocol ": "wants an MJCF; tests/protocols/test_postures.py",
 }
 #: A page whose commands measure for minutes to hours; test_docs.py knows their options.
 MEASURED = "docs/benchmarks.md"

@@ -15,16 +15,11 @@ import mujoco
 import numpy as np
 
 from drakegrasp.bench.mujoco_drive import FingerDrive
-from drakegrasp.bench.mujoco_scene import (
-    IMMOVABLE,
-    TIME_STEP,
-    build_mujoco_scene,
-    pair_friction,
-    quaternion,
-)
 from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, Array, invert_pose, make_pose, rotation_angle
 from drakegrasp.hand.description import load_hand
+from drakegrasp.mjcf.links import TIME_STEP, pair_friction, quaternion
+from drakegrasp.mjcf.scene import IMMOVABLE, build_mujoco_scene
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Pregrasp

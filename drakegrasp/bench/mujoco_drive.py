@@ -20,7 +20,7 @@ class FingerDrive:
         """Find the joints and motors.
 
         Args:
-            model: With the joints and motors of `mujoco_scene`; its limits are changed.
+            model: With the joints and motors of `mjcf.scene`; its limits are changed.
             hand: The hand.
             drive: What holds the closing joints, see `drakegrasp.simulation.drive`.
         """

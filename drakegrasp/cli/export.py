@@ -10,7 +10,7 @@ from drakegrasp.cli.errors import say
 from drakegrasp.cli.options import PATH, dataset_argument, shared
 
 #: The formats as the help lists them; loading them would take longer than printing the help.
-FORMATS = ("hf", "original", "dexgraspbench", "isaac_grasp", "glb")
+FORMATS = ("hf", "original", "dexgraspbench", "isaac_grasp", "glb", "mjcf")
 
 
 @click.command()
@@ -36,9 +36,11 @@ def export(out: Path, directory: Path | None, form: str, licence: str, quiet: bo
                    Face Hub has them; needs pip install 'drakegrasp[hub]'
     original       HDF5 as of the paper's released code: depth first, 27 numbers
                    a grasp, axes of its cameras
-    dexgraspbench  a .npy file per grasp: poses and joints
+    dexgraspbench  hand, objects and grasps as that benchmark's code evaluates
+                   them; needs pip install 'drakegrasp[peer]'
     isaac_grasp    a YAML file per object: poses of the palm link, joints by name
     glb            a 3D scene per grasp: the object in the closed hand
+    mjcf           the same for MuJoCo, with the table; needs drakegrasp[peer]
     """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
     from drakegrasp.exchange.export import export_dataset
     from drakegrasp.runtime.progress import progress_bar

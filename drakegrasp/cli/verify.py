@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from contextlib import nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,18 @@ from drakegrasp.cli.options import PATH, shared
 
 if TYPE_CHECKING:
     from drakegrasp.verification.result import Verification
+
+
+@dataclass(frozen=True, kw_only=True)
+class PostureRequest:
+    """The options of the command for a protocol that runs in MuJoCo."""
+
+    grasps: Path
+    protocol: str
+    hand: str | None
+    assets: Path
+    out: Path | None
+    workers: int | None
 
 
 @click.command()
@@ -63,7 +76,28 @@ if TYPE_CHECKING:
     is_flag=True,
     help="Move the points, not the normals, to the surface of the object first.",
 )
-@click.option("--hand", metavar="NAME|YAML", help="The hand.  [default: that of the configuration]")
+@click.option(
+    "--protocol",
+    metavar="NAME|FILE.py:NAME",
+    default="lift",
+    show_default=True,
+    help="The rule of the verdict: lift, dexgraspbench, dexgraspbench-tabletop, dexonomy-hard, or "
+    "a class of your own. All but lift take GRASPS as files of DexGraspBench, and --hand as MJCF.",
+)
+@click.option(
+    "--simulator",
+    type=click.Choice(["drake", "mujoco"]),
+    help="Where the protocol must run.  [default: where it is at home]",
+)
+@click.option(
+    "--assets",
+    type=PATH,
+    metavar="DIR",
+    help="With files of DexGraspBench: the folder in which they name their objects.  [default: .]",
+)
+@click.option(
+    "--hand", metavar="NAME|YAML|XML", help="The hand.  [default: that of the configuration]"
+)
 @click.option(
     "--config",
     metavar="YAML|PRESET",
@@ -87,6 +121,9 @@ def verify(
     scheduler_file: Path | None,
     quiet: bool,
     as_json: bool,
+    protocol: str,
+    simulator: str | None,
+    assets: Path | None,
     **options: Any,
 ) -> None:
     """Try predicted grasps in the simulator.
@@ -99,6 +136,9 @@ def verify(
     points in metres, then the unit normals out of the object, in the order of the hand's
     fingers.
 
+    With another protocol than lift, GRASPS is a .npy file of DexGraspBench, with pregrasp, grasp
+    and squeeze, or a folder of such files; --hand is an MJCF, whose world is the hand's root.
+
     If GRASPS is a data file of a dataset, and neither --object nor --dataset is given, the
     command tries the grasps of that dataset.
 
@@ -106,6 +146,22 @@ def verify(
     standard error. A row that is no grasp has the outcome `invalid`. Exit code: 0 if every grasp
     has a verdict, whatever it is; 2 for input that cannot be used.
     """
+    if not _is_lift(protocol, simulator):
+        _refuse_options(protocol, scheduler=scheduler, scheduler_file=scheduler_file, **options)
+        _verify_postures(
+            PostureRequest(
+                grasps=options["grasps"],
+                protocol=protocol,
+                hand=options["hand"],
+                assets=assets or Path(),
+                out=out,
+                workers=workers,
+            ),
+            show=not quiet,
+        )
+        return
+    if assets is not None:
+        raise click.UsageError("--assets must be used with another --protocol than lift")
     from drakegrasp.api import run_verification
     from drakegrasp.cli.tables import make_console, verdict_table
     from drakegrasp.cli.verify_request import VerifyRequest, place_requested, requested_rows
@@ -156,3 +212,75 @@ def verify(
         make_console(stderr=True).print(verdict_table(results))
         for hint, count in count_hints(result.hints for result in results):
             say(f"{count} of {len(results)} grasps would fit much better: {hint}", err=True)
+
+
+def _is_lift(name: str, simulator: str | None) -> bool:
+    """Return whether a protocol is the lift in Drake.
+
+    Raises:
+        ConfigError: If there is no such protocol.
+        click.UsageError: If it does not run in the simulator.
+    """
+    from drakegrasp.protocols.catalog import find_protocol
+
+    protocol, stored = find_protocol(name)
+    if simulator not in (None, protocol.simulator):
+        raise click.UsageError(
+            f"--simulator of protocol {stored} must be {protocol.simulator}, got {simulator}"
+        )
+    return protocol.simulator == "drake"
+
+
+def _refuse_options(protocol: str, **options: Any) -> None:
+    """Refuse options that grasps of DexGraspBench's format answer by themselves.
+
+    Raises:
+        click.UsageError: If one is given.
+    """
+    usual = {"method": "hand", "overrides": (), "snap_points": False}
+    for name, value in options.items():
+        if name not in ("grasps", "hand") and value is not None and value != usual.get(name):
+            option = {"mesh": "object", "overrides": "set"}.get(name, name.replace("_", "-"))
+            raise click.UsageError(f"--{option} must not be used with protocol {protocol}")
+
+
+def _verify_postures(request: PostureRequest, *, show: bool) -> None:
+    """Write the verdicts on files of DexGraspBench, and how many hold.
+
+    Raises:
+        DataError: If there are no files, or an object cannot be read.
+        HandError, ConfigError, MachineError: As `prepare_trials`.
+    """
+    from drakegrasp.errors import DataError, HandError
+    from drakegrasp.protocols.postures import json_line, prepare_trials, verify_postures
+    from drakegrasp.runtime.executor import processes
+    from drakegrasp.runtime.files import atomic_path
+    from drakegrasp.runtime.progress import progress_bar
+    from drakegrasp.verification.result_files import result_paths
+
+    # All files, and what they have in common.
+    path, hand = request.grasps, Path(request.hand or "")
+    files = [path] if path.is_file() else sorted(path.rglob("*.npy"))
+    if not files:
+        raise DataError(f"{path}: must be a .npy file or a folder of them, got none")
+    if hand.suffix != ".xml":
+        raise HandError(f"hand must be an MJCF (.xml) with this protocol, got {request.hand!r}")
+    trials = prepare_trials(request.protocol, hand, request.assets)
+
+    # A line per verdict as it comes.
+    held, to = 0, None if request.out is None else result_paths(request.out)[0]
+    with (
+        nullcontext() if to is None else atomic_path(to) as part,
+        nullcontext(sys.stdout) if part is None else part.open("w", encoding="utf-8") as stream,
+        processes(request.workers) as execute,
+        progress_bar("verify", "grasps", show=show) as report,
+    ):
+        for index, result in enumerate(verify_postures(files, trials, execute)):
+            stream.write(json_line(index, result, trials) + "\n")
+            stream.flush()
+            held += result.verdict.success
+            report(index + 1, len(files), holding=held)
+    if to is not None:
+        say(str(to))
+    if show:
+        say(f"{held:,} of {len(files):,} grasps hold by {trials.protocol}", err=True)

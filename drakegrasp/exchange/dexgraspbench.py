@@ -1,27 +1,32 @@
-"""The format of DexGraspBench (github JYChen18/DexGraspBench): a .npy file per grasp.
+"""The files of DexGraspBench (github JYChen18/DexGraspBench), so that its code evaluates samples.
 
-In: a dataset. Out: `grasps/<object>/<trial_id>.npy`, each a dictionary with the object's pose and
-three postures of the hand, and `objects/<object>/mesh.obj`. A posture is the palm link's position
-[m] and quaternion (w, x, y, z), then the joints in the order of `joint_names` and the units of
-`joint_units`, rad or m:
+In: a dataset. Out: a folder whose content is copied into that repository: hand (MJCF and YAML),
+objects (convex parts, and the volume from which the benchmark has the density) and a .npy file per
+grasp, each a dictionary with the object's pose and three postures of the hand. A posture is the
+palm link's position [m] and quaternion (w, x, y, z), then the joints in the order of `joint_names`
+and the units of `joint_units`, rad or m:
 
-* `pregrasp_qpos`: where the attempt begins, fingers open at its spread;
 * `grasp_qpos`: after closing, as it is stored;
-* `squeeze_qpos`: the same, closing and coupled joints moved a tenth further: the command of a
-  position controller that presses, as the benchmark makes it of grasps that have none.
+* `pregrasp_qpos`: closing and coupled joints opened by `APART`, or as far as they were open;
+* `squeeze_qpos`: the same joints closed further by `APART`: the command of a position controller
+  that presses. The benchmark's own grasps go on from pregrasp and grasp by equal steps, too.
 
-All poses are over the table, in {T}. The benchmark evaluates a grasp with its own model of a hand,
-whose joints and root must be those of ours.
+All poses are over the table, in {T}. The hand is `mjcf.hand_model`: gains, torques and damping are
+those of the benchmark's Shadow Hand.
 """
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import yaml
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from drakegrasp.arithmetic import multiply
@@ -30,63 +35,125 @@ from drakegrasp.dataset.paths import model_path
 from drakegrasp.exchange.closed_grasps import ClosedGrasp, read_closed_grasps
 from drakegrasp.frames import Array, invert_pose
 from drakegrasp.hand.description import Hand, load_hand
-from drakegrasp.mesh.wavefront import obj_text
+from drakegrasp.mesh.wavefront import hull_text
 from drakegrasp.objects.model import load_object
 from drakegrasp.runtime.progress import Report
 from drakegrasp.visualization.still_scene import StillScene
 
-#: By how much of their path the fingers are commanded to close further.
-SQUEEZE = 0.1
+#: By how much pregrasp and squeeze are apart from the grasp [rad], of joints that slide by
+#: `description.SLIDE`.
+APART = 0.2
+#: Where hand and objects are in the benchmark's repository, and the name of the experiment.
+ASSETS, EXPERIMENT = Path("assets/drakegrasp"), "export"
 
 
 def write_dexgraspbench(out: Path, folder: Path, progress: Report) -> int:
-    """Write a file per sample and return their number; see `export.export_dataset`."""
-    hand = load_hand(read_manifest(out).config.hand)
-    posed, grasps = StillScene(hand), list(read_closed_grasps(out))
-    progress(0, len(grasps))
-    done = 0
-    for name, same in groupby(grasps, key=lambda grasp: grasp.object_name):
-        # The mesh of the object, in {O}.
-        model = load_object(model_path(out, name))
-        mesh = folder / "objects" / name / "mesh.obj"
-        mesh.parent.mkdir(parents=True)
-        mesh.write_text(
-            obj_text(model.visual_vertices, model.visual_faces, normals=False), encoding="utf-8"
-        )
+    """Write the files and return the number of samples; see `export.export_dataset`."""
+    from drakegrasp.mjcf.convex_parts import convex_parts
+    from drakegrasp.mjcf.hand_model import make_hand_model, write_hand_model
 
-        (folder / "grasps" / name).mkdir(parents=True)
+    # The hand, by a name that the benchmark does not have.
+    hand = load_hand(read_manifest(out).config.hand)
+    model, posed = make_hand_model(hand), StillScene(hand)
+    write_hand_model(model, folder / ASSETS / "hand" / "hand.xml")
+    name = f"drakegrasp_{hand.name}"
+    (folder / "config" / "hand").mkdir(parents=True)
+    settings = yaml.safe_dump(hand_settings(hand), sort_keys=False)
+    (folder / "config" / "hand" / f"{name}.yaml").write_text(settings, encoding="utf-8")
+
+    # Object by object.
+    grasps = list(read_closed_grasps(out))
+    progress(0, len(grasps))
+    done, data = 0, folder / "output" / f"{EXPERIMENT}_{name}" / "graspdata"
+    for thing, same in groupby(grasps, key=lambda grasp: grasp.object_name):
+        write_object(
+            folder / ASSETS / "objects" / thing, convex_parts(load_object(model_path(out, thing)))
+        )
+        (data / thing).mkdir(parents=True)
         for grasp in same:
-            content: Any = grasp_dictionary(hand, posed, grasp)
-            np.save(folder / "grasps" / name / f"{grasp.trial_id}.npy", content)
+            content: Any = grasp_dictionary(hand, posed, model.joints, grasp)
+            np.save(data / thing / f"{grasp.trial_id}.npy", content)
             done += 1
             progress(done, len(grasps))
     return done
 
 
-def grasp_dictionary(hand: Hand, posed: StillScene, grasp: ClosedGrasp) -> dict[str, Any]:
+def hand_settings(hand: Hand) -> dict[str, Any]:
+    """Return what the benchmark's YAML says of a hand; fingertips have the names of their links."""
+    tips = list(hand.fingertip_links)
+    return {
+        "xml_path": str(ASSETS / "hand" / "hand.xml"),
+        "mocap": True,
+        "exclude_table_contact": None,
+        "color": [0.45, 0.48, 0.52, 1.0],
+        "finger_prefix": tips,
+        "valid_body_name": list(hand.link_chains),
+        "tip_body_name": tips,
+    }
+
+
+def write_object(folder: Path, parts: Sequence[Array]) -> None:
+    """Write an object's convex parts, and their volume as its mass at a density of one.
+
+    Args:
+        folder: Of the object.
+        parts: The corners (n, 3) of each part in {O} [m].
+    """
+    (folder / "urdf" / "meshes").mkdir(parents=True)
+    for number, corners in enumerate(parts):
+        path = folder / "urdf" / "meshes" / f"convex_piece_{number:03d}.obj"
+        path.write_text(hull_text(corners), encoding="utf-8")
+    volume = float(sum(ConvexHull(corners).volume for corners in parts))
+    (folder / "info").mkdir()
+    info = json.dumps({"scale": 1.0, "density": 1.0, "mass": volume})
+    (folder / "info" / "simplified.json").write_text(info, encoding="utf-8")
+
+
+def grasp_dictionary(
+    hand: Hand, posed: StillScene, joints: Sequence[str], grasp: ClosedGrasp
+) -> dict[str, Any]:
     """Return what the file of a grasp holds, see the module.
 
     Args:
         hand: The hand.
-        posed: The same hand, which knows the order of its joints.
+        posed: The same hand, which knows the order of the stored joints.
+        joints: Names of the joints in the order of the file.
         grasp: The sample.
     """
-    # The palm link's pose, and the joints at the three instants.
-    X_TB = multiply(grasp.X_TG, invert_pose(hand.X_BG))
-    start = posed.positions(grasp.spread)
-    spread = np.isin(posed.joints, hand.spread.joints)
-    squeezed = grasp.q + SQUEEZE * np.where(spread, 0.0, grasp.q - start)
+    # The palm link's pose, and how far each joint moves: in proportion to its finger's closing.
+    X_TB = pose_vector(multiply(grasp.X_TG, invert_pose(hand.X_BG)))
+    step = dict.fromkeys(hand.joint_names, 0.0)
+    closing = APART * hand.closing_unit
+    for name, gain in zip(hand.joint_names, hand.joint_gain[:, 1:], strict=True):
+        step[name] = float(gain @ closing)
+    open_at = dict(zip(posed.joints, posed.positions(grasp.spread), strict=True))
+    closed = dict(zip(posed.joints, grasp.q, strict=True))
+
+    def posture(share: float) -> Array:
+        q = [closed[name] + share * step[name] for name in joints]
+        if share < 0.0:
+            # No finger opens farther than it can.
+            q = [
+                _between(at, open_at[name], closed[name])
+                for name, at in zip(joints, q, strict=True)
+            ]
+        return np.concatenate([X_TB, q])
 
     return {
         "obj_pose": pose_vector(grasp.X_TO),
         "obj_scale": 1.0,
-        "obj_path": f"objects/{grasp.object_name}",
-        "pregrasp_qpos": np.concatenate([pose_vector(X_TB), start]),
-        "grasp_qpos": np.concatenate([pose_vector(X_TB), grasp.q]),
-        "squeeze_qpos": np.concatenate([pose_vector(X_TB), squeezed]),
-        "joint_names": list(posed.joints),
-        "joint_units": [hand.joint_units[name] for name in posed.joints],
+        "obj_path": str(ASSETS / "objects" / grasp.object_name),
+        "pregrasp_qpos": posture(-1.0),
+        "grasp_qpos": posture(0.0),
+        "squeeze_qpos": posture(1.0),
+        "joint_names": list(joints),
+        "joint_units": [hand.joint_units[name] for name in joints],
     }
+
+
+def _between(at: float, one: float, other: float) -> float:
+    """Return the position nearest to one given between two others."""
+    return min(max(at, min(one, other)), max(one, other))
 
 
 def pose_vector(X_AB: npt.ArrayLike) -> Array:

@@ -15,11 +15,12 @@ from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.errors import DataError
+from drakegrasp.runtime.environment import require_mujoco
 from drakegrasp.runtime.files import atomic_folder
 from drakegrasp.runtime.progress import Report, silent
 
-#: `hf` needs the extra `[hub]`.
-Format = Literal["hf", "original", "dexgraspbench", "isaac_grasp", "glb"]
+#: `hf` needs the extra `[hub]`; `dexgraspbench` and `mjcf` need `[peer]`.
+Format = Literal["hf", "original", "dexgraspbench", "isaac_grasp", "glb", "mjcf"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 
 
@@ -71,14 +72,19 @@ def _writer(form: Format, licence: str) -> Callable[[Path, Path, Report], int]:
         from drakegrasp.exchange.original import write_original
 
         return write_original
-    if form == "dexgraspbench":
-        from drakegrasp.exchange.dexgraspbench import write_dexgraspbench
+    if form == "glb":
+        from drakegrasp.exchange.posed_scenes import write_glb
 
-        return write_dexgraspbench
+        return write_glb
     if form == "isaac_grasp":
         from drakegrasp.exchange.isaac_grasp import write_isaac_grasp
 
         return write_isaac_grasp
-    from drakegrasp.exchange.posed_scenes import write_glb
+    require_mujoco("mujoco", "coacd")
+    if form == "mjcf":
+        from drakegrasp.exchange.mujoco_scenes import write_mjcf
 
-    return write_glb
+        return write_mjcf
+    from drakegrasp.exchange.dexgraspbench import write_dexgraspbench
+
+    return write_dexgraspbench

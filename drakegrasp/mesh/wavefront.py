@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+import trimesh
 from scipy.sparse import coo_matrix
 
 from drakegrasp.frames import Array
@@ -34,6 +35,12 @@ def obj_text(vertices: npt.ArrayLike, faces: npt.ArrayLike, *, normals: bool) ->
     corners = np.stack((f, index.reshape(f.shape)), axis=2).reshape(-1, 6) + 1
     lines += ["f {}//{} {}//{} {}//{}".format(*row) for row in corners.tolist()]
     return "\n".join(lines) + "\n"
+
+
+def hull_text(corners: npt.ArrayLike) -> str:
+    """Return the convex hull of corners (n, 3) as Wavefront text, its faces turned outwards."""
+    hull = trimesh.convex.convex_hull(np.asarray(corners, dtype=float))
+    return obj_text(hull.vertices, hull.faces, normals=False)
 
 
 def _corner_normals(vertices: Array, faces: Faces) -> Array:

@@ -15,7 +15,9 @@ import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 
+from drakegrasp.errors import MachineError
 from drakegrasp.runtime.allocator import has_jemalloc, kept_variables
 
 #: Least time between two returns of free memory [s]; one takes about 20 ms.
@@ -33,6 +35,20 @@ def available_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def require_mujoco(*modules: str) -> None:
+    """Refuse work that needs libraries of the extra `[peer]` which are missing.
+
+    Args:
+        modules: `mujoco`, `coacd` or both.
+
+    Raises:
+        MachineError: If one is missing.
+    """
+    for module in modules:
+        if find_spec(module) is None:
+            raise MachineError(f"{module} must be installed: pip install 'drakegrasp[peer]'")
 
 
 def release_memory() -> None:

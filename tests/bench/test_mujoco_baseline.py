@@ -23,15 +23,11 @@ pytest.importorskip("coacd")
 
 import mujoco
 
-from drakegrasp.bench import mujoco_baseline, mujoco_scene
+from drakegrasp.bench import mujoco_baseline
 from drakegrasp.bench.mujoco_baseline import MujocoBaseline
-from drakegrasp.bench.mujoco_scene import (
-    STIFF,
-    TIME_STEP,
-    TORSION_RADIUS,
-    build_mujoco_scene,
-    pair_friction,
-)
+from drakegrasp.mjcf import scene as mujoco_scene
+from drakegrasp.mjcf.links import STIFF, TIME_STEP, TORSION_RADIUS, pair_friction
+from drakegrasp.mjcf.scene import build_mujoco_scene
 
 pytestmark = pytest.mark.sim
 

@@ -1,20 +1,30 @@
-"""The format of DexGraspBench: a file per grasp, from which the posture comes back."""
+"""The files of DexGraspBench: a hand, objects and grasps that its loader reads."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
+import yaml
 
-from drakegrasp.exchange.closed_grasps import ClosedGrasp
-from drakegrasp.exchange.dexgraspbench import SQUEEZE, grasp_dictionary
-from drakegrasp.frames import Array
-from drakegrasp.hand.description import load_hand
-from drakegrasp.visualization.still_scene import StillScene
+pytest.importorskip("coacd")
+mujoco = pytest.importorskip("mujoco")
+
+from drakegrasp.exchange.closed_grasps import ClosedGrasp  # noqa: E402
+from drakegrasp.exchange.dexgraspbench import APART, grasp_dictionary  # noqa: E402
+from drakegrasp.frames import Array, multiply  # noqa: E402
+from drakegrasp.hand.description import load_hand  # noqa: E402
+from drakegrasp.hand.kinematics import fingertip_poses  # noqa: E402
+from drakegrasp.mjcf.hand_model import make_hand_model  # noqa: E402
+from drakegrasp.protocols.grasp_file import read_grasp_file  # noqa: E402
+from drakegrasp.protocols.object_folder import read_object_folder  # noqa: E402
+from drakegrasp.visualization.still_scene import StillScene  # noqa: E402
 
 
 def pose_of(vector: Array) -> Array:
@@ -29,52 +39,110 @@ def folder(exported: Callable[[str], Path]) -> Path:
     return exported("dexgraspbench")
 
 
+@pytest.fixture(scope="module")
+def settings(folder: Path) -> dict[str, Any]:
+    return yaml.safe_load((folder / "config/hand/drakegrasp_barrett.yaml").read_text())
+
+
+def content_of(folder: Path, grasp: ClosedGrasp) -> dict[str, Any]:
+    data = folder / "output/export_drakegrasp_barrett/graspdata"
+    path = data / grasp.object_name / f"{grasp.trial_id}.npy"
+    return np.load(path, allow_pickle=True).item()
+
+
 def test_poses_and_joints_come_back(folder: Path, grasps: list[ClosedGrasp]) -> None:
     hand = load_hand()
     assert len(list(folder.rglob("*.npy"))) == len(grasps)
     for grasp in grasps:
-        path = folder / "grasps" / grasp.object_name / f"{grasp.trial_id}.npy"
-        content = np.load(path, allow_pickle=True).item()
+        content = content_of(folder, grasp)
         assert pose_of(content["obj_pose"]) == pytest.approx(grasp.X_TO, abs=1e-9)
         for key in ("pregrasp_qpos", "grasp_qpos", "squeeze_qpos"):
             X_TG = pose_of(content[key][:7]) @ hand.X_BG
             assert pytest.approx(grasp.X_TG, abs=1e-9) == X_TG
-        assert (content["grasp_qpos"][7:] == grasp.q).all()
-        assert content["joint_names"] == list(StillScene(hand).joints)
+        q = dict(zip(content["joint_names"], content["grasp_qpos"][7:], strict=True))
+        assert q == dict(zip(StillScene(hand).joints, grasp.q, strict=True))
         assert set(content["joint_units"]) == {"rad"}
 
 
-def test_fingers_begin_open_and_squeeze_further(folder: Path, grasps: list[ClosedGrasp]) -> None:
-    hand, grasp = load_hand(), grasps[0]
-    path = folder / "grasps" / grasp.object_name / f"{grasp.trial_id}.npy"
-    content = np.load(path, allow_pickle=True).item()
-    spread = np.isin(content["joint_names"], hand.spread.joints)
+def test_fingers_open_and_press_by_equal_steps(folder: Path, grasps: list[ClosedGrasp]) -> None:
+    hand, content = load_hand(), content_of(folder, grasps[0])
     start, closed, squeezed = (
-        content[f"{name}_qpos"][7:] for name in ("pregrasp", "grasp", "squeeze")
+        dict(zip(content["joint_names"], content[f"{name}_qpos"][7:], strict=True))
+        for name in ("pregrasp", "grasp", "squeeze")
     )
-    assert start == pytest.approx(np.where(spread, grasp.spread, 0.0))
-    assert (squeezed[spread] == closed[spread]).all()
-    assert squeezed[~spread] == pytest.approx((1.0 + SQUEEZE) * closed[~spread])
+    for finger in hand.fingers:
+        for joint, ratio in (
+            (finger.closing_joint, 1.0),
+            *((c.joint, c.ratio) for c in finger.coupled),
+        ):
+            assert squeezed[joint] - closed[joint] == pytest.approx(APART * ratio)
+            assert start[joint] == pytest.approx(max(closed[joint] - APART * ratio, 0.0), abs=1e-9)
+    for joint in hand.spread.joints:
+        assert start[joint] == closed[joint] == squeezed[joint]
 
 
 def test_fingers_that_slide_have_lengths(grasps: list[ClosedGrasp]) -> None:
-    hand = load_hand("franka")
-    q = np.array([0.01, 0.02])
-    content = grasp_dictionary(hand, StillScene(hand), replace(grasps[0], q=q, spread=0.0))
+    hand, q = load_hand("franka"), np.array([0.03, 0.03])
+    grasp = replace(grasps[0], q=q, spread=0.0)
+    joints = make_hand_model(hand).joints
+    content = grasp_dictionary(hand, StillScene(hand), joints, grasp)
     assert content["joint_units"] == ["m", "m"]
-    assert len(content["joint_names"]) == 2
-    start, closed, squeezed = (
-        content[f"{name}_qpos"][7:] for name in ("pregrasp", "grasp", "squeeze")
-    )
-    assert start == pytest.approx([0.0, 0.0])
-    assert (closed == q).all()
-    assert squeezed == pytest.approx((1.0 + SQUEEZE) * q)
+    moved = content["squeeze_qpos"][7:] - content["grasp_qpos"][7:]
+    assert np.abs(moved) == pytest.approx([0.1 * APART] * 2)
 
 
-def test_meshes_are_the_objects(folder: Path, grasps: list[ClosedGrasp]) -> None:
-    for name in {grasp.object_name for grasp in grasps}:
-        mesh = trimesh.load_mesh(folder / "objects" / name / "mesh.obj")
-        assert mesh.is_watertight
+def test_hand_is_one_model_with_fingertips_where_drake_has_them(
+    folder: Path, settings: dict[str, Any]
+) -> None:
+    """As the benchmark has it: the world of the MJCF is the palm link."""
+    hand = load_hand()
+    model = mujoco.MjModel.from_xml_path(str(folder / settings["xml_path"]))
+    data = mujoco.MjData(model)
+    closing = 0.3 * hand.closing_unit
+    c = np.concatenate([[0.2], closing])
+    for name, gain, offset in zip(
+        hand.joint_names, hand.joint_gain, hand.joint_offset, strict=True
+    ):
+        data.qpos[model.joint(name).qposadr[0]] = gain @ c + offset
+    mujoco.mj_kinematics(model, data)
+    expected = fingertip_poses(hand, spread=0.2, closing=closing)
+    for link, X_GF in zip(hand.fingertip_links, expected, strict=True):
+        p_WF = multiply(hand.X_BG, X_GF)[:3, 3]
+        np.testing.assert_allclose(data.body(link).xpos, p_WF, atol=1e-6)
+
+
+def test_motors_have_the_gains_of_the_benchmark(folder: Path, settings: dict[str, Any]) -> None:
+    model = mujoco.MjModel.from_xml_path(str(folder / settings["xml_path"]))
+    assert model.nu == 5
+    # The benchmark's MuJoCo does not know the attribute by which newer ones write a position.
+    assert "input=" not in (folder / settings["xml_path"]).read_text()
+    assert set(model.actuator_gainprm[:, 0]) == {5.0}
+    assert (np.abs(model.actuator_forcerange) == 3.0).all()
+
+
+def test_settings_name_links_of_the_model(folder: Path, settings: dict[str, Any]) -> None:
+    model = mujoco.MjModel.from_xml_path(str(folder / settings["xml_path"]))
+    bodies = {model.body(i).name for i in range(model.nbody)}
+    assert set(settings["valid_body_name"]) <= bodies
+    assert settings["tip_body_name"] == list(load_hand().fingertip_links)
+
+
+def test_objects_have_their_volume(folder: Path, grasps: list[ClosedGrasp]) -> None:
+    """From it the benchmark has the density that makes every object as heavy."""
+    for grasp in grasps:
+        path = content_of(folder, grasp)["obj_path"]
+        info = json.loads((folder / path / "info/simplified.json").read_text())
+        parts = [trimesh.load_mesh(p) for p in (folder / path / "urdf/meshes").glob("*.obj")]
+        assert all(part.is_volume for part in parts)
+        assert info["mass"] == pytest.approx(sum(part.volume for part in parts))
         # The boxes of the dataset stand on the table with their centre as origin.
-        height = next(grasp.X_TO[2, 3] for grasp in grasps if grasp.object_name == name)
-        assert mesh.bounds[0][2] == pytest.approx(-height)
+        lowest = min(part.bounds[0][2] for part in parts)
+        assert lowest == pytest.approx(-grasp.X_TO[2, 3], abs=1e-3)
+
+
+def test_own_reader_reads_what_is_exported(folder: Path, grasps: list[ClosedGrasp]) -> None:
+    data = folder / "output/export_drakegrasp_barrett/graspdata"
+    path = data / grasps[0].object_name / f"{grasps[0].trial_id}.npy"
+    stored = read_grasp_file(path)
+    assert (stored.motion.grasp == content_of(folder, grasps[0])["grasp_qpos"]).all()
+    assert read_object_folder(folder / stored.object_path, stored.object_scale).volume > 1e-5

@@ -1,0 +1,145 @@
+"""Posed scenes for MuJoCo: an MJCF per grasp, with object, table and the hand at the grasp.
+
+In: a dataset. Out: `<object>/<trial_id>.xml`, which `mujoco.MjModel.from_xml_path` loads, and
+`meshes/`. Everything is in {T}. The keyframe `grasp` has the joints as the fingers closed, the
+object where it rests, and the motors' commands at these joints. The object's mass is its own;
+friction is that of the configuration. The palm is fixed to the world.
+"""
+
+from __future__ import annotations
+
+from itertools import groupby
+from pathlib import Path
+from xml.sax.saxutils import escape
+
+import mujoco
+
+from drakegrasp.arithmetic import multiply
+from drakegrasp.config import Config
+from drakegrasp.dataset.manifest import read_manifest
+from drakegrasp.dataset.paths import model_path
+from drakegrasp.exchange.closed_grasps import ClosedGrasp, read_closed_grasps
+from drakegrasp.exchange.dexgraspbench import pose_vector
+from drakegrasp.frames import invert_pose
+from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.mesh.wavefront import hull_text
+from drakegrasp.mjcf.convex_parts import convex_parts
+from drakegrasp.mjcf.hand_model import HandModel, make_hand_model
+from drakegrasp.mjcf.links import pair_friction, set_inertia
+from drakegrasp.objects.model import ObjectModel, load_object, object_colour
+from drakegrasp.runtime.progress import Report
+from drakegrasp.visualization.still_scene import StillScene
+
+#: Half extents of the table [m], whose top is at z = 0.
+TABLE = (0.8, 0.8, 0.05)
+#: Folder of all meshes, and the one of the hand's in it.
+MESHES, HAND = "meshes", "hand"
+
+
+def write_mjcf(out: Path, folder: Path, progress: Report) -> int:
+    """Write a scene per sample and return their number; see `export.export_dataset`."""
+    config = read_manifest(out).config
+    hand = load_hand(config.hand)
+    posed, grasps = StillScene(hand), list(read_closed_grasps(out))
+    progress(0, len(grasps))
+    done = 0
+    for name, same in groupby(grasps, key=lambda grasp: grasp.object_name):
+        thing = load_object(model_path(out, name))
+        scene = ObjectScenes(hand, thing, config, folder)
+        (folder / name).mkdir()
+        for grasp in same:
+            text = scene.posed(grasp, posed.joints)
+            (folder / name / f"{grasp.trial_id}.xml").write_text(text, encoding="utf-8")
+            done += 1
+            progress(done, len(grasps))
+    return done
+
+
+class ObjectScenes:
+    """The scenes of an object, one grasp after the other."""
+
+    def __init__(self, hand: Hand, thing: ObjectModel, config: Config, folder: Path) -> None:
+        """Write the meshes, and build the scene.
+
+        Args:
+            hand: The hand.
+            thing: The object.
+            config: Friction of hand and table.
+            folder: To which `meshes/` is written.
+        """
+        # The table.
+        physics = thing.own_physics(config.physics)
+        self._hand, self._meshes = hand, folder / MESHES
+        self._spec = mujoco.MjSpec()
+        self._spec.modelname = thing.name
+        self._spec.worldbody.add_light(pos=[0.3, -0.3, 1.5], dir=[-0.2, 0.2, -1.0])
+        self._spec.worldbody.add_geom(
+            name="table",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=[0.0, 0.0, -TABLE[2]],
+            size=TABLE,
+            rgba=[0.74, 0.70, 0.64, 1.0],
+            friction=pair_friction(physics.friction_table),
+            condim=4,
+            priority=1,
+        )
+
+        # The hand, whose palm each grasp moves, and the object.
+        model = make_hand_model(hand, physics.friction_hand)
+        self._joints = model.joints
+        self._frame = self._attach(model)
+        self._add_object(thing, physics.friction_hand)
+        self._key = self._spec.add_key(name="grasp")
+
+    def posed(self, grasp: ClosedGrasp, joints: tuple[str, ...]) -> str:
+        """Return the MJCF of a grasp.
+
+        Args:
+            grasp: The sample.
+            joints: Names of its joints, in the order in which they are stored.
+        """
+        palm = pose_vector(multiply(grasp.X_TG, invert_pose(self._hand.X_BG)))
+        self._frame.pos, self._frame.quat = palm[:3], palm[3:]
+        q = dict(zip(joints, grasp.q.tolist(), strict=True))
+        self._key.qpos = [*(q[name] for name in self._joints), *pose_vector(grasp.X_TO)]
+        self._key.ctrl = [q[joint] for joint in self._motor_joints()]
+
+        # Meshes have absolute paths while it is compiled, and go with the folder afterwards.
+        self._spec.compile()
+        return self._spec.to_xml().replace(escape(str(self._meshes)), f"../{MESHES}")
+
+    def _motor_joints(self) -> list[str]:
+        """Return the joints of the motors."""
+        return [motor.target.removeprefix(f"{HAND}/") for motor in self._spec.actuators]
+
+    def _attach(self, model: HandModel) -> mujoco.MjsFrame:
+        """Add the hand; return the frame that carries its palm."""
+        for mesh in model.spec.meshes:
+            mesh.file = self._write(HAND, mesh.file, model.meshes[mesh.file])
+        frame = self._spec.worldbody.add_frame()
+        frame.attach_body(model.spec.body(self._hand.palm_link), f"{HAND}/", "")
+        return frame
+
+    def _add_object(self, thing: ObjectModel, friction: float) -> None:
+        body = self._spec.worldbody.add_body(name="object")
+        body.add_freejoint(name="object")
+        set_inertia(body, thing.mass, thing.p_OOcm, thing.I_OOcm_O)
+        for number, corners in enumerate(convex_parts(thing)):
+            name = f"part_{number:03d}"
+            self._spec.add_mesh(
+                name=name, file=self._write(thing.name, f"{name}.obj", hull_text(corners))
+            )
+            body.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_MESH,
+                meshname=name,
+                rgba=[*object_colour(thing.name), 1.0],
+                friction=pair_friction(friction),
+                condim=4,
+            )
+
+    def _write(self, folder: str, name: str, text: str) -> str:
+        """Write a mesh and return its path."""
+        path = self._meshes / folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+        return str(path)

@@ -1,0 +1,1 @@
+"""Hands and objects as models of MuJoCo (MJCF). Needs the extra `[peer]`."""

@@ -1,0 +1,246 @@
+"""Links of a hand as bodies of MuJoCo: inertia, collision shapes and their contacts.
+
+In: a hand that Drake has read. Out: bodies, added to a specification.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from pydrake.common.eigen_geometry import AngleAxis
+from pydrake.geometry import (
+    Box,
+    Capsule,
+    Cylinder,
+    GeometryId,
+    SceneGraph,
+    SceneGraphInspector,
+    Sphere,
+)
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import Joint, RigidBody
+
+from drakegrasp.frames import Array
+from drakegrasp.hand.chains import joint_axis, joint_slides, moving_joint
+from drakegrasp.hand.description import Hand
+from drakegrasp.hand.parsing import add_model
+from drakegrasp.hand.shapes import hull_corners
+
+#: Time step [s].
+TIME_STEP = 0.002
+#: Time constant [s] and damping ratio of contacts, joint limits and couplings: the stiffest that
+#: MuJoCo allows is two steps. Its default of 20 ms lets a finger penetrate by more than 1 mm.
+STIFF = (2.0 * TIME_STEP, 1.0)
+#: Impedance of joint limits and couplings, near that of a rigid constraint: a finger's limit then
+#: gives way by less than 0.01 degrees under its largest load.
+RIGID = (0.999, 0.9999, 0.001, 0.5, 2.0)
+#: Torsion radius of a fingertip's patch in Drake [m]: the median of 336 patches of the Barrett Hand
+#: on built-in objects (pipelines/measurements/torsion_radius.py).
+TORSION_RADIUS = 0.0029
+
+
+@dataclass(frozen=True, kw_only=True)
+class Collides:
+    """With what a geom collides, as bits of MuJoCo's masks."""
+
+    contype: int
+    conaffinity: int
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MovingJoint:
+    """A joint of a hand, which is to be added to its body.
+
+    Attributes:
+        name: Of the joint.
+        body: The link that it moves.
+        axis, point: Where it is, (3,), in the body's frame.
+        limits: Lower and upper position [rad or m].
+        slides: Whether it slides.
+        damping: [N m s/rad or N s/m].
+    """
+
+    name: str
+    body: mujoco.MjsBody
+    axis: Array
+    point: Array
+    limits: tuple[float, float]
+    slides: bool
+    damping: float
+
+    def add(self, **attributes: object) -> mujoco.MjsJoint:
+        """Add it with its limits and other attributes of MuJoCo."""
+        kinds = mujoco.mjtJoint
+        return self.body.add_joint(
+            name=self.name,
+            type=kinds.mjJNT_SLIDE if self.slides else kinds.mjJNT_HINGE,
+            axis=self.axis,
+            pos=self.point,
+            limited=True,
+            range=self.limits,
+            **attributes,
+        )
+
+
+def add_links(
+    spec: mujoco.MjSpec,
+    hand: Hand,
+    parent: mujoco.MjsBody,
+    friction: float,
+    *,
+    touches: Collides,
+) -> Iterator[MovingJoint]:
+    """Add the links of a hand; yield each joint that moves, which the caller adds.
+
+    A joint of the preshape is none in MuJoCo: its body stands where the joint would put it.
+
+    Args:
+        spec: To which shapes are added.
+        hand: The hand.
+        parent: The body to which the palm link is fixed.
+        friction: Coefficient of the hand's contacts.
+        touches: With what its shapes collide.
+    """
+    # Drake reads the model.
+    plant, scene_graph = MultibodyPlant(0.0), SceneGraph()
+    plant.RegisterAsSourceForSceneGraph(scene_graph)
+    instance = add_model(plant, hand.model)
+    inspector = scene_graph.model_inspector()
+
+    def add(body: mujoco.MjsBody, link: RigidBody, X_PL: RigidTransform) -> mujoco.MjsBody:
+        return _add_link(spec, plant, inspector, friction, touches, body, link, X_PL)
+
+    # The palm, then link by link in the file's order, in which parents come first.
+    palm = plant.GetBodyByName(hand.palm_link, instance)
+    bodies = {hand.palm_link: add(parent, palm, RigidTransform())}
+    for index in plant.GetJointIndices(instance):
+        joint = plant.get_joint(index)
+        child = joint.child_body()
+        X_PF = joint.frame_on_parent().GetFixedPoseInBodyFrame()
+        X_CM = joint.frame_on_child().GetFixedPoseInBodyFrame()
+        X_PC = X_PF @ _fixed_motion(joint, hand) @ X_CM.inverse()
+        body = bodies[child.name()] = add(bodies[joint.parent_body().name()], child, X_PC)
+        if moving_joint(joint) and joint.name() not in hand.preshape:
+            yield MovingJoint(
+                name=joint.name(),
+                body=body,
+                axis=X_CM.rotation().matrix() @ joint_axis(joint),
+                point=X_CM.translation(),
+                limits=(joint.position_lower_limit(), joint.position_upper_limit()),
+                slides=joint_slides(joint),
+                damping=joint.default_damping(),
+            )
+
+
+def _fixed_motion(joint: Joint, hand: Hand) -> RigidTransform:
+    """Return the motion of a joint that is fixed, or keeps its position in the hand's preshape."""
+    if not moving_joint(joint):
+        return joint.X_FM()
+    position, axis = hand.preshape.get(joint.name(), 0.0), joint_axis(joint)
+    if joint_slides(joint):
+        return RigidTransform(position * axis)
+    return RigidTransform(RotationMatrix(AngleAxis(position, axis)), np.zeros(3))
+
+
+def add_couplings(spec: mujoco.MjSpec, hand: Hand) -> None:
+    """Let each coupled joint follow the closing joint of its finger."""
+    for finger in hand.fingers:
+        for coupling in finger.coupled:
+            spec.add_equality(
+                type=mujoco.mjtEq.mjEQ_JOINT,
+                objtype=mujoco.mjtObj.mjOBJ_JOINT,
+                name1=coupling.joint,
+                name2=finger.closing_joint,
+                data=[coupling.offset, coupling.ratio, *np.zeros(mujoco.mjNEQDATA - 2)],
+                solref=STIFF,
+                solimp=RIGID,
+            )
+
+
+def quaternion(R: Array) -> Array:
+    """Return the quaternion (w, x, y, z) of a rotation matrix (3, 3)."""
+    found = np.zeros(4)
+    mujoco.mju_mat2Quat(found, np.ascontiguousarray(R).ravel())
+    return found
+
+
+def pair_friction(coefficient: float) -> list[float]:
+    """Return what MuJoCo calls the friction of a geom, for a pair's coefficient of friction.
+
+    These are the coefficients of sliding and of turning about the normal, and of rolling, which
+    contacts here do not have. That of turning is torque per normal force [m], so it depends on the
+    coefficient of the pair.
+    """
+    return [coefficient, coefficient * TORSION_RADIUS, 0.0]
+
+
+def _add_link(
+    spec: mujoco.MjSpec,
+    plant: MultibodyPlant,
+    inspector: SceneGraphInspector,
+    friction: float,
+    touches: Collides,
+    parent: mujoco.MjsBody,
+    link: RigidBody,
+    X_PL: RigidTransform,
+) -> mujoco.MjsBody:
+    """Add a link L with its inertia and shapes S to its parent P."""
+    body = parent.add_body(
+        name=link.name(), pos=X_PL.translation(), quat=quaternion(X_PL.rotation().matrix())
+    )
+    inertia = link.default_spatial_inertia()
+    p_LLcm = inertia.get_com()
+    central = inertia.Shift(p_LLcm).CalcRotationalInertia().CopyToFullMatrix3()
+    set_inertia(body, inertia.get_mass(), p_LLcm, central)
+    body.gravcomp = 1.0
+
+    for geometry in plant.GetCollisionGeometriesForBody(link):
+        kind, size, mesh = _shape(spec, inspector, geometry, link.name())
+        X_LS = inspector.GetPoseInFrame(geometry)
+        body.add_geom(
+            type=kind,
+            size=size,
+            meshname=mesh,
+            pos=X_LS.translation(),
+            quat=quaternion(X_LS.rotation().matrix()),
+            contype=touches.contype,
+            conaffinity=touches.conaffinity,
+            friction=pair_friction(friction),
+            solref=STIFF,
+            condim=4,
+        )
+    return body
+
+
+def _shape(
+    spec: mujoco.MjSpec, inspector: SceneGraphInspector, geometry: GeometryId, link: str
+) -> tuple[mujoco.mjtGeom, list[float], str]:
+    """Return MuJoCo's kind, size and mesh of a shape of the hand; meshes are added to the model.
+
+    MuJoCo has these primitives, too; the corners of `hand.shapes` only approximate them.
+    """
+    shape, kinds = inspector.GetShape(geometry), mujoco.mjtGeom
+    if isinstance(shape, Box):
+        return kinds.mjGEOM_BOX, list(shape.size() / 2.0), ""
+    if isinstance(shape, Cylinder):
+        return kinds.mjGEOM_CYLINDER, [shape.radius(), shape.length() / 2.0, 0.0], ""
+    if isinstance(shape, Capsule):
+        return kinds.mjGEOM_CAPSULE, [shape.radius(), shape.length() / 2.0, 0.0], ""
+    if isinstance(shape, Sphere):
+        return kinds.mjGEOM_SPHERE, [shape.radius(), 0.0, 0.0], ""
+    corners = hull_corners(inspector, geometry)
+    assert corners is not None
+    name = f"{link}.{inspector.GetName(geometry)}"
+    spec.add_mesh(name=name, uservert=corners.ravel())
+    return kinds.mjGEOM_MESH, [0.0, 0.0, 0.0], name
+
+
+def set_inertia(body: mujoco.MjsBody, mass: float, com: Array, central: Array) -> None:
+    """Give a body its mass [kg], centre of mass (3,) [m] and central inertia (3, 3) [kg m^2]."""
+    body.explicitinertial = True
+    body.mass, body.ipos = mass, com
+    body.fullinertia = central[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]

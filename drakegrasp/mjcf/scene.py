@@ -1,0 +1,198 @@
+"""Object, table and hand as a model of MuJoCo, for the attempts of a build.
+
+In: a prepared object, a hand and the configuration. Out: a compiled `MujocoScene`. MuJoCo collides
+convex shapes only, so the object is cut into convex parts. Masses, inertias, joints, shapes and
+friction are those that Drake simulates. Needs the extra `[peer]`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from drakegrasp.config import Config
+from drakegrasp.frames import X_WT, Array
+from drakegrasp.hand.description import SLIDE, Hand
+from drakegrasp.mjcf.convex_parts import convex_parts
+from drakegrasp.mjcf.links import (
+    RIGID,
+    STIFF,
+    TIME_STEP,
+    Collides,
+    add_couplings,
+    add_links,
+    pair_friction,
+    set_inertia,
+)
+from drakegrasp.objects.model import ObjectModel
+
+#: Friction is this much stiffer than the normal direction, and is solved again until it is exact
+#: (`noslip`): MuJoCo's regularized friction lets what is held creep.
+FRICTION_STIFFNESS, NOSLIP_ITERATIONS = 10.0, 20
+#: Gain of the fingers' speed [N m s/rad]; for those that slide it follows from
+#: `description.SLIDE`.
+FINGER_DAMPING = 5.0
+#: Mass [kg] and inertia [kg m^2] of the bodies that carry the wrist, and a small inertia of the
+#: rotors [kg m^2] that keeps joints stable.
+CARRIER_MASS, CARRIER_INERTIA, ARMATURE = 0.01, 1e-5, 2e-4
+#: Inertia that is added to what no contact may move [kg, kg m^2]: the wrist, which follows its path
+#: exactly, and the object while the hand closes.
+IMMOVABLE = 1e4
+#: Bits of MuJoCo's collision masks.
+_HAND, _OBJECT, _TABLE = 1, 2, 4
+_ON_HAND = Collides(contype=_HAND, conaffinity=_OBJECT | _TABLE)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SpreadJoint:
+    """A joint that an attempt sets and locks: it is no joint of the model, its body is turned.
+
+    Attributes:
+        body: Name of the body.
+        axis: Of the joint, (3,), unit, in the body's frame.
+        quaternion: Orientation of the body at angle zero, (4,), in its parent's frame.
+    """
+
+    body: str
+    axis: Array
+    quaternion: Array
+
+    def orientation(self, angle: float) -> Array:
+        """Return the body's quaternion (4,) at an angle [rad]."""
+        turn, total = np.zeros(4), np.zeros(4)
+        mujoco.mju_axisAngle2Quat(turn, self.axis, angle)
+        mujoco.mju_mulQuat(total, self.quaternion, turn)
+        return total
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MujocoScene:
+    """A compiled model; bodies and joints have the names of the hand's files.
+
+    Attributes:
+        model: The model, with the bodies `object` and `wrist_x` to `wrist_z` and the geom `table`.
+        spreads: The spread joints.
+        parts: Number of the object's convex parts.
+    """
+
+    model: mujoco.MjModel
+    spreads: tuple[SpreadJoint, ...]
+    parts: int
+
+
+def build_mujoco_scene(model: ObjectModel, hand: Hand, config: Config) -> MujocoScene:
+    """Return object, table and hand as a model of MuJoCo."""
+    config = config.model_copy(update={"physics": model.own_physics(config.physics)})
+    parts = convex_parts(model)
+    spec = _spec()
+    _add_table(spec, config)
+    _add_object(spec, model, parts, config)
+    spreads = _add_hand(spec, hand, config)
+    return MujocoScene(model=spec.compile(), spreads=tuple(spreads), parts=len(parts))
+
+
+def _spec() -> mujoco.MjSpec:
+    """Return an empty model with the solver's settings."""
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    spec.compiler.balanceinertia = True
+    spec.option.timestep = TIME_STEP
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = FRICTION_STIFFNESS
+    spec.option.noslip_iterations = NOSLIP_ITERATIONS
+    spec.option.tolerance = 1e-10
+    return spec
+
+
+def _add_table(spec: mujoco.MjSpec, config: Config) -> None:
+    thickness = 0.05
+    spec.worldbody.add_geom(
+        name="table",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=X_WT[:3, 3] - [0.0, 0.0, thickness],
+        size=[0.8, 0.8, thickness],
+        contype=_TABLE,
+        conaffinity=_HAND | _OBJECT,
+        friction=pair_friction(config.physics.friction_table),
+        solref=STIFF,
+        condim=4,
+        # Its friction decides, not the larger one of the pair.
+        priority=1,
+    )
+
+
+def _add_object(
+    spec: mujoco.MjSpec, model: ObjectModel, parts: list[Array], config: Config
+) -> None:
+    body = spec.worldbody.add_body(name="object")
+    body.add_freejoint(name="object")
+    set_inertia(body, model.mass, model.p_OOcm, model.I_OOcm_O)
+    for k, corners in enumerate(parts):
+        spec.add_mesh(name=f"part_{k}", uservert=corners.ravel())
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_MESH,
+            meshname=f"part_{k}",
+            contype=_OBJECT,
+            conaffinity=_HAND | _TABLE,
+            friction=pair_friction(config.physics.friction_hand),
+            solref=STIFF,
+            condim=4,
+        )
+
+
+def _add_hand(spec: mujoco.MjSpec, hand: Hand, config: Config) -> list[SpreadJoint]:
+    """Add the hand on its wrist; return its spread joints."""
+    wrist, spreads = _add_wrist(spec), []
+    for joint in add_links(spec, hand, wrist, config.physics.friction_hand, touches=_ON_HAND):
+        if joint.name in hand.spread.joints:
+            spreads.append(
+                SpreadJoint(
+                    body=joint.body.name, axis=joint.axis, quaternion=joint.body.quat.copy()
+                )
+            )
+            continue
+        unit = SLIDE if joint.slides else 1.0
+        joint.add(
+            damping=joint.damping,
+            armature=ARMATURE / unit**2,
+            solref_limit=STIFF,
+            solimp_limit=RIGID,
+        )
+    _add_drives(spec, hand)
+    return spreads
+
+
+def _add_wrist(spec: mujoco.MjSpec) -> mujoco.MjsBody:
+    """Add three light bodies on sliding joints, which follow a path; return the last."""
+    parent = spec.worldbody
+    for name, axis in zip("xyz", np.eye(3), strict=True):
+        parent = parent.add_body(name=f"wrist_{name}")
+        set_inertia(parent, CARRIER_MASS, np.zeros(3), CARRIER_INERTIA * np.eye(3))
+        parent.gravcomp = 1.0
+        parent.add_joint(
+            name=f"wrist_{name}",
+            type=mujoco.mjtJoint.mjJNT_SLIDE,
+            axis=axis,
+            armature=IMMOVABLE,
+        )
+    return parent
+
+
+def _add_drives(spec: mujoco.MjSpec, hand: Hand) -> None:
+    """Give each finger its motor, with a limited torque, and its coupled joints."""
+    for finger, unit in zip(hand.fingers, hand.closing_unit.tolist(), strict=True):
+        spec.joint(finger.closing_joint).armature = finger.rotor_inertia * finger.gear_ratio**2
+        limit = finger.effort_limit
+        motor = spec.add_actuator(
+            name=finger.name,
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            target=finger.closing_joint,
+            forcelimited=True,
+            forcerange=[-limit, limit],
+        )
+        motor.set_to_velocity(kv=FINGER_DAMPING / unit**2)
+
+    add_couplings(spec, hand)

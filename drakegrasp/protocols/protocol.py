@@ -1,0 +1,218 @@
+"""What a protocol is: numbers, their source, and a trial from which a verdict follows.
+
+In: the numbers of a field's benchmark. Out: `MujocoProtocol`, the base of those that run in MuJoCo,
+and of a user's own. A trial moves the hand through three postures (pregrasp, grasp, squeeze), each
+a `GraspMotion` in the order of the hand's MJCF, and then pushes the object or lifts it. MuJoCo is
+loaded with the scene only, `drakegrasp.protocols.scene`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from drakegrasp.errors import ConfigError
+from drakegrasp.frames import Array
+
+if TYPE_CHECKING:
+    from drakegrasp.protocols.scene import ProtocolScene
+
+Simulator = Literal["drake", "mujoco"]
+#: Unit vectors of the six pushes in {W}, in the order of DexGraspBench.
+AXES = ((-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GraspMotion:
+    """Three postures of a hand with n joints, and where the object is.
+
+    A posture is the pose of the MJCF's root in {W}, as position [m] and quaternion (w, x, y, z),
+    then the joint positions [rad or m] in the order of the MJCF.
+
+    Attributes:
+        pregrasp: (7 + n,), where the trial begins.
+        grasp: (7 + n,), where the fingers meet the object.
+        squeeze: (7 + n,), the command with which they press.
+        object_pose: (7,), position and quaternion of the object in {W}.
+    """
+
+    pregrasp: Array
+    grasp: Array
+    squeeze: Array
+    object_pose: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class PostureVerdict:
+    """What a trial measured.
+
+    Attributes:
+        success: Whether every rule of the protocol is met.
+        reason: "" of a success, else the rule that is not: `penetration` at the start, `moved`,
+            `turned`, `diverged` (the simulation), or `invalid` with what is wrong.
+        moved: Distance of the object from where it should be, when the trial ended [m].
+        turned: Its angle from there [rad].
+        penetration: Deepest contact of hand and object at the start [m].
+        push: Number of the push in which the trial ended, None if there was none.
+    """
+
+    success: bool
+    reason: str = ""
+    moved: float = np.nan
+    turned: float = np.nan
+    penetration: float = np.nan
+    push: int | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class MujocoProtocol:
+    """A protocol that runs in MuJoCo; without changes the numbers of DexGraspBench.
+
+    A protocol of your own is a subclass with a name, a source and other numbers, or with another
+    `run`.
+
+    Attributes:
+        name: By which it is asked for.
+        source: Where the numbers are from: a repository and its commit, or a paper.
+        mass: Of the object [kg]; None: from its density.
+        density: [kg/m^3], in place of the mass.
+        friction: Coefficient of sliding, and torque about the normal per normal force [m].
+        time_step: [s].
+        noslip_iterations, impratio: Of MuJoCo's solver, whose cone is elliptic.
+        solref, solimp: Of the hand's contacts, see MuJoCo's documentation.
+        joint_margin: Distance from a joint's limit at which MuJoCo begins to hold it [rad or m].
+        position_gain, velocity_gain: Of every actuator; those of the MJCF if None.
+        stage: How often the command changes on the way from posture to posture, and the time steps
+            in between.
+        acceleration: Force of a push over the object's mass [m/s^2].
+        directions: Of the pushes in {W}, unit vectors.
+        push: How often a push is judged, and the time steps in between; it ends early when the
+            object has gone.
+        lift: By how much the hand is raised [m]; None of a protocol that pushes.
+        max_penetration: Deepest contact allowed at the start, of hand and object and within the
+            hand [m]; None if it is not asked.
+        max_moved: The object must be nearer to where it should be [m].
+        max_turned: Its angle from there must be smaller [rad]; None if it is not asked.
+    """
+
+    name: str
+    source: str
+    mass: float | None = 0.1
+    density: float | None = None
+    friction: tuple[float, float] = (0.6, 0.02)
+    time_step: float = 0.004
+    noslip_iterations: int = 2
+    impratio: float = 10.0
+    solref: tuple[float, float] = (0.005, 1.0)
+    solimp: tuple[float, float, float] = (0.5, 0.99, 0.0001)
+    joint_margin: float = 0.0
+    position_gain: float | None = None
+    velocity_gain: float | None = None
+    stage: tuple[int, int] = (10, 10)
+    acceleration: float = 10.0
+    directions: tuple[tuple[float, float, float], ...] = AXES
+    push: tuple[int, int] = (10, 50)
+    lift: float | None = None
+    max_penetration: float | None = 0.01
+    max_moved: float = 0.05
+    max_turned: float | None = float(np.deg2rad(15.0))
+
+    def __post_init__(self) -> None:
+        """Refuse an object of two masses, or of none."""
+        if (self.mass is None) == (self.density is None):
+            raise ConfigError(
+                f"{self.name}: mass or density must be None, and only one of them, "
+                f"got {self.mass} and {self.density}"
+            )
+
+    @property
+    def simulator(self) -> Simulator:
+        """Where it runs."""
+        return "mujoco"
+
+    def object_mass(self, volume: float) -> float:
+        """Return the mass of an object of a volume [m^3] in [kg]."""
+        return self.density * volume if self.mass is None else self.mass  # type: ignore[operator]
+
+    def run(self, scene: ProtocolScene, motion: GraspMotion) -> PostureVerdict:
+        """Return the verdict on a grasp.
+
+        Args:
+            scene: Hand and object with the numbers of this protocol.
+            motion: The grasp.
+        """
+        # A hand that begins deep in the object, or in itself, has failed.
+        scene.reset(motion.pregrasp, motion.object_pose)
+        penetration, within_hand = scene.penetrations()
+        if self.max_penetration is not None and (
+            max(penetration, within_hand) > self.max_penetration
+        ):
+            return PostureVerdict(success=False, reason="penetration", penetration=penetration)
+
+        goal = scene.object_pose()
+        if self.lift is None:
+            verdict = self.judge_pushes(scene, motion, goal)
+        else:
+            verdict = self.judge_lift(scene, motion, goal)
+        return replace(verdict, penetration=penetration)
+
+    def judge_pushes(
+        self, scene: ProtocolScene, motion: GraspMotion, goal: Array
+    ) -> PostureVerdict:
+        """Return the verdict on an object that each push finds as the trial began."""
+        verdict = PostureVerdict(success=False)
+        for number, direction in enumerate(self.directions):
+            scene.reset(motion.pregrasp, motion.object_pose)
+            self.squeeze(scene, motion)
+            self.apply(scene, np.asarray(direction, dtype=float))
+            for _ in range(self.push[0]):
+                scene.step(self.push[1])
+                verdict = replace(self.judge(scene, goal), push=number)
+                if not verdict.success:
+                    return verdict
+        return verdict
+
+    def judge_lift(self, scene: ProtocolScene, motion: GraspMotion, goal: Array) -> PostureVerdict:
+        """Return the verdict on an object that weighs from the start and is lifted."""
+        raised, height = motion.squeeze.copy(), np.array([0.0, 0.0, self.lift])
+        raised[:3] += height
+        self.apply(scene, np.array([0.0, 0.0, -1.0]))
+        self.squeeze(scene, motion)
+        scene.move(motion.squeeze, raised, *self.stage)
+        return self.judge(scene, np.concatenate([goal[:3] + height, goal[3:]]))
+
+    def squeeze(self, scene: ProtocolScene, motion: GraspMotion) -> None:
+        """Move the hand from the pregrasp to the grasp and on to the squeeze."""
+        scene.move(motion.pregrasp, motion.grasp, *self.stage)
+        scene.move(motion.grasp, motion.squeeze, *self.stage)
+
+    def apply(self, scene: ProtocolScene, direction: Array) -> None:
+        """Push the object from now on, at its centre of mass."""
+        scene.push(self.acceleration * scene.mass * direction)
+
+    def judge(self, scene: ProtocolScene, goal: Array) -> PostureVerdict:
+        """Return the verdict on where the object is now; it should be in a pose (7,)."""
+        moved, turned = displacement(goal, scene.object_pose())
+        reason = ""
+        if not np.isfinite([moved, turned]).all():
+            reason = "diverged"
+        elif moved >= self.max_moved:
+            reason = "moved"
+        elif self.max_turned is not None and turned >= self.max_turned:
+            reason = "turned"
+        return PostureVerdict(success=not reason, reason=reason, moved=moved, turned=turned)
+
+    def numbers(self) -> dict[str, Any]:
+        """Return all numbers by name, for a result."""
+        return {k: v for k, v in asdict(self).items() if k not in ("name", "source")}
+
+
+def displacement(one: Array, other: Array) -> tuple[float, float]:
+    """Return the distance [m] and the angle [rad] between two poses (7,).
+
+    A quaternion that has gone round by a whole turn is one turn away, as in DexGraspBench.
+    """
+    cosine = float(np.clip(one[3:] @ other[3:], -1.0, 1.0))
+    return float(np.linalg.norm(other[:3] - one[:3])), 2.0 * float(np.arccos(cosine))

@@ -1,0 +1,257 @@
+"""Hand and object in MuJoCo, with the numbers of a protocol.
+
+In: the MJCF of a hand, an object's convex parts and a protocol. Out: a `ProtocolScene`, which is
+reset, moved, pushed and measured. The hand's root is welded to a body that moves as it is told, as
+DexGraspBench does it (`src/util/hand_util.py`). Needs the extra `[peer]`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from drakegrasp.errors import HandError, MeshError, one_line
+from drakegrasp.frames import Array
+from drakegrasp.protocols.object_folder import ObjectFolder
+from drakegrasp.protocols.protocol import MujocoProtocol
+
+#: Before the names of what comes from the hand's MJCF.
+HAND = "hand-"
+#: Impedance of the weld that moves the hand, and where the scale of its torques is in its data.
+_WELD, _TORQUE_SCALE = (0.9, 0.95, 0.001, 0.5, 2.0), 10
+#: Settings of the solver that a protocol has.
+_SETTINGS = (*("timestep", "integrator", "disableflags", "cone", "noslip_iterations", "impratio"),)
+#: Half extents of the table's plane, which has no edge, and the spacing of its grid.
+_PLANE = (0.0, 0.0, 1.0)
+
+
+class ProtocolScene:
+    """A hand of n joints and an object, under a protocol's rules.
+
+    Attributes:
+        joints: Number of the hand's joint positions, n.
+        mass: Of the object, as the protocol says [kg].
+        modelled_mass: Of the object in the model [kg]: it differs where parts overlap.
+    """
+
+    def __init__(self, protocol: MujocoProtocol, hand: Path, thing: ObjectFolder) -> None:
+        """Build the scene.
+
+        Args:
+            protocol: The numbers.
+            hand: MJCF of the hand; its world is the hand's root.
+            thing: The object.
+
+        Raises:
+            HandError: If the MJCF cannot be used.
+            MeshError: If a part of the object cannot be used.
+        """
+        self.mass = protocol.object_mass(thing.volume)
+        spec = _spec(protocol)
+        _add_hand(spec, protocol, hand)
+        if protocol.lift is not None:
+            spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=_PLANE)
+        _add_object(spec, thing, self.mass / thing.volume)
+        for geom in spec.geoms:
+            geom.friction[:2] = protocol.friction
+            geom.condim = 4
+        spec.add_key()
+
+        # The file names of the object were checked, so what is wrong here is wrong with the hand.
+        try:
+            self._model = spec.compile()
+        except ValueError as error:
+            raise HandError(f"{hand}: must be an MJCF of a hand, got {one_line(error)}") from None
+        self._data = mujoco.MjData(self._model)
+        self._object = self._model.body("object").id
+        self.modelled_mass = float(self._model.body_subtreemass[self._object])
+        self.joints = self._model.nq - 14
+        self._commands = self._command_matrix()
+
+    def _command_matrix(self) -> Array:
+        """Return the commands per joint position, (actuators, n)."""
+        m, d = self._model, self._data
+        mujoco.mj_resetDataKeyframe(m, d, 0)
+        mujoco.mj_forward(m, d)
+        matrix = np.zeros((m.nu, m.nv))
+        mujoco.mju_sparse2dense(
+            matrix, d.actuator_moment, d.moment_rownnz, d.moment_rowadr, d.moment_colind
+        )
+        return matrix[:, 6:-6]
+
+    def reset(self, posture: Array, object_pose: Array) -> None:
+        """Put hand (7 + n,) and object (7,) at rest in their poses; nothing pushes."""
+        m, d = self._model, self._data
+        m.key_qpos[0] = np.concatenate([posture, object_pose])
+        m.key_ctrl[0] = self._commands @ posture[7:]
+        m.key_qvel[0] = 0.0
+        m.key_mpos[0], m.key_mquat[0] = posture[:3], posture[3:7]
+        mujoco.mj_resetDataKeyframe(m, d, 0)
+        mujoco.mj_forward(m, d)
+
+    def move(self, start: Array, end: Array, changes: int, steps: int) -> None:
+        """Command the hand from a posture (7 + n,) to another.
+
+        Args:
+            start: Where the command begins.
+            end: Where it ends.
+            changes: How often it changes, by equal amounts.
+            steps: Time steps after each change.
+        """
+        shares = np.linspace(0.0, 1.0, changes + 1)
+        p = np.linspace(start[:3], end[:3], changes + 1)
+        ends = Rotation.from_quat(np.stack([start[3:7], end[3:7]]), scalar_first=True)
+        q = Slerp([0.0, 1.0], ends)(shares).as_quat(scalar_first=True)
+        commands = np.linspace(self._commands @ start[7:], self._commands @ end[7:], changes + 1)
+        for i in range(1, changes + 1):
+            self._data.mocap_pos[0], self._data.mocap_quat[0] = p[i], q[i]
+            self._data.ctrl[:] = commands[i]
+            mujoco.mj_forward(self._model, self._data)
+            self.step(steps)
+
+    def step(self, steps: int) -> None:
+        """Simulate time steps."""
+        mujoco.mj_step(self._model, self._data, steps)
+
+    def push(self, force: Array) -> None:
+        """Let a force (3,) [N] act on the object's centre of mass until the next reset."""
+        self._data.xfrc_applied[self._object, :3] = force
+
+    def push_where_it_is(self, force: Array) -> None:
+        """Let a force (3,) [N] act on the point where the centre of mass is now.
+
+        Its torque about the object's origin stays as it is when the object moves.
+        """
+        m, d = self._model, self._data
+        d.qfrc_applied[:] = 0.0
+        mujoco.mj_applyFT(
+            m, d, force, np.zeros(3), d.subtree_com[self._object], self._object, d.qfrc_applied
+        )
+
+    def object_pose(self) -> Array:
+        """Return position [m] and quaternion (w, x, y, z) of the object in {W}, (7,)."""
+        return self._data.qpos[-7:].copy()
+
+    def penetrations(self) -> tuple[float, float]:
+        """Return the deepest contacts of the object, and of the hand with itself or the table [m].
+
+        Nought where nothing touches.
+        """
+        bodies, d = self._model.geom_bodyid, self._data
+        with_object, others = [0.0], [0.0]
+        for contact in d.contact[: d.ncon]:
+            pair = bodies[contact.geom1], bodies[contact.geom2]
+            (with_object if self._object in pair else others).append(-contact.dist)
+        return max(with_object), max(others)
+
+
+def _spec(protocol: MujocoProtocol) -> mujoco.MjSpec:
+    """Return an empty model with the solver's settings; nothing has weight."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep = protocol.time_step
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_GRAVITY
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.noslip_iterations = protocol.noslip_iterations
+    spec.option.impratio = protocol.impratio
+    return spec
+
+
+def _read_hand(path: Path) -> mujoco.MjSpec:
+    """Return the MJCF of a hand, whose meshes have absolute paths.
+
+    Raises:
+        HandError: If it cannot be read.
+    """
+    try:
+        hand = mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise HandError(f"{path}: must be an MJCF of a hand, got {one_line(error)}") from None
+    for mesh in hand.meshes:
+        if mesh.file:
+            mesh.file = str((path.parent / hand.meshdir / mesh.file).resolve())
+    hand.meshdir = ""
+    return hand
+
+
+def _add_hand(spec: mujoco.MjSpec, protocol: MujocoProtocol, path: Path) -> None:
+    """Add the hand, free in space, and the body that moves it."""
+    hand = _read_hand(path)
+    # The protocol's settings hold, not the file's; MuJoCo warns where the two differ.
+    for name in _SETTINGS:
+        setattr(hand.option, name, getattr(spec.option, name))
+
+    # What the protocol says of contacts, joints and motors.
+    for geom in hand.geoms:
+        geom.solimp[:3], geom.solref[:2] = protocol.solimp, protocol.solref
+    for joint in hand.joints if protocol.joint_margin else ():
+        joint.margin = protocol.joint_margin
+    for actuator in hand.actuators:
+        if protocol.position_gain is not None:
+            actuator.gainprm[0], actuator.biasprm[1] = (
+                protocol.position_gain,
+                -protocol.position_gain,
+            )
+        if protocol.velocity_gain is not None:
+            actuator.biasprm[2] = -protocol.velocity_gain
+
+    root = spec.worldbody.add_frame().attach_body(hand.worldbody, HAND, "")
+    root.add_freejoint(name="hand_freejoint")
+    spec.worldbody.add_body(name="mocap_body", mocap=True)
+    weld = np.zeros(mujoco.mjNEQDATA)
+    weld[_TORQUE_SCALE] = 1.0
+    spec.add_equality(
+        type=mujoco.mjtEq.mjEQ_WELD,
+        objtype=mujoco.mjtObj.mjOBJ_BODY,
+        name1="mocap_body",
+        name2=f"{HAND}world",
+        solimp=_WELD,
+        data=weld,
+    )
+
+
+def _add_object(spec: mujoco.MjSpec, thing: ObjectFolder, density: float) -> None:
+    """Add the object, free in space, as the last body.
+
+    Raises:
+        MeshError: If a part is no mesh.
+    """
+    body = spec.worldbody.add_body(name="object")
+    body.add_freejoint(name="obj_freejoint")
+    for number, path in enumerate(thing.parts):
+        name = f"object_part_{number}"
+        _refuse_no_mesh(path)
+        spec.add_mesh(name=name, file=str(path.resolve()), scale=[thing.scale] * 3)
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, density=density)
+
+
+def _refuse_no_mesh(path: Path) -> None:
+    """Refuse a file that MuJoCo cannot read as a mesh."""
+    alone = mujoco.MjSpec()
+    alone.add_mesh(name="part", file=str(path.resolve()))
+    alone.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="part")
+    try:
+        alone.compile()
+    except ValueError as error:
+        raise MeshError(f"{path}: must be a convex part, got {one_line(error)}") from None
+
+
+def hand_digest(path: Path) -> str:
+    """Return 16 digits of the SHA-256 of an MJCF and its meshes.
+
+    Raises:
+        HandError: If the MJCF or a mesh cannot be read.
+    """
+    hand = _read_hand(path)
+    try:
+        text = hashlib.sha256(path.read_bytes())
+        for mesh in hand.meshes:
+            if mesh.file:
+                text.update(Path(mesh.file).read_bytes())
+    except OSError as error:
+        raise HandError(f"{path}: its meshes must be readable, got {one_line(error)}") from None
+    return text.hexdigest()[:16]
