@@ -22,10 +22,10 @@ import yaml
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.errors import GraspError, one_line
-from drakegrasp.exchange.plain_pickle import read_plain_pickle
 from drakegrasp.exchange.posture_rows import Rows, quaternion_poses
 from drakegrasp.frames import Array, invert_pose
 from drakegrasp.hand.description import Hand
+from drakegrasp.runtime.plain_pickle import read_plain_pickle
 from drakegrasp.yaml_text import parse_yaml
 
 #: The postures of DexGraspBench, by what they are to us.

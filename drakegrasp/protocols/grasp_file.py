@@ -6,30 +6,21 @@ numbers, texts and containers are read from it, and no code runs.
 
 from __future__ import annotations
 
-import io
-import pickle
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from drakegrasp.errors import DataError, one_line
+from drakegrasp.errors import DataError, GraspError
 from drakegrasp.frames import Array
 from drakegrasp.protocols.protocol import GraspMotion
+from drakegrasp.runtime.plain_pickle import read_plain_pickle
 
 #: Keys of the postures, in the order of `GraspMotion`.
 POSTURES = ("pregrasp_qpos", "grasp_qpos", "squeeze_qpos")
-#: A file of a grasp is some kilobytes.
-MOST_BYTES = 1_000_000
 #: A hand farther from the object is a mistake of units [m].
 FAR = 10.0
-#: What arrays are made of when they are unpickled; NumPy 1 and 2 have other names for it.
-_ARRAYS = {
-    (module, name)
-    for name in ("_reconstruct", "scalar")
-    for module in ("numpy.core.multiarray", "numpy._core.multiarray")
-} | {("numpy", "ndarray"), ("numpy", "dtype"), ("_codecs", "encode")}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -45,16 +36,6 @@ class StoredGrasp:
     motion: GraspMotion
     object_path: Path
     object_scale: float
-
-
-class _Unpickler(pickle.Unpickler):
-    """Makes arrays and nothing else."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        """Refuse what is no part of an array."""
-        if (module, name) not in _ARRAYS:
-            raise pickle.UnpicklingError(f"{module}.{name} is no array")
-        return super().find_class(module, name)
 
 
 def read_grasp_file(path: Path) -> StoredGrasp:
@@ -92,21 +73,9 @@ def read_dictionary(path: Path) -> dict[str, Any]:
         DataError: If the file has none, or other things than arrays, numbers and texts.
     """
     try:
-        with path.open("rb") as file:
-            data = file.read(MOST_BYTES + 1)
-        if len(data) > MOST_BYTES:
-            raise DataError(f"must be at most {MOST_BYTES:,} bytes, got more")
-        stream = io.BytesIO(data)
-        version = np.lib.format.read_magic(stream)
-        read = np.lib.format.read_array_header_1_0, np.lib.format.read_array_header_2_0
-        _, _, dtype = read[version[0] - 1](stream)
-        content = _Unpickler(stream).load() if dtype.hasobject else None
-    except DataError:
-        raise
-    except Exception as error:
-        raise DataError(f"must be a .npy file of a grasp, got {one_line(error)}") from None
-    if isinstance(content, np.ndarray) and content.shape == () and content.dtype == object:
-        content = content.item()
+        content = read_plain_pickle(path)
+    except GraspError as error:
+        raise DataError(str(error).removeprefix(f"{path}: ")) from None
     if not isinstance(content, dict):
         raise DataError("must be a .npy file with a dictionary, got another array")
     return content

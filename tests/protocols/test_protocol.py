@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import EDGE, HERE, box_folder, jaws
+from helpers.jaws import EDGE, HERE, box_folder, jaws
 
 from drakegrasp.errors import ConfigError
 from drakegrasp.protocols.catalog import (

@@ -7,6 +7,7 @@ before it is made.
 
 from __future__ import annotations
 
+import io
 import pickle
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -15,6 +16,8 @@ import numpy as np
 
 from drakegrasp.errors import GraspError, one_line
 
+#: Files of grasps are smaller [bytes].
+MOST_BYTES = 64_000_000
 #: All that a pickle of NumPy arrays, of NumPy 1 or 2, needs by name.
 _ALLOWED = {
     *(
@@ -42,13 +45,21 @@ def read_plain_pickle(path: Path) -> Any:
     """Return the object of a .npy file that holds one.
 
     Raises:
-        GraspError: If the file is none, or its object is of anything but plain values.
+        GraspError: If the file is none, is too large, or its object is of anything but plain
+            values.
     """
     try:
         with path.open("rb") as file:
-            shape, dtype = _header(file)
-            if dtype.hasobject and shape == ():
-                return _PlainUnpickler(file).load().item()
+            data = file.read(MOST_BYTES + 1)
+        if len(data) > MOST_BYTES:
+            raise GraspError(f"{path}: must be at most {MOST_BYTES:,} bytes, got more")
+        stream = io.BytesIO(data)
+        shape, dtype = _header(stream)
+        if dtype.hasobject and shape == ():
+            found = _PlainUnpickler(stream).load()
+            return found.item() if isinstance(found, np.ndarray) else found
+    except GraspError:
+        raise
     except pickle.UnpicklingError as error:
         raise GraspError(
             f"{path}: must hold dictionaries, texts, numbers and arrays alone, "
