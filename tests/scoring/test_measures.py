@@ -44,7 +44,8 @@ def test_the_headline_asks_for_a_sample_with_contacts_where_they_were_asked_for(
 
 
 def test_the_k_best_of_a_row_count_in_success_at_k_only() -> None:
-    one = judged("net", [["fails", "sample", "fails"], ["fails", "fails", "sample"], ["sample"] * 3])
+    rows = [["fails", "sample", "fails"], ["fails", "fails", "sample"], ["sample"] * 3]
+    one = judged("net", rows)
     found = estimates(one, grouping(0, 1, 2), DRAWS, oracle=False)
     assert found["headline"].value == pytest.approx(1 / 3, abs=1e-6)
     assert found["success@2"].value == pytest.approx(2 / 3, abs=1e-6)
