@@ -131,7 +131,8 @@ def score(request: Request, verify: Verify, folder: Path | None) -> Score:
         settings=settings,
         limit=request.config.verify.max_contact_error,
         oracle=request.config.verify.max_tries > 1,
-        new_classes=not set(grouping.classes) & _classes(request.train),
+        known_objects=len(set(grouping.names) & _texts(request.train, "object_name")),
+        new_classes=not set(grouping.classes) & _texts(request.train, "class_name"),
         benchmark=read_benchmark(request.data.path.parent, settings["versions"]),
         again=request.again,
     )
@@ -244,8 +245,8 @@ def _place(row: int, objects: Sequence[str], resting: Sequence[int]) -> tuple[st
     return objects[row], resting[row], row
 
 
-def _classes(data: GraspDataset) -> set[str]:
-    return set(data.column("object_props/class_name").tolist())
+def _texts(data: GraspDataset, name: str) -> set[str]:
+    return set(data.column(f"object_props/{name}").tolist())
 
 
 def _described(data: GraspDataset, rows: Sequence[int]) -> dict[str, Any]:

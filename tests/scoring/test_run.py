@@ -111,6 +111,13 @@ def test_without_blind_rows_a_card_says_so(data: GraspDataset) -> None:
     assert any(warning.startswith("no blind row") for warning in card["warnings"])
 
 
+def test_objects_that_were_trained_on_are_a_warning(data: GraspDataset) -> None:
+    warning = "2 test objects have names of training objects"
+    card = score(request_of(data, train=data), FakeVerify(is_own(data)), None).card
+    assert warning in card["warnings"]
+    assert warning not in score(request_of(data), FakeVerify(is_own(data)), None).card["warnings"]
+
+
 def test_own_contacts_are_those_that_are_tried(data: GraspDataset) -> None:
     placed = place_on_rows(data.column("grasps"), data)
     for each in placed:
