@@ -9,7 +9,6 @@ import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -61,14 +60,16 @@ def _draw_headline(axes: Axes, card: Mapping[str, Any], colours: Mapping[str, st
         axes.plot(value, i, "o", color=colours[name], markersize=7)
         held = 100.0 * each["measures"]["held"]["value"]
         axes.plot(held, i, "|", color=colours[name], markersize=11, markeredgewidth=1.4)
-    axes.set_yticks(range(len(card["sets"])), _names(card["sets"]))
+    axes.set_yticks(range(len(card["sets"])), [shortened(name, LONGEST) for name in card["sets"]])
+    for label, name in zip(axes.get_yticklabels(), card["sets"], strict=True):
+        label.set_color(colours[name])
     axes.set_ylim(len(card["sets"]) - 0.5, -0.5)
     axes.set_xlim(-2.0, 102.0)
     axes.grid(axis="x", color="#E3E6EA")
     axes.set_axisbelow(True)
-    axes.set_xlabel("%  of rows, mean over objects", color=INK)
+    axes.set_xlabel("per cent of rows, mean over objects", color=INK)
     axes.set_title(
-        f"Sample within {card['limit_mm']:g} mm, 95 % interval\n(bar: held anywhere)",
+        f"Sample within {card['limit_mm']:g} mm, 95 % interval\n(tick: held anywhere)",
         fontsize="medium", color=INK,
     )  # fmt: skip
 
@@ -77,14 +78,13 @@ _ENDS = ("value", "low", "high")
 
 
 def _draw_curves(axes: Axes, card: Mapping[str, Any], colours: Mapping[str, str]) -> None:
-    """Draw held(d) of each set, with its name at the end of the line where there is room."""
+    """Draw held(d) of each set, in the colour of its name in the first panel."""
     for name, each in card["sets"].items():
         curve = each["held_within_mm"]
         values = [100.0 * share for share in curve.values()]
         wide = 2.4 if name in card["headline"] else 1.5
-        label = shortened(name, LONGEST)
         limits = [float(d) for d in curve]
-        axes.plot(limits, values, color=colours[name], linewidth=wide, label=label)
+        axes.plot(limits, values, color=colours[name], linewidth=wide)
     axes.axvline(card["limit_mm"], color=INK, linewidth=0.8, linestyle=":")
     axes.set_xlim(0.0, max(float(d) for d in curve))
     axes.set_ylim(-2.0, 102.0)
@@ -92,7 +92,6 @@ def _draw_curves(axes: Axes, card: Mapping[str, Any], colours: Mapping[str, str]
     axes.set_axisbelow(True)
     axes.set_xlabel("d: largest distance of a contact from the one asked for [mm]", color=INK)
     axes.set_title("held(d) [%]", fontsize="medium", color=INK)
-    axes.legend(frameon=False, fontsize="small", labelcolor=INK)
 
 
 def _draw_calibration(
@@ -102,7 +101,7 @@ def _draw_calibration(
     for name, each in groups.items():
         stated = [group["confidence"] for group in each]
         shares = [100.0 * group["share"] for group in each]
-        axes.plot(stated, shares, "o-", color=colours[name], label=shortened(name, LONGEST))
+        axes.plot(stated, shares, "o-", color=colours[name])
         if min(stated) >= 0.0 and max(stated) <= 1.0:
             axes.plot([0.0, 1.0], [0.0, 100.0], color=INK, linewidth=0.8, linestyle=":")
     axes.set_ylim(-2.0, 102.0)
@@ -110,7 +109,6 @@ def _draw_calibration(
     axes.set_axisbelow(True)
     axes.set_xlabel("stated confidence, five groups", color=INK)
     axes.set_title("share that counts [%]", fontsize="medium", color=INK)
-    axes.legend(frameon=False, fontsize="small", labelcolor=INK)
 
 
 def _caption(figure: Figure, card: Mapping[str, Any]) -> None:
@@ -123,7 +121,3 @@ def _caption(figure: Figure, card: Mapping[str, Any]) -> None:
         f"Drake {card['settings']['versions']['drake']}"
     )
     figure.supxlabel(text, fontsize="small", color=INK)
-
-
-def _names(sets: Mapping[str, Any]) -> list[str]:
-    return [shortened(name, LONGEST) for name in np.array(list(sets)).tolist()]
