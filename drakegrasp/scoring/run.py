@@ -145,6 +145,14 @@ def score(request: Request, verify: Verify, folder: Path | None) -> Score:
 def _chosen_rows(request: Request) -> list[int]:
     """Return the rows to score, in order: those of the predictions, some of each object."""
     data, predictions = request.data, request.predictions
+    numbers = data.column("grasps").shape[1]
+    for each in predictions:
+        if each.grasps.shape[1] != numbers:
+            raise GraspError(
+                f"{each.name}: a grasp must be {numbers} numbers, got {each.grasps.shape[1]}"
+            )
+
+    # Those of the predictions; all of a method are for the same.
     rows = np.unique(predictions[0].rows) if predictions else np.arange(len(data))
     for other in predictions[1:]:
         if not np.array_equal(np.unique(other.rows), rows):

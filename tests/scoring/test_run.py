@@ -106,6 +106,11 @@ def test_predictions_for_different_rows_are_refused(data: GraspDataset) -> None:
         score(request_of(data, predictions=one + other), FakeVerify(is_own(data)), None)
 
 
+def test_grasps_of_another_hand_are_refused(data: GraspDataset) -> None:
+    with pytest.raises(GraspError, match="a grasp must be 18 numbers, got 12"):
+        score(request_of(data, np.zeros((len(data), 12))), FakeVerify(is_own(data)), None)
+
+
 def test_without_blind_rows_a_card_says_so(data: GraspDataset) -> None:
     card = score(request_of(data, references=("own",)), FakeVerify(is_own(data)), None).card
     assert any(warning.startswith("no blind row") for warning in card["warnings"])
