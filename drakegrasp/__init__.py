@@ -13,7 +13,9 @@ if TYPE_CHECKING:
     from drakegrasp.api import (
         PlacedObject,
         build_dataset,
+        make_benchmark,
         place_object,
+        score,
         verify_grasp,
         verify_grasps,
         verify_rows,
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     from drakegrasp.hand.description import Hand, load_hand
     from drakegrasp.hand.settings import load_config
     from drakegrasp.outcomes import Outcome
+    from drakegrasp.scoring.run import Score
     from drakegrasp.simulation.postures.posture import Posture, make_posture
     from drakegrasp.simulation.postures.trial import run_trial
     from drakegrasp.verification.result import PoseTrial, Verification
@@ -49,6 +52,7 @@ _HOMES = {
     "Posture": "simulation.postures.posture",
     "Replay": "build.replay",
     "Sample": "dataset.reader",
+    "Score": "scoring.run",
     "Trials": "dataset.trials",
     "Verification": "verification.result",
     "Violation": "dataset.checks.findings",
@@ -56,11 +60,13 @@ _HOMES = {
     "check_dataset": "dataset.checks.run",
     "load_config": "hand.settings",
     "load_hand": "hand.description",
+    "make_benchmark": "api",
     "make_posture": "simulation.postures.posture",
     "pack_grasp": "grasp",
     "place_object": "api",
     "replay_trial": "build.replay",
     "run_trial": "simulation.postures.trial",
+    "score": "api",
     "transform_grasp": "grasp",
     "unpack_grasp": "grasp",
     "verify_grasp": "api",
@@ -80,6 +86,7 @@ __all__ = [
     "Posture",
     "Replay",
     "Sample",
+    "Score",
     "Trials",
     "Verification",
     "Violation",
@@ -87,11 +94,13 @@ __all__ = [
     "check_dataset",
     "load_config",
     "load_hand",
+    "make_benchmark",
     "make_posture",
     "pack_grasp",
     "place_object",
     "replay_trial",
     "run_trial",
+    "score",
     "transform_grasp",
     "unpack_grasp",
     "verify_grasp",
