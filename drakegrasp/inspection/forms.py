@@ -43,6 +43,7 @@ def attempt_form(snapshot: Snapshot, query: Query, *, failures: bool) -> dict[st
     outcomes = [Outcome(int(n)).label for n in np.unique(table.outcome)]
     removals = [Removal(int(n)) for n in np.unique(table.removal) if n != NONE]
     reasons = [removal.label for removal in removals if removal is not Removal.KEPT]
+
     selects = [
         *object_fields(snapshot, query.object_name, query.class_name),
         ("outcome", "outcome", options(outcomes, query.outcome, any_="any")),
@@ -51,6 +52,7 @@ def attempt_form(snapshot: Snapshot, query: Query, *, failures: bool) -> dict[st
         ("removal", "removed by", options(reasons, query.removal)),
         ("decision", "decision", options(DECISIONS, query.decision)),
     ]
+
     titles = {name: q.title for name, q in QUANTITIES.items()} | {"row": "row of the dataset"}
     return {
         "selects": [field for field in selects if failures or field[0] != "outcome"],

@@ -109,6 +109,7 @@ def parse_query(params: Mapping[str, str]) -> Query:
         "order": ("up", "down"),
     }
     refuse_other_choices(params, choices)
+
     outcome = params.get("outcome", "") or "success"
     return Query(
         object_name=params.get("object", ""),

@@ -142,8 +142,8 @@ def make_scene(
 
 def _contacts(row: Mapping[str, Any], when: str, X_TO: Array) -> list[dict[str, Any]]:
     """Return the contacts of one instant in {T}."""
-    names = ("p_OQ", "nhat_Q_O", "f_Q_O")
-    return contacts_in_table(*(row[f"{when}_{name}"] for name in names), X_TO)
+    points, normals, forces = (row[f"{when}_{name}"] for name in ("p_OQ", "nhat_Q_O", "f_Q_O"))
+    return contacts_in_table(points, normals, forces, X_TO)
 
 
 def contacts_in_table(p_OQ: Array, nhat_Q_O: Array, f_Q_O: Array, X_TO: Array) -> list[Any]:

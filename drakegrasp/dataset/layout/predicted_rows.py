@@ -67,8 +67,12 @@ def read_predicted_rows(file: h5py.File) -> PredictedRows | None:
     """Return the rows that a file of results is about; None if it does not say so."""
     group = file.get(GROUP)
     try:
-        texts = {name: str(group.attrs[name]) for name in ("split", "camera", "shards")}
-        columns = {f.name: group[f.name][:].astype(np.int64) for f in PREDICTED_ROW_FIELDS}
+        return PredictedRows(
+            split=str(group.attrs["split"]),
+            camera=str(group.attrs["camera"]),
+            shards=str(group.attrs["shards"]),
+            row=group["row"][:].astype(np.int64),
+            trial_id=group["trial_id"][:].astype(np.int64),
+        )
     except (AttributeError, KeyError, TypeError, ValueError):
         return None
-    return PredictedRows(**texts, **columns)

@@ -74,6 +74,7 @@ def predictions_page(
     page = min(query.page, pages)
     shown = chosen if links.static else chosen[(page - 1) * PAGE : page * PAGE]
     held = int(np.count_nonzero(predictions.words["held"][chosen]))
+
     return render(
         "predictions.html",
         links,
@@ -243,6 +244,8 @@ def _cards(
     places = predictions.places[shown].tolist()
     rows = read_rows(snapshot, places, THUMBNAIL)
     verdicts = predictions.read(shown.tolist(), ON_CARDS)
+
+    # What a page without a server filters and sorts by are attributes of the card.
     for i, at, row, verdict in zip(shown.tolist(), places, rows, verdicts, strict=True):
         numbers = {name: float(values[i]) for name, values in predictions.features.items()}
         values = {
@@ -254,6 +257,8 @@ def _cards(
             "worst": f"{order[i]:.9g}",
             "row": f"{predictions.rows.row[i]}",
         }
+
+        # What the card shows.
         marks, size = _marks(predictions, verdict, row, camera), snapshot.config.camera.size
         cards.append(
             {

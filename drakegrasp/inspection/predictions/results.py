@@ -19,16 +19,11 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import norm
-from drakegrasp.dataset.layout.opening import (
-    opened,
-    read_codes,
-    refuse_first,
-    refuse_other_schema,
-)
+from drakegrasp.dataset.layout.opening import opened, read_codes, refuse_first
 from drakegrasp.dataset.layout.predicted_rows import PredictedRows, read_predicted_rows
 from drakegrasp.dataset.layout.structure import Difference
 from drakegrasp.dataset.layout.trial_files import Stamp, stamp
-from drakegrasp.dataset.schema import VERIFICATION_FIELDS, Field, Shown
+from drakegrasp.dataset.schema import VERIFICATION_FIELDS, Field, Shown, refuse_other_schema
 from drakegrasp.errors import DataError
 from drakegrasp.inspection.catalog import Snapshot
 from drakegrasp.outcomes import Outcome
@@ -52,6 +47,15 @@ QUANTITIES = {
 #: Words of a verdict on a grasp that is held; and all, to filter by.
 WORDS = ("held", "success", "precision", "stable", "sample")
 VERDICTS = ("fails", *WORDS, "held_any")
+#: Those that are columns of the file.
+_MEASURED = {
+    "contact_error": "error",
+    "normal_error": "normal_error",
+    "surface_distance": "surface",
+    "slip": "slip",
+    "turn": "turn",
+    "smallest_friction": "friction",
+}
 Bools = npt.NDArray[np.bool_]
 Array = npt.NDArray[np.float64]
 
@@ -160,23 +164,14 @@ def _read_predictions(path: Path, read_at: Stamp, snapshot: Snapshot) -> Predict
         # What the words and numbers are made of.
         told = [name for name in VERDICTS if name in group and name != "held"]
         words = {name: group[name][:] for name in told}
-        names = ("p_OQ", "contact_error", "normal_error", "surface_distance", "slip", "turn")
-        names = (*names, "smallest_friction")
-        values = {n: group[n][:] if n in group else None for n in names}
+        values = {name: group[name][:] if name in group else None for name in _MEASURED}
+        p_OQ = group["p_OQ"][:]
     held = outcome == Outcome.SUCCESS
     true = snapshot.trials[rows.trial_id.tolist()]["closed_p_OQ"]
-    features = {
-        "error": _largest(values["contact_error"], count),
-        "normal_error": _largest(values["normal_error"], count),
-        # Another hand may have another number of fingers.
-        "true_error": _largest(
-            norm(values["p_OQ"] - true) if values["p_OQ"].shape == true.shape else None, count
-        ),
-        "surface": _largest(values["surface_distance"], count),
-        "slip": _largest(values["slip"], count),
-        "turn": _largest(values["turn"], count),
-        "friction": _largest(values["smallest_friction"], count),
-    }
+    # Another hand may have another number of fingers.
+    apart = norm(p_OQ - true) if p_OQ.shape == true.shape else None
+    features = {name: _largest(values[column], count) for column, name in _MEASURED.items()}
+    features["true_error"] = _largest(apart, count)
     return Predictions(
         path=path,
         stamp=read_at,

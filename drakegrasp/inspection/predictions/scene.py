@@ -76,5 +76,5 @@ def _marks(
     points, normals, pushes = values
     if points is None or normals is None or (forces and pushes is None):
         return NO_CONTACTS
-    pushes = pushes if forces else np.zeros_like(points)
-    return [{"kind": kind, **c} for c in contacts_in_table(points, normals, pushes, X_TO)]
+    pushed = np.zeros_like(points) if pushes is None or not forces else pushes
+    return [{"kind": kind, **c} for c in contacts_in_table(points, normals, pushed, X_TO)]
