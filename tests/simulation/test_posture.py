@@ -14,6 +14,7 @@ from drakegrasp.frames import X_WT, make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.outcomes import Outcome
+from drakegrasp.simulation.drive import disengage, engage
 from drakegrasp.simulation.placement import PlacedObject
 from drakegrasp.simulation.postures.posture import (
     OPENED,
@@ -24,7 +25,13 @@ from drakegrasp.simulation.postures.posture import (
     start_of,
 )
 from drakegrasp.simulation.postures.trial import run_trial
-from drakegrasp.simulation.scene import hand_joint_names
+from drakegrasp.simulation.scene import (
+    closing_angles,
+    command_joints,
+    hand_joint_names,
+    joint_limits,
+    reset_attempt,
+)
 from drakegrasp.simulation.trial import TrialRecord, run_attempt
 
 #: A pose that no frame has.
@@ -184,6 +191,26 @@ def test_joints_with_motors_of_their_own_hold_the_cube(scene, cube, config, held
     assert pickle.dumps(run_attempt(scene, standing(cube), start, rules)) == pickle.dumps(record)
     usual = run_attempt(scene, standing(cube), from_above(cube, STANDOFF), config)
     assert pickle.dumps(usual) == pickle.dumps(held)
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_worm_of_a_joint_holds_against_the_way_of_its_motor(scene, cube, given, sign):
+    own, X_WO = scene.own_motors(), X_WT @ standing(cube)
+    half = (given.q_pregrasp + given.q_grasp) / 2.0
+    reset_attempt(own, X_WO, X_WO @ given.X_OG, spread=0.0, q=half)
+    angles = closing_angles(own)
+    command_joints(own, [0.0], [angles + 0.2 * sign])
+    engage(own, "worm")
+    try:
+        for joint, angle, limits in zip(
+            own.closing_joints, angles, own.closing_limits, strict=True
+        ):
+            held = (angle, limits[1]) if sign > 0.0 else (limits[0], angle)
+            assert joint_limits(joint) == pytest.approx(held)
+    finally:
+        disengage(own)
+    assert [joint_limits(joint) for joint in own.closing_joints] == list(own.closing_limits)
 
 
 @pytest.mark.sim
