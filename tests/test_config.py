@@ -73,6 +73,7 @@ candidates:
   local_y_deg: [0, 72]
   local_z_deg: [20]
   jitter_deg: 5
+  postures: 00c0ffee00c0ffee
   standoffs: [0.05]
   spreads_deg: [0, 90]
 screen:

@@ -420,10 +420,10 @@ TRIAL_FIELDS: tuple[Field, ...] = (
         *_LINEAGE,
         Field("posture_row", "", "float64", "-", "-",
               "row of the posture in its file; NaN for a palm pose of a sampler", some=True,
-              optional=True),
+              since=4, optional=True),
         Field("own_motors", "", "bool", "-", "-",
               "whether each joint had a motor of its own, because the posture does not follow the "
-              "couplings of the hand file", optional=True),
+              "couplings of the hand file", since=4, optional=True),
         _SPREAD,
         Field("seed", "", "uint64", "-", "-",
               "state of the candidate's random stream, from which the spread was drawn, or of the "

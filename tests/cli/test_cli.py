@@ -133,7 +133,7 @@ def test_options_of_built_in_objects_are_refused_with_other_meshes(
 
 def test_options_of_built_in_objects_are_values_of_the_configuration(tmp_path: Path) -> None:
     request = {"objects": "builtin", "out": tmp_path, "overrides": ["builtin.seed=9"], "units": "m"}
-    request |= dict.fromkeys(("config", "manifest", "quiet", "only"))
+    request |= dict.fromkeys(("config", "manifest", "quiet", "only", "postures"))
     for per_class, seed, expected in ((3, None, (3, 9)), (None, 4, (2, 4)), (None, None, (2, 9))):
         options = {**request, "per_class": per_class, "objects_seed": seed}
         config = parse_request(options).config
