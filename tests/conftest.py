@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -53,14 +55,35 @@ def small_config() -> Config:
     return load_config(overrides=SMALL)
 
 
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """Return a folder that one process of a run makes; the others wait for it, and all only read.
+
+    Args:
+        factory: Of this process.
+        name: Of the folder.
+        make: Makes it.
+    """
+    common = factory.getbasetemp()
+    common = common.parent if "PYTEST_XDIST_WORKER" in os.environ else common
+    folder, made = common / name, common / f"{name}.made"
+    with open(common / f"{name}.lock", "wb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not made.exists():
+            make(folder)
+            made.touch()
+    return folder
+
+
 @pytest.fixture(scope="session")
 def small_dataset(
     small_meshes: Path, small_config: Config, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
-    """A dataset built in this process, without Dask. Read only: copy it to change it."""
-    out = tmp_path_factory.mktemp("dataset") / "out"
-    build(find_meshes(small_meshes), out, small_config, run_here, show=False)
-    return out
+    """A dataset built in one process, without Dask. Read only: copy it to change it."""
+
+    def make(out: Path) -> None:
+        build(find_meshes(small_meshes), out, small_config, run_here, show=False)
+
+    return made_once(tmp_path_factory, "small_dataset", make)
 
 
 @pytest.fixture(scope="session")

@@ -323,7 +323,7 @@ def test_script_builds_what_a_plain_loop_builds(box: Path, tmp_path: Path) -> No
     build(find_meshes(box), tmp_path / "here", load_config(overrides=TINY), run_here, show=False)
     command = [sys.executable, PIPELINES / "submit_build.py", "--objects", box, *TINY_OPTIONS]
     out = tmp_path / "out"
-    options = ["--out", out, "--workers", "2", "--memory", "2GB"]
+    options = ["--out", out, "--workers", "1", "--memory", "2GB"]
     result = subprocess.run([*command, *options], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
     assert "2 work units simulated" in result.stdout
