@@ -17,7 +17,12 @@ def test_figures_are_written_beside_the_dataset(
     def refuse(data: object, trial_id: int | None) -> None:
         raise DataError("not in this test")
 
+    def touch(figure: object, path: Path) -> None:
+        for suffix in (".png", ".svg"):
+            path.with_suffix(suffix).touch()
+
     monkeypatch.setattr(write, "_phases", refuse)
+    monkeypatch.setattr(write, "_write", touch)
     result = run("figures", out, "--quiet")
     assert result.exit_code == 0, result.output
     assert result.stdout.splitlines() == [

@@ -89,29 +89,24 @@ def test_what_the_dataset_lacks_is_left_out(sound: Path, tmp_path: Path) -> None
     assert json.loads((folder / NUMBERS_FILE).read_text())["hold"]["held"] == 0
 
 
-@pytest.mark.usefixtures("no_render")
-def test_names_are_drawn_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of one object, whose name would be a formula, a tag, and letters that the font lacks."""
-    name = "1_$^$ <script>&\"' 碗 x" + 30 * "y"
-    monkeypatch.setattr(datasets, "BOXES", {name: ((0.06, 0.05, 0.10), "a $^$ class")})
-    out = make_dataset(tmp_path / "out", tmp_path)
-    written = write_figures(out, tmp_path / "figures")
-    assert set(written.left_out) == {"phases"}
-    for svg in (tmp_path / "figures").glob("*.svg"):
-        assert b"<script" not in svg.read_bytes()
-    assert name in json.loads((tmp_path / "figures" / NUMBERS_FILE).read_text())["objects"]
-
-
-def test_without_opengl_the_other_figures_are_drawn(
+def test_names_are_drawn_as_they_are_also_without_opengl(
     sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Of one object, whose name would be a formula, a tag, and letters that the font lacks."""
+
     def fail(*_: object) -> None:
         raise MachineError("no EGL")
 
     monkeypatch.setattr(write, "phases_figure", fail)
-    written = write_figures(sound, tmp_path / "figures")
+    name = "1_$^$ <script>&\"' 碗 x" + 30 * "y"
+    monkeypatch.setattr(datasets, "BOXES", {name: ((0.06, 0.05, 0.10), "a $^$ class")})
+    out = make_dataset(tmp_path / "out", tmp_path)
+    written = write_figures(out, tmp_path / "figures")
     assert set(written.names) == ALL - {"phases"}
     assert written.left_out == {"phases": "no EGL"}
+    for svg in (tmp_path / "figures").glob("*.svg"):
+        assert b"<script" not in svg.read_bytes()
+    assert name in json.loads((tmp_path / "figures" / NUMBERS_FILE).read_text())["objects"]
     with pytest.raises(MachineError, match="no EGL"):
         write_figures(sound, tmp_path / "asked", trial_id=0)
 
