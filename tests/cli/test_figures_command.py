@@ -18,6 +18,7 @@ def test_figures_are_written_beside_the_dataset(
         raise DataError("not in this test")
 
     def touch(figure: object, path: Path) -> None:
+        path.parent.mkdir(exist_ok=True)
         for suffix in (".png", ".svg"):
             path.with_suffix(suffix).touch()
 
