@@ -153,6 +153,18 @@ def test_a_sample_that_moved_too_far_in_the_hand_is_found(
     must_find(out / OTO, (OTO, "/train", 1, f"a sample must pass the filter {reason}"))
 
 
+@pytest.mark.parametrize(("row", "slip", "turn_deg"), [(0, 0.005, 5.0), (1, 0.010, 10.0)])
+def test_on_a_limit_rounding_finds_nothing(
+    out: Path, row: int, slip: float, turn_deg: float
+) -> None:
+    """In single precision the limit of a turn is beyond itself."""
+    limits = {"slip": slip, "turn": np.deg2rad(turn_deg)}
+    for stable in (True, False) if row == 0 else (False,):
+        for name, value in {**limits, "stable": stable}.items():
+            change(out, OTO, f"train/{GRASP}{name}", row, lambda _, v=value: v)
+        must_find(out / OTO)
+
+
 def test_a_sample_on_the_palm_is_found(out: Path) -> None:
     change(out, OTO, f"train/{GRASP}other_links_held", 1, lambda _: 1)
     for name in ("precision", "stable"):
