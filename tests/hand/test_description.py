@@ -36,6 +36,12 @@ def link_kind(name: str) -> str:
     return name.rpartition("_")[2]
 
 
+def test_barrett_has_its_published_figures(hand: Hand) -> None:
+    assert [finger.torque_limit for finger in hand.fingers] == [2.0, 2.0, 4.0]
+    assert hand.closing_speed == pytest.approx([np.pi / 3] * 3)
+    np.testing.assert_allclose(hand.X_BG[:3, 3], [0.0, 0.0, 0.07795])
+
+
 def parsed_plant(hand: Hand) -> MultibodyPlant:
     plant = MultibodyPlant(0.0)
     add_model(plant, hand.model)
