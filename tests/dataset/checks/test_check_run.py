@@ -22,6 +22,7 @@ from helpers.datasets import (
     found,
     make_dataset,
     must_find,
+    must_find_without_shards,
     set_at,
 )
 
@@ -245,15 +246,25 @@ def test_a_truncated_file_is_found_and_the_others_are_still_checked(out: Path) -
         check_dataset(out / OTM)
 
 
+def damage(path: Path, column: str) -> None:
+    """Overwrite the first bytes of a column's first chunk."""
+    with h5py.File(path) as file:
+        offset = file[column].id.get_chunk_info(0).byte_offset
+    with open(path, "r+b") as raw:
+        raw.seek(offset)
+        raw.write(b"\xff" * 64)
+
+
 @pytest.mark.parametrize("column", ["images", "object_props/work2mass"])
 def test_rows_that_cannot_be_read_are_found(out: Path, column: str) -> None:
     """Also those of a column that both data files have; they are compared with nothing."""
-    with h5py.File(out / OTO) as file:
-        offset = file[f"train/{column}"].id.get_chunk_info(0).byte_offset
-    with open(out / OTO, "r+b") as raw:
-        raw.seek(offset)
-        raw.write(b"\xff" * 64)
+    damage(out / OTO, f"train/{column}")
     must_find(out, (OTO, "/train", None, "rows 0 to 1 must be readable"))
+
+
+def test_samples_are_not_compared_with_trials_that_cannot_be_read(out: Path) -> None:
+    damage(out / TRIALS, "trials/slip")
+    must_find_without_shards(out, (TRIALS, "/trials", None, "rows 0 to 35 must be readable"))
 
 
 def test_what_is_no_dataset_is_refused(tmp_path: Path) -> None:
