@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import trimesh
+from helpers.datasets import make_dataset
 from helpers.meshes import G3DB, SMALL, write_fixed
+from helpers.objects import CUBE, box_model
 from hypothesis import settings
 
 from drakegrasp.build.pipeline import build
 from drakegrasp.config import Config
+from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.settings import load_config
+from drakegrasp.objects.model import ObjectModel
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.executor import run_here
 
@@ -48,11 +55,62 @@ def small_config() -> Config:
     return load_config(overrides=SMALL)
 
 
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """Return a folder that one process of a run makes; the others wait for it, and all only read.
+
+    Args:
+        factory: Of this process.
+        name: Of the folder.
+        make: Makes it.
+    """
+    common = factory.getbasetemp()
+    common = common.parent if "PYTEST_XDIST_WORKER" in os.environ else common
+    folder, made = common / name, common / f"{name}.made"
+    with open(common / f"{name}.lock", "wb") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not made.exists():
+            make(folder)
+            made.touch()
+    return folder
+
+
 @pytest.fixture(scope="session")
 def small_dataset(
     small_meshes: Path, small_config: Config, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
-    """A dataset built in this process, without Dask. Read only: copy it to change it."""
-    out = tmp_path_factory.mktemp("dataset") / "out"
-    build(find_meshes(small_meshes), out, small_config, run_here, show=False)
-    return out
+    """A dataset built in one process, without Dask. Read only: copy it to change it."""
+
+    def make(out: Path) -> None:
+        build(find_meshes(small_meshes), out, small_config, run_here, show=False)
+
+    return made_once(tmp_path_factory, "small_dataset", make)
+
+
+@pytest.fixture(scope="session")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset that nobody simulated: nine successes of 36 attempts on three boxes. Read only."""
+    return make_dataset(tmp_path_factory.mktemp("sound"), tmp_path_factory.mktemp("meshes"))
+
+
+@pytest.fixture
+def out(sound: Path, tmp_path: Path) -> Path:
+    """A copy of it that a test may change."""
+    return Path(shutil.copytree(sound, tmp_path / "out"))
+
+
+@pytest.fixture(scope="session")
+def config() -> Config:
+    """The defaults."""
+    return load_config()
+
+
+@pytest.fixture(scope="session")
+def hand() -> Hand:
+    """The one of the defaults."""
+    return load_hand()
+
+
+@pytest.fixture(scope="session")
+def cube(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
+    """One that the hand can grasp."""
+    return box_model(tmp_path_factory.mktemp("cube"), [CUBE] * 3)

@@ -18,7 +18,6 @@ from drakegrasp.config import (
     apply_override,
     parse_config,
     parse_stored,
-    preset_names,
     with_whole_lifts,
 )
 from drakegrasp.errors import ConfigError, DrakegraspError
@@ -274,10 +273,6 @@ def test_resolved_values_load_again_to_the_same(tmp_path: Path) -> None:
     assert parse_config(json.loads(json.dumps(config.to_dict()))) == config
 
 
-def test_presets_are_listed() -> None:
-    assert preset_names() == ["bench1", "fast", "paper", "randomized", "released"]
-
-
 def test_the_defaults_are_the_papers_numbers_but_for_the_split() -> None:
     assert load_config() == load_config()
     paper = load_config("paper")
@@ -349,11 +344,9 @@ def test_number_may_be_written_as_people_do(text: str, value: float) -> None:
         ("camara.size=64", r"camara: must be a known key \(.*\bcamera\b.*\), got an unknown one"),
         ("objects.mass=heavy", r"objects\.mass: must be a valid number.*, got 'heavy'"),
         ("objects.mass=null", r"objects\.mass: must be a valid number, got None"),
-        ("objects.mass=[1, 2]", r"objects\.mass: must be a valid number, got \[1, 2\]"),
         ("objects.mass=-1", r"objects\.mass: must be greater than 0, got -1"),
         ("objects.mass=0", r"objects\.mass: must be greater than 0, got 0"),
         ("objects.mass=.nan", r"objects\.mass: must be a finite number, got nan"),
-        ("objects.mass=.inf", r"objects\.mass: must be a finite number, got inf"),
         ("objects.min_diagonal=3", r"objects: min_diagonal must be less than .*, got 3\.0 and 2\."),
         ("physics.time_step=.nan", r"physics\.time_step: must be .*, got nan"),
         (
@@ -365,21 +358,18 @@ def test_number_may_be_written_as_people_do(text: str, value: float) -> None:
         ("objects.mass=true", r"objects\.mass: must be .*, got True"),
         ("seed=yes", r"seed: must be .*, got True"),
         ("lift.p_TG=[0, 0, .nan]", r"must be a finite number, got nan"),
-        ("lift.p_TG=[.inf,0,0]", r"must be a finite number, got inf"),
         ("filters.min_camera_height=.nan", r"must be a finite number, got nan"),
         ("seed=1.5", r"seed: must be a valid integer.*, got 1\.5"),
         ("seed=-1", r"seed: must be greater than or equal to 0, got -1"),
         ("hand=3", r"hand: must be a valid string, got 3"),
         ("max_grasps=0", r"max_grasps: must be greater than or equal to 1, got 0"),
         ("camera=3", r"camera: must be .*, got 3"),
-        ("camera=[1]", r"camera: must be .*, got \[1\]"),
         ("camera.near=0.75", r"camera: near must be less than far, got 0\.75 and 0\.75"),
         ("camera.far=0.001", r"camera: near must be less than far, got 0\.01 and 0\.001"),
         ("camera.fov_y_deg=180", r"camera\.fov_y_deg: must be less than 180, got 180"),
         ("camera.size.width=3", r"camera\.size: must be a valid integer, got \{'width': 3\}"),
         ("candidates.standoffs=[]", r"candidates\.standoffs: must be a list of at least 1, got \["),
         ("candidates.standoffs=[0.1, -1]", r"standoffs\.1: must be greater than 0, got -1"),
-        ("candidates.standoffs=0.1", r"candidates\.standoffs: must be .*, got 0\.1"),
         ("candidates.global_x_deg=[.inf]", r"global_x_deg\.0: must be a finite number, got inf"),
         ("candidates.spreads_deg=[.nan]", r"candidates\.spreads_deg\.0: must be .*, got nan"),
         ("randomize.mass=[2, 1]", r"randomize\.mass: must be a range, low .*, got \[2\.0, 1\.0\]"),
@@ -387,7 +377,6 @@ def test_number_may_be_written_as_people_do(text: str, value: float) -> None:
         ("randomize.mass=1", r"randomize\.mass: must be a list, got 1"),
         ("randomize.table_colour=2", r"table_colour: must be less than or equal to 1, got 2"),
         ("randomize.light_angle_deg=70", r"light_angle_deg: must be .* equal to 60, got 70"),
-        ("lift.p_TG=3", r"lift\.p_TG: must be .*, got 3"),
         ("lift.p_TG=[0, 0]", r"lift\.p_TG.*: must be .*, got \[0, 0\]"),
         ("lift.p_TG=[0, 0, 0, 1]", r"lift\.p_TG: must be .*, got \[0, 0, 0, 1\]"),
         ("split.valid_fraction=1", r"split\.valid_fraction: must be less than 1, got 1"),

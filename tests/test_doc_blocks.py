@@ -15,7 +15,7 @@ import pytest
 import trimesh
 import yaml
 from click.testing import CliRunner
-from helpers.datasets import BOXES, make_dataset
+from helpers.datasets import BOXES
 from helpers.meshes import write_fixed
 
 from drakegrasp.cli.main import main
@@ -187,14 +187,6 @@ def test_yaml_blocks_are_read(tmp_path: Path) -> None:
     assert sorted(kinds) == ["config", "hand", "objects"]
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset that nobody simulated."""
-    folder = tmp_path_factory.mktemp("docs")
-    (folder / "meshes").mkdir()
-    return make_dataset(folder / "out", folder / "meshes")
-
-
 def meshes(folder: Path) -> Path:
     """Write two meshes in centimetres."""
     folder.mkdir()
@@ -209,10 +201,10 @@ def meshes(folder: Path) -> Path:
     ids=lambda line: f"{LINES[line]} {line[:40]}",
 )
 def test_commands_of_the_docs_run(
-    line: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    line: str, sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    out = Path(shutil.copytree(made, tmp_path / "OUT"))
+    out = Path(shutil.copytree(sound, tmp_path / "OUT"))
     if "MESHES" in line:
         meshes(tmp_path / "MESHES")
     with h5py.File(out / "trials.hdf5") as file:

@@ -32,11 +32,6 @@ def test_unpacking_and_packing_loses_no_bit(grasp: Array) -> None:
     np.testing.assert_array_equal(pack_grasp(points, normals), grasp)
 
 
-@given(grasps)
-def test_identity_changes_nothing(grasp: Array) -> None:
-    np.testing.assert_array_equal(transform_grasp(np.eye(4), grasp), grasp)
-
-
 @given(grasps, vectors)
 def test_translation_moves_points_and_leaves_normals(grasp: Array, p_AB: Array) -> None:
     points, normals = unpack_grasp(transform_grasp(make_pose(np.eye(3), p_AB), grasp))

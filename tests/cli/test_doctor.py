@@ -210,11 +210,6 @@ def test_memory_is_the_machines_or_the_containers_whichever_is_less(
     assert doctor.check_memory() == Finding(name="memory", ok=True, what="unknown")
 
 
-def test_cores_are_those_that_the_process_may_use(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor.os, "sched_getaffinity", lambda pid: {0, 3, 5}, raising=False)
-    assert doctor.check_cores() == Finding(name="cores", ok=True, what="3")
-
-
 def test_doctor_works_where_drake_and_all_else_are_missing(tmp_path: Path) -> None:
     """It is called exactly then: it must come to its end and report."""
     code = (

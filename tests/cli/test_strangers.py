@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 from helpers.commands import run
-from helpers.datasets import OTO, TRIALS, make_dataset
+from helpers.datasets import OTO, TRIALS
 
 from drakegrasp.dataset.log import BuildLog, read_log
 from drakegrasp.dataset.reader import GraspDataset
@@ -23,18 +22,6 @@ from drakegrasp.runtime.processes import host_label
 
 #: What a terminal would obey: a title of its window, as bytes of 7 and of 8 bits.
 STEERING = "\x1b]0;x\x07\x9b31m"
-
-
-@pytest.fixture(scope="module")
-def theirs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("theirs")
-    (folder / "meshes").mkdir()
-    return make_dataset(folder / "out", folder / "meshes")
-
-
-@pytest.fixture
-def out(theirs: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(theirs, tmp_path / "out"))
 
 
 def refusal(*arguments: str | Path) -> str:

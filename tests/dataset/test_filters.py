@@ -15,10 +15,6 @@ from drakegrasp.dataset.filters import is_outlier, judge_successes
 from drakegrasp.outcomes import Removal
 
 
-def test_good_ones_are_kept() -> None:
-    assert np.all(judge_successes(good(10), FilterConfig()) == Removal.KEPT)
-
-
 @pytest.mark.parametrize(
     ("field", "value", "reason"),
     [
@@ -152,12 +148,6 @@ def test_held_asks_nothing_of_the_hold_and_the_same_of_the_contacts() -> None:
 def test_motion_that_is_unknown_is_no_sample() -> None:
     successes = replace(good(2), slip=np.array([np.nan, 0.0]))
     assert judge_successes(successes, FilterConfig()).tolist() == [Removal.SLID, Removal.KEPT]
-
-
-def test_rejected_trials_are_found_by_id() -> None:
-    assert judge_successes(good(4), FilterConfig(), rejected=[6]).tolist() == [
-        *(0, 0, Removal.REJECTED, 0)
-    ]
 
 
 @pytest.mark.parametrize("name", ["grasp_T", "held_O"])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers.datasets import make_dataset
 
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.manifest import read_manifest
@@ -55,9 +54,8 @@ def test_text_has_an_id_per_line(tmp_path: Path) -> None:
         read_rejected(path)
 
 
-def test_keys_that_are_no_success_are_left_out(tmp_path: Path) -> None:
+def test_keys_that_are_no_success_are_left_out(out: Path) -> None:
     """Of a failure, and of an object that is gone: the others count."""
-    out = make_dataset(tmp_path / "out", tmp_path)
     failure, gone = AttemptKey("1_box_a", 0, 1), AttemptKey("0_gone", 0, 0)
     path = out / "reject.json"
     write_decisions(path, Decisions(rejected=frozenset([A, failure, gone])))

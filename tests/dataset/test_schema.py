@@ -62,11 +62,6 @@ def test_letters_of_a_shape_become_lengths(
     assert np.isnan(values).all()
 
 
-def test_letter_without_a_length_is_an_error() -> None:
-    with pytest.raises(KeyError, match="k"):
-        Field("name", "k 3", "float64", "m", "O", "nothing").row_shape({"j": 4})
-
-
 def test_contact_fields_are_those_that_the_simulation_reads() -> None:
     """All but the force of the table, which no file keeps."""
     names = {field.name for field in dataclasses.fields(Contacts)}

@@ -26,7 +26,7 @@ def test_paths_run_from_the_open_hand_to_the_limit_in_small_steps(hand):
         assert np.all(steps <= path.travel + 1e-7)
 
 
-def test_points_of_a_fingertip_move_with_it(hand):
+def test_points_of_a_finger_move_with_it(hand):
     spread, k = 0.3, 120
     paths = hand_paths(hand, spread)
     for i, finger in enumerate(hand.fingers):
@@ -40,6 +40,19 @@ def test_points_of_a_fingertip_move_with_it(hand):
         assert distance.max() < 1e-6
         assert np.all(tips > corners.min(axis=0) - 1e-6)
         assert np.all(tips < corners.max(axis=0) + 1e-6)
+
+        # Its other links come after the fingertip, and no link that another finger moves.
+        (link,) = (
+            name
+            for name, chain in hand.link_chains.items()
+            if chain.gain[:, 1 + i].any() and name != finger.fingertip
+        )
+        X_GL = link_poses(hand, link, spread=spread, closing=closing)
+        corners = transform_points(X_GL, np.concatenate(link_shapes(hand)[link]))
+        others = path.points[k, path.tip :]
+        assert np.all(others > corners.min(axis=0) - 1e-6)
+        assert np.all(others < corners.max(axis=0) + 1e-6)
+        assert np.ptp(others, axis=0) == pytest.approx(np.ptp(corners, axis=0), abs=2e-3)
 
 
 def test_points_leave_no_gap_on_a_surface():

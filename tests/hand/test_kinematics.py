@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.hands import drake_fingertip_poses
 
 from drakegrasp.hand.description import Hand
-from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses, joint_positions
+from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses
 
 #: The palm's surface above the base [m]; the table below is given from there.
 PALM_SURFACE = 0.0793
@@ -58,15 +57,6 @@ def test_forward_kinematics_agrees_with_the_table(hand: Hand, row: str) -> None:
     np.testing.assert_allclose(X_BFi[:3, :3] @ N_FiV, n, atol=1e-3)
 
 
-def test_numpy_and_drake_have_the_same_forward_kinematics(hand: Hand) -> None:
-    rng = np.random.default_rng(0)
-    limits = coordinate_limits(hand)
-    for _ in range(5):
-        c = rng.uniform(limits[:, 0], limits[:, 1])
-        X_GF = fingertip_poses(hand, spread=c[0], closing=c[1:])
-        np.testing.assert_allclose(X_GF, drake_fingertip_poses(hand, c[0], c[1:]), atol=1e-9)
-
-
 def test_many_postures_are_evaluated_as_one_by_one(hand: Hand) -> None:
     rng = np.random.default_rng(1)
     spread, closing = rng.random((4, 1)), rng.random((4, 2, 3))
@@ -74,14 +64,6 @@ def test_many_postures_are_evaluated_as_one_by_one(hand: Hand) -> None:
     assert X_GF.shape == (4, 2, 3, 4, 4)
     one = fingertip_poses(hand, spread=spread[3, 0], closing=closing[3, 1])
     np.testing.assert_allclose(X_GF[3, 1], one, atol=1e-15)
-
-
-def test_distal_joints_turn_by_a_third_and_both_spread_joints_alike(hand: Hand) -> None:
-    q = joint_positions(hand, 0.4, [0.3, 0.6, 0.9])
-    assert q["finger1_spread_joint"] == q["finger2_spread_joint"] == 0.4
-    for i, angle in enumerate([0.3, 0.6, 0.9], start=1):
-        assert q[f"finger{i}_proximal_joint"] == angle
-        assert q[f"finger{i}_distal_joint"] == pytest.approx(angle / 3)
 
 
 def test_coordinate_limits_are_those_of_the_joints_that_stop_first(hand: Hand) -> None:

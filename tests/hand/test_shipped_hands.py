@@ -75,14 +75,14 @@ def test_franka_is_where_its_figures_put_it(closing: float, y: float) -> None:
     np.testing.assert_allclose(1e3 * p_BP, [[0.0, y, 103.4], [0.0, -y, 103.4]], atol=0.01)
 
 
-@pytest.mark.parametrize("name", ["allegro", "allegro_four", "franka"])
+@pytest.mark.parametrize("name", FINGERS)
 def test_kinematics_agrees_with_drake(name: str) -> None:
     hand, rng = load_hand(name), np.random.default_rng(1)
-    lower, upper = coordinate_limits(hand)[1:].T
-    for closing in rng.uniform(lower, upper, (5, hand.num_fingers)):
+    lower, upper = coordinate_limits(hand).T
+    for spread, *closing in rng.uniform(lower, upper, (5, 1 + hand.num_fingers)):
         np.testing.assert_allclose(
-            fingertip_poses(hand, spread=0.0, closing=closing),
-            drake_fingertip_poses(hand, 0.0, closing),
+            fingertip_poses(hand, spread=spread, closing=closing),
+            drake_fingertip_poses(hand, spread, np.array(closing)),
             atol=1e-12,
         )
 

@@ -63,34 +63,26 @@ def deaths_until_done(journal: Path, *faults: str) -> tuple[int, list[str]]:
     raise AssertionError("the unit must come to its end")
 
 
-@pytest.mark.parametrize(
-    ("kind", "deaths", "verdict"),
-    [
-        ("crash", NATIVE_DEATHS, Verdict.CRASHED),
-        ("abort", NATIVE_DEATHS, Verdict.CRASHED),
-        ("exit", SILENT_DEATHS, Verdict.VANISHED),
-        ("memory", SILENT_DEATHS, Verdict.VANISHED),
-        ("hang", HUNG_DEATHS, Verdict.HUNG),
-        ("freeze", HUNG_DEATHS, Verdict.HUNG),
-    ],
-)
-def test_failing_step_is_found_and_the_others_run(
-    tmp_path: Path, kind: str, deaths: int, verdict: Verdict
-) -> None:
-    found, lines = deaths_until_done(tmp_path / "journal", f"{kind}:try 4")
-    assert found == deaths
-    assert [line for line in lines if not line.endswith("runs")] == [f"try 4 {verdict.name}"]
+#: Ways to die: how often a step may, and what is said of it then.
+FATES = {
+    "crash": (NATIVE_DEATHS, Verdict.CRASHED),
+    "abort": (NATIVE_DEATHS, Verdict.CRASHED),
+    "memory": (SILENT_DEATHS, Verdict.VANISHED),
+    "hang": (HUNG_DEATHS, Verdict.HUNG),
+    "freeze": (HUNG_DEATHS, Verdict.HUNG),
+}
+
+
+def test_failing_steps_are_found_one_by_one_and_the_others_run(tmp_path: Path) -> None:
+    """Also the first step and the last one."""
+    steps = dict(zip(FATES, (0, 2, 5, 6, 9), strict=True))
+    faults = [f"{kind}:try {i}" for kind, i in steps.items()]
+    found, lines = deaths_until_done(tmp_path / "journal", *faults)
+    assert found == sum(deaths for deaths, _ in FATES.values())
+    failing = {line for line in lines if not line.endswith("runs")}
+    assert failing == {f"try {steps[kind]} {verdict.name}" for kind, (_, verdict) in FATES.items()}
     assert sorted(line.split()[1] for line in lines) == [str(i) for i in range(10)]
     assert list(tmp_path.iterdir()) == []
-
-
-def test_several_guilty_steps_are_found_one_by_one(tmp_path: Path) -> None:
-    found, lines = deaths_until_done(
-        tmp_path / "journal", "crash:try 0", "hang:try 3", "crash:try 9"
-    )
-    assert found == 2 * NATIVE_DEATHS + HUNG_DEATHS
-    failing = [line for line in lines if not line.endswith("runs")]
-    assert failing == ["try 0 CRASHED", "try 3 HUNG", "try 9 CRASHED"]
 
 
 def test_suspect_runs_first_and_is_cleared_by_passing(tmp_path: Path) -> None:

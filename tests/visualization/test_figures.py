@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 from doc_figures import find_sample, frames_figure, hero_figure
-from helpers.datasets import MISSING, make_dataset
+from helpers.datasets import MISSING
 from helpers.machine import needs_egl
 from helpers.scripts import PIPELINES
 from matplotlib.image import imread
@@ -148,19 +148,12 @@ def test_examples_of_the_docs_run(
     assert f"f = {K[0, 0]:.2f} px, c = {K[0, 2]:.1f} px" in text
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a small dataset of boxes, see `helpers.datasets`. Read only."""
-    folder = tmp_path_factory.mktemp("figures")
-    return make_dataset(folder / "out", folder / "meshes")
-
-
 @pytest.mark.sim
 @needs_egl
-def test_snapshots_show_the_hand_and_the_object(dataset: Path, tmp_path: Path) -> None:
+def test_snapshots_show_the_hand_and_the_object(sound: Path, tmp_path: Path) -> None:
     from trial_pictures import render_trial
 
-    pictures = render_trial(dataset, 0, size=(160, 120))
+    pictures = render_trial(sound, 0, size=(160, 120))
     assert [p.image.shape for p in pictures] == [(120, 160, 3)] * 3
     for picture in pictures:
         assert picture.image.std() > 5.0
@@ -168,17 +161,17 @@ def test_snapshots_show_the_hand_and_the_object(dataset: Path, tmp_path: Path) -
     np.testing.assert_array_equal(pictures[0].X_WC, pictures[1].X_WC)
     assert np.abs(pictures[0].image.astype(int) - pictures[1].image).max() > 50
     assert pictures[2].X_WC[2, 3] > pictures[1].X_WC[2, 3]
-    files = [dataset / f"grasping_{camera}.hdf5" for camera in ("oto", "otm")]
+    files = [sound / f"grasping_{camera}.hdf5" for camera in ("oto", "otm")]
     hero_figure(*files, 0, pictures, tmp_path / "hero.png")
     assert imread(tmp_path / "hero.png").shape[1] > 1000
 
 
 @pytest.mark.sim
 @needs_egl
-def test_figure_of_the_frames_has_them_all(dataset: Path, tmp_path: Path) -> None:
+def test_figure_of_the_frames_has_them_all(sound: Path, tmp_path: Path) -> None:
     from trial_pictures import frames_panels
 
-    panels = frames_panels(dataset, 0)
+    panels = frames_panels(sound, 0)
     names = [name for p in panels for name in (*(t.label for t in p.triads), *p.points, *p.arrows)]
     letters = ["W", "T", "O", "Ocm", "G", "F1", "F2", "F3", "Q1", "Q2", "Q3", "C", "I"]
     assert set(names) == set(letters)
@@ -194,14 +187,14 @@ def test_figure_of_the_frames_has_them_all(dataset: Path, tmp_path: Path) -> Non
 
 @pytest.mark.sim
 @needs_egl
-def test_chosen_view_sees_every_fingertip(dataset: Path) -> None:
+def test_chosen_view_sees_every_fingertip(sound: Path) -> None:
     from drakegrasp.frames import X_WT
     from drakegrasp.hand.description import load_hand
     from drakegrasp.simulation.construction import build_scene
     from drakegrasp.simulation.scene import hand_joint_names
     from drakegrasp.visualization.figures.trial_stages import load_trial
 
-    trial = load_trial(dataset, 0)
+    trial = load_trial(sound, 0)
     scene = build_scene(trial.model, trial.config.physics, load_hand(trial.config.hand))
     # What trials.hdf5 holds is in the order of the simulated scene.
     assert list(trial.scene.joints) == list(hand_joint_names(scene))
@@ -221,13 +214,13 @@ def test_chosen_view_sees_every_fingertip(dataset: Path) -> None:
 
 
 @pytest.mark.sim
-def test_only_lifted_trials_can_be_shown(dataset: Path) -> None:
+def test_only_lifted_trials_can_be_shown(sound: Path) -> None:
     from drakegrasp.visualization.figures.trial_stages import load_trial
 
     with pytest.raises(DataError, match="missing_fingertip"):
-        load_trial(dataset, MISSING)
+        load_trial(sound, MISSING)
     with pytest.raises(DataError, match="0 to 35"):
-        load_trial(dataset, 36)
+        load_trial(sound, 36)
 
 
 def test_figures_import_no_drake() -> None:

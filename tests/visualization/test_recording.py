@@ -16,13 +16,12 @@ import h5py
 import msgpack
 import numpy as np
 import pytest
-from helpers.objects import CUBE, box_model, from_above, standing
+from helpers.objects import CUBE, from_above, standing
 from helpers.verdicts import some_forces
 
 from drakegrasp.build.replay import record_trial
 from drakegrasp.config import Config
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.candidates import Attempt
@@ -41,16 +40,6 @@ NHAT_Q_O = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
 OBJECT, HAND, ANIMATION = b"visualizer/object/object", b"palm_plate", b"set_animation"
 #: No file is larger [bytes]; three.js alone is some two million.
 LARGEST = 5_000_000
-
-
-@pytest.fixture(scope="module")
-def config() -> Config:
-    return load_config()
-
-
-@pytest.fixture(scope="module")
-def cube(tmp_path_factory: pytest.TempPathFactory) -> ObjectModel:
-    return box_model(tmp_path_factory.mktemp("cube"), [CUBE] * 3)
 
 
 @pytest.fixture(scope="module")

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import numpy as np
-import pytest
-from helpers.datasets import SLIPPED, end_lift, make_dataset
+from helpers.datasets import SLIPPED, end_lift
 
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.card.content import card_content, content_of
@@ -21,23 +19,11 @@ from drakegrasp.dataset.paths import CARD_FILES
 from drakegrasp.outcomes import Outcome
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("card")
-    (folder / "meshes").mkdir()
-    return make_dataset(folder / "out", folder / "meshes")
-
-
-@pytest.fixture
-def dataset(made: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(made, tmp_path / "out"))
-
-
-def test_counts_are_those_of_the_files(dataset: Path) -> None:
-    counts = json.loads((dataset / CARD_FILES[0]).read_text(encoding="utf-8"))["counts"]
+def test_counts_are_those_of_the_files(out: Path) -> None:
+    counts = json.loads((out / CARD_FILES[0]).read_text(encoding="utf-8"))["counts"]
     with (
-        h5py.File(dataset / "trials.hdf5") as trials,
-        h5py.File(dataset / "grasping_otm.hdf5") as data,
+        h5py.File(out / "trials.hdf5") as trials,
+        h5py.File(out / "grasping_otm.hdf5") as data,
     ):
         names = trials["objects/name"].asstr()[:]
         index, outcome = trials["trials/object"][:], trials["trials/outcome"][:]
@@ -65,9 +51,9 @@ def test_counts_are_those_of_the_files(dataset: Path) -> None:
     }
 
 
-def test_text_has_the_counts_and_nothing_that_is_markup(dataset: Path) -> None:
-    content = card_content(dataset)
-    assert (dataset / CARD_FILES[1]).read_text(encoding="utf-8") == card_text(content)
+def test_text_has_the_counts_and_nothing_that_is_markup(out: Path) -> None:
+    content = card_content(out)
+    assert (out / CARD_FILES[1]).read_text(encoding="utf-8") == card_text(content)
     row = content["counts"]["objects"].pop("3_brick")
     content["counts"]["objects"]["<b>a|b\\|c"] = {**row, "attempts": 1234567}
     text = card_text(content)
@@ -76,89 +62,85 @@ def test_text_has_the_counts_and_nothing_that_is_markup(dataset: Path) -> None:
         assert each["limit"] in text
 
 
-def test_card_says_that_held_grasps_are_a_lower_bound(dataset: Path) -> None:
+def test_card_says_that_held_grasps_are_a_lower_bound(out: Path) -> None:
     """Where lifts were ended, and only there."""
-    assert "lower bound" not in card_text(card_content(dataset))
-    end_lift(dataset, SLIPPED, 0.02)
-    content = card_content(dataset)
+    assert "lower bound" not in card_text(card_content(out))
+    end_lift(out, SLIPPED, 0.02)
+    content = card_content(out)
     assert content["counts"]["outcomes"]["moved"] == 1
     (limit,) = [each for each in content["limits"] if "lower bound" in each["limit"]]
     assert limit["limit"].endswith("(moved): 1.")
     assert limit["docs"] == "docs/reference/outcomes.md"
 
 
-def test_limits_name_pages_that_exist(dataset: Path) -> None:
+def test_limits_name_pages_that_exist(out: Path) -> None:
     root = Path(__file__).resolve().parents[3]
-    for each in card_content(dataset)["limits"]:
+    for each in card_content(out)["limits"]:
         assert (root / each["docs"]).is_file()
 
 
-def test_the_same_dataset_has_the_same_bytes(dataset: Path) -> None:
-    before = [(dataset / name).read_bytes() for name in CARD_FILES]
-    assemble(dataset)
-    assert [(dataset / name).read_bytes() for name in CARD_FILES] == before
+def test_the_same_dataset_has_the_same_bytes(out: Path) -> None:
+    before = [(out / name).read_bytes() for name in CARD_FILES]
+    assemble(out)
+    assert [(out / name).read_bytes() for name in CARD_FILES] == before
 
 
-def test_the_rule_of_the_split_is_named(dataset: Path) -> None:
+def test_the_rule_of_the_split_is_named(out: Path) -> None:
     for rule in ("class", "object"):
-        assemble(dataset, overrides=[f"split.by={rule}"])
-        assert json.loads((dataset / CARD_FILES[0]).read_text(encoding="utf-8"))["split_by"] == rule
-        assert (
-            f"### Samples by split, which is by {rule}\n" in (dataset / CARD_FILES[1]).read_text()
-        )
+        assemble(out, overrides=[f"split.by={rule}"])
+        assert json.loads((out / CARD_FILES[0]).read_text(encoding="utf-8"))["split_by"] == rule
+        assert f"### Samples by split, which is by {rule}\n" in (out / CARD_FILES[1]).read_text()
 
 
-def test_licences_are_those_of_the_manifest(dataset: Path) -> None:
-    manifest = read_manifest(dataset)
+def test_licences_are_those_of_the_manifest(out: Path) -> None:
+    manifest = read_manifest(out)
     first, *others = manifest.objects
-    write_manifest(
-        replace(manifest, objects=(replace(first, licence="CC-BY-4.0"), *others)), dataset
-    )
-    assert read_manifest(dataset).objects[0].licence == "CC-BY-4.0"
-    assemble(dataset)
-    card = json.loads((dataset / CARD_FILES[0]).read_text(encoding="utf-8"))
+    write_manifest(replace(manifest, objects=(replace(first, licence="CC-BY-4.0"), *others)), out)
+    assert read_manifest(out).objects[0].licence == "CC-BY-4.0"
+    assemble(out)
+    card = json.loads((out / CARD_FILES[0]).read_text(encoding="utf-8"))
     assert card["licences"] == {
         "CC-BY-4.0": [first.name],
         "not stated": [entry.name for entry in others],
     }
 
 
-def test_objects_are_those_of_the_files_while_a_build_adds_some(dataset: Path) -> None:
-    before = card_content(dataset)
-    manifest = read_manifest(dataset)
+def test_objects_are_those_of_the_files_while_a_build_adds_some(out: Path) -> None:
+    before = card_content(out)
+    manifest = read_manifest(out)
     more = replace(manifest.objects[0], name="9_new", licence="MIT")
-    write_manifest(replace(manifest, objects=(*manifest.objects, more)), dataset)
-    assert card_content(dataset) == before
+    write_manifest(replace(manifest, objects=(*manifest.objects, more)), out)
+    assert card_content(out) == before
     assert before["title"] == "Simulated grasps of 3 objects"
 
 
-def test_drive_and_fingers_are_named(dataset: Path) -> None:
-    content = card_content(dataset)
+def test_drive_and_fingers_are_named(out: Path) -> None:
+    content = card_content(out)
     assert content["settings"]["lift.drive"] == "worm"
-    manifest = replace(read_manifest(dataset), fingers={"thumb": True, "ring": False})
+    manifest = replace(read_manifest(out), fingers={"thumb": True, "ring": False})
     for drive, hand, expected in (
         ("locked", "barrett", "locked"),
         (None, "/gone/my.yaml", "that of the hand file"),
     ):
         lift = manifest.config.lift.model_copy(update={"drive": drive})
         config = manifest.config.model_copy(update={"hand": hand, "lift": lift})
-        files = (dataset / "trials.hdf5", dataset / "grasping_oto.hdf5")
+        files = (out / "trials.hdf5", out / "grasping_oto.hdf5")
         content = content_of(replace(manifest, config=config), *files)
         assert content["settings"]["lift.drive"] == expected
         assert "in the order of a grasp: thumb, ring." in card_text(content)
 
 
-def test_check_finds_the_card_of_other_files(dataset: Path) -> None:
-    assert check_dataset(dataset) == []
-    path = dataset / CARD_FILES[0]
+def test_check_finds_the_card_of_other_files(out: Path) -> None:
+    assert check_dataset(out) == []
+    path = out / CARD_FILES[0]
     content = json.loads(path.read_text(encoding="utf-8"))
     content["counts"]["all"]["samples"] += 1
     for text in (json.dumps(content), "[]", "{"):
         path.write_text(text, encoding="utf-8")
-        (violation,) = check_dataset(dataset)
+        (violation,) = check_dataset(out)
         assert (violation.file, violation.what) == (
             CARD_FILES[0],
             "the data card must count what the files hold",
         )
     path.unlink()
-    assert check_dataset(dataset) == []
+    assert check_dataset(out) == []

@@ -65,27 +65,33 @@ def test_every_condition_of_a_sample_differs_from_the_others(drawn: Path) -> Non
     assert all(p["work2inertia"][0] > 0.0 for p in inertia)
 
 
-@pytest.mark.parametrize("name", [f.name for f in CONDITION_FIELDS])
+CONDITIONS = [f.name for f in CONDITION_FIELDS]
+
+
+def other_conditions(out: Path, file: str, group: str, row: int, names: list[str]) -> None:
+    for name in names:
+        # A pose stays one.
+        edit = set_at(3, to=0.5) if name == "X_C0C" else lambda v: v + v.dtype.type(1)
+        change(out, file, f"{group}/{name}", row, edit)
+
+
 @pytest.mark.parametrize("where", ["sound", "drawn"])
 def test_a_condition_that_was_not_drawn_is_found(
-    request: pytest.FixtureRequest, tmp_path: Path, where: str, name: str
+    request: pytest.FixtureRequest, tmp_path: Path, where: str
 ) -> None:
     out = Path(shutil.copytree(request.getfixturevalue(where), tmp_path / "out"))
-    # A pose stays one.
-    edit = set_at(3, to=0.5) if name == "X_C0C" else lambda v: v + v.dtype.type(1)
-    change(out, TRIALS, f"trials/{name}", BELOW, edit)
-    must_find(out, (TRIALS, "/trials", BELOW, f"{name} must follow from its shard"))
-    what = f"{name} must follow from what the seed gives the attempt"
-    must_find_without_shards(out, (TRIALS, "/trials", BELOW, what))
+    other_conditions(out, TRIALS, "trials", BELOW, CONDITIONS)
+    row = (TRIALS, "/trials", BELOW)
+    must_find(out, *((*row, f"{name} must follow from its shard") for name in CONDITIONS))
+    what = "must follow from what the seed gives the attempt"
+    must_find_without_shards(out, *((*row, f"{name} {what}") for name in CONDITIONS))
 
 
-@pytest.mark.parametrize("name", [f.name for f in CONDITION_FIELDS if f.name != "mass"])
-def test_a_condition_of_a_sample_that_is_not_its_trials_is_found(spoilt: Path, name: str) -> None:
-    edit = set_at(3, to=0.5) if name == "X_C0C" else lambda v: v + v.dtype.type(1)
-    change(spoilt, OTM, f"train/conditions/{name}", 1, edit)
-    hits = found(spoilt)
-    assert (OTM, "/train", 1, f"conditions/{name} must follow from its trial") in hits
-    assert {h[:3] for h in hits} == {(OTM, "/train", 1)}
+def test_a_condition_of_a_sample_that_is_not_its_trials_is_found(spoilt: Path) -> None:
+    names = [name for name in CONDITIONS if name != "mass"]
+    other_conditions(spoilt, OTM, "train/conditions", 1, names)
+    what = "must follow from its trial"
+    must_find(spoilt, *((OTM, "/train", 1, f"conditions/{name} {what}") for name in names))
 
 
 def test_noise_of_another_seed_is_found_as_a_wrong_depth(spoilt: Path) -> None:

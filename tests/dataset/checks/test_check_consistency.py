@@ -16,25 +16,27 @@ from drakegrasp.dataset.manifest import read_manifest, write_manifest
 from drakegrasp.outcomes import Outcome
 
 
-def test_a_sample_of_another_trial_is_found(out: Path) -> None:
+def test_what_a_sample_says_of_its_trial_and_its_object_is_checked(out: Path) -> None:
+    """Each in a sample of its own."""
     with h5py.File(out / OTO, "r+") as file, h5py.File(out / TRIALS) as trials:
         # A failure of the same object, whichever object the split has drawn.
         sample_of = trials["trials/object"][file["test/trial_id"][0]]
         failed = trials["trials/outcome"][:] == Outcome.MISSING_FINGERTIP
         same = trials["trials/object"][:] == sample_of
         file["test/trial_id"][0] = np.flatnonzero(failed & same)[0]
+        file["train/object_props/object_name"][0] = file["test/object_props/object_name"][0]
+    for name in BOTH:
+        change(out, name, "test/trial_id", 1, lambda _: 10**9)
+        change(out, name, "test/object_props/class_name", 2, lambda _: "other")
+    trial = "trial_id must follow from shards and manifest"
+    what = "must follow from its trial"
     must_find(
         out,
-        (OTO, "/test", 0, "trial_id must follow from shards and manifest"),
+        (OTO, "/test", 0, trial),
+        (OTO, "/train", 0, f"object_props/object_name {what}"),
+        *((name, "/test", 1, trial) for name in BOTH),
+        *((name, "/test", 2, f"object_props/class_name {what}") for name in BOTH),
     )
-
-
-def test_a_trial_id_out_of_range_is_found(out: Path) -> None:
-    for name in BOTH:
-        change(out, name, "test/trial_id", 0, lambda _: 10**9)
-    assert {h for h in found(out) if h[1]} == {
-        (name, "/test", 0, "trial_id must follow from shards and manifest") for name in BOTH
-    }
 
 
 def test_a_trial_in_two_splits_is_found(out: Path) -> None:
@@ -43,20 +45,7 @@ def test_a_trial_in_two_splits_is_found(out: Path) -> None:
     assert (OTO, "/valid", 0, "trial_id must be unique in all splits") in found(out / OTO)
 
 
-def test_an_object_in_two_splits_is_found(out: Path) -> None:
-    with h5py.File(out / OTO, "r+") as file:
-        file["train/object_props/object_name"][0] = file["test/object_props/object_name"][0]
-    must_find(
-        out,
-        (OTO, "/train", 0, "object_props/object_name must follow from its trial"),
-    )
-
-
-def test_classes_are_checked(out: Path) -> None:
-    for name in BOTH:
-        change(out, name, "test/object_props/class_name", 0, lambda _: "other")
-    what = "object_props/class_name must follow from its trial"
-    must_find(out, *((name, "/test", 0, what) for name in BOTH))
+def test_classes_of_an_object_are_the_same_in_all_splits(out: Path) -> None:
     with h5py.File(out / OTO, "r+") as file:
         file["train/object_props/class_name"][...] = "brick"
         file["valid/object_props/class_name"][...] = "cup"

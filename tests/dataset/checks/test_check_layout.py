@@ -67,8 +67,12 @@ LAYOUT_CASES: Mapping[str, tuple[str, Callable[[h5py.File], Any], str, str]] = {
 }
 
 
+#: What a file by itself does not show: a file of another version is refused.
+OF_DATASET = ("schema", "camera")
+
+
 @pytest.mark.parametrize("case", LAYOUT_CASES)
 def test_a_wrong_layout_or_attribute_is_found(out: Path, case: str) -> None:
     name, edit, group, what = LAYOUT_CASES[case]
     edit_file(out / name, edit)
-    must_find(out, (name, group, None, what))
+    must_find(out if case in OF_DATASET else out / name, (name, group, None, what))

@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import pickle
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from helpers.datasets import make_dataset
 
 from drakegrasp.dataset.loaders.torch_samples import TorchSamples
 from drakegrasp.dataset.paths import DATA_FILES
@@ -21,11 +21,8 @@ from torch.utils.data import DataLoader, Dataset, Subset, default_collate  # noq
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> GraspDataset:
-    folder = tmp_path_factory.mktemp("torch")
-    (folder / "meshes").mkdir()
-    out = make_dataset(folder / "out", folder / "meshes")
-    return GraspDataset(out / DATA_FILES["oto"], split="test")
+def data(sound: Path) -> GraspDataset:
+    return GraspDataset(sound / DATA_FILES["oto"], split="test")
 
 
 def test_every_field_has_its_value_and_type(data: GraspDataset) -> None:

@@ -18,10 +18,10 @@ def titles(pages: list) -> list[str]:
     return [text.get_text() for page in pages for axes in page.axes for text in axes.texts]
 
 
-def test_each_class_has_its_first_sample(boxes: Path) -> None:
-    pages, trials = class_sheets(boxes / OTO)
+def test_each_class_has_its_first_sample(sound: Path) -> None:
+    pages, trials = class_sheets(sound / OTO)
     first: dict[str, int] = {}
-    with h5py.File(boxes / OTO, "r") as file:
+    with h5py.File(sound / OTO, "r") as file:
         for split in SPLITS:
             group = file[split]
             names = group["object_props/class_name"].asstr()[:]
@@ -32,9 +32,9 @@ def test_each_class_has_its_first_sample(boxes: Path) -> None:
     assert titles(pages) == ["box", f"trial {first['box']}", "brick", f"trial {first['brick']}"]
 
 
-def test_many_classes_fill_pages(boxes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_classes_fill_pages(sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(class_sheet, "PER_PAGE", 1)
-    pages, _ = class_sheets(boxes / OTO)
+    pages, _ = class_sheets(sound / OTO)
     assert len(pages) == 2
 
 

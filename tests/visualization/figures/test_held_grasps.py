@@ -15,8 +15,8 @@ from drakegrasp.errors import DataError
 from drakegrasp.visualization.figures.held_grasps import read_approaches, read_held
 
 
-def test_every_success_is_read_once(boxes: Path) -> None:
-    held = read_held(boxes)
+def test_every_success_is_read_once(sound: Path) -> None:
+    held = read_held(sound)
     assert held.trial_ids.tolist() == [0, 3, 11, 12, 15, 23, 24, 27, 35]
     assert [int(group.sum()) for group in held.groups.values()] == [9, 9, 9]
     np.testing.assert_allclose(held.quantities["slip in the hand [mm]"], 1e3 * SLIP)
@@ -25,8 +25,8 @@ def test_every_success_is_read_once(boxes: Path) -> None:
     np.testing.assert_allclose(held.quantities["largest penetration after the lift [mm]"], 0.1)
 
 
-def test_a_file_without_successes_has_none(boxes: Path, tmp_path: Path) -> None:
-    shutil.copy(boxes / TRIALS, tmp_path)
+def test_a_file_without_successes_has_none(sound: Path, tmp_path: Path) -> None:
+    shutil.copy(sound / TRIALS, tmp_path)
     edit_file(tmp_path / TRIALS, lambda f: f["trials/outcome"].write_direct(np.full(36, 9, "u1")))
     held = read_held(tmp_path)
     assert len(held.trial_ids) == 0
@@ -38,17 +38,17 @@ def test_what_is_no_dataset_is_refused(tmp_path: Path) -> None:
         read_held(tmp_path)
 
 
-def test_approaches_are_of_one_object(boxes: Path, tmp_path: Path) -> None:
-    config = read_manifest(boxes).config
-    found = read_approaches(boxes, "2_box_b", config)
+def test_approaches_are_of_one_object(sound: Path, tmp_path: Path) -> None:
+    config = read_manifest(sound).config
+    found = read_approaches(sound, "2_box_b", config)
     assert found.attempts == 12
     assert found.groups.tolist() == [2, 2, 2]  # stable
     # All palms are tilted by 0.25 rad; the one attempt whose ray misses, row 7, approached nothing.
     np.testing.assert_allclose(found.successes[:, 2], np.cos(0.25), atol=1e-9)
-    with h5py.File(boxes / TRIALS, "r") as file:
+    with h5py.File(sound / TRIALS, "r") as file:
         palms = file["trials/X_OG"][12:24][[1, 2, 4, 5, 6, 8, 9, 10]].reshape(-1, 3, 4)
     np.testing.assert_allclose(found.directions, -palms[:, :, 2], atol=1e-9)
-    with h5py.File(boxes / TRIALS, "r") as file:
+    with h5py.File(sound / TRIALS, "r") as file:
         standoffs = np.array(config.candidates.standoffs)
         rows = file["trials/standoff_index"][12:24][[0, 3, 11]]
     lengths = np.linalg.norm(found.rays[:, 1] - found.rays[:, 0], axis=1)

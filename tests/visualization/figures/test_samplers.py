@@ -18,8 +18,8 @@ from drakegrasp.simulation.candidates import Candidates
 from drakegrasp.visualization.figures.samplers import compare_samplers, palm_rays
 
 
-def test_what_was_not_tried_has_no_successes(boxes: Path) -> None:
-    found = compare_samplers(boxes)
+def test_what_was_not_tried_has_no_successes(sound: Path) -> None:
+    found = compare_samplers(sound)
     assert found.numbers["object"] == "1_box_a"
     tried, drawn = (found.numbers["of_object"][name] for name in ("rotations", "normals"))
     assert (tried["attempts"], tried["successes"]) == (12, 3)
@@ -35,27 +35,27 @@ def test_what_was_not_tried_has_no_successes(boxes: Path) -> None:
     assert found.standoff == 0.12
 
 
-def test_objects_without_trials_are_left_out(boxes: Path, tmp_path: Path) -> None:
+def test_objects_without_trials_are_left_out(sound: Path, tmp_path: Path) -> None:
     """A build that adds meshes writes the manifest first."""
-    out = Path(shutil.copytree(boxes, tmp_path / "out"))
+    out = Path(shutil.copytree(sound, tmp_path / "out"))
     manifest = read_manifest(out)
     more = replace(manifest.objects[0], name="0_new")
     write_manifest(replace(manifest, objects=(more, *manifest.objects)), out)
-    assert compare_samplers(out).numbers == compare_samplers(boxes).numbers
+    assert compare_samplers(out).numbers == compare_samplers(sound).numbers
 
 
-def test_both_samplers_have_numbers_of_their_own_datasets(boxes: Path, tmp_path: Path) -> None:
+def test_both_samplers_have_numbers_of_their_own_datasets(sound: Path, tmp_path: Path) -> None:
     other = make_dataset(tmp_path / "other", tmp_path, "candidates.method=normals")
-    for first, second in ((boxes, other), (other, boxes)):
+    for first, second in ((sound, other), (other, sound)):
         numbers = compare_samplers(first, second).numbers
         for method in ("normals", "rotations"):
             assert numbers["of_object"][method]["attempts"] == 12
             assert numbers["of_objects"][method]["successes"] == 9
 
 
-def test_datasets_must_differ_by_the_sampler_alone(boxes: Path, tmp_path: Path) -> None:
+def test_datasets_must_differ_by_the_sampler_alone(sound: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"candidates.method=normals .* got another candidates"):
-        compare_samplers(boxes, boxes)
+        compare_samplers(sound, sound)
     for folder in (tmp_path / "a", tmp_path / "b"):
         folder.mkdir()
     rough = make_dataset(
@@ -63,10 +63,10 @@ def test_datasets_must_differ_by_the_sampler_alone(boxes: Path, tmp_path: Path) 
         "candidates.method=normals", "physics.friction_hand=0.9", "filters.max_slip=0.02",
     )  # fmt: skip
     with pytest.raises(DataError, match=r"got another physics.friction_hand$"):
-        compare_samplers(boxes, rough)
+        compare_samplers(sound, rough)
 
 
-def test_rays_end_on_the_surface(boxes: Path) -> None:
+def test_rays_end_on_the_surface(sound: Path) -> None:
     poses = np.tile(np.diag([1.0, -1.0, -1.0, 1.0]), (3, 1, 1))
     poses[:, 2, 3] = [0.3, 0.4, 0.5]
     candidates = Candidates(
@@ -86,9 +86,9 @@ def test_rays_end_on_the_surface(boxes: Path) -> None:
 
 
 def test_attempts_that_the_simulator_did_not_decide_do_not_count(
-    boxes: Path, tmp_path: Path
+    sound: Path, tmp_path: Path
 ) -> None:
-    out = Path(shutil.copytree(boxes, tmp_path / "out"))
+    out = Path(shutil.copytree(sound, tmp_path / "out"))
 
     def time_out(file: h5py.File) -> None:
         file["trials/outcome"][2] = Outcome.TIMEOUT

@@ -41,9 +41,9 @@ def no_render(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.sim
 @needs_egl
 def test_the_same_dataset_gives_the_same_bytes(
-    boxes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    written = write_figures(boxes, tmp_path / "a")
+    written = write_figures(sound, tmp_path / "a")
     assert written.left_out == {}
     assert set(written.names) == ALL
     files = contents(tmp_path / "a")
@@ -59,14 +59,14 @@ def test_the_same_dataset_gives_the_same_bytes(
 
     # The style of somebody's papers changes nothing.
     with mpl.rc_context({"font.size": 25, "axes.grid": True, "savefig.dpi": 30}):
-        write_figures(boxes, tmp_path / "b")
+        write_figures(sound, tmp_path / "b")
     again = contents(tmp_path / "b")
     assert {name for name in files if files[name] != again[name]} == set()
 
 
 @pytest.mark.usefixtures("no_render")
-def test_what_the_dataset_lacks_is_left_out(boxes: Path, tmp_path: Path) -> None:
-    out = Path(shutil.copytree(boxes, tmp_path / "out"))
+def test_what_the_dataset_lacks_is_left_out(sound: Path, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(sound, tmp_path / "out"))
     (out / OTO).unlink()
     (out / "objects" / "1_box_a.plan.h5").unlink()
     edit_file(out / TRIALS, lambda f: f["trials/outcome"].write_direct(np.full(36, 9, "u1")))
@@ -89,37 +89,32 @@ def test_what_the_dataset_lacks_is_left_out(boxes: Path, tmp_path: Path) -> None
     assert json.loads((folder / NUMBERS_FILE).read_text())["hold"]["held"] == 0
 
 
-@pytest.mark.usefixtures("no_render")
-def test_names_are_drawn_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of one object, whose name would be a formula, a tag, and letters that the font lacks."""
-    name = "1_$^$ <script>&\"' 碗 x" + 30 * "y"
-    monkeypatch.setattr(datasets, "BOXES", {name: ((0.06, 0.05, 0.10), "a $^$ class")})
-    out = make_dataset(tmp_path / "out", tmp_path)
-    written = write_figures(out, tmp_path / "figures")
-    assert set(written.left_out) == {"phases"}
-    for svg in (tmp_path / "figures").glob("*.svg"):
-        assert b"<script" not in svg.read_bytes()
-    assert name in json.loads((tmp_path / "figures" / NUMBERS_FILE).read_text())["objects"]
-
-
-def test_without_opengl_the_other_figures_are_drawn(
-    boxes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_names_are_drawn_as_they_are_also_without_opengl(
+    sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Of one object, whose name would be a formula, a tag, and letters that the font lacks."""
+
     def fail(*_: object) -> None:
         raise MachineError("no EGL")
 
     monkeypatch.setattr(write, "phases_figure", fail)
-    written = write_figures(boxes, tmp_path / "figures")
+    name = "1_$^$ <script>&\"' 碗 x" + 30 * "y"
+    monkeypatch.setattr(datasets, "BOXES", {name: ((0.06, 0.05, 0.10), "a $^$ class")})
+    out = make_dataset(tmp_path / "out", tmp_path)
+    written = write_figures(out, tmp_path / "figures")
     assert set(written.names) == ALL - {"phases"}
     assert written.left_out == {"phases": "no EGL"}
+    for svg in (tmp_path / "figures").glob("*.svg"):
+        assert b"<script" not in svg.read_bytes()
+    assert name in json.loads((tmp_path / "figures" / NUMBERS_FILE).read_text())["objects"]
     with pytest.raises(MachineError, match="no EGL"):
-        write_figures(boxes, tmp_path / "asked", trial_id=0)
+        write_figures(sound, tmp_path / "asked", trial_id=0)
 
 
-def test_what_was_asked_for_must_be_drawn(boxes: Path, tmp_path: Path) -> None:
+def test_what_was_asked_for_must_be_drawn(sound: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"candidates\.method=normals"):
-        write_figures(boxes, tmp_path, compare=boxes)
+        write_figures(sound, tmp_path, compare=sound)
     with pytest.raises(DataError, match="trial must be 0 to 35, got 36"):
-        write_figures(boxes, tmp_path, trial_id=36)
+        write_figures(sound, tmp_path, trial_id=36)
     with pytest.raises(DataError, match="must have been lifted, got below_table"):
-        write_figures(boxes, tmp_path, trial_id=2)
+        write_figures(sound, tmp_path, trial_id=2)
