@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import HERE, jaws
 from helpers.commands import error_line, run
+from helpers.jaws import HERE, jaws
 
 from drakegrasp.errors import ConfigError, DataError, HandError, MachineError, MeshError
 from drakegrasp.exchange.dexgraspbench import write_object
