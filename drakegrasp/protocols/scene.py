@@ -88,7 +88,6 @@ class ProtocolScene:
         m, d = self._model, self._data
         m.key_qpos[0] = np.concatenate([posture, object_pose])
         m.key_ctrl[0] = self._commands @ posture[7:]
-        m.key_qvel[0] = 0.0
         m.key_mpos[0], m.key_mquat[0] = posture[:3], posture[3:7]
         mujoco.mj_resetDataKeyframe(m, d, 0)
         mujoco.mj_forward(m, d)

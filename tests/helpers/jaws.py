@@ -1,4 +1,4 @@
-"""A made-up hand of two sliding jaws for MuJoCo, boxes as folders, and grasps of them."""
+"""A made-up hand of two sliding jaws, and grasps of a box between them."""
 
 from __future__ import annotations
 

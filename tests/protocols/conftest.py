@@ -1,4 +1,4 @@
-"""Fixtures of a made-up hand of two sliding jaws, see `helpers.jaws`."""
+"""The jaws and the box of helpers/jaws.py as files, and a judge of grasps."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers.jaws import EDGE, HAND, box_folder, jaws
 
 pytest.importorskip("mujoco")
-
-from helpers.jaws import EDGE, HAND, box_folder, jaws
 
 from drakegrasp.protocols.catalog import DexGraspBench
 from drakegrasp.protocols.object_folder import ObjectFolder

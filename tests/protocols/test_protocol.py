@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.jaws import EDGE, HERE, box_folder, jaws
+from helpers.jaws import EDGE, HAND, HERE, box_folder, jaws
 
 from drakegrasp.errors import ConfigError
 from drakegrasp.protocols.catalog import (
@@ -83,6 +83,18 @@ def test_deep_start_fails_at_once_if_it_is_asked(judge: Judge) -> None:
     assert deep.push is None
     assert judge(jaws(-0.011), max_penetration=None).penetration > 0.01
     assert judge(jaws(-0.011), max_penetration=None).reason != "penetration"
+
+
+def test_hand_that_begins_in_itself_fails(hand: Path, box: ObjectFolder, tmp_path: Path) -> None:
+    """Jaws of 10 mm are in the same place, the box is elsewhere."""
+    rules = DexGraspBench(max_penetration=0.005)
+    crossed = jaws(-0.025, object_pose=np.array([0.0, 0.0, 1.0, *HERE[3:]]))
+    solid = tmp_path / "hand.xml"
+    solid.write_text(HAND.replace('<exclude body1="left" body2="right"/>', ""))
+    for path, deep in ((hand, False), (solid, True)):
+        verdict = rules.run(ProtocolScene(rules, path, box), crossed)
+        assert verdict.penetration == 0.0
+        assert (verdict.reason == "penetration") == deep
 
 
 def test_directions_are_tried_in_their_order(judge: Judge) -> None:
