@@ -105,12 +105,15 @@ def _of_arrays(arrays: Mapping[str, Any]) -> Rows:
         if name not in arrays:
             raise GraspError(f"{name} must be there, got only {listed(sorted(arrays))}")
     texts = {name: _texts(arrays[name], name) for name in _TEXTS if name in arrays}
+
+    # The palm's poses, in either form.
     if "X_FG" in arrays:
         X_FG = _stacked(arrays["X_FG"], "X_FG")
     elif {"position", "quaternion"} <= set(arrays):
         X_FG = quaternion_poses(arrays["position"], arrays["quaternion"])
     else:
         raise GraspError("X_FG, or position and quaternion, must be there, got none")
+
     return Rows(
         objects=texts["object"],
         X_FL=X_FG,
@@ -196,6 +199,8 @@ def _of_columns(columns: Mapping[str, list[Any]]) -> Rows:
     place = [*("x", "y", "z"), *("qw", "qx", "qy", "qz")]
     if missing := [name for name in ("object", *place) if name not in columns]:
         raise GraspError(f"columns must include {missing[0]}, got {listed(list(columns))}")
+
+    # The joints of each stage, in the order of the grasp.
     q: dict[str, Any] = {}
     joints: list[str] | None = None
     for stage in ("grasp", "pregrasp", "squeeze"):
@@ -207,6 +212,7 @@ def _of_columns(columns: Mapping[str, list[Any]]) -> Rows:
             q[stage] = np.column_stack([_floats(columns, f"{stage}_{n}") for n in joints])
     if "grasp" not in q:
         raise GraspError("columns must include one grasp_JOINT for each joint, got none")
+
     numbers = np.column_stack([_floats(columns, name) for name in place])
     return Rows(
         objects=[str(name) for name in columns["object"]],

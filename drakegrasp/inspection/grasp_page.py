@@ -130,6 +130,8 @@ def _facts(snapshot: Snapshot, i: int, row: dict[str, Any]) -> list[tuple[str, s
     standoff = f"{1e3 * standoffs[s]:.0f} mm" if s < len(standoffs) else str(s)
     if snapshot.config.candidates.postures is not None:
         standoff = "none, a given posture"
+
+    # What no other part of the page shows.
     in_parts = {part.name for part in PARTS}
     return [
         ("palm pose, stand-off", f"{key.candidate}, {standoff}"),

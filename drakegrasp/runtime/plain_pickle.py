@@ -53,6 +53,8 @@ def read_plain_pickle(path: Path) -> Any:
             data = file.read(MOST_BYTES + 1)
         if len(data) > MOST_BYTES:
             raise GraspError(f"{path}: must be at most {MOST_BYTES:,} bytes, got more")
+
+        # One element, and that a Python object.
         stream = io.BytesIO(data)
         shape, dtype = _header(stream)
         if dtype.hasobject and shape == ():

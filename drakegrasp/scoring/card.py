@@ -87,6 +87,8 @@ def card_of(
     draws = resample(clusters)
     described = {each.name: _set_of(each, grouping, own, draws, origin.oracle) for each in sets}
     tested = [each for each in sets if each.name not in REFERENCES]
+
+    # The headline comes first: a reader of the JSON sees it without scrolling.
     card: dict[str, Any] = {
         "form": FORM,
         "headline": {each.name: described[each.name]["measures"]["headline"] for each in tested},
@@ -161,6 +163,8 @@ def _warnings(grouping: Grouping, origin: Origin, sets: Sequence[Judged]) -> lis
         found.append(f"{origin.known_objects} test objects have names of training objects")
     if not any(REFERENCES[each.name].trained for each in sets if each.name in REFERENCES):
         found.append("no blind row stands beside the score, so it says little (--train)")
+
+    # A failure of the machine counts against the grasp.
     unknown = sum(
         verdict.outcome in ("solver_error", "timeout", "crashed")
         for each in sets

@@ -133,6 +133,8 @@ def make_table(
         raise GraspError(f"frame must be one of {', '.join(TABLE_FRAMES)}, got {frame!r}")
     if (X_TC is None) == (frame == "camera"):
         raise GraspError("X_TC must be given with the frame camera, and only then")
+
+    # Numbers that every row must have, and those that a row may lack.
     where = np.zeros(count) if resting is None else _numbers(resting, (count,), "resting")
     if not np.array_equal(where, where.astype(np.int64)) or (where < 0).any():
         raise GraspError("resting must be indices of resting poses, got other numbers")
@@ -209,6 +211,7 @@ def given_candidates(
     Raises:
         GraspError: If a row is for a resting pose or a scale that the object does not have.
     """
+    # Each row must be of a pose and a scale that the object has.
     count = min(len(table), config.candidates.max)
     for i in range(count):
         place = f"postures, row {table.row[i]} ({model.name})"
@@ -223,6 +226,8 @@ def given_candidates(
                 f"{place}: scale must be that of the object, {model.scale:g} (objects.yaml states "
                 f"it), got {table.scale[i]:g}"
             )
+
+    # All palm poses in {O}.
     frames = [_frame_in_object(table, i, X_TO[table.resting[i]], X_OM) for i in range(count)]
     poses = [multiply(X_OF, X) for X_OF, X in zip(frames, table.X_FG, strict=False)]
     return Candidates(
@@ -270,6 +275,8 @@ def posture_attempts(
     """
     given = candidates.postures
     assert given is not None
+
+    # A stage that a row lacks is NaN in the plan.
     for i in indices:
         posture = Posture(
             candidates.X_OG[i],

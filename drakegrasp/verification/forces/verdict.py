@@ -79,6 +79,7 @@ class ForceVerdict:
     @property
     def reason(self) -> str:
         """Why the grasp holds or fails, in one sentence without a full stop."""
+        # The prediction may be too far off to select a contact.
         found, shares = self.contacts, self.deciding.shares
         off = int(np.argmax(found.distance))
         if found.distance[off] > MAX_DISTANCE:
@@ -93,6 +94,8 @@ class ForceVerdict:
                 f"normal {off + 1} is {np.rad2deg(found.angle[off]):.0f}° off the surface's own, "
                 f"more than {np.rad2deg(MAX_ANGLE):.0f}°"
             )
+
+        # Or the surface there cannot carry the load.
         if not np.isfinite(self.planned_share):
             return f"no forces within the surface's friction cones carry it{self._other()}"
         if self.planned_share > 1.0:
