@@ -13,7 +13,9 @@ if TYPE_CHECKING:
     from drakegrasp.api import (
         PlacedObject,
         build_dataset,
+        make_benchmark,
         place_object,
+        score,
         verify_grasp,
         verify_grasps,
         verify_rows,
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     from drakegrasp.hand.description import Hand, load_hand
     from drakegrasp.hand.settings import load_config
     from drakegrasp.outcomes import Outcome
+    from drakegrasp.scoring.run import Score
     from drakegrasp.verification.result import PoseTrial, Verification
 
 __version__ = metadata.version("drakegrasp")
@@ -46,6 +49,7 @@ _HOMES = {
     "PoseTrial": "verification.result",
     "Replay": "build.replay",
     "Sample": "dataset.reader",
+    "Score": "scoring.run",
     "Trials": "dataset.trials",
     "Verification": "verification.result",
     "Violation": "dataset.checks.findings",
@@ -53,9 +57,11 @@ _HOMES = {
     "check_dataset": "dataset.checks.run",
     "load_config": "hand.settings",
     "load_hand": "hand.description",
+    "make_benchmark": "api",
     "pack_grasp": "grasp",
     "place_object": "api",
     "replay_trial": "build.replay",
+    "score": "api",
     "transform_grasp": "grasp",
     "unpack_grasp": "grasp",
     "verify_grasp": "api",
@@ -74,6 +80,7 @@ __all__ = [
     "PoseTrial",
     "Replay",
     "Sample",
+    "Score",
     "Trials",
     "Verification",
     "Violation",
@@ -81,9 +88,11 @@ __all__ = [
     "check_dataset",
     "load_config",
     "load_hand",
+    "make_benchmark",
     "pack_grasp",
     "place_object",
     "replay_trial",
+    "score",
     "transform_grasp",
     "unpack_grasp",
     "verify_grasp",

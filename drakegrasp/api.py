@@ -31,19 +31,28 @@ from drakegrasp.dataset.manifest import claim_directory
 from drakegrasp.dataset.paths import BUILTIN_FOLDER
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import ConfigError, GraspError, MeshError, listed
-from drakegrasp.frames import as_numbers
+from drakegrasp.frames import Array, as_numbers
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.runtime.executor import count_workers, run_here
 from drakegrasp.runtime.progress import progress_bar
+from drakegrasp.scoring.benchmark import PRESET, write_objects
+from drakegrasp.scoring.ranked import ranked_sets
+from drakegrasp.scoring.references import REFERENCES
+from drakegrasp.scoring.run import Request, Score
+from drakegrasp.scoring.run import score as score_request
 from drakegrasp.shapes.catalog import builtin_sources, draw_builtin
 from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.placement import Placed, config_for
 from drakegrasp.simulation.placement import PlacedObject as ObjectOnTable
 from drakegrasp.simulation.placement import place_object as put_on_table
 from drakegrasp.verification.batch import ResultCallback, ignore_result, verify_batch
-from drakegrasp.verification.placed_grasp import place_on_object, place_on_rows
+from drakegrasp.verification.placed_grasp import (
+    dataset_config,
+    place_on_object,
+    place_on_rows,
+)
 from drakegrasp.verification.result import Verification
 from drakegrasp.verification.verify import PlacedGrasp
 
@@ -445,3 +454,120 @@ def _refuse_workers(
     if workers is not None and (scheduler or scheduler_file):
         raise ConfigError("workers must not be given with a scheduler, which has its own")
     count_workers(workers)
+
+
+def score(
+    predictions: npt.ArrayLike | str | Path | Sequence[str | Path],
+    dataset: GraspDataset,
+    *,
+    rows: Sequence[int] | None = None,
+    confidence: npt.ArrayLike | None = None,
+    train: GraspDataset | None = None,
+    references: Sequence[str] = tuple(REFERENCES),
+    per_object: int | None = None,
+    overrides: Sequence[str] = (),
+    out: str | Path | None = None,
+    again: str = "drakegrasp.score",
+    workers: int | None = None,
+    scheduler: str | None = None,
+    scheduler_file: str | Path | None = None,
+    show: bool = False,
+) -> Score:
+    """Return the score of predicted grasps beside reference rows; see docs/how-to/score.md.
+
+    Args:
+        predictions: In the frame of the rows' camera: (n, 6k), one per row, or (n, m, 6k), m per
+            row; or a file of them, or several files of one method that was trained several times.
+            An empty list scores the reference rows alone.
+        dataset: The split whose rows the predictions are for.
+        rows: With an array: (n,), the row of each; all rows, in order, if None.
+        confidence: With an array: (n,) or (n, m), greater is better.
+        train: Training rows for reference rows; the split `train` of the same file if None.
+        references: Names of the reference rows, see `scoring.references.REFERENCES`.
+        per_object: Rows of each object, at most; all if None.
+        overrides: `"key=value"` settings; `verify.max_tries` is 1 if they do not say otherwise,
+            because the headline is of the first wrist pose.
+        out: Folder that keeps verdicts, so that the same call goes on, and gets the card.
+        again: What the card says about how to make it again.
+        workers: Processes on this machine; one per core if None.
+        scheduler: Address of a running Dask scheduler to use instead.
+        scheduler_file: Its JSON file, instead of the address.
+        show: Whether to show progress on standard error.
+
+    Raises:
+        GraspError: If predictions and rows do not fit.
+        ConfigError, DataError, HandError, MachineError: As `run_verification`.
+    """
+    # What is scored, by which rules.
+    unknown = [name for name in references if name not in REFERENCES]
+    if unknown:
+        raise GraspError(f"references must be of {', '.join(REFERENCES)}, got {unknown[0]!r}")
+    settings = ("verify.max_tries=1", *overrides)
+    name, ranked = ranked_sets(predictions, dataset, rows=rows, confidence=confidence)
+    request = Request(
+        data=dataset,
+        train=GraspDataset(dataset.path, split="train") if train is None else train,
+        predictions=ranked,
+        name=name,
+        references=tuple(references),
+        per_object=per_object,
+        config=dataset_config(dataset, overrides=settings),
+        again=again,
+    )
+
+    # Its verdicts, by this process or workers, and the card.
+    def try_all(grasps: Array, chosen: Sequence[int], on_result: ResultCallback) -> object:
+        placed = place_on_rows(grasps, dataset, chosen, overrides=settings)
+        return run_verification(
+            placed,
+            workers=workers,
+            scheduler=scheduler,
+            scheduler_file=scheduler_file,
+            on_result=on_result,
+            show=show,
+        )
+
+    scored = score_request(request, try_all, None if out is None else Path(out))
+    if out is not None:
+        scored.save(Path(out))
+    return scored
+
+
+def make_benchmark(
+    out: str | Path,
+    *,
+    only: Sequence[str] = (),
+    overrides: Sequence[str] = (),
+    workers: int | None = None,
+    scheduler: str | None = None,
+    scheduler_file: str | Path | None = None,
+    show: bool = True,
+) -> BuildReport:
+    """Make the frozen benchmark `drakegrasp-bench-1`; the same as `drakegrasp bench-set`.
+
+    Args:
+        out: Directory of the benchmark, which is a dataset whose samples all test.
+        only: Names of objects, for a part of the benchmark; all if empty.
+        overrides: `"key=value"` settings that differ from the published ones; each card says so.
+        workers: Processes on this machine; one per core if None.
+        scheduler: Address of a running Dask scheduler to use instead.
+        scheduler_file: Its JSON file, instead of the address.
+        show: Whether to show progress on standard error.
+
+    Raises:
+        MeshError: If `only` names no object.
+        ConfigError, DataError, MachineError: As `build_dataset`.
+    """
+    config, folder = load_config(PRESET, list(overrides)), Path(out).absolute()
+    with progress_bar("objects", "meshes", show=show) as report:
+        meshes = write_objects(folder, config, only=only, progress=report)
+    return build_dataset(
+        meshes,
+        folder,
+        config=config,
+        only=only,
+        workers=workers,
+        scheduler=scheduler,
+        scheduler_file=scheduler_file,
+        show=show,
+    )

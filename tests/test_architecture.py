@@ -36,6 +36,7 @@ ORDER = (
     "cluster",
     "verification",
     "exchange",
+    "scoring",
     "bench",
     "api",
     "cli",
@@ -59,7 +60,7 @@ WALLS = {
         *("hand", "vision", "simulation", "visualization", "commissioning", "verification"),
         "bench",
     ),
-    "pyarrow": ("exchange",),
+    "pyarrow": ("exchange", "scoring.ranked"),
     "torch": ("dataset.loaders.torch_samples",),
 }
 #: Modules that name a type of a library for the type checker alone: what callers give or get.

@@ -276,7 +276,7 @@ def test_resolved_values_load_again_to_the_same(tmp_path: Path) -> None:
 
 
 def test_presets_are_listed() -> None:
-    assert preset_names() == ["fast", "paper", "randomized", "released"]
+    assert preset_names() == ["bench1", "fast", "paper", "randomized", "released"]
 
 
 def test_the_defaults_are_the_papers_numbers_but_for_the_split() -> None:
@@ -426,7 +426,8 @@ def test_file_that_is_no_configuration_is_refused(tmp_path: Path, text: str, mes
 @pytest.mark.parametrize("name", ["papper", "no/such.yaml", "."])
 def test_missing_file_is_refused_with_the_presets_there_are(name: str) -> None:
     with pytest.raises(
-        ConfigError, match=rf"presets fast, paper, randomized, released, got '{re.escape(name)}'"
+        ConfigError,
+        match=rf"presets bench1, fast, paper, randomized, released, got '{re.escape(name)}'",
     ):
         load_config(name)
 

@@ -168,7 +168,7 @@ def commands() -> dict[str, click.Command]:
 def command_lines(page: Path) -> Iterator[tuple[click.Command, list[str]]]:
     """Yield the commands of a page's plain code blocks with their arguments."""
     text = "\n".join(blocks(page, "")).replace("\\\n", " ")
-    for name, rest in re.findall(r"^drakegrasp ([a-z]+)(.*)", text, re.M):
+    for name, rest in re.findall(r"^drakegrasp ([a-z][a-z-]*)(.*)", text, re.M):
         yield main.commands[name], shlex.split(rest, comments=True)
     for script, rest in re.findall(r"^python pipelines/([\w/]+)\.py(.*)", text, re.M):
         command = load_script(script).main
@@ -185,7 +185,7 @@ def options_of(command: click.Command) -> set[str]:
 
 @pytest.mark.parametrize("page", DOCS, ids=page_id)
 def test_commands_and_options_in_the_docs_exist(page: Path) -> None:
-    for name in re.findall(r"`drakegrasp ([a-z]+)", read(page)):
+    for name in re.findall(r"`drakegrasp ([a-z][a-z-]*)", read(page)):
         assert name in main.commands
     for command, words in command_lines(page):
         unknown = {word for word in words if word.startswith("-")} - options_of(command)

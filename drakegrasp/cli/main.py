@@ -25,6 +25,7 @@ from drakegrasp.cli.hand import hand
 from drakegrasp.cli.inspect import figures, inspect_
 from drakegrasp.cli.morph import morph
 from drakegrasp.cli.options import PATH, chosen_settings, dataset_argument, shared
+from drakegrasp.cli.score import bench_set, score
 from drakegrasp.cli.verify import verify
 from drakegrasp.runtime.allocator import restart_with_jemalloc
 
@@ -151,13 +152,13 @@ objects.add_command(morph)
 # The help lists them in this order.
 for _command in (
     *(doctor, objects, audit, hand, build, assemble, merge, check, stats, inspect_, figures),
-    *(replay, verify, export, bench),
+    *(replay, verify, score, bench_set, export, bench),
 ):
     main.add_command(_command)
 
 
 def run() -> None:
     """Run the program; commands that may simulate in this process have jemalloc for it."""
-    if sys.argv[1:2] in (["bench"], ["verify"], ["hand"]):
+    if sys.argv[1:2] in (["bench"], ["verify"], ["score"], ["hand"]):
         restart_with_jemalloc()
     main()

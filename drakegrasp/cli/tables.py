@@ -392,6 +392,23 @@ def cross_check_lines(report: Mapping[str, Any]) -> list[str]:
     return [*lines, f"with {versions}"]
 
 
+def score_table(card: Mapping[str, Any], seconds: Mapping[str, float]) -> Table:
+    """Return the sets of a score card beside each other, with seconds per verdict."""
+    names = [name for name in card["measures"] if name != "headline"]
+    title = f"Sample, success@1, first wrist pose, mean over {card['objects']} objects [%]"
+    table = _table(title, "set", "headline", "95 %\ninterval", *names, "s per\nverdict")
+    for name, each in card["sets"].items():
+        values = each["measures"]
+        head = values["headline"]
+        cells = [
+            f"{100 * head['value']:.1f}",
+            f"{100 * head['low']:.0f} to {100 * head['high']:.0f}",
+        ]
+        cells += [f"{100 * values[measure]['value']:.0f}" for measure in names]
+        table.add_row(_safe(name), *cells, f"{seconds[name]:.2f}")
+    return table
+
+
 def _table(title: str, first: str, *numbers: str) -> Table:
     """Return an empty table: a column of names and columns of numbers, by their heads."""
     table = Table(

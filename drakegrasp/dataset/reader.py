@@ -76,6 +76,7 @@ class GraspDataset:
         camera: Camera of the images and of the grasps' frame, `oto` or `otm`.
         K: Camera matrix (3, 3) [px].
         image_size: Edge of the square images [px].
+        content: Hash that says which samples the split holds, and of which dataset.
 
     Raises:
         DataError: If the file is missing, damaged or differs from the schema, or the split is
@@ -94,7 +95,7 @@ class GraspDataset:
             self.image_size = int(file[split]["images"].shape[-1])
             self.K = np.array(file.attrs["K"])
             self.camera = str(file.attrs["camera"])
-            self._content = _content(file, split)
+            self.content = _content(file, split)
 
     def __len__(self) -> int:
         return self._length
@@ -223,7 +224,7 @@ class GraspDataset:
         # The rows of another file would be other samples.
         try:
             file = open_hdf5(self.path)
-            if _content(file, self.split) != self._content:
+            if _content(file, self.split) != self.content:
                 raise OSError("one with other samples")
         except (OSError, KeyError) as error:
             raise DataError(

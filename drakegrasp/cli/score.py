@@ -1,0 +1,178 @@
+"""`drakegrasp score` and `drakegrasp bench-set`: a score card, and the frozen benchmark."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from drakegrasp.cli.errors import say
+from drakegrasp.cli.options import FILE, PATH, shared
+
+if TYPE_CHECKING:
+    from drakegrasp.scoring.run import Score
+
+#: Where files are written if --out does not say.
+DEFAULT_FOLDER = Path("score")
+
+
+@click.command()
+@click.argument("predictions", type=FILE, metavar="[PREDICTIONS]...", nargs=-1)
+@click.option(
+    "--dataset",
+    type=PATH,
+    required=True,
+    metavar="FILE",
+    help="The data file OUT/grasping_oto.hdf5 or _otm, whose rows the predictions are for.",
+)
+@click.option(
+    "--split",
+    type=click.Choice(["train", "valid", "test"]),
+    default="test",
+    show_default=True,
+    help="Rows of the dataset.",
+)
+@click.option(
+    "--train",
+    type=PATH,
+    metavar="FILE",
+    help="Data file whose training rows give the reference rows.  [default: --dataset]",
+)
+@click.option(
+    "--reference",
+    "references",
+    multiple=True,
+    metavar="NAME",
+    help="Score these reference rows only; may be given several times: own, nearest image, "
+    "constant, random, top-down, palm normals, surface.  [default: all]",
+)
+@click.option(
+    "--per-object", type=click.IntRange(1), metavar="N", help="Rows of each object, at most."
+)
+@shared("--set")
+@click.option(
+    "--out",
+    type=PATH,
+    metavar="DIR",
+    default=DEFAULT_FOLDER,
+    show_default=True,
+    help="Folder of the card and of the verdicts; the same command goes on from there.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print the card as JSON.")
+@shared("--workers", "--scheduler", "--scheduler-file")
+@shared("--quiet", help="Show neither progress nor the table.")
+def score(
+    predictions: tuple[Path, ...],
+    dataset: Path,
+    split: str,
+    train: Path | None,
+    references: tuple[str, ...],
+    per_object: int | None,
+    overrides: tuple[str, ...],
+    out: Path,
+    as_json: bool,
+    workers: int | None,
+    scheduler: str | None,
+    scheduler_file: Path | None,
+    quiet: bool,
+) -> None:
+    """Score predicted grasps beside reference rows, and write a card.
+
+    Each of PREDICTIONS is a .npy, HDF5 or Parquet file: (n, 6k) numbers, one grasp per row of the
+    split, or (n, m, 6k), m per row, in the camera's frame. Several files are of one method that
+    was trained several times. Without any, the reference rows are scored alone.
+
+    DIR gets card.json, card.md, card.png, and the verdicts, so that an interrupted score goes on.
+    """
+    from drakegrasp.api import score as score_predictions
+    from drakegrasp.cli.tables import make_console, score_table
+    from drakegrasp.dataset.reader import GraspDataset
+    from drakegrasp.scoring.references import REFERENCES
+
+    scored = score_predictions(
+        predictions,
+        GraspDataset(dataset, split=split),
+        train=None if train is None else GraspDataset(train, split="train"),
+        references=references or tuple(REFERENCES),
+        per_object=per_object,
+        overrides=overrides,
+        out=out,
+        again=_command(predictions, dataset, split, train, references, per_object, overrides),
+        workers=workers,
+        scheduler=scheduler,
+        scheduler_file=scheduler_file,
+        show=not quiet,
+    )
+    if as_json:
+        click.echo(json.dumps(scored.card, indent=1))
+    else:
+        say_paths(scored, out)
+    if not quiet:
+        make_console(stderr=True).print(score_table(scored.card, scored.seconds))
+        for warning in scored.card["warnings"]:
+            say(f"warning: {warning}", err=True)
+
+
+def say_paths(scored: Score, out: Path) -> None:
+    """Print the headline of the predictions, and where the card is."""
+    for name, value in scored.card["headline"].items():
+        low, high = 100.0 * value["low"], 100.0 * value["high"]
+        say(f"{name}: {100.0 * value['value']:.1f} % ({low:.1f} to {high:.1f})")
+    say(str(out / "card.md"))
+
+
+def _command(
+    predictions: tuple[Path, ...],
+    dataset: Path,
+    split: str,
+    train: Path | None,
+    references: tuple[str, ...],
+    per_object: int | None,
+    overrides: tuple[str, ...],
+) -> str:
+    """Return the command that makes the card again, without what changes no verdict."""
+    words = ["drakegrasp", "score", *map(str, predictions), "--dataset", str(dataset)]
+    words += [] if split == "test" else ["--split", split]
+    words += [] if train is None else ["--train", str(train)]
+    for name in references:
+        words += ["--reference", name]
+    words += [] if per_object is None else ["--per-object", str(per_object)]
+    for text in overrides:
+        words += ["--set", text]
+    return shlex.join(words)
+
+
+@click.command("bench-set")
+@click.argument("out", type=PATH, metavar="OUT")
+@shared("--only", "--set", "--workers", "--scheduler", "--scheduler-file", "--quiet")
+def bench_set(
+    out: Path,
+    only: tuple[str, ...],
+    overrides: tuple[str, ...],
+    workers: int | None,
+    scheduler: str | None,
+    scheduler_file: Path | None,
+    quiet: bool,
+) -> None:
+    """Make the frozen benchmark drakegrasp-bench-1 in OUT.
+
+    256 built-in objects with masses and frictions of their own, all for testing. Their meshes are
+    compared with the published hashes. With --only or --set it is a part of the benchmark or
+    another one, and each card says so. The same command continues an interrupted build.
+    """
+    from drakegrasp.api import make_benchmark
+    from drakegrasp.cli.build import print_report
+
+    report = make_benchmark(
+        out,
+        only=only,
+        overrides=overrides,
+        workers=workers,
+        scheduler=scheduler,
+        scheduler_file=scheduler_file,
+        show=not quiet,
+    )
+    print_report(report)

@@ -1,0 +1,1 @@
+"""Scores of predicted grasps beside reference rows: cards, and the frozen benchmark."""

@@ -1,0 +1,151 @@
+"""The frozen benchmark `drakegrasp-bench-1`: its objects, and what a card says of it.
+
+In: a directory. Out: meshes, with masses and frictions of their own, for a build with the preset
+`bench1`; and a file that says where they differ from the published ones. All draws come from
+`seeding`, so whoever makes the benchmark gets the same objects.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Collection, Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from drakegrasp.config import Config
+from drakegrasp.dataset.manifest import differences, read_manifest
+from drakegrasp.dataset.paths import BUILTIN_FOLDER
+from drakegrasp.errors import DataError, MeshError
+from drakegrasp.hand.settings import load_config
+from drakegrasp.objects.sources import MANIFEST_NAME
+from drakegrasp.runtime.files import write_atomic
+from drakegrasp.runtime.json_text import read_json
+from drakegrasp.runtime.progress import Report, silent
+from drakegrasp.seeding import Stream, object_key
+from drakegrasp.shapes.catalog import LICENCE, BuiltinObject, draw_builtin, wavefront
+from drakegrasp.shapes.classes import CLASSES
+
+NAME, PRESET = "drakegrasp-bench-1", "bench1"
+#: Masses [kg] and friction coefficients that the objects draw from.
+MASSES = (0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
+FRICTIONS = (0.3, 0.5, 0.71)
+#: Classes that no training set may have, and the seed that chooses them.
+NEW_CLASSES, SEED = 16, 20261
+#: What a benchmark says of itself, beside its meshes.
+FILE_NAME = "benchmark.json"
+#: Digits of the published hashes of the meshes.
+HASH_DIGITS = 16
+
+
+def new_classes() -> list[str]:
+    """Return the classes that no training set may have, sorted."""
+    order = Stream(SEED, object_key(NAME)).permutation(len(CLASSES))
+    return sorted(CLASSES[i].name for i in order[:NEW_CLASSES])
+
+
+def published() -> dict[str, Any]:
+    """Return what is published of the benchmark: versions, and a hash of each object's mesh."""
+    text = resources.files("drakegrasp.scoring").joinpath("bench1.json").read_text("utf-8")
+    found: dict[str, Any] = json.loads(text)
+    return found
+
+
+def material_of(item: BuiltinObject) -> tuple[float, float]:
+    """Return mass [kg] and friction coefficient of an object.
+
+    The objects of a class go through the coefficients in turn, from one that is drawn; so each
+    coefficient has a third of the objects, of all classes.
+    """
+    mass = Stream(SEED, object_key(NAME), object_key(item.name)).integers(len(MASSES), 1)[0]
+    start = Stream(SEED, object_key(NAME), object_key(item.object_class.name)).integers(3, 1)[0]
+    return MASSES[int(mass)], FRICTIONS[int(start + item.index) % len(FRICTIONS)]
+
+
+def write_objects(
+    out: Path, config: Config, *, only: Collection[str] = (), progress: Report = silent
+) -> Path:
+    """Write the objects of the benchmark and return their folder.
+
+    Args:
+        out: Directory of the benchmark.
+        config: The preset, or a smaller one, e.g. in tests.
+        only: Names of the objects; all if empty.
+        progress: Is told how many meshes there are.
+
+    Raises:
+        MeshError: If `only` names no object.
+        OSError: If the files cannot be written.
+    """
+    # Which objects.
+    items = {item.name: item for item in draw_builtin(config.builtin)}
+    unknown = sorted(set(only) - items.keys())
+    if unknown:
+        raise MeshError(f"only must be names of objects of {NAME}, got {unknown[0]!r}")
+    chosen = [item for name, item in items.items() if not only or name in only]
+
+    # Their meshes, compared with the published ones.
+    folder, known, differ = out / BUILTIN_FOLDER, published(), list[str]()
+    folder.mkdir(parents=True, exist_ok=True)
+    said: dict[str, Any] = {}
+    for done, item in enumerate(chosen, start=1):
+        content = wavefront(item.build())
+        digest = hashlib.sha256(content).hexdigest()[:HASH_DIGITS]
+        if known["objects"].get(item.name) != digest:
+            differ.append(item.name)
+        write_atomic(folder / f"{item.name}.obj", content)
+        mass, friction = material_of(item)
+        said[item.name] = {"mass": mass, "friction": friction}
+        progress(done, len(chosen))
+
+    # What is said of them.
+    text = yaml.safe_dump({"units": "m", "licence": LICENCE, "objects": said}, sort_keys=True)
+    write_atomic(folder / MANIFEST_NAME, text.encode())
+    about = {
+        "name": NAME,
+        "objects": len(chosen),
+        "of": len(known["objects"]),
+        "different_meshes": differ,
+        "new_classes": new_classes(),
+    }
+    write_atomic(folder / FILE_NAME, (json.dumps(about, indent=1) + "\n").encode())
+    return folder
+
+
+def read_benchmark(out: Path, versions: Mapping[str, str]) -> dict[str, Any] | None:
+    """Return what the benchmark in a directory says of itself; None if it is another dataset.
+
+    Args:
+        out: The directory.
+        versions: Of the packages that try the grasps; those that are not the published ones are in
+            what is returned, because simulated values may then differ.
+
+    Raises:
+        DataError: If its file is damaged.
+    """
+    path = out / BUILTIN_FOLDER / FILE_NAME
+    if not path.is_file():
+        return None
+    try:
+        found = read_json(path)
+        whole = found["objects"] == found["of"] and not found["different_meshes"]
+        config = read_manifest(out).config
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path}: must be the file of a benchmark, got another: {error}") from None
+
+    # What differs from the published benchmark.
+    stated, preset = published()["versions"], load_config(PRESET)
+    other = differences(preset, config, ignored=("verify", "attempt_seconds"))
+    return {
+        **found,
+        "frozen": bool(whole and not other),
+        "other_settings": other,
+        "other_versions": {
+            name: f"{versions.get(name)}, published with {version}"
+            for name, version in stated.items()
+            if versions.get(name) != version
+        },
+    }

@@ -1,0 +1,284 @@
+"""The card of a score: everything that another person needs to compare with it, or to run it again.
+
+In: the judged sets and where they come from. Out: plain JSON types, and the same as Markdown. No
+time and no number of workers is in it, so equal verdicts give equal cards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from drakegrasp.frames import Array
+from drakegrasp.scoring.bootstrap import LEVEL, RESAMPLES, Resampling, resample
+from drakegrasp.scoring.measures import (
+    COVER,
+    CURVE_MM,
+    Grouping,
+    Judged,
+    by_class,
+    by_object,
+    calibration,
+    coverage,
+    curve,
+    difference,
+    diversity,
+    estimates,
+    penetration,
+)
+from drakegrasp.scoring.references import REFERENCES
+
+#: Name of the card's form.
+FORM = "drakegrasp-score-1"
+#: With fewer test objects a warning is on the card.
+FEW_OBJECTS = 20
+#: What the measures are, in the order of a table.
+MEANINGS = {
+    "headline": "a sample, held by the first wrist pose with every contact within d; best-ranked "
+    "prediction of each row; mean over objects",
+    "success": "held by the first wrist pose with every contact within d",
+    "sample": "all rules of a sample, wherever the fingertips touch",
+    "held": "held by the first wrist pose, wherever the fingertips touch",
+    "precision": "held by the fingertips alone",
+    "stable": "a precision grasp that moves less than 5 mm and 5 degrees",
+    "held_any": "any of at most five wrist poses holds: an oracle chose among them",
+    "objects": "objects with a row that counts in the headline",
+}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Origin:
+    """Where a score comes from.
+
+    Attributes:
+        dataset: What was scored on: file, split, hashes, rows.
+        settings: All that decides a verdict, with the versions.
+        limit: d, the largest distance between asked and reached contacts [m].
+        oracle: Whether more wrist poses than the first were tried.
+        known_objects: Scored objects whose names are in the training split.
+        new_classes: Whether no class of the scored objects is in the training split.
+        benchmark: What the frozen benchmark says of itself; None for another dataset.
+        again: The command that makes the card again.
+    """
+
+    dataset: Mapping[str, Any]
+    settings: Mapping[str, Any]
+    limit: float
+    oracle: bool
+    known_objects: int
+    new_classes: bool
+    benchmark: Mapping[str, Any] | None
+    again: str
+
+
+def card_of(
+    sets: Sequence[Judged], grouping: Grouping, own: Mapping[int, Array], origin: Origin
+) -> dict[str, Any]:
+    """Return the card.
+
+    Args:
+        sets: The predictions if there are any, then the reference rows.
+        grouping: Of the scored rows.
+        own: By row (3k,), contact points of its own grasp in {O} [m].
+        origin: Where the score comes from.
+    """
+    # What is drawn, and each set; all sets share the draws.
+    clusters = grouping.classes if origin.new_classes else grouping.names
+    draws = resample(clusters)
+    described = {each.name: _set_of(each, grouping, own, draws, origin.oracle) for each in sets}
+    tested = [each for each in sets if each.name not in REFERENCES]
+
+    card: dict[str, Any] = {
+        "form": FORM,
+        "headline": {each.name: described[each.name]["measures"]["headline"] for each in tested},
+        "measures": {k: v for k, v in MEANINGS.items() if k != "held_any" or origin.oracle},
+        "limit_mm": round(1e3 * origin.limit, 3),
+        "rows": len(grouping.rows),
+        "objects": len(grouping.names),
+        "classes": len(set(grouping.classes)),
+        "intervals": {
+            "level": LEVEL,
+            "resamples": RESAMPLES,
+            "drawn": "classes" if origin.new_classes else "objects",
+            "training_seeds": max((len(each.ranked) for each in tested), default=0),
+        },
+        "warnings": _warnings(grouping, origin, sets),
+        "sets": described,
+        "above": {
+            one.name: {
+                other.name: asdict(difference(one, other, grouping, draws))
+                for other in sets
+                if other is not one
+            }
+            for one in tested
+        },
+        "by_class": {each.name: by_class(each, grouping) for each in sets},
+        "by_object": {each.name: by_object(each, grouping) for each in sets},
+        "dataset": dict(origin.dataset),
+        "settings": dict(origin.settings),
+        "again": origin.again,
+    }
+    return card if origin.benchmark is None else card | {"benchmark": dict(origin.benchmark)}
+
+
+def _set_of(
+    judged: Judged,
+    grouping: Grouping,
+    own: Mapping[int, Array],
+    draws: Resampling,
+    oracle: bool,
+) -> dict[str, Any]:
+    """Return what the card says of a set."""
+    verdicts = [verdict for each in judged.verdicts for verdict in each]
+    outcomes = sorted({v.outcome for v in verdicts})
+    reference = REFERENCES.get(judged.name)
+    measured = estimates(judged, grouping, draws, oracle=oracle)
+    return {
+        "what": reference.words if reference else "predictions",
+        "files": [{"name": r.name, "sha256": r.sha256} for r in judged.ranked],
+        "predictions": len(verdicts),
+        "measures": {name: asdict(value) for name, value in measured.items()},
+        "held_within_mm": dict(zip(map(str, CURVE_MM), curve(judged, grouping), strict=True)),
+        "penetration": penetration(judged),
+        "diversity": diversity(judged),
+        "coverage": coverage(judged, own, grouping),
+        "calibration": calibration(judged),
+        "outcomes": {name: sum(v.outcome == name for v in verdicts) for name in outcomes},
+    }
+
+
+def _warnings(grouping: Grouping, origin: Origin, sets: Sequence[Judged]) -> list[str]:
+    """Return what a reader must know before comparing."""
+    found = []
+    if len(grouping.names) < FEW_OBJECTS:
+        found.append(
+            f"only {len(grouping.names)} test objects: intervals of fewer than {FEW_OBJECTS} are "
+            "too narrow, and an order of methods may not last"
+        )
+    total = origin.dataset["split_rows"]
+    if len(grouping.rows) < total:
+        found.append(f"{len(grouping.rows)} of the {total} rows of the split were scored")
+    if origin.known_objects:
+        found.append(f"{origin.known_objects} test objects have names of training objects")
+    if not any(REFERENCES[each.name].trained for each in sets if each.name in REFERENCES):
+        found.append("no blind row stands beside the score, so it says little (--train)")
+
+    # Verdicts that say nothing about the grasp.
+    unknown = sum(
+        verdict.outcome in ("solver_error", "timeout", "crashed")
+        for each in sets
+        for verdicts in each.verdicts
+        for verdict in verdicts
+    )
+    if unknown:
+        found.append(f"{unknown} predictions have no verdict (solver error, timeout): they fail")
+    return found
+
+
+# Markdown
+
+
+def card_text(card: Mapping[str, Any]) -> str:
+    """Return a card as Markdown."""
+    lines = ["# Score of predicted grasps", ""]
+    for name, value in card["headline"].items():
+        lines += [f"**{name}: {_interval(value)}** sample, success@1, first wrist pose, mean over "
+                  f"{card['objects']} objects ({card['rows']} rows).", ""]  # fmt: skip
+    lines += [f"> Warning: {warning}." for warning in card["warnings"]]
+    lines += [""] if card["warnings"] else []
+
+    # The sets beside each other.
+    lines += _table(card, [name for name in card["measures"] if name != "objects"])
+    drawn, level = card["intervals"]["drawn"], card["intervals"]["level"]
+    lines += [
+        "",
+        f"Per cent; intervals of {level:.0%} by a paired bootstrap over {drawn}. A contact must be "
+        f"within {card['limit_mm']:g} mm of the one asked for in the first two columns.",
+        "",
+        *(f"* `{name}`: {words}" for name, words in card["measures"].items()),
+        "",
+    ]
+    lines += _more(card)
+
+    # By class.
+    names = list(card["sets"])
+    lines += ["## By class", "", _row(["class", *names]), _row(["---"] * (len(names) + 1))]
+    for name in next(iter(card["by_class"].values())):
+        lines.append(_row([name, *(_percent(card["by_class"][each][name]) for each in names)]))
+    return "\n".join([*lines, "", *_origin(card)]) + "\n"
+
+
+def _table(card: Mapping[str, Any], measures: Sequence[str]) -> list[str]:
+    head = ["set", *measures, "objects", "predictions"]
+    lines = [_row(head), _row(["---"] * len(head))]
+    for name, each in card["sets"].items():
+        values = each["measures"]
+        cells = [_interval(values[m]) if m == "headline" else _percent(values[m]["value"])
+                 for m in (*measures, "objects")]  # fmt: skip
+        lines.append(_row([name, *cells, str(each["predictions"])]))
+    return lines
+
+
+def _more(card: Mapping[str, Any]) -> list[str]:
+    """Return the lines on what stands beside the headline."""
+    # The curve, and what is told of what counts.
+    names = card["sets"]
+    lines = ["## held(d)", "", "Held with every contact within d of the one asked for [%].", ""]
+    lines += [_row(["d [mm]", *names]), _row(["---"] * (len(names) + 1))]
+    for limit in map(str, CURVE_MM):
+        cells = [_percent(each["held_within_mm"][limit]) for each in names.values()]
+        lines.append(_row([limit, *cells]))
+    lines += ["", "## Beside it", ""]
+    lines += [_row(["set", "penetration [mm]", "coverage [%]", "diversity"]), _row(["---"] * 4)]
+    for name, each in names.items():
+        depth = "-" if each["penetration"] is None else f"{1e3 * each['penetration']:.2f}"
+        variance = "-" if each["diversity"] is None else " ".join(
+            _percent(share) for share in each["diversity"]
+        )  # fmt: skip
+        lines.append(_row([name, depth, _percent(each["coverage"]), variance]))
+    lines += [
+        "",
+        f"Coverage: share of own grasps within {1e3 * COVER:g} mm of a prediction that counts. "
+        "Diversity: per cent of variance in the first one to five principal components of palm and "
+        "joints; lower is more diverse.",
+        "",
+    ]
+
+    # Several predictions per row, and stated confidence.
+    for name, each in names.items():
+        more = {m: v for m, v in each["measures"].items() if m.startswith("success@")}
+        lines += [f"* {name}, {measure}: {_interval(value)}" for measure, value in more.items()]
+        for group in each["calibration"]:
+            lines.append(
+                f"* {name}, confidence {group['confidence']:.3g}: {_percent(group['share'])} of "
+                f"{group['count']}"
+            )
+    for name, others in card["above"].items():
+        for other, value in others.items():
+            lines.append(f"* {name} above {other}: {_interval(value)}")
+    return [*lines, ""]
+
+
+def _origin(card: Mapping[str, Any]) -> list[str]:
+    """Return the lines that say where a card comes from and how to make it again."""
+    lines = ["## Made from", ""]
+    lines += [f"* {key}: `{value}`" for key, value in card["dataset"].items()]
+    for name, each in card["sets"].items():
+        lines += [f"* {name}: `{file['name']}` `{file['sha256'][:16]}`" for file in each["files"]]
+    lines += [f"* {key} {value}" for key, value in card["settings"]["versions"].items()]
+    lines += [f"* benchmark {key}: {value}" for key, value in card.get("benchmark", {}).items()]
+    return [*lines, "", "Again:", "", f"    {card['again']}"]
+
+
+def _row(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.0f}"
+
+
+def _interval(value: Mapping[str, float]) -> str:
+    numbers = (100.0 * value[name] for name in ("value", "low", "high"))
+    return "{:.0f} ({:.0f} to {:.0f})".format(*numbers)

@@ -1,0 +1,248 @@
+"""Ranked predictions: arrays and files come in, one prediction per line goes out.
+
+A file gives m predictions for each row of a split. They are ranked by the stated confidence, or
+stand in their order where none is stated.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.dataset.hdf5 import open_hdf5
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.errors import GraspError, MachineError, first_line
+from drakegrasp.frames import Array, as_numbers
+from drakegrasp.verification.prediction import HDF5_SUFFIXES, read_numbers
+
+SUFFIXES = (".npy", *HDF5_SUFFIXES, ".parquet")
+#: Names of the arrays in an HDF5 file, and of the columns in a Parquet file.
+GRASPS, ROWS, CONFIDENCE = "grasps", "rows", "confidence"
+
+Rows = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Ranked:
+    """Predictions for rows of a split, in the order of rows, and of ranks within a row.
+
+    Attributes:
+        name: Of the file, or of what made them.
+        grasps: (N, 6k), in the camera's frame.
+        rows: (N,), the row of each.
+        ranks: (N,), 0 for the best of a row.
+        confidence: (N,), as stated; None if it is not.
+        sha256: Of the file, or of the numbers.
+    """
+
+    name: str
+    grasps: Array
+    rows: Rows
+    ranks: Rows
+    confidence: Array | None = None
+    sha256: str
+
+    def of_rows(self, rows: Sequence[int]) -> Ranked:
+        """Return the predictions for some rows."""
+        kept = np.flatnonzero(np.isin(self.rows, rows))
+        return Ranked(
+            name=self.name,
+            grasps=self.grasps[kept],
+            rows=self.rows[kept],
+            ranks=self.ranks[kept],
+            confidence=None if self.confidence is None else self.confidence[kept],
+            sha256=self.sha256,
+        )
+
+
+def rank(
+    name: str,
+    grasps: npt.ArrayLike,
+    *,
+    length: int,
+    rows: npt.ArrayLike | None = None,
+    confidence: npt.ArrayLike | None = None,
+    sha256: str | None = None,
+) -> Ranked:
+    """Return predictions in the order of rows and ranks.
+
+    Args:
+        name: What errors and the card call them.
+        grasps: (n, 6k), one per row, or (n, m, 6k), m per row. NaN stays: it is a bad prediction,
+            not a mistake of the caller.
+        length: Rows of the split.
+        rows: (n,), the row that each is for; a row may come several times with (n, 6k). All rows of
+            the split in order if None.
+        confidence: (n,) or (n, m), greater is better.
+        sha256: Of the file; that of the numbers if None.
+
+    Raises:
+        GraspError: If shapes do not fit each other, or a row does not exist.
+    """
+    # One line per prediction.
+    array = as_numbers(grasps, f"{name}: grasps must be numbers")
+    if array.ndim not in (2, 3) or array.size == 0:
+        raise GraspError(
+            f"{name}: grasps must be (n, 6k), or (n, m, 6k) for m per row, got {array.shape}"
+        )
+    count, each = array.shape[0], 1 if array.ndim == 2 else array.shape[1]
+    flat = array.reshape(count * each, array.shape[-1])
+    line_rows = np.repeat(_rows_of(name, rows, count, length), each)
+
+    # The best first; of equals the one that was given first.
+    stated = None
+    if confidence is not None:
+        stated = as_numbers(confidence, f"{name}: confidence must be numbers")
+        if stated.shape != array.shape[:-1]:
+            raise GraspError(
+                f"{name}: confidence must be {array.shape[:-1]}, one per grasp, got {stated.shape}"
+            )
+        stated = np.where(np.isfinite(stated), stated, -np.inf).ravel()
+    falling = np.zeros(len(flat)) if stated is None else -stated
+    order = np.lexsort((np.arange(len(flat)), falling, line_rows))
+    ordered = line_rows[order]
+    _, starts, counts = np.unique(ordered, return_index=True, return_counts=True)
+    return Ranked(
+        name=name,
+        grasps=flat[order],
+        rows=ordered,
+        ranks=np.arange(len(flat)) - np.repeat(starts, counts),
+        confidence=None if stated is None else stated[order],
+        sha256=sha256 or hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest(),
+    )
+
+
+def _rows_of(name: str, rows: npt.ArrayLike | None, count: int, length: int) -> Rows:
+    """Return the row (n,) of each entry of an array of predictions."""
+    if rows is None and count != length:
+        raise GraspError(
+            f"{name}: without {ROWS!r} there must be predictions for each of the {length} rows of "
+            f"the split, got {count}"
+        )
+    chosen = np.arange(count) if rows is None else np.asarray(rows)
+    if chosen.dtype.kind not in "iu" or chosen.shape != (count,):
+        raise GraspError(
+            f"{name}: {ROWS} must be one whole number per entry ({count}), "
+            f"got {chosen.dtype} of shape {chosen.shape}"
+        )
+    wrong = chosen[(chosen < 0) | (chosen >= length)]
+    if len(wrong):
+        raise GraspError(f"{name}: {ROWS} must be 0 to {length - 1}, got {wrong[0]}")
+    return chosen.astype(np.int64)
+
+
+def read_ranked(path: Path, *, length: int, split: str) -> Ranked:
+    """Return the predictions of a file.
+
+    Args:
+        path: `.npy`: (n, 6k) or (n, m, 6k). HDF5: the array `grasps` in the group of the split,
+            else at the root, and `rows`, `confidence` beside it. Parquet: a line per prediction,
+            with the column `grasps` of lists, and optionally `rows` and `confidence`.
+        length: Rows of the split.
+        split: Its name.
+
+    Raises:
+        GraspError: If the file holds anything else; the message names it.
+        MachineError: If a Parquet file is given and pyarrow is not installed.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES or not path.is_file():
+        got = repr(suffix) if path.is_file() else "none"
+        raise GraspError(
+            f"{path}: must be a file of predictions ({', '.join(SUFFIXES)}), got {got}"
+        )
+    if suffix == ".npy":
+        arrays: Mapping[str, Any] = {GRASPS: read_numbers(path)}
+    else:
+        arrays = _read_parquet(path) if suffix == ".parquet" else _read_hdf5(path, split)
+    return rank(
+        str(path),
+        arrays[GRASPS],
+        length=length,
+        rows=arrays.get(ROWS),
+        confidence=arrays.get(CONFIDENCE),
+        sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
+    )
+
+
+def _read_hdf5(path: Path, split: str) -> dict[str, Any]:
+    """Return the arrays of an HDF5 file that it has."""
+    try:
+        with open_hdf5(path) as file:
+            group = file[split] if isinstance(file.get(f"{split}/{GRASPS}"), h5py.Dataset) else file
+            names = [
+                n for n in (GRASPS, ROWS, CONFIDENCE) if isinstance(group.get(n), h5py.Dataset)
+            ]
+            found = {name: group[name][()] for name in names}
+    except (OSError, KeyError, RuntimeError, MemoryError) as error:
+        raise GraspError(
+            f"{path}: must be an HDF5 file with predictions, got none ({first_line(error)})"
+        ) from None
+    if GRASPS not in found:
+        raise GraspError(f"{path}: must hold an array {GRASPS!r} in /{split} or at the root")
+    return found
+
+
+def _read_parquet(path: Path) -> dict[str, Any]:
+    """Return the columns of a Parquet file that it has."""
+    try:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    except ModuleNotFoundError:
+        raise MachineError(
+            f"{path}: Parquet needs pyarrow, got none: pip install 'drakegrasp[hub]'"
+        ) from None
+    try:
+        table = pq.read_table(path)
+        names = [name for name in (GRASPS, ROWS, CONFIDENCE) if name in table.column_names]
+        found = {name: table.column(name).to_pylist() for name in names}
+        found[GRASPS] = np.array(found[GRASPS], dtype=float)
+    except (OSError, KeyError, TypeError, ValueError, pa.ArrowException) as error:
+        raise GraspError(
+            f"{path}: must be a Parquet file with a column {GRASPS!r} of equally long lists of "
+            f"numbers, got none ({first_line(error)})"
+        ) from None
+    return found
+
+
+def ranked_sets(
+    predictions: Any,
+    data: GraspDataset,
+    *,
+    rows: Sequence[int] | None = None,
+    confidence: npt.ArrayLike | None = None,
+) -> tuple[str, tuple[Ranked, ...]]:
+    """Return the name of what is scored, and its predictions by training seed.
+
+    Args:
+        predictions: An array, a path, or paths.
+        data: The split.
+        rows: With an array: the row of each.
+        confidence: With an array: of each.
+
+    Raises:
+        GraspError: If they cannot be used, or rows or confidence are given with files.
+        MachineError: See `read_ranked`.
+    """
+    # One array.
+    single = isinstance(predictions, str | Path)
+    paths = [predictions] if single else predictions
+    if not all(isinstance(path, str | Path) for path in paths):
+        one = rank("predictions", predictions, length=len(data), rows=rows, confidence=confidence)
+        return one.name, (one,)
+
+    # Files, each of a training seed.
+    if rows is not None or confidence is not None:
+        raise GraspError("rows and confidence must be in the files if files are given, got them")
+    found = tuple(read_ranked(Path(path), length=len(data), split=data.split) for path in paths)
+    names = [Path(path).name for path in paths]
+    if len(found) < 2:
+        return (names or [""])[0], found
+    return f"{names[0]} and {len(found) - 1} more", found

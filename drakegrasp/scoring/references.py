@@ -1,0 +1,259 @@
+"""Reference rows: predictions that the program makes itself, to be scored beside a network's.
+
+In: the rows to score, and training rows. Out: a grasp per row in the camera's frame. `constant` and
+`random` never look at the image. The camera stands at a fixed place of the palm, so a grasp in its
+frame gives the wrist away: a network that is not far above these two has learned nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.frames import Array, invert_pose, rotate_vectors, transform_points, unpack_pose
+from drakegrasp.grasp import pack_grasp, unpack_grasp
+from drakegrasp.seeding import Stream, object_key
+from drakegrasp.vision.camera import project, unproject
+
+#: Cells along each edge of the image descriptor.
+CELLS = 16
+#: What a pixel of the object counts as in it, beside depths [m].
+MASK_DEPTH = 0.1
+#: Training images that are compared, at most; drawn if there are more.
+MOST_IMAGES = 5000
+#: What a normal counts as beside points, in the distance between grasps [m].
+NORMAL_LENGTH = 0.05
+#: A grasp from above meets the object so far below its highest visible point, or half-way down [m].
+DEPTH_OF_GRASP = 0.03
+#: Between neighbouring fingers of a grasp from above [m].
+FINGER_SPACING = 0.04
+#: Half the edge of the square of pixels from which a normal is fitted.
+PATCH = 2
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scene:
+    """The rows to score, the training rows, and the seed of what is drawn.
+
+    Attributes:
+        data: Its split has the rows.
+        rows: To score.
+        train: The training split; it may be empty.
+        seed: Of the draws.
+    """
+
+    data: GraspDataset
+    rows: Sequence[int]
+    train: GraspDataset
+    seed: int = 0
+
+    @cached_property
+    def train_grasps(self) -> Array:
+        """(n, 6k), grasps of the training rows."""
+        return np.asarray(self.train.column("grasps"), dtype=float)
+
+    @cached_property
+    def constant(self) -> Array:
+        """(6k,), the training grasp nearest to their mean."""
+        scaled = self.train_grasps.copy()
+        scaled[:, scaled.shape[1] // 2 :] *= NORMAL_LENGTH
+        return self.train_grasps[np.argmin(((scaled - scaled.mean(axis=0)) ** 2).sum(axis=1))]
+
+    @cached_property
+    def thumb(self) -> int:
+        """The finger whose normal is most against the mean of the others, in most grasps."""
+        grasps = self.train_grasps if len(self.train_grasps) else self.data.column("grasps")
+        normals = grasps.reshape(len(grasps), 2, -1, 3)[:, 1]
+        against = np.einsum("nki,ni->nk", normals, normals.sum(axis=1)).argmin(axis=1)
+        return int(np.bincount(against).argmax())
+
+    def stream(self, name: str, row: int) -> Stream:
+        """Return the stream of a reference for a row; the row's trial names it, not its place."""
+        return Stream(self.seed, object_key(name), int(self.data.value("trial_id", row)))
+
+    def visible(self, row: int) -> Visible:
+        """Return what the camera sees of the object of a row."""
+        image, mask = self.data.value("images", row), self.data.value("masks", row)
+        v, u = np.nonzero(mask)
+        return Visible(
+            K=self.data.K,
+            pixels=np.column_stack([u, v]),
+            points=unproject(self.data.K, np.column_stack([u, v]), image[3][v, u]),
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Visible:
+    """The object's pixels: (n, 2) u and v, and their points p_CQ (n, 3) [m]."""
+
+    K: Array
+    pixels: npt.NDArray[np.int64]
+    points: Array
+
+    def contact(self, pixel: int) -> tuple[Array, Array]:
+        """Return the point of an object pixel and the normal of a plane through its patch.
+
+        The normal points to the camera, as what is seen does.
+        """
+        near = np.abs(self.pixels - self.pixels[pixel]).max(axis=1) <= PATCH
+        patch, point = self.points[near], self.points[pixel]
+        view = -point / np.linalg.norm(point)
+        if len(patch) < 3:
+            return point, view
+        normal = np.linalg.svd(patch - patch.mean(axis=0))[2][2]
+        return point, normal if normal @ view >= 0.0 else -normal
+
+
+def own(scene: Scene) -> Array:
+    """Return the stored grasps of the rows: the ceiling."""
+    return np.asarray(scene.data.column("grasps")[list(scene.rows)], dtype=float)
+
+
+def nearest_image(scene: Scene) -> Array:
+    """Return the grasp of the training image whose descriptor is nearest.
+
+    The descriptor has the mean depth [m], cut at the far plane, and 0.1 times the share of object
+    pixels, of each cell of a grid of 16 by 16; the distance is Euclidean.
+    """
+    count = len(scene.train)
+    known = np.arange(count)
+    if count > MOST_IMAGES:
+        drawn = Stream(scene.seed, object_key("nearest image")).permutation(count)
+        known = np.sort(drawn[:MOST_IMAGES])
+    table = np.array([_descriptor(scene.train, int(row)) for row in known])
+    nearest = []
+    for row in scene.rows:
+        distance = ((table - _descriptor(scene.data, row)) ** 2).sum(axis=1)
+        nearest.append(known[np.argmin(distance)])
+    return scene.train_grasps[nearest]
+
+
+def _descriptor(data: GraspDataset, row: int) -> Array:
+    """Return the descriptor (2 * CELLS^2,) of a row's image."""
+    depth = np.asarray(data.value("images", row)[3], dtype=float)
+    mask = np.asarray(data.value("masks", row), dtype=float)
+    edges = np.linspace(0, len(depth), min(CELLS, len(depth)) + 1).astype(int)[:-1]
+    area = np.diff([*edges, len(depth)])
+    cells = []
+    for image in (depth, MASK_DEPTH * mask):
+        sums = np.add.reduceat(np.add.reduceat(image, edges, axis=0), edges, axis=1)
+        cells.append((sums / np.outer(area, area)).ravel())
+    return np.concatenate(cells)
+
+
+def constant(scene: Scene) -> Array:
+    """Return one grasp for all rows: the training grasp nearest to the mean, in the camera's frame.
+
+    A normal of length 1 counts as 50 mm in the distance.
+    """
+    return np.tile(scene.constant, (len(scene.rows), 1))
+
+
+def random_train(scene: Scene) -> Array:
+    """Return a training grasp for each row, drawn at random, in the camera's frame."""
+    count = len(scene.train)
+    drawn = [int(scene.stream("random", row).integers(count, 1)[0]) for row in scene.rows]
+    return scene.train_grasps[drawn]
+
+
+def top_down(scene: Scene) -> Array:
+    """Return a grasp from above at the visible centroid, which closes across the minor axis.
+
+    The axes are principal axes of the visible points, seen from above. The finger that opposes the
+    others in most training grasps is on one side, the others on the other, 30 mm below the highest
+    visible point or half-way down.
+    """
+    poses = scene.data.column(f"object_props/frame_work2cam_{scene.data.camera}")
+    return np.array([_from_above(scene, row, unpack_pose(poses[row])) for row in scene.rows])
+
+
+def _from_above(scene: Scene, row: int, X_TC: Array) -> Array:
+    """Return the grasp (6k,) of `top_down` for a row, with the pose of its camera."""
+    # Visible points from above, and their axes.
+    p_TQ = transform_points(X_TC, scene.visible(row).points)
+    centroid = p_TQ[:, :2].mean(axis=0)
+    centred = p_TQ[:, :2] - centroid
+    major, minor = np.linalg.svd(centred.T @ centred)[0].T
+    low, high = np.quantile(centred @ minor, [0.02, 0.98])
+    top = float(np.quantile(p_TQ[:, 2], 0.98))
+    height = max(top - DEPTH_OF_GRASP, top / 2.0)
+
+    # The thumb on one side, the others side by side on the other.
+    fingers, others = scene.data.column("grasps").shape[1] // 6, 0
+    points, normals = np.zeros((fingers, 3)), np.zeros((fingers, 3))
+    for finger in range(fingers):
+        if finger == scene.thumb:
+            side, reach, along = 1.0, high, 0.0
+        else:
+            side, reach = -1.0, low
+            along = FINGER_SPACING * (others - (fingers - 2) / 2.0)
+            others += 1
+        points[finger] = [*(centroid + reach * minor + along * major), height]
+        normals[finger] = [*(side * minor), 0.0]
+    X_CT = invert_pose(X_TC)
+    return pack_grasp(transform_points(X_CT, points), rotate_vectors(X_CT, normals))
+
+
+def palm_normals(scene: Scene) -> Array:
+    """Return contacts where rays about the palm's direction meet what is seen.
+
+    The rays go through the contacts of the constant grasp, which lie about the palm's direction, or
+    through the object's nearest pixel; points and normals are those of the depth image.
+    """
+    axis = unpack_grasp(scene.constant)[0]
+
+    def choose(scene: Scene, row: int, seen: Visible, fingers: int) -> list[int]:
+        targets = project(scene.data.K, axis)
+        return [int(np.argmin(((seen.pixels - uv) ** 2).sum(axis=1))) for uv in targets]
+
+    return _on_surface(scene, choose)
+
+
+def surface_points(scene: Scene) -> Array:
+    """Return random visible points of the object, with the normals of the depth image."""
+
+    def choose(scene: Scene, row: int, seen: Visible, fingers: int) -> list[int]:
+        drawn = scene.stream("surface", row).integers(len(seen.pixels), fingers)
+        return [int(pixel) for pixel in drawn]
+
+    return _on_surface(scene, choose)
+
+
+def _on_surface(scene: Scene, choose: Callable[[Scene, int, Visible, int], Sequence[int]]) -> Array:
+    """Return grasps whose contacts are object pixels that a function chooses for each finger."""
+    grasps = []
+    for row in scene.rows:
+        seen = scene.visible(row)
+        fingers = len(scene.data.value("grasps", row)) // 6
+        contacts = [seen.contact(pixel) for pixel in choose(scene, row, seen, fingers)]
+        points, normals = zip(*contacts, strict=True)
+        grasps.append(pack_grasp(points, normals))
+    return np.array(grasps)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reference:
+    """A maker of reference rows: what it makes, in words, and whether it needs training rows."""
+
+    make: Callable[[Scene], Array]
+    words: str
+    trained: bool = True
+
+
+#: By name, in the order of a card: the ceiling, the network's rivals, the blind rows, geometry.
+REFERENCES = {
+    "own": Reference(make=own, words="the rows' own grasps: the ceiling", trained=False),
+    "nearest image": Reference(make=nearest_image, words="grasp of the nearest training image"),
+    "constant": Reference(make=constant, words="one grasp for all rows (blind)"),
+    "random": Reference(make=random_train, words="a random training grasp (blind)"),
+    "top-down": Reference(
+        make=top_down, words="from above, across the minor axis of what is seen", trained=False
+    ),
+    "palm normals": Reference(make=palm_normals, words="rays about the palm's direction"),
+    "surface": Reference(make=surface_points, words="random visible points", trained=False),
+}

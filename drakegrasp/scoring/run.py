@@ -1,0 +1,284 @@
+"""The path of a score: predictions and rows come in, a `Score` goes out.
+
+Reference rows are made, all predictions that have no verdict yet are tried together, and the
+verdicts become a card. Who does the work is the caller's choice (`Verify`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from drakegrasp.config import Config
+from drakegrasp.dataset.manifest import installed_versions
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.errors import GraspError, MachineError
+from drakegrasp.frames import Array, invert_pose, transform_points, unpack_pose
+from drakegrasp.grasp import unpack_grasp
+from drakegrasp.runtime.files import write_atomic
+from drakegrasp.scoring.benchmark import read_benchmark
+from drakegrasp.scoring.card import Origin, card_of, card_text
+from drakegrasp.scoring.measures import Grouping, Judged, seconds
+from drakegrasp.scoring.ranked import Ranked, rank
+from drakegrasp.scoring.references import REFERENCES, Scene
+from drakegrasp.scoring.verdict import Verdict, VerdictFile, verdict_key, verdict_of
+from drakegrasp.seeding import Stream, object_key
+from drakegrasp.verification.result import Verification
+
+#: Tries grasps (n, 6k) on rows (n,) and calls back with the place of each and its verification.
+Verify: TypeAlias = Callable[[Array, Sequence[int], Callable[[int, Verification], None]], object]
+#: Files of a score.
+CARD_JSON, CARD_TEXT, CARD_PICTURE, VERDICTS = "card.json", "card.md", "card.png", "verdicts.jsonl"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Score:
+    """A score of predictions beside reference rows.
+
+    Attributes:
+        card: Plain JSON types, see docs/how-to/score.md.
+        seconds: By set, the median wall-clock time of a verdict [s]; the card has no time in it.
+        sets: The predictions of each set and their verdicts.
+    """
+
+    card: dict[str, Any]
+    seconds: dict[str, float]
+    sets: tuple[Judged, ...]
+
+    @property
+    def text(self) -> str:
+        """The card as Markdown."""
+        return card_text(self.card)
+
+    def save(self, folder: Path) -> list[Path]:
+        """Write the card as JSON, Markdown and a picture, and return the paths.
+
+        Raises:
+            OSError: If the folder cannot be written.
+        """
+        from drakegrasp.visualization.score_card import card_picture
+
+        folder.mkdir(parents=True, exist_ok=True)
+        contents = {
+            CARD_JSON: (json.dumps(self.card, indent=1) + "\n").encode(),
+            CARD_TEXT: self.text.encode(),
+            CARD_PICTURE: card_picture(self.card),
+        }
+        for name, content in contents.items():
+            write_atomic(folder / name, content)
+        return [folder / name for name in contents]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Request:
+    """What is to be scored.
+
+    Attributes:
+        data: Its split has the rows.
+        train: Rows from which reference rows are made.
+        predictions: By training seed; none scores the reference rows alone.
+        name: Of the predictions, on the card.
+        references: Names of the reference rows, in the order of the card.
+        per_object: Rows of each object, at most; all if None.
+        config: Of the verification.
+        again: The command that makes the card again.
+    """
+
+    data: GraspDataset
+    train: GraspDataset
+    predictions: tuple[Ranked, ...]
+    name: str
+    references: tuple[str, ...]
+    per_object: int | None
+    config: Config
+    again: str
+
+
+def score(request: Request, verify: Verify, folder: Path | None) -> Score:
+    """Return the score of predictions.
+
+    Args:
+        request: What to score.
+        verify: Tries grasps.
+        folder: Keeps verdicts, so that the same call goes on; nothing is kept if None.
+
+    Raises:
+        GraspError: If there is nothing to score, or the predictions are for different rows.
+    """
+    # The rows, and what is scored on them.
+    rows = _chosen_rows(request)
+    grouping = _grouping(request.data, rows)
+    sets = [(request.name, tuple(each.of_rows(rows) for each in request.predictions))]
+    sets = [each for each in sets if each[1]] + _reference_rows(request, rows)
+
+    # Their verdicts: all predictions that have none are tried together.
+    settings = {"config": request.config.to_dict(), "versions": installed_versions(request.config)}
+    verdicts = _verdicts([r for _, each in sets for r in each], request, settings, verify, folder)
+    judged, start = [], 0
+    for name, ranked in sets:
+        found = verdicts[start : start + len(ranked)]
+        judged.append(Judged(name=name, ranked=ranked, verdicts=tuple(found)))
+        start += len(ranked)
+
+    origin = Origin(
+        dataset=_described(request.data, rows),
+        settings=settings,
+        limit=request.config.verify.max_contact_error,
+        oracle=request.config.verify.max_tries > 1,
+        known_objects=len(set(grouping.names) & _texts(request.train, "object_name")),
+        new_classes=not set(grouping.classes) & _texts(request.train, "class_name"),
+        benchmark=read_benchmark(request.data.path.parent, settings["versions"]),
+        again=request.again,
+    )
+    own = dict(zip(rows, own_contacts(request.data, rows), strict=True))
+    card = card_of(judged, grouping, own, origin)
+    times = {each.name: seconds(each) for each in judged}
+    return Score(card=card, seconds=times, sets=tuple(judged))
+
+
+def _chosen_rows(request: Request) -> list[int]:
+    """Return the rows to score, in order: those of the predictions, some of each object."""
+    data, predictions = request.data, request.predictions
+    numbers = data.column("grasps").shape[1]
+    for each in predictions:
+        if each.grasps.shape[1] != numbers:
+            raise GraspError(
+                f"{each.name}: a grasp must be {numbers} numbers, got {each.grasps.shape[1]}"
+            )
+
+    # Those of the predictions; all of a method are for the same.
+    rows = np.unique(predictions[0].rows) if predictions else np.arange(len(data))
+    for other in predictions[1:]:
+        if not np.array_equal(np.unique(other.rows), rows):
+            raise GraspError(
+                f"{other.name}: must have predictions for the rows of {predictions[0].name}, "
+                "got other rows"
+            )
+    if not len(rows):
+        raise GraspError(f"{data.path}: {data.split} must have rows to score, got none")
+    if request.per_object is None:
+        return [int(row) for row in rows]
+
+    # Drawn by the names of their objects, so other objects do not change them.
+    names = data.column("object_props/object_name")[rows]
+    chosen: list[int] = []
+    for name in sorted(set(names.tolist())):
+        own = rows[names == name]
+        order = Stream(0, object_key(name), object_key("rows")).permutation(len(own))
+        chosen += [int(row) for row in own[order[: request.per_object]]]
+    return sorted(chosen)
+
+
+def _grouping(data: GraspDataset, rows: Sequence[int]) -> Grouping:
+    """Return the rows by object."""
+    objects = data.column("object_props/object_name")[list(rows)]
+    classes = data.column("object_props/class_name")[list(rows)]
+    names, first, members = np.unique(objects, return_index=True, return_inverse=True)
+    return Grouping(
+        rows=tuple(rows),
+        objects=members,
+        names=tuple(names.tolist()),
+        classes=tuple(classes[first].tolist()),
+    )
+
+
+def _reference_rows(request: Request, rows: Sequence[int]) -> list[tuple[str, tuple[Ranked, ...]]]:
+    """Return the reference rows that can be made."""
+    scene = Scene(data=request.data, rows=rows, train=request.train)
+    made: list[tuple[str, tuple[Ranked, ...]]] = []
+    for name in request.references:
+        reference = REFERENCES[name]
+        if reference.trained and not len(request.train):
+            continue
+        grasps = reference.make(scene)
+        ranked = rank(name, grasps, length=len(request.data), rows=np.asarray(rows))
+        made.append((name, (ranked,)))
+    return made
+
+
+def _verdicts(
+    sets: Sequence[Ranked],
+    request: Request,
+    settings: Mapping[str, Any],
+    verify: Verify,
+    folder: Path | None,
+) -> list[tuple[Verdict, ...]]:
+    """Return the verdicts of each of several sets of predictions."""
+    # What is to be tried, each once: two sets may have the same grasp.
+    content = request.data.content
+    keys = [
+        [
+            verdict_key(settings, content, row, grasp)
+            for row, grasp in zip(each.rows.tolist(), each.grasps, strict=True)
+        ]
+        for each in sets
+    ]
+    known = VerdictFile(None if folder is None else folder / VERDICTS)
+    missing: dict[str, tuple[Array, int]] = {}
+    for each, own_keys in zip(sets, keys, strict=True):
+        for key, grasp, row in zip(own_keys, each.grasps, each.rows.tolist(), strict=True):
+            if key not in known.verdicts:
+                missing.setdefault(key, (grasp, row))
+
+    # Try it, object by object; each verdict is kept as soon as it is known.
+    if missing:
+        objects = request.data.column("object_props/object_name").tolist()
+        resting = request.data.column("grasp_props/resting").tolist()
+        ordered = sorted(missing.items(), key=lambda each: _place(each[1][1], objects, resting))
+        names = [key for key, _ in ordered]
+        try:
+            verify(
+                np.array([grasp for _, (grasp, _) in ordered]),
+                [row for _, (_, row) in ordered],
+                lambda index, result: known.add(names[index], verdict_of(result)),
+            )
+        finally:
+            known.close()
+    left = [key for key in missing if key not in known.verdicts]
+    if left:
+        raise MachineError(f"each prediction must have a verdict, got none for {len(left)}")
+    return [tuple(known.verdicts[key] for key in each) for each in keys]
+
+
+def _place(row: int, objects: Sequence[str], resting: Sequence[int]) -> tuple[str, int, int]:
+    """Return what orders rows so that those of an object in a resting pose stand together.
+
+    Verdicts come in the caller's order; in this one none waits for another object.
+    """
+    return objects[row], resting[row], row
+
+
+def _texts(data: GraspDataset, name: str) -> set[str]:
+    return set(data.column(f"object_props/{name}").tolist())
+
+
+def _described(data: GraspDataset, rows: Sequence[int]) -> dict[str, Any]:
+    """Return what a card says of the dataset. The hashes tell whether values differ."""
+    grasps = np.ascontiguousarray(data.column("grasps")[list(rows)], dtype=np.float32)
+    trials = np.ascontiguousarray(data.column("trial_id")[list(rows)], dtype=np.int64)
+    return {
+        "file": data.path.name,
+        "split": data.split,
+        "split_rows": len(data),
+        "content": data.content,
+        "rows_sha256": hashlib.sha256(trials.tobytes() + grasps.tobytes()).hexdigest(),
+    }
+
+
+def own_contacts(data: GraspDataset, rows: Sequence[int]) -> list[Array]:
+    """Return (3k,) contact points in {O} [m] of the own grasp of each row."""
+    X_TC = unpack_pose(data.column(f"object_props/frame_work2cam_{data.camera}")[list(rows)])
+    X_WT = unpack_pose(data.column("object_props/frame_world2work")[list(rows)])
+    X_WO = unpack_pose(data.column("object_props/frame_world2obj")[list(rows)])
+    X_OC = invert_pose(X_WO) @ X_WT @ X_TC
+    grasps = data.column("grasps")[list(rows)]
+    return [
+        transform_points(X, unpack_grasp(grasp)[0]).ravel()
+        for X, grasp in zip(X_OC, grasps, strict=True)
+    ]

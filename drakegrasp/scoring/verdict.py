@@ -1,0 +1,162 @@
+"""What a score keeps of the verdict on one prediction, and where it is kept.
+
+This is the seam: whatever tries a grasp, by whatever rule, becomes a `Verdict` here. Verdicts are
+kept as lines of JSON under the key of what was tried, so an interrupted score goes on.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+
+from drakegrasp.frames import Array
+from drakegrasp.runtime.json_text import parse_json
+from drakegrasp.verification.result import Verification
+
+#: Decimals of lengths [m] and angles [rad]: those to which contacts are rounded, and two more.
+_DIGITS = 6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """The verdict on one prediction. All but `held_any` is of the first wrist pose.
+
+    Attributes:
+        outcome: Name of the outcome.
+        held, precision, stable, sample: As in a dataset, wherever the fingertips touch.
+        success: Held, with every contact within `verify.max_contact_error` of the asked one.
+        held_any: Whether any of at most five wrist poses holds: an oracle chose among them.
+        contact_error: Largest distance between asked and reached contacts [m]; None if a fingertip
+            did not touch.
+        penetration: Largest after closing [m]; None if the hand did not close.
+        contacts: (3k,), the asked points in {O} [m]; empty for what is no grasp.
+        posture: Position [m], rotation vector [rad] and joints after closing in {O}; empty if the
+            hand did not close.
+        seconds: Wall-clock time [s].
+    """
+
+    outcome: str
+    success: bool
+    held: bool
+    precision: bool
+    stable: bool
+    sample: bool
+    held_any: bool
+    contact_error: float | None
+    penetration: float | None
+    contacts: tuple[float, ...]
+    posture: tuple[float, ...]
+    seconds: float
+
+    @property
+    def counted(self) -> bool:
+        """Whether it counts in the headline: a sample, made by the contacts that were asked for."""
+        return self.success and self.sample
+
+
+def verdict_of(result: Verification) -> Verdict:
+    """Return what a score keeps of a verification."""
+    first, farthest = result.first, result.farthest_contact
+    closed = None if first is None else first.trial.closed
+    return Verdict(
+        outcome=result.outcome.label,
+        success=result.success,
+        held=result.held,
+        precision=result.precision,
+        stable=result.stable,
+        sample=result.sample,
+        held_any=result.held_any,
+        contact_error=_rounded(farthest) if math.isfinite(farthest) else None,
+        penetration=None if closed is None else _rounded(np.nanmax(closed.contacts.penetration)),
+        contacts=_tuple(result.p_OQ),
+        posture=() if closed is None or first is None else _posture(first.trial.X_OG, closed.q),
+        seconds=sum(result.seconds.values()),
+    )
+
+
+def _posture(X_OG: Array, q: Array) -> tuple[float, ...]:
+    from scipy.spatial.transform import Rotation
+
+    turned = Rotation.from_matrix(X_OG[:3, :3]).as_rotvec()
+    return _tuple(np.concatenate([X_OG[:3, 3], turned, q]))
+
+
+def _rounded(value: Any) -> float:
+    return round(float(value), _DIGITS) + 0.0
+
+
+def _tuple(values: Array | None) -> tuple[float, ...]:
+    if values is None or not np.isfinite(values).all():
+        return ()
+    return tuple(_rounded(value) for value in np.ravel(values))
+
+
+class VerdictFile:
+    """Verdicts by the key of what was tried, kept as lines of JSON.
+
+    A line that was cut off by a crash is left out, and its grasp tried again.
+
+    Args:
+        path: The file, made with the first line; None keeps the verdicts in memory only.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self.path, self.verdicts = path, dict[str, Verdict]()
+        self._stream: TextIO | None = None
+        if path is not None and path.is_file():
+            for line in path.read_bytes().splitlines():
+                self._read(line)
+
+    def _read(self, line: bytes) -> None:
+        try:
+            tree = parse_json(line)
+            values = {f.name: tree[f.name] for f in fields(Verdict)}
+            as_tuples = {name: tuple(values[name]) for name in ("contacts", "posture")}
+            self.verdicts[str(tree["key"])] = Verdict(**(values | as_tuples))
+        except (ValueError, KeyError, TypeError):
+            return
+
+    def add(self, key: str, verdict: Verdict) -> None:
+        """Keep a verdict; its line is complete when the call returns.
+
+        Raises:
+            OSError: If the file cannot be written.
+        """
+        self.verdicts[key] = verdict
+        if self.path is None:
+            return
+        if self._stream is None:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._stream = self.path.open("a", encoding="utf-8")
+            # A line that was cut off must not become one with the next.
+            self._stream.write("\n" if self._stream.tell() else "")
+        self._stream.write(json.dumps({"key": key, **asdict(verdict)}) + "\n")
+        self._stream.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._stream is not None:
+            self._stream.close()
+            self._stream = None
+
+
+def verdict_key(settings: Mapping[str, Any], signature: str, row: int, grasp: Array) -> str:
+    """Return the key (32 hex digits) of a prediction that is tried on a row of a dataset.
+
+    Args:
+        settings: All that decides the verdict beside the row: rules and versions.
+        signature: Of the dataset's content.
+        row: Of the split.
+        grasp: (6k,).
+    """
+    text = json.dumps([settings, signature, row], sort_keys=True)
+    digest = hashlib.sha256(text.encode())
+    digest.update(np.ascontiguousarray(grasp, dtype=np.float64).tobytes())
+    return digest.hexdigest()[:32]

@@ -1,0 +1,79 @@
+"""`drakegrasp score` and `bench-set`: a card that no worker changes, and one-line errors."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.commands import error_line, run
+from helpers.datasets import OTO, make_dataset
+
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.scoring.benchmark import read_benchmark
+
+#: Rows that take little time.
+FEW = ("--per-object", 1, "--reference", "own", "--reference", "constant", "--quiet")
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+@pytest.mark.cluster
+def test_a_card_does_not_depend_on_the_number_of_workers(
+    small_dataset: Path, tmp_path: Path
+) -> None:
+    path = small_dataset / OTO
+    test = GraspDataset(path, split="test")
+    np.save(tmp_path / "net.npy", np.flip(test.column("grasps"), axis=0))
+    given = ("score", tmp_path / "net.npy", "--dataset", path, *FEW)
+    texts = []
+    for workers in (1, 2):
+        out = tmp_path / f"by {workers}"
+        result = run(*given, "--out", out, "--workers", workers)
+        assert result.exit_code == 0, result.output
+        assert result.stdout.splitlines()[0].startswith("net.npy: ")
+        assert {"card.json", "card.md", "card.png", "verdicts.jsonl"} == {
+            each.name for each in out.iterdir()
+        }
+        texts.append((out / "card.json").read_bytes())
+    assert texts[0] == texts[1]
+
+    # Verdicts that are there are not tried again, and the card goes to standard output.
+    again = run(*given, "--out", tmp_path / "by 1", "--json")
+    card = json.loads(again.stdout)
+    assert card == json.loads(texts[0])
+    assert list(card["sets"]) == ["net.npy", "own", "constant"]
+    assert card["again"].endswith("--per-object 1")
+    assert card["sets"]["own"]["measures"]["held"]["value"] > 0.0
+
+
+def test_mistakes_are_one_line(tmp_path: Path) -> None:
+    data = make_dataset(tmp_path / "out", tmp_path / "meshes") / OTO
+    np.save(tmp_path / "short.npy", np.zeros((1, 18)))
+    few = run("score", tmp_path / "short.npy", "--dataset", data)
+    assert few.exit_code == 2
+    assert "must be predictions for each of the" in error_line(few)
+    unknown = run("score", "--dataset", data, "--reference", "magic")
+    assert unknown.exit_code == 2
+    assert "references must be of own, nearest image," in error_line(unknown)
+    other = run("bench-set", tmp_path / "bench", "--only", "99_chair_1")
+    assert other.exit_code == 2
+    assert "'99_chair_1'" in error_line(other)
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+@pytest.mark.cluster
+def test_a_part_of_the_benchmark_is_built_and_all_of_it_tests(tmp_path: Path) -> None:
+    out, name = tmp_path / "bench", "6_can_1"
+    settings = ("samples_per_object=1", "samples_patience=20", "camera.size=32")
+    changes = [word for text in settings for word in ("--set", text)]
+    result = run("bench-set", out, "--only", name, *changes, "--workers", 1, "--quiet")
+    assert result.exit_code == 0, result.output
+    assert "different_meshes" in (out / "builtin" / "benchmark.json").read_text()
+    about = read_benchmark(out, {})
+    assert about is not None
+    assert about["different_meshes"] == []
+    assert "samples_per_object" in about["other_settings"]
+    assert not len(GraspDataset(out / OTO, split="train"))

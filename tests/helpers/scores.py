@@ -1,0 +1,88 @@
+"""Predictions with verdicts that a test states, without a simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from drakegrasp.scoring.measures import Grouping, Judged
+from drakegrasp.scoring.ranked import rank
+from drakegrasp.scoring.verdict import Verdict
+
+FAILS = Verdict(
+    outcome="dropped",
+    success=False,
+    held=False,
+    precision=False,
+    stable=False,
+    sample=False,
+    held_any=False,
+    contact_error=None,
+    penetration=None,
+    contacts=(0.0,) * 9,
+    posture=(),
+    seconds=1.0,
+)
+
+
+def verdict(word: str, error: float = 0.004, confidence: float = 0.0) -> Verdict:
+    """Return a verdict: "sample", "held" or "fails"; held ones count within 20 mm."""
+    if word == "fails":
+        return FAILS
+    held = FAILS.__dict__ | {"outcome": "success", "held": True, "held_any": True}
+    held |= {"success": error <= 0.02, "contact_error": error, "penetration": 0.001}
+    return Verdict(**(held | ({"sample": True, "precision": True} if word == "sample" else {})))
+
+
+def judged(name: str, *seeds: Sequence[Sequence[str]]) -> Judged:
+    """Return a set whose seeds state a word for each rank of each row."""
+    ranked, verdicts = [], []
+    for rows in seeds:
+        grasps = np.zeros((len(rows), len(rows[0]), 18))
+        ranked.append(rank(name, grasps, length=len(rows)))
+        verdicts.append(tuple(verdict(word) for row in rows for word in row))
+    return Judged(name=name, ranked=tuple(ranked), verdicts=tuple(verdicts))
+
+
+def grouping(*objects: int) -> Grouping:
+    """Return rows that belong to objects of these numbers; each object is its own class."""
+    count = max(objects) + 1
+    return Grouping(
+        rows=tuple(range(len(objects))),
+        objects=np.array(objects),
+        names=tuple(f"object {i}" for i in range(count)),
+        classes=tuple(f"class {i}" for i in range(count)),
+    )
+
+
+class FakeVerify:
+    """Tries nothing: a grasp holds if a function of it says so. Counts what it was asked."""
+
+    def __init__(self, holds: Callable[[np.ndarray], bool], stop_after: int | None = None) -> None:
+        self.holds, self.asked, self.stop_after = holds, 0, stop_after
+
+    def __call__(self, grasps: Any, rows: Sequence[int], on_result: Any) -> None:
+        for index, grasp in enumerate(grasps):
+            if self.stop_after is not None and index == self.stop_after:
+                raise KeyboardInterrupt
+            self.asked += 1
+            held = self.holds(grasp)
+            on_result(
+                index,
+                SimpleNamespace(
+                    outcome=SimpleNamespace(label="success" if held else "dropped"),
+                    success=held,
+                    held=held,
+                    precision=held,
+                    stable=held,
+                    sample=held,
+                    held_any=held,
+                    first=None,
+                    farthest_contact=0.001 if held else np.nan,
+                    p_OQ=np.zeros((3, 3)),
+                    seconds={"simulate": 0.5},
+                ),
+            )

@@ -1,0 +1,124 @@
+"""The frozen benchmark: the same objects for everybody, and a card that says what is not."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import pytest
+import yaml
+
+from drakegrasp.dataset.manifest import Manifest, installed_versions, write_manifest
+from drakegrasp.dataset.paths import BUILTIN_FOLDER
+from drakegrasp.errors import DataError, MeshError
+from drakegrasp.hand.settings import load_config
+from drakegrasp.objects.sources import find_meshes
+from drakegrasp.scoring import benchmark
+from drakegrasp.scoring.benchmark import (
+    FRICTIONS,
+    MASSES,
+    NEW_CLASSES,
+    PRESET,
+    material_of,
+    new_classes,
+    published,
+    read_benchmark,
+    write_objects,
+)
+from drakegrasp.shapes.catalog import draw_builtin
+from drakegrasp.shapes.classes import CLASSES
+
+CONFIG = load_config(PRESET)
+#: Mass [kg] and friction of the first object, and the classes that no training set may have.
+FIRST_MATERIAL = (0.1, 0.71)
+NEW = [
+    *("alarm_clock", "banana", "book", "bowl", "bowling_pin", "bucket", "can", "candlestick"),
+    *("chess_pawn", "comb", "lamp", "mushroom", "pumpkin", "teapot", "towel_roll", "toy_car"),
+]
+BOTTLE = next(item.name for item in draw_builtin(CONFIG.builtin) if item.name.startswith("10_"))
+
+
+@pytest.fixture(scope="module")
+def part(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One object of the benchmark, with the manifest that a build would write."""
+    out = tmp_path_factory.mktemp("benchmark")
+    write_objects(out, CONFIG, only=[BOTTLE])
+    write_manifest(Manifest(config=CONFIG, versions=installed_versions(CONFIG)), out)
+    return out
+
+
+def test_every_object_is_published_and_no_other() -> None:
+    names = {item.name for item in draw_builtin(CONFIG.builtin)}
+    assert published()["objects"].keys() == names
+    assert len(names) >= 200
+
+
+def test_each_class_has_all_frictions_and_masses_are_used_alike() -> None:
+    items = draw_builtin(CONFIG.builtin)
+    frictions: dict[str, set[float]] = {}
+    for item in items:
+        frictions.setdefault(item.object_class.name, set()).add(material_of(item)[1])
+    assert all(found == set(FRICTIONS) for found in frictions.values())
+    masses = Counter(material_of(item)[0] for item in items)
+    assert masses.keys() == set(MASSES)
+    assert min(masses.values()) > len(items) / len(MASSES) / 2
+
+
+def test_draws_are_frozen() -> None:
+    """Whoever makes the benchmark gets these; a change of them is another benchmark."""
+    first = draw_builtin(CONFIG.builtin)[0]
+    assert material_of(first) == FIRST_MATERIAL
+    assert new_classes() == NEW
+    assert set(NEW) < {item.name for item in CLASSES}
+    assert len(NEW) == NEW_CLASSES
+
+
+def test_meshes_are_those_published_and_have_their_own_material(part: Path) -> None:
+    about = read_benchmark(part, published()["versions"])
+    assert about is not None
+    assert about["different_meshes"] == []
+    assert about["other_versions"] == {}
+    (source,) = find_meshes(part / BUILTIN_FOLDER)
+    item = next(item for item in draw_builtin(CONFIG.builtin) if item.name == BOTTLE)
+    assert (source.mass, source.friction) == material_of(item)
+
+
+def test_a_part_of_the_benchmark_is_not_frozen(part: Path) -> None:
+    about = read_benchmark(part, published()["versions"])
+    assert about is not None
+    assert (about["objects"], about["of"], about["frozen"]) == (1, 256, False)
+
+
+def test_other_meshes_versions_and_settings_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(benchmark, "wavefront", lambda mesh: b"v 0 0 0\n")
+    write_objects(tmp_path, CONFIG, only=[BOTTLE])
+    other = load_config(PRESET, ["lift.hold_time=1"])
+    write_manifest(Manifest(config=other, versions=installed_versions(other)), tmp_path)
+    about = read_benchmark(tmp_path, {**published()["versions"], "drake": "0"})
+    assert about is not None
+    assert about["different_meshes"] == [BOTTLE]
+    assert list(about["other_versions"]) == ["drake"]
+    assert "lift.hold_time" in about["other_settings"]
+
+
+def test_another_dataset_is_no_benchmark_and_a_damaged_file_is_refused(tmp_path: Path) -> None:
+    assert read_benchmark(tmp_path, {}) is None
+    (tmp_path / BUILTIN_FOLDER).mkdir()
+    (tmp_path / BUILTIN_FOLDER / benchmark.FILE_NAME).write_text(json.dumps({"name": "x"}))
+    with pytest.raises(DataError, match="must be the file of a benchmark"):
+        read_benchmark(tmp_path, {})
+
+
+def test_an_unknown_object_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(MeshError, match="'99_chair_1'"):
+        write_objects(tmp_path, CONFIG, only=["99_chair_1"])
+    assert not list(tmp_path.iterdir())
+
+
+def test_all_objects_test(part: Path) -> None:
+    assert CONFIG.split.train_classes == ()
+    said = yaml.safe_load((part / BUILTIN_FOLDER / "objects.yaml").read_text())
+    assert said["objects"].keys() == {BOTTLE}

@@ -1,0 +1,85 @@
+"""Reference rows: what each makes of a row, and that the blind ones never look."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.datasets import OTO, make_dataset
+
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.frames import rotate_vectors, transform_points, unpack_pose
+from drakegrasp.grasp import unpack_grasp
+from drakegrasp.scoring import references
+from drakegrasp.scoring.references import REFERENCES, Scene
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    folder = tmp_path_factory.mktemp("scene")
+    out = make_dataset(folder / "out", folder / "meshes", "split.by=class")
+    data = GraspDataset(out / OTO, split="test")
+    return Scene(
+        data=data, rows=list(range(len(data))), train=GraspDataset(out / OTO, split="train")
+    )
+
+
+@pytest.mark.parametrize("name", REFERENCES)
+def test_every_reference_gives_a_grasp_with_unit_normals_for_each_row(
+    scene: Scene, name: str
+) -> None:
+    grasps = REFERENCES[name].make(scene)
+    assert grasps.shape == (len(scene.rows), 18)
+    lengths = np.linalg.norm(grasps[:, 9:].reshape(-1, 3, 3), axis=-1)
+    np.testing.assert_allclose(lengths, 1.0, atol=1e-6)
+    np.testing.assert_array_equal(REFERENCES[name].make(scene), grasps)
+
+
+def test_own_grasps_are_the_stored_ones(scene: Scene) -> None:
+    np.testing.assert_array_equal(references.own(scene), scene.data.column("grasps"))
+
+
+@pytest.mark.parametrize("name", ["constant", "random"])
+def test_blind_rows_are_training_grasps_and_never_look(
+    scene: Scene, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    value = scene.data.value
+
+    def blind(field: str, row: int) -> object:
+        assert field not in ("images", "masks")
+        return value(field, row)
+
+    monkeypatch.setattr(scene.data, "value", blind)
+    made = {tuple(grasp) for grasp in REFERENCES[name].make(scene)}
+    assert made <= {tuple(grasp) for grasp in scene.train_grasps}
+    assert name != "constant" or len(made) == 1
+
+
+def test_the_nearest_image_of_a_training_image_is_itself(scene: Scene) -> None:
+    same = Scene(data=scene.train, rows=range(len(scene.train)), train=scene.train)
+    np.testing.assert_array_equal(references.nearest_image(same), scene.train_grasps)
+
+
+def test_a_grasp_from_above_closes_level_across_the_object(scene: Scene) -> None:
+    poses = scene.data.column("object_props/frame_work2cam_oto")
+    for row, grasp in zip(scene.rows, references.top_down(scene), strict=True):
+        X_TC = unpack_pose(poses[row])
+        points, normals = unpack_grasp(grasp)
+        p_TQ, nhat_Q_T = transform_points(X_TC, points), rotate_vectors(X_TC, normals)
+        np.testing.assert_allclose(p_TQ[:, 2], p_TQ[0, 2])
+        np.testing.assert_allclose(nhat_Q_T[:, 2], 0.0, atol=1e-6)
+        others = [i for i in range(3) if i != scene.thumb]
+        np.testing.assert_allclose(nhat_Q_T[others], -nhat_Q_T[[scene.thumb] * 2], atol=1e-6)
+        # Each contact is on the side to which its normal points.
+        middle = p_TQ.mean(axis=0)
+        assert (((p_TQ - middle) * nhat_Q_T).sum(axis=1) > 0.0).all()
+
+
+def test_contacts_on_what_is_seen_lie_on_the_box_and_face_the_camera(scene: Scene) -> None:
+    """The faces of the boxes are planes, so the fitted normals are those of the faces."""
+    for make in (references.palm_normals, references.surface_points):
+        for row, grasp in zip(scene.rows, make(scene), strict=True):
+            points, normals = unpack_grasp(grasp)
+            seen = scene.visible(row).points
+            away = np.linalg.norm(seen[:, None] - points[None], axis=-1).min(axis=0)
+            assert away.max() < 1e-6
+            assert ((points * normals).sum(axis=1) <= 0.0).all()

@@ -1,0 +1,147 @@
+"""The path of a score with verdicts that a test states: card, cache, warnings, order of sets."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.datasets import OTO, make_dataset
+from helpers.scores import FakeVerify
+
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.errors import GraspError
+from drakegrasp.scoring.ranked import ranked_sets
+from drakegrasp.scoring.run import VERDICTS, Request, own_contacts, score
+from drakegrasp.verification.placed_grasp import dataset_config, place_on_rows
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> GraspDataset:
+    folder = tmp_path_factory.mktemp("scored")
+    out = make_dataset(folder / "out", folder / "meshes", "split.by=class")
+    return GraspDataset(out / OTO, split="test")
+
+
+def request_of(data: GraspDataset, given: Any = (), **changes: Any) -> Request:
+    name, ranked = ranked_sets(given, data)
+    values: dict[str, Any] = {
+        "data": data,
+        "train": GraspDataset(data.path, split="train"),
+        "predictions": ranked,
+        "name": name,
+        "references": ("own", "constant"),
+        "per_object": None,
+        "config": dataset_config(data, overrides=("verify.max_tries=1",)),
+        "again": "drakegrasp score",
+    }
+    return Request(**(values | changes))
+
+
+def is_own(data: GraspDataset) -> Any:
+    own = data.column("grasps")
+    return lambda grasp: bool((np.abs(own - grasp).max(axis=1) < 1e-6).any())
+
+
+def test_predictions_stand_beside_reference_rows_on_the_same_rows(data: GraspDataset) -> None:
+    predicted = data.column("grasps").astype(float)
+    predicted[::2] = np.nan
+    card = score(request_of(data, predicted), FakeVerify(is_own(data)), None).card
+    assert list(card["sets"]) == ["predictions", "own", "constant"]
+    assert {each["predictions"] for each in card["sets"].values()} == {len(data)}
+    shares = {name: each["measures"]["headline"]["value"] for name, each in card["sets"].items()}
+    assert shares["own"] == 1.0
+    assert shares["constant"] == 0.0
+    assert 0.0 < shares["predictions"] < 1.0
+    assert card["above"]["predictions"]["own"]["value"] < 0.0
+    assert card["warnings"][0].startswith("only 2 test objects")
+
+
+def test_an_interrupted_score_goes_on(data: GraspDataset, tmp_path: Path) -> None:
+    """Also after a line that a crash cut off."""
+    with pytest.raises(KeyboardInterrupt):
+        score(request_of(data), FakeVerify(is_own(data), stop_after=3), tmp_path)
+    lines = (tmp_path / VERDICTS).read_bytes()
+    (tmp_path / VERDICTS).write_bytes(lines[:-20])
+
+    second = FakeVerify(is_own(data))
+    card = score(request_of(data), second, tmp_path).card
+    assert second.asked == 2 * len(data) - 2
+    third = FakeVerify(is_own(data))
+    assert score(request_of(data), third, tmp_path).card == card
+    assert third.asked == 0
+    assert card == score(request_of(data), FakeVerify(is_own(data)), None).card
+
+
+def test_verdicts_of_other_rules_are_not_taken(data: GraspDataset, tmp_path: Path) -> None:
+    score(request_of(data), FakeVerify(is_own(data)), tmp_path)
+    other = FakeVerify(is_own(data))
+    config = dataset_config(data, overrides=("physics.friction_hand=0.5",))
+    score(request_of(data, config=config), other, tmp_path)
+    assert other.asked == 2 * len(data)
+
+
+def test_some_rows_of_each_object_are_the_same_for_all_sets(data: GraspDataset) -> None:
+    card = score(request_of(data, per_object=1), FakeVerify(is_own(data)), None).card
+    assert card["rows"] == card["objects"] == 2
+    assert f"2 of the {len(data)} rows of the split were scored" in card["warnings"]
+
+
+def test_files_of_several_training_seeds_are_one_set(data: GraspDataset, tmp_path: Path) -> None:
+    grasps = data.column("grasps")
+    np.save(tmp_path / "a.npy", grasps)
+    np.save(tmp_path / "b.npy", np.zeros_like(grasps))
+    paths = [tmp_path / "a.npy", tmp_path / "b.npy"]
+    card = score(request_of(data, paths), FakeVerify(is_own(data)), None).card
+    assert card["headline"]["a.npy and 1 more"]["value"] == 0.5
+    assert card["intervals"]["training_seeds"] == 2
+
+
+def test_predictions_for_different_rows_are_refused(data: GraspDataset) -> None:
+    one = ranked_sets(data.column("grasps")[:1], data, rows=[0])[1]
+    other = ranked_sets(data.column("grasps")[:1], data, rows=[1])[1]
+    with pytest.raises(GraspError, match="must have predictions for the rows"):
+        score(request_of(data, predictions=one + other), FakeVerify(is_own(data)), None)
+
+
+def test_grasps_of_another_hand_are_refused(data: GraspDataset) -> None:
+    with pytest.raises(GraspError, match="a grasp must be 18 numbers, got 12"):
+        score(request_of(data, np.zeros((len(data), 12))), FakeVerify(is_own(data)), None)
+
+
+def test_without_blind_rows_a_card_says_so(data: GraspDataset) -> None:
+    card = score(request_of(data, references=("own",)), FakeVerify(is_own(data)), None).card
+    assert any(warning.startswith("no blind row") for warning in card["warnings"])
+
+
+def test_objects_that_were_trained_on_are_a_warning(data: GraspDataset) -> None:
+    warning = "2 test objects have names of training objects"
+    card = score(request_of(data, train=data), FakeVerify(is_own(data)), None).card
+    assert warning in card["warnings"]
+    assert warning not in score(request_of(data), FakeVerify(is_own(data)), None).card["warnings"]
+
+
+def test_own_contacts_are_those_that_are_tried(data: GraspDataset) -> None:
+    placed = place_on_rows(data.column("grasps"), data)
+    for each in placed:
+        found = own_contacts(data, [each.index])[0]
+        np.testing.assert_allclose(found.reshape(3, 3), each.p_OQ, atol=1e-6)
+
+
+def test_files_of_a_card_are_whole_and_come_again(data: GraspDataset, tmp_path: Path) -> None:
+    predicted = np.repeat(data.column("grasps")[:, None], 5, axis=1).astype(float)
+    predicted[:, 1:] = 0.0
+    confidence = np.linspace(0.9, 0.1, 5 * len(data)).reshape(len(data), 5)
+    _, ranked = ranked_sets(predicted, data, confidence=confidence)
+    scored = score(request_of(data, predictions=ranked, name="net"), FakeVerify(is_own(data)), None)
+    paths = scored.save(tmp_path)
+    assert json.loads(paths[0].read_text()) == scored.card
+    text = paths[1].read_text()
+    assert "**net: 100 (100 to 100)** sample" in text
+    assert "net, success@5" in text
+    assert "confidence" in text
+    picture = paths[2].read_bytes()
+    assert picture.startswith(b"\x89PNG")
+    assert scored.save(tmp_path)[2].read_bytes() == picture
