@@ -136,7 +136,7 @@ def read_benchmark(out: Path, versions: Mapping[str, str]) -> dict[str, Any] | N
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path}: must be the file of a benchmark, got another: {error}") from None
 
-    # It is frozen if nothing that decides a verdict differs.
+    # What differs from the published benchmark.
     stated, preset = published()["versions"], load_config(PRESET)
     other = differences(preset, config, ignored=("verify", "attempt_seconds"))
     return {

@@ -83,12 +83,12 @@ def card_of(
         own: By row (3k,), contact points of its own grasp in {O} [m].
         origin: Where the score comes from.
     """
+    # What is drawn, and each set; all sets share the draws.
     clusters = grouping.classes if origin.new_classes else grouping.names
     draws = resample(clusters)
     described = {each.name: _set_of(each, grouping, own, draws, origin.oracle) for each in sets}
     tested = [each for each in sets if each.name not in REFERENCES]
 
-    # The headline comes first: a reader of the JSON sees it without scrolling.
     card: dict[str, Any] = {
         "form": FORM,
         "headline": {each.name: described[each.name]["measures"]["headline"] for each in tested},
@@ -164,7 +164,7 @@ def _warnings(grouping: Grouping, origin: Origin, sets: Sequence[Judged]) -> lis
     if not any(REFERENCES[each.name].trained for each in sets if each.name in REFERENCES):
         found.append("no blind row stands beside the score, so it says little (--train)")
 
-    # A failure of the machine counts against the grasp.
+    # Verdicts that say nothing about the grasp.
     unknown = sum(
         verdict.outcome in ("solver_error", "timeout", "crashed")
         for each in sets

@@ -82,18 +82,14 @@ class Grouping:
 
     def means(self, values: npt.ArrayLike) -> Array:
         """Return (..., objects) means over the rows of each object of values (..., rows)."""
-        array = np.asarray(values, dtype=float)
-        counts = np.bincount(self.objects, minlength=len(self.names))
-        sums = np.zeros((*array.shape[:-1], len(self.names)))
-        np.add.at(sums, (..., self.objects), array)
-        return sums / counts
+        member = np.eye(len(self.names))[self.objects]
+        return np.asarray(np.asarray(values, dtype=float) @ member / member.sum(axis=0))
 
     def best(self, values: npt.ArrayLike) -> Array:
         """Return (..., objects) the largest value of each object's rows."""
         array = np.asarray(values, dtype=float)
-        most = np.zeros((*array.shape[:-1], len(self.names)))
-        np.maximum.at(most, (..., self.objects), array)
-        return most
+        members = [self.objects == index for index in range(len(self.names))]
+        return np.stack([array[..., own].max(axis=-1) for own in members], axis=-1)
 
 
 def first_table(judged: Judged, grouping: Grouping, name: str) -> Array:

@@ -190,7 +190,8 @@ def _grouping(data: GraspDataset, rows: Sequence[int]) -> Grouping:
 
 def _reference_rows(request: Request, rows: Sequence[int]) -> list[tuple[str, tuple[Ranked, ...]]]:
     """Return the reference rows that can be made."""
-    scene, made = Scene(data=request.data, rows=rows, train=request.train), []
+    scene = Scene(data=request.data, rows=rows, train=request.train)
+    made: list[tuple[str, tuple[Ranked, ...]]] = []
     for name in request.references:
         reference = REFERENCES[name]
         if reference.trained and not len(request.train):

@@ -90,7 +90,7 @@ def _draw_curves(axes: Axes, card: Mapping[str, Any], colours: Mapping[str, str]
     axes.set_ylim(-2.0, 102.0)
     axes.grid(color="#E3E6EA")
     axes.set_axisbelow(True)
-    axes.set_xlabel("d: largest distance of a contact from the one asked for [mm]", color=INK)
+    axes.set_xlabel("d: farthest contact from the one asked for [mm]", color=INK)
     axes.set_title("held(d) [%]", fontsize="medium", color=INK)
 
 

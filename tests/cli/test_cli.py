@@ -18,6 +18,7 @@ import pytest
 import trimesh
 from helpers.assertions import arrays_of
 from helpers.commands import error_line, run
+from helpers.datasets import make_dataset
 from matplotlib.image import imread
 
 from drakegrasp.cli.main import main

