@@ -10,12 +10,11 @@ from importlib import import_module, metadata
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from drakegrasp.api import (
+    from drakegrasp.api.building import build_dataset, make_benchmark
+    from drakegrasp.api.scoring import score
+    from drakegrasp.api.verifying import (
         PlacedObject,
-        build_dataset,
-        make_benchmark,
         place_object,
-        score,
         verify_grasp,
         verify_grasps,
         verify_rows,
@@ -47,7 +46,7 @@ _HOMES = {
     "GraspDataset": "dataset.reader",
     "Hand": "hand.description",
     "Outcome": "outcomes",
-    "PlacedObject": "api",
+    "PlacedObject": "api.verifying",
     "PoseTrial": "verification.result",
     "Posture": "simulation.postures.posture",
     "Replay": "build.replay",
@@ -56,22 +55,22 @@ _HOMES = {
     "Trials": "dataset.trials",
     "Verification": "verification.result",
     "Violation": "dataset.checks.findings",
-    "build_dataset": "api",
+    "build_dataset": "api.building",
     "check_dataset": "dataset.checks.run",
     "load_config": "hand.settings",
     "load_hand": "hand.description",
-    "make_benchmark": "api",
+    "make_benchmark": "api.building",
     "make_posture": "simulation.postures.posture",
     "pack_grasp": "grasp",
-    "place_object": "api",
+    "place_object": "api.verifying",
     "replay_trial": "build.replay",
     "run_trial": "simulation.postures.trial",
-    "score": "api",
+    "score": "api.scoring",
     "transform_grasp": "grasp",
     "unpack_grasp": "grasp",
-    "verify_grasp": "api",
-    "verify_grasps": "api",
-    "verify_rows": "api",
+    "verify_grasp": "api.verifying",
+    "verify_grasps": "api.verifying",
+    "verify_rows": "api.verifying",
 }
 
 __all__ = [

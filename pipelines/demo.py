@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from drakegrasp.api import build_dataset
+from drakegrasp.api.building import build_dataset
 from drakegrasp.cli.build import print_stats
 from drakegrasp.cli.tables import make_console
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE

@@ -22,7 +22,7 @@ from typing import Any
 import click
 from distributed import Client
 
-from drakegrasp.api import build_on, find_sources
+from drakegrasp.api.building import build_on, find_sources
 from drakegrasp.cli.build import print_plan, print_report
 from drakegrasp.cli.errors import OneCommand
 from drakegrasp.cli.options import build_options, parse_request, shared, tls_files, tls_options

@@ -13,9 +13,9 @@ import pytest
 import trimesh
 from distributed import Client
 
-from drakegrasp.api import (
+from drakegrasp.api.building import build_on
+from drakegrasp.api.verifying import (
     PlacedObject,
-    build_on,
     place_object,
     verify_grasp,
     verify_grasps,

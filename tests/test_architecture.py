@@ -18,7 +18,7 @@ import drakegrasp
 PACKAGE = Path(drakegrasp.__file__).parent
 
 #: The rooms; each may import only from those before it, see docs/explanation/architecture.md.
-#: The first is the vocabulary: the modules at the top of the package, but for `api`.
+#: The first is the vocabulary: the modules at the top of the package.
 ORDER = (
     "(root)",
     "runtime",
@@ -68,7 +68,10 @@ WALLS = {
     "torch": ("dataset.loaders.torch_samples",),
 }
 #: Modules that name a type of a library for the type checker alone: what callers give or get.
-NAMES_TYPES = {("api", "distributed"), ("verification.result", "matplotlib")}
+NAMES_TYPES = {
+    *((f"api.{module}", "distributed") for module in ("building", "verifying", "workers")),
+    ("verification.result", "matplotlib"),
+}
 #: Reading data: NumPy and h5py, and nothing of these.
 HEAVY = (
     *("pydrake", "dask", "distributed", "trimesh", "scipy", "matplotlib", "rich", "pydantic"),
@@ -94,7 +97,7 @@ def folders() -> list[Path]:
 def room_of(module: str) -> str:
     """Return the place of a module in the order."""
     top, _, rest = module.partition(".")
-    return top if rest or top == "api" else "(root)"
+    return top if rest else "(root)"
 
 
 def imports_of(module: str, *, types: bool = True) -> set[str]:
@@ -151,7 +154,7 @@ def loaded_by(module: str, names: tuple[str, ...]) -> str:
 
 def test_every_folder_is_in_the_order() -> None:
     rooms = {path.name for path in PACKAGE.iterdir() if path.is_dir() and path.name[0] != "_"}
-    assert rooms - DATA == set(ORDER) - {"(root)", "api"}
+    assert rooms - DATA == set(ORDER) - {"(root)"}
     assert {room_of(module) for module in MODULE_NAMES} == set(ORDER)
     assert not [path for name in DATA for path in (PACKAGE / name).rglob("*.py")]
 

@@ -57,11 +57,10 @@ NO_CODE = {
     "OUT/manifest.json ": "files of a dataset",
     "The grasp of 15_candlestick_short": "what `explain` says",
     "ok    files ": "what `hand check` prints",
-    "api.py  ": "the calls of a build",
+    "api/building.py  ": "the calls of a build",
     "f = S / (2 tan": "a formula",
     "minimise ": "a formula",
     "Σ_i ": "a formula",
-    "‖f_tangential‖": "a formula",
 }
 #: Blocks marked `py`: Python that is not run as it stands, by a part of it, and why.
 PY_NOT_RUN = {

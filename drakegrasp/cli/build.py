@@ -45,7 +45,7 @@ def build(
     The command simulates grasps of every object and writes trials.hdf5,
     grasping_oto.hdf5 and grasping_otm.hdf5 to DIR.
     """
-    from drakegrasp.api import build_dataset
+    from drakegrasp.api.building import build_dataset
 
     files = tls_files(options)
     request = parse_request(options)

@@ -87,7 +87,7 @@ def score(
 
     DIR gets card.json, card.md, card.png, and the verdicts, so that an interrupted score goes on.
     """
-    from drakegrasp.api import score as score_predictions
+    from drakegrasp.api.scoring import score as score_predictions
     from drakegrasp.cli.tables import make_console, score_table
     from drakegrasp.dataset.reader import GraspDataset
     from drakegrasp.scoring.references import REFERENCES
@@ -163,7 +163,7 @@ def bench_set(
     compared with the published hashes. With --only or --set it is a part of the benchmark or
     another one, and each card says so. The same command continues an interrupted build.
     """
-    from drakegrasp.api import make_benchmark
+    from drakegrasp.api.building import make_benchmark
     from drakegrasp.cli.build import print_report
 
     report = make_benchmark(

@@ -162,7 +162,7 @@ def verify(
         return
     if assets is not None:
         raise click.UsageError("--assets must be used with another --protocol than lift")
-    from drakegrasp.api import run_verification
+    from drakegrasp.api.verifying import run_verification
     from drakegrasp.cli.tables import make_console, verdict_table
     from drakegrasp.cli.verify_request import VerifyRequest, place_requested, requested_rows
     from drakegrasp.verification.hints import count_hints

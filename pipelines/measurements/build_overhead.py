@@ -26,7 +26,7 @@ from typing import Any
 
 import click
 
-from drakegrasp.api import build_dataset
+from drakegrasp.api.building import build_dataset
 from drakegrasp.cli.options import shared
 from drakegrasp.config import Config
 from drakegrasp.dataset.log import read_log

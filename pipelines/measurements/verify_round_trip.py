@@ -20,7 +20,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.api import verify_rows
+from drakegrasp.api.verifying import verify_rows
 from drakegrasp.cluster.connect import connect
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import DATA_FILES, TRIALS_FILE

@@ -16,7 +16,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from drakegrasp.api import verify_rows
+from drakegrasp.api.verifying import verify_rows
 from drakegrasp.cluster.connect import connect
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.reader import GraspDataset

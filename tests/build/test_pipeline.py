@@ -14,7 +14,7 @@ import pytest
 import trimesh
 from helpers.assertions import assert_same_dataset
 
-from drakegrasp.api import build_dataset
+from drakegrasp.api.building import build_dataset
 from drakegrasp.build.pipeline import BuildReport, build
 from drakegrasp.build.prepare import prepare_one
 from drakegrasp.build.replay import replay_trial

@@ -11,7 +11,7 @@ import pytest
 from helpers.assertions import assert_same_dataset
 from helpers.meshes import SMALL
 
-from drakegrasp.api import verify_rows
+from drakegrasp.api.verifying import verify_rows
 from drakegrasp.build.pipeline import build
 from drakegrasp.build.replay import record_trial, replay_trial
 from drakegrasp.config import Config

@@ -219,7 +219,7 @@ def test_crashes_that_no_physics_explains_end_the_build_with_an_error(
         return build(find_meshes(objects), out, config, run_here, show=show)
 
     monkeypatch.setattr("drakegrasp.build.work_unit._try_step", _crash)
-    monkeypatch.setattr("drakegrasp.api.build_dataset", build_here)
+    monkeypatch.setattr("drakegrasp.api.building.build_dataset", build_here)
     (tmp_path / "meshes").mkdir()
     trimesh.creation.box([0.06, 0.05, 0.12]).export(tmp_path / "meshes" / "1_box.obj")
     few = ("--set", "candidates.max=1")
@@ -266,7 +266,7 @@ def test_build_connects_with_the_certificates_that_it_is_given(
         raise MachineError("connected")
         yield
 
-    monkeypatch.setattr("drakegrasp.api.connect", connect)
+    monkeypatch.setattr("drakegrasp.api.building.connect", connect)
     (tmp_path / "meshes").mkdir()
     trimesh.creation.box([0.06, 0.05, 0.12]).export(tmp_path / "meshes" / "1_box.obj")
     build = ["build", "--objects", tmp_path / "meshes", "--out", tmp_path / "out"]

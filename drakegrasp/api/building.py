@@ -1,0 +1,227 @@
+"""Building a dataset or the frozen benchmark on Dask workers.
+
+These are the functions that `drakegrasp` exports and the command line calls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from drakegrasp.api.workers import announced, refuse_workers
+from drakegrasp.build.pipeline import (
+    BuildReport,
+    build_locked,
+    posture_config,
+    refuse_unusable,
+)
+from drakegrasp.build.request import BUILTIN
+from drakegrasp.cluster.admission import admitted_workers
+from drakegrasp.cluster.certificates import security_of
+from drakegrasp.cluster.connect import connect
+from drakegrasp.cluster.executor import RESUBMISSIONS, DaskExecutor
+from drakegrasp.config import Config
+from drakegrasp.dataset.lock import build_lock
+from drakegrasp.dataset.manifest import claim_directory
+from drakegrasp.dataset.paths import BUILTIN_FOLDER
+from drakegrasp.errors import GraspError, MeshError, listed
+from drakegrasp.exchange.posture_files import read_postures
+from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.settings import load_config
+from drakegrasp.objects.sources import MeshSource, find_meshes
+from drakegrasp.runtime.progress import progress_bar
+from drakegrasp.scoring.benchmark import PRESET, write_objects
+from drakegrasp.shapes.catalog import builtin_sources, draw_builtin
+from drakegrasp.simulation.drive import drive_of
+from drakegrasp.simulation.postures.table import PostureTable, refuse_unknown_objects
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+
+def build_dataset(
+    objects: str | Path,
+    out: str | Path,
+    *,
+    config: Config | None = None,
+    units: str = "m",
+    manifest: str | Path | None = None,
+    only: Sequence[str] = (),
+    postures: str | Path | PostureTable | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    scheduler_file: str | Path | None = None,
+    tls_files: tuple[Path, Path, Path] | None = None,
+    show: bool = True,
+) -> BuildReport:
+    """Build the dataset of a directory of meshes; the same as `drakegrasp build`.
+
+    Work that is complete in `out` is kept: the same call continues where an earlier one stopped.
+
+    Args:
+        objects: Directory of meshes, or "builtin" for the built-in objects, of which
+            `config.builtin` says how many.
+        out: Directory of the dataset; it must be visible to every worker.
+        config: All the rules; the defaults if None.
+        units: Unit of length of the meshes: m, cm or mm.
+        manifest: YAML file with units and classes per mesh, if it is not beside the meshes.
+        only: Names of the objects to build; all if empty.
+        postures: Instead of drawn palm poses: a file of postures, or a table of them. Only the
+            objects that it names are built.
+        workers: Processes on this machine; one per core if None.
+        scheduler: Address of a running Dask scheduler to use instead.
+        scheduler_file: Its JSON file, instead of the address.
+        tls_files: To encrypt: certificate authority, certificate and private key (PEM).
+        show: Whether to show progress on standard error.
+
+    Raises:
+        MeshError: If there is no mesh.
+        GraspError: If a row of the postures is none, or of an object that is not there.
+        ConfigError: If both workers and a scheduler are given, or the address is empty.
+        DataError: If `out` cannot be used, another process builds there, or no mesh can be
+            simulated.
+        MachineError: If there is no scheduler, the workers cannot do the work, or no room is
+            left; the same call continues when that is fixed.
+    """
+    refuse_workers(workers, scheduler, scheduler_file)
+    out, config = Path(out).absolute(), config or load_config()
+    hand = load_hand(config.hand)
+    drive_of(hand, config.lift)
+    if isinstance(postures, str | Path):
+        postures = read_postures(Path(postures), hand)
+    sources = find_sources(objects, units, manifest)
+    security = None if tls_files is None else security_of(tls_files)
+    cluster = announced(connect(workers, scheduler, scheduler_file, security=security), show)
+    return build_on(cluster, sources, out, config, only=only, postures=postures, show=show)
+
+
+def find_sources(
+    objects: str | Path, units: str, manifest: str | Path | None
+) -> list[MeshSource] | None:
+    """Return the meshes of a directory, or None for the built-in objects.
+
+    Raises:
+        MeshError: If there is no mesh.
+    """
+    if str(objects) == BUILTIN:
+        return None
+    return find_meshes(objects, units=units, manifest=manifest)
+
+
+def build_on(
+    cluster: AbstractContextManager[Client],
+    sources: Sequence[MeshSource] | None,
+    out: Path,
+    config: Config,
+    *,
+    only: Sequence[str] = (),
+    postures: PostureTable | None = None,
+    show: bool = True,
+) -> BuildReport:
+    """Build a dataset on the workers of a cluster; see `build_dataset`.
+
+    The directory is locked before the workers start: a second build is refused before that.
+
+    Args:
+        cluster: Starts workers that all see `out`, and yields their client, e.g. `connect(2)`. A
+            client of the caller's own goes in as `contextlib.nullcontext(client)`.
+        sources: The meshes; None for the built-in objects.
+        out: Directory of the dataset, absolute.
+        config: All the rules.
+        only: As for `build_dataset`.
+        postures: As for `build_dataset`.
+        show: Whether to show progress on standard error.
+
+    Raises:
+        ConfigError: As `refuse_unusable` of `build.pipeline`.
+        DataError: If `out` cannot be used, another process builds there, or no mesh can be
+            simulated.
+        MeshError: If `only` names no object.
+        MachineError: If a worker would give other results than this machine.
+    """
+    refuse_unusable(config)
+    config = posture_config(config, postures)
+    known = draw_builtin(config.builtin) if sources is None else sources
+    _refuse_unknown(only, [each.name for each in known])
+    if postures is not None:
+        refuse_unknown_objects(postures, [each.name for each in known])
+        only = [name for name in dict.fromkeys(postures.objects) if not only or name in only]
+        if not only:
+            raise GraspError("postures must be of an object that is built, got none of them")
+    with build_lock(out) as dead, ExitStack() as stack:
+        # A directory that cannot be used is refused before workers start.
+        claim_directory(out, config)
+        client = stack.enter_context(cluster)
+        stack.enter_context(admitted_workers(client, config))
+
+        # The built-in objects become mesh files of the dataset.
+        if sources is None:
+            with progress_bar("objects", "meshes", show=show) as report:
+                sources = builtin_sources(out / BUILTIN_FOLDER, config.builtin, report, only)
+        sources = [source for source in sources if not only or source.name in only]
+
+        execute = DaskExecutor(client, resubmissions=RESUBMISSIONS)
+        return build_locked(
+            sources,
+            out,
+            config,
+            execute,
+            dead=dead,
+            postures=postures,
+            pool=execute.pool,
+            show=show,
+        )
+
+
+def _refuse_unknown(only: Sequence[str], names: Sequence[str]) -> None:
+    """Refuse names that no object has.
+
+    Raises:
+        MeshError: If there is one.
+    """
+    unknown = [name for name in only if name not in names]
+    if unknown:
+        known = listed(names)
+        raise MeshError(f"only must be names of objects ({known}), got {unknown[0]!r}")
+
+
+def make_benchmark(
+    out: str | Path,
+    *,
+    only: Sequence[str] = (),
+    overrides: Sequence[str] = (),
+    workers: int | None = None,
+    scheduler: str | None = None,
+    scheduler_file: str | Path | None = None,
+    show: bool = True,
+) -> BuildReport:
+    """Make the frozen benchmark `drakegrasp-bench-1`; the same as `drakegrasp bench-set`.
+
+    Args:
+        out: Directory of the benchmark, which is a dataset whose samples all test.
+        only: Names of objects, for a part of the benchmark; all if empty.
+        overrides: `"key=value"` settings that differ from the published ones; each card says so.
+        workers: Processes on this machine; one per core if None.
+        scheduler: Address of a running Dask scheduler to use instead.
+        scheduler_file: Its JSON file, instead of the address.
+        show: Whether to show progress on standard error.
+
+    Raises:
+        MeshError: If `only` names no object.
+        ConfigError, DataError, MachineError: As `build_dataset`.
+    """
+    config, folder = load_config(PRESET, list(overrides)), Path(out).absolute()
+    with progress_bar("objects", "meshes", show=show) as report:
+        meshes = write_objects(folder, config, only=only, progress=report)
+    return build_dataset(
+        meshes,
+        folder,
+        config=config,
+        only=only,
+        workers=workers,
+        scheduler=scheduler,
+        scheduler_file=scheduler_file,
+        show=show,
+    )

@@ -1,0 +1,103 @@
+"""Scoring predicted grasps beside reference rows, on Dask workers or in this process."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy.typing as npt
+
+from drakegrasp.api.verifying import run_verification
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.errors import GraspError
+from drakegrasp.frames import Array
+from drakegrasp.scoring.ranked import ranked_sets
+from drakegrasp.scoring.references import REFERENCES
+from drakegrasp.scoring.run import Request, Score
+from drakegrasp.scoring.run import score as score_request
+from drakegrasp.verification.batch import ResultCallback
+from drakegrasp.verification.placed_grasp import (
+    dataset_config,
+    place_on_rows,
+)
+
+if TYPE_CHECKING:
+    pass
+
+
+def score(
+    predictions: npt.ArrayLike | str | Path | Sequence[str | Path],
+    dataset: GraspDataset,
+    *,
+    rows: Sequence[int] | None = None,
+    confidence: npt.ArrayLike | None = None,
+    train: GraspDataset | None = None,
+    references: Sequence[str] = tuple(REFERENCES),
+    per_object: int | None = None,
+    overrides: Sequence[str] = (),
+    out: str | Path | None = None,
+    again: str = "drakegrasp.score",
+    workers: int | None = None,
+    scheduler: str | None = None,
+    scheduler_file: str | Path | None = None,
+    show: bool = False,
+) -> Score:
+    """Return the score of predicted grasps beside reference rows; see docs/how-to/score.md.
+
+    Args:
+        predictions: In the frame of the rows' camera: (n, 6k), one per row, or (n, m, 6k), m per
+            row; or a file of them, or several files of one method that was trained several times.
+            An empty list scores the reference rows alone.
+        dataset: The split whose rows the predictions are for.
+        rows: With an array: (n,), the row of each; all rows, in order, if None.
+        confidence: With an array: (n,) or (n, m), greater is better.
+        train: Training rows for reference rows; the split `train` of the same file if None.
+        references: Names of the reference rows, see `scoring.references.REFERENCES`.
+        per_object: Rows of each object, at most; all if None.
+        overrides: `"key=value"` settings; `verify.max_tries` is 1 if they do not say otherwise,
+            because the headline is of the first wrist pose.
+        out: Folder that keeps verdicts, so that the same call goes on, and gets the card.
+        again: What the card says about how to make it again.
+        workers: Processes on this machine; one per core if None.
+        scheduler: Address of a running Dask scheduler to use instead.
+        scheduler_file: Its JSON file, instead of the address.
+        show: Whether to show progress on standard error.
+
+    Raises:
+        GraspError: If predictions and rows do not fit.
+        ConfigError, DataError, HandError, MachineError: As `run_verification`.
+    """
+    # What is scored, by which rules.
+    unknown = [name for name in references if name not in REFERENCES]
+    if unknown:
+        raise GraspError(f"references must be of {', '.join(REFERENCES)}, got {unknown[0]!r}")
+    settings = ("verify.max_tries=1", *overrides)
+    name, ranked = ranked_sets(predictions, dataset, rows=rows, confidence=confidence)
+    request = Request(
+        data=dataset,
+        train=GraspDataset(dataset.path, split="train") if train is None else train,
+        predictions=ranked,
+        name=name,
+        references=tuple(references),
+        per_object=per_object,
+        config=dataset_config(dataset, overrides=settings),
+        again=again,
+    )
+
+    # Its verdicts, by this process or workers, and the card.
+    def try_all(grasps: Array, chosen: Sequence[int], on_result: ResultCallback) -> object:
+        placed = place_on_rows(grasps, dataset, chosen, overrides=settings)
+        return run_verification(
+            placed,
+            workers=workers,
+            scheduler=scheduler,
+            scheduler_file=scheduler_file,
+            on_result=on_result,
+            show=show,
+        )
+
+    scored = score_request(request, try_all, None if out is None else Path(out))
+    if out is not None:
+        scored.save(Path(out))
+    return scored

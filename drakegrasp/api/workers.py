@@ -1,0 +1,40 @@
+"""What all public calls do with the workers that they are given."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from drakegrasp.cluster.connect import dashboard_line, has_dashboard
+from drakegrasp.errors import ConfigError
+from drakegrasp.runtime.executor import count_workers
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+
+@contextmanager
+def announced(cluster: AbstractContextManager[Client], show: bool) -> Iterator[Client]:
+    """Enter a cluster and print the link to its dashboard, if it has one."""
+    with cluster as client:
+        if show and has_dashboard() and client.dashboard_link:
+            sys.stderr.write(f"{dashboard_line(client)}\n")
+        yield client
+
+
+def refuse_workers(
+    workers: int | None, scheduler: str | None, scheduler_file: str | Path | None
+) -> None:
+    """Refuse a number of workers that is below one, or given with a scheduler.
+
+    Raises:
+        ConfigError: If so.
+    """
+    if scheduler is not None and not scheduler.strip():
+        raise ConfigError(f"scheduler must be an address like tcp://host:8786, got {scheduler!r}")
+    if workers is not None and (scheduler or scheduler_file):
+        raise ConfigError("workers must not be given with a scheduler, which has its own")
+    count_workers(workers)
