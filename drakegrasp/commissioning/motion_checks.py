@@ -86,7 +86,7 @@ def check_palm(hand: Hand) -> Finding:
             continue
         X_GL = link_poses(hand, link, spread=0.0, closing=closing)
         for corners in shapes:
-            depth = _ray_end(transform_points(X_GL, corners))
+            depth = ray_end(transform_points(X_GL, corners))
             if depth > worst:
                 worst, blocked = depth, link
     faults = []
@@ -245,7 +245,7 @@ def _facing(hand: Hand) -> Array:
     return np.array(cosines)
 
 
-def _ray_end(corners: Array) -> float:
+def ray_end(corners: Array) -> float:
     """Return where the ray along +Gz leaves a hull of corners (n, 3) in {G} [m]; 0 if it misses."""
     # On the ray p = t z each plane n.p + d <= 0 of the hull is a limit of t.
     equations = ConvexHull(corners).equations

@@ -73,7 +73,7 @@ def _findings(name_or_yaml: str | Path, config: Config) -> Iterator[Finding]:
 
     # Geometry, then grasps.
     sound = True
-    for finding in _geometry(hand):
+    for finding in check_geometry(hand):
         sound = sound and finding.ok
         yield finding
     if sound:
@@ -81,7 +81,8 @@ def _findings(name_or_yaml: str | Path, config: Config) -> Iterator[Finding]:
             yield check_grasp(hand, config, shape)
 
 
-def _geometry(hand: Hand) -> Iterator[Finding]:
+def check_geometry(hand: Hand) -> Iterator[Finding]:
+    """Yield what is right and wrong about a hand's geometry; nothing is simulated."""
     # Seen from behind, fingers run the other way round.
     palm = motion_checks.check_palm(hand)
     yield palm
