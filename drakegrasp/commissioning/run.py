@@ -11,16 +11,13 @@ from pathlib import Path
 
 from drakegrasp.commissioning import model_checks, motion_checks
 from drakegrasp.commissioning.finding import Finding
-from drakegrasp.commissioning.trial_grasps import check_grasp
+from drakegrasp.commissioning.trial_grasps import GRASPS, check_grasp
 from drakegrasp.config import Config
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.runtime.blas import one_thread
-
-#: Objects that the hand must grasp.
-SHAPES = ("box", "cylinder")
 
 
 @one_thread
@@ -77,8 +74,8 @@ def _findings(name_or_yaml: str | Path, config: Config) -> Iterator[Finding]:
         sound = sound and finding.ok
         yield finding
     if sound:
-        for shape in SHAPES:
-            yield check_grasp(hand, config, shape)
+        for shape, line in GRASPS:
+            yield check_grasp(hand, config, shape, line)
 
 
 def check_geometry(hand: Hand) -> Iterator[Finding]:

@@ -92,7 +92,7 @@ def find_palm_frames(
             continue
         beyond = float((cloud @ direction).max() - grip.middle @ direction)
         oblique = np.arccos(min(float(np.abs(direction).max()), 1.0)) > 1e-3
-        rpy = RotationMatrix(X_BG[:3, :3]).ToRollPitchYaw().vector()
+        rpy = RotationMatrix.ProjectToRotationMatrix(X_BG[:3, :3]).ToRollPitchYaw().vector()
         frames.append(
             PalmFrame(
                 p_BG=np.round(X_BG[:3, 3], 4) + 0.0,

@@ -79,6 +79,8 @@ def read_mesh(path: Path) -> tuple[Array, Faces, Array | None]:
     try:
         scene: Any = trimesh.load_scene(path)
         mesh: Any = scene.to_mesh()
+        # Seams of textures and shading would tear where faces are left out.
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
         vertices = np.asarray(mesh.vertices, dtype=float)
         faces = np.asarray(mesh.faces, dtype=np.int64)
     except ImportError as error:

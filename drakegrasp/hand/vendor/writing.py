@@ -113,7 +113,7 @@ def _joint(joint: VendorJoint, mimic: Mimic | None) -> Element:
 
 
 def _origin(X: Array) -> Element:
-    rpy = RotationMatrix(X[:3, :3], True).ToRollPitchYaw().vector()
+    rpy = RotationMatrix.ProjectToRotationMatrix(X[:3, :3]).ToRollPitchYaw().vector()
     return Element("origin", {"xyz": _numbers(X[:3, 3]), "rpy": _numbers(rpy)})
 
 
