@@ -37,17 +37,13 @@ MASS = 0.3
 ABOVE_TABLE, BEFORE_PALM, AROUND_PADS = 0.1, 0.008, 0.012
 #: Least size of an object in any direction [m].
 LEAST_SIZE = 0.03
-#: Where the line is along which the fingers close: its angle above the horizontal [rad], in words.
-#: At 0 the palm faces the table.
-LINES = {
-    "across gravity": 0.0,
-    "at 45° to gravity": np.deg2rad(45.0),
-    "along gravity": np.deg2rad(90.0),
-}
+#: The line along which the fingers close, by its angle above the horizontal [rad]. Where it is
+#: level, the palm faces the table.
+LINES = {"level": 0.0, "tilted": np.deg2rad(45.0), "upright": np.deg2rad(90.0)}
 #: Objects that the hand must grasp, and the lines on which it must.
 GRASPS = tuple(("box", line) for line in LINES) + (
-    ("cylinder", "across gravity"),
-    ("sphere", "across gravity"),
+    ("cylinder", "level"),
+    ("sphere", "level"),
 )
 
 
@@ -68,7 +64,7 @@ class TrialGrasp:
     width: float
 
 
-def check_grasp(hand: Hand, config: Config, shape: str, line: str) -> Finding:
+def check_grasp(hand: Hand, config: Config, shape: str, line: str = "level") -> Finding:
     """Return whether the hand can grasp and lift an object, and how far that slips.
 
     Fingers that can be pushed open may lose what nothing centres between them. Of such a hand the
@@ -81,7 +77,7 @@ def check_grasp(hand: Hand, config: Config, shape: str, line: str) -> Finding:
         line: On which the fingers close, one of `LINES`.
     """
     # Try until one holds, which a whole lift shows.
-    name = f"grasp of a {shape}" + (f", {line}" if LINES[line] else "")
+    name = f"{shape}, {line} line"
     config = with_whole_lifts(config)
     drive = drive_of(hand, config.lift)
     rules = _with_drive(config, "locked" if drive == "torque" else drive)
@@ -167,7 +163,7 @@ def _slip(record: TrialRecord) -> str:
     return f"slips by {1e3 * record.lift.slip:.2f} mm and {np.rad2deg(record.lift.turn):.1f}°"
 
 
-def trial_grasps(hand: Hand, shape: str, line: str) -> Iterator[TrialGrasp]:
+def trial_grasps(hand: Hand, shape: str, line: str = "level") -> Iterator[TrialGrasp]:
     """Yield attempts at an object of a few widths, see `check_grasp`."""
     for width in WIDTHS:
         pinch = find_pinch(hand, width)

@@ -161,11 +161,11 @@ def prism_corners(radius: float, half_length: float) -> Array:
     return np.concatenate(ends)
 
 
-def ball_corners(radius: float) -> Array:
-    """Return points on a sphere about the origin."""
+def ball_corners(radius: float, count: int = CIRCLE**2) -> Array:
+    """Return points (count, 3) on a sphere about the origin [m]."""
     # A Fibonacci lattice: even spacing without poles.
-    i = np.arange(CIRCLE**2) + 0.5
-    z, turn = 1.0 - 2.0 * i / CIRCLE**2, np.pi * (1.0 + np.sqrt(5.0)) * i
+    i = np.arange(count) + 0.5
+    z, turn = 1.0 - 2.0 * i / count, np.pi * (1.0 + np.sqrt(5.0)) * i
     across = np.sqrt(1.0 - z**2)
     sine, cosine = sin_cos(turn)
     return radius * np.column_stack([across * cosine, across * sine, z])

@@ -32,8 +32,9 @@ def hand_text(tree: Mapping[str, Any], reasons: Mapping[str, str], head: list[st
                     start = "- " if n == 0 else "  "
                     why = reasons.get(f"{key}.{i}.{name}")
                     lines += _entry(f"{start}{name}:", item, why)
-            lines.append("")
         else:
+            # What comes after a block stands apart from it.
+            lines += [""] if lines[-1].startswith(" ") else []
             lines += _line(0, f"{key}: {_flow(value)}", reasons.get(key))
     return "\n".join(lines) + "\n"
 

@@ -317,7 +317,7 @@ def _reasons(
         }
         effort = f"effort of {answers.effort:g} (given)" if answers.effort else "the model's effort"
         for kind in ("torque", "force"):
-            reasons[f"{key}.{kind}_limit"] = f"from {effort}: what the weakest joint lets it press"
+            reasons[f"{key}.{kind}_limit"] = f"from {effort}; no side presses more than the other"
             reasons[f"{key}.holding_{kind}"] = "guessed: twice that"
     closed = {j.name for m in grip.members for j in m.chain.joints}
     for name in model.joints:

@@ -30,7 +30,7 @@ ROUND, ROUND_COST = np.deg2rad([0.0, 30.0, 60.0]), 0.2
 #: A finger that turns about its own direction has no side by which it closes, as a cosine.
 SQUARE = 0.3
 #: Grips that are returned at most.
-GRIPS = 6
+GRIPS = 40
 #: A hand of more fingers than this grasps with so many.
 FINGERS = 3
 

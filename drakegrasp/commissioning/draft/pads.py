@@ -97,7 +97,8 @@ def find_pad(parts: Sequence[Array], points: Array, normal: Array, along: Array)
     level = max(level, top - 0.45 * length)
     at = points[np.abs(heights - level) < 2.0 * SPACING]
     front = at[at @ normal > (at @ normal).max() - 0.002]
-    middle = float(np.median(front @ across))
+    sides = front @ across
+    middle = float(sides.max() + sides.min()) / 2.0
 
     # The surface there: a ray along the normal leaves the last of the parts.
     start = level * along + middle * across + (points @ normal).min() * normal

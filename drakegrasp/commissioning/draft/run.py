@@ -14,10 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drakegrasp.commissioning.draft.answers import Answers
-from drakegrasp.commissioning.draft.fingers import find_chains, find_palm
+from drakegrasp.commissioning.draft.clearance import Clearance
+from drakegrasp.commissioning.draft.fingers import STEPS, find_chains, find_palm
 from drakegrasp.commissioning.draft.hand_text import hand_text
 from drakegrasp.commissioning.draft.hand_tree import Draft, draft_tree, positions
-from drakegrasp.commissioning.draft.opposition import find_grips, find_reach
+from drakegrasp.commissioning.draft.opposition import Grip, find_grips, find_reach
 from drakegrasp.commissioning.draft.palm import find_palm_frames
 from drakegrasp.commissioning.finding import Finding
 from drakegrasp.commissioning.model_checks import check_couplings, check_efforts, check_limits
@@ -32,8 +33,8 @@ from drakegrasp.hand.vendor.writing import write_urdf
 from drakegrasp.runtime.blas import one_thread
 from drakegrasp.runtime.files import atomic_folder
 
-#: Palm frames that are tried with each grip, and shares of the closing at which links are looked at.
-FRAMES, SHARES = 2, (0.0, 0.25, 0.5, 0.75, 1.0)
+#: Grips that are tried, palm frames with each, and shares of the closing at which links are looked at.
+GRIPS, FRAMES, SHARES = 4, 2, (0.0, 0.25, 0.5, 0.75, 1.0)
 #: A pinch that costs more than this is none: fingers that pass each other.
 WORST = 3.0
 #: Files of a vendor that say what may be done with the model.
@@ -136,11 +137,20 @@ def _drafts(model: VendorModel, answers: Answers, config: Config) -> Iterator[Dr
             "do not close with --joint NAME=POSITION, or what closes the other way with --reverse "
             "JOINT"
         )
-    for grip in grips:
+    # Those whose links meet too early come last.
+    clearance = Clearance(model, palm)
+    clear = [g for g in grips if clearance.is_clear(g, _until_pinched(model, g))]
+    for grip in [*clear[:GRIPS], *grips[:1]]:
         postures = [positions(model, grip, share) for share in SHARES]
         frames = find_palm_frames(model, palm, grip, postures, answers.approach)
         for frame in frames[:FRAMES]:
             yield draft_tree(model, palm, grip, frame, answers, config)
+
+
+def _until_pinched(model: VendorModel, grip: Grip) -> list[dict[str, float]]:
+    """Return the positions of all joints on the way to the pinch."""
+    last = max(grip.step) / (STEPS - 1)
+    return [positions(model, grip, share * last) for share in SHARES]
 
 
 def _write(draft: Draft, folder: Path, path: Path) -> Path:

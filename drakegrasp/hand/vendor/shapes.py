@@ -26,7 +26,7 @@ from pydrake.geometry import (
 
 from drakegrasp.arithmetic import dot
 from drakegrasp.frames import Array, transform_points
-from drakegrasp.hand.shapes import CIRCLE, ball_corners, box_corners, hull_corners, prism_corners
+from drakegrasp.hand.shapes import ball_corners, box_corners, hull_corners, prism_corners
 from drakegrasp.mesh.surfaces import Faces
 
 #: Corners of the hull of a collision mesh: of a ball of 10 mm radius they miss less than 0.4 mm.
@@ -131,7 +131,7 @@ def _thinned(points: Array) -> Array:
     extents = np.ptp(points, axis=0)
     if extents.min() < 1e-4:
         points = np.concatenate([points - 2e-4, points + 2e-4])
-    directions = ball_corners(1.0)[:: CIRCLE**2 // CORNERS]
+    directions = ball_corners(1.0, CORNERS)
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     directions = np.concatenate([axes, directions])
     farthest = [int(np.argmax(dot(points, direction))) for direction in directions]
