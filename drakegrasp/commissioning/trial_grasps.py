@@ -86,8 +86,9 @@ def check_grasp(hand: Hand, config: Config, shape: str, line: str = "level") -> 
     for grasp in trial_grasps(hand, shape, line):
         scene = build_scene(grasp.model, config.physics, hand)
         record = run_attempt(scene, grasp.X_TO, grasp.pregrasp, rules)
-        outcomes[record.outcome.label] += 1
-        if record.outcome is not Outcome.SUCCESS:
+        held = record.outcome is Outcome.SUCCESS
+        outcomes[record.outcome.label if not held or _stays(record, config) else MOVED] += 1
+        if not held or not _stays(record, config):
             missing.update(_missing(hand, record))
             continue
         text = (
@@ -107,6 +108,8 @@ def check_grasp(hand: Hand, config: Config, shape: str, line: str = "level") -> 
     return Finding(name=name, ok=False, text=text + _mend(outcomes, missing))
 
 
+#: What is held, but moves more in the hand than a sample may.
+MOVED = "moved too far in the hand"
 #: How to mend a hand that holds nothing along the line on which its fingers close.
 _SOFT = (
     "two motors that push against each other do not hold along their line; say `drive: worm` if "
@@ -135,7 +138,7 @@ def _mend(outcomes: Counter[str], missing: Counter[str]) -> str:
         return ": other links touch it first; open the hand wider, or move the palm back (p_BG)"
     if label == Outcome.START_COLLISION.label:
         return ": the open hand is in its way; keep fingers that do not grasp away with preshape"
-    if label in (Outcome.SLIPPED.label, Outcome.DROPPED.label):
+    if label in (Outcome.SLIPPED.label, Outcome.DROPPED.label, MOVED):
         return ": pads must face each other where they meet, and motors press enough (efforts)"
     return ""
 

@@ -90,7 +90,7 @@ def test_meshes_of_many_formats_are_drawn(tmp_path: Path, suffix: str) -> None:
     again = read(out)
     assert len(again.links["left_jaw"].visuals) == 1
     if suffix == ".glb":
-        np.testing.assert_allclose(again.links["left_jaw"].visuals[0].colour, [1.0, 0.0, 0.0])
+        np.testing.assert_allclose(again.links["left_jaw"].visuals[0].colour, [1.0, 0.15, 0.15])
 
 
 def test_a_picture_that_cannot_be_read_is_left_out_and_said(tmp_path: Path) -> None:

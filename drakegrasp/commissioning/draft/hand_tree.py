@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from os.path import commonprefix
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,8 @@ STANDOFFS = (0.45, 0.65, 0.8)
 #: Share of what friction carries that is the payload.
 PAYLOAD = 0.5
 #: Names of fingers, by what the names of their links contain.
-NAMES = ("thumb", "index", "middle", "ring", "pinky", "little", "left", "right")
+NAMES = ("thumb", "index", "middle", "ring", "pinky", "little")
+SIDES = ("left", "right")
 #: Spreads that are tried if two joints spread fingers [deg], and how far they must turn [rad].
 SPREADS_DEG, SPREADING = [0.0, 11.25, 22.5], 0.9
 
@@ -95,7 +97,7 @@ def draft_tree(
 
     # The fingers; joints that nothing else drives keep a position.
     coupled = _couplings(model, grip)
-    names = _names(model, grip)
+    names = _names(grip)
     fingers = []
     for i, member in enumerate(grip.members):
         joint = _closing(member)
@@ -235,16 +237,20 @@ def _rebased(
     return replace(model, joints=joints, mimics=mimics)
 
 
-def _names(model: VendorModel, grip: Grip) -> list[str]:
-    """Return a name for each finger."""
-    names = []
-    for member in grip.members:
-        texts = [member.chain.tip, *(joint.name for joint in reversed(member.chain.joints))]
-        texts += [joint.child for joint in member.chain.joints]
-        words = [word for text in texts for word in NAMES if word in text.lower()]
-        names.append(words[0] if words else member.chain.tip)
-    alike = len(set(names)) < len(names)
-    return [member.chain.tip for member in grip.members] if alike else names
+def _names(grip: Grip) -> list[str]:
+    """Return a name for each finger: a usual one, a side, or what tells its link from others."""
+    tips = [member.chain.tip for member in grip.members]
+    for words in (NAMES, SIDES):
+        found = []
+        for member in grip.members:
+            texts = [member.chain.tip, *(joint.name for joint in reversed(member.chain.joints))]
+            texts += [joint.child for joint in member.chain.joints]
+            found += [word for text in texts for word in words if word in text.lower()][:1]
+        if len(set(found)) == len(tips):
+            return found
+    end = len(commonprefix([tip[::-1] for tip in tips]))
+    short = [tip[: len(tip) - end].rstrip("_-.") for tip in tips]
+    return short if all(short) else tips
 
 
 def _spread(

@@ -2,7 +2,7 @@
 
 In: a URDF, SDFormat or MJCF file, and what a person says of the hand. Out: a folder that is complete
 by itself: hand file, model, meshes. Of several ways to grasp, the first is taken that passes the
-checks of its geometry, or else the one that fails the fewest.
+checks of its geometry and holds a box and a ball, or else the one that fails the fewest.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 from drakegrasp.commissioning.draft.answers import Answers
@@ -23,6 +24,7 @@ from drakegrasp.commissioning.draft.palm import find_palm_frames
 from drakegrasp.commissioning.finding import Finding
 from drakegrasp.commissioning.model_checks import check_couplings, check_efforts, check_limits
 from drakegrasp.commissioning.run import check_geometry
+from drakegrasp.commissioning.trial_grasps import check_grasp
 from drakegrasp.config import Config
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import load_hand
@@ -34,7 +36,9 @@ from drakegrasp.runtime.blas import one_thread
 from drakegrasp.runtime.files import atomic_folder
 
 #: Grips that are tried, palm frames with each, and shares of the closing at which links are looked at.
-GRIPS, FRAMES, SHARES = 4, 2, (0.0, 0.25, 0.5, 0.75, 1.0)
+GRIPS, FRAMES, SHARES = 6, 2, (0.0, 0.25, 0.5, 0.75, 1.0)
+#: Objects that it must hold.
+SHAPES = ("box", "sphere")
 #: A pinch that costs more than this is none: fingers that pass each other.
 WORST = 3.0
 #: Files of a vendor that say what may be done with the model.
@@ -87,14 +91,21 @@ def draft_hand(
     # The first that passes, or the one with the fewest faults.
     best: tuple[int, Draft, tuple[Finding, ...]] | None = None
     with tempfile.TemporaryDirectory() as scratch:
-        for n, draft in enumerate(_drafts(model, answers, config)):
-            folder = Path(scratch) / str(n)
-            folder.mkdir()
-            findings = _findings(_write(draft, folder, path), config)
-            faults = sum(not finding.ok for finding in findings)
-            if best is None or faults < best[0]:
-                best = faults, draft, findings
-            if faults == 0:
+        folders = (Path(scratch) / str(n) for n in count())
+        for drafts in _drafts(model, answers, config):
+            # The palm frames of a grip, until its geometry is sound; then whether it holds.
+            for draft in drafts:
+                file = _write(draft, next(folders), path)
+                findings = _findings(file, config)
+                sound = all(finding.ok for finding in findings)
+                if sound:
+                    findings = (*findings, *_grasps(file, config))
+                faults = sum(not finding.ok for finding in findings)
+                if best is None or faults < best[0]:
+                    best = faults, draft, findings
+                if sound:
+                    break
+            if best is not None and best[0] == 0:
                 break
     if best is None:
         raise HandError(
@@ -125,8 +136,10 @@ def _refuse_unknown(model: VendorModel, answers: Answers) -> None:
             raise HandError(f"--joint {name} must be {lower:g}..{upper:g}, got {position:g}")
 
 
-def _drafts(model: VendorModel, answers: Answers, config: Config) -> Iterator[Draft]:
-    """Yield hand files, the likeliest first."""
+def _drafts(
+    model: VendorModel, answers: Answers, config: Config
+) -> Iterator[Iterator[Draft]]:
+    """Yield hand files, the likeliest first: for each grip those of its palm frames."""
     palm = find_palm(model, answers)
     chains = find_chains(model, palm, answers)
     grips = find_grips([find_reach(model, palm, chain) for chain in chains])
@@ -143,8 +156,9 @@ def _drafts(model: VendorModel, answers: Answers, config: Config) -> Iterator[Dr
     for grip in [*clear[:GRIPS], *grips[:1]]:
         postures = [positions(model, grip, share) for share in SHARES]
         frames = find_palm_frames(model, palm, grip, postures, answers.approach)
-        for frame in frames[:FRAMES]:
-            yield draft_tree(model, palm, grip, frame, answers, config)
+        yield (
+            draft_tree(model, palm, grip, frame, answers, config) for frame in frames[:FRAMES]
+        )
 
 
 def _until_pinched(model: VendorModel, grip: Grip) -> list[dict[str, float]]:
@@ -155,6 +169,7 @@ def _until_pinched(model: VendorModel, grip: Grip) -> list[dict[str, float]]:
 
 def _write(draft: Draft, folder: Path, path: Path) -> Path:
     """Write the files of a hand, and return the hand file."""
+    folder.mkdir(exist_ok=True)
     stem = path.stem if path.stem.endswith("_hand") else f"{path.stem}_hand"
     model = folder / f"{stem}.urdf"
     head = [f"Made from {path.name} by `drakegrasp hand new`.", *draft.changed, *draft.model.notes]
@@ -186,3 +201,12 @@ def _findings(file: Path, config: Config) -> tuple[Finding, ...]:
         check_efforts(hand, config),
         *check_geometry(hand),
     )
+
+
+def _grasps(file: Path, config: Config) -> Iterator[Finding]:
+    """Yield what trial grasps say, up to the first that fails."""
+    for shape in SHAPES:
+        finding = check_grasp(load_hand(file), config, shape)
+        yield finding
+        if not finding.ok:
+            return

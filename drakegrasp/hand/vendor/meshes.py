@@ -25,6 +25,8 @@ from drakegrasp.mesh.wavefront import obj_text
 FORMATS = (".obj", ".stl", ".dae", ".glb", ".gltf", ".ply")
 #: A mesh file has at most so many bytes; a mesh with more faces than this is drawn with so many.
 LARGEST, MOST_FACES = 200_000_000, 8_000
+#: No colour is darker: nothing of a black hand can be told in a picture.
+DARKEST = 0.15
 
 
 @dataclass(eq=False)
@@ -109,4 +111,4 @@ def _colour(scene: Any) -> Array | None:
         colour = getattr(material, "main_color", None)
         if colour is not None:
             found.append((float(mesh.area), np.asarray(colour, dtype=float)[:3] / 255.0))
-    return max(found, key=lambda pair: pair[0])[1] if found else None
+    return np.maximum(max(found, key=lambda pair: pair[0])[1], DARKEST) if found else None
