@@ -10,13 +10,13 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import count
+from dataclasses import dataclass, replace
+from itertools import chain, count, islice
 from pathlib import Path
 
 from drakegrasp.commissioning.draft.answers import Answers
 from drakegrasp.commissioning.draft.clearance import Clearance
-from drakegrasp.commissioning.draft.fingers import STEPS, find_chains, find_palm
+from drakegrasp.commissioning.draft.fingers import find_chains, find_palm
 from drakegrasp.commissioning.draft.hand_text import hand_text
 from drakegrasp.commissioning.draft.hand_tree import Draft, draft_tree, positions
 from drakegrasp.commissioning.draft.opposition import Grip, find_grips, find_reach
@@ -37,6 +37,8 @@ from drakegrasp.runtime.files import atomic_folder
 
 #: Grips that are tried, palm frames with each, and shares of the closing at which links are looked at.
 GRIPS, FRAMES, SHARES = 6, 2, (0.0, 0.25, 0.5, 0.75, 1.0)
+#: Postures at which links of different fingers are compared.
+POSTURES = 24
 #: Objects that it must hold.
 SHAPES = ("box", "sphere")
 #: A pinch that costs more than this is none: fingers that pass each other.
@@ -95,12 +97,12 @@ def draft_hand(
         for drafts in _drafts(model, answers, config):
             # The palm frames of a grip, until its geometry is sound; then whether it holds.
             for draft in drafts:
-                file = _write(draft, next(folders), path)
+                file = _write(_undrawn(draft), next(folders), path)
                 findings = _findings(file, config)
                 sound = all(finding.ok for finding in findings)
                 if sound:
                     findings = (*findings, *_grasps(file, config))
-                faults = sum(not finding.ok for finding in findings)
+                faults = sum(not finding.ok for finding in findings) + (not sound)
                 if best is None or faults < best[0]:
                     best = faults, draft, findings
                 if sound:
@@ -142,18 +144,18 @@ def _drafts(
     """Yield hand files, the likeliest first: for each grip those of its palm frames."""
     palm = find_palm(model, answers)
     chains = find_chains(model, palm, answers)
-    grips = find_grips([find_reach(model, palm, chain) for chain in chains])
+    grips = find_grips([find_reach(model, palm, c) for c in chains])
     if not grips or grips[0].cost > WORST:
-        tips = ", ".join(chain.tip for chain in chains)
+        tips = ", ".join(c.tip for c in chains)
         raise HandError(
             f"model: no fingers of {tips} close against each other: give positions of joints that "
             "do not close with --joint NAME=POSITION, or what closes the other way with --reverse "
             "JOINT"
         )
-    # Those whose links meet too early come last.
+    # Those whose links meet too early are left out; the first of all is better than none.
     clearance = Clearance(model, palm)
-    clear = [g for g in grips if clearance.is_clear(g, _until_pinched(model, g))]
-    for grip in [*clear[:GRIPS], *grips[:1]]:
+    clear = (g for g in grips if clearance.is_clear(g, _on_the_way(model, g)))
+    for grip in chain(islice(clear, GRIPS), grips[:1]):
         postures = [positions(model, grip, share) for share in SHARES]
         frames = find_palm_frames(model, palm, grip, postures, answers.approach)
         yield (
@@ -161,10 +163,15 @@ def _drafts(
         )
 
 
-def _until_pinched(model: VendorModel, grip: Grip) -> list[dict[str, float]]:
-    """Return the positions of all joints on the way to the pinch."""
-    last = max(grip.step) / (STEPS - 1)
-    return [positions(model, grip, share * last) for share in SHARES]
+def _on_the_way(model: VendorModel, grip: Grip) -> Iterator[dict[str, float]]:
+    """Yield the positions of all joints on the way from the open hand to the closed one."""
+    return (positions(model, grip, n / (POSTURES - 1)) for n in range(POSTURES))
+
+
+def _undrawn(draft: Draft) -> Draft:
+    """Return a draft without pictures: most of the time of writing one is theirs."""
+    links = {name: replace(link, visuals=()) for name, link in draft.model.links.items()}
+    return replace(draft, model=replace(draft.model, links=links))
 
 
 def _write(draft: Draft, folder: Path, path: Path) -> Path:

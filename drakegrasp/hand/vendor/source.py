@@ -106,9 +106,9 @@ def read_source(path: Path, packages: Mapping[str, Path], given: Sequence[Path] 
         HandError: If it cannot be read, in one line that says how to mend it.
     """
     path = Path(path)
-    if path.suffix == ".xacro":
+    if path.suffix.lower() == ".xacro":
         raise HandError(f"{path}: must be URDF, got xacro: run `xacro {path.name} > hand.urdf`")
-    if path.suffix not in SUFFIXES:
+    if path.suffix.lower() not in SUFFIXES:
         raise HandError(f"{path}: must end in .urdf, .sdf or .xml (MJCF), got {path.suffix!r}")
     for name, folder in packages.items():
         if not folder.is_dir():
