@@ -9,10 +9,10 @@ import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 
 from drakegrasp.commissioning.finding import Finding, judge
-from drakegrasp.hand.model_text import Mimic, declared_masses, declared_mimics, read_xml
 from drakegrasp.config import Config
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import coordinate_limits
+from drakegrasp.hand.model_text import Mimic, declared_masses, declared_mimics, read_xml
 from drakegrasp.hand.parsing import add_model
 from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.simulation.construction import FINGER_DAMPING

@@ -122,9 +122,9 @@ def check_palm(hand: Hand) -> Finding:
         text += f"; it reaches {1e3 * beyond:.0f} mm beyond what it pinches"
         if beyond > BEYOND_PINCH:
             faults.append(
-                f"the palm must be able to face a table, but the hand reaches {1e3 * beyond:.0f} mm "
-                "beyond what it pinches along +Gz: turn palm.rpy_deg, or keep fingers that do not "
-                "grasp away with preshape"
+                "the palm must be able to face a table, but the hand reaches "
+                f"{1e3 * beyond:.0f} mm beyond what it pinches along +Gz: turn "
+                "palm.rpy_deg, or keep fingers that do not grasp away with preshape"
             )
     return judge("palm", faults, text)
 
@@ -172,7 +172,7 @@ def _turned_round(hand: Hand, i: int) -> str:
     lower, upper = hand.joint_limits[hand.joint_names.index(finger.closing_joint)]
     return (
         f"a positive position of joint {finger.closing_joint!r} opens the hand; reverse its axis, "
-        f"limits ({-upper + 0.0:g}..{-lower + 0.0:g}) and origin, or let `drakegrasp hand new` do it"
+        f"limits ({-upper + 0.0:g}..{-lower + 0.0:g}) and origin, or take `drakegrasp hand new`"
     )
 
 

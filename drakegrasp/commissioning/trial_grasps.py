@@ -2,9 +2,9 @@
 
 In: a hand. Out: for each object the best of a few attempts, whose palm poses follow from how the
 fingertips close (`pinch`). The attempts are those of a build: `run_attempt` simulates them. The
-object hangs in the air until it is held, so that gravity may act along the line on which the fingers
-close, across it, or in between: a hand whose fingers do not resist along that line holds in only
-some of these.
+object hangs in the air until it is held, so that gravity may act along the line on which the
+fingers close, across it, or in between: a hand whose fingers do not resist along that line holds in
+only some of these.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ LEAST_SIZE = 0.03
 #: level, the palm faces the table.
 LINES = {"level": 0.0, "tilted": np.deg2rad(45.0), "upright": np.deg2rad(90.0)}
 #: Objects that the hand must grasp, and the lines on which it must.
-GRASPS = tuple(("box", line) for line in LINES) + (
+GRASPS = (
+    *(("box", line) for line in LINES),
     ("cylinder", "level"),
     ("sphere", "level"),
 )

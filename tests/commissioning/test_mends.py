@@ -13,7 +13,7 @@ from helpers.hands import write_tongs
 from helpers.vendors import box, fixed, link
 
 from drakegrasp.commissioning.finding import Finding
-from drakegrasp.commissioning.motion_checks import check_palm, check_pads
+from drakegrasp.commissioning.motion_checks import check_pads, check_palm
 from drakegrasp.commissioning.trial_grasps import LINES, check_grasp, trial_grasps
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.files import MODELS
@@ -124,7 +124,9 @@ def test_a_grasp_that_fails_says_what_may_mend_it(
 def test_two_motors_that_push_against_each_other_hold_nothing_along_their_line() -> None:
     """On a level line friction carries; on an upright one the stronger side gives way."""
     hand = replace(load_hand("franka"), drive="torque")
-    level, upright = (check_grasp(hand, load_config(), "box", line) for line in ("level", "upright"))
+    level, upright = (
+        check_grasp(hand, load_config(), "box", line) for line in ("level", "upright")
+    )
     assert level.ok, level.text
     assert not upright.ok, upright.text
     assert "two motors that push against each other do not hold along their line" in upright.text

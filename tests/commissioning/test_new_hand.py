@@ -39,7 +39,9 @@ def draft(folder: Path, text: str, name: str = "hand.urdf", **answers: object) -
 def pads(hand: Hand, share: float) -> np.ndarray:
     """Return the pad points (k, 3) in {G} when the hand has closed by a share."""
     X_GF = fingertip_poses(hand, spread=0.0, closing=share * closed_positions(hand))
-    points = [transform_points(X, f.p_FiP[None])[0] for X, f in zip(X_GF, hand.fingers, strict=True)]
+    points = [
+        transform_points(X, f.p_FiP[None])[0] for X, f in zip(X_GF, hand.fingers, strict=True)
+    ]
     return np.array(points)
 
 
@@ -83,7 +85,7 @@ def test_both_sides_press_equally(tmp_path: Path) -> None:
 
 
 def test_an_effort_is_that_of_the_weakest_joint(tmp_path: Path) -> None:
-    """A thumb's last joint of a tenth of the torque lets it press less, unless its lever is short."""
+    """A thumb whose last joint has a tenth of the torque presses less."""
     weak = MITTEN.replace(
         'name="thumb_2" type="revolute"><parent link="thumb_near"/><child link="thumb_far"/>'
         '<origin xyz="0.04 0 0"/><axis xyz="0 -1 0"/><limit lower="0" upper="1.2" effort="1.0"',
@@ -100,9 +102,7 @@ def test_an_effort_is_that_of_the_weakest_joint(tmp_path: Path) -> None:
 
 def test_spread_joints_are_told_from_those_that_close(tmp_path: Path) -> None:
     """From SDFormat, with meshes, of the package's own hand."""
-    drafted = draft_hand(
-        MODELS / "barrett_hand.sdf", tmp_path / "out", answers=Answers(effort=2.0)
-    )
+    drafted = draft_hand(MODELS / "barrett_hand.sdf", tmp_path / "out", answers=Answers(effort=2.0))
     assert [finding.text for finding in drafted.findings if not finding.ok] == []
     hand, own = load_hand(drafted.path), load_hand("barrett")
     assert set(hand.spread.joints) == set(own.spread.joints)

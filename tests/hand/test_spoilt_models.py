@@ -141,9 +141,7 @@ def test_a_spoilt_model_is_refused_in_one_line(tmp_path: Path, fault: str) -> No
     assert not out.exists()
 
 
-def test_a_sound_model_is_not_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sound_model_is_not_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the faults were planted in."""
     drawn: list[Callable[..., None]] = []
     monkeypatch.setattr("drakegrasp.cli.hand._draw", lambda *files: drawn.append(files))

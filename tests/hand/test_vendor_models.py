@@ -51,7 +51,9 @@ def test_masses_of_welded_links_add_up(tmp_path: Path) -> None:
 
 def test_a_mimic_leads_to_the_joint_that_leads_it(tmp_path: Path) -> None:
     """Through all joints in between."""
-    chained = JAWS.replace('<mimic joint="left_slide"/>', '<mimic joint="third" multiplier="2" offset="0.01"/>').replace(  # noqa: E501
+    chained = JAWS.replace(
+        '<mimic joint="left_slide"/>', '<mimic joint="third" multiplier="2" offset="0.01"/>'
+    ).replace(
         "</robot>",
         '<link name="bar"/><joint name="third" type="prismatic"><parent link="body"/><child '
         'link="bar"/><axis xyz="0 1 0"/><limit lower="0" upper="0.05" effort="1" velocity="1"/>'

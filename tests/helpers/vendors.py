@@ -1,4 +1,4 @@
-"""Small models of hands as vendors write them: frames without mass, mimics, meshes, other formats."""
+"""Small models of hands as vendors write them: massless frames, mimics, meshes, other formats."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from drakegrasp.hand.finger_sweep import even_points
 from drakegrasp.hand.shapes import hull_planes
 from drakegrasp.hand.vendor.model import VendorModel
 
-#: Links other than fingertips overlap by less [m]: points miss a part of what `check_overlaps` sees.
+#: Links other than fingertips overlap by less [m]: points miss a part of what Drake sees.
 SUNK = 2e-4
 #: Spacing of the points by which two shapes are compared [m].
 SPACING = 0.006

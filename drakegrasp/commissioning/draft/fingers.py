@@ -1,7 +1,7 @@
 """The fingers of a vendor's model, and the ways in which each may close.
 
-In: a `VendorModel`. Out: its palm, a chain of joints per finger, and for each finger some `Closing`:
-straight lines in the space of its joints, from open to closed.
+In: a `VendorModel`. Out: its palm, a chain of joints per finger, and for each finger some
+`Closing`: straight lines in the space of its joints, from open to closed.
 
 Joints that turn about the same axis as the last one of a finger, at zero, bend it: they close
 together. The others (a spread, an abduction, a thumb's opposition) keep a position.
@@ -32,8 +32,8 @@ BENT = (0.0, 0.3)
 STEPS = 12
 #: A link of the same motor that reaches less than this share of the farthest is no finger.
 REACH = 0.8
-#: What it costs to start elsewhere than at zero, to close in the smaller part of a range, and that a
-#: joint that does not close is away from its rest [1/rad].
+#: What it costs to start elsewhere than at zero, to close in the smaller part of a range, and that
+#: another joint is away from its rest [1/rad].
 NOT_ZERO, SMALLER, AWAY = 1.0, 0.6, 0.08
 #: A closing joint moves at least so far [rad, m]; one without limits is taken to move so far [rad].
 LEAST, UNLIMITED = {False: 0.15, True: 0.004}, np.pi / 2.0
@@ -180,8 +180,7 @@ def _without_linkages(model: VendorModel, palm: str, leaves: Sequence[str]) -> l
         leaf
         for leaf in leaves
         if not any(
-            motors[leaf] <= motors[other] and reach[leaf] < REACH * reach[other]
-            for other in leaves
+            motors[leaf] <= motors[other] and reach[leaf] < REACH * reach[other] for other in leaves
         )
     ]
 
@@ -316,5 +315,3 @@ def _bends(
 
 def _finite(joint: VendorJoint) -> Array:
     return np.where(np.isfinite(joint.limits), joint.limits, [-UNLIMITED, UNLIMITED])
-
-

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from os.path import commonprefix
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -149,7 +149,7 @@ def draft_tree(
         tree=tree,
         reasons=reasons,
         changed=[
-            f"joint {_closing(m).name}: position here = ({_sign(m):+g}) * (the vendor's - {_zero(m):g})"
+            f"joint {_closing(m).name}: position is {_sign(m):+g} * (the vendor's - {_zero(m):g})"
             for m in grip.members
             if _sign(m) != 1.0 or _zero(m) != 0.0
         ],
@@ -248,14 +248,14 @@ def _names(grip: Grip) -> list[str]:
             found += [word for text in texts for word in words if word in text.lower()][:1]
         if len(set(found)) == len(tips):
             return found
-    end = len(commonprefix([tip[::-1] for tip in tips]))
+    # What is the same at the end of all names says nothing.
+    alike = (len(set(letters)) == 1 for letters in zip(*(tip[::-1] for tip in tips), strict=False))
+    end = sum(1 for _ in takewhile(bool, alike))
     short = [tip[: len(tip) - end].rstrip("_-.") for tip in tips]
     return short if all(short) else tips
 
 
-def _spread(
-    model: VendorModel, grip: Grip, frame: PalmFrame, driven: set[str]
-) -> dict[str, float]:
+def _spread(model: VendorModel, grip: Grip, frame: PalmFrame, driven: set[str]) -> dict[str, float]:
     """Return the sign of each of two joints that spread fingers about Gz; none if not so."""
     found: dict[str, float] = {}
     for member in grip.members:
@@ -290,9 +290,7 @@ def _speeds(grip: Grip, limits: Array, config: Config) -> dict[str, float]:
     return speeds
 
 
-def _reasons(
-    model: VendorModel, grip: Grip, frame: PalmFrame, answers: Answers
-) -> dict[str, str]:
+def _reasons(model: VendorModel, grip: Grip, frame: PalmFrame, answers: Answers) -> dict[str, str]:
     """Return why the values are so, by the paths of their keys."""
     reasons = {
         "palm.link": "given" if answers.palm else "the link from which the fingers branch",
@@ -309,7 +307,7 @@ def _reasons(
         "payload": "half of what friction carries at these efforts [kg]",
     }
     for i, member in enumerate(grip.members):
-        joint, key = _closing(member), f"fingers.{i}"
+        key = f"fingers.{i}"
         flipped = _sign(member) != 1.0 or _zero(member) != 0.0
         reasons |= {
             f"{key}.fingertip": "the last link with shapes",

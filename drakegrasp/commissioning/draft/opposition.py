@@ -25,7 +25,7 @@ UNEVEN, APART, OFF_WIDTH = 0.5, 20.0, 40.0
 LATE, LATE_COST, OPENING, NARROW = 0.75, 2.0, 0.06, 10.0
 #: Pads that come so close meet [m].
 MEETING = 0.006
-#: Angles by which a contact may be nearer to the end of a fingertip than its pad [rad], and their cost.
+#: Angles by which a contact may be nearer to a fingertip's end than its pad [rad], and their cost.
 ROUND, ROUND_COST = np.deg2rad([0.0, 30.0, 60.0]), 0.2
 #: A finger that turns about its own direction has no side by which it closes, as a cosine.
 SQUARE = 0.3

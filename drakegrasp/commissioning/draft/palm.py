@@ -67,12 +67,13 @@ def find_palm_frames(
         postures: Positions of all joints, from the open to the closed hand.
         approach: (3,), +Gz in B, if it is known.
     """
+
     # The corners of each shape in B, in the open hand, and of all links on the way.
     def placed(posture: Mapping[str, float]) -> list[Array]:
         return [
             transform_points(model.pose(name, posture, palm), shape.corners())
             for name, link in model.links.items()
-            if name == palm or model.chain(name, palm)[:1] and _carried(model, name, palm)
+            if name == palm or (model.chain(name, palm)[:1] and _carried(model, name, palm))
             for shape in link.collisions
         ]
 
@@ -111,9 +112,7 @@ def _carried(model: VendorModel, link: str, palm: str) -> bool:
     return model.chain(link, palm)[0].parent == palm
 
 
-def _directions(
-    grip: Grip, centre: Array, approach: Array | None
-) -> list[tuple[Array, float]]:
+def _directions(grip: Grip, centre: Array, approach: Array | None) -> list[tuple[Array, float]]:
     """Return unit directions (3,) that Gz may have, and how far they are aside [rad]."""
     if approach is not None:
         return [(approach / np.linalg.norm(approach), 0.0)]
@@ -126,9 +125,7 @@ def _directions(
     third = np.cross(axis, line)
     turns = np.deg2rad(np.arange(-165, 181, STEP_DEG))
     found = [np.cos(t) * line + np.sin(t) * third for t in turns]
-    found += [
-        own for own in (*np.eye(3), *-np.eye(3)) if abs(own @ axis) < np.sin(ALIGNED)
-    ]
+    found += [own for own in (*np.eye(3), *-np.eye(3)) if abs(own @ axis) < np.sin(ALIGNED)]
     return [(d, float(np.arccos(np.clip(d @ line, -1.0, 1.0)))) for d in found]
 
 

@@ -1,8 +1,8 @@
 """Drafts a hand file from a vendor's model.
 
-In: a URDF, SDFormat or MJCF file, and what a person says of the hand. Out: a folder that is complete
-by itself: hand file, model, meshes. Of several ways to grasp, the first is taken that passes the
-checks of its geometry and holds a box and a ball, or else the one that fails the fewest.
+In: a URDF, SDFormat or MJCF file, and what a person says of the hand. Out: a folder that is
+complete by itself: hand file, model, meshes. Of several ways to grasp, the first is taken that
+passes the checks of its geometry and holds a box and a ball, or else the one with the fewest faults.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from drakegrasp.hand.vendor.writing import write_urdf
 from drakegrasp.runtime.blas import one_thread
 from drakegrasp.runtime.files import atomic_folder
 
-#: Grips that are tried, palm frames with each, and shares of the closing at which links are looked at.
+#: Grips that are tried, palm frames with each, and shares of the closing at which links are seen.
 GRIPS, FRAMES, SHARES = 6, 2, (0.0, 0.25, 0.5, 0.75, 1.0)
 #: Postures at which links of different fingers are compared.
 POSTURES = 24
@@ -138,9 +138,7 @@ def _refuse_unknown(model: VendorModel, answers: Answers) -> None:
             raise HandError(f"--joint {name} must be {lower:g}..{upper:g}, got {position:g}")
 
 
-def _drafts(
-    model: VendorModel, answers: Answers, config: Config
-) -> Iterator[Iterator[Draft]]:
+def _drafts(model: VendorModel, answers: Answers, config: Config) -> Iterator[Iterator[Draft]]:
     """Yield hand files, the likeliest first: for each grip those of its palm frames."""
     palm = find_palm(model, answers)
     chains = find_chains(model, palm, answers)
@@ -158,9 +156,7 @@ def _drafts(
     for grip in chain(islice(clear, GRIPS), grips[:1]):
         postures = [positions(model, grip, share) for share in SHARES]
         frames = find_palm_frames(model, palm, grip, postures, answers.approach)
-        yield (
-            draft_tree(model, palm, grip, frame, answers, config) for frame in frames[:FRAMES]
-        )
+        yield (draft_tree(model, palm, grip, frame, answers, config) for frame in frames[:FRAMES])
 
 
 def _on_the_way(model: VendorModel, grip: Grip) -> Iterator[dict[str, float]]:

@@ -97,4 +97,3 @@ def _levers(model: VendorModel, member: Member, step: int) -> tuple[float, dict[
 def _leader(model: VendorModel, joint: str) -> str:
     mimic = model.mimics.get(joint)
     return joint if mimic is None else mimic.leader
-

@@ -212,7 +212,7 @@ class _Parts:
 def _merge(parts: _Parts, efforts: Mapping[str, float], notes: Sequence[str]) -> VendorModel:
     """Return the model whose welded links are one."""
     plant = parts.plant
-    bodies = {plant.get_body(i).index(): plant.get_body(i) for i in plant.GetBodyIndices(parts.instance)}  # fmt: skip
+    bodies = {index: plant.get_body(index) for index in plant.GetBodyIndices(parts.instance)}
     joints = [plant.get_joint(i) for i in plant.GetJointIndices(parts.instance)]
     above = _carriers(plant, bodies, joints)
 
@@ -268,7 +268,9 @@ def _merge(parts: _Parts, efforts: Mapping[str, float], notes: Sequence[str]) ->
     )
 
 
-def _carriers(plant: MultibodyPlant, bodies: Mapping[Any, Any], joints: Sequence[Any]) -> dict[Any, Any]:  # fmt: skip
+def _carriers(
+    plant: MultibodyPlant, bodies: Mapping[Any, Any], joints: Sequence[Any]
+) -> dict[Any, Any]:
     """Return the joint that carries each body but the root."""
     above: dict[Any, Any] = {}
     for joint in joints:
@@ -317,9 +319,7 @@ def _weight(parts: _Parts, body: Any) -> tuple[float, int, int]:
     return (0.0 if inertia is None else inertia.mass), shapes, pictures
 
 
-def _link(
-    parts: _Parts, name: str, members: Sequence[tuple[Any, Array]]
-) -> tuple[Link, list[str]]:
+def _link(parts: _Parts, name: str, members: Sequence[tuple[Any, Array]]) -> tuple[Link, list[str]]:
     """Return the link of welded bodies with their poses in its frame, and notes."""
     notes, found = [], {Role.kProximity: [], Role.kIllustration: []}  # type: ignore[var-annotated]
     inertias = []
@@ -390,9 +390,7 @@ def _resolve(mimics: Sequence[Mimic], joints: Mapping[str, VendorJoint]) -> dict
             nxt = given[leader]
             ratio, offset, leader = ratio * nxt.ratio, offset + ratio * nxt.offset, nxt.leader
         if leader not in joints or leader in seen:
-            raise HandError(
-                f"model: joint {name!r} must follow a joint that moves, got {leader!r}"
-            )
+            raise HandError(f"model: joint {name!r} must follow a joint that moves, got {leader!r}")
         if ratio == 0.0:
             raise HandError(f"model: joint {name!r} must follow {leader!r} by a ratio, got 0")
         resolved[name] = Mimic(joint=name, leader=leader, ratio=ratio, offset=offset)
@@ -401,7 +399,9 @@ def _resolve(mimics: Sequence[Mimic], joints: Mapping[str, VendorJoint]) -> dict
 
 def _refuse_size(model: VendorModel) -> None:
     """Refuse a model without shapes, or one whose units are not metres."""
-    points = [transform_points(model.pose(n, {}), link.corners()) for n, link in model.links.items()]
+    points = [
+        transform_points(model.pose(n, {}), link.corners()) for n, link in model.links.items()
+    ]
     cloud = np.concatenate(points)
     if not len(cloud):
         raise HandError("model: must have shapes, got links without any")

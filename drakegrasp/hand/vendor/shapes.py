@@ -121,9 +121,7 @@ def read_shape(
     if corners is None:
         return None
     solid = trimesh.convex.convex_hull(corners)
-    return Shape(
-        kind="mesh", X_LS=X, vertices=solid.vertices, faces=solid.faces, colour=colour
-    )
+    return Shape(kind="mesh", X_LS=X, vertices=solid.vertices, faces=solid.faces, colour=colour)
 
 
 def _thinned(points: Array) -> Array:

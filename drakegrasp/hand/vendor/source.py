@@ -22,6 +22,8 @@ FORMATS = {"robot": "urdf", "sdf": "sdf", "mujoco": "xml"}
 SUFFIXES = (".urdf", ".sdf", ".xml", ".mjcf")
 #: A model's text has at most so many bytes, elements within each other, and files of its own.
 LONGEST, DEEPEST, MOST_INCLUDES = 20_000_000, 200, 50
+#: Bytes that are parsed at a time.
+BITE = 65_536
 #: What an element of a model may not lead to: Drake would look for the file itself.
 _ELSEWHERE = {"robot": ("drake:include",), "sdf": ("include",), "mujoco": ("hfield", "plugin")}
 
@@ -48,7 +50,9 @@ class Folders:
         """
         scheme, separator, rest = uri.partition("://")
         if separator and scheme not in ("package", "file", "model"):
-            raise HandError(f"model: mesh {uri!r} must be a file, got an address: nothing is fetched")
+            raise HandError(
+                f"model: mesh {uri!r} must be a file, got an address: nothing is fetched"
+            )
         if separator and scheme != "file":
             name, _, rest = rest.partition("/")
             folder = self.packages.get(name) or self._above(name)
@@ -147,18 +151,21 @@ def _parse(path: Path) -> Element:
     if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
         raise HandError(f"{path}: must be XML without a document type, got <!DOCTYPE>")
 
-    # Depth is known before a tree is built.
-    depth, parser = 0, ElementTree.XMLPullParser(("start", "end"))
+    # It is read bit by bit: what is too deep need not be built.
+    depth, root, parser = 0, None, ElementTree.XMLPullParser(("start", "end"))
     try:
-        parser.feed(text)
+        for start in range(0, len(text) + 1, BITE):
+            parser.feed(text[start : start + BITE])
+            for event, element in parser.read_events():
+                root = element if root is None else root
+                depth += 1 if event == "start" else -1
+                if depth > DEEPEST:
+                    raise HandError(f"{path}: must be XML of at most {DEEPEST} levels, got more")
         parser.close()
-        for event, element in parser.read_events():
-            depth += 1 if event == "start" else -1
-            if depth > DEEPEST:
-                raise HandError(f"{path}: must be XML of at most {DEEPEST} levels, got more")
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise HandError(f"{path}: must be XML, got text that is not ({one_line(error)})") from None
-    return element
+    assert root is not None
+    return root
 
 
 def _include(root: Element, base: Path, folders: Folders, count: list[int]) -> None:

@@ -98,7 +98,9 @@ def _joint(joint: VendorJoint, mimic: Mimic | None) -> Element:
     SubElement(element, "child", {"link": joint.child})
     element.append(_origin(joint.X_PJ))
     SubElement(element, "axis", {"xyz": _numbers(joint.axis)})
-    limits = {} if unlimited else dict(zip(("lower", "upper"), map(_number, joint.limits)))
+    limits = (
+        {} if unlimited else dict(zip(("lower", "upper"), map(_number, joint.limits), strict=True))
+    )
     speed = joint.velocity if np.isfinite(joint.velocity) else 10.0
     extra = {"effort": _number(joint.effort), "velocity": _number(speed)}
     SubElement(element, "limit", {**limits, **extra})
