@@ -78,7 +78,7 @@ def check_grasp(hand: Hand, config: Config, shape: str, line: str = "level") -> 
         line: On which the fingers close, one of `LINES`.
     """
     # Try until one holds, which a whole lift shows.
-    name = f"{shape}, {line} line"
+    name = f"{shape}, {line}"
     config = with_whole_lifts(config)
     drive = drive_of(hand, config.lift)
     rules = _with_drive(config, "locked" if drive == "torque" else drive)

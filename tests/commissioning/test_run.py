@@ -257,6 +257,6 @@ def test_every_hand_of_the_package_passes(name: str) -> None:
     assert [finding.text for finding in findings if not finding.ok] == []
     assert reported == findings
     assert [finding.name for finding in findings[-2:]] == [
-        "cylinder, level line",
-        "sphere, level line",
+        "cylinder, level",
+        "sphere, level",
     ]

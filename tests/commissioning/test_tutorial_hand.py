@@ -39,7 +39,7 @@ def test_the_tutorial_hand_passes_every_check_of_the_page(tongs: Path) -> None:
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-GRASPS = [f"{shape}, {line} line" for shape, line in trial_grasps.GRASPS]
+GRASPS = [f"{shape}, {line}" for shape, line in trial_grasps.GRASPS]
 
 
 def test_a_fault_ends_the_command_with_one(tongs: Path) -> None:

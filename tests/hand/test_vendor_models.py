@@ -64,6 +64,14 @@ def test_a_mimic_leads_to_the_joint_that_leads_it(tmp_path: Path) -> None:
     assert mimic.offset == pytest.approx(0.21)
 
 
+def test_limits_that_bar_the_way_of_a_mimic_are_its_leaders(tmp_path: Path) -> None:
+    """Vendors give a joint that turns the other way the limits of its leader."""
+    model = read(write_model(tmp_path, JAWS.replace('slide"/>', 'slide" multiplier="-1"/>')))
+    np.testing.assert_allclose(model.joints["right_slide"].limits, [-0.05, 0.0])
+    assert any("joint right_slide: its limits 0..0.05 bar the way" in n for n in model.notes)
+    assert read(write_model(tmp_path / "sound", JAWS)).notes == ()
+
+
 def test_mjcf_says_the_same_as_urdf(tmp_path: Path) -> None:
     """Equalities of joints are its mimics, ranges of force its efforts."""
     urdf = read(write_model(tmp_path, JAWS))

@@ -2,7 +2,7 @@
 
 In: a URDF, SDFormat or MJCF file, and what a person says of the hand. Out: a folder that is
 complete by itself: hand file, model, meshes. Of several ways to grasp, the first is taken that
-passes the checks of its geometry and holds a box and a ball, or else the one with the fewest faults.
+passes the checks of its geometry and holds three objects, else the one that fails the fewest.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ GRIPS, FRAMES, SHARES = 6, 2, (0.0, 0.25, 0.5, 0.75, 1.0)
 #: Postures at which links of different fingers are compared.
 POSTURES = 24
 #: Objects that it must hold.
-SHAPES = ("box", "sphere")
+SHAPES = ("box", "sphere", "cylinder")
 #: A pinch that costs more than this is none: fingers that pass each other.
 WORST = 3.0
 #: Files of a vendor that say what may be done with the model.

@@ -146,7 +146,7 @@ def read_model(source: Source) -> VendorModel:
         plant.RegisterAsSourceForSceneGraph(graph)
         parts = _Parts(plant, graph, _parse(plant, path), meshes.colours, masses)
         model = _merge(parts, _efforts(source.root, plant), notes)
-    model = replace(model, mimics=_resolve(mimics, model.joints))
+    model = _with_room(replace(model, mimics=_resolve(mimics, model.joints)))
     _refuse_size(model)
     return model
 
@@ -395,6 +395,26 @@ def _resolve(mimics: Sequence[Mimic], joints: Mapping[str, VendorJoint]) -> dict
             raise HandError(f"model: joint {name!r} must follow {leader!r} by a ratio, got 0")
         resolved[name] = Mimic(joint=name, leader=leader, ratio=ratio, offset=offset)
     return resolved
+
+
+def _with_room(model: VendorModel) -> VendorModel:
+    """Return the model in which joints that follow may go where their leaders take them.
+
+    Limits of some vendors' mimics have the wrong sign.
+    """
+    joints, notes = dict(model.joints), list(model.notes)
+    for name, mimic in model.mimics.items():
+        joint = joints[name]
+        led = np.sort(mimic.ratio * joints[mimic.leader].limits + mimic.offset)
+        shared = min(led[1], joint.limits[1]) - max(led[0], joint.limits[0])
+        if np.isfinite(led).all() and shared < 0.5 * (led[1] - led[0]):
+            lower, upper = joint.limits
+            joints[name] = replace(joint, limits=led)
+            notes.append(
+                f"joint {name}: its limits {lower:g}..{upper:g} bar the way of its mimic; now "
+                f"{led[0]:g}..{led[1]:g}"
+            )
+    return replace(model, joints=joints, notes=tuple(notes))
 
 
 def _refuse_size(model: VendorModel) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -152,7 +153,8 @@ def _parse(path: Path) -> Element:
         raise HandError(f"{path}: must be XML without a document type, got <!DOCTYPE>")
 
     # It is read bit by bit: what is too deep need not be built.
-    depth, root, parser = 0, None, ElementTree.XMLPullParser(("start", "end"))
+    depth, root = 0, None
+    parser: Any = ElementTree.XMLPullParser(("start", "end"))
     try:
         for start in range(0, len(text) + 1, BITE):
             parser.feed(text[start : start + BITE])
@@ -164,7 +166,7 @@ def _parse(path: Path) -> Element:
         parser.close()
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise HandError(f"{path}: must be XML, got text that is not ({one_line(error)})") from None
-    assert root is not None
+    assert isinstance(root, Element)
     return root
 
 
