@@ -11,7 +11,7 @@ import pytest
 import yaml
 from click.testing import CliRunner
 from helpers.machine import needs_egl
-from helpers.vendors import JAWS, JAWS_MJCF, MITTEN, write_model
+from helpers.vendors import JAWS, JAWS_MJCF, MITTEN, box, joint, link, write_model
 
 from drakegrasp.cli.main import main
 from drakegrasp.commissioning.draft.answers import Answers
@@ -76,6 +76,17 @@ def test_fingers_oppose_a_thumb_whose_base_is_turned(tmp_path: Path) -> None:
     assert set(hand.preshape) == {"thumb_turn"}
     # The palm faces +x of its link.
     assert hand.X_BG[0, 2] > 0.9
+
+
+def test_bars_of_a_linkage_are_no_fingers(tmp_path: Path) -> None:
+    """A bar of the jaws' motor, which reaches less far than they do."""
+    bar = link("bar", 0.01, box("0.01 0.01 0.02", "0 0 0.01")) + joint(
+        "bar_slide", "prismatic", "body", "bar", "0.02 0 0", "0 1 0", "0 0.05 60",
+        '<mimic joint="left_slide"/>',
+    )  # fmt: skip
+    hand = load_hand(draft(tmp_path, JAWS.replace("</robot>", bar + "</robot>")).path)
+    assert set(hand.fingertip_links) == {"left_jaw", "right_jaw"}
+    assert any(c.joint == "bar_slide" for finger in hand.fingers for c in finger.coupled)
 
 
 def test_both_sides_press_equally(tmp_path: Path) -> None:

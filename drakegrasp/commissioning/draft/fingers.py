@@ -166,13 +166,17 @@ def _is_leaf(model: VendorModel, link: str, palm: str) -> bool:
 
 
 def _without_linkages(model: VendorModel, palm: str, leaves: Sequence[str]) -> list[str]:
-    """Return the leaves without the bars of linkages: short ones of a motor that moves others."""
-    reach, motors = {}, {}
+    """Return the leaves without the bars of linkages.
+
+    Those are moved by a motor that moves others, and have fewer joints or reach less far.
+    """
+    reach, motors, joined = {}, {}, {}
     for leaf in leaves:
         X = model.pose(leaf, {}, palm)
         corners = model.links[leaf].corners() @ X[:3, :3].T + X[:3, 3]
         reach[leaf] = float(np.linalg.norm(corners, axis=1).max())
         joints = model.chain(leaf, palm)
+        joined[leaf] = len(joints)
         motors[leaf] = {
             model.mimics[j.name].leader if j.name in model.mimics else j.name for j in joints
         }
@@ -180,7 +184,9 @@ def _without_linkages(model: VendorModel, palm: str, leaves: Sequence[str]) -> l
         leaf
         for leaf in leaves
         if not any(
-            motors[leaf] <= motors[other] and reach[leaf] < REACH * reach[other] for other in leaves
+            motors[leaf] <= motors[other]
+            and (joined[leaf] < joined[other] or reach[leaf] < REACH * reach[other])
+            for other in leaves
         )
     ]
 

@@ -42,7 +42,7 @@ POSTURES = 24
 #: Objects that it must hold.
 SHAPES = ("box", "sphere", "cylinder")
 #: A pinch that costs more than this is none: fingers that pass each other.
-WORST = 3.0
+WORST = 2.4
 #: Files of a vendor that say what may be done with the model.
 LICENCES = ("LICENSE*", "LICENCE*", "COPYING*", "NOTICE*")
 
