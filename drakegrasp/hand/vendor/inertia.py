@@ -10,8 +10,7 @@ import trimesh
 
 from drakegrasp.frames import Array, transform_points
 
-#: Mean density of a hand's links [kg/m^3], for those whose model gives no mass: the boxes and hulls
-#: of the Allegro Hand's fingers (0.52 kg in 0.00042 m^3) and of plastic with motors are near it.
+#: Mean density of links whose model gives no mass [kg/m^3]: own choice, that of solid plastic.
 DENSITY = 1200.0
 
 
