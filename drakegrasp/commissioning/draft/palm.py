@@ -6,7 +6,7 @@ fingers close, and its ray from the palm to the pinch is free; Gy points to the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,7 +55,7 @@ def find_palm_frames(
     model: VendorModel,
     palm: str,
     grip: Grip,
-    postures: list[Mapping[str, float]],
+    postures: Sequence[Mapping[str, float]],
     approach: Array | None,
 ) -> list[PalmFrame]:
     """Return the palm frames of a grip, the best first; none if the palm faces no pinch.
