@@ -89,6 +89,8 @@ def differences(
         # Each field by itself; the number of rows is that of most datasets.
         rows = _most_frequent([dataset.shape[0] for dataset in datasets.values() if dataset.shape])
         for f in fields:
+            if f.optional and f.name not in file[name]:
+                continue
             path, dataset = f"/{name}/{f.name}", datasets.get(f.name)
             yield from _of_field(path, dataset, f, rows, lengths)
             if thorough and dataset is not None:
@@ -173,8 +175,7 @@ def _of_field(
         lengths: Of the letters in the shapes, where they are known.
     """
     if dataset is None:
-        if not field.optional:
-            yield Difference(path=path, what="the dataset must be there", got="none")
+        yield Difference(path=path, what="the dataset must be there", got="none")
         return
 
     dtype, stored = dataset.dtype, dataset.shape
