@@ -26,6 +26,7 @@ class PostureRequest:
     hand: str | None
     assets: Path
     out: Path | None
+    as_json: bool
     workers: int | None
 
 
@@ -155,9 +156,10 @@ def verify(
                 hand=options["hand"],
                 assets=assets or Path(),
                 out=out,
+                as_json=as_json,
                 workers=workers,
             ),
-            show=not quiet,
+            show=not (quiet or as_json),
         )
         return
     if assets is not None:
@@ -248,18 +250,19 @@ def _verify_postures(request: PostureRequest, *, show: bool) -> None:
     """Write the verdicts on files of DexGraspBench, and how many hold.
 
     Raises:
-        DataError: If there are no files, or an object cannot be read.
+        DataError: If there are no files, or the results cannot be written.
         HandError, ConfigError, MachineError: As `prepare_trials`.
     """
     from drakegrasp.errors import DataError, HandError
     from drakegrasp.protocols.postures import json_line, prepare_trials, verify_postures
     from drakegrasp.runtime.executor import processes
-    from drakegrasp.runtime.files import atomic_path
     from drakegrasp.runtime.progress import progress_bar
-    from drakegrasp.verification.result_files import result_paths
+    from drakegrasp.verification.result_files import refuse_unwritable, result_paths, text_lines
 
     # All files, and what they have in common.
-    path, hand = request.grasps, Path(request.hand or "")
+    path, hand, out = request.grasps, Path(request.hand or ""), request.out
+    if out is not None:
+        refuse_unwritable(out)
     files = [path] if path.is_file() else sorted(path.rglob("*.npy"))
     if not files:
         raise DataError(f"{path}: must be a .npy file or a folder of them, got none")
@@ -268,19 +271,25 @@ def _verify_postures(request: PostureRequest, *, show: bool) -> None:
     trials = prepare_trials(request.protocol, hand, request.assets)
 
     # A line per verdict as it comes.
-    held, to = 0, None if request.out is None else result_paths(request.out)[0]
+    held = 0
     with (
-        nullcontext() if to is None else atomic_path(to) as part,
-        nullcontext(sys.stdout) if part is None else part.open("w", encoding="utf-8") as stream,
+        nullcontext(_print_line) if out is None else text_lines(out) as write,
         processes(request.workers) as execute,
         progress_bar("verify", "grasps", show=show) as report,
     ):
         for index, result in enumerate(verify_postures(files, trials, execute)):
-            stream.write(json_line(index, result, trials) + "\n")
-            stream.flush()
+            line = json_line(index, result, trials)
+            write(line)
+            if request.as_json and out is not None:
+                _print_line(line)
             held += result.verdict.success
             report(index + 1, len(files), holding=held)
-    if to is not None:
-        say(str(to))
+    if out is not None and not request.as_json:
+        say(str(result_paths(out)[0]))
     if show:
         say(f"{held:,} of {len(files):,} grasps hold by {trials.protocol}", err=True)
+
+
+def _print_line(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()

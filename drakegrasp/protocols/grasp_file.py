@@ -100,12 +100,15 @@ def _vector(content: dict[str, Any], key: str) -> Array:
     length = np.linalg.norm(vector[3:7])
     if not length > 0.0:
         raise DataError(f"{key} must have a quaternion, got zeros")
+    vector[3:7] /= length
     return vector
 
 
 def _inner_path(value: Any) -> Path:
     """Return a path that does not leave the folder of the objects."""
     path = Path(str(value))
-    if path.is_absolute() or ".." in path.parts:
-        raise DataError(f"obj_path must be a path within the folder of the objects, got {path}")
+    if path.is_absolute() or ".." in path.parts or "\0" in str(value):
+        raise DataError(
+            f"obj_path must be a path within the folder of the objects, got {str(path)!r}"
+        )
     return path

@@ -52,7 +52,7 @@ def read_object_folder(folder: Path, scale: float) -> ObjectFolder:
     try:
         info = read_json(folder / INFO)
         unit = info["mass"] / (info["density"] * info["scale"] ** 3)
-    except (KeyError, TypeError, ZeroDivisionError, OSError, ValueError) as error:
+    except (KeyError, TypeError, ArithmeticError, OSError, ValueError) as error:
         raise DataError(
             f"{folder / INFO}: must have mass, density and scale, got {one_line(error)}"
         ) from None

@@ -15,8 +15,10 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from drakegrasp import __version__
-from drakegrasp.errors import ConfigError, DataError
+from drakegrasp.errors import ConfigError, DataError, MeshError
 from drakegrasp.protocols.catalog import Protocol, find_protocol
 from drakegrasp.protocols.grasp_file import read_grasp_file
 from drakegrasp.protocols.object_folder import read_object_folder
@@ -112,10 +114,10 @@ def _verify_one(task: tuple[Path, PostureTrials]) -> PostureResult:
     path, trials = task
     try:
         grasp = read_grasp_file(path)
-    except DataError as error:
+        scene, digests = _scene(trials, grasp.object_path, grasp.object_scale)
+    except (DataError, MeshError) as error:
         return _invalid(path, str(error))
 
-    scene, digests = _scene(trials, grasp.object_path, grasp.object_scale)
     if len(grasp.motion.grasp) != 7 + scene.joints:
         got = len(grasp.motion.grasp)
         return _invalid(path, f"a posture must be {7 + scene.joints} numbers, got {got}")
@@ -171,7 +173,7 @@ def json_line(index: int, result: PostureResult, trials: PostureTrials) -> str:
         "index": index,
         "file": str(result.file),
         **verdict,
-        **describe(_protocol(trials), trials.protocol),
+        **_plain(describe(_protocol(trials), trials.protocol)),
         "simulator": "mujoco",
         "versions": versions(),
         "digests": dict(result.digests),
@@ -185,6 +187,13 @@ def versions() -> dict[str, str]:
 
 
 def _plain(value: Any) -> Any:
+    """Return a value of a protocol, which may be a user's own, as one of JSON."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, Mapping):
+        return {str(key): _plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
     if isinstance(value, float):
         return float(f"{value:.{DIGITS}g}") if isfinite(value) else None
     return value

@@ -196,7 +196,7 @@ class MujocoProtocol:
         """Return the verdict on where the object is now; it should be in a pose (7,)."""
         moved, turned = displacement(goal, scene.object_pose())
         reason = ""
-        if not np.isfinite([moved, turned]).all():
+        if scene.diverged or not np.isfinite([moved, turned]).all():
             reason = "diverged"
         elif moved >= self.max_moved:
             reason = "moved"

@@ -27,6 +27,12 @@ _WELD, _TORQUE_SCALE = (0.9, 0.95, 0.001, 0.5, 2.0), 10
 _SETTINGS = (*("timestep", "integrator", "disableflags", "cone", "noslip_iterations", "impratio"),)
 #: Half extents of the table's plane, which has no edge, and the spacing of its grid.
 _PLANE = (0.0, 0.0, 1.0)
+#: What MuJoCo warns of when it begins again from its rest.
+_DIVERGED = (
+    mujoco.mjtWarning.mjWARN_BADQPOS,
+    mujoco.mjtWarning.mjWARN_BADQVEL,
+    mujoco.mjtWarning.mjWARN_BADQACC,
+)
 
 
 class ProtocolScene:
@@ -115,6 +121,11 @@ class ProtocolScene:
     def step(self, steps: int) -> None:
         """Simulate time steps."""
         mujoco.mj_step(self._model, self._data, steps)
+
+    @property
+    def diverged(self) -> bool:
+        """Whether the simulation failed since the last reset: MuJoCo then starts from its rest."""
+        return any(self._data.warning[kind].number > 0 for kind in _DIVERGED)
 
     def push(self, force: Array) -> None:
         """Let a force (3,) [N] act on the object's centre of mass until the next reset."""

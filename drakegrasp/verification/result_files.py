@@ -86,7 +86,14 @@ def _is_writable(folder: Path) -> bool:
 
 @contextmanager
 def json_lines(out: Path) -> Iterator[Callable[[int, Verification], None]]:
-    """Yield a function that writes the next JSON line.
+    """Yield a function that writes the next verdict as a JSON line, see `text_lines`."""
+    with text_lines(out) as write:
+        yield lambda index, result: write(json_line(index, result))
+
+
+@contextmanager
+def text_lines(out: Path) -> Iterator[Callable[[str], None]]:
+    """Yield a function that writes the next line of NAME.jsonl.
 
     Until the block ends, the lines are in NAME.part.jsonl; they stay there if the block raises. No
     file is made before the first line.
@@ -101,12 +108,12 @@ def json_lines(out: Path) -> Iterator[Callable[[int, Verification], None]]:
     part, stream = part_path(out), None
     with ExitStack() as stack:
 
-        def write(index: int, result: Verification) -> None:
+        def write(line: str) -> None:
             nonlocal stream
             if stream is None:
                 part.parent.mkdir(parents=True, exist_ok=True)
                 stream = stack.enter_context(part.open("w", encoding="utf-8"))
-            write_json_line(index, result, stream)
+            _write_line(line, stream)
 
         yield write
     if stream is not None:
@@ -128,8 +135,16 @@ def write_json_line(index: int, result: Verification, stream: TextIO) -> None:
         result: Its verdict.
         stream: Where to write.
     """
-    text = json.dumps(_plain(as_dict(index, result)), ensure_ascii=False, allow_nan=False)
-    stream.write(text + "\n")
+    _write_line(json_line(index, result), stream)
+
+
+def json_line(index: int, result: Verification) -> str:
+    """Return a result as a line of strict JSON, see `write_json_line`."""
+    return json.dumps(_plain(as_dict(index, result)), ensure_ascii=False, allow_nan=False)
+
+
+def _write_line(line: str, stream: TextIO) -> None:
+    stream.write(line + "\n")
     stream.flush()
 
 

@@ -73,7 +73,9 @@ MODULES = {
         }.items()
     },
     "drakegrasp/verification/verify.py": ["tests/verification/test_verify.py"],
-    "drakegrasp/verification/forces/verdict.py": ["tests/verification/forces/test_verdict.py"],
+    "drakegrasp/verification/forces/verdict.py": [
+        "tests/verification/forces/test_force_verdict.py"
+    ],
 }
 #: An option of pytest that leaves slow tests out.
 QUICK = "-mnot server and not slow"

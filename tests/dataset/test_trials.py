@@ -204,7 +204,9 @@ def test_file_that_was_replaced_is_refused(out: Path) -> None:
 
 def test_numbers_that_stand_for_nothing_are_refused(out: Path) -> None:
     edit_file(out / TRIALS, lambda f: f["trials/outcome"].write_direct(np.full(36, 99, "u1")))
-    with pytest.raises(DataError, match=f"/trials/outcome must be 0 to {max(Outcome):d}, got 99 in row 7"):
+    with pytest.raises(
+        DataError, match=f"/trials/outcome must be 0 to {max(Outcome):d}, got 99 in row 7"
+    ):
         Trials(out)[[7, 9]]["outcome"]
     edit_file(out / TRIALS, lambda f: f["successes/removal"].write_direct(np.full(9, 99, "u1")))
     with pytest.raises(DataError, match="/successes/removal must be 0 to 15, got 99 in row 0"):

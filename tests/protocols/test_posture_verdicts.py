@@ -16,7 +16,7 @@ import pytest
 from helpers.commands import error_line, run
 from helpers.jaws import HERE, jaws
 
-from drakegrasp.errors import ConfigError, DataError, HandError, MachineError, MeshError
+from drakegrasp.errors import ConfigError, DataError, HandError, MachineError
 from drakegrasp.exchange.dexgraspbench import write_object
 from drakegrasp.protocols.catalog import find_protocol
 from drakegrasp.protocols.grasp_file import read_grasp_file
@@ -272,13 +272,14 @@ def test_bad_mjcf_is_one_line(tmp_path: Path, assets: Path, text: str) -> None:
     assert "\n" not in str(raised.value)
 
 
-def test_bad_part_of_an_object_is_one_line(
+def test_bad_part_of_an_object_or_none_costs_only_its_grasps(
     trials: PostureTrials, write: Write, assets: Path
 ) -> None:
     (assets / "box/urdf/meshes/convex_piece_000.obj").write_text("v 0 0 0\n")
-    with pytest.raises(MeshError, match=r"convex_piece_000\.obj: must be a convex part") as raised:
-        list(verify_postures([write()], trials))
-    assert "\n" not in str(raised.value)
+    bad, gone = verify_postures([write("0.npy"), write("1.npy", obj_path="gone")], trials)
+    assert re.search(r"convex_piece_000\.obj: must be a convex part", bad.verdict.reason)
+    assert "\n" not in bad.verdict.reason
+    assert "must hold the object's convex parts" in gone.verdict.reason
 
 
 def test_object_without_parts_or_volume_is_refused(tmp_path: Path, assets: Path) -> None:
