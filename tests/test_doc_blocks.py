@@ -44,7 +44,7 @@ NOT_RUN = {
     "drakegrasp score ": "tries hundreds of grasps; tests/cli/test_score_command.py",
     "drakegrasp bench-set ": "simulates for hours; tests/scoring/test_benchmark.py",
     "drakegrasp hand check ": "tests/commissioning/test_tutorial_hand.py runs it",
-    "drakegrasp verify GRASPS --protocol ": "wants an MJCF; tests/protocols/test_posture_verdicts.py",
+    "drakegrasp verify GRASPS --protocol ": "wants an MJCF; tests/protocols",
 }
 #: A page whose commands measure for minutes to hours; test_docs.py knows their options.
 MEASURED = "docs/benchmarks.md"

@@ -50,7 +50,7 @@ FEW_GRASPS = 4
 MOST_TOGETHER, TASKS_PER_WORKER = 16, 4
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class PlacedObject(ObjectOnTable):
     """An object on the table, on which grasps can be verified; made by `place_object`."""
 

@@ -29,6 +29,8 @@ from drakegrasp.errors import (
 
 #: A signal that comes while a module is imported is sent again after this time [s].
 AGAIN_SECONDS = 0.05
+#: Commands that go on where they were stopped.
+RESUMABLE = ("build", "score")
 #: Errors in what the user asked for. All other errors are failures of the work.
 WRONG_USAGE = (ConfigError, GraspError, HandError, MeshError)
 
@@ -65,7 +67,7 @@ class OneCommand(click.Command):
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command that was asked for."""
         of_group = isinstance(self, click.Group)
-        with one_line_errors(lambda: not of_group or ctx.invoked_subcommand == "build"):
+        with one_line_errors(lambda: not of_group or ctx.invoked_subcommand in RESUMABLE):
             return super().invoke(ctx)
 
 

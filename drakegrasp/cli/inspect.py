@@ -20,8 +20,8 @@ PORT = 8321
     "results",
     type=PATH,
     metavar="RESULTS",
-    help="Show predictions beside the rows that they are for: the file that verify --dataset ... "
-    "--out has written.",
+    help="Show predictions beside the rows that they are for: the results that "
+    "verify --dataset FILE --out NAME wrote.",
 )
 @click.option(
     "--port",

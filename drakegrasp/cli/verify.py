@@ -267,7 +267,9 @@ def _verify_postures(request: PostureRequest, *, show: bool) -> None:
     if not files:
         raise DataError(f"{path}: must be a .npy file or a folder of them, got none")
     if hand.suffix != ".xml":
-        raise HandError(f"hand must be an MJCF (.xml) with this protocol, got {request.hand!r}")
+        raise HandError(
+            f"--hand must be an MJCF (.xml) with --protocol {request.protocol}, got {request.hand}"
+        )
     trials = prepare_trials(request.protocol, hand, request.assets)
 
     # A line per verdict as it comes.

@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import get_args
 
 import click
 import h5py
@@ -27,6 +28,7 @@ from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.frames import make_pose
+from drakegrasp.protocols.protocol import Simulator
 from drakegrasp.shapes.catalog import BuiltinObject
 from drakegrasp.verification.prediction import FRAMES
 from drakegrasp.verification.verify import METHODS
@@ -373,6 +375,7 @@ def test_choices_of_verify_are_those_of_the_code() -> None:
         "split": SPLITS,
         "frame": FRAMES,
         "method": METHODS,
+        "simulator": get_args(Simulator),
     }
 
 
@@ -427,7 +430,7 @@ def test_hand_is_simulated_by_default(cube: Path, tmp_path: Path) -> None:
 
 @pytest.mark.sim
 def test_files_are_written_instead_of_lines(cube: Path, tmp_path: Path) -> None:
-    file = save(tmp_path, *[pinch() * np.inf] * 3)
+    file = save(tmp_path, *[np.full(18, np.inf)] * 3)
     out = tmp_path / "new" / "run.1"
     result = run("verify", file, "--object", cube, "--units", "cm", "--out", out)
     assert result.stdout.splitlines() == [f"{out}.jsonl", f"{out}.h5"]

@@ -61,6 +61,8 @@ def opened(path: Path, what: str, *, again: bool = False) -> Iterator[h5py.File]
     Raises:
         DataError: If it is missing or damaged.
     """
+    if path.is_dir():
+        raise DataError(f"{path}: must be {what}, got a folder; name the file in it")
     try:
         with open_hdf5(path, again=again) as file:
             yield file

@@ -38,6 +38,9 @@ TORSION_RADIUS = 2.0 / 3.0 * PATCH_RADIUS
 MAX_DISTANCE, MAX_ANGLE = 0.005, np.deg2rad(45.0)
 #: Distances that differ by less are equal [m]: predictions are rounded to 0.1 mm.
 SAME_DISTANCE = 1e-4
+#: A face that agrees with the normal may be so much farther than the nearest one [m]: less than the
+#: wall of a cup.
+MAX_DETOUR = 1e-3
 #: Points on the ring of a patch.
 RING_POINTS = 8
 
@@ -78,11 +81,13 @@ def surface_contacts(
     """
     points, normals = np.asarray(p_OQ, dtype=float), np.asarray(nhat_Q_O, dtype=float)
 
-    # Nearest among the faces that agree with the normal, else among all.
+    # Nearest among the faces that agree with the normal, else among all. Beyond a wall's other side
+    # no fingertip can be: a face that is much farther than the nearest one is not chosen.
     feet = _feet(model.collision.triangles, points)
     distance = np.linalg.norm(feet - points[:, None], axis=2)
     cosine = normals @ model.collision.face_normals.T
-    agreeing = np.where(cosine >= np.cos(MAX_ANGLE), distance, np.inf)
+    near_enough = distance <= distance.min(axis=1, keepdims=True) + MAX_DETOUR
+    agreeing = np.where((cosine >= np.cos(MAX_ANGLE)) & near_enough, distance, np.inf)
     found = agreeing.min(axis=1) <= MAX_DISTANCE
     chosen = _nearest(np.where(found[:, None], agreeing, distance), cosine)
 
