@@ -68,12 +68,13 @@ def test_at_an_edge_the_normal_chooses_between_the_faces(box: ObjectModel) -> No
     assert np.allclose(found.p_OQ, edge)
 
 
-def test_on_the_wrong_side_of_a_thin_wall_the_normal_chooses_the_side(tmp_path: Path) -> None:
+def test_a_normal_cannot_name_the_other_side_of_a_wall(tmp_path: Path) -> None:
+    """No fingertip fits where a flipped normal would have it, e.g. within a bottle."""
     plate = box_model(tmp_path, [0.003, 0.1, 0.1])
     p = [[-0.0015, 0.01, 0.0], [0.0015, 0.01, 0.0]]
     found = surface_contacts(plate, p, [RIGHT, RIGHT])
-    assert np.allclose(found.p_OQ, [0.0015, 0.01, 0.0])
-    assert np.allclose(found.distance, [0.003, 0.0])
+    assert np.allclose(found.p_OQ, p)
+    assert found.off_surface.tolist() == [True, False]
 
 
 def test_numbers_that_are_not_finite_are_off_the_surface(box: ObjectModel) -> None:
