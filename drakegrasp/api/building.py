@@ -15,6 +15,7 @@ from drakegrasp.build.pipeline import (
     BuildReport,
     build_locked,
     posture_config,
+    refuse_missing,
     refuse_unusable,
 )
 from drakegrasp.build.request import BUILTIN
@@ -26,13 +27,13 @@ from drakegrasp.config import Config
 from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import claim_directory
 from drakegrasp.dataset.paths import BUILTIN_FOLDER
-from drakegrasp.errors import GraspError, MeshError, listed
+from drakegrasp.errors import DataError, GraspError, MeshError, listed
 from drakegrasp.exchange.posture_files import read_postures
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
 from drakegrasp.runtime.progress import progress_bar
-from drakegrasp.scoring.benchmark import PRESET, write_objects
+from drakegrasp.scoring.benchmark import FILE_NAME, NAME, PRESET, write_objects
 from drakegrasp.shapes.catalog import builtin_sources, draw_builtin
 from drakegrasp.simulation.drive import drive_of
 from drakegrasp.simulation.postures.table import PostureTable, refuse_unknown_objects
@@ -213,8 +214,11 @@ def make_benchmark(
         ConfigError, DataError, MachineError: As `build_dataset`.
     """
     config, folder = load_config(PRESET, list(overrides)), Path(out).absolute()
-    with progress_bar("objects", "meshes", show=show) as report:
-        meshes = write_objects(folder, config, only=only, progress=report)
+    with build_lock(folder):
+        # A directory that cannot be used is refused before anything in it changes.
+        _claim_benchmark(folder, config, only)
+        with progress_bar("objects", "meshes", show=show) as report:
+            meshes = write_objects(folder, config, only=only, progress=report)
     return build_dataset(
         meshes,
         folder,
@@ -225,3 +229,20 @@ def make_benchmark(
         scheduler_file=scheduler_file,
         show=show,
     )
+
+
+def _claim_benchmark(folder: Path, config: Config, only: Sequence[str]) -> None:
+    """Refuse a directory that this call cannot make or continue as the benchmark.
+
+    Raises:
+        DataError: If it holds other files, another dataset, or objects that `only` leaves out.
+    """
+    known = claim_directory(folder, config)
+    if known is None:
+        return
+    if not (folder / BUILTIN_FOLDER / FILE_NAME).is_file():
+        raise DataError(
+            f"{folder}: must be empty or hold {NAME}, got another dataset; choose another OUT"
+        )
+    names = only or [each.name for each in draw_builtin(config.builtin)]
+    refuse_missing(known, names, folder)

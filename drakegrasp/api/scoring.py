@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy.typing as npt
 
@@ -17,13 +16,7 @@ from drakegrasp.scoring.references import REFERENCES
 from drakegrasp.scoring.run import Request, Score
 from drakegrasp.scoring.run import score as score_request
 from drakegrasp.verification.batch import ResultCallback
-from drakegrasp.verification.placed_grasp import (
-    dataset_config,
-    place_on_rows,
-)
-
-if TYPE_CHECKING:
-    pass
+from drakegrasp.verification.placed_grasp import dataset_config, overridden_keys, place_on_rows
 
 
 def score(
@@ -65,7 +58,8 @@ def score(
         show: Whether to show progress on standard error.
 
     Raises:
-        GraspError: If predictions and rows do not fit.
+        GraspError: If predictions and rows do not fit, there is nothing to score, or `train` is of
+            another camera or hand.
         ConfigError, DataError, HandError, MachineError: As `run_verification`.
     """
     # What is scored, by which rules.
@@ -82,6 +76,7 @@ def score(
         references=tuple(references),
         per_object=per_object,
         config=dataset_config(dataset, overrides=settings),
+        overridden=tuple(overridden_keys(settings)),
         again=again,
     )
 

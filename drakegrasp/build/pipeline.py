@@ -7,7 +7,7 @@ work unit. Results may come back in any order; the files are the same.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -198,7 +198,7 @@ def build_locked(
         # The directory must be ours, and the dataset in it must be of these meshes.
         known = claim_directory(out, config)
         if known is not None:
-            _refuse_missing(known, sources, out)
+            refuse_missing(known, [source.name for source in sources], out)
 
         notices = [] if dead is None else [f"the lock of a dead build was taken over: {dead}"]
         notices += _sweep(out)
@@ -287,9 +287,17 @@ def _sweep(out: Path) -> list[str]:
     return [f"{_count(swept, 'temporary file')} of dead processes removed"] if swept else []
 
 
-def _refuse_missing(known: Manifest, sources: Sequence[MeshSource], out: Path) -> None:
-    """Refuse to continue a dataset without a mesh that it was built from."""
-    names = {source.name for source in sources}
+def refuse_missing(known: Manifest, names: Collection[str], out: Path) -> None:
+    """Refuse to continue a dataset without a mesh that it was built from.
+
+    Args:
+        known: The manifest of the dataset.
+        names: Of the meshes that are given.
+        out: Directory of the dataset.
+
+    Raises:
+        DataError: If one is missing.
+    """
     built = [entry.name for entry in known.objects] + [mesh.name for mesh in known.refused]
     missing = [name for name in built if name not in names]
     if missing:

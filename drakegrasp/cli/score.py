@@ -107,7 +107,7 @@ def score(
         show=not quiet,
     )
     if as_json:
-        click.echo(json.dumps(scored.card, indent=1))
+        click.echo(json.dumps(scored.card, indent=1, allow_nan=False))
     else:
         say_paths(scored, out)
     if not quiet:

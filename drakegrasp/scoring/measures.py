@@ -163,13 +163,15 @@ def _within(verdict: Verdict, limit: float) -> bool:
 def calibration(judged: Judged) -> list[dict[str, float]]:
     """Return mean confidence and share that counts, of groups of predictions; empty if none stated.
 
-    All predictions are in it, whatever their rank, in groups of equal size by confidence.
+    All predictions whose confidence is a finite number are in it, whatever their rank, in groups of
+    equal size by confidence.
     """
     if any(ranked.confidence is None for ranked in judged.ranked):
         return []
     stated = np.concatenate([r.confidence for r in judged.ranked if r.confidence is not None])
     counted = np.array([v.counted for verdicts in judged.verdicts for v in verdicts], dtype=float)
     order = np.argsort(stated, kind="stable")
+    order = order[np.isfinite(stated[order])]
     return [
         {
             "confidence": _rounded(stated[group].mean()),

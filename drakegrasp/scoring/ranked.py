@@ -38,7 +38,7 @@ class Ranked:
         grasps: (N, 6k), in the camera's frame.
         rows: (N,), the row of each.
         ranks: (N,), 0 for the best of a row.
-        confidence: (N,), as stated; None if it is not.
+        confidence: (N,), as stated, -inf for what is no finite number; None if it is not.
         sha256: Of the file, or of the numbers.
     """
 
@@ -233,7 +233,12 @@ def ranked_sets(
     """
     # One array.
     single = isinstance(predictions, str | Path)
-    paths = [predictions] if single else predictions
+    try:
+        paths = [predictions] if single else list(predictions)
+    except TypeError:
+        raise GraspError(
+            f"predictions must be an array, a file or a list of files, got {predictions!r}"
+        ) from None
     if not all(isinstance(path, str | Path) for path in paths):
         one = rank("predictions", predictions, length=len(data), rows=rows, confidence=confidence)
         return one.name, (one,)

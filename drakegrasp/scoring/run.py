@@ -66,7 +66,7 @@ class Score:
 
         folder.mkdir(parents=True, exist_ok=True)
         contents = {
-            CARD_JSON: (json.dumps(self.card, indent=1) + "\n").encode(),
+            CARD_JSON: (json.dumps(self.card, indent=1, allow_nan=False) + "\n").encode(),
             CARD_TEXT: self.text.encode(),
             CARD_PICTURE: card_picture(self.card),
         }
@@ -87,6 +87,7 @@ class Request:
         references: Names of the reference rows, in the order of the card.
         per_object: Rows of each object, at most; all if None.
         config: Of the verification.
+        overridden: Paths of the keys that the caller sets; a row's own friction gives way to them.
         again: The command that makes the card again.
     """
 
@@ -97,6 +98,7 @@ class Request:
     references: tuple[str, ...]
     per_object: int | None
     config: Config
+    overridden: tuple[str, ...]
     again: str
 
 
@@ -109,16 +111,26 @@ def score(request: Request, verify: Verify, folder: Path | None) -> Score:
         folder: Keeps verdicts, so that the same call goes on; nothing is kept if None.
 
     Raises:
-        GraspError: If there is nothing to score, or the predictions are for different rows.
+        GraspError: If there is nothing to score, the predictions are for different rows, or the
+            training rows are of another camera or hand.
     """
+    _refuse_other_train(request.data, request.train)
+
     # The rows, and what is scored on them.
     rows = _chosen_rows(request)
     grouping = _grouping(request.data, rows)
     sets = [(request.name, tuple(each.of_rows(rows) for each in request.predictions))]
     sets = [each for each in sets if each[1]] + _reference_rows(request, rows)
+    if not sets:
+        raise GraspError("there must be predictions or reference rows to score, got none")
 
     # Their verdicts: all predictions that have none are tried together.
-    settings = {"config": request.config.to_dict(), "versions": installed_versions(request.config)}
+    versions = installed_versions(request.config)
+    settings = {
+        "config": request.config.to_dict(),
+        "overridden": sorted(request.overridden),
+        "versions": versions,
+    }
     verdicts = _verdicts([r for _, each in sets for r in each], request, settings, verify, folder)
     judged, start = [], 0
     for name, ranked in sets:
@@ -133,7 +145,7 @@ def score(request: Request, verify: Verify, folder: Path | None) -> Score:
         oracle=request.config.verify.max_tries > 1,
         known_objects=len(set(grouping.names) & _texts(request.train, "object_name")),
         new_classes=not set(grouping.classes) & _texts(request.train, "class_name"),
-        benchmark=read_benchmark(request.data.path.parent, settings["versions"]),
+        benchmark=read_benchmark(request.data.path.parent, request.config, versions),
         again=request.again,
     )
     own = dict(zip(rows, own_contacts(request.data, rows), strict=True))
@@ -142,9 +154,26 @@ def score(request: Request, verify: Verify, folder: Path | None) -> Score:
     return Score(card=card, seconds=times, sets=tuple(judged))
 
 
+def _refuse_other_train(data: GraspDataset, train: GraspDataset) -> None:
+    """Refuse training rows whose grasps are no predictions for the rows to score.
+
+    Raises:
+        GraspError: If they are in the frame of the other camera, or of a hand with more or fewer
+            fingers.
+    """
+    numbers, found = (each.column("grasps").shape[1] for each in (data, train))
+    if (train.camera, found) != (data.camera, numbers):
+        raise GraspError(
+            f"{train.path}: training rows must be of the camera and hand of {data.path.name} "
+            f"({data.camera}, {numbers} numbers), got {train.camera}, {found} numbers"
+        )
+
+
 def _chosen_rows(request: Request) -> list[int]:
     """Return the rows to score, in order: those of the predictions, some of each object."""
     data, predictions = request.data, request.predictions
+    if request.per_object is not None and request.per_object < 1:
+        raise GraspError(f"per_object must be 1 or more, got {request.per_object}")
     numbers = data.column("grasps").shape[1]
     for each in predictions:
         if each.grasps.shape[1] != numbers:
@@ -211,7 +240,8 @@ def _verdicts(
 ) -> list[tuple[Verdict, ...]]:
     """Return the verdicts of each of several sets of predictions."""
     # What is to be tried, each once: two sets may have the same grasp.
-    content = request.data.content
+    # The files of the two cameras have the same content.
+    content = f"{request.data.content} {request.data.camera}"
     keys = [
         [
             verdict_key(settings, content, row, grasp)

@@ -152,7 +152,7 @@ def verdict_key(settings: Mapping[str, Any], signature: str, row: int, grasp: Ar
 
     Args:
         settings: All that decides the verdict beside the row: rules and versions.
-        signature: Of the dataset's content.
+        signature: Of the dataset's content, with the camera in whose frame grasps are.
         row: Of the split.
         grasp: (6k,).
     """

@@ -115,8 +115,16 @@ def place_on_rows(
 
     if config is not None:
         return placed_grasps
-    kept = {text.partition("=")[0].strip() for text in overrides}
+    kept = overridden_keys(overrides)
     return _as_tried(placed_grasps, dataset, chosen, manifest.config.randomize, kept)
+
+
+def overridden_keys(overrides: Sequence[str]) -> set[str]:
+    """Return the paths of the keys that overrides set, e.g. "physics.friction_hand".
+
+    They decide beside the configuration: what was drawn for a row gives way even to an equal value.
+    """
+    return {text.partition("=")[0].strip() for text in overrides}
 
 
 def dataset_config(

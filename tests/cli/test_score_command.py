@@ -10,6 +10,7 @@ import pytest
 from helpers.commands import error_line, run
 from helpers.datasets import OTO, make_dataset
 
+from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.scoring.benchmark import read_benchmark
 
@@ -72,7 +73,7 @@ def test_a_part_of_the_benchmark_is_built_and_all_of_it_tests(tmp_path: Path) ->
     result = run("bench-set", out, "--only", name, *changes, "--workers", 1, "--quiet")
     assert result.exit_code == 0, result.output
     assert "different_meshes" in (out / "builtin" / "benchmark.json").read_text()
-    about = read_benchmark(out, {})
+    about = read_benchmark(out, read_manifest(out).config, {})
     assert about is not None
     assert about["different_meshes"] == []
     assert "samples_per_object" in about["other_settings"]

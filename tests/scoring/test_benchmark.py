@@ -9,10 +9,16 @@ from pathlib import Path
 import pytest
 import yaml
 
-from drakegrasp.dataset.manifest import Manifest, installed_versions, write_manifest
+from drakegrasp.api.building import make_benchmark
+from drakegrasp.dataset.manifest import (
+    Manifest,
+    RefusedMesh,
+    installed_versions,
+    write_manifest,
+)
 from drakegrasp.dataset.paths import BUILTIN_FOLDER
 from drakegrasp.errors import DataError, MeshError
-from drakegrasp.hand.settings import load_config
+from drakegrasp.hand.settings import load_config, override_config
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.scoring import benchmark
 from drakegrasp.scoring.benchmark import (
@@ -30,6 +36,7 @@ from drakegrasp.shapes.catalog import draw_builtin
 from drakegrasp.shapes.classes import CLASSES
 
 CONFIG = load_config(PRESET)
+SCORED = override_config(CONFIG, ["verify.max_tries=1"])
 #: Mass [kg] and friction of the first object, and the classes that no training set may have.
 FIRST_MATERIAL = (0.1, 0.71)
 NEW = [
@@ -75,9 +82,10 @@ def test_draws_are_frozen() -> None:
 
 
 def test_meshes_are_those_published_and_have_their_own_material(part: Path) -> None:
-    about = read_benchmark(part, published()["versions"])
+    about = read_benchmark(part, SCORED, published()["versions"])
     assert about is not None
     assert about["different_meshes"] == []
+    assert about["other_settings"] == ""
     assert about["other_versions"] == {}
     (source,) = find_meshes(part / BUILTIN_FOLDER)
     item = next(item for item in draw_builtin(CONFIG.builtin) if item.name == BOTTLE)
@@ -85,9 +93,50 @@ def test_meshes_are_those_published_and_have_their_own_material(part: Path) -> N
 
 
 def test_a_part_of_the_benchmark_is_not_frozen(part: Path) -> None:
-    about = read_benchmark(part, published()["versions"])
+    about = read_benchmark(part, SCORED, published()["versions"])
     assert about is not None
     assert (about["objects"], about["of"], about["frozen"]) == (1, 256, False)
+
+
+def test_a_score_by_other_rules_is_not_frozen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = {"objects": {BOTTLE: published()["objects"][BOTTLE]}, "versions": {}}
+    monkeypatch.setattr(benchmark, "published", lambda: whole)
+    write_objects(tmp_path, CONFIG, only=[BOTTLE])
+    write_manifest(Manifest(config=CONFIG, versions=installed_versions(CONFIG)), tmp_path)
+    looser = override_config(SCORED, ["verify.max_contact_error=0.06"])
+    for config, other in ((SCORED, ""), (looser, "max_contact_error"), (CONFIG, "max_tries")):
+        about = read_benchmark(tmp_path, config, {})
+        assert about is not None
+        assert about["frozen"] == (other == "")
+        assert other in about["other_settings"]
+
+
+@pytest.mark.parametrize("manifest", [True, False])
+def test_a_folder_of_something_else_stays_as_it_is(tmp_path: Path, manifest: bool) -> None:
+    if manifest:
+        write_manifest(Manifest(config=CONFIG, versions=installed_versions(CONFIG)), tmp_path)
+    else:
+        (tmp_path / "thesis.tex").write_text("mine")
+    before = list(tmp_path.iterdir())
+    with pytest.raises(DataError, match="must be empty or hold"):
+        make_benchmark(tmp_path, only=[BOTTLE], show=False)
+    assert list(tmp_path.iterdir()) == before
+
+
+def test_a_finished_benchmark_is_not_made_a_part_of_itself(tmp_path: Path) -> None:
+    write_objects(tmp_path, CONFIG, only=[BOTTLE])
+    stored = Manifest(
+        config=CONFIG,
+        versions=installed_versions(CONFIG),
+        refused=(RefusedMesh(name=BOTTLE, mesh_sha256="0", reason="too heavy"),),
+    )
+    write_manifest(stored, tmp_path)
+    before = {path: path.read_bytes() for path in (tmp_path / BUILTIN_FOLDER).iterdir()}
+    with pytest.raises(DataError, match=f"every mesh .* got none named {BOTTLE}"):
+        make_benchmark(tmp_path, only=["6_can_1"], show=False)
+    assert {path: path.read_bytes() for path in (tmp_path / BUILTIN_FOLDER).iterdir()} == before
 
 
 def test_other_meshes_versions_and_settings_are_named(
@@ -97,7 +146,7 @@ def test_other_meshes_versions_and_settings_are_named(
     write_objects(tmp_path, CONFIG, only=[BOTTLE])
     other = load_config(PRESET, ["lift.hold_time=1"])
     write_manifest(Manifest(config=other, versions=installed_versions(other)), tmp_path)
-    about = read_benchmark(tmp_path, {**published()["versions"], "drake": "0"})
+    about = read_benchmark(tmp_path, SCORED, {**published()["versions"], "drake": "0"})
     assert about is not None
     assert about["different_meshes"] == [BOTTLE]
     assert list(about["other_versions"]) == ["drake"]
@@ -105,11 +154,11 @@ def test_other_meshes_versions_and_settings_are_named(
 
 
 def test_another_dataset_is_no_benchmark_and_a_damaged_file_is_refused(tmp_path: Path) -> None:
-    assert read_benchmark(tmp_path, {}) is None
+    assert read_benchmark(tmp_path, SCORED, {}) is None
     (tmp_path / BUILTIN_FOLDER).mkdir()
     (tmp_path / BUILTIN_FOLDER / benchmark.FILE_NAME).write_text(json.dumps({"name": "x"}))
     with pytest.raises(DataError, match="must be the file of a benchmark"):
-        read_benchmark(tmp_path, {})
+        read_benchmark(tmp_path, SCORED, {})
 
 
 def test_an_unknown_object_is_refused(tmp_path: Path) -> None:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from helpers.datasets import OTO, make_dataset
+from helpers.datasets import OTM, OTO, make_dataset
 from helpers.scores import FakeVerify
 
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError
+from drakegrasp.runtime.json_text import read_json
 from drakegrasp.scoring.ranked import ranked_sets
 from drakegrasp.scoring.run import VERDICTS, Request, own_contacts, score
 from drakegrasp.verification.placed_grasp import dataset_config, place_on_rows
@@ -25,7 +27,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> GraspDataset:
     return GraspDataset(out / OTO, split="test")
 
 
-def request_of(data: GraspDataset, given: Any = (), **changes: Any) -> Request:
+def request_of(data: GraspDataset, /, given: Any = (), **changes: Any) -> Request:
     name, ranked = ranked_sets(given, data)
     values: dict[str, Any] = {
         "data": data,
@@ -35,6 +37,7 @@ def request_of(data: GraspDataset, given: Any = (), **changes: Any) -> Request:
         "references": ("own", "constant"),
         "per_object": None,
         "config": dataset_config(data, overrides=("verify.max_tries=1",)),
+        "overridden": ("verify.max_tries",),
         "again": "drakegrasp score",
     }
     return Request(**(values | changes))
@@ -75,12 +78,27 @@ def test_an_interrupted_score_goes_on(data: GraspDataset, tmp_path: Path) -> Non
     assert card == score(request_of(data), FakeVerify(is_own(data)), None).card
 
 
-def test_verdicts_of_other_rules_are_not_taken(data: GraspDataset, tmp_path: Path) -> None:
-    score(request_of(data), FakeVerify(is_own(data)), tmp_path)
-    other = FakeVerify(is_own(data))
-    config = dataset_config(data, overrides=("physics.friction_hand=0.5",))
-    score(request_of(data, config=config), other, tmp_path)
-    assert other.asked == 2 * len(data)
+def other_friction(data: GraspDataset) -> dict[str, Any]:
+    return {"config": dataset_config(data, overrides=("physics.friction_hand=0.5",))}
+
+
+def same_friction_for_all_rows(data: GraspDataset) -> dict[str, Any]:
+    return {"overridden": ("physics.friction_hand", "verify.max_tries")}
+
+
+def other_camera(data: GraspDataset) -> dict[str, Any]:
+    path = data.path.parent / OTM
+    return {"data": GraspDataset(path, split="test"), "train": GraspDataset(path, split="train")}
+
+
+@pytest.mark.parametrize("change", [other_friction, same_friction_for_all_rows, other_camera])
+def test_verdicts_of_other_rules_are_not_taken(
+    data: GraspDataset, tmp_path: Path, change: Callable[[GraspDataset], dict[str, Any]]
+) -> None:
+    given, other = np.ones((len(data), 18)), FakeVerify(is_own(data))
+    score(request_of(data, given, references=()), FakeVerify(is_own(data)), tmp_path)
+    score(request_of(data, given, references=(), **change(data)), other, tmp_path)
+    assert other.asked == len(data)
 
 
 def test_some_rows_of_each_object_are_the_same_for_all_sets(data: GraspDataset) -> None:
@@ -106,9 +124,29 @@ def test_predictions_for_different_rows_are_refused(data: GraspDataset) -> None:
         score(request_of(data, predictions=one + other), FakeVerify(is_own(data)), None)
 
 
-def test_grasps_of_another_hand_are_refused(data: GraspDataset) -> None:
-    with pytest.raises(GraspError, match="a grasp must be 18 numbers, got 12"):
-        score(request_of(data, np.zeros((len(data), 12))), FakeVerify(is_own(data)), None)
+def other_hand(data: GraspDataset) -> dict[str, Any]:
+    grasps = np.zeros((2, 24))
+    return {
+        "train": SimpleNamespace(path=Path("four.hdf5"), camera="oto", column=lambda name: grasps)
+    }
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda data: {"given": np.zeros((len(data), 12))}, "must be 18 numbers, got 12"),
+        (lambda data: {"given": None}, "predictions must be an array, a file or .*, got None"),
+        (lambda data: {"references": ()}, "predictions or reference rows to score, got none"),
+        (lambda data: {"per_object": 0}, "per_object must be 1 or more, got 0"),
+        (lambda data: {"train": other_camera(data)["train"]}, "got otm, 18 numbers"),
+        (other_hand, r"must be of the camera .* \(oto, 18 numbers\), got oto, 24 numbers"),
+    ],
+)
+def test_what_cannot_be_scored_is_refused(
+    data: GraspDataset, change: Callable[[GraspDataset], dict[str, Any]], message: str
+) -> None:
+    with pytest.raises(GraspError, match=message):
+        score(request_of(data, **change(data)), FakeVerify(is_own(data)), None)
 
 
 def test_without_blind_rows_a_card_says_so(data: GraspDataset) -> None:
@@ -134,10 +172,14 @@ def test_files_of_a_card_are_whole_and_come_again(data: GraspDataset, tmp_path: 
     predicted = np.repeat(data.column("grasps")[:, None], 5, axis=1).astype(float)
     predicted[:, 1:] = 0.0
     confidence = np.linspace(0.9, 0.1, 5 * len(data)).reshape(len(data), 5)
+    confidence[0, 4] = np.nan
     _, ranked = ranked_sets(predicted, data, confidence=confidence)
     scored = score(request_of(data, predictions=ranked, name="net"), FakeVerify(is_own(data)), None)
     paths = scored.save(tmp_path)
-    assert json.loads(paths[0].read_text()) == scored.card
+    assert read_json(paths[0]) == scored.card
+    assert sum(group["count"] for group in scored.card["sets"]["net"]["calibration"]) == (
+        5 * len(data) - 1
+    )
     text = paths[1].read_text()
     assert "**net: 100 (100 to 100)** sample" in text
     assert "net, success@5" in text
