@@ -54,8 +54,14 @@ def read_dexgraspbench(path: Path, hand: Hand) -> Rows:
 
     # The root of the hand in the object's frame, in metres.
     count = len(grasp)
+    for stage, rows in qpos.items():
+        if len(rows) != count:
+            raise GraspError(f"{path}: {QPOS[stage]} must be of {count} rows, got {len(rows)}")
     obj_pose = content.get("obj_pose", [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-    pose = np.broadcast_to(_vectors(path, obj_pose, "obj_pose"), (count, 7))
+    pose = _vectors(path, obj_pose, "obj_pose")
+    if pose.shape not in ((1, 7), (count, 7)):
+        raise GraspError(f"{path}: obj_pose must be 7 numbers for 1 or {count}, got {pose.shape}")
+    pose = np.broadcast_to(pose, (count, 7))
     X_WM = quaternion_poses(pose[:, :3], pose[:, 3:])
     X_WL = quaternion_poses(grasp[:, :3], grasp[:, 3:7])
     try:
@@ -70,7 +76,7 @@ def read_dexgraspbench(path: Path, hand: Hand) -> Rows:
         X_FL=multiply(invert_pose(X_WM), X_WL),
         link=hand.palm_link,
         frame="object" if own else "mesh",
-        q={stage: rows[:, 7:] for stage, rows in qpos.items() if len(rows) == count},
+        q={stage: rows[:, 7:] for stage, rows in qpos.items()},
         joints=_names(path, content.get("joint_names")),
         numbers={} if own else {"scale": scale},
         said=[path.name] * count,
@@ -117,7 +123,8 @@ def read_isaac_grasp(path: Path, hand: Hand) -> Rows:
 
     # Each grasp with the same joints.
     first = next(iter(grasps.values()))
-    joints = list(first.get("cspace_position") or ()) if isinstance(first, dict) else []
+    named = first.get("cspace_position") if isinstance(first, dict) else None
+    joints = list(named) if isinstance(named, dict) else []
     places, q, said = list[Any](), dict[str, list[Any]](), list[str]()
     for name, grasp in grasps.items():
         place = f"{path}: {name}"

@@ -10,6 +10,7 @@ import csv
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import h5py
 import numpy as np
@@ -83,11 +84,14 @@ def _of_folder(folder: Path, hand: Hand) -> PostureTable:
 def _read_arrays(path: Path) -> dict[str, Any]:
     try:
         if path.suffix.lower() == ".npz":
-            with np.load(path, allow_pickle=False) as file:
+            with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
                 return {name: file[name] for name in file.files}
         with open_hdf5(path) as file:
             return {name: _dataset(file[name]) for name in file}
-    except (OSError, ValueError, KeyError, DataError) as error:
+    except (
+        *(OSError, EOFError, BadZipFile, MemoryError),
+        *(TypeError, ValueError, KeyError, DataError),
+    ) as error:
         raise GraspError(f"must be a readable file of arrays, got: {one_line(error)}") from None
 
 
@@ -140,9 +144,9 @@ def _texts(value: Any, name: str) -> list[str]:
     return [str(each) for each in array.tolist()]
 
 
-def _only(values: Sequence[str] | None, name: str) -> str | None:
+def _only(values: Sequence[str | None] | None, name: str) -> str | None:
     """Return the one text of a column, or None if there is none."""
-    different = set(values or ())
+    different = {value or "" for value in values or ()}
     if len(different) > 1:
         raise GraspError(f"{name} must be the same in all rows, got {', '.join(sorted(different))}")
     return different.pop() if different else None

@@ -8,7 +8,10 @@ before it is made.
 from __future__ import annotations
 
 import io
+import math
 import pickle
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -18,27 +21,134 @@ from drakegrasp.errors import GraspError, one_line
 
 #: Files of grasps are smaller [bytes].
 MOST_BYTES = 64_000_000
-#: All that a pickle of NumPy arrays, of NumPy 1 or 2, needs by name.
+#: The types of an array: floats, integers, booleans and texts, as NumPy's pickles name them.
+_CODE = re.compile(r"f[248]|[iu][1248]|b1|[US][1-9][0-9]{0,6}|O8?")
+
+
+class _StandIn:
+    """What a pickle gets for a name of NumPy's: a call of ours, whose attributes it cannot set."""
+
+    def __init__(self, make: Callable[..., Any]) -> None:
+        self._make = make
+
+    def __call__(self, *args: Any) -> Any:
+        return self._make(*args)
+
+    def __setstate__(self, state: Any) -> None:
+        raise ValueError("a name of NumPy must not be changed")
+
+
+class _Type:
+    """A type of an array; NumPy's own would take fields and flags that make pointers of bytes."""
+
+    def __init__(self, code: Any, *_: Any) -> None:
+        if not isinstance(code, str) or not _CODE.fullmatch(code):
+            raise pickle.UnpicklingError(f"numpy.dtype of {str(code)[:40]!r}")
+        self.dtype = np.dtype(code)
+
+    def __setstate__(self, state: Any) -> None:
+        # Version, byte order, subarray, names, fields; size, alignment and flags follow the code.
+        _, order, *parts = state[:5]
+        if order not in ("<", ">", "=", "|") or any(part is not None for part in parts):
+            raise pickle.UnpicklingError("numpy.dtype with fields")
+        self.dtype = self.dtype.newbyteorder(order)
+
+
+class _Array:
+    """An array to be: NumPy's pickles make it first and say later what is in it."""
+
+    def __init__(self, *_: Any) -> None:
+        self.parts: tuple[Any, ...] = ()
+
+    def __setstate__(self, state: Any) -> None:
+        _, *self.parts = state
+
+
+def _buffered(data: Any, kind: Any, shape: Any, order: Any, *_: Any) -> _Array:
+    """Stand in for `_frombuffer` of NumPy, by which pickles of protocol 5 make arrays."""
+    if order not in ("C", "F"):
+        raise ValueError(f"order of an array must be C or F, got {order!r}")
+    array = _Array()
+    array.parts = (shape, kind, order == "F", data)
+    return array
+
+
+def _array(shape: Any, kind: Any, fortran: Any, data: Any) -> np.ndarray:
+    """Return an array of which each byte is in the file."""
+    shape = shape if isinstance(shape, tuple) else (shape,)
+    if not isinstance(kind, _Type) or not all(type(n) is int and n >= 0 for n in shape):
+        raise ValueError("an array must have a shape and a type")
+    objects = kind.dtype.hasobject
+    needed = math.prod(shape) * (1 if objects else kind.dtype.itemsize)
+    if not isinstance(data, list if objects else bytes | bytearray) or len(data) != needed:
+        raise ValueError("an array must have as many bytes as its shape says")
+    if objects:
+        array = np.empty(len(data), dtype=object)
+        for i, each in enumerate(data):
+            array[i] = each
+        return array.reshape(shape, order="F" if fortran else "C")
+    array = np.frombuffer(data, kind.dtype) if data else np.empty(0, kind.dtype)
+    array = array.reshape(shape, order="F" if fortran else "C").copy(order="K")
+    if array.dtype.kind == "U":
+        array.tolist()  # raises where a number is no character
+    return array
+
+
+def _scalar(kind: Any, data: Any) -> Any:
+    if not isinstance(kind, _Type) or kind.dtype.hasobject:
+        raise pickle.UnpicklingError("numpy scalar of another type")
+    return _array((), kind, False, data)[()]
+
+
+def _encode(text: Any, encoding: Any) -> bytes:
+    """Stand in for `_codecs.encode`, by which old protocols write bytes; others run zlib."""
+    if encoding != "latin1" or not isinstance(text, str):
+        raise pickle.UnpicklingError(f"_codecs.encode to {str(encoding)[:40]!r}")
+    return text.encode("latin1")
+
+
+#: All that a pickle of NumPy arrays, of NumPy 1 or 2, needs by name. None of it is NumPy's own.
 _ALLOWED = {
-    *(
-        (f"numpy.{core}.multiarray", name)
+    ("numpy", "ndarray"): _StandIn(_Array),
+    ("numpy", "dtype"): _StandIn(_Type),
+    ("_codecs", "encode"): _StandIn(_encode),
+    **{
+        (f"numpy.{core}.{module}", name): _StandIn(make)
         for core in ("core", "_core")
-        for name in ("_reconstruct", "scalar")
-    ),
-    *((f"numpy.{core}.numeric", "_frombuffer") for core in ("core", "_core")),
-    ("numpy", "ndarray"),
-    ("numpy", "dtype"),
-    ("_codecs", "encode"),
+        for module, name, make in (
+            ("multiarray", "_reconstruct", _Array),
+            ("multiarray", "scalar", _scalar),
+            ("numeric", "_frombuffer", _buffered),
+        )
+    },
 }
 
 
 class _PlainUnpickler(pickle.Unpickler):
-    """Refuses every name but those of NumPy's arrays, so nothing else can be called."""
+    """Refuses every name but those of NumPy's arrays, and calls stand-ins for these."""
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in _ALLOWED:
             raise pickle.UnpicklingError(f"{module}.{name}")
-        return super().find_class(module, name)
+        return _ALLOWED[module, name]
+
+
+def _plain(value: Any, made: dict[int, Any]) -> Any:
+    """Return a value with its arrays made; what the pickle has once is made once."""
+    if value is None or isinstance(value, str | bytes | bytearray | int | float | np.generic):
+        return value
+    if id(value) not in made:
+        if isinstance(value, dict):
+            new: Any = {_plain(key, made): _plain(each, made) for key, each in value.items()}
+        elif isinstance(value, list | tuple):
+            new = type(value)([_plain(each, made) for each in value])
+        elif isinstance(value, _Array):
+            shape, kind, fortran, data = value.parts
+            new = _array(shape, kind, fortran, _plain(data, made))
+        else:
+            raise pickle.UnpicklingError(type(value).__name__)
+        made[id(value)] = new
+    return made[id(value)]
 
 
 def read_plain_pickle(path: Path) -> Any:
@@ -58,7 +168,7 @@ def read_plain_pickle(path: Path) -> Any:
         stream = io.BytesIO(data)
         shape, dtype = _header(stream)
         if dtype.hasobject and shape == ():
-            found = _PlainUnpickler(stream).load()
+            found = _plain(_PlainUnpickler(stream).load(), {})
             return found.item() if isinstance(found, np.ndarray) else found
     except GraspError:
         raise

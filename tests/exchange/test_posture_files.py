@@ -270,6 +270,9 @@ def test_arrays_that_are_no_postures_are_refused_in_a_line(tmp_path, changes, wo
         ({"grasp_qpos": np.zeros(23)}, "row 0: position and quaternion"),
         ({"joint_names": [1, 2]}, "joint_names must be a list of texts"),
         ({"obj_pose": np.zeros(3)}, "obj_pose must be rows of a pose"),
+        ({"obj_pose": np.zeros(8)}, r"obj_pose must be 7 numbers for 1 or 1, got \(1, 8\)"),
+        ({"obj_pose": np.zeros((3, 7))}, r"obj_pose must be 7 numbers .*, got \(3, 7\)"),
+        ({"squeeze_qpos": np.zeros((2, 23))}, "squeeze_qpos must be of 1 rows, got 2"),
     ],
 )
 def test_dictionaries_that_are_no_grasps_are_refused_in_a_line(tmp_path, changes, words):
@@ -284,6 +287,13 @@ def test_dictionaries_that_are_no_grasps_are_refused_in_a_line(tmp_path, changes
         ("a.csv", "x,y\n1,2\n", "columns must include object, got x, y"),
         ("a.csv", "object,x\nmug\n", "row 0 of 1 values under a header of 2"),
         ("a.npz", "junk", "must be a readable file of arrays"),
+        ("a.npz", "", "must be a readable file of arrays"),
+        ("a.npz", "PK\3\4", "must be a readable file of arrays"),
+        (
+            "a.yaml",
+            "{format: isaac_grasp, format_version: 1, grasps: {a: {cspace_position: 5}}}",
+            "a must have position, orientation and cspace_position",
+        ),
         ("a.npy", "junk", r"must be a \.npy file"),
         ("a.yaml", "format: other", "format must be isaac_grasp"),
         ("a.yaml", "format: isaac_grasp\nformat_version: 2.0", "format_version must be 1.0"),
@@ -294,6 +304,24 @@ def test_other_files_are_refused_in_a_line(tmp_path, name, content, words):
     (tmp_path / name).write_text(content, encoding="utf-8")
     with pytest.raises(GraspError, match=words):
         read_postures(tmp_path / name, HAND)
+
+
+def test_array_that_is_named_as_several_is_refused(tmp_path):
+    with (tmp_path / "a.npz").open("wb") as file:
+        np.save(file, GRASP)
+    with pytest.raises(GraspError, match="must be a readable file of arrays"):
+        read_postures(tmp_path / "a.npz", HAND)
+
+
+def test_frame_that_some_rows_lack_is_refused(tmp_path):
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    parquet.write_table(
+        pyarrow.table(columns() | {"frame": ["table", None]}), tmp_path / "p.parquet"
+    )
+    with pytest.raises(GraspError, match="frame must be the same in all rows"):
+        read_postures(tmp_path / "p.parquet", HAND)
 
 
 def test_what_is_not_there_is_refused(tmp_path):

@@ -12,7 +12,7 @@ from helpers.objects import STANDOFF, from_above, standing
 from drakegrasp.errors import GraspError
 from drakegrasp.frames import X_WT, make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.kinematics import joint_positions
+from drakegrasp.hand.kinematics import coordinate_limits, joint_positions
 from drakegrasp.outcomes import Outcome
 from drakegrasp.simulation.drive import disengage, engage
 from drakegrasp.simulation.placement import PlacedObject
@@ -123,6 +123,23 @@ def test_joint_of_the_preshape_is_locked_where_the_grasp_has_it():
     assert path is not None
     assert not path.own_motors
     assert path.start[at] == posture.q_grasp[at]
+
+
+def test_joint_without_a_motor_is_locked_where_the_grasp_has_it():
+    hand = load_hand("allegro")
+    at = joint_order(hand).index("ring_mcp_joint")
+    pregrasp, grasp = np.full(16, 0.3), np.full(16, 0.6)
+    path = start_of(Posture(X, grasp, pregrasp), hand).path
+    assert path is not None
+    assert path.own_motors
+    assert path.start[at] == 0.6
+
+
+def test_spread_beyond_its_limit_is_brought_within():
+    hand = load_hand()
+    start = start_of(posture_of(hand, 4.0, [1.0, 1.0, 1.0]), hand)
+    assert start.path is None
+    assert start.spread == coordinate_limits(hand)[0, 1]
 
 
 def test_joints_beyond_their_limits_are_brought_within():

@@ -183,6 +183,7 @@ def start_of(posture: Posture, hand: Hand) -> Pregrasp:
     index = {name: i for i, name in enumerate(joint_order(hand))}
     # Of spread joints that differ, the first.
     spread = float(posture.q_grasp[index[hand.spread.joints[0]]]) if hand.spread.joints else 0.0
+    spread = float(np.clip(spread, *coordinate_limits(hand)[0]))
     closing = np.array([start[index[finger.closing_joint]] for finger in hand.fingers])
     closing = np.clip(closing, *coordinate_limits(hand)[1:].T)
 
@@ -197,7 +198,7 @@ def start_of(posture: Posture, hand: Hand) -> Pregrasp:
 
     # Joints that no motor moves are locked where the grasp has them.
     start = start.copy()
-    for name in hand.spread.joints if own_motors else hand.locked_joints:
+    for name in _without_motor(hand) if own_motors else hand.locked_joints:
         start[index[name]] = posture.q_grasp[index[name]]
     # No hand is beyond its limits.
     limits = dict(zip(hand.joint_names, hand.joint_limits, strict=True))
@@ -211,6 +212,17 @@ def start_of(posture: Posture, hand: Hand) -> Pregrasp:
         closing=closing,
         path=JointPath(start=start, grasp=grasp, squeeze=squeeze, own_motors=own_motors),
     )
+
+
+def _without_motor(hand: Hand) -> list[str]:
+    """Return the joints that stay where they are when each has a motor of its own, as the scene."""
+    moved = {
+        name
+        for finger, chain in zip(hand.fingers, hand.chains, strict=True)
+        for name, slides in zip(chain.joints, chain.slides.tolist(), strict=True)
+        if slides == finger.slides and name not in hand.spread.joints
+    }
+    return [name for name in hand.joint_names if name not in moved]
 
 
 def follows_couplings(q: Array, hand: Hand) -> bool:
