@@ -87,7 +87,7 @@ def _array(shape: Any, kind: Any, fortran: Any, data: Any) -> np.ndarray:
         for i, each in enumerate(data):
             array[i] = each
         return array.reshape(shape, order="F" if fortran else "C")
-    array = np.frombuffer(data, kind.dtype) if data else np.empty(0, kind.dtype)
+    array = np.frombuffer(bytes(data), kind.dtype) if data else np.empty(0, kind.dtype)
     array = array.reshape(shape, order="F" if fortran else "C").copy(order="K")
     if array.dtype.kind == "U":
         array.tolist()  # raises where a number is no character
