@@ -183,6 +183,8 @@ def _read_columns(path: Path) -> dict[str, list[Any]]:
     try:
         with path.open(encoding="utf-8", newline="") as file:
             header, *rows = csv.reader(file)
+            if twice := [name for name in header if header.count(name) > 1]:
+                raise GraspError(f"columns must have different names, got {twice[0]} twice")
             return {
                 name: list(column)
                 for name, column in zip(header, _columns(header, rows), strict=True)

@@ -285,6 +285,7 @@ def test_dictionaries_that_are_no_grasps_are_refused_in_a_line(tmp_path, changes
     ("name", "content", "words"),
     [
         ("a.csv", "x,y\n1,2\n", "columns must include object, got x, y"),
+        ("a.csv", "x,x\n1,2\n", "columns must have different names, got x twice"),
         ("a.csv", "object,x\nmug\n", "row 0 of 1 values under a header of 2"),
         ("a.npz", "junk", "must be a readable file of arrays"),
         ("a.npz", "", "must be a readable file of arrays"),
