@@ -180,6 +180,8 @@ def _read_columns(path: Path) -> dict[str, list[Any]]:
             return dict(parquet.read_table(path).to_pydict())
         except (OSError, ValueError) as error:
             raise GraspError(f"must be a Parquet file, got: {one_line(error)}") from None
+
+    # CSV, whose names stand in the first line.
     try:
         with path.open(encoding="utf-8", newline="") as file:
             header, *rows = csv.reader(file)
