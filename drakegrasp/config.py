@@ -32,6 +32,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from drakegrasp.errors import ConfigError, one_line
+from drakegrasp.runtime.foreign_files import read_text
 from drakegrasp.yaml_text import parse_yaml
 
 #: Limits of every quantity, so that sums stay finite.
@@ -652,7 +653,7 @@ def read_settings(source: str | Path) -> dict[str, Any]:
                 f"got {str(source)!r}"
             )
         try:
-            text, name = path.read_text(encoding="utf-8"), str(path)
+            text, name = read_text(path), str(path)
         except (OSError, UnicodeDecodeError) as error:
             raise ConfigError(f"{path}: must be a readable UTF-8 file, got: {error}") from None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -30,9 +31,15 @@ def refuse_workers(
 ) -> None:
     """Refuse a number of workers that is below one, or given with a scheduler.
 
+    A process that was started as a worker, and that only imports the caller's script, ends here.
+
     Raises:
         ConfigError: If so.
     """
+    # Python imports the script into each process that it starts: a call that is not under
+    # `if __name__ == "__main__"` would begin there, too.
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        sys.exit(1)
     if scheduler is not None and not scheduler.strip():
         raise ConfigError(f"scheduler must be an address like tcp://host:8786, got {scheduler!r}")
     if workers is not None and (scheduler or scheduler_file):

@@ -24,6 +24,7 @@ from drakegrasp.errors import (
     GraspError,
     HandError,
     MeshError,
+    first_line,
     printable,
 )
 
@@ -105,6 +106,8 @@ def one_line_errors(resumable: Callable[[], bool] = lambda: False) -> Iterator[N
     except (OSError, RuntimeError) as error:
         text = str(error).strip() or type(error).__name__
         _end(f"error: {text.splitlines()[0]}", 1)
+    except MemoryError as error:
+        _end(f"error: not enough memory on this machine ({first_line(error)})", 1)
     except KeyboardInterrupt as stop:
         line = "stopped" + "; the same command goes on from here" * resumable()
         _end(line, 143 if isinstance(stop, _Terminated) else 130)

@@ -104,13 +104,17 @@ def figures(
     distributions  slip, turn, forces
     approaches     from where successes came
     """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
+    from drakegrasp.runtime.foreign_files import refuse_link
     from drakegrasp.runtime.progress import progress_bar
     from drakegrasp.visualization.figures.write import write_figures
 
+    if folder is None:
+        folder = out / "figures"
+        refuse_link(folder)
     with progress_bar("draw", "figures", show=not quiet) as progress:
         written = write_figures(
             out,
-            out / "figures" if folder is None else folder,
+            folder,
             compare=compare,
             trial_id=trial,
             progress=progress,

@@ -7,6 +7,7 @@ Results go to standard output, progress and errors to standard error. Exit codes
 
 from __future__ import annotations
 
+import io
 import math
 import sys
 from dataclasses import asdict
@@ -159,6 +160,10 @@ for _command in (
 
 def run() -> None:
     """Run the program; commands that may simulate in this process have jemalloc for it."""
+    # A terminal of another encoding shows ? where it has no such character.
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     if sys.argv[1:2] in (["bench"], ["verify"], ["score"], ["hand"]):
         restart_with_jemalloc()
     main()

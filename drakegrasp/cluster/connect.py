@@ -127,9 +127,15 @@ def _start_local(
     workers: int | None, security: Security | None, memory: str | None
 ) -> Iterator[Client]:
     with undisturbed_loop() as loop:
-        cluster = PrivateCluster(
-            workers or available_cores(), loop=loop, security=security, memory=memory or "auto"
-        )
+        try:
+            cluster = PrivateCluster(
+                workers or available_cores(), loop=loop, security=security, memory=memory or "auto"
+            )
+        except RuntimeError as error:
+            raise MachineError(
+                f"worker processes must start, got: {error}; in a script, the call must be under "
+                "if __name__ == '__main__'"
+            ) from None
         with closing_cluster(cluster), Client(cluster) as client:
             yield client
 

@@ -15,8 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.dataset.schema import Field
-from drakegrasp.errors import DataError, printable
+from drakegrasp.errors import DataError, first_line, printable
 from drakegrasp.runtime.file_set import refuse_half_replaced
+from drakegrasp.runtime.foreign_files import refuse_irregular
 from drakegrasp.runtime.names import NAME_RULE, is_name
 
 try:
@@ -25,6 +26,8 @@ except ModuleNotFoundError:
     deflate = None
 
 AnyArray = npt.NDArray[Any]
+#: How many bytes the compression of HDF5 packs into one at most (zlib: 1,032 to 1).
+MOST_PACKED = 1_032
 #: Level of compression: higher ones save a tenth of the bytes for twice the time.
 GZIP_LEVEL = 1
 #: Rows in a chunk of a column of small values.
@@ -34,8 +37,8 @@ COLUMN_CHUNK = 2048
 def open_hdf5(path: Path, *, again: bool = False) -> h5py.File:
     """Open a file of a dataset to read it; close it after use.
 
-    An untrusted file may use links or external storage; our files never do, so such a file is
-    refused.
+    An untrusted file may use links or external storage, or claim rows that it does not hold; our
+    files never do, so such a file is refused.
 
     Args:
         path: Of the file.
@@ -43,10 +46,11 @@ def open_hdf5(path: Path, *, again: bool = False) -> h5py.File:
 
     Raises:
         OSError: If it cannot be read.
-        DataError: If a process died while it replaced the files beside it, or it has links or
-            values that lie elsewhere.
+        DataError: If a process died while it replaced the files beside it, or it has links, values
+            that lie elsewhere, or more rows than it can hold.
     """
     refuse_half_replaced(path.parent)
+    refuse_irregular(path)
     file = h5py.File(path, "r")
     if again:
         return file
@@ -54,8 +58,8 @@ def open_hdf5(path: Path, *, again: bool = False) -> h5py.File:
         elsewhere = _find_elsewhere(file)
     except BaseException as error:
         file.close()
-        if isinstance(error, RuntimeError):
-            raise OSError(str(error)) from None  # what HDF5 says of a damaged file
+        if says_damage(error):
+            raise OSError(first_line(error)) from None
         raise
     if elsewhere is not None:
         file.close()
@@ -63,8 +67,22 @@ def open_hdf5(path: Path, *, again: bool = False) -> h5py.File:
     return file
 
 
+def says_damage(error: BaseException) -> bool:
+    """Return whether an error says that an HDF5 file is damaged.
+
+    h5py raises errors of many kinds then, even a KeyError or a TypeError, but always itself.
+    """
+    if isinstance(error, OSError | UnicodeDecodeError | MemoryError):
+        return True
+    last = error.__traceback__
+    while last is not None and last.tb_next is not None:
+        last = last.tb_next
+    return last is not None and "h5py" in Path(last.tb_frame.f_code.co_filename).parts
+
+
 def _find_elsewhere(file: h5py.File) -> str | None:
-    """Describe the first link or external dataset of a file, or return None."""
+    """Describe the first link, external dataset or impossible size in a file, or return None."""
+    size = file.id.get_filesize()
     groups, seen = [(file.id, "")], set()
     while groups:
         group, path = groups.pop()
@@ -78,8 +96,11 @@ def _find_elsewhere(file: h5py.File) -> str | None:
             address = h5py.h5o.get_info(item).addr
             if isinstance(item, h5py.h5g.GroupID) and address not in seen:
                 groups.append((item, name))
-            elif isinstance(item, h5py.h5d.DatasetID) and _is_elsewhere(item):
-                return f"values outside of it at {name}"
+            elif isinstance(item, h5py.h5d.DatasetID):
+                if _is_elsewhere(item):
+                    return f"values outside of it at {name}"
+                if _claimed_bytes(item) > MOST_PACKED * size:
+                    return f"more rows than a file of {size:,} byte can hold at {name}"
             seen.add(address)
     return None
 
@@ -88,6 +109,11 @@ def _is_elsewhere(dataset: h5py.h5d.DatasetID) -> bool:
     """Return whether the values of a dataset are in other files."""
     made = dataset.get_create_plist()
     return made.get_external_count() > 0 or made.get_layout() == h5py.h5d.VIRTUAL
+
+
+def _claimed_bytes(dataset: h5py.h5d.DatasetID) -> int:
+    """Return how many bytes the values of a dataset would take."""
+    return int(dataset.get_space().get_simple_extent_npoints()) * int(dataset.get_type().get_size())
 
 
 def read_texts(dataset: h5py.Dataset) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from drakegrasp.runtime.files import open_own
+from drakegrasp.runtime.foreign_files import refuse_irregular
 from drakegrasp.runtime.json_text import parse_json
 
 FILE_NAME = "log.jsonl"
@@ -58,6 +59,7 @@ def read_log(out: Path) -> Iterator[dict[str, Any]]:
     A line that is no event is skipped, such as one that a full disk has cut off.
     """
     try:
+        refuse_irregular(out / FILE_NAME)
         file = (out / FILE_NAME).open("rb")
     except OSError:
         return

@@ -10,6 +10,7 @@ from drakegrasp.dataset.layout.plans import refuse_other_plan
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import DataError
 from drakegrasp.runtime.files import refuse_broken_seal
+from drakegrasp.runtime.foreign_files import read_content
 from drakegrasp.runtime.names import NAME_RULE, is_name
 
 #: The file of all attempts, the two files of samples by camera, and the manifest.
@@ -52,7 +53,7 @@ def _file_name(name: str) -> str:
 
 def model_file_sha256(out: Path, name: str) -> str:
     """Return the hash of the file of an object's meshes, hexadecimal."""
-    return hashlib.sha256(model_path(out, name).read_bytes()).hexdigest()
+    return hashlib.sha256(read_content(model_path(out, name))).hexdigest()
 
 
 def recorded_model(out: Path, name: str) -> str:

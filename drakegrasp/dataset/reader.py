@@ -21,10 +21,10 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.hdf5 import ImageRows, open_hdf5
+from drakegrasp.dataset.hdf5 import ImageRows, open_hdf5, says_damage
 from drakegrasp.dataset.layout.opening import open_samples
 from drakegrasp.dataset.schema import DATA_FIELDS, SPLITS
-from drakegrasp.errors import DataError, MachineError
+from drakegrasp.errors import DataError, MachineError, first_line
 
 if TYPE_CHECKING:
     from drakegrasp.dataset.loaders.torch_samples import TorchSamples
@@ -134,8 +134,11 @@ class GraspDataset:
         Raises:
             KeyError: If there is no such field.
         """
-        value: Any = self._field(name)[row]
-        return value.decode() if FIELDS[name].dtype == "str" else value
+        try:
+            value: Any = self._field(name)[row]
+            return value.decode() if FIELDS[name].dtype == "str" else value
+        except Exception as error:
+            raise self._told(error) from None
 
     def read_images(self, name: str, rows: Sequence[int], images: npt.NDArray[Any]) -> None:
         """Read images of some rows into an array, without a copy on the way.
@@ -151,8 +154,11 @@ class GraspDataset:
         field = self._field(name)
         if not isinstance(field, ImageRows):
             raise DataError(f"field must be one of images, masks, got {name!r}")
-        for image, row in zip(images, rows, strict=True):
-            field.read_into(row, image)
+        try:
+            for image, row in zip(images, rows, strict=True):
+                field.read_into(row, image)
+        except Exception as error:
+            raise self._told(error) from None
 
     def column(self, name: str) -> npt.NDArray[Any]:
         """Return all rows (n, ...) of a field, e.g. `grasps` or `grasp_props/stable`.
@@ -172,9 +178,12 @@ class GraspDataset:
         dataset = self._open()[self.split].get(name)
         if dataset is None:
             return FIELDS[name].empty(self._length, {})[start:stop]
-        if FIELDS[name].dtype == "str":
-            return np.asarray(dataset.asstr()[start:stop])
-        return np.asarray(dataset[start:stop])
+        try:
+            if FIELDS[name].dtype == "str":
+                return np.asarray(dataset.asstr()[start:stop])
+            return np.asarray(dataset[start:stop])
+        except Exception as error:
+            raise self._told(error) from None
 
     def to_torch(self, fields: Sequence[str] = ("images", "grasps")) -> TorchSamples:
         """Return the split as a `torch.utils.data.Dataset` of tensors.
@@ -234,6 +243,12 @@ class GraspDataset:
         self._file, self._process = file, os.getpid()
         _open_readers.add(self)
         return file
+
+    def _told(self, error: Exception) -> Exception:
+        """Return an error as a `DataError` that names the file if the file is damaged."""
+        if isinstance(error, DataError) or not says_damage(error):
+            return error
+        return DataError(f"{self.path}: must be undamaged, got: {first_line(error)}")
 
     def _close(self) -> None:
         if self._file is not None:

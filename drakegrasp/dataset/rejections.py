@@ -20,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, with_config
 from drakegrasp.dataset.layout.json_files import Name, read_mapping, validated
 from drakegrasp.errors import DataError, printable
 from drakegrasp.runtime.files import write_atomic
+from drakegrasp.runtime.foreign_files import read_text
 
 FILE_NAME = "reject.json"
 #: Version of the file's layout.
@@ -137,7 +138,7 @@ def read_rejected(path: Path) -> list[int] | list[AttemptKey]:
     if path.suffix == ".json":
         return sorted(read_decisions(path).rejected)
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = read_text(path).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         got = "a binary file" if isinstance(error, UnicodeDecodeError) else error.strerror
         raise DataError(f"{path}: must be a text file of trial ids, got {got}") from None

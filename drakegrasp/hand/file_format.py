@@ -28,6 +28,7 @@ from pydantic import (
 from drakegrasp.config import describe_mistake
 from drakegrasp.errors import HandError, one_line
 from drakegrasp.frames import Array
+from drakegrasp.runtime.foreign_files import read_text
 from drakegrasp.yaml_text import parse_yaml
 
 #: Version of the keys that this module reads.
@@ -254,7 +255,7 @@ def read_hand_file(path: Path) -> HandFile:
         HandError: If a key or a value cannot be used, in one line.
     """
     try:
-        tree: Any = parse_yaml(path.read_text(encoding="utf-8"))
+        tree: Any = parse_yaml(read_text(path))
     except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
         raise HandError(f"{path}: must be YAML, got text that is not ({one_line(error)})") from None
 

@@ -20,6 +20,7 @@ import yaml
 from drakegrasp.arithmetic import Array, dot, multiply, norm
 from drakegrasp.errors import HandError, one_line
 from drakegrasp.hand.files import chance_file
+from drakegrasp.runtime.foreign_files import read_text
 from drakegrasp.yaml_text import parse_yaml
 
 #: Chances are multiples of this: the last bits of an exponential depend on the machine.
@@ -88,7 +89,7 @@ def read_lift_chance(name_or_yaml: str | Path) -> LiftChance | None:
     if not path.is_file():
         return None
     try:
-        tree: Any = parse_yaml(path.read_text(encoding="utf-8"))
+        tree: Any = parse_yaml(read_text(path))
         weights = {str(name): float(value) for name, value in dict(tree["weights"]).items()}
         model = LiftChance(float(tree["bias"]), weights)
     except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:

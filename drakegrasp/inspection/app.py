@@ -7,7 +7,6 @@ changes a file is a POST with the token of this run, which only our own pages kn
 
 from __future__ import annotations
 
-import json
 import secrets
 import threading
 from collections import OrderedDict
@@ -45,6 +44,7 @@ from drakegrasp.inspection.recording import Recordings
 from drakegrasp.inspection.rows import read_look, read_rows
 from drakegrasp.inspection.scene3d import HandView, object_surface, scene_of
 from drakegrasp.outcomes import Outcome
+from drakegrasp.runtime.json_text import parse_json
 from drakegrasp.visualization.thumbnails import strip_png
 
 ASSETS = Path(__file__).parent / "static"
@@ -327,7 +327,7 @@ async def _post(
         if len(body) > MAX_BODY:
             raise HTTPException(413, f"the request must be at most {MAX_BODY} bytes")
     try:
-        content = json.loads(body or b"{}")
+        content = parse_json(body or b"{}")
     except ValueError:
         content = None
     if not isinstance(content, dict):

@@ -12,6 +12,8 @@ from drakegrasp.errors import MeshError, one_line
 from drakegrasp.frames import Array
 from drakegrasp.mesh.repair import weld
 from drakegrasp.mesh.surfaces import Faces, stack
+from drakegrasp.runtime.foreign_files import read_content
+from drakegrasp.runtime.json_text import parse_json
 
 #: Mesh files that can be read; other files are ignored.
 SUFFIXES = (".obj", ".stl", ".ply", ".glb")
@@ -31,6 +33,12 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh:
     return clean_triangles(vertices, faces, path.name)
 
 
+#: Parts of the names of extensions that change how a mesh looks, not its shape.
+_LOOKS = ("material", "texture", "light")
+#: Most nodes of a scene: trimesh takes a millisecond for each.
+MOST_NODES = 10_000
+
+
 def read_bytes(path: Path) -> bytes:
     """Return a mesh file's content.
 
@@ -38,7 +46,7 @@ def read_bytes(path: Path) -> bytes:
         MeshError: If it cannot be read.
     """
     try:
-        return path.read_bytes()
+        return read_content(path)
     except OSError as error:
         raise MeshError(
             f"{path.name}: must be a readable file, got: {error.strerror or error}"
@@ -66,6 +74,8 @@ def parse_mesh(name: str, content: bytes) -> tuple[Array, Faces]:
 
     # Parsers raise all kinds of exceptions on foreign bytes.
     try:
+        if suffix == ".glb":
+            _refuse_extensions(content)
         with np.errstate(all="ignore"):
             scene = trimesh.load_scene(
                 io.BytesIO(content), file_type=suffix[1:], process=False, skip_materials=True
@@ -79,7 +89,26 @@ def parse_mesh(name: str, content: bytes) -> tuple[Array, Faces]:
                     parts.append(part.apply_transform(X_SN))
             return _concatenate(parts)
     except Exception as error:
-        raise MeshError(f"{name}: must be a valid {suffix} mesh, got: {one_line(error)}") from error
+        # trimesh wants another package to guess the encoding of bytes that are no UTF-8.
+        got = "text that is not UTF-8" if isinstance(error, ImportError) else one_line(error)
+        raise MeshError(f"{name}: must be a valid {suffix} mesh, got: {got}") from error
+
+
+def _refuse_extensions(content: bytes) -> None:
+    """Refuse a GLB whose shape needs an extension or too many nodes: trimesh reads on without.
+
+    Raises:
+        ValueError: If it does.
+    """
+    if content[:4] != b"glTF":
+        return
+    tree = parse_json(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    needed = tree.get("extensionsRequired", []) if isinstance(tree, dict) else []
+    shapes = [name for name in needed if not any(word in name for word in _LOOKS)]
+    if shapes:
+        raise ValueError(f"the extension {shapes[0]}, which is not read; export without it")
+    if isinstance(tree, dict) and len(tree.get("nodes", [])) > MOST_NODES:
+        raise ValueError(f"{len(tree['nodes']):,} nodes, more than {MOST_NODES:,}")
 
 
 def clean_triangles(vertices: Array, faces: Faces, name: str) -> trimesh.Trimesh:

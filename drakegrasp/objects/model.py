@@ -39,6 +39,7 @@ from drakegrasp.objects.sources import (
     upright_vertices,
 )
 from drakegrasp.runtime.files import write_atomic
+from drakegrasp.runtime.foreign_files import read_content
 from drakegrasp.runtime.names import is_name
 from drakegrasp.seeding import object_key
 
@@ -316,7 +317,7 @@ def load_object(path: str | Path) -> ObjectModel:
     # The arrays, as they are in the file.
     path = Path(path)
     try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as content:
+        with np.load(io.BytesIO(read_content(path)), allow_pickle=False) as content:
             values: dict[str, Any] = {f.name: content[f.name] for f in fields(ObjectModel)}
     except Exception as error:
         raise MeshError(

@@ -41,6 +41,7 @@ from drakegrasp.errors import MeshError, one_line
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.mesh.loading import MANY_FACES, SUFFIXES, clean_triangles, parse_mesh, read_bytes
 from drakegrasp.runtime.environment import release_memory
+from drakegrasp.runtime.foreign_files import read_text
 from drakegrasp.runtime.names import NAME_RULE, is_name
 from drakegrasp.yaml_text import parse_yaml
 
@@ -147,7 +148,7 @@ class _Manifest(pydantic.BaseModel):
 def _read_manifest(path: Path) -> _Manifest:
     """Return the content of an `objects.yaml`."""
     try:
-        content = parse_yaml(path.read_text(encoding="utf-8"))
+        content = parse_yaml(read_text(path))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise MeshError(f"{path}: must be a readable YAML file, got: {one_line(error)}") from error
     try:

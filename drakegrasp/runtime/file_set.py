@@ -17,6 +17,7 @@ from pathlib import Path
 
 from drakegrasp.errors import DataError
 from drakegrasp.runtime.files import is_temporary_of, sync, temporary_name, write_atomic
+from drakegrasp.runtime.json_text import read_json
 
 #: The list of files that are being replaced.
 LIST_NAME = "replacement.json"
@@ -111,8 +112,10 @@ def _read_list(path: Path) -> dict[str, str]:
         DataError: If it names anything but files of its folder that were written for it.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+        content = read_json(path)
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError) as error:
         raise _no_list(path, f"a broken one ({error})") from None
     if not isinstance(content, dict):
         raise _no_list(path, "something else")

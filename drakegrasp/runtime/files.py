@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING
 import h5py
 
 from drakegrasp.errors import DataError, DiskFullError
+from drakegrasp.runtime.foreign_files import LARGEST_SEALED, refuse_irregular
 from drakegrasp.runtime.processes import host_label, is_running
 
 if TYPE_CHECKING:
@@ -196,6 +197,7 @@ def read_seal(path: Path) -> bytes:
         DataError: If the file cannot be read.
     """
     try:
+        refuse_irregular(path)
         with path.open("rb", buffering=0) as file:
             return file.read(SEAL_SIZE)
     except OSError as error:
@@ -213,6 +215,7 @@ def refuse_broken_seal(path: Path, what: str = "shard") -> None:
         DataError: If the file is damaged or missing.
     """
     try:
+        refuse_irregular(path, LARGEST_SEALED)
         with path.open("rb") as file:
             stored = file.read(SEAL_SIZE)
             intact = stored == _seal_of(file)

@@ -42,6 +42,7 @@ from pathlib import Path
 from typing import Any
 
 from drakegrasp.runtime.files import temporary_name
+from drakegrasp.runtime.foreign_files import LARGEST_TEXT, refuse_irregular
 from drakegrasp.runtime.processes import lock_file
 
 #: Crashes in a row in one step after which it is not tried again: one may be the machine's fault.
@@ -260,6 +261,7 @@ def _read_history(path: Path, identity: Mapping[str, Any]) -> _History | None:
     if path.is_symlink():
         return history  # it will be replaced
     try:
+        refuse_irregular(path, LARGEST_TEXT)
         with path.open("r+b") as file:  # NFS locks only files that are open for writing
             # On a file system without locks (None) nobody is known to hold one.
             if lock_file(file) is False:

@@ -10,6 +10,8 @@ import json
 from pathlib import Path
 from typing import Any, NoReturn
 
+from drakegrasp.runtime.foreign_files import LARGEST_TEXT, read_content
+
 
 def read_json(path: Path) -> Any:
     """Return the content of a JSON file.
@@ -18,7 +20,7 @@ def read_json(path: Path) -> Any:
         OSError: If it cannot be read.
         ValueError: As for `parse_json`.
     """
-    return parse_json(path.read_bytes())
+    return parse_json(read_content(path, LARGEST_TEXT))
 
 
 def parse_json(text: str | bytes) -> Any:

@@ -19,6 +19,7 @@ from drakegrasp.config import LARGEST
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.errors import GraspError, first_line
 from drakegrasp.frames import Array, as_numbers, invert_pose
+from drakegrasp.runtime.foreign_files import read_text, refuse_irregular
 
 Frame = Literal["object", "camera", "workspace"]
 FRAMES: tuple[str, ...] = get_args(Frame)
@@ -209,6 +210,7 @@ def read_numbers(path: Path) -> Array:
         GraspError: If the file cannot be read, or holds anything else.
     """
     try:
+        refuse_irregular(path)
         with path.open("rb") as file:
             array = np.lib.format.read_array(file, allow_pickle=False)
     # A damaged header may claim any size, hence the MemoryError.
@@ -223,7 +225,7 @@ def _read_csv(path: Path) -> Array:
     """Return the numbers of a text file, a row per line, without a header."""
     # The cells of all lines that are not empty.
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = read_text(path, "utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise GraspError(
             f"{path}: must be a text file of numbers, got none ({first_line(error)})"

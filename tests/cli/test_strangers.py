@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ import trimesh
 from helpers.commands import run
 from helpers.datasets import OTO, TRIALS
 
+from drakegrasp.api.building import build_dataset
 from drakegrasp.dataset.log import BuildLog, read_log
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import DataError
@@ -70,6 +72,78 @@ def test_folder_that_is_a_link_is_neither_written_nor_swept(
     )
     assert run("stats", out).exit_code == 0
     assert mine.read_text() == "mine\n"
+
+
+def test_folder_of_figures_that_is_a_link_is_not_written_to(out: Path, tmp_path: Path) -> None:
+    (out / "figures").symlink_to(tmp_path, target_is_directory=True)
+    before = sorted(tmp_path.iterdir())
+    assert "figures: must be a folder of the dataset to write to, got a link" in refusal(
+        "figures", out
+    )
+    assert sorted(tmp_path.iterdir()) == before
+
+
+#: Other kinds of files: what makes one, and what is said of it.
+KINDS = {
+    "pipe": (os.mkfifo, "a pipe"),
+    "device": (lambda path: path.symlink_to("/dev/zero"), "a device"),
+    "huge": (lambda path: (path.touch(), os.truncate(path, 2**40)), "a file of 1,099,511,627,776"),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", ["manifest.json", OTO, TRIALS])
+def test_other_kind_of_file_is_neither_waited_for_nor_read(out: Path, kind: str, name: str) -> None:
+    make, said = KINDS[kind]
+    (out / name).unlink()
+    make(out / name)
+    assert f"{name}: " in refusal("stats", out) and said in refusal("stats", out)
+
+
+def test_list_of_replaced_files_that_is_a_pipe_is_not_waited_for(out: Path) -> None:
+    os.mkfifo(out / "replacement.json")
+    assert "a pipe" in refusal("assemble", out)
+
+
+def test_log_and_card_that_are_pipes_are_not_waited_for(out: Path) -> None:
+    (out / "DATACARD.json").unlink()
+    for name in ("log.jsonl", "DATACARD.json"):
+        os.mkfifo(out / name)
+    assert list(read_log(out)) == []
+    assert "the data card must count" in run("check", out).output
+
+
+@pytest.mark.parametrize("rows", [400_000_000, 2**50])
+def test_columns_that_claim_more_rows_than_the_file_can_hold_are_refused(
+    out: Path, rows: int
+) -> None:
+    with h5py.File(out / TRIALS, "r+") as file:
+        for column in file["trials"].values():
+            column.resize(rows, axis=0)
+    assert "more rows than a file of" in refusal("stats", out)
+
+
+def test_damaged_image_names_the_file(out: Path) -> None:
+    with h5py.File(out / OTO, "r") as file:
+        split = max(("train", "valid", "test"), key=lambda name: len(file[name]["images"]))
+        place = file[split]["images"].id.get_chunk_info(0).byte_offset
+    content = bytearray((out / OTO).read_bytes())
+    content[place + 100] ^= 1
+    (out / OTO).write_bytes(content)
+    data = GraspDataset(out / OTO, split=split)
+    with pytest.raises(DataError, match=f"{OTO}: must be undamaged, got: "):
+        data[0]
+    with pytest.raises(DataError, match=f"{OTO}: must be undamaged, got: "):
+        data.read_images("images", [0], np.empty((1, 4, *[data.image_size] * 2), np.float32))
+
+
+def test_script_that_a_worker_imports_again_starts_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(multiprocessing.current_process(), "_inheriting", True, raising=False)
+    with pytest.raises(SystemExit):
+        build_dataset("builtin", tmp_path / "OUT")
+    assert not (tmp_path / "OUT").exists()
 
 
 @pytest.mark.parametrize("name", ["../../outside", f"a{STEERING}", ".hidden", ""])

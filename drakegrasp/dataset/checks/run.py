@@ -11,7 +11,6 @@ Of a whole dataset the three files are compared first with what assembling gives
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -31,6 +30,7 @@ from drakegrasp.dataset.schema import CAMERAS, refuse_other_schema
 from drakegrasp.errors import DataError, first_line
 from drakegrasp.runtime.executor import Executor, in_order, run_here
 from drakegrasp.runtime.file_set import refuse_half_replaced
+from drakegrasp.runtime.json_text import read_json
 from drakegrasp.runtime.progress import Report, silent
 
 __all__ = ["Violation", "check_dataset"]
@@ -180,7 +180,7 @@ def _check_card(out: Path, findings: Findings) -> None:
     except (DataError, ValueError, IndexError):
         return  # a file is damaged, and found above
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))["counts"]
+        found = read_json(path)["counts"]
     except FileNotFoundError:
         return
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -12,6 +12,7 @@ from pydantic import AfterValidator, BaseModel, ValidationError
 
 from drakegrasp.config import describe_mistake
 from drakegrasp.errors import DataError, one_line, printable
+from drakegrasp.runtime.foreign_files import LARGEST_TEXT, read_content
 from drakegrasp.runtime.json_text import parse_json
 from drakegrasp.runtime.names import NAME_RULE, is_name
 
@@ -41,7 +42,7 @@ def read_mapping(path: Path, what: str) -> tuple[dict[str, Any], bytes]:
         DataError: If it cannot be read, or is something else.
     """
     try:
-        content = path.read_bytes()
+        content = read_content(path, LARGEST_TEXT)
         tree = parse_json(content)
     except FileNotFoundError:
         raise

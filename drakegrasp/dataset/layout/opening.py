@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.hdf5 import open_hdf5
+from drakegrasp.dataset.hdf5 import open_hdf5, says_damage
 from drakegrasp.dataset.layout.attributes import OF_CAMERA, ORIGIN, Rule, attribute_mistakes
 from drakegrasp.dataset.layout.structure import DATA_TABLES, TRIAL_TABLES, differences
 from drakegrasp.dataset.schema import refuse_other_schema
@@ -66,7 +66,11 @@ def opened(path: Path, what: str, *, again: bool = False) -> Iterator[h5py.File]
     try:
         with open_hdf5(path, again=again) as file:
             yield file
-    except (OSError, UnicodeDecodeError) as error:
+    except DataError:
+        raise
+    except Exception as error:
+        if not says_damage(error):
+            raise
         raise DataError(f"{path}: must be {what}, got none ({first_line(error)})") from None
 
 

@@ -1,0 +1,372 @@
+"""Spoil the files of a dataset by chance; whoever reads it must get equal values, or one line.
+
+\b
+    python pipelines/measurements/fuzz_files.py OUT --count 3000 --seed 0 > fuzz.jsonl
+
+Each case spoils one file of a copy of OUT in one way: a bit is flipped, the end is cut off, all
+columns are made longer, a column is put in the place of another, JSON gets another value or another
+structure, another kind of file (a pipe, a device, a folder, a file of 1 TB) takes the place. Then
+the loaders, `stats` and `check` read the copy, each in a process of its own with 2 GB of memory and
+20 s; with `--all` every command that reads a dataset does. Prints a line of JSON for each finding:
+a traceback, a hang, memory, a signal, or other values without a word. The same seed spoils the same
+bytes of the same dataset. Exit code 1 if there is a finding.
+"""  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import hashlib
+import importlib
+import io
+import json
+import multiprocessing
+import os
+import random
+import resource
+import shutil
+import socket
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+import h5py
+import numpy as np
+
+from drakegrasp.cli.main import main as command
+from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.schema import SPLITS
+from drakegrasp.dataset.trials import Trials
+from drakegrasp.errors import DrakegraspError
+from drakegrasp.runtime.progress import progress_bar
+
+#: What a process may take beside what this one has [byte], and how long it may run [s].
+MEMORY, SECONDS = 2**31, 20.0
+#: Files of a dataset that hold columns.
+COLUMNS = ("trials.hdf5", "grasping_oto.hdf5", "grasping_otm.hdf5")
+#: Rows that columns are made to claim.
+CLAIMS = (400_000_000, 2**50)
+#: Most lines of an error, with the last state of a progress bar; and the code of a traceback.
+LINES, UNEXPECTED = 3, 99
+
+
+# --- Ways to spoil a file ---
+
+
+def flip(path: Path, draw: random.Random) -> str:
+    """Flip one bit of a file, half of the time in a byte that is not zero."""
+    content = bytearray(path.read_bytes())
+    place = draw.randrange(len(content))
+    if draw.random() < 0.5:
+        while not content[place]:
+            place = draw.randrange(len(content))
+    bit = draw.randrange(8)
+    content[place] ^= 1 << bit
+    path.write_bytes(content)
+    return f"bit {bit} of byte {place} flipped"
+
+
+def truncate(path: Path, draw: random.Random) -> str:
+    """Cut off the end of a file."""
+    size = draw.randrange(path.stat().st_size)
+    os.truncate(path, size)
+    return f"cut to {size} byte"
+
+
+def stretch(path: Path, draw: random.Random) -> str:
+    """Let all columns of a group claim more rows than there are."""
+    rows = draw.choice(CLAIMS)
+    with h5py.File(path, "r+") as file:
+        group = file[draw.choice([name for name in file if len(file[name])])]
+
+        def visit(_: str, item: h5py.Dataset | h5py.Group) -> None:
+            if isinstance(item, h5py.Dataset) and item.chunks:
+                item.resize(rows, axis=0)
+
+        group.visititems(visit)
+        return f"columns of {group.name} resized to {rows} rows"
+
+
+def swap(path: Path, draw: random.Random) -> str:
+    """Put two columns of a file in each other's place."""
+    with h5py.File(path, "r+") as file:
+        names: list[str] = []
+        file.visititems(
+            lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None
+        )
+        one, other = draw.sample(names, 2)
+        file.move(one, "kept")
+        file.move(other, one)
+        file.move("kept", other)
+    return f"{one} and {other} swapped"
+
+
+def restructure(path: Path, draw: random.Random) -> str:
+    """Put another value somewhere into a JSON file."""
+    tree = json.loads(path.read_text(encoding="utf-8"))
+    values: list[Any] = [None, [], {}, "", -1, 1e300, True, "\x1b[31m", "../../x", [[]] * 3]
+    value = draw.choice([*values, 2**70, "x" * 100_000])
+    steps: list[Any] = []
+    node = tree
+    while isinstance(node, dict | list) and node:
+        keys: list[Any] = list(node) if isinstance(node, dict) else list(range(len(node)))
+        steps.append(draw.choice(keys))
+        child = node[steps[-1]]
+        if draw.random() < 0.3 or not isinstance(child, dict | list) or not child:
+            node[steps[-1]] = value
+            break
+        node = child
+    path.write_text(json.dumps(tree), encoding="utf-8")
+    return f"{'.'.join(map(str, steps))} set to {str(value)[:40]!r}"
+
+
+def nest(path: Path, draw: random.Random) -> str:
+    """Fill a JSON file with brackets."""
+    depth = draw.choice([1_000, 100_000])
+    path.write_text("[" * depth, encoding="utf-8")
+    return f"{depth} brackets"
+
+
+def other_kind(path: Path, draw: random.Random) -> str:
+    """Put another kind of file in the place of one."""
+    kinds: dict[str, Callable[[], Any]] = {
+        "a pipe": lambda: os.mkfifo(path),
+        "a folder": path.mkdir,
+        "a socket": lambda: socket.socket(socket.AF_UNIX).bind(_short(path)),
+        "a link to /dev/zero": lambda: path.symlink_to("/dev/zero"),
+        "a link to itself": lambda: path.symlink_to(path),
+        "a link to nothing": lambda: path.symlink_to(path.with_name("nothing")),
+        "a file of 1 TB": lambda: _sparse(path),
+        "an empty file": path.touch,
+    }
+    kind = draw.choice(list(kinds))
+    path.unlink()
+    kinds[kind]()
+    return f"replaced by {kind}"
+
+
+def _short(path: Path) -> str:
+    """Return a path relative to the working directory: names of sockets are short."""
+    return os.path.relpath(path)
+
+
+def _sparse(path: Path) -> None:
+    path.touch()
+    os.truncate(path, 2**40)
+
+
+SPOIL_HDF5 = (flip, flip, flip, flip, truncate, stretch, swap, other_kind)
+SPOIL_JSON = (flip, truncate, restructure, restructure, nest, other_kind)
+SPOIL_OTHERS = (flip, truncate, other_kind)
+
+
+def ways(path: Path) -> tuple[Callable[[Path, random.Random], str], ...]:
+    """Return the ways to spoil a file, those drawn more often several times."""
+    if path.suffix == ".json":
+        return SPOIL_JSON
+    return SPOIL_HDF5 if path.name in COLUMNS else SPOIL_OTHERS
+
+
+# --- Readers ---
+
+
+def load(out: Path) -> None:
+    """Print a hash of all that the loaders give."""
+    digest = hashlib.sha256()
+    for camera in COLUMNS[1:]:
+        for split in SPLITS:
+            for sample in GraspDataset(out / camera, split=split):
+                for value in (sample.image, sample.mask, sample.grasp, *sample.props.values()):
+                    digest.update(np.asarray(value).tobytes())
+    trials = Trials(out)
+    for name in ("outcome", "X_TO", "closed_q", "closed_p_OQ", "slip", "object_name"):
+        with contextlib.suppress(KeyError):
+            digest.update(np.asarray(trials[name]).astype(str).tobytes())
+    sys.stdout.write(digest.hexdigest() + "\n")
+
+
+def commands(everything: bool) -> dict[str, Callable[[Path], object]]:
+    """Return what reads a dataset, by its name."""
+
+    def say(*line: str) -> Callable[[Path], object]:
+        def run(out: Path) -> object:
+            words = [word.replace("OUT", str(out)) for word in line]
+            return command.main(words, prog_name="drakegrasp", standalone_mode=True)
+
+        return run
+
+    readers = {
+        "load": load,
+        "stats": say("stats", "OUT"),
+        "check": say("check", "OUT", "--workers", "1"),
+    }
+    if everything:
+        readers |= {
+            "replay": say("replay", "OUT", "--trial", "0"),
+            "figures": say("figures", "OUT", "--out", "OUT/pictures"),
+            "inspect": say("inspect", "OUT", "--static", "OUT/page"),
+            "export": say("export", "OUT", "--to", "glb", "--out", "OUT/exported"),
+            "assemble": say("assemble", "OUT"),
+            "verify": say("verify", "--dataset", "OUT/grasping_oto.hdf5", "--out", "OUT/verified"),
+        }
+    return readers
+
+
+def _child(run: Callable[[Path], object], out: Path, folder: Path) -> None:
+    """Run a reader with its output in files and its memory bounded, and end the process."""
+    faulthandler.disable()
+    for number, name in ((1, "out"), (2, "err")):
+        os.dup2(os.open(folder / name, os.O_WRONLY | os.O_CREAT), number)
+    sys.stdout = io.TextIOWrapper(io.FileIO(1, "w"))
+    sys.stderr = io.TextIOWrapper(io.FileIO(2, "w"))
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    most = pages * resource.getpagesize() + MEMORY
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    code = 0
+    try:
+        run(out)
+    except DrakegraspError as error:
+        sys.stderr.write(f"error: {error}\n")
+        code = 1
+    except SystemExit as stop:
+        code = stop.code if isinstance(stop.code, int) else 1
+    except BaseException:
+        traceback.print_exc()
+        code = UNEXPECTED
+    (folder / "modules").write_text("\n".join(sys.modules), encoding="utf-8")
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Said:
+    """How a reader ended: its exit code, None if it did not end, and what it printed."""
+
+    code: int | None
+    out: str = ""
+    err: str = ""
+    modules: str = ""
+
+
+def read(run: Callable[[Path], object], out: Path) -> Said:
+    """Let a reader read a dataset in a process of its own."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        process = multiprocessing.get_context("fork").Process(
+            target=_child, args=(run, out, folder)
+        )
+        process.start()
+        process.join(SECONDS)
+        if process.is_alive():
+            process.kill()
+            process.join()
+            return Said(code=None)
+        texts = {
+            path.name: path.read_text(encoding="utf-8", errors="replace")
+            for path in folder.iterdir()
+        }
+        return Said(code=process.exitcode, **texts)
+
+
+def judge(said: Said, sound: Said) -> str | None:
+    """Return what is wrong with how a reader took a spoilt dataset; None if nothing is."""
+    lines = said.err.strip().splitlines()
+    if said.code is None:
+        return f"no end within {SECONDS:g} s"
+    if said.code < 0:
+        return f"signal {-said.code}"
+    if "Traceback" in said.err or said.code == UNEXPECTED:
+        return f"a traceback: {lines[-1][:200] if lines else ''}"
+    if any(text in said.out + said.err for text in ("Unable to allocate", "MemoryError")):
+        return f"memory: {(lines or [said.out])[-1][:200]}"
+    if said.code == 0:
+        return None if said.out == sound.out else "other values without a word"
+    if len(lines) > LINES:
+        return f"{len(lines)} lines: {said.err[:200]!r}"
+    return None if said.out.strip() or lines else "an exit code without a word"
+
+
+# --- Cases ---
+
+
+def files(out: Path) -> list[Path]:
+    """Return the files of a dataset that are spoilt, relative to it; those with data twice."""
+    found = sorted(path.relative_to(out) for path in out.rglob("*") if path.is_file())
+    main = [path for path in found if path.name in COLUMNS or path.name == "manifest.json"]
+    others = [path for path in found if path not in main and path.suffix != ".jsonl"]
+    return main * 4 + others
+
+
+def fuzz(
+    out: Path, count: int, seed: int, everything: bool = False, first: int = 0
+) -> Iterator[dict[str, Any] | None]:
+    """Yield for each case and reader what is wrong, or None.
+
+    Args:
+        out: A sound dataset; it is only read.
+        count: Number of cases.
+        seed: Of all draws.
+        everything: Whether every command reads, or only the loaders, `stats` and `check`.
+        first: Number of the first case.
+    """
+    readers = commands(everything)
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "OUT"
+        shutil.copytree(out, copy)
+        sound = {name: read(run, copy) for name, run in readers.items()}
+        wrong = {name: said.err for name, said in sound.items() if said.code != 0}
+        if wrong:
+            raise RuntimeError(f"a sound dataset must be read, got {wrong}")
+        # What the readers import is imported here, once: a fork of this process has it.
+        used = {name for said in sound.values() for name in said.modules.splitlines()}
+        for module in sorted(used - set(sys.modules)):
+            with contextlib.suppress(Exception):
+                importlib.import_module(module)
+        for number in range(first, first + count):
+            draw = random.Random(f"{seed}/{number}")
+            shutil.rmtree(copy)
+            shutil.copytree(out, copy)
+            name = draw.choice(files(copy))
+            how = draw.choice(ways(copy / name))(copy / name, draw)
+            for reader, run in readers.items():
+                began = time.monotonic()
+                finding = {
+                    "case": number,
+                    "file": str(name),
+                    "how": how,
+                    "reader": reader,
+                    "wrong": judge(read(run, copy), sound[reader]),
+                    "seconds": round(time.monotonic() - began, 1),
+                }
+                yield finding if finding["wrong"] else None
+
+
+@click.command(help=__doc__)
+@click.argument("out", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option("--count", default=300, show_default=True, help="Number of cases.")
+@click.option("--first", default=0, show_default=True, help="Number of the first case.")
+@click.option("--seed", default=0, show_default=True, help="Of all draws.")
+@click.option("--all", "everything", is_flag=True, help="Read with every command.")
+def main(out: Path, count: int, first: int, seed: int, everything: bool) -> None:
+    """Run the script."""
+    findings = 0
+    with progress_bar("fuzz", "reads") as progress:
+        cases = list(commands(everything))
+        for number, finding in enumerate(fuzz(out, count, seed, everything, first), 1):
+            progress(number, count * len(cases))
+            if finding:
+                findings += 1
+                click.echo(json.dumps(finding))
+    click.echo(json.dumps({"cases": count, "findings": findings}))
+    sys.exit(bool(findings))
+
+
+if __name__ == "__main__":
+    main()
