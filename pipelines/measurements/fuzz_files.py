@@ -7,7 +7,7 @@ Each case spoils one file of a copy of OUT in one way: a bit is flipped, the end
 columns are made longer, a column is put in the place of another, JSON gets another value or another
 structure, another kind of file (a pipe, a device, a folder, a file of 1 TB) takes the place. Then
 the loaders, `stats` and `check` read the copy, each in a process of its own with 2 GB of memory and
-20 s; with `--all` every command that reads a dataset does. Prints a line of JSON for each finding:
+60 s; with `--all` every command that reads a dataset does. Prints a line of JSON for each finding:
 a traceback, a hang, memory, a signal, or other values without a word. The same seed spoils the same
 bytes of the same dataset. Exit code 1 if there is a finding.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
@@ -47,7 +47,7 @@ from drakegrasp.errors import DrakegraspError
 from drakegrasp.runtime.progress import progress_bar
 
 #: What a process may take beside what this one has [byte], and how long it may run [s].
-MEMORY, SECONDS = 2**31, 20.0
+MEMORY, SECONDS = 2**31, 60.0
 #: Files of a dataset that hold columns.
 COLUMNS = ("trials.hdf5", "grasping_oto.hdf5", "grasping_otm.hdf5")
 #: Rows that columns are made to claim.
