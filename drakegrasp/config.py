@@ -13,6 +13,7 @@ import json
 import re
 import warnings
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path, PurePath
 from typing import Annotated, Any, Literal, Self
@@ -450,10 +451,29 @@ POSTPROCESSING_KEYS = (
 DEFAULT_HAND = "barrett"
 
 
+@dataclass(frozen=True, kw_only=True)
+class CarriedHand:
+    """A hand whose files lie in a dataset, which may be a stranger's.
+
+    Attributes:
+        path: Its hand file, in the folder that holds all its files.
+        digest: What the dataset says of them, see `drakegrasp.hand.folder.hand_digest`.
+    """
+
+    path: Path
+    digest: str
+
+
+#: What names a hand: one of the package, a hand file, or one that a dataset carries.
+HandSource = str | Path | CarriedHand
+
+
 class Config(_Section):
     """Everything that decides what is in a dataset, except the meshes."""
 
-    hand: str = DEFAULT_HAND  # a hand in drakegrasp/models, or a path to a hand's YAML
+    # A hand in drakegrasp/models, or a path to a hand's YAML; that of a dataset's own hand is
+    # relative to the dataset.
+    hand: str = DEFAULT_HAND
     seed: Seed = 0
     # Candidates in a work unit; None: 50, growing up to 400.
     unit_candidates: Count | None = None
@@ -480,6 +500,18 @@ class Config(_Section):
     filters: FilterConfig = FilterConfig()
     split: SplitConfig = SplitConfig()
     verify: VerifyConfig = VerifyConfig()
+    _carried: CarriedHand | None = PrivateAttr(None)
+
+    @property
+    def hand_source(self) -> str | CarriedHand:
+        """What to load the hand from: the dataset that carries it, or what `hand` names."""
+        return self._carried or self.hand
+
+    def with_hand(self, hand: str, source: HandSource | None = None) -> Config:
+        """Return the configuration with another hand, which a dataset carries if `source` does."""
+        config = self.model_copy(update={"hand": hand})
+        config._carried = source if isinstance(source, CarriedHand) else None
+        return config
 
     @model_validator(mode="after")
     def _filters_within_stop(self) -> Config:

@@ -191,7 +191,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     train = read_lifts(arguments.train)
     if arguments.write is None:
-        model = read_lift_chance(read_manifest(arguments.train).config.hand)
+        model = read_lift_chance(read_manifest(arguments.train).config.hand_source)
         if model is None:
             parser.error("the hand must have weights, or --write must be given")
     else:

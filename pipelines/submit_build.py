@@ -104,7 +104,7 @@ def main(
     running = _present(start_cluster(cluster, request.out), request.show)
     postures = None
     if request.postures is not None:
-        postures = read_postures(request.postures, load_hand(request.config.hand))
+        postures = read_postures(request.postures, load_hand(request.config.hand_source))
     report = build_on(
         running,
         sources,

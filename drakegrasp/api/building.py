@@ -25,10 +25,12 @@ from drakegrasp.cluster.connect import connect
 from drakegrasp.cluster.executor import RESUBMISSIONS, DaskExecutor
 from drakegrasp.config import Config
 from drakegrasp.dataset.lock import build_lock
-from drakegrasp.dataset.manifest import claim_directory
+from drakegrasp.dataset.manifest import claim_directory, release_directory
 from drakegrasp.dataset.paths import BUILTIN_FOLDER
+from drakegrasp.dataset.paths import FILE_NAME as MANIFEST
 from drakegrasp.errors import DataError, GraspError, MeshError, listed
 from drakegrasp.exchange.posture_files import read_postures
+from drakegrasp.hand.carried import carry_hand
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import MeshSource, find_meshes
@@ -88,7 +90,7 @@ def build_dataset(
     """
     refuse_workers(workers, scheduler, scheduler_file)
     out, config = Path(out).absolute(), config or load_config()
-    hand = load_hand(config.hand)
+    hand = load_hand(config.hand_source)
     drive_of(hand, config.lift)
     if isinstance(postures, str | Path):
         postures = read_postures(Path(postures), hand)
@@ -153,7 +155,11 @@ def build_on(
             raise GraspError("postures must be of an object that is built, got none of them")
     with build_lock(out) as dead, ExitStack() as stack:
         # A directory that cannot be used is refused before workers start.
-        claim_directory(out, config)
+        before = claim_directory(out, config)
+
+        # Workers read the hand in the directory.
+        stack.callback(_release_unused, out)
+        config = carry_hand(out, config, before.config.hand if before else None)
         client = stack.enter_context(cluster)
         stack.enter_context(admitted_workers(client, config))
 
@@ -174,6 +180,12 @@ def build_on(
             pool=execute.pool,
             show=show,
         )
+
+
+def _release_unused(out: Path) -> None:
+    """Remove what a build that did not begin has put into a directory."""
+    if not (out / MANIFEST).exists():
+        release_directory(out)
 
 
 def _refuse_unknown(only: Sequence[str], names: Sequence[str]) -> None:

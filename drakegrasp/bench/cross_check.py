@@ -128,7 +128,7 @@ def cross_check(out: Path, count: int, *, progress: Report = silent) -> dict[str
             progress(len(rows), len(lifts), held=sum(_holds(row) for row in rows))
 
     return {
-        "drive": drive_of(load_hand(config.hand), config.lift),
+        "drive": drive_of(load_hand(config.hand_source), config.lift),
         "groups": {
             group: agreement([row for row in rows if row["group"] == group]) for group in GROUPS
         },

@@ -63,7 +63,7 @@ class Simulated(NamedTuple):
 
 def variants(config: Config) -> dict[str, Variant]:
     """Return the variants of a configuration by name: `VARIANTS`, and its hand's other drives."""
-    hand = load_hand(config.hand)
+    hand = load_hand(config.hand_source)
     own = drive_of(hand, config.lift)
     others = {}
     for name, drive in DRIVES.items():
@@ -167,7 +167,7 @@ def _simulate(
     prepared = bench.prepared
     if variant.fine:
         prepared = replace(prepared, model=_finer(prepared.model))
-    scene = build_scene(prepared.model, other.physics, load_hand(other.hand))
+    scene = build_scene(prepared.model, other.physics, load_hand(other.hand_source))
     bench = TrialSetup(prepared=prepared, config=other, scene=scene)
 
     outcomes = []

@@ -149,7 +149,7 @@ def _measure_object(
 
     # Build what all attempts share, and screen them by geometry.
     with _cpu_timed(seconds, "scene"):
-        scene = build_scene(prepared.model, config.physics, load_hand(config.hand))
+        scene = build_scene(prepared.model, config.physics, load_hand(config.hand_source))
         bench = TrialSetup(prepared=prepared, config=config, scene=scene)
     with _cpu_timed(seconds, "field"):
         _ = prepared.model.field

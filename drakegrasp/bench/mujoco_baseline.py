@@ -86,7 +86,7 @@ class MujocoBaseline:
         Raises:
             ConfigError: See `drive_of`.
         """
-        self._config, self._hand = config, load_hand(config.hand)
+        self._config, self._hand = config, load_hand(config.hand_source)
         self._usual = usual_materials(model, config.physics)
         self.place(X_TO)
         scene = build_mujoco_scene(model, self._hand, config)

@@ -91,7 +91,7 @@ def trial_setup(out: Path, header: ShardHeader, config: Config) -> TrialSetup:
         DataError: If the object's files are damaged, or of another configuration or mesh.
     """
     prepared = _load(out, header.object_name, header.mesh_sha256, config)
-    scene = cached_scene(prepared.model, config.physics, config.hand)
+    scene = cached_scene(prepared.model, config.physics, config.hand_source)
     return TrialSetup(prepared=prepared, config=config, scene=scene)
 
 
@@ -115,7 +115,7 @@ def list_attempts(prepared: PreparedObject, indices: range, config: Config) -> l
     if drawn.postures is None:
         made = make_attempts(drawn, indices, config.candidates, **place)
     else:
-        made = posture_attempts(drawn, indices, load_hand(config.hand), **place)
+        made = posture_attempts(drawn, indices, load_hand(config.hand_source), **place)
     return [_with_conditions(attempt, model, config) for attempt in made]
 
 
@@ -151,7 +151,7 @@ def _with_conditions(attempt: Attempt, model: ObjectModel, config: Config) -> At
 def predict_attempts(setup: TrialSetup, attempts: Sequence[Attempt]) -> list[Prediction | None]:
     """Return what geometry says of each attempt; one call for all of them is much faster."""
     config, prepared = setup.config, setup.prepared
-    hand = load_hand(config.hand)
+    hand = load_hand(config.hand_source)
 
     # A call is about one resting pose.
     found: list[Prediction | None] = [None] * len(attempts)
@@ -175,7 +175,8 @@ def try_attempt(
     )
     if record.outcome is Outcome.SOLVER_ERROR:
         forget_scenes()
-        setup.scene = cached_scene(setup.prepared.model, setup.config.physics, setup.config.hand)
+        config = setup.config
+        setup.scene = cached_scene(setup.prepared.model, config.physics, config.hand_source)
     return record
 
 

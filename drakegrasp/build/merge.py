@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 
-from drakegrasp.config import Config
+from drakegrasp.config import CarriedHand, Config
 from drakegrasp.dataset.assemble import Assembly, assemble_locked
 from drakegrasp.dataset.assembly.survey import headers_by_object
 from drakegrasp.dataset.lock import build_lock
@@ -31,6 +31,7 @@ from drakegrasp.dataset.paths import model_path, plan_path, shards_folder
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import is_assembled
 from drakegrasp.errors import DataError
+from drakegrasp.hand.carried import carry_hand
 from drakegrasp.runtime.executor import Executor, run_here
 from drakegrasp.runtime.files import atomic_folder, disk_full_named, sync
 from drakegrasp.runtime.progress import Report, silent
@@ -77,6 +78,7 @@ def merge(
     Raises:
         DataError: If the directory is in use, a dataset is not complete, or two of them are not of
             one configuration, one hand and one version, or differ in what both have.
+        HandError: If the files of the hand in a dataset have changed.
         DiskFullError: If there is no room.
     """
     # Refuse what cannot be done before anything is written.
@@ -90,6 +92,7 @@ def merge(
     with disk_full_named(into), atomic_folder(into) as folder, build_lock(folder):
         for part in parts:
             _take_files(part, folder)
+        manifest = _with_hand(manifest, manifests.values(), folder)
         write_manifest(manifest, folder)
         return assemble_locked(folder, manifest, execute=execute, progress=progress)
 
@@ -132,7 +135,7 @@ def _with_hand_of(known: Config, config: Config) -> Config:
     """Return a configuration with the same hand elsewhere: its files count, by their digest."""
     if PurePath(known.hand).stem != PurePath(config.hand).stem:
         return config
-    return config.model_copy(update={"hand": known.hand})
+    return config.with_hand(known.hand)
 
 
 def _parts(manifests: Mapping[Path, Manifest]) -> list[_Part]:
@@ -210,6 +213,15 @@ def _merged_manifest(manifests: Mapping[Path, Manifest], parts: Iterable[_Part])
         refused=tuple({mesh.name: mesh for mesh in refused if mesh.name not in objects}.values()),
         rejected=tuple(dict.fromkeys(rejected)),
     )
+
+
+def _with_hand(manifest: Manifest, parts: Iterable[Manifest], folder: Path) -> Manifest:
+    """Return a merged manifest with the hand in its folder, if a dataset carries it."""
+    for part in parts:
+        if isinstance(part.config.hand_source, CarriedHand):
+            config = manifest.config.with_hand(part.config.hand, part.config.hand_source)
+            return replace(manifest, config=carry_hand(folder, config), joints=part.joints)
+    return manifest
 
 
 def _take_files(part: _Part, folder: Path) -> None:

@@ -41,7 +41,9 @@ from drakegrasp.dataset.prepared_objects import load_prepared
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.statistics import is_assembled
 from drakegrasp.errors import ConfigError, DataError, DrakegraspError, listed
+from drakegrasp.hand.carried import carry_hand
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.parsing import position_order
 from drakegrasp.objects.sources import MeshSource, source_sha256
 from drakegrasp.runtime.executor import Executor, WorkerPool
 from drakegrasp.runtime.files import disk_full_named, sweep_temporary
@@ -127,7 +129,7 @@ def build(
         MachineError: If the workers cannot do the work.
     """
     refuse_unusable(config)
-    drive_of(load_hand(config.hand), config.lift)
+    drive_of(load_hand(config.hand_source), config.lift)
     with build_lock(out) as dead:
         return build_locked(
             sources, out, config, execute, dead=dead, postures=postures, pool=pool, show=show
@@ -199,6 +201,7 @@ def build_locked(
         known = claim_directory(out, config)
         if known is not None:
             refuse_missing(known, [source.name for source in sources], out)
+        config = carry_hand(out, config, known.config.hand if known else None)
 
         notices = [] if dead is None else [f"the lock of a dead build was taken over: {dead}"]
         notices += _sweep(out)
@@ -223,8 +226,10 @@ def _build(
     out, start = job.out, time.monotonic()
 
     # The manifest comes first: without one a directory holds no dataset.
-    new = Manifest(config=config, versions=installed_versions(config), fingers=finger_names(config))
-    manifest = replace(known or new, config=config)
+    hand, versions = load_hand(config.hand_source), installed_versions(config)
+    new = Manifest(config=config, versions=versions, fingers=finger_names(config))
+    manifest = replace(known or new, config=config, joints=position_order(hand.model))
+    manifest = replace(manifest, versions={**manifest.versions, "hand": versions["hand"]})
     write_manifest(manifest, out)
     job.events.started(manifest, notices)
     if warning := nothing_trains(sources, config.split):

@@ -63,7 +63,7 @@ def replay_trial(out: str | Path, trial_id: int) -> Replay:
     prepared, config = stored.prepared, stored.config
 
     # Run the attempt as a work unit would, up to the row that it would store.
-    scene = build_scene(prepared.model, config.physics, load_hand(config.hand))
+    scene = build_scene(prepared.model, config.physics, load_hand(config.hand_source))
     setup = TrialSetup(prepared=prepared, config=config, scene=scene)
     record = try_attempt(setup, stored.attempt)
     row = trial_rows(setup, [stored.attempt], [record], [measure_contacts(setup, record)])

@@ -34,7 +34,7 @@ def nothing_trains(sources: Sequence[MeshSource], split: SplitConfig) -> str:
 
 def too_heavy(manifest: Manifest) -> str:
     """Return which objects are heavier than the payload of the hand file; empty if none is."""
-    hand = load_hand(manifest.config.hand)
+    hand = load_hand(manifest.config.hand_source)
     if hand.payload is None:
         return ""
     names = [entry.name for entry in manifest.objects if entry.mass > hand.payload]

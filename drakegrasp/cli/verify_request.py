@@ -134,7 +134,7 @@ def _place(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
 def _refuse_no_grasps(path: Path, grasps: Array, config: Config) -> None:
     """Refuse numbers that are no grasps of the hand, with the name of their file."""
     try:
-        read_grasps(grasps, len(read_hand_file(hand_file(config.hand)).fingers))
+        read_grasps(grasps, len(read_hand_file(hand_file(config.hand_source)).fingers))
     except GraspError as error:
         raise GraspError(f"{path}: {error}") from None
 

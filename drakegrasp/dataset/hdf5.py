@@ -191,6 +191,8 @@ def create_field(
         shuffle=not text,
     )
     dataset.attrs.update({"unit": field.unit, "frame": field.frame, "meaning": field.meaning})
+    if "j" in field.axes and "joints" in group.file.attrs:
+        dataset.attrs["joints"] = group.file.attrs["joints"]
     dataset.resize(rows, axis=0)
     return dataset
 

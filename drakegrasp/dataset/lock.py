@@ -34,7 +34,7 @@ from drakegrasp.runtime.processes import Process, lock_file, this_process
 
 FILE_NAME = "build.lock"
 #: Folders that a build makes in the directory.
-FOLDERS = ("builtin", "objects", "shards")
+FOLDERS = ("builtin", "hand", "objects", "shards")
 #: Directories that a thread of this process holds, and the lock of this set.
 _held: set[str] = set()
 _claiming = threading.Lock()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -47,8 +48,10 @@ from drakegrasp.dataset.schema import (
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.errors import ConfigError, DataError, GraspError
 from drakegrasp.frames import read_pose, unpack_pose
+from drakegrasp.hand.carried import HAND_FOLDER, carried_hand
 from drakegrasp.hand.file_format import read_hand_file
-from drakegrasp.hand.files import hand_digest, hand_file
+from drakegrasp.hand.files import hand_file
+from drakegrasp.hand.folder import hand_digest, is_hand
 from drakegrasp.hand.settings import override_config
 from drakegrasp.runtime.file_set import refuse_half_replaced
 from drakegrasp.runtime.files import probe_folder, write_atomic
@@ -68,9 +71,17 @@ def _refuse_no_pose(packed: tuple[float, ...]) -> tuple[float, ...]:
     return packed
 
 
+def _refuse_unprintable(text: str) -> str:
+    """Refuse what would steer a terminal."""
+    if not text.isprintable():
+        raise ValueError(f"it must be printable, got {text!r}")
+    return text
+
+
 #: Types of what a manifest holds; they are checked when one is read.
 Axis = Annotated[str, Field(pattern=r"^[+-][xyz]$")]
 Hex = Annotated[str, Field(pattern="^[0-9a-f]+$")]
+Text = Annotated[str, AfterValidator(_refuse_unprintable)]
 Whole = Annotated[int, Field(ge=0, le=2**63 - 1)]
 Pose = Annotated[
     tuple[Number, ...], Field(min_length=12, max_length=12), AfterValidator(_refuse_no_pose)
@@ -207,6 +218,7 @@ class Manifest:
         rejected: Attempts that an inspection rejects: successes that are no samples.
         versions: Versions of the packages that made the dataset, and a hash of the hand's files.
         fingers: Name of each finger in grasp order, and whether a grasp needs its fingertip.
+        joints: Names of the hand's joints in the order of the fields `q`; older datasets have none.
         schema_version: Version of the schema of the dataset's files.
     """
 
@@ -216,6 +228,7 @@ class Manifest:
     rejected: tuple[AttemptKey, ...] = ()
     versions: dict[str, str]
     fingers: dict[str, bool] = field(default_factory=dict)
+    joints: tuple[str, ...] = ()
     schema_version: int = SCHEMA_VERSION
 
     def headers(self) -> Iterator[ShardHeader]:
@@ -273,20 +286,20 @@ class Manifest:
 
 def finger_names(config: Config) -> dict[str, bool]:
     """Return the name of each finger in grasp order, and whether a grasp needs its fingertip."""
-    fingers = read_hand_file(hand_file(config.hand)).fingers
+    fingers = read_hand_file(hand_file(config.hand_source)).fingers
     return {finger.name: finger.required for finger in fingers}
 
 
 def installed_versions(config: Config) -> dict[str, str]:
     """Return the versions of all that may change a result: packages, and the hand's files."""
     packages = {name: metadata.version(name) for name in VERSIONED}
-    return {**packages, "hand": hand_digest(config.hand)}
+    return {**packages, "hand": hand_digest(config.hand_source)}
 
 
 def origin_attributes(
-    config: Config, versions: dict[str, str], fingers: Mapping[str, bool]
+    config: Config, versions: dict[str, str], fingers: Mapping[str, bool], joints: Sequence[str]
 ) -> dict[str, Any]:
-    """Return the attributes of every file: conventions, configuration, versions, fingers."""
+    """Return the attributes of every file: conventions, configuration, versions, the hand's."""
     return {
         **{f"convention_{key}": text for key, text in CONVENTIONS.items()},
         "schema_version": SCHEMA_VERSION,
@@ -295,6 +308,7 @@ def origin_attributes(
         "seed": config.seed,
         "versions": json.dumps(versions, sort_keys=True),
         "fingers": json.dumps(dict(fingers)),
+        **({"joints": json.dumps(list(joints))} if joints else {}),
     }
 
 
@@ -317,6 +331,7 @@ def _content(manifest: Manifest) -> dict[str, Any]:
         "split_by": manifest.split_rule,
         "versions": manifest.versions,
         "fingers": manifest.fingers,
+        **({"joints": list(manifest.joints)} if manifest.joints else {}),
         "objects": [entry.to_json() for entry in manifest.objects],
         "refused": [entry.to_json() for entry in manifest.refused],
     }
@@ -351,8 +366,10 @@ def read_manifest(out: Path) -> Manifest:
     except ConfigError as error:
         raise DataError(f"{path}: {error}") from None
 
+    # A dataset that was passed on has its hand with it.
+    carried = carried_hand(out, config.hand, stored.versions.get("hand", ""))
     manifest = Manifest(
-        config=config,
+        config=config.with_hand(config.hand, carried),
         **{f.name: getattr(stored, f.name) for f in fields(Manifest) if f.name != "config"},
     )
     if (mistake := next(_contradictions(stored, manifest), None)) is not None:
@@ -396,6 +413,7 @@ class _Stored(BaseModel):
     split_by: Rule | None = None
     versions: dict[str, str]
     fingers: dict[str, bool] = {}
+    joints: tuple[Text, ...] = ()
     objects: tuple[ObjectEntry, ...]
     refused: tuple[RefusedMesh, ...]
     rejected: tuple[AttemptKey, ...] = ()
@@ -459,6 +477,10 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
     # With a manifest it must continue the same dataset.
     manifest = read_manifest(out)
     refuse_older(manifest, out)
+    installed = installed_versions(config)
+    same_hand = is_hand(config.hand_source, manifest.versions.get("hand"))
+    if same_hand:  # wherever its files are
+        config = config.with_hand(manifest.config.hand)
     if manifest.config.simulation_hash() != config.simulation_hash():
         raise DataError(
             f"{out}: must be empty or hold this configuration's dataset, got one that differs in "
@@ -469,9 +491,8 @@ def claim_directory(out: Path, config: Config) -> Manifest | None:
             f"{out}: must be of one seed to be built on, got a merged dataset of several; build on "
             "those that it was merged of"
         )
-    installed = installed_versions(config)
     for name in REQUIRED_VERSIONS:
-        if manifest.versions.get(name) != installed[name]:
+        if manifest.versions.get(name) != installed[name] and not (same_hand and name == "hand"):
             raise DataError(
                 f"{out}: must be continued with {name} {manifest.versions.get(name)}, which made "
                 f"it, got {installed[name]}; choose another --out"
@@ -499,6 +520,8 @@ def release_directory(out: Path) -> None:
     """Remove the files of a build that made nothing, and the directory if it is then empty."""
     for name in (FILE_NAME, log.FILE_NAME):
         (out / name).unlink(missing_ok=True)
+    if not (out / HAND_FOLDER).is_symlink():
+        shutil.rmtree(out / HAND_FOLDER, ignore_errors=True)
     # A directory with anything else in it was there before.
     for folder in (*(out / name for name in lock.FOLDERS), out):
         with suppress(OSError):

@@ -53,7 +53,7 @@ def write_dexgraspbench(out: Path, folder: Path, progress: Report) -> int:
     from drakegrasp.mjcf.hand_model import make_hand_model, write_hand_model
 
     # The hand, by a name that the benchmark does not have.
-    hand = load_hand(read_manifest(out).config.hand)
+    hand = load_hand(read_manifest(out).config.hand_source)
     model, posed = make_hand_model(hand), StillScene(hand)
     write_hand_model(model, folder / ASSETS / "hand" / "hand.xml")
     name = f"drakegrasp_{hand.name}"

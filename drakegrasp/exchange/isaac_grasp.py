@@ -29,7 +29,7 @@ from drakegrasp.simulation.postures.posture import joint_order
 
 def write_isaac_grasp(out: Path, folder: Path, progress: Report) -> int:
     """Write the samples of a dataset and return their number; see `export.export_dataset`."""
-    hand = load_hand(read_manifest(out).config.hand)
+    hand = load_hand(read_manifest(out).config.hand_source)
     grasps = list(read_closed_grasps(out))
     (folder / "meshes").mkdir()
     done = 0

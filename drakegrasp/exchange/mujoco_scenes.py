@@ -39,7 +39,7 @@ MESHES, HAND = "meshes", "hand"
 def write_mjcf(out: Path, folder: Path, progress: Report) -> int:
     """Write a scene per sample and return their number; see `export.export_dataset`."""
     config = read_manifest(out).config
-    hand = load_hand(config.hand)
+    hand = load_hand(config.hand_source)
     posed, grasps = StillScene(hand), list(read_closed_grasps(out))
     progress(0, len(grasps))
     done = 0

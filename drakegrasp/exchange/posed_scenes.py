@@ -33,7 +33,7 @@ TIP_COLOUR, LINK_COLOUR = (0.93, 0.55, 0.20, 1.0), (0.45, 0.48, 0.52, 1.0)
 
 def write_glb(out: Path, folder: Path, progress: Report) -> int:
     """Write a scene per sample and return their number; see `export.export_dataset`."""
-    hand = load_hand(read_manifest(out).config.hand)
+    hand = load_hand(read_manifest(out).config.hand_source)
     posed, links = StillScene(hand), link_meshes(hand)
     grasps = list(read_closed_grasps(out))
     progress(0, len(grasps))

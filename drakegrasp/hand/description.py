@@ -22,6 +22,7 @@ from pydrake.math import RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 
+from drakegrasp.config import CarriedHand, HandSource
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, invert_pose, make_pose
 from drakegrasp.hand.chains import (
@@ -34,7 +35,8 @@ from drakegrasp.hand.chains import (
     moving_joint,
 )
 from drakegrasp.hand.file_format import Drive, Finger, HandFile, Spread, read_hand_file
-from drakegrasp.hand.files import find_packages, hand_file, hand_files
+from drakegrasp.hand.files import find_packages, hand_file
+from drakegrasp.hand.folder import hand_folder
 from drakegrasp.hand.lift_chance import LiftChance, read_lift_chance
 from drakegrasp.hand.parsing import ModelFile, add_model
 from drakegrasp.hand.shapes import pad_surfaces
@@ -101,41 +103,51 @@ class Hand:
         return np.array([finger.required for finger in self.fingers])
 
 
-def load_hand(name_or_yaml: str | Path = "barrett") -> Hand:
-    """Return a hand that comes with the package, or the hand of a YAML file.
+def load_hand(source: HandSource = "barrett") -> Hand:
+    """Return a hand that comes with the package, the hand of a YAML file, or that of a dataset.
 
     Args:
-        name_or_yaml: One of `files.hand_names()`, or the path of a YAML file with the keys of
-            `file_format.HandFile`; its `model` is a path relative to the YAML file.
+        source: One of `files.hand_names()`, or the path of a YAML file with the keys of
+            `file_format.HandFile`; its `model` is a path relative to the YAML file. That of a
+            dataset is `Config.hand_source` of its configuration.
 
     Raises:
-        HandError: If there is no such hand, a key or value of the YAML cannot be used, or
-            the model lacks a link or joint that the YAML names.
+        HandError: If there is no such hand, a key or value of the YAML cannot be used,
+            the model lacks a link or joint that the YAML names, or the files of a dataset's hand
+            have changed.
     """
     # Use a hand that was loaded before, if its files did not change.
-    path = hand_file(name_or_yaml)
-    known = _loaded.get(path)
+    path = hand_file(source)
+    key = source if isinstance(source, CarriedHand) else path
+    known = _loaded.get(key)
     if known is not None and known[0].model.stamp == _stamp(known[1]):
         return known[0]
 
-    files = hand_files(path)
-    stamp = _stamp(files)
-    described = read_hand_file(path)
-    folder = path.parent.resolve()
+    folder = hand_folder(source)
+    stamp = _stamp(folder.sources)
+    if isinstance(source, CarriedHand) and folder.digest != source.digest:
+        raise HandError(
+            f"{path.parent}: must hold the hand of the dataset ({source.digest}), got other files "
+            f"({folder.digest})"
+        )
+    described, packages = read_hand_file(path), dict[str, Path]()
     try:
-        packages = find_packages(folder, described.model, described.packages)
-        model = ModelFile(folder / described.model, tuple(sorted(packages.items())), stamp)
+        if not isinstance(source, CarriedHand):  # which names no packages
+            own = path.parent.resolve()
+            packages = find_packages(own, described.model, described.packages)
+        place = path.parent.resolve() / described.model
+        model = ModelFile(place, tuple(sorted(packages.items())), stamp)
         hand = _build_hand(path.stem.removesuffix("_hand"), described, model)
         hand = replace(hand, lift_chance=read_lift_chance(path))
         _refuse_empty_pads(hand)
     except HandError as error:
         raise HandError(f"{path}: {error}") from None
-    _loaded[path] = hand, files
+    _loaded[key] = hand, folder.sources
     return hand
 
 
 #: Loaded hands with their files: parsing takes 40 ms.
-_loaded: dict[Path, tuple[Hand, list[Path]]] = {}
+_loaded: dict[Path | CarriedHand, tuple[Hand, Sequence[Path]]] = {}
 
 
 def _stamp(files: Sequence[Path]) -> tuple[int, ...]:

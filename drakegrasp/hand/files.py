@@ -1,24 +1,16 @@
-"""Locates and hashes a hand's files. Does not import Drake."""
+"""Locates the files of a hand. Does not import Drake."""
 
 from __future__ import annotations
 
-import hashlib
-import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
-import yaml
-
+from drakegrasp.config import CarriedHand, HandSource
 from drakegrasp.errors import HandError
-from drakegrasp.yaml_text import parse_yaml
 
 #: Folder of the table and of the hands that come with the package, as `<name>_hand.yaml`.
 MODELS = Path(__file__).resolve().parent.parent / "models"
-#: The files that a model names: meshes in SDFormat, and in URDF.
-_URIS = re.compile(rb"<uri>\s*(.*?)\s*</uri>|<mesh\b[^>]*\bfilename\s*=\s*[\"'](.*?)[\"']")
-_PACKAGE = "package://"
 
 
 def hand_names() -> list[str]:
@@ -26,22 +18,39 @@ def hand_names() -> list[str]:
     return sorted(path.name.removesuffix("_hand.yaml") for path in MODELS.glob("*_hand.yaml"))
 
 
-def hand_file(name_or_yaml: str | Path) -> Path:
-    """Return the YAML file of a hand that comes with the package, or the given YAML file.
+def hand_file(source: HandSource) -> Path:
+    """Return the YAML file of a hand that comes with the package, or the one that is given.
 
     Raises:
-        HandError: If there is no such file.
+        HandError: If there is no such file, or that of a dataset is elsewhere.
     """
-    if name_or_yaml in hand_names():
-        return MODELS / f"{name_or_yaml}_hand.yaml"
-    path = Path(name_or_yaml)
+    if isinstance(source, CarriedHand):
+        refuse_outside(source.path, source.path.parent)
+        return source.path
+    if source in hand_names():
+        return MODELS / f"{source}_hand.yaml"
+    path = Path(source)
     if not path.is_file():
         names = ", ".join(hand_names())
-        raise HandError(f"hand must be one of {names} or a YAML file, got {str(name_or_yaml)!r}")
+        raise HandError(f"hand must be one of {names} or a YAML file, got {str(source)!r}")
     return path
 
 
-def chance_file(name_or_yaml: str | Path) -> Path:
+def refuse_outside(path: Path, folder: Path) -> None:
+    """Refuse what is no plain file of a folder, which may be a stranger's.
+
+    Raises:
+        HandError: If it is missing or something else, or it or the folder is a link.
+    """
+    try:
+        found, real = path.resolve(strict=True), folder.parent.resolve() / folder.name
+    except (OSError, RuntimeError, ValueError):
+        raise HandError(f"{path}: must be a file of the dataset's hand, got none") from None
+    if not (found.is_relative_to(real) and found.is_file()):
+        raise HandError(f"{path}: must be a file in {folder}, got a link or no file")
+
+
+def chance_file(source: HandSource) -> Path:
     """Return the file of the weights by which lifts are chosen, which few hands have.
 
     It lies beside the hand file: `<name>_chance.yaml` of `<name>_hand.yaml`.
@@ -49,7 +58,7 @@ def chance_file(name_or_yaml: str | Path) -> Path:
     Raises:
         HandError: If there is no such hand.
     """
-    path = hand_file(name_or_yaml)
+    path = hand_file(source)
     return path.with_name(f"{path.stem.removesuffix('_hand')}_chance.yaml")
 
 
@@ -77,62 +86,6 @@ def find_packages(folder: Path, model: str, packages: Mapping[str, str]) -> dict
             raise HandError(f"packages.{name}: must be a folder, got {place!r}")
         found[name] = folder / place
     return found
-
-
-def hand_digest(name_or_yaml: str | Path) -> str:
-    """Return a hash (16 hex digits) of a hand's YAML, its model, meshes and weights.
-
-    It distinguishes two hands of the same name. A missing file counts as empty; refusing it is
-    left to `description.load_hand`.
-
-    Raises:
-        HandError: If there is no such hand.
-    """
-    digest = hashlib.sha256()
-    for path in hand_files(name_or_yaml):
-        digest.update(path.read_bytes() if path.is_file() else b"")
-    return digest.hexdigest()[:16]
-
-
-def hand_files(name_or_yaml: str | Path) -> list[Path]:
-    """Return the files of a hand: YAML, model, weights of lifts, meshes; some may not exist.
-
-    Raises:
-        HandError: If there is no such hand.
-    """
-    # The hand file, and the model that it names.
-    path = hand_file(name_or_yaml)
-    described = _described(path)
-    name = str(described.get("model", ""))
-    model = path.parent / name
-    text = model.read_bytes() if model.is_file() else b""
-
-    # The files that the model names, in the order of their names.
-    packages = described.get("packages")
-    named = packages.items() if isinstance(packages, dict) else ()
-    folders = {str(k): path.parent / str(v) for k, v in named}
-    if _PACKAGE.encode() in text:
-        folders = find_packages(path.parent, name, {}) | folders
-    uris = sorted({(one or other).decode() for one, other in _URIS.findall(text)})
-    meshes = [_mesh_file(uri, model.parent, folders) for uri in uris]
-    return [path, model, chance_file(path), *meshes]
-
-
-def _mesh_file(uri: str, folder: Path, packages: Mapping[str, Path]) -> Path:
-    """Return the file of a URI in a model, which may not exist."""
-    if not uri.startswith(_PACKAGE):
-        return folder / uri.removeprefix("file://")
-    package, _, rest = uri.removeprefix(_PACKAGE).partition("/")
-    return packages.get(package, folder / package) / rest
-
-
-def _described(path: Path) -> Mapping[str, Any]:
-    """Return the keys of a hand file; none if it is not one."""
-    try:
-        tree = parse_yaml(path.read_bytes())
-    except (yaml.YAMLError, UnicodeDecodeError):
-        return {}
-    return tree if isinstance(tree, dict) else {}
 
 
 def _package_name(manifest: Path) -> str:

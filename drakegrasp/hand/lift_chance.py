@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import combinations
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ import numpy.typing as npt
 import yaml
 
 from drakegrasp.arithmetic import Array, dot, multiply, norm
+from drakegrasp.config import HandSource
 from drakegrasp.errors import HandError, one_line
 from drakegrasp.hand.files import chance_file
 from drakegrasp.runtime.foreign_files import read_text
@@ -79,13 +79,13 @@ class LiftChance:
         return np.asarray(np.rint(1.0 / (1.0 + np.exp(-score)) / GRID) * GRID)
 
 
-def read_lift_chance(name_or_yaml: str | Path) -> LiftChance | None:
+def read_lift_chance(source: HandSource) -> LiftChance | None:
     """Return the model of a hand; None if it has none.
 
     Raises:
         HandError: If there is no such hand, or its file of weights cannot be used.
     """
-    path = chance_file(name_or_yaml)
+    path = chance_file(source)
     if not path.is_file():
         return None
     try:

@@ -73,3 +73,20 @@ def add_model(plant: MultibodyPlant, model: ModelFile) -> ModelInstanceIndex:
     for constraint in set(plant.GetConstraintIds()) - constraints:
         plant.RemoveConstraint(constraint)
     return instance
+
+
+def position_order(model: ModelFile) -> tuple[str, ...]:
+    """Return the names of a model's joints in the order of its positions, that of every `q`.
+
+    It is that of the tree of links, which may be another than that of the file.
+
+    Raises:
+        HandError: As `add_model`.
+    """
+    plant = MultibodyPlant(0.0)
+    instance = add_model(plant, model)
+    names = {plant.get_joint(index).name() for index in plant.GetJointIndices(instance)}
+    plant.Finalize()  # which adds a joint for the palm
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
+    moving = [joint for joint in joints if joint.name() in names and joint.num_positions()]
+    return tuple(joint.name() for joint in sorted(moving, key=lambda joint: joint.position_start()))

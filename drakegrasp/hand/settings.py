@@ -68,7 +68,8 @@ def load_config(
 def override_config(config: Config, overrides: Sequence[str], **values: Any) -> Config:
     """Return a configuration with overrides applied, see `load_config`.
 
-    Another hand brings its own stand-offs and spreads, unless they are overridden, too.
+    Another hand brings its own stand-offs and spreads, unless they are overridden, too. That of a
+    dataset stays what the dataset carries, unless it is named.
 
     Raises:
         ConfigError, HandError: See `load_config`.
@@ -84,7 +85,10 @@ def override_config(config: Config, overrides: Sequence[str], **values: Any) -> 
     if tree["hand"] != config.hand and isinstance(candidates, dict):
         same = [key for key in HAND_KEYS if candidates.get(key) == known["candidates"][key]]
         tree["candidates"] = {**candidates, **dict.fromkeys(same)}
-    return _completed(tree, config.code)
+    changed = _completed(tree, config.code)
+    named = {key for key, value in values.items() if value is not None}
+    named |= {text.partition("=")[0].strip() for text in overrides}
+    return changed if "hand" in named else changed.with_hand(config.hand, config.hand_source)
 
 
 def _with_absolute_hand(tree: dict[str, Any]) -> dict[str, Any]:

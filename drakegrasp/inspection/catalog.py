@@ -34,6 +34,7 @@ from drakegrasp.dataset.schema import SCHEMA_VERSION
 from drakegrasp.dataset.shards import ShardHeader
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import DataError
+from drakegrasp.hand.carried import carried_hand
 from drakegrasp.inspection.table import AttemptTable, first_rows, join, read_table
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.json_text import parse_json
@@ -282,6 +283,9 @@ def _read_assembled(out: Path, stamps: Mapping[Path, Stamp]) -> tuple[Snapshot, 
     except ValueError as error:
         path = out / TRIALS_FILE
         raise DataError(f"{path}: attribute config must be one, got {error}") from None
+    versions = json.loads(str(trials.attributes.get("versions", "{}")))
+    carried = carried_hand(out, config.hand, str(versions.get("hand", "")))
+    config = config.with_hand(config.hand, carried)
     names, classes, meshes = (
         tuple(trials.objects[key].tolist()) for key in ("name", "class_name", "mesh_sha256")
     )

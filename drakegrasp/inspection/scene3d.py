@@ -33,7 +33,7 @@ class HandView:
     """
 
     def __init__(self, config: Config) -> None:
-        self._name = config.hand
+        self._source = config.hand_source
         self._lock = threading.Lock()
         self._scene: Any = None
         self._surfaces: dict[str, bytes] = {}
@@ -50,7 +50,7 @@ class HandView:
             from drakegrasp.visualization.surfaces import link_surfaces
 
             try:
-                scene = StillScene(load_hand(self._name))
+                scene = StillScene(load_hand(self._source))
                 self._surfaces, self._scene = link_surfaces(scene), scene
             except (DrakegraspError, RuntimeError, OSError) as error:
                 self.problem = f"the hand cannot be shown: {str(error).splitlines()[0]}"

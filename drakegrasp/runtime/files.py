@@ -326,7 +326,10 @@ def _is_stale(path: Path) -> bool:
 
 def _remove(path: Path) -> bool:
     try:
-        path.unlink()
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)  # of `atomic_folder`
+        else:
+            path.unlink()
     except FileNotFoundError:
         return False
     return True

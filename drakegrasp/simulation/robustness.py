@@ -142,7 +142,7 @@ class _Repeater:
         physics = config.physics.model_copy(update={"time_step": step, "coarse_steps": 1})
         # Whether a grasp holds is the verdict of a whole lift.
         self._config = with_whole_lifts(config).model_copy(update={"physics": physics})
-        self._model, self._X_TO, self._hand = model, X_TO, load_hand(config.hand)
+        self._model, self._X_TO, self._hand = model, X_TO, load_hand(config.hand_source)
         self._scene = build_scene(model, physics, self._hand)
 
     def predict(self, attempt: Attempt) -> Prediction | None:

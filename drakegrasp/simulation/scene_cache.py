@@ -19,7 +19,7 @@ from typing import TypeVar, cast
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.config import CameraConfig, PhysicsConfig
+from drakegrasp.config import CameraConfig, HandSource, PhysicsConfig
 from drakegrasp.hand.description import load_hand
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.construction import build_scene
@@ -36,10 +36,10 @@ _kept: dict[Hashable, Scene | Renderer] = {}
 _lock = threading.Lock()
 
 
-def cached_scene(model: ObjectModel, physics: PhysicsConfig, hand_name: str) -> Scene:
-    """Return the scene of an object with a hand, by its name or YAML file."""
+def cached_scene(model: ObjectModel, physics: PhysicsConfig, source: HandSource) -> Scene:
+    """Return the scene of an object with a hand, see `load_hand`."""
     # A hand whose files have changed is loaded anew, and is then another key.
-    hand = load_hand(hand_name)
+    hand = load_hand(source)
     return _cached((*_scene_key(model, physics), hand), lambda: build_scene(model, physics, hand))
 
 

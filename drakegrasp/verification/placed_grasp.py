@@ -28,7 +28,7 @@ from drakegrasp.frames import (
     unpack_pose,
 )
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.files import hand_digest
+from drakegrasp.hand.folder import hand_digest, is_hand
 from drakegrasp.hand.settings import override_config
 from drakegrasp.simulation.placement import (
     PlacedObject,
@@ -149,11 +149,13 @@ def dataset_config(
     if config is not None:
         refuse_no_config(config)
     known = read_manifest(dataset.path.parent).config
+    if config is not None and config.hand == known.hand:
+        config = config.with_hand(known.hand, known.hand_source)
     used = override_config(config or known, overrides) if overrides else config or known
     used = _with_hand(used, hand)
     refuse_other_objects(used, known, "as in the dataset, whose objects are prepared")
     if hand is None and used.hand == known.hand:
-        _refuse_other_hand(dataset, used.hand)
+        _refuse_other_hand(dataset, used)
     return used
 
 
@@ -161,18 +163,17 @@ def _with_hand(config: Config, hand: str | Path | None) -> Config:
     return config if hand is None else override_config(config, [], hand=str(hand))
 
 
-def _refuse_other_hand(dataset: GraspDataset, hand: str) -> None:
+def _refuse_other_hand(dataset: GraspDataset, config: Config) -> None:
     """Refuse the hand of a dataset if its files have changed since.
 
     Raises:
         HandError: If so, or if they are gone.
     """
     known = read_manifest(dataset.path.parent).versions.get("hand")
-    found = hand_digest(hand)
-    if known not in (None, found):
+    if known is not None and not is_hand(config.hand_source, known):
         raise HandError(
-            f"{hand}: files of the hand must be those of the dataset ({known}), got others "
-            f"({found}); name the hand to verify with it as it is now"
+            f"{config.hand}: files of the hand must be those of the dataset ({known}), got others "
+            f"({hand_digest(config.hand_source)}); name the hand to verify with it as it is now"
         )
 
 
@@ -184,7 +185,7 @@ def _read(grasps: npt.ArrayLike, method: str, config: Config) -> GraspRows:
     """Return the rows of numbers as grasps of the configuration's hand."""
     if method not in METHODS:
         raise GraspError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
-    return read_grasps(grasps, load_hand(config.hand).num_fingers)
+    return read_grasps(grasps, load_hand(config.hand_source).num_fingers)
 
 
 def _placed(

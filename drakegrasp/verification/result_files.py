@@ -25,6 +25,7 @@ from drakegrasp.dataset.schema import VERIFICATION_FIELDS, Field, sizes
 from drakegrasp.errors import DataError
 from drakegrasp.frames import pack_pose
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.parsing import position_order
 from drakegrasp.runtime.files import atomic_hdf5, probe_folder, sync_and_rename
 from drakegrasp.simulation.lift import Lift
 from drakegrasp.simulation.trial import Closed
@@ -250,10 +251,11 @@ def write_results(
     Raises:
         OSError: If the disk is full or the folder cannot be written.
     """
-    hand = load_hand(config.hand)
+    hand = load_hand(config.hand_source)
     shape = sizes(fingers=hand.num_fingers, joints=len(hand.joint_names), image=0)
     with atomic_hdf5(path) as file:
-        origin = origin_attributes(config, installed_versions(config), finger_names(config))
+        versions, fingers = installed_versions(config), finger_names(config)
+        origin = origin_attributes(config, versions, fingers, position_order(hand.model))
         file.attrs.update(origin)
         group = file.create_group(GROUP)
         for field in VERIFICATION_FIELDS:

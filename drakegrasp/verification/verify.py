@@ -122,7 +122,7 @@ def verify_placed(grasp: PlacedGrasp) -> Verification:
         return result
     with timed(base.seconds, "hints"):
         X_OA = np.eye(4) if grasp.X_OA is None else grasp.X_OA
-        hints = find_hints(base.placed.model, load_hand(base.config.hand),
+        hints = find_hints(base.placed.model, load_hand(base.config.hand_source),
                            grasp.p_OQ, base.nhat_Q_O, X_OA=X_OA, X_OB=grasp.X_OB)  # fmt: skip
     return replace(result, hints=hints)
 
@@ -149,7 +149,7 @@ def _lift_by_hand(base: Verification) -> Verification:
     """Find palm poses for the contacts, and try them until one holds the object."""
     # Palm poses that bring the fingertips to the contacts, the best first.
     config, X_TO = base.config, base.placed.X_TO_simulated
-    hand = load_hand(config.hand)
+    hand = load_hand(config.hand_source)
     with timed(base.seconds, "fit"):
         fits = fit_wrist(hand, base.p_OQ, base.nhat_Q_O, up_O=X_TO[2, :3], height=float(X_TO[2, 3]))
     with timed(base.seconds, "simulate"):
@@ -214,8 +214,8 @@ def _run(
     Returns:
         What the trial started from, and what happened.
     """
-    scene = cached_scene(placed.model, config.physics, config.hand)
-    hand = load_hand(config.hand)
+    scene = cached_scene(placed.model, config.physics, config.hand_source)
+    hand = load_hand(config.hand_source)
     least = coordinate_limits(hand)[1:, 0]
     for share in MARGINS:
         margin = share * np.deg2rad(config.verify.open_margin_deg) * hand.closing_unit

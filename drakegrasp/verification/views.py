@@ -109,7 +109,7 @@ def render_views(verified: Verification) -> list[View]:
     """
     # The contacts: predicted ones, those after closing, and where these are after the lift.
     model = verified.placed.model
-    scene = StillScene(load_hand(verified.config.hand), model)
+    scene = StillScene(load_hand(verified.config.hand_source), model)
     X_WO = X_WT @ verified.placed.X_TO_simulated
     marks = [
         _predicted(verified),

@@ -30,18 +30,20 @@ _HEAD = f"""<!-- Made by `make docs-pages` from dataset/schema.py: change that, 
 Schema version {SCHEMA_VERSION}. In the shapes `N` is the number of rows, `k` of fingers, `j` of
 the hand's joints, `6k` the length of a grasp (18 for three fingers) and `S` the size of the images.
 Frames are explained in [frames-and-units.md](frames-and-units.md). Every dataset of a file carries
-its `unit`, `frame` and `meaning` as attributes.
+its `unit`, `frame` and `meaning` as attributes; one of joints (`j`) also has the names of its
+`joints`, in JSON.
 
 ```
 OUT/
   manifest.json            configuration, its hash, seed, versions, objects, refused meshes
+  hand/                    the hand: hand file, model, meshes, weights of lifts, licences
   objects/NAME.npz         an object: meshes, mass, centre of mass, inertia
   objects/NAME.plan.h5     its resting pose and palm poses
   shards/NAME/RANGE.h5     what one work unit found; immutable
   trials.hdf5              a row per attempt, whatever its outcome
   grasping_oto.hdf5        samples, camera rolled with the palm
   grasping_otm.hdf5        the same samples, image up is world up
-  DATACARD.md, .json       what it is, how it was made, counts, licences of the meshes, known limits
+  DATACARD.md, .json       what it is, how it was made, counts, licences, known limits
   log.jsonl                what happened while it was built, and when: a line of JSON per event
   reject.json              grasps that an inspection rejects; only if there was one
   build.lock               while a build runs: by which process
@@ -50,8 +52,17 @@ OUT/
 The data card is written with the three files, and `drakegrasp check` compares its counts with
 them. It has no time and no machine in it: equal files have equal cards.
 
-Only the data files, `grasping_*.hdf5`, are needed to train. With `objects/` and `manifest.json`,
-every trial can be replayed.
+Only the data files, `grasping_*.hdf5`, are needed to train. With `objects/`, `hand/` and
+`manifest.json`, every trial can be replayed.
+
+`hand/` is copied when a build begins, and read by workers and by every later command. Files below
+the hand file keep their places and bytes. A model that names others, by an absolute path, one that
+leads out of its folder, or `package://`, is rewritten: they are in `hand/files/`. `versions` in the
+manifest has a digest of hand file, model, weights and meshes, without their paths: a build goes on
+with a hand of the same digest, wherever it is and whatever its file is called, `merge` demands the
+same digest, and `check` compares it. Datasets of version 0.2 and before have no `hand/`: a hand of
+the package is then the installed one, and a hand file is read at its path; a build that goes on
+adds it.
 """
 
 _CONTRACT = """## What makes two files equal
@@ -103,7 +114,9 @@ they are of two states, and every reader refuses them. The next command with OUT
 
 A dataset may come from anywhere. No link in its directory is followed when something is written or
 deleted. An HDF5 file that has soft or external links, or values in another file, is refused. Names
-of objects are names: printable, without slashes. Control characters reach no terminal, log or page.
+of objects are names: printable, without slashes. What the hand in `hand/` names lies there: links
+that lead out, other paths and more than 512 MB are refused. Control characters reach no terminal,
+log or page.
 
 ## Missing values
 
@@ -122,8 +135,9 @@ grasps. `moved` says that the attempt is no sample, not that the hand would have
 _ATTRIBUTES = """
 Further attributes: `schema_version`, `camera` and `split_by` (`class` or `object`) of the data
 files, camera matrix `K` [px], `near` and `far` [m], `config` and `versions` (JSON), `config_hash`,
-`seed`, and of what the file was assembled from: `signature`, a hash of all in the manifest that
-decides a row, and `shards`, a hash of their seals.
+`seed`, the names of the hand's `fingers` and `joints` in their order (JSON), and of what the file
+was assembled from: `signature`, a hash of all in the manifest that decides a row, and `shards`, a
+hash of their seals.
 """
 
 _DATA = """## grasping_oto.hdf5 and grasping_otm.hdf5
@@ -145,8 +159,9 @@ _VERIFICATION = """
 
 `drakegrasp verify ... --out NAME` writes two files, with a row or a line per grasp in the order of
 the input. `NAME.h5` has the attributes `convention_*`, `schema_version`, `config`, `config_hash`,
-`seed` and `versions`, and a group `/grasps`. What a method or a stage did not reach is NaN, 0,
-false or empty; "from" says with which stage a value begins. Equal input gives equal bytes.
+`seed`, `versions`, `fingers` and `joints`, and a group `/grasps`. What a method or a stage did not
+reach is NaN, 0, false or empty; "from" says with which stage a value begins. Equal input gives
+equal bytes.
 """
 
 _ROWS = """

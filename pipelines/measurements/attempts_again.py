@@ -106,7 +106,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         done = 0
         for number in np.unique(columns["object"]):
             model = prepare(sources[names[number]], config).model
-            scene = build_scene(model, config.physics, load_hand(config.hand))
+            scene = build_scene(model, config.physics, load_hand(config.hand_source))
             if scene.coarse_scene is not None:
                 scene.coarse_scene()  # it is built once, and not at the cost of the first lift
             for i in np.flatnonzero(columns["object"] == number):

@@ -51,7 +51,7 @@ def try_both(
     config = rules["never"]
     prepared = prepare(source, config)
     attempts = list_attempts(prepared, range(len(prepared.candidates)), config)
-    scene = build_scene(prepared.model, config.physics, load_hand(config.hand))
+    scene = build_scene(prepared.model, config.physics, load_hand(config.hand_source))
     # It is built once, and not at the cost of the first lift.
     if scene.coarse_scene is not None:
         scene.coarse_scene()

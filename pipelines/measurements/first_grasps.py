@@ -56,7 +56,7 @@ def search(source: MeshSource, config: Config) -> tuple[int, int, bool]:
         config: All the rules.
     """
     prepared = prepare(source, config)
-    scene = build_scene(prepared.model, config.physics, load_hand(config.hand))
+    scene = build_scene(prepared.model, config.physics, load_hand(config.hand_source))
     setup = TrialSetup(prepared=prepared, config=config, scene=scene)
     count, held = len(prepared.candidates), 0
     for begin in range(0, count, STRIDE):

@@ -65,7 +65,7 @@ def lift_again(
     config = read_manifest(dataset).config
     asked = {"physics": other.physics, "randomize": other.randomize}
     rules = config.model_copy(update=asked)
-    hand = load_hand(other.hand)
+    hand = load_hand(other.hand_source)
     fingers = tuple(replace(finger, holding_torque=UNLIMITED) for finger in hand.fingers)
     strong = replace(hand, fingers=fingers)
     with h5py.File(dataset / TRIALS_FILE) as file:

@@ -28,7 +28,7 @@ from drakegrasp.simulation.trial import run_attempt
 
 def outcomes(prepared: PreparedObject, attempts: list[Attempt], config: Config) -> list[Outcome]:
     """Return the outcomes of attempts under a configuration."""
-    scene = build_scene(prepared.model, config.physics, load_hand(config.hand))
+    scene = build_scene(prepared.model, config.physics, load_hand(config.hand_source))
     poses = prepared.resting_poses
     return [run_attempt(scene, poses[a.resting], a, config).outcome for a in attempts]
 

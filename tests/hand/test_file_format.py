@@ -19,7 +19,8 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import SLIDE, load_hand
-from drakegrasp.hand.files import MODELS, hand_digest
+from drakegrasp.hand.files import MODELS
+from drakegrasp.hand.folder import hand_digest
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses, joint_positions
 from drakegrasp.hand.parsing import add_model
 from drakegrasp.hand.shapes import link_shapes

@@ -13,7 +13,15 @@ from helpers.shards import some_shard
 from drakegrasp.dataset.shards import write_shard
 from drakegrasp.runtime import files
 from drakegrasp.runtime.file_set import LIST_NAME, replaced_together
-from drakegrasp.runtime.files import atomic_hdf5, atomic_path, probe_folder, write_atomic
+from drakegrasp.runtime.files import (
+    atomic_folder,
+    atomic_hdf5,
+    atomic_path,
+    probe_folder,
+    sweep_temporary,
+    write_atomic,
+)
+from drakegrasp.runtime.processes import host_label
 
 
 def everything_in(folder: Path) -> list[Path]:
@@ -125,3 +133,21 @@ def watch_sync(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Path, set[Path]]]:
 
     monkeypatch.setattr(os, "fsync", watch)
     return synced
+
+
+def test_a_folder_that_a_dead_process_was_filling_is_removed(tmp_path: Path) -> None:
+    """One of a process that runs stays, and so does what a link leads to."""
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    out = tmp_path / "out"
+    dead = out / f".hand.{host_label()}~999999999~0123456789ab.tmp"
+    (dead / "meshes").mkdir(parents=True)
+    (dead / "meshes" / "palm.obj").write_text("half")
+    link = out / f".hand.{host_label()}~999999999~0123456789ac.tmp"
+    link.symlink_to(kept)
+    with atomic_folder(out / "hand") as alive:
+        assert sweep_temporary(out) == [link]  # `atomic_folder` has removed the other one
+        assert alive.exists()
+    dead.mkdir()
+    assert sweep_temporary(out) == [dead]
+    assert kept.exists() and (out / "hand").exists() and not dead.exists()

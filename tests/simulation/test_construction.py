@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from helpers.hands import write_tongs
 from helpers.objects import from_above, model_of, standing
 from pydrake.multibody.plant import DiscreteContactApproximation
 from pydrake.multibody.tree import BodyIndex, RigidBody
 
 from drakegrasp.config import Config
 from drakegrasp.frames import X_WT
-from drakegrasp.hand.description import Hand
+from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.parsing import position_order
 from drakegrasp.hand.settings import override_config
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.simulation.construction import (
@@ -29,6 +32,7 @@ from drakegrasp.simulation.scene import (
     closing_angles,
     closing_rates,
     finger_speed,
+    hand_joint_names,
     release,
     reset_attempt,
     reset_object,
@@ -229,3 +233,17 @@ def test_hand_meets_the_collision_mesh_and_the_table_its_hull(
             "object::hand": len(ring.faces),
             "object::table": len(model.resting_surface.faces),
         }
+
+
+def test_positions_have_an_order_that_is_not_that_of_the_file(
+    tmp_path: Path, cube: ObjectModel, config: Config
+) -> None:
+    path = write_tongs(tmp_path)
+    model = tmp_path / "tongs.urdf"
+    joints = re.findall(r"  <joint .*?</joint>\n", model.read_text(), re.DOTALL)
+    text = re.sub(r"  <joint .*?</joint>\n", "", model.read_text(), flags=re.DOTALL)
+    model.write_text(text.replace("</robot>", "".join([*reversed(joints), "</robot>"])))
+    hand = load_hand(path)
+    scene = build_scene(cube, config.physics, hand)
+    assert list(position_order(hand.model)) == hand_joint_names(scene)
+    assert hand_joint_names(scene) != list(hand.joint_names)

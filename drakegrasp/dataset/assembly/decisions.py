@@ -196,7 +196,7 @@ def file_attributes(manifest: Manifest, seals: str, camera: str = "") -> dict[st
     """
     own = {"camera": camera, "split_by": manifest.split_rule} if camera else {}
     return {
-        **origin_attributes(manifest.config, manifest.versions, manifest.fingers),
+        **origin_attributes(manifest.config, manifest.versions, manifest.fingers, manifest.joints),
         **lens_attributes(manifest.config.camera),
         "signature": manifest.signature(),
         "shards": seals,

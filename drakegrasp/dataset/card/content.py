@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from drakegrasp.config import Config
+from drakegrasp.config import CarriedHand, Config
 from drakegrasp.dataset.hdf5 import read_names
 from drakegrasp.dataset.layout.opening import open_samples
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry, read_manifest
@@ -27,12 +27,18 @@ from drakegrasp.dataset.statistics import (
     splits_of,
 )
 from drakegrasp.dataset.trials import Trials
+from drakegrasp.errors import HandError, printable
 from drakegrasp.hand.file_format import read_hand_file
 from drakegrasp.hand.files import hand_file, hand_names
+from drakegrasp.hand.folder import hand_folder
 from drakegrasp.outcomes import Outcome, Removal
 
 #: What the licence is called of meshes for which none is stated.
 NOT_STATED = "not stated"
+#: The licence of a hand that comes with the package and has none of its own.
+OWN_LICENCE = "BSD-3-Clause, that of drakegrasp"
+#: Signs of a licence's first line.
+LONGEST_LINE = 100
 #: Known limits, and the page of drakegrasp's docs that says more.
 LIMITS = (
     ("Everything is simulated: no grasp was tried on a real robot.", "explanation/physics.md"),
@@ -70,6 +76,7 @@ FILES = {
     "trials.hdf5": "every attempt with its outcome, also those that failed",
     "manifest.json": "all settings, versions, objects and refused meshes",
     "objects/": "what was simulated of each mesh",
+    "hand/": "the hand: its file, model, meshes and licence",
 }
 
 
@@ -108,7 +115,10 @@ def content_of(manifest: Manifest, trials: Path, data: Path) -> dict[str, Any]:
     return {
         "title": f"Simulated grasps of {len(entries)} object{'s' * (len(entries) != 1)}",
         "hand": Path(manifest.config.hand).stem,
+        "hand_digest": manifest.versions.get("hand", ""),
+        "hand_licences": _hand_licences(manifest.config),
         "fingers": list(manifest.fingers),
+        "joints": list(manifest.joints),
         "schema_version": SCHEMA_VERSION,
         "seeds": sorted({entry.config_in(manifest.config).seed for entry in entries}),
         "config_hash": manifest.config.simulation_hash(),
@@ -145,12 +155,37 @@ def _settings(config: Config) -> dict[str, Any]:
     tree = config.to_dict()
     settings = {f"{room}.{key}": tree[room][key] for room, names in keys.items() for key in names}
 
-    # Labels depend on the drive. The file of somebody's own hand may be elsewhere now.
+    # Labels depend on the drive. The file of an older dataset's hand may be elsewhere now.
     if config.lift.drive is None:
-        built_in = config.hand in hand_names()
-        own = read_hand_file(hand_file(config.hand)).drive if built_in else "that of the hand file"
+        path = _known_hand_file(config)
+        own = "that of the hand file" if path is None else read_hand_file(path).drive
         settings["lift.drive"] = own
     return settings
+
+
+def _known_hand_file(config: Config) -> Path | None:
+    """Return the hand file of the dataset or of the package; None if it is neither's."""
+    if not isinstance(config.hand_source, CarriedHand) and config.hand not in hand_names():
+        return None
+    try:
+        return hand_file(config.hand_source)
+    except HandError:
+        return None
+
+
+def _hand_licences(config: Config) -> dict[str, str]:
+    """Return the first line of each licence of a hand, by the name of its file."""
+    if _known_hand_file(config) is None:
+        return {}
+    folder = hand_folder(config.hand_source)
+    found = {place: _first_line(folder.content(place)) for place in folder.licences}
+    return found or ({"LICENSE": OWN_LICENCE} if config.hand in hand_names() else {})
+
+
+def _first_line(text: bytes) -> str:
+    """Return the first line of a text that says something, shortened."""
+    lines = (printable(line.strip()) for line in text.decode(errors="replace").splitlines())
+    return next(filter(None, lines), "")[:LONGEST_LINE]
 
 
 def _counts(data: Path, funnel: Funnel) -> dict[str, Any]:

@@ -56,13 +56,17 @@ def card_text(content: Mapping[str, Any]) -> str:
 
 
 def _what(content: Mapping[str, Any]) -> str:
-    fingers = f"The fingers in the order of a grasp: {', '.join(content['fingers'])}."
+    said = (("fingers in the order of a grasp", "fingers"), ("joints in that of a `q`", "joints"))
+    fingers, joints = (
+        f" The {what}: {', '.join(map(_plain, content[key]))}." if content[key] else ""
+        for what, key in said
+    )
     conventions = "\n".join(f"* **{k}**: {text}" for k, text in content["conventions"].items())
     return f"""## What it is
 
 Every sample is a grasp that a simulated hand (`{content["hand"]}`) closed, lifted and held, with
 colour, depth and mask as a camera behind the palm sees the object before. Made by drakegrasp; its
-docs explain every field. {fingers if content["fingers"] else ""}
+docs explain every field.{fingers}{joints}
 
 {conventions}"""
 
@@ -90,7 +94,14 @@ Versions: {versions}."""
 
 def _licences(content: Mapping[str, Any]) -> str:
     rows = [(licence, ", ".join(names)) for licence, names in content["licences"].items()]
-    return f"""## Licence of the meshes
+    hand = _table(("file", "its first line"), list(content["hand_licences"].items()))
+    return f"""## Licence of the hand
+
+The files of the hand `{content["hand"]}` are in `hand/`, digest `{content["hand_digest"]}`.
+
+{hand if content["hand_licences"] else "Its licence is not stated."}
+
+## Licence of the meshes
 
 As it was stated in `objects.yaml`; that of the built-in objects is the package's.
 

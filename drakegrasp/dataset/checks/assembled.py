@@ -36,7 +36,7 @@ from drakegrasp.dataset.paths import FILE_NAME
 from drakegrasp.outcomes import Removal
 
 #: Attributes that say of what a file was assembled, the cause of others first.
-ORIGIN = ("config", "split_by", "versions", "fingers", "shards", "signature")
+ORIGIN = ("config", "split_by", "versions", "fingers", "joints", "shards", "signature")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

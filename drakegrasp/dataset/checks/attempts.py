@@ -20,7 +20,7 @@ from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import FILE_NAME, model_path
 from drakegrasp.dataset.schema import CONDITION_FIELDS
 from drakegrasp.errors import HandError
-from drakegrasp.hand.files import hand_digest
+from drakegrasp.hand.folder import is_hand
 from drakegrasp.hand.lift_chance import GRASP_CONTACTS, ClosedGrasp, LiftChance, read_lift_chance
 from drakegrasp.objects.model import ObjectModel, load_object
 from drakegrasp.outcomes import Outcome
@@ -107,9 +107,9 @@ def chances(
     """
     # Other files of the hand may have other weights.
     try:
-        if hand_digest(manifest.config.hand) != manifest.versions.get("hand"):
+        if not is_hand(manifest.config.hand_source, manifest.versions.get("hand")):
             return
-        chance = read_lift_chance(manifest.config.hand)
+        chance = read_lift_chance(manifest.config.hand_source)
     except HandError:
         return
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from drakegrasp.config import CarriedHand
 from drakegrasp.dataset.assembly.survey import Survey, SurveyTask, survey_object, survey_tasks
 from drakegrasp.dataset.checks.findings import Findings, Violation, of_file
 from drakegrasp.dataset.manifest import Manifest, ObjectEntry
@@ -21,7 +22,9 @@ from drakegrasp.dataset.paths import (
     refuse_changed_model,
 )
 from drakegrasp.dataset.shards import read_trials
-from drakegrasp.errors import DataError, MeshError, first_line
+from drakegrasp.errors import DataError, HandError, MeshError, first_line
+from drakegrasp.hand.carried import HAND_FOLDER
+from drakegrasp.hand.folder import hand_digest
 from drakegrasp.objects.model import load_object
 from drakegrasp.outcomes import Outcome
 
@@ -64,6 +67,20 @@ def check_object(task: ObjectTask) -> tuple[Findings, bool, Survey | None]:
         except DataError:
             findings.add(_broken_shards(task.shards))
     return findings, readable, survey
+
+
+def carried_hand_as_built(manifest: Manifest) -> Iterator[Violation]:
+    """The hand that the dataset carries is the one that built it."""
+    source, what = manifest.config.hand_source, f"the hand must be that of {FILE_NAME}"
+    if not isinstance(source, CarriedHand):
+        return  # an older dataset carries none
+    try:
+        found = hand_digest(source)
+    except HandError as error:
+        yield of_file(HAND_FOLDER, what, first_line(error).rpartition(", got ")[2])
+        return
+    if found != source.digest:
+        yield of_file(HAND_FOLDER, f"{what}, {source.digest}", found)
 
 
 def _meshes(out: Path, entry: ObjectEntry) -> Iterator[Violation]:

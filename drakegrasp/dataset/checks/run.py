@@ -20,7 +20,7 @@ from drakegrasp.dataset.checks.attempts import Dataset
 from drakegrasp.dataset.checks.data_file import samples_tasks, splits
 from drakegrasp.dataset.checks.findings import Findings, Violation, of_file
 from drakegrasp.dataset.checks.layout import look_at
-from drakegrasp.dataset.checks.object_files import check_object, object_tasks
+from drakegrasp.dataset.checks.object_files import carried_hand_as_built, check_object, object_tasks
 from drakegrasp.dataset.checks.rows import Check, CheckedFile
 from drakegrasp.dataset.checks.trials_file import successes, trials_tasks
 from drakegrasp.dataset.hdf5 import open_hdf5
@@ -100,6 +100,7 @@ def _check_directory(out: Path, check: Check) -> None:
             objects.add(entry.name)
         if survey is not None:
             surveys.append(survey)
+    check.findings.add(carried_hand_as_built(manifest))
     dataset = Dataset(out=out, manifest=manifest, readable=frozenset(objects))
     sound = len(surveys) == sum(entry.candidates > 0 for entry in manifest.objects)
     sound &= len(surveys) > 0 and len(objects) == len(manifest.objects)

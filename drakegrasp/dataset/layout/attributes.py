@@ -33,6 +33,14 @@ def _is_truths(value: Any) -> bool:
     return _is_mapping(value) and all(isinstance(v, bool) for v in parse_json(value).values())
 
 
+def _is_names(value: Any) -> bool:
+    try:
+        names = parse_json(value) if isinstance(value, str) else None
+    except ValueError:
+        return False
+    return isinstance(names, list) and all(map(_is_text, names))
+
+
 def _is_whole(value: Any) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= 0)
 
@@ -64,6 +72,7 @@ ORIGIN: Mapping[str, Rule] = {
     "seed": COUNT,
     "versions": _MAPPING,
     "fingers": ("whether a grasp needs each finger, in JSON", _is_truths),
+    "joints": ("names of the hand's joints, in JSON", _is_names),
     "signature": TEXT,
     "shards": TEXT,
     "K": ("a matrix of 3 x 3 finite numbers", _is_matrix),
@@ -71,7 +80,7 @@ ORIGIN: Mapping[str, Rule] = {
     "far": _POSITIVE,
 }
 #: Those that files of before they were written may lack.
-_YOUNG = ("fingers", "split_by")
+_YOUNG = ("fingers", "joints", "split_by")
 #: And of the data files.
 OF_CAMERA: Mapping[str, Rule] = {
     **ORIGIN,

@@ -38,11 +38,11 @@ def run_trial(placed: PlacedObject, posture: Posture, config: Config | None = No
         raise GraspError(f"posture must be a Posture, got a {type(posture).__name__}")
     config = with_whole_lifts(config_for(placed, config))
     refuse_other_objects(config, placed.config, "as the object was placed with")
-    hand = load_hand(config.hand)
+    hand = load_hand(config.hand_source)
     posture = make_posture(
         hand, posture.X_OG, posture.q_grasp, posture.q_pregrasp, posture.q_squeeze
     )
-    scene = cached_scene(placed.model, config.physics, config.hand)
+    scene = cached_scene(placed.model, config.physics, config.hand_source)
     trial = run_attempt(scene, placed.X_TO_simulated, start_of(posture, hand), config)
 
     # A scene in which Drake failed is never used again.

@@ -172,7 +172,7 @@ def _grasp(
     model: ObjectModel, contacts: SurfaceContacts, config: Config, *, patches: bool
 ) -> GraspContacts:
     """Return contacts as points or patches, with the limits of the hand's fingertips."""
-    hand = load_hand(config.hand)
+    hand = load_hand(config.hand_source)
     points = patch_points(model, contacts) if patches else (contacts.p_OQ, contacts.nhat_Q_O)
     return GraspContacts(
         *points, model.p_OOcm, force_limit=fingertip_forces(hand, drive_of(hand, config.lift))

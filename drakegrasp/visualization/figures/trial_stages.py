@@ -82,7 +82,7 @@ def load_trial(out: Path, trial_id: int, *, table_size: float = TABLE_SIZE) -> T
     X_WG_lifted = X_WO_lifted @ unpack_pose(row["X_OG_lifted"])
 
     model = load_prepared(out, name, config).model
-    scene = StillScene(load_hand(config.hand), model, table_size=table_size)
+    scene = StillScene(load_hand(config.hand_source), model, table_size=table_size)
     return TrialStages(
         scene=scene,
         place=Poses(X_WG=X_WG, q=scene.positions(float(row["spread"])), X_WO=X_WO),

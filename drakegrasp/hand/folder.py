@@ -1,0 +1,342 @@
+"""The files of a hand as a folder that holds all of them, and a digest of its content.
+
+In: a hand. Out: what such a folder holds: hand file, model, weights, meshes with the files that
+they name, licences. Files below the hand file keep their places and bytes. The hand file or the
+model is rewritten only where it names something else: an absolute path, one that leads out of the
+folder, or a `package://` URI. The hand in such a folder has the same folder and digest again. Does
+not import Drake.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import posixpath
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from drakegrasp.config import CarriedHand, HandSource
+from drakegrasp.errors import HandError
+from drakegrasp.hand.files import MODELS, chance_file, find_packages, hand_file, refuse_outside
+from drakegrasp.hand.references import MODELS as MODEL_SUFFIXES
+from drakegrasp.hand.references import (
+    file_of,
+    mesh_references,
+    model_references,
+    names_packages,
+    rewritten,
+)
+from drakegrasp.yaml_text import parse_yaml
+
+#: Limits of a hand's files, in all [byte] and their number: a dataset may be a stranger's.
+LARGEST, LARGEST_YAML, MOST_FILES = 2**29, 2**18, 1000
+#: Files of licences beside a hand file or its model; files of which lines are about licences.
+_LICENCE = re.compile(r"(LICEN[CS]E|COPYING|NOTICE)([._ -].*)?", re.IGNORECASE)
+_README = re.compile(r"(README(\..*)?|package\.xml)", re.IGNORECASE)
+_MENTION = re.compile(r"licen[cs]e|copyright", re.IGNORECASE)
+#: File of these lines.
+MENTIONS = "LICENSE-mentioned.txt"
+#: The keys of a hand file that name other files.
+_MODEL_LINE = re.compile(r"^model:.*$", re.MULTILINE)
+_PACKAGES_LINES = re.compile(r"^packages:.*\n(?:[ \t]+\S.*\n)*", re.MULTILINE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HandFolder:
+    """What a folder with the files of a hand holds, by places in it.
+
+    Attributes:
+        texts: Hand file, models and lines about licences, as they are there.
+        files: The other files, where they are now.
+        counted: Places of what the digest is of, in its order; some may be of no file.
+        sources: Every file that was looked for.
+        licences: Places of the licences.
+    """
+
+    texts: Mapping[str, bytes]
+    files: Mapping[str, Path]
+    counted: tuple[str, ...]
+    sources: tuple[Path, ...]
+    licences: tuple[str, ...]
+
+    def content(self, place: str) -> bytes:
+        """Return the bytes of a file; none of one that is not there."""
+        if place in self.texts:
+            return self.texts[place]
+        return self.files[place].read_bytes() if place in self.files else b""
+
+    @property
+    def digest(self) -> str:
+        """A hash (16 hex digits) of hand file, model, weights and meshes; no path is in it."""
+        digest = hashlib.sha256()
+        for place in self.counted:
+            digest.update(self.content(place))
+        return digest.hexdigest()[:16]
+
+
+def hand_digest(source: HandSource) -> str:
+    """Return a hash (16 hex digits) of a hand's files, see `HandFolder.digest`.
+
+    It distinguishes two hands of the same name. A missing file counts as empty; refusing it is
+    left to `description.load_hand`.
+
+    Raises:
+        HandError: As `hand_folder`.
+    """
+    return hand_folder(source).digest
+
+
+def is_hand(source: HandSource, digest: str | None) -> bool:
+    """Return whether the files of a hand have a digest.
+
+    Version 0.2 took that of the model and the hand file before they are rewritten.
+
+    Raises:
+        HandError: As `hand_folder`.
+    """
+    folder = hand_folder(source)
+    return digest in (folder.digest, _plain_digest(hand_file(source)))
+
+
+def hand_folder(source: HandSource, name: str | None = None) -> HandFolder:
+    """Return what a folder with all files of a hand holds.
+
+    Args:
+        source: The hand.
+        name: Of its hand file in the folder; the name that it has if None.
+
+    Raises:
+        HandError: If there is no such hand, its files are too large, or a dataset's hand names
+            files elsewhere.
+    """
+    # The hand file; a model elsewhere is put beside it.
+    path = hand_file(source)
+    found = _Found(within=path.parent if isinstance(source, CarriedHand) else None)
+    found.has(path)
+    name, described = name or path.name, _described(path)
+    packages = found.packages_of(path, described)
+    model = str(described.get("model", ""))
+    place = found.place_of(model, "") or Path(model).name
+    moved = place != posixpath.normpath(model)
+    found.texts[name] = _with_model(path, place) if moved or packages else path.read_bytes()
+
+    # The model, the weights that few hands have, and licences.
+    if found.has(path.parent / model):
+        found.add_model(place, path.parent / model, packages, found.uris)
+    chance = f"{Path(name).stem.removesuffix('_hand')}_chance.yaml"
+    found.add(chance, chance_file(source))
+    folders = dict.fromkeys([path.parent, (path.parent / model).parent, *packages.values()])
+    licences = found.add_licences(list(folders), path.stem.removesuffix("_hand"))
+
+    uris = (found.uris[uri] for uri in sorted(found.uris))
+    return HandFolder(
+        texts=found.texts,
+        files=found.files,
+        counted=(name, place, chance, *uris, *found.parts.values()),
+        sources=tuple(found.sources),
+        licences=licences,
+    )
+
+
+@dataclass(kw_only=True)
+class _Found:
+    """The files of a hand that were found so far.
+
+    Attributes:
+        within: Folder that nothing may leave: that of a dataset's hand; None for another hand.
+        uris: Places of what the model names, by its references, in the folder's model.
+        parts: Places of geometry that other files name, by themselves.
+        texts, files: As in `HandFolder`.
+        sources: Whether each file that was looked for is there.
+        size: Of the files [byte].
+    """
+
+    within: Path | None
+    uris: dict[str, str] = field(default_factory=dict)
+    parts: dict[str, str] = field(default_factory=dict)
+    texts: dict[str, bytes] = field(default_factory=dict)
+    files: dict[str, Path] = field(default_factory=dict)
+    sources: dict[Path, bool] = field(default_factory=dict)
+    size: int = 0
+
+    def place_of(self, reference: str, base: str) -> str | None:
+        """Return the place of what a file in the folder `base` names; None if it is elsewhere.
+
+        Raises:
+            HandError: If it is elsewhere, and the hand is a dataset's.
+        """
+        place = posixpath.normpath(posixpath.join(base, reference))
+        is_relative = "://" not in reference and not reference.startswith("/")
+        if is_relative and place.split("/")[0] != "..":
+            return place
+        if self.within is not None:
+            raise HandError(f"{self.within}: must name files in it only, got {reference!r}")
+        return None
+
+    def has(self, path: Path) -> bool:
+        """Note a file, and return whether it is there.
+
+        Raises:
+            HandError: If it is elsewhere, and the hand is a dataset's, or the files are too large.
+        """
+        if path in self.sources:
+            return self.sources[path]
+        if "\0" in str(path):
+            return False
+        if self.within is not None and os.path.lexists(path):
+            refuse_outside(path, self.within)
+        self.sources[path] = path.is_file()
+        if not self.sources[path]:
+            return False
+        size = path.stat().st_size
+        self.size += size
+        is_text = path.suffix.lower() in (".yaml", ".yml")
+        if (
+            self.size > LARGEST
+            or (is_text and size > LARGEST_YAML)
+            or len(self.sources) > MOST_FILES
+        ):
+            raise HandError(
+                f"{path}: the files of a hand must be at most {MOST_FILES} and {LARGEST >> 20} MB "
+                f"in all, its YAML {LARGEST_YAML >> 10} kB, got more"
+            )
+        return True
+
+    def packages_of(self, path: Path, described: Mapping[str, Any]) -> dict[str, Path]:
+        """Return the folders of the packages that a hand file or its model names.
+
+        Raises:
+            HandError: If a hand file of a dataset names one.
+        """
+        if self.within is None:
+            return _packages(path)
+        if described.get("packages"):
+            raise HandError(f"{path}: must name files in its folder only, got packages")
+        return {}
+
+    def add(self, place: str, path: Path) -> None:
+        """Add a file and those that it names, unless it is missing or there already."""
+        if place in self.files or place in self.texts or not self.has(path):
+            return
+        if path.suffix.lower() in MODEL_SUFFIXES:
+            self.add_model(place, path, {}, self.parts)
+            return
+        self.files[place] = path
+        for reference, is_geometry in mesh_references(path):
+            inner = self.place_of(reference, posixpath.dirname(place))
+            if inner is None:
+                continue  # it is drawn without
+            if is_geometry:
+                self.parts[inner] = inner
+            self.add(inner, path.parent / reference)
+
+    def add_model(
+        self, place: str, path: Path, packages: Mapping[str, Path], counted: dict[str, str]
+    ) -> None:
+        """Add a model that is there, and the files that it names, by references to their places.
+
+        Args:
+            place: Of the model.
+            path: Where it is now.
+            packages: Folders of `package://` URIs by name.
+            counted: Gets the places of geometry by their references.
+        """
+        base = posixpath.dirname(place)
+
+        def add_named(uri: str, is_geometry: bool) -> str:
+            named, inner = file_of(uri, path.parent, packages), self.place_of(uri, base)
+            if inner is None:
+                inner = _elsewhere(named, self.has(named))
+                uri = posixpath.relpath(inner, base or ".")
+            if is_geometry:
+                counted[uri] = inner
+            self.add(inner, named)
+            return uri
+
+        self.texts[place] = b""  # of one that includes itself
+        self.texts[place] = rewritten(path.read_bytes(), add_named)
+
+    def add_licences(self, folders: list[Path], hand: str) -> tuple[str, ...]:
+        """Add the licences in some folders, and lines about them; return their places."""
+        places, lines = list[str](), list[str]()
+        for folder in folders:
+            for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+                # Where there are files of several hands a licence may have the name of its hand.
+                name = path.name.removeprefix(f"{hand}_")
+                if _LICENCE.fullmatch(name):
+                    place = name if name not in self.files else f"{name}-{len(places)}"
+                    self.add(place, path)
+                    places += [place] if place in self.files else []
+                elif _README.fullmatch(name) and self.within is None and folder != MODELS:
+                    lines += _mentions(path) if self.has(path) else []
+        if lines:
+            self.texts[MENTIONS] = "\n".join([*dict.fromkeys(lines), ""]).encode()
+            places.append(MENTIONS)
+        return tuple(places)
+
+
+def _elsewhere(path: Path, there: bool) -> str:
+    """Return the place of a file that is not below the hand file."""
+    if not there:
+        return f"absent/{path.name}"
+    return f"files/{hashlib.sha256(path.read_bytes()).hexdigest()[:16]}/{path.name}"
+
+
+def _mentions(path: Path) -> list[str]:
+    """Return the lines of a file that are about licences."""
+    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    return [f"{path.name}: {line.strip()}" for line in lines if _MENTION.search(line)]
+
+
+def _described(path: Path) -> Mapping[str, Any]:
+    """Return the keys of a hand file; none if it is not one."""
+    try:
+        tree = parse_yaml(path.read_bytes())
+    except (yaml.YAMLError, UnicodeDecodeError):
+        return {}
+    return tree if isinstance(tree, dict) else {}
+
+
+def _packages(path: Path) -> dict[str, Path]:
+    """Return the folders of the packages that a hand file or its model names."""
+    described = _described(path)
+    named, model = described.get("packages"), path.parent / str(described.get("model", ""))
+    own = named.items() if isinstance(named, dict) else ()
+    folders = {str(k): path.parent / str(v) for k, v in own}
+    if model.is_file() and names_packages(model.read_bytes()):
+        return find_packages(path.parent, str(described.get("model")), {}) | folders
+    return folders
+
+
+def _with_model(path: Path, place: str) -> bytes:
+    """Return the text of a hand file with the model at another place, and without packages."""
+    keys = {**_described(path), "model": place}
+    keys.pop("packages", None)
+
+    # Comments stay, unless the keys are written in an unusual way.
+    try:
+        text = path.read_text(encoding="utf-8")
+        text = _MODEL_LINE.sub(lambda match: yaml.safe_dump({"model": place}).strip(), text)
+        text = _PACKAGES_LINES.sub("", text)
+        same = parse_yaml(text) == keys
+    except (yaml.YAMLError, UnicodeDecodeError):
+        same = False
+    return text.encode() if same else yaml.safe_dump(keys, sort_keys=False).encode()
+
+
+def _plain_digest(path: Path) -> str:
+    """Return the digest of a hand's files as version 0.2 took it, see `is_hand`."""
+    described, packages = _described(path), _packages(path)
+    model = path.parent / str(described.get("model", ""))
+    text = model.read_bytes() if model.is_file() else b""
+    named = {uri for uri, is_geometry in model_references(text) if is_geometry}
+    meshes = [file_of(uri, model.parent, packages) for uri in sorted(named)]
+    digest = hashlib.sha256()
+    for file in (path, model, chance_file(path), *meshes):
+        digest.update(file.read_bytes() if file.is_file() else b"")
+    return digest.hexdigest()[:16]

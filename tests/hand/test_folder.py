@@ -1,0 +1,255 @@
+"""A hand in a folder of its own is the same hand, whatever its model named before."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.hands import PINCER_SDF, write_pincer, write_tongs
+from helpers.meshes import box, write
+
+from drakegrasp.config import CarriedHand, Config
+from drakegrasp.errors import DiskFullError, HandError
+from drakegrasp.hand import carried as carrying
+from drakegrasp.hand.carried import carry_hand
+from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.files import MODELS
+from drakegrasp.hand.folder import hand_digest, hand_folder, is_hand
+from drakegrasp.hand.settings import load_config
+from drakegrasp.hand.shapes import link_shapes
+
+#: A mesh of the gripper's palm, and where its model finds it.
+MESH = "<mesh><uri>{}</uri><drake:declare_convex/></mesh>"
+
+
+def with_mesh(uri: str) -> str:
+    """Return the gripper's model with a mesh for a palm."""
+    mesh = MESH.format(uri)
+    return PINCER_SDF.replace("<box><size>0.04 0.12 0.02</size></box>", mesh).replace(
+        '<sdf version="1.9">', '<sdf version="1.9" xmlns:drake="drake.mit.edu">'
+    )
+
+
+def write_layout(root: Path, layout: str) -> Path:
+    """Write the gripper with its mesh in one of the ways in which models are laid out."""
+    folders = {name: root / name for name in ("mine", "vendor/urdf", "vendor/meshes")}
+    for folder in folders.values():
+        folder.mkdir(parents=True)
+    mesh = folders["vendor/meshes"] / "palm.obj"
+    write(mesh, box((0.04, 0.12, 0.02)))
+    (root / "vendor" / "package.xml").write_text("<package><name>kit</name></package>")
+    model, uri, packages = {
+        "beside": ("pincer.sdf", "palm.obj", {}),
+        "above": ("../vendor/urdf/pincer.sdf", "../meshes/palm.obj", {}),
+        "absolute": (str(root / "vendor/urdf/pincer.sdf"), f"file://{mesh}", {}),
+        "package": ("../vendor/urdf/pincer.sdf", "package://kit/meshes/palm.obj", {}),
+        "named package": (
+            "pincer.sdf",
+            "package://other/meshes/palm.obj",
+            {"other": "../vendor"},
+        ),
+    }[layout]
+    if layout == "beside":
+        shutil.copy(mesh, folders["mine"])
+    named = {"packages": packages} if packages else {}
+    path = write_pincer(folders["mine"], model=model, **named)
+    (folders["mine"] / model).write_text(with_mesh(uri))
+    return path
+
+
+def carried_source(out: Path, config: Config) -> CarriedHand:
+    """Carry a hand, and return it."""
+    source = carry_hand(out, config).hand_source
+    assert isinstance(source, CarriedHand)
+    return source
+
+
+@pytest.mark.parametrize("layout", ["beside", "above", "absolute", "package", "named package"])
+def test_the_copy_loads_by_itself_as_the_same_hand(layout: str, tmp_path: Path) -> None:
+    path = write_layout(tmp_path / "there", layout)
+    path.write_text(f"# Measured by hand.\n{path.read_text()}")
+    known, digest = load_hand(path), hand_digest(path)
+    shapes = link_shapes(known)
+    copy = carried_source(tmp_path / "out", load_config(hand=str(path)))
+    assert copy.digest == digest == hand_digest(copy)
+    assert is_hand(copy, digest) and is_hand(path, digest)
+
+    assert copy.path.read_text().startswith("# Measured by hand.\n")
+
+    shutil.rmtree(tmp_path / "there")
+    hand = load_hand(copy)
+    for name in ("joint_gain", "joint_offset", "joint_limits", "X_BG", "closing_speed"):
+        assert np.array_equal(getattr(hand, name), getattr(known, name))
+    assert (hand.name, hand.fingers, hand.joint_names) == (
+        known.name,
+        known.fingers,
+        known.joint_names,
+    )
+    found = link_shapes(hand)
+    assert found.keys() == shapes.keys()
+    assert all(
+        np.array_equal(a, b)
+        for link in shapes
+        for a, b in zip(found[link], shapes[link], strict=True)
+    )
+    # And it can be carried on.
+    config = load_config().with_hand("hand/pincer_hand.yaml", copy)
+    again = carried_source(tmp_path / "next", config)
+    assert hand_digest(again) == digest
+
+
+def test_files_below_the_hand_file_keep_their_bytes(tmp_path: Path) -> None:
+    folder = hand_folder("barrett")
+    for place in {*folder.texts, *folder.files}:
+        assert folder.content(place) == (MODELS / place).read_bytes()
+    assert not folder.licences
+    path = write_tongs(tmp_path)
+    copy = carried_source(tmp_path / "out", load_config(hand=str(path)))
+    for name in ("tongs.urdf", "tongs_hand.yaml"):
+        assert (copy.path.parent / name).read_bytes() == (tmp_path / name).read_bytes()
+
+
+def test_materials_textures_and_licences_come_along(tmp_path: Path) -> None:
+    path = write_layout(tmp_path / "there", "above")
+    meshes = tmp_path / "there" / "vendor" / "meshes"
+    mesh = meshes / "palm.obj"
+    mesh.write_text(f"mtllib palm.mtl\n{mesh.read_text()}")
+    (meshes / "palm.mtl").write_text("newmtl a\nmap_Kd -s 1 1 1 skin.png\n")
+    (meshes / "skin.png").write_bytes(b"a picture")
+    (path.parent / "LICENSE.txt").write_text("\nMIT License\n")
+    (meshes.parent / "urdf" / "README.md").write_text("# Kit\n\nLicence: Apache-2.0\nand more\n")
+    folder = carried_source(tmp_path / "out", load_config(hand=str(path))).path.parent
+    (copied,) = folder.glob("files/*/palm.obj")
+    assert copied.read_bytes() == mesh.read_bytes()
+    assert (copied.parent / "skin.png").read_bytes() == b"a picture"
+    assert (folder / "LICENSE.txt").read_text() == "\nMIT License\n"
+    assert (folder / "LICENSE-mentioned.txt").read_text() == "README.md: Licence: Apache-2.0\n"
+
+
+def test_the_digest_of_older_datasets_is_known(tmp_path: Path) -> None:
+    """It was taken of the model as it is, also where the copy's is rewritten."""
+    path = write_layout(tmp_path, "package")
+    files = path, path.parent / "../vendor/urdf/pincer.sdf", tmp_path / "vendor/meshes/palm.obj"
+    older = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
+    assert older != hand_digest(path)
+    assert is_hand(path, older)
+    assert not is_hand(path, older[::-1])
+
+
+def change(path: Path, before: str, after: str) -> None:
+    text = path.read_text()
+    assert before in text
+    path.write_text(text.replace(before, after))
+
+
+def link_out(folder: Path, name: str, target: Path) -> None:
+    (folder / name).unlink()
+    (folder / name).symlink_to(target)
+
+
+FAULTS = {
+    "another model": lambda folder, out: change(folder / "pincer.sdf", "0.04 0.02", "0.05 0.02"),
+    "an absolute model": lambda folder, out: change(
+        folder / "pincer_hand.yaml", "model: pincer.sdf", f"model: {out}/secret.sdf"
+    ),
+    "a model above": lambda folder, out: change(
+        folder / "pincer_hand.yaml", "model: pincer.sdf", "model: ../secret.sdf"
+    ),
+    "a mesh above": lambda folder, out: change(folder / "pincer.sdf", "palm.obj", "../palm.obj"),
+    "an absolute mesh": lambda folder, out: change(
+        folder / "pincer.sdf", "palm.obj", f"file://{out}/palm.obj"
+    ),
+    "packages": lambda folder, out: change(
+        folder / "pincer_hand.yaml", "model: pincer.sdf", "packages: {a: ..}\nmodel: pincer.sdf"
+    ),
+    "a large hand file": lambda folder, out: change(
+        folder / "pincer_hand.yaml", "model: pincer.sdf", "model: pincer.sdf" + " " * 300_000
+    ),
+    "a package": lambda folder, out: change(folder / "pincer.sdf", "palm.obj", "package://a/b.obj"),
+    "a linked mesh": lambda folder, out: link_out(folder, "palm.obj", out / "palm.obj"),
+    "a linked hand file": lambda folder, out: link_out(
+        folder, "pincer_hand.yaml", out / "secret.yaml"
+    ),
+    "a material above": lambda folder, out: change(
+        folder / "palm.obj", "v ", "mtllib ../a.mtl\nv "
+    ),
+    "a directory": lambda folder, out: (
+        (folder / "palm.obj").unlink(),
+        (folder / "palm.obj").mkdir(),
+    ),
+    "a linked folder": lambda folder, out: (
+        folder.rename(out / "elsewhere"),
+        folder.symlink_to(out / "elsewhere"),
+    ),
+    "a pipe": lambda folder, out: ((folder / "palm.obj").unlink(), os.mkfifo(folder / "palm.obj")),
+    "no model": lambda folder, out: (folder / "pincer.sdf").unlink(),
+    "no hand file": lambda folder, out: (folder / "pincer_hand.yaml").unlink(),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_stranger_s_hand_stays_in_its_folder(
+    fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_layout(tmp_path / "there", "beside")
+    copy = carried_source(tmp_path / "out", load_config(hand=str(path)))
+    for name in ("secret.sdf", "palm.obj", "secret.yaml"):
+        (tmp_path / "out" / name).write_text("nothing")
+    load_hand(copy)
+    FAULTS[fault](copy.path.parent, tmp_path / "out")
+    read, reader = list[Path](), Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda path: read.append(path) or reader(path))
+    with pytest.raises(HandError) as caught:
+        load_hand(copy)
+    assert "\n" not in str(caught.value)
+    # The digest of a stranger's hand is the stranger's, too: what is elsewhere is never read.
+    assert all(path.parent == copy.path.parent for path in read)
+    inside = fault in ("another model", "no model")
+    assert ("got other files" in str(caught.value)) == inside
+
+
+def test_a_hand_that_is_too_large_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_layout(tmp_path, "beside")
+    monkeypatch.setattr("drakegrasp.hand.folder.LARGEST", 1500)
+    with pytest.raises(HandError, match="must be at most 1000 and 0 MB in all, its YAML 256 kB"):
+        hand_folder(path)
+
+
+def test_a_copy_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk is full half-way; then there is room, and what was left of another hand goes."""
+    config, out, full = load_config(hand=str(write_tongs(tmp_path))), tmp_path / "out", [True]
+
+    def sync(path: Path) -> None:
+        if full and path.name.endswith(".urdf"):
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(carrying, "sync", sync)
+    with pytest.raises(DiskFullError):
+        carry_hand(out, config)
+    assert not list(out.iterdir())
+    full.clear()
+    (out / "hand").mkdir()
+    (out / "hand" / "other.obj").write_text("of another hand")
+    copy = carried_source(out, config)
+    assert sorted(p.name for p in copy.path.parent.iterdir()) == ["tongs.urdf", "tongs_hand.yaml"]
+    assert [p.name for p in out.iterdir()] == ["hand"]
+
+
+def test_an_include_in_a_model_comes_along(tmp_path: Path) -> None:
+    """And its text counts."""
+    path = write_pincer(tmp_path)
+    change(
+        tmp_path / "pincer.sdf",
+        '<link name="palm">',
+        '<link name="palm"><!-- <uri>part.sdf</uri> -->',
+    )
+    before = hand_digest(path)
+    (tmp_path / "part.sdf").write_text("<sdf/>")
+    folder = hand_folder(path)
+    assert folder.content("part.sdf") == b"<sdf/>" and folder.digest != before
