@@ -33,7 +33,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from drakegrasp.errors import ConfigError, one_line
-from drakegrasp.runtime.foreign_files import read_text
+from drakegrasp.foreign_files import read_text
 from drakegrasp.yaml_text import parse_yaml
 
 #: Limits of every quantity, so that sums stay finite.

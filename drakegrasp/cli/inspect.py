@@ -104,7 +104,7 @@ def figures(
     distributions  slip, turn, forces
     approaches     from where successes came
     """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
-    from drakegrasp.runtime.foreign_files import refuse_link
+    from drakegrasp.foreign_files import refuse_link
     from drakegrasp.runtime.progress import progress_bar
     from drakegrasp.visualization.figures.write import write_figures
 

@@ -9,8 +9,8 @@ from drakegrasp.dataset.layout.opening import opened
 from drakegrasp.dataset.layout.plans import refuse_other_plan
 from drakegrasp.dataset.schema import CAMERAS
 from drakegrasp.errors import DataError
+from drakegrasp.foreign_files import read_content
 from drakegrasp.runtime.files import refuse_broken_seal
-from drakegrasp.runtime.foreign_files import read_content
 from drakegrasp.runtime.names import NAME_RULE, is_name
 
 #: The file of all attempts, the two files of samples by camera, and the manifest.

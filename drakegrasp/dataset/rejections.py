@@ -19,8 +19,8 @@ from pydantic import BaseModel, ConfigDict, Field, with_config
 
 from drakegrasp.dataset.layout.json_files import Name, read_mapping, validated
 from drakegrasp.errors import DataError, printable
+from drakegrasp.foreign_files import read_text
 from drakegrasp.runtime.files import write_atomic
-from drakegrasp.runtime.foreign_files import read_text
 
 FILE_NAME = "reject.json"
 #: Version of the file's layout.

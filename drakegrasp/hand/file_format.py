@@ -27,8 +27,8 @@ from pydantic import (
 
 from drakegrasp.config import describe_mistake
 from drakegrasp.errors import HandError, one_line
+from drakegrasp.foreign_files import read_text
 from drakegrasp.frames import Array
-from drakegrasp.runtime.foreign_files import read_text
 from drakegrasp.yaml_text import parse_yaml
 
 #: Version of the keys that this module reads.

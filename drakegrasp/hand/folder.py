@@ -184,6 +184,7 @@ class _Found:
         Raises:
             HandError: If it is elsewhere, and the hand is a dataset's, or the files are too large.
         """
+        # A file counts once; that of a dataset must be in its folder.
         if path in self.sources:
             return self.sources[path]
         if "\0" in str(path):
@@ -193,6 +194,8 @@ class _Found:
         self.sources[path] = path.is_file()
         if not self.sources[path]:
             return False
+
+        # A stranger's files must not fill the memory, and YAML takes many times its bytes.
         size = path.stat().st_size
         self.size += size
         is_text = path.suffix.lower() in (".yaml", ".yml")

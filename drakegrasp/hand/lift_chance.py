@@ -19,8 +19,8 @@ import yaml
 from drakegrasp.arithmetic import Array, dot, multiply, norm
 from drakegrasp.config import HandSource
 from drakegrasp.errors import HandError, one_line
+from drakegrasp.foreign_files import read_text
 from drakegrasp.hand.files import chance_file
-from drakegrasp.runtime.foreign_files import read_text
 from drakegrasp.yaml_text import parse_yaml
 
 #: Chances are multiples of this: the last bits of an exponential depend on the machine.

@@ -9,10 +9,10 @@ import numpy as np
 import trimesh
 
 from drakegrasp.errors import MeshError, one_line
+from drakegrasp.foreign_files import read_content
 from drakegrasp.frames import Array
 from drakegrasp.mesh.repair import weld
 from drakegrasp.mesh.surfaces import Faces, stack
-from drakegrasp.runtime.foreign_files import read_content
 from drakegrasp.runtime.json_text import parse_json
 
 #: Mesh files that can be read; other files are ignored.

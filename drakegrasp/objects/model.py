@@ -22,6 +22,7 @@ import trimesh
 
 from drakegrasp.config import ObjectConfig, PhysicsConfig
 from drakegrasp.errors import MeshError, one_line
+from drakegrasp.foreign_files import read_content
 from drakegrasp.frames import Array
 from drakegrasp.mesh.coarsening import coarsen
 from drakegrasp.mesh.components import count_parts
@@ -39,7 +40,6 @@ from drakegrasp.objects.sources import (
     upright_vertices,
 )
 from drakegrasp.runtime.files import write_atomic
-from drakegrasp.runtime.foreign_files import read_content
 from drakegrasp.runtime.names import is_name
 from drakegrasp.seeding import object_key
 

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 import h5py
 
 from drakegrasp.errors import DataError, DiskFullError
-from drakegrasp.runtime.foreign_files import LARGEST_SEALED, refuse_irregular
+from drakegrasp.foreign_files import LARGEST_SEALED, refuse_irregular
 from drakegrasp.runtime.processes import host_label, is_running
 
 if TYPE_CHECKING:

@@ -41,8 +41,8 @@ from io import FileIO
 from pathlib import Path
 from typing import Any
 
+from drakegrasp.foreign_files import LARGEST_TEXT, refuse_irregular
 from drakegrasp.runtime.files import temporary_name
-from drakegrasp.runtime.foreign_files import LARGEST_TEXT, refuse_irregular
 from drakegrasp.runtime.processes import lock_file
 
 #: Crashes in a row in one step after which it is not tried again: one may be the machine's fault.

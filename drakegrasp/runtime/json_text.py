@@ -10,7 +10,7 @@ import json
 from pathlib import Path
 from typing import Any, NoReturn
 
-from drakegrasp.runtime.foreign_files import LARGEST_TEXT, read_content
+from drakegrasp.foreign_files import LARGEST_TEXT, read_content
 
 
 def read_json(path: Path) -> Any:

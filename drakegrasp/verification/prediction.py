@@ -18,8 +18,8 @@ import numpy.typing as npt
 from drakegrasp.config import LARGEST
 from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.errors import GraspError, first_line
+from drakegrasp.foreign_files import read_text, refuse_irregular
 from drakegrasp.frames import Array, as_numbers, invert_pose
-from drakegrasp.runtime.foreign_files import read_text, refuse_irregular
 
 Frame = Literal["object", "camera", "workspace"]
 FRAMES: tuple[str, ...] = get_args(Frame)
