@@ -115,9 +115,10 @@ they are of two states, and every reader refuses them. The next command with OUT
 A dataset may come from anywhere. No link in its directory is followed when something is written or
 deleted. An HDF5 file that has soft or external links, values in another file or more rows than its
 bytes can hold is refused, and so are pipes, devices and files that are too large for what they
-should be; a link to a file is followed to read it, as the cache of a hub needs. Names of objects are names: printable, without slashes. What the hand in `hand/` names lies there: links
-that lead out, other paths and more than 512 MB are refused. Control characters reach no terminal,
-log or page.
+should be; a link to a file is followed to read it, as the cache of a hub needs. Names of objects
+are names: printable, without slashes. What the hand in `hand/` names lies there: links that lead
+out, other paths and more than 512 MB are refused. Control characters reach no terminal, log or
+page.
 
 ## Missing values
 
