@@ -269,10 +269,10 @@ def test_arrays_that_are_no_postures_are_refused_in_a_line(tmp_path, changes, wo
         ({"grasp_qpos": "a"}, "grasp_qpos must be numbers"),
         ({"grasp_qpos": np.zeros(23)}, "row 0: position and quaternion"),
         ({"joint_names": [1, 2]}, "joint_names must be a list of texts"),
-        ({"obj_pose": np.zeros(3)}, "obj_pose must be rows of a pose"),
+        ({"obj_pose": np.zeros(3)}, "obj_pose must be rows of 7 numbers or more"),
         ({"obj_pose": np.zeros(8)}, r"obj_pose must be 7 numbers for 1 or 1, got \(1, 8\)"),
         ({"obj_pose": np.zeros((3, 7))}, r"obj_pose must be 7 numbers .*, got \(3, 7\)"),
-        ({"squeeze_qpos": np.zeros((2, 23))}, "squeeze_qpos must be of 1 rows, got 2"),
+        ({"squeeze_qpos": np.zeros((2, 23))}, "the postures must have equal lengths"),
     ],
 )
 def test_dictionaries_that_are_no_grasps_are_refused_in_a_line(tmp_path, changes, words):
