@@ -63,6 +63,24 @@ def read_postures(path: Path, hand: Hand) -> PostureTable:
     raise GraspError(f"{path}: must be a file of postures ({known}), got another")
 
 
+def holds_postures(path: Path) -> bool:
+    """Return whether a file that holds postures or predictions of contacts holds postures.
+
+    Raises:
+        GraspError: If it cannot be read.
+    """
+    suffix = path.suffix.lower()
+    try:
+        if suffix in ARRAYS[1:] and path.is_file():
+            with open_hdf5(path) as file:
+                return "q_grasp" in file
+        if suffix in TABLES and path.is_file():
+            return "object" in _read_columns(path)
+    except (OSError, DataError, GraspError) as error:
+        raise GraspError(f"{path}: {one_line(error)}") from None
+    return suffix == ARRAYS[0] or suffix in YAMLS
+
+
 def _of_folder(folder: Path, hand: Hand) -> PostureTable:
     """Return the postures of all files of one foreign layout in a folder and those below."""
     for pattern, read in (("*.npy", read_dexgraspbench), ("*.y*ml", read_isaac_grasp)):

@@ -69,12 +69,12 @@ class PostureResult:
 
 
 def verify_postures(
-    files: Sequence[Path], trials: PostureTrials, execute: Executor = run_here
+    files: Sequence[Path | str], trials: PostureTrials, execute: Executor = run_here
 ) -> Iterator[PostureResult]:
     """Yield the verdicts on files, in their order.
 
     Args:
-        files: Of DexGraspBench's format.
+        files: Of DexGraspBench's format; a text says why a grasp is none.
         trials: From `prepare_trials`.
         execute: Runs the trials.
 
@@ -109,9 +109,11 @@ def prepare_trials(name: str, hand: Path, objects: Path) -> PostureTrials:
     return PostureTrials(protocol=stored, code=code, hand=hand, objects=objects)
 
 
-def _verify_one(task: tuple[Path, PostureTrials]) -> PostureResult:
+def _verify_one(task: tuple[Path | str, PostureTrials]) -> PostureResult:
     """Return the verdict on one file."""
     path, trials = task
+    if isinstance(path, str):
+        return _invalid(Path(), path)
     try:
         stored = read_grasp_file(path)
         motion, folder = one_motion(stored), inner_path(stored.object_path)

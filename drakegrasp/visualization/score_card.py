@@ -25,16 +25,18 @@ LONGEST = 28
 def card_picture(card: Mapping[str, Any], *, dpi: int = 150) -> bytes:
     """Return a card as PNG, at a resolution [pixels per inch]."""
     calibrated = {n: s["calibration"] for n, s in card["sets"].items() if s["calibration"]}
-    columns = 3 if calibrated else 2
+    protocol = card["settings"].get("protocol")
+    columns = 1 + (protocol is None) + bool(calibrated)
     size = (4.6 * columns, 1.6 + 0.36 * max(len(card["sets"]), 6))
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(1, columns, squeeze=False)[0]
     colours = _colours(card)
 
     _draw_headline(axes[0], card, colours)
-    _draw_curves(axes[1], card, colours)
+    if protocol is None:
+        _draw_curves(axes[1], card, colours)
     if calibrated:
-        _draw_calibration(axes[2], calibrated, colours)
+        _draw_calibration(axes[-1], calibrated, colours)
     for panel in axes:
         for side in ("top", "right"):
             panel.spines[side].set_visible(False)
@@ -68,10 +70,11 @@ def _draw_headline(axes: Axes, card: Mapping[str, Any], colours: Mapping[str, st
     axes.grid(axis="x", color="#E3E6EA")
     axes.set_axisbelow(True)
     axes.set_xlabel("per cent of rows, mean over objects", color=INK)
-    axes.set_title(
-        f"Sample within {card['limit_mm']:g} mm, 95 % interval\n(tick: held anywhere)",
-        fontsize="medium", color=INK,
-    )  # fmt: skip
+    protocol = card["settings"].get("protocol")
+    title = f"Sample within {card['limit_mm']:g} mm, 95 % interval\n(tick: held anywhere)"
+    if protocol is not None:
+        title = f"Success by {protocol['protocol']}, 95 % interval"
+    axes.set_title(title, fontsize="medium", color=INK)
 
 
 _ENDS = ("value", "low", "high")
