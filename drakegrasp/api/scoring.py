@@ -101,11 +101,12 @@ def score(
     )
 
     # Its verdicts, by this process or workers, and the card.
-    def try_all(grasps: Array, chosen: Sequence[int], deliver: Deliver) -> object:
+    def try_all(grasps: Array, chosen: Sequence[int], deliver: Deliver) -> None:
         placed = place_on_rows(grasps, dataset, chosen, overrides=settings)
         if peer:
-            return _try_by_protocol(placed, protocol, deliver, workers=workers, show=show)
-        return run_verification(
+            _try_by_protocol(placed, protocol, deliver, workers=workers, show=show)
+            return
+        run_verification(
             placed,
             workers=workers,
             scheduler=scheduler,

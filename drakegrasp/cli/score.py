@@ -96,12 +96,14 @@ def score(
     """
     from drakegrasp.api.scoring import score as score_predictions
     from drakegrasp.cli.tables import make_console, score_table
+    from drakegrasp.dataset.manifest import read_manifest
     from drakegrasp.dataset.reader import GraspDataset
     from drakegrasp.errors import DataError, GraspError
     from drakegrasp.scoring.references import REFERENCES
 
     # A bad dataset is wrong usage, as for `verify`.
     try:
+        read_manifest(dataset.parent)
         data = GraspDataset(dataset, split=split)
         trained = None if train is None else GraspDataset(train, split="train")
     except DataError as error:

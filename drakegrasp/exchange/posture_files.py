@@ -10,7 +10,7 @@ import csv
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
+from zipfile import BadZipFile, ZipFile
 
 import h5py
 import numpy as np
@@ -26,6 +26,8 @@ from drakegrasp.simulation.postures.table import PostureTable
 
 #: Suffixes of the layouts.
 ARRAYS, TABLES, YAMLS = (".npz", ".h5", ".hdf5"), (".csv", ".parquet"), (".yaml", ".yml")
+#: Arrays are smaller, all together [bytes]: two million postures of a hand with 16 joints.
+MOST_BYTES = 1_000_000_000
 #: The arrays of our own layout that are neither poses nor joints.
 _TEXTS = ("object", "joints", "source", "frame", "link")
 _KNOWN = (
@@ -102,15 +104,24 @@ def _of_folder(folder: Path, hand: Hand) -> PostureTable:
 def _read_arrays(path: Path) -> dict[str, Any]:
     try:
         if path.suffix.lower() == ".npz":
+            with path.open("rb") as raw, ZipFile(raw) as packed:
+                _refuse_large(sum(item.file_size for item in packed.infolist()))
             with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
                 return {name: file[name] for name in file.files}
         with open_hdf5(path) as file:
+            _refuse_large(sum(getattr(file[name], "nbytes", 0) for name in file))
             return {name: _dataset(file[name]) for name in file}
     except (
         *(OSError, EOFError, BadZipFile, MemoryError),
         *(TypeError, ValueError, KeyError, DataError),
     ) as error:
         raise GraspError(f"must be a readable file of arrays, got: {one_line(error)}") from None
+
+
+def _refuse_large(size: int) -> None:
+    """Refuse arrays that are larger than any postures: a small file can unpack to terabytes."""
+    if size > MOST_BYTES:
+        raise GraspError(f"arrays must be at most {MOST_BYTES:.0e} bytes, got {size:.1e}")
 
 
 def _dataset(item: h5py.Dataset | h5py.Group) -> Any:

@@ -240,7 +240,8 @@ def _more(card: Mapping[str, Any]) -> list[str]:
     # The curve, and what is told of what counts.
     names, lines = card["sets"], list[str]()
     if "protocol" not in card["settings"]:
-        lines += ["## held(d)", "", "Held with every contact within d of the one asked for [%].", ""]
+        words = "Held with every contact within d of the one asked for [%]."
+        lines += ["## held(d)", "", words, ""]
         lines += [_row(["d [mm]", *names]), _row(["---"] * (len(names) + 1))]
         for limit in map(str, CURVE_MM):
             cells = [_percent(each["held_within_mm"][limit]) for each in names.values()]

@@ -154,7 +154,8 @@ def build_object_scene(
     physics = model.own_physics(physics)
     draft = _draft(model, physics, resting_surface or model.resting_surface, meshcat)
     draft.plant.Finalize()
-    _part_surfaces(draft.plant, draft.scene_graph.collision_filter_manager(), (draft.object, draft.table), [])
+    manager = draft.scene_graph.collision_filter_manager()
+    _part_surfaces(draft.plant, manager, (draft.object, draft.table), [])
     return ObjectScene(**draft.scene_fields())
 
 
@@ -236,7 +237,8 @@ def _build(
 
     # What needs the finalized plant: collision filters and the wrist's input.
     parts = [geometry for geometry, _ in parts_of_hand["parts"]]
-    _part_surfaces(plant, scene_graph.collision_filter_manager(), (draft.object, draft.table), parts)
+    manager = scene_graph.collision_filter_manager()
+    _part_surfaces(plant, manager, (draft.object, draft.table), parts)
     _filter_within_hand(plant, scene_graph, instance, fingertips)
     draft.builder.Connect(
         trajectory.get_output_port(),

@@ -58,8 +58,8 @@ def _make_scene(model: ObjectModel, physics: PhysicsConfig, hand: Hand) -> Scene
         _diagrams[key] = known
         return swap_object(known, model, physics)
     while len(_diagrams) >= DIAGRAMS:
-        gone = _diagrams.pop(next(iter(_diagrams)))
-        _forget(lambda kept: isinstance(kept, Scene) and kept.plant is gone.plant)
+        plant = _diagrams.pop(next(iter(_diagrams))).plant
+        _forget(lambda kept, plant=plant: isinstance(kept, Scene) and kept.plant is plant)
     return _diagrams.setdefault(key, build_scene(model, physics, hand))
 
 

@@ -14,6 +14,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from drakegrasp.errors import GraspError
+from drakegrasp.exchange import posture_files
 from drakegrasp.exchange.posture_files import read_postures
 from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
@@ -121,6 +122,25 @@ def test_joints_that_the_hand_file_moves_may_be_left_out(tmp_path):
     assert q["index_pip_joint"] == pytest.approx(0.7)
     assert q["thumb_ip_joint"] == pytest.approx(0.175)
     assert q["thumb_opposition_joint"] == HAND.preshape["thumb_opposition_joint"]
+
+
+def test_degrees_are_refused_and_one_wild_row_is_not(tmp_path):
+    np.savez(tmp_path / "p.npz", **{**arrays(), "q_grasp": np.rad2deg(GRASP + 1.0)})
+    with pytest.raises(GraspError, match=r"grasp joints must be in radians, .* look like degrees"):
+        read_postures(tmp_path / "p.npz", HAND)
+
+    wild = np.concatenate([GRASP, GRASP[:1]])
+    wild[0, 0] = 50.0
+    rows = {name: np.concatenate([v, v[:1]]) for name, v in arrays().items() if len(v) == 2}
+    np.savez(tmp_path / "w.npz", **{**arrays(), **rows, "q_grasp": wild})
+    assert read_postures(tmp_path / "w.npz", HAND).q_grasp[0].max() == 50.0
+
+
+@pytest.mark.parametrize("write", [write_npz, write_hdf5])
+def test_arrays_larger_than_any_postures_are_refused(tmp_path, write, monkeypatch):
+    monkeypatch.setattr(posture_files, "MOST_BYTES", 100)
+    with pytest.raises(GraspError, match=r"arrays must be at most 1e\+02 bytes, got"):
+        read_postures(write(tmp_path), HAND)
 
 
 # Formats of others
