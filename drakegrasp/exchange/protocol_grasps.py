@@ -53,8 +53,11 @@ def write_grasps(
         hand: Their hand.
         folder: To which the paths of objects in the files are relative.
     """
+    # The hand, and where its spread is among the joints.
     files, written = BenchFiles(hand, folder), set[str]()
     spread = joint_order(hand).index(hand.spread.joints[0]) if hand.spread.joints else None
+
+    # Each grasp, and its object before the first.
     found = list[Path | str]()
     for number, each in enumerate(grasps):
         posture, placed = each.posture, each.placed

@@ -18,6 +18,7 @@ from typing import TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
+from pydrake.multibody.plant import MultibodyPlant
 
 from drakegrasp.config import CameraConfig, PhysicsConfig
 from drakegrasp.hand.description import Hand, load_hand
@@ -58,8 +59,7 @@ def _make_scene(model: ObjectModel, physics: PhysicsConfig, hand: Hand) -> Scene
         _diagrams[key] = known
         return swap_object(known, model, physics)
     while len(_diagrams) >= DIAGRAMS:
-        plant = _diagrams.pop(next(iter(_diagrams))).plant
-        _forget(lambda kept, plant=plant: isinstance(kept, Scene) and kept.plant is plant)
+        _forget(_diagrams.pop(next(iter(_diagrams))).plant)
     return _diagrams.setdefault(key, build_scene(model, physics, hand))
 
 
@@ -73,7 +73,7 @@ def forget_scenes() -> None:
     """Drop every scene: one in which Drake failed must not be used again."""
     with _lock:
         _diagrams.clear()
-        _forget(lambda kept: isinstance(kept, Scene))
+        _forget()
 
 
 def _cached(key: Hashable, build: Callable[[], _Kept]) -> _Kept:
@@ -90,10 +90,11 @@ def _cached(key: Hashable, build: Callable[[], _Kept]) -> _Kept:
         return cast(_Kept, kept)
 
 
-def _forget(which: Callable[[Scene | Renderer], bool]) -> None:
-    """Drop some of what is kept."""
-    for key in [key for key, kept in _kept.items() if which(kept)]:
-        del _kept[key]
+def _forget(plant: MultibodyPlant | None = None) -> None:
+    """Drop the scenes of a plant, or all."""
+    for key, kept in list(_kept.items()):
+        if isinstance(kept, Scene) and plant in (None, kept.plant):
+            del _kept[key]
     # Diagrams sit in reference cycles and own memory that Python does not count.
     gc.collect()
 

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from drakegrasp.errors import GraspError
 from drakegrasp.exchange import posture_files
 from drakegrasp.exchange.posture_files import read_postures
+from drakegrasp.exchange.posture_rows import quaternion_poses
 from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
 from drakegrasp.simulation.postures.posture import joint_order
@@ -141,6 +142,13 @@ def test_arrays_larger_than_any_postures_are_refused(tmp_path, write, monkeypatc
     monkeypatch.setattr(posture_files, "MOST_BYTES", 100)
     with pytest.raises(GraspError, match=r"arrays must be at most 1e\+02 bytes, got"):
         read_postures(write(tmp_path), HAND)
+
+
+def test_quaternion_of_another_length_is_refused_and_a_rounded_one_is_not():
+    with pytest.raises(GraspError, match="row 1: position and quaternion must be finite"):
+        quaternion_poses(np.zeros((2, 3)), [[1.0, 0.0, 0.0, 0.0], [1.002, 0.0, 0.0, 0.0]])
+    (X,) = quaternion_poses([[1.0, 2.0, 3.0]], [[0.9995, 0.0, 0.0, 0.0]])
+    np.testing.assert_allclose(X, make_pose(np.eye(3), [1.0, 2.0, 3.0]), atol=1e-15)
 
 
 # Formats of others
