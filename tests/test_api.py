@@ -79,6 +79,7 @@ def test_workers_change_nothing(test_split: GraspDataset, tmp_path: Path) -> Non
     assert (tmp_path / "here.h5").read_bytes() == (tmp_path / "there.h5").read_bytes()
     names = test_split.column("object_props/object_name")[rows]
     assert [v.placed.model.name for v in here] == names.tolist()
+    assert all(isinstance(v.placed, PlacedObject) for v in here)
 
 
 def test_results_come_in_the_order_of_the_grasps(cube: PlacedObject) -> None:

@@ -64,7 +64,7 @@ WALLS = {
     ),
     "mujoco": ("mjcf", "protocols.scene", "bench", "exchange.mujoco_scenes"),
     "coacd": ("mjcf.convex_parts",),
-    "pyarrow": ("exchange", "scoring.ranked"),
+    "pyarrow": ("exchange", "verification.prediction"),
     "torch": ("dataset.loaders.torch_samples",),
 }
 #: Modules that name a type of a library for the type checker alone: what callers give or get.

@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TypeAlias
 
 import numpy.typing as npt
 
 from drakegrasp.api.verifying import run_verification
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.errors import GraspError
+from drakegrasp.errors import ConfigError, GraspError
+from drakegrasp.exchange.protocol_grasps import fitted_postures, write_grasps
 from drakegrasp.frames import Array
+from drakegrasp.hand.description import load_hand
+from drakegrasp.protocols.catalog import Lift, find_protocol
+from drakegrasp.protocols.postures import describe, prepare_trials, verify_postures, versions
+from drakegrasp.runtime.executor import processes
+from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.scoring.ranked import ranked_sets
 from drakegrasp.scoring.references import REFERENCES
 from drakegrasp.scoring.run import Request, Score
 from drakegrasp.scoring.run import score as score_request
-from drakegrasp.verification.batch import ResultCallback
+from drakegrasp.scoring.verdict import Verdict, protocol_verdict, verdict_of
 from drakegrasp.verification.placed_grasp import dataset_config, overridden_keys, place_on_rows
+from drakegrasp.verification.verify import PlacedGrasp
+
+#: Receives verdicts as they come: called with the place of a grasp and its verdict.
+Deliver: TypeAlias = Callable[[int, Verdict], None]
 
 
 def score(
@@ -29,6 +41,7 @@ def score(
     references: Sequence[str] = tuple(REFERENCES),
     per_object: int | None = None,
     overrides: Sequence[str] = (),
+    protocol: str = "lift",
     out: str | Path | None = None,
     again: str = "drakegrasp.score",
     workers: int | None = None,
@@ -50,6 +63,8 @@ def score(
         per_object: Rows of each object, at most; all if None.
         overrides: `"key=value"` settings; `verify.max_tries` is 1 if they do not say otherwise,
             because the headline is of the first wrist pose.
+        protocol: The rule of a verdict, by name or `FILE.py:NAME`. All but "lift" try the first
+            wrist pose of a prediction in MuJoCo, on this machine.
         out: Folder that keeps verdicts, so that the same call goes on, and gets the card.
         again: What the card says about how to make it again.
         workers: Processes on this machine; one per core if None.
@@ -68,6 +83,10 @@ def score(
         raise GraspError(f"references must be of {', '.join(REFERENCES)}, got {unknown[0]!r}")
     settings = ("verify.max_tries=1", *overrides)
     name, ranked = ranked_sets(predictions, dataset, rows=rows, confidence=confidence)
+    rule, stored = find_protocol(protocol)
+    peer = not isinstance(rule, Lift)
+    if peer and (scheduler or scheduler_file):
+        raise ConfigError(f"scheduler must be None with protocol {stored}, got one")
     request = Request(
         data=dataset,
         train=GraspDataset(dataset.path, split="train") if train is None else train,
@@ -78,17 +97,21 @@ def score(
         config=dataset_config(dataset, overrides=settings),
         overridden=tuple(overridden_keys(settings)),
         again=again,
+        protocol={**describe(rule, stored), "versions": versions()} if peer else None,
     )
 
     # Its verdicts, by this process or workers, and the card.
-    def try_all(grasps: Array, chosen: Sequence[int], on_result: ResultCallback) -> object:
+    def try_all(grasps: Array, chosen: Sequence[int], deliver: Deliver) -> None:
         placed = place_on_rows(grasps, dataset, chosen, overrides=settings)
-        return run_verification(
+        if peer:
+            _try_by_protocol(placed, protocol, deliver, workers=workers, show=show)
+            return
+        run_verification(
             placed,
             workers=workers,
             scheduler=scheduler,
             scheduler_file=scheduler_file,
-            on_result=on_result,
+            on_result=lambda index, result: deliver(index, verdict_of(result)),
             show=show,
         )
 
@@ -96,3 +119,25 @@ def score(
     if out is not None:
         scored.save(Path(out))
     return scored
+
+
+def _try_by_protocol(
+    grasps: Sequence[PlacedGrasp],
+    protocol: str,
+    deliver: Deliver,
+    *,
+    workers: int | None,
+    show: bool,
+) -> None:
+    """Try the first wrist pose of grasps by a protocol of MuJoCo."""
+    hand = load_hand(grasps[0].config.hand_source)
+    with (
+        TemporaryDirectory() as folder,
+        processes(workers) as execute,
+        progress_bar("score", "grasps", show=show) as report,
+    ):
+        path, files = write_grasps(list(fitted_postures(grasps)), hand, Path(folder))
+        found = verify_postures(files, prepare_trials(protocol, path, Path(folder)), execute)
+        for done, (grasp, result) in enumerate(zip(grasps, found, strict=True), start=1):
+            deliver(grasp.index, protocol_verdict(grasp, result.verdict))
+            report(done, len(grasps))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -175,6 +175,14 @@ def verify_rows(
         predictions, data, rows, frame=frame, hand=hand, method=method, snap_points=snap_points,
         config=config,
     )  # fmt: skip
+
+    # The object of a verdict can verify more grasps.
+    things = {id(grasp.placed): grasp.placed for grasp in placed}
+    doors = {
+        key: PlacedObject(model=thing.model, X_TO=thing.X_TO, config=thing.config)
+        for key, thing in things.items()
+    }
+    placed = [replace(grasp, placed=doors[id(grasp.placed)]) for grasp in placed]
     return _verify_on(client, placed, show=show)
 
 

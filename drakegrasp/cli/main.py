@@ -27,7 +27,7 @@ from drakegrasp.cli.inspect import figures, inspect_
 from drakegrasp.cli.morph import morph
 from drakegrasp.cli.options import PATH, chosen_settings, dataset_argument, shared
 from drakegrasp.cli.score import bench_set, score
-from drakegrasp.cli.verify import verify
+from drakegrasp.cli.verify.command import verify
 from drakegrasp.runtime.allocator import restart_with_jemalloc
 
 

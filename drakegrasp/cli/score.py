@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -54,6 +54,14 @@ DEFAULT_FOLDER = Path("score")
 )
 @shared("--set")
 @click.option(
+    "--protocol",
+    metavar="NAME|FILE.py:NAME",
+    default="lift",
+    show_default=True,
+    help="The rule of a verdict, see `drakegrasp verify`. All but lift try the first wrist pose of "
+    "a prediction in MuJoCo.",
+)
+@click.option(
     "--out",
     type=PATH,
     metavar="DIR",
@@ -72,12 +80,11 @@ def score(
     references: tuple[str, ...],
     per_object: int | None,
     overrides: tuple[str, ...],
+    protocol: str,
     out: Path,
     as_json: bool,
-    workers: int | None,
-    scheduler: str | None,
-    scheduler_file: Path | None,
     quiet: bool,
+    **workers: Any,
 ) -> None:
     """Score predicted grasps beside reference rows, and write a card.
 
@@ -89,21 +96,32 @@ def score(
     """
     from drakegrasp.api.scoring import score as score_predictions
     from drakegrasp.cli.tables import make_console, score_table
+    from drakegrasp.dataset.manifest import read_manifest
     from drakegrasp.dataset.reader import GraspDataset
+    from drakegrasp.errors import DataError, GraspError
     from drakegrasp.scoring.references import REFERENCES
 
+    # A bad dataset is wrong usage, as for `verify`.
+    try:
+        read_manifest(dataset.parent)
+        data = GraspDataset(dataset, split=split)
+        trained = None if train is None else GraspDataset(train, split="train")
+    except DataError as error:
+        raise GraspError(str(error)) from None
+    again = _command(
+        predictions, dataset, split, train, references, per_object, overrides, protocol
+    )
     scored = score_predictions(
         predictions,
-        GraspDataset(dataset, split=split),
-        train=None if train is None else GraspDataset(train, split="train"),
+        data,
+        train=trained,
         references=references or tuple(REFERENCES),
         per_object=per_object,
         overrides=overrides,
+        protocol=protocol,
         out=out,
-        again=_command(predictions, dataset, split, train, references, per_object, overrides),
-        workers=workers,
-        scheduler=scheduler,
-        scheduler_file=scheduler_file,
+        again=again,
+        **workers,
         show=not quiet,
     )
     if as_json:
@@ -132,6 +150,7 @@ def _command(
     references: tuple[str, ...],
     per_object: int | None,
     overrides: tuple[str, ...],
+    protocol: str,
 ) -> str:
     """Return the command that makes the card again, without what changes no verdict."""
     words = ["drakegrasp", "score", *map(str, predictions), "--dataset", str(dataset)]
@@ -142,6 +161,7 @@ def _command(
     words += [] if per_object is None else ["--per-object", str(per_object)]
     for text in overrides:
         words += ["--set", text]
+    words += [] if protocol == "lift" else ["--protocol", protocol]
     return shlex.join(words)
 
 
@@ -152,10 +172,8 @@ def bench_set(
     out: Path,
     only: tuple[str, ...],
     overrides: tuple[str, ...],
-    workers: int | None,
-    scheduler: str | None,
-    scheduler_file: Path | None,
     quiet: bool,
+    **workers: Any,
 ) -> None:
     """Make the frozen benchmark drakegrasp-bench-1 in OUT.
 
@@ -170,9 +188,7 @@ def bench_set(
         out,
         only=only,
         overrides=overrides,
-        workers=workers,
-        scheduler=scheduler,
-        scheduler_file=scheduler_file,
+        **workers,
         show=not quiet,
     )
     print_report(report)

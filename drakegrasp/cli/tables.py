@@ -395,7 +395,9 @@ def cross_check_lines(report: Mapping[str, Any]) -> list[str]:
 def score_table(card: Mapping[str, Any], seconds: Mapping[str, float]) -> Table:
     """Return the sets of a score card beside each other, with seconds per verdict."""
     names = [name for name in card["measures"] if name != "headline"]
-    title = f"Sample, success@1, first wrist pose, mean over {card['objects']} objects [%]"
+    protocol = card["settings"].get("protocol")
+    counts = "Sample" if protocol is None else f"By {protocol['protocol']}"
+    title = f"{counts}, success@1, first wrist pose, mean over {card['objects']} objects [%]"
     table = _table(title, "set", "headline", "95 %\ninterval", *names, "s per\nverdict")
     for name, each in card["sets"].items():
         values = each["measures"]

@@ -355,7 +355,7 @@ def read_manifest(out: Path) -> Manifest:
         tree, content = read_mapping(path, "a readable manifest")
     except FileNotFoundError:
         raise DataError(
-            f"{out}: must be the directory of a dataset, got one without {FILE_NAME}"
+            f"{out.absolute()}: must be the directory of a dataset, got one without {FILE_NAME}"
         ) from None
 
     # The version first: another schema may have other keys.

@@ -36,7 +36,8 @@ from drakegrasp.exchange.closed_grasps import ClosedGrasp, read_closed_grasps
 from drakegrasp.frames import Array, invert_pose
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.mesh.wavefront import hull_text
-from drakegrasp.objects.model import load_object
+from drakegrasp.objects.model import ObjectModel, load_object
+from drakegrasp.protocols.grasp_file import POSTURES
 from drakegrasp.runtime.progress import Report
 from drakegrasp.visualization.still_scene import StillScene
 
@@ -49,13 +50,9 @@ ASSETS, EXPERIMENT = Path("assets/drakegrasp"), "export"
 
 def write_dexgraspbench(out: Path, folder: Path, progress: Report) -> int:
     """Write the files and return the number of samples; see `export.export_dataset`."""
-    from drakegrasp.mjcf.convex_parts import convex_parts
-    from drakegrasp.mjcf.hand_model import make_hand_model, write_hand_model
-
     # The hand, by a name that the benchmark does not have.
     hand = load_hand(read_manifest(out).config.hand_source)
-    model, posed = make_hand_model(hand), StillScene(hand)
-    write_hand_model(model, folder / ASSETS / "hand" / "hand.xml")
+    files = BenchFiles(hand, folder)
     name = f"drakegrasp_{hand.name}"
     (folder / "config" / "hand").mkdir(parents=True)
     settings = yaml.safe_dump(hand_settings(hand), sort_keys=False)
@@ -66,16 +63,57 @@ def write_dexgraspbench(out: Path, folder: Path, progress: Report) -> int:
     progress(0, len(grasps))
     done, data = 0, folder / "output" / f"{EXPERIMENT}_{name}" / "graspdata"
     for thing, same in groupby(grasps, key=lambda grasp: grasp.object_name):
-        write_object(
-            folder / ASSETS / "objects" / thing, convex_parts(load_object(model_path(out, thing)))
-        )
-        (data / thing).mkdir(parents=True)
+        files.write_object(load_object(model_path(out, thing)))
         for grasp in same:
-            content: Any = grasp_dictionary(hand, posed, model.joints, grasp)
-            np.save(data / thing / f"{grasp.trial_id}.npy", content)
+            files.write_grasp(data / thing / f"{grasp.trial_id}.npy", grasp)
             done += 1
             progress(done, len(grasps))
     return done
+
+
+class BenchFiles:
+    """Writes a hand, objects and grasps as the benchmark reads them.
+
+    Attributes:
+        hand_path: MJCF of the hand.
+    """
+
+    def __init__(self, hand: Hand, folder: Path) -> None:
+        """Write the hand.
+
+        Args:
+            hand: The hand.
+            folder: To which the paths of objects in the files are relative.
+        """
+        from drakegrasp.mjcf.hand_model import make_hand_model, write_hand_model
+
+        model = make_hand_model(hand)
+        self.posed, self._joints = StillScene(hand), model.joints
+        self._folder, self.hand_path = folder, folder / ASSETS / "hand" / "hand.xml"
+        write_hand_model(model, self.hand_path)
+
+    def write_object(self, model: ObjectModel) -> None:
+        """Write an object's convex parts."""
+        from drakegrasp.mjcf.convex_parts import convex_parts
+
+        write_object(self._folder / ASSETS / "objects" / model.name, convex_parts(model))
+
+    def write_grasp(self, path: Path, grasp: ClosedGrasp, **known: Array | None) -> None:
+        """Write a grasp.
+
+        Args:
+            path: Of its file.
+            grasp: The grasp.
+            known: (j,), joints of "pregrasp" and "squeeze" in the plant's order, where they are
+                not to be derived from the grasp.
+        """
+        content: Any = grasp_dictionary(self.posed.hand, self.posed, self._joints, grasp)
+        places = [self.posed.joints.index(name) for name in self._joints]
+        for stage, q in known.items():
+            if q is not None:
+                content[POSTURES[stage]][7:] = q[places]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.save(path, content)
 
 
 def hand_settings(hand: Hand) -> dict[str, Any]:

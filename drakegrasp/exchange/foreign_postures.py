@@ -2,10 +2,8 @@
 
 In: a file. Out: its `Rows`. Two formats:
 
-* DexGraspBench (github JYChen18/DexGraspBench), which BODex and Dexonomy write: a .npy file with a
-  pickled dictionary of a grasp or of several. `pregrasp_qpos`, `grasp_qpos` and `squeeze_qpos` are
-  the position [m] and the quaternion (w, x, y, z) of the hand's root, then the joints; `obj_pose`
-  the object's in the same frame, `obj_scale` its scale, `obj_path` its folder.
+* DexGraspBench (github JYChen18/DexGraspBench), which BODex and Dexonomy write, see
+  `protocols.grasp_file`;
 * isaac_grasp 1.0 (nvidia-isaac-ros.github.io, "Isaac Grasp File"): a YAML file of the grasps of one
   object, each with the gripper's pose in the object's frame and joints by name.
 
@@ -21,15 +19,13 @@ import numpy as np
 import yaml
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.errors import GraspError, one_line
+from drakegrasp.errors import DataError, GraspError, one_line
 from drakegrasp.exchange.posture_rows import Rows, quaternion_poses
-from drakegrasp.frames import Array, invert_pose
+from drakegrasp.frames import invert_pose
 from drakegrasp.hand.description import Hand
-from drakegrasp.runtime.plain_pickle import read_plain_pickle
+from drakegrasp.protocols.grasp_file import read_grasp_file
 from drakegrasp.yaml_text import parse_yaml
 
-#: The postures of DexGraspBench, by what they are to us.
-QPOS = {"grasp": "grasp_qpos", "pregrasp": "pregrasp_qpos", "squeeze": "squeeze_qpos"}
 #: What an isaac_grasp file of ours says of its origin.
 CREATED_WITH = "drakegrasp"
 
@@ -40,67 +36,25 @@ def read_dexgraspbench(path: Path, hand: Hand) -> Rows:
     Raises:
         GraspError: If it is none.
     """
-    content = read_plain_pickle(path)
-    if not isinstance(content, dict):
-        raise GraspError(f"{path}: must hold a dictionary, got {type(content).__name__}")
-    for key in ("grasp_qpos", "obj_path"):
-        if key not in content:
-            got = ", ".join(map(str, content))
-            raise GraspError(f"{path}: {key} must be in the dictionary, got {got}")
-    qpos = {
-        stage: _vectors(path, content[key], key) for stage, key in QPOS.items() if key in content
-    }
-    grasp = qpos["grasp"]
+    try:
+        stored = read_grasp_file(path)
+    except DataError as error:
+        raise GraspError(f"{path}: {error}") from None
 
     # The root of the hand in the object's frame, in metres.
-    count = len(grasp)
-    for stage, rows in qpos.items():
-        if len(rows) != count:
-            raise GraspError(f"{path}: {QPOS[stage]} must be of {count} rows, got {len(rows)}")
-    obj_pose = content.get("obj_pose", [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-    pose = _vectors(path, obj_pose, "obj_pose")
-    if pose.shape not in ((1, 7), (count, 7)):
-        raise GraspError(f"{path}: obj_pose must be 7 numbers for 1 or {count}, got {pose.shape}")
-    pose = np.broadcast_to(pose, (count, 7))
+    grasp, pose = stored.postures["grasp"], stored.object_pose
     X_WM = quaternion_poses(pose[:, :3], pose[:, 3:])
     X_WL = quaternion_poses(grasp[:, :3], grasp[:, 3:7])
-    try:
-        scale = np.broadcast_to(
-            np.asarray(content.get("obj_scale", np.nan), dtype=float).ravel(), (count,)
-        )
-    except (TypeError, ValueError):
-        raise GraspError(f"{path}: obj_scale must be one number, got something else") from None
-    own = "joint_units" in content
     return Rows(
-        objects=[PurePosixPath(str(content["obj_path"])).name] * count,
+        objects=[PurePosixPath(stored.object_path).name] * len(grasp),
         X_FL=multiply(invert_pose(X_WM), X_WL),
         link=hand.palm_link,
-        frame="object" if own else "mesh",
-        q={stage: rows[:, 7:] for stage, rows in qpos.items()},
-        joints=_names(path, content.get("joint_names")),
-        numbers={} if own else {"scale": scale},
-        said=[path.name] * count,
+        frame="object" if stored.exported else "mesh",
+        q={stage: rows[:, 7:] for stage, rows in stored.postures.items()},
+        joints=stored.joints,
+        numbers={} if stored.exported else {"scale": stored.object_scale},
+        said=[path.name] * len(grasp),
     )
-
-
-def _vectors(path: Path, value: Any, key: str) -> Array:
-    """Return numbers as rows (n, m) of at least seven."""
-    try:
-        rows = np.atleast_2d(np.asarray(value, dtype=float))
-    except (TypeError, ValueError):
-        raise GraspError(f"{path}: {key} must be numbers, got something else") from None
-    if rows.ndim != 2 or rows.shape[1] < 7:
-        raise GraspError(f"{path}: {key} must be rows of a pose and joints, got {rows.shape}")
-    return rows
-
-
-def _names(path: Path, value: Any) -> list[str] | None:
-    if value is None:
-        return None
-    names = value.tolist() if isinstance(value, np.ndarray) else value
-    if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
-        raise GraspError(f"{path}: joint_names must be a list of texts, got something else")
-    return list(names)
 
 
 def read_isaac_grasp(path: Path, hand: Hand) -> Rows:

@@ -10,7 +10,7 @@ import csv
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
+from zipfile import BadZipFile, ZipFile
 
 import h5py
 import numpy as np
@@ -26,6 +26,8 @@ from drakegrasp.simulation.postures.table import PostureTable
 
 #: Suffixes of the layouts.
 ARRAYS, TABLES, YAMLS = (".npz", ".h5", ".hdf5"), (".csv", ".parquet"), (".yaml", ".yml")
+#: Arrays are smaller, all together [bytes]: two million postures of a hand with 16 joints.
+MOST_BYTES = 1_000_000_000
 #: The arrays of our own layout that are neither poses nor joints.
 _TEXTS = ("object", "joints", "source", "frame", "link")
 _KNOWN = (
@@ -63,6 +65,24 @@ def read_postures(path: Path, hand: Hand) -> PostureTable:
     raise GraspError(f"{path}: must be a file of postures ({known}), got another")
 
 
+def holds_postures(path: Path) -> bool:
+    """Return whether a file that holds postures or predictions of contacts holds postures.
+
+    Raises:
+        GraspError: If it cannot be read.
+    """
+    suffix = path.suffix.lower()
+    try:
+        if suffix in ARRAYS[1:] and path.is_file():
+            with open_hdf5(path) as file:
+                return "q_grasp" in file
+        if suffix in TABLES and path.is_file():
+            return "object" in _read_columns(path)
+    except (OSError, DataError, GraspError) as error:
+        raise GraspError(f"{path}: {one_line(error)}") from None
+    return suffix == ARRAYS[0] or suffix in YAMLS
+
+
 def _of_folder(folder: Path, hand: Hand) -> PostureTable:
     """Return the postures of all files of one foreign layout in a folder and those below."""
     for pattern, read in (("*.npy", read_dexgraspbench), ("*.y*ml", read_isaac_grasp)):
@@ -84,15 +104,24 @@ def _of_folder(folder: Path, hand: Hand) -> PostureTable:
 def _read_arrays(path: Path) -> dict[str, Any]:
     try:
         if path.suffix.lower() == ".npz":
+            with path.open("rb") as raw, ZipFile(raw) as packed:
+                _refuse_large(sum(item.file_size for item in packed.infolist()))
             with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
                 return {name: file[name] for name in file.files}
         with open_hdf5(path) as file:
+            _refuse_large(sum(getattr(file[name], "nbytes", 0) for name in file))
             return {name: _dataset(file[name]) for name in file}
     except (
         *(OSError, EOFError, BadZipFile, MemoryError),
         *(TypeError, ValueError, KeyError, DataError),
     ) as error:
         raise GraspError(f"must be a readable file of arrays, got: {one_line(error)}") from None
+
+
+def _refuse_large(size: int) -> None:
+    """Refuse arrays that are larger than any postures: a small file can unpack to terabytes."""
+    if size > MOST_BYTES:
+        raise GraspError(f"arrays must be at most {MOST_BYTES:.0e} bytes, got {size:.1e}")
 
 
 def _dataset(item: h5py.Dataset | h5py.Group) -> Any:

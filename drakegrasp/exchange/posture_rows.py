@@ -134,8 +134,10 @@ def _in_order(hand: Hand, part: Rows) -> dict[str, Array]:
     if missing := [name for name in order if name not in known]:
         raise GraspError(f"joints must include {listed(missing)}, got {listed(joints)}")
     found = {}
+    turning = [hand.joint_units[name] == "rad" for name in joints]
     for stage, values in part.q.items():
         rows = _rows(values, len(joints), stage)
+        _refuse_degrees(rows[:, turning], stage)
         columns = dict(zip(joints, rows.T, strict=True))
         for name in order:
             if name not in columns and name in hand.preshape:
@@ -155,6 +157,16 @@ def _rows(values: Any, count: int, stage: str) -> Array:
     if rows.ndim != 2 or rows.shape[1] != count:
         raise GraspError(f"{stage} joints must be of shape (n, {count}), got {rows.shape}")
     return rows
+
+
+def _refuse_degrees(rows: Array, stage: str) -> None:
+    """Refuse joints of which most rows have one beyond a whole turn, as in degrees."""
+    largest = np.abs(rows[np.isfinite(rows).all(axis=1)]).max(axis=1, initial=0.0)
+    if len(largest) and np.median(largest) > 2.0 * np.pi:
+        raise GraspError(
+            f"{stage} joints must be in radians, got up to {largest.max():.4g}: these look like "
+            "degrees"
+        )
 
 
 def quaternion_poses(positions: npt.ArrayLike, quaternions: npt.ArrayLike) -> Array:

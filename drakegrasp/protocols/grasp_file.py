@@ -1,11 +1,12 @@
-"""A grasp as DexGraspBench stores it: a .npy file with three postures and the pose of an object.
+"""Grasps as DexGraspBench stores them: a .npy file with postures and the pose of an object.
 
-In: the file, which may be a stranger's. Out: a `StoredGrasp`. Such a file is a pickle; only arrays,
-numbers, texts and containers are read from it, and no code runs.
+In: the file, which may be a stranger's. Out: its `StoredGrasps`, and the `GraspMotion` of one. Such
+a file is a pickle; only arrays, numbers, texts and containers are read from it, and no code runs.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,52 +19,95 @@ from drakegrasp.protocols.protocol import GraspMotion
 from drakegrasp.runtime.plain_pickle import read_plain_pickle
 
 #: Keys of the postures, in the order of `GraspMotion`.
-POSTURES = ("pregrasp_qpos", "grasp_qpos", "squeeze_qpos")
+POSTURES = {"pregrasp": "pregrasp_qpos", "grasp": "grasp_qpos", "squeeze": "squeeze_qpos"}
 #: A hand farther from the object is a mistake of units [m].
 FAR = 10.0
+_ORIGIN = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class StoredGrasp:
-    """A grasp of a file.
+class StoredGrasps:
+    """The n grasps of a file, on one object, with a hand of m joints.
+
+    A pose is a position [m] and a quaternion (w, x, y, z); those of hand and object have one frame.
 
     Attributes:
-        motion: The postures and the object's pose.
-        object_path: Folder of the object, relative to that of all objects.
-        object_scale: Its scale.
+        postures: (n, 7 + m), pose of the hand's root and joints, by "grasp", and "pregrasp" and
+            "squeeze" if the file has them.
+        object_pose: (n, 7), of the object; none is the origin.
+        object_path: Folder of the object.
+        object_scale: (n,), its scale; NaN if the file does not say.
+        joints: (m,), their names; None if the file does not say.
+        exported: Whether drakegrasp wrote the file.
     """
 
-    motion: GraspMotion
-    object_path: Path
-    object_scale: float
+    postures: Mapping[str, Array]
+    object_pose: Array
+    object_path: str
+    object_scale: Array
+    joints: tuple[str, ...] | None
+    exported: bool
 
 
-def read_grasp_file(path: Path) -> StoredGrasp:
-    """Return the grasp of a file.
+def read_grasp_file(path: Path) -> StoredGrasps:
+    """Return the grasps of a file; their numbers may still be none of a grasp.
 
     Raises:
-        DataError: If the file is none of a grasp, or its numbers cannot be a grasp's.
+        DataError: If the file has none.
     """
     content = read_dictionary(path)
-    missing = [k for k in (*POSTURES, "obj_pose", "obj_scale", "obj_path") if k not in content]
-    if missing:
-        raise DataError(f"must have {missing[0]}, got none")
+    for key in ("grasp_qpos", "obj_path"):
+        if key not in content:
+            raise DataError(f"must have {key}, got {', '.join(map(str, content))}")
+    postures = {name: _rows(content, key) for name, key in POSTURES.items() if key in content}
+    grasp = postures["grasp"]
+    if any(each.shape != grasp.shape for each in postures.values()):
+        raise DataError("the postures must have equal lengths")
 
-    pregrasp, grasp, squeeze = (_vector(content, key) for key in POSTURES)
-    if not pregrasp.shape == grasp.shape == squeeze.shape:
-        raise DataError("the three postures must have equal lengths")
-    object_pose = _vector(content, "obj_pose")
-    if len(object_pose) != 7:
-        raise DataError(f"obj_pose must be 7 numbers, got {len(object_pose)}")
-    if max(np.linalg.norm(q[:3] - object_pose[:3]) for q in (pregrasp, grasp, squeeze)) > FAR:
-        raise DataError(f"the hand must be within {FAR:g} m of the object")
-    return StoredGrasp(
-        motion=GraspMotion(
-            pregrasp=pregrasp, grasp=grasp, squeeze=squeeze, object_pose=object_pose
-        ),
-        object_path=_inner_path(content["obj_path"]),
-        object_scale=float(_numbers(content, "obj_scale").reshape(-1)[0]),
+    # Of the object.
+    count = len(grasp)
+    poses = _rows({"obj_pose": _ORIGIN, **content}, "obj_pose")
+    if poses.shape not in ((1, 7), (count, 7)):
+        raise DataError(f"obj_pose must be 7 numbers for 1 or {count}, got {poses.shape}")
+    scale = _numbers({"obj_scale": np.nan, **content}, "obj_scale").ravel()
+    if len(scale) not in (1, count):
+        raise DataError(f"obj_scale must be a number, for 1 or {count}, got {len(scale)}")
+    return StoredGrasps(
+        postures=postures,
+        object_pose=np.broadcast_to(poses, (count, 7)),
+        object_path=str(content["obj_path"]),
+        object_scale=np.broadcast_to(scale, (count,)),
+        joints=_names(content.get("joint_names")),
+        exported="joint_units" in content,
     )
+
+
+def one_motion(grasps: StoredGrasps) -> GraspMotion:
+    """Return the motion of the one grasp of a file.
+
+    Raises:
+        DataError: If there are more, a posture is missing, or the numbers cannot be a grasp's.
+    """
+    if len(grasps.object_pose) != 1:
+        raise DataError(f"grasp_qpos must be a vector, got {len(grasps.object_pose)} of them")
+    if missing := [key for name, key in POSTURES.items() if name not in grasps.postures]:
+        raise DataError(f"must have {missing[0]}, got none")
+    vectors = {name: _unit(grasps.postures[name][0], key) for name, key in POSTURES.items()}
+    object_pose = _unit(grasps.object_pose[0], "obj_pose")
+    if max(np.linalg.norm(q[:3] - object_pose[:3]) for q in vectors.values()) > FAR:
+        raise DataError(f"the hand must be within {FAR:g} m of the object")
+    return GraspMotion(**vectors, object_pose=object_pose)
+
+
+def inner_path(path: str) -> Path:
+    """Return a path that does not leave the folder of the objects.
+
+    Raises:
+        DataError: If it does.
+    """
+    if Path(path).is_absolute() or ".." in Path(path).parts or "\0" in path:
+        raise DataError(f"obj_path must be a path within the folder of the objects, got {path!r}")
+    return Path(path)
 
 
 def read_dictionary(path: Path) -> dict[str, Any]:
@@ -81,34 +125,35 @@ def read_dictionary(path: Path) -> dict[str, Any]:
     return content
 
 
-def _numbers(content: dict[str, Any], key: str) -> Array:
-    """Return the numbers of a key, at least one."""
+def _numbers(content: Mapping[str, Any], key: str) -> Array:
     try:
-        numbers = np.asarray(content[key], dtype=float)
+        return np.asarray(content[key], dtype=float)
     except (TypeError, ValueError):
         raise DataError(f"{key} must be numbers, got something else") from None
-    if not numbers.size or not np.isfinite(numbers).all():
+
+
+def _rows(content: Mapping[str, Any], key: str) -> Array:
+    """Return vectors that begin with a pose, (n, 7 or more)."""
+    rows = np.atleast_2d(_numbers(content, key))
+    if rows.ndim != 2 or not len(rows) or rows.shape[1] < 7:
+        raise DataError(f"{key} must be rows of 7 numbers or more, got {rows.shape}")
+    return rows
+
+
+def _names(value: Any) -> tuple[str, ...] | None:
+    names = value.tolist() if isinstance(value, np.ndarray) else value
+    if names is None:
+        return None
+    if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+        raise DataError("joint_names must be a list of texts, got something else")
+    return tuple(names)
+
+
+def _unit(vector: Array, key: str) -> Array:
+    """Return a vector whose quaternion is of length 1."""
+    if not np.isfinite(vector).all():
         raise DataError(f"{key} must be finite numbers, got others")
-    return numbers
-
-
-def _vector(content: dict[str, Any], key: str) -> Array:
-    """Return a vector that begins with a pose; its quaternion becomes a unit one."""
-    vector = _numbers(content, key).copy()
-    if vector.ndim != 1 or len(vector) < 7:
-        raise DataError(f"{key} must be a vector of 7 numbers or more, got {vector.shape}")
     length = np.linalg.norm(vector[3:7])
     if not length > 0.0:
         raise DataError(f"{key} must have a quaternion, got zeros")
-    vector[3:7] /= length
-    return vector
-
-
-def _inner_path(value: Any) -> Path:
-    """Return a path that does not leave the folder of the objects."""
-    path = Path(str(value))
-    if path.is_absolute() or ".." in path.parts or "\0" in str(value):
-        raise DataError(
-            f"obj_path must be a path within the folder of the objects, got {str(path)!r}"
-        )
-    return path
+    return np.concatenate([vector[:3], vector[3:7] / length, vector[7:]])

@@ -20,7 +20,7 @@ import numpy as np
 from drakegrasp import __version__
 from drakegrasp.errors import ConfigError, DataError, MeshError
 from drakegrasp.protocols.catalog import Protocol, find_protocol
-from drakegrasp.protocols.grasp_file import read_grasp_file
+from drakegrasp.protocols.grasp_file import inner_path, one_motion, read_grasp_file
 from drakegrasp.protocols.object_folder import read_object_folder
 from drakegrasp.protocols.protocol import MujocoProtocol, PostureVerdict
 from drakegrasp.runtime.environment import require_mujoco
@@ -69,12 +69,12 @@ class PostureResult:
 
 
 def verify_postures(
-    files: Sequence[Path], trials: PostureTrials, execute: Executor = run_here
+    files: Sequence[Path | str], trials: PostureTrials, execute: Executor = run_here
 ) -> Iterator[PostureResult]:
     """Yield the verdicts on files, in their order.
 
     Args:
-        files: Of DexGraspBench's format.
+        files: Of DexGraspBench's format; a text says why a grasp is none.
         trials: From `prepare_trials`.
         execute: Runs the trials.
 
@@ -109,23 +109,26 @@ def prepare_trials(name: str, hand: Path, objects: Path) -> PostureTrials:
     return PostureTrials(protocol=stored, code=code, hand=hand, objects=objects)
 
 
-def _verify_one(task: tuple[Path, PostureTrials]) -> PostureResult:
+def _verify_one(task: tuple[Path | str, PostureTrials]) -> PostureResult:
     """Return the verdict on one file."""
     path, trials = task
+    if isinstance(path, str):
+        return _invalid(Path(), path)
     try:
-        grasp = read_grasp_file(path)
-        scene, digests = _scene(trials, grasp.object_path, grasp.object_scale)
+        stored = read_grasp_file(path)
+        motion, folder = one_motion(stored), inner_path(stored.object_path)
+        scene, digests = _scene(trials, folder, float(stored.object_scale[0]))
     except (DataError, MeshError) as error:
         return _invalid(path, str(error))
 
-    if len(grasp.motion.grasp) != 7 + scene.joints:
-        got = len(grasp.motion.grasp)
+    if len(motion.grasp) != 7 + scene.joints:
+        got = len(motion.grasp)
         return _invalid(path, f"a posture must be {7 + scene.joints} numbers, got {got}")
     protocol = _protocol(trials)
     if "@" in trials.protocol:
-        verdict = run_own(trials.protocol, protocol.run, scene, grasp.motion)
+        verdict = run_own(trials.protocol, protocol.run, scene, motion)
     else:
-        verdict = protocol.run(scene, grasp.motion)
+        verdict = protocol.run(scene, motion)
     if not isinstance(verdict, PostureVerdict):
         raise ConfigError(f"{trials.protocol}: run must return a PostureVerdict, got {verdict!r}")
     return PostureResult(file=path, verdict=verdict, digests=digests)

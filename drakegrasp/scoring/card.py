@@ -33,6 +33,12 @@ from drakegrasp.scoring.references import REFERENCES
 FORM = "drakegrasp-score-1"
 #: With fewer test objects a warning is on the card.
 FEW_OBJECTS = 20
+#: What the measures are where a protocol other than the lift decides.
+BY_PROTOCOL = {
+    "headline": "success by the protocol of the first wrist pose; best-ranked prediction of each "
+    "row; mean over objects",
+    "objects": "objects with a row that succeeds",
+}
 #: What the measures are, in the order of a table.
 MEANINGS = {
     "headline": "a sample, held by the first wrist pose with every contact within d; best-ranked "
@@ -88,11 +94,13 @@ def card_of(
     draws = resample(clusters)
     described = {each.name: _set_of(each, grouping, own, draws, origin.oracle) for each in sets}
     tested = [each for each in sets if each.name not in REFERENCES]
+    by_protocol = "protocol" in origin.settings
+    measures = {k: v for k, v in MEANINGS.items() if k != "held_any" or origin.oracle}
 
     card: dict[str, Any] = {
         "form": FORM,
         "headline": {each.name: described[each.name]["measures"]["headline"] for each in tested},
-        "measures": {k: v for k, v in MEANINGS.items() if k != "held_any" or origin.oracle},
+        "measures": BY_PROTOCOL if by_protocol else measures,
         "limit_mm": round(1e3 * origin.limit, 3),
         "rows": len(grouping.rows),
         "objects": len(grouping.names),
@@ -181,20 +189,27 @@ def _warnings(grouping: Grouping, origin: Origin, sets: Sequence[Judged]) -> lis
 
 def card_text(card: Mapping[str, Any]) -> str:
     """Return a card as Markdown."""
+    protocol = card["settings"].get("protocol")
+    counts = "sample" if protocol is None else f"by {protocol['protocol']}"
     lines = ["# Score of predicted grasps", ""]
     for name, value in card["headline"].items():
-        lines += [f"**{name}: {_interval(value)}** sample, success@1, first wrist pose, mean over "
-                  f"{card['objects']} objects ({card['rows']} rows).", ""]  # fmt: skip
+        lines += [f"**{name}: {_interval(value)}** {counts}, success@1, first wrist pose, mean "
+                  f"over {card['objects']} objects ({card['rows']} rows).", ""]  # fmt: skip
     lines += [f"> Warning: {warning}." for warning in card["warnings"]]
     lines += [""] if card["warnings"] else []
 
     # The sets beside each other.
     lines += _table(card, [name for name in card["measures"] if name != "objects"])
     drawn, level = card["intervals"]["drawn"], card["intervals"]["level"]
+    within = (
+        f"A contact must be within {card['limit_mm']:g} mm of the one asked for in the first two "
+        "columns."
+        if protocol is None
+        else f"Of {protocol['source']}."
+    )
     lines += [
         "",
-        f"Per cent; intervals of {level:.0%} by a paired bootstrap over {drawn}. A contact must be "
-        f"within {card['limit_mm']:g} mm of the one asked for in the first two columns.",
+        f"Per cent; intervals of {level:.0%} by a paired bootstrap over {drawn}. {within}",
         "",
         *(f"* `{name}`: {words}" for name, words in card["measures"].items()),
         "",
@@ -223,12 +238,14 @@ def _table(card: Mapping[str, Any], measures: Sequence[str]) -> list[str]:
 def _more(card: Mapping[str, Any]) -> list[str]:
     """Return the lines on what stands beside the headline."""
     # The curve, and what is told of what counts.
-    names = card["sets"]
-    lines = ["## held(d)", "", "Held with every contact within d of the one asked for [%].", ""]
-    lines += [_row(["d [mm]", *names]), _row(["---"] * (len(names) + 1))]
-    for limit in map(str, CURVE_MM):
-        cells = [_percent(each["held_within_mm"][limit]) for each in names.values()]
-        lines.append(_row([limit, *cells]))
+    names, lines = card["sets"], list[str]()
+    if "protocol" not in card["settings"]:
+        words = "Held with every contact within d of the one asked for [%]."
+        lines += ["## held(d)", "", words, ""]
+        lines += [_row(["d [mm]", *names]), _row(["---"] * (len(names) + 1))]
+        for limit in map(str, CURVE_MM):
+            cells = [_percent(each["held_within_mm"][limit]) for each in names.values()]
+            lines.append(_row([limit, *cells]))
     lines += ["", "## Beside it", ""]
     lines += [_row(["set", "penetration [mm]", "coverage [%]", "diversity"]), _row(["---"] * 4)]
     for name, each in names.items():
@@ -266,7 +283,9 @@ def _origin(card: Mapping[str, Any]) -> list[str]:
     lines += [f"* {key}: `{value}`" for key, value in card["dataset"].items()]
     for name, each in card["sets"].items():
         lines += [f"* {name}: `{file['name']}` `{file['sha256'][:16]}`" for file in each["files"]]
-    lines += [f"* {key} {value}" for key, value in card["settings"]["versions"].items()]
+    settings = card["settings"]
+    versions = settings["versions"] | settings.get("protocol", {}).get("versions", {})
+    lines += [f"* {key} {value}" for key, value in versions.items()]
     lines += [f"* benchmark {key}: {value}" for key, value in card.get("benchmark", {}).items()]
     return [*lines, "", "Again:", "", f"    {card['again']}"]
 

@@ -7,24 +7,18 @@ stand in their order where none is stated.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import numpy.typing as npt
 
-from drakegrasp.dataset.hdf5 import open_hdf5
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.errors import GraspError, MachineError, first_line
+from drakegrasp.errors import GraspError
 from drakegrasp.frames import Array, as_numbers
-from drakegrasp.verification.prediction import HDF5_SUFFIXES, read_numbers
-
-SUFFIXES = (".npy", *HDF5_SUFFIXES, ".parquet")
-#: Names of the arrays in an HDF5 file, and of the columns in a Parquet file.
-GRASPS, ROWS, CONFIDENCE = "grasps", "rows", "confidence"
+from drakegrasp.verification.prediction import ROWS, read_predictions
 
 Rows = npt.NDArray[np.int64]
 
@@ -142,9 +136,7 @@ def read_ranked(path: Path, *, length: int, split: str) -> Ranked:
     """Return the predictions of a file.
 
     Args:
-        path: `.npy`: (n, 6k) or (n, m, 6k). HDF5: the array `grasps` in the group of the split,
-            else at the root, and `rows`, `confidence` beside it. Parquet: a line per prediction,
-            with the column `grasps` of lists, and optionally `rows` and `confidence`.
+        path: As `read_predictions` reads it; grasps are (n, 6k) or (n, m, 6k).
         length: Rows of the split.
         split: Its name.
 
@@ -152,64 +144,15 @@ def read_ranked(path: Path, *, length: int, split: str) -> Ranked:
         GraspError: If the file holds anything else; the message names it.
         MachineError: If a Parquet file is given and pyarrow is not installed.
     """
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES or not path.is_file():
-        got = repr(suffix) if path.is_file() else "none"
-        raise GraspError(
-            f"{path}: must be a file of predictions ({', '.join(SUFFIXES)}), got {got}"
-        )
-    if suffix == ".npy":
-        arrays: Mapping[str, Any] = {GRASPS: read_numbers(path)}
-    else:
-        arrays = _read_parquet(path) if suffix == ".parquet" else _read_hdf5(path, split)
+    read = read_predictions(path, split=split, axes=3)
     return rank(
         str(path),
-        arrays[GRASPS],
+        read.grasps,
         length=length,
-        rows=arrays.get(ROWS),
-        confidence=arrays.get(CONFIDENCE),
+        rows=read.rows,
+        confidence=read.confidence,
         sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
     )
-
-
-def _read_hdf5(path: Path, split: str) -> dict[str, Any]:
-    """Return the arrays of an HDF5 file that it has."""
-    try:
-        with open_hdf5(path) as file:
-            group = file[split] if isinstance(file.get(f"{split}/{GRASPS}"), h5py.Dataset) else file
-            names = [
-                n for n in (GRASPS, ROWS, CONFIDENCE) if isinstance(group.get(n), h5py.Dataset)
-            ]
-            found = {name: group[name][()] for name in names}
-    except (OSError, KeyError, RuntimeError, MemoryError) as error:
-        raise GraspError(
-            f"{path}: must be an HDF5 file with predictions, got none ({first_line(error)})"
-        ) from None
-    if GRASPS not in found:
-        raise GraspError(f"{path}: must hold an array {GRASPS!r} in /{split} or at the root")
-    return found
-
-
-def _read_parquet(path: Path) -> dict[str, Any]:
-    """Return the columns of a Parquet file that it has."""
-    try:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-    except ModuleNotFoundError:
-        raise MachineError(
-            f"{path}: Parquet needs pyarrow, got none: pip install 'drakegrasp[hub]'"
-        ) from None
-    try:
-        table = pq.read_table(path)
-        names = [name for name in (GRASPS, ROWS, CONFIDENCE) if name in table.column_names]
-        found = {name: table.column(name).to_pylist() for name in names}
-        found[GRASPS] = np.array(found[GRASPS], dtype=float)
-    except (OSError, KeyError, TypeError, ValueError, pa.ArrowException) as error:
-        raise GraspError(
-            f"{path}: must be a Parquet file with a column {GRASPS!r} of equally long lists of "
-            f"numbers, got none ({first_line(error)})"
-        ) from None
-    return found
 
 
 def ranked_sets(

@@ -27,12 +27,11 @@ from drakegrasp.scoring.card import Origin, card_of, card_text
 from drakegrasp.scoring.measures import Grouping, Judged, seconds
 from drakegrasp.scoring.ranked import Ranked, rank
 from drakegrasp.scoring.references import REFERENCES, Scene
-from drakegrasp.scoring.verdict import Verdict, VerdictFile, verdict_key, verdict_of
+from drakegrasp.scoring.verdict import Verdict, VerdictFile, verdict_key
 from drakegrasp.seeding import Stream, object_key
-from drakegrasp.verification.result import Verification
 
-#: Tries grasps (n, 6k) on rows (n,) and calls back with the place of each and its verification.
-Verify: TypeAlias = Callable[[Array, Sequence[int], Callable[[int, Verification], None]], object]
+#: Tries grasps (n, 6k) on rows (n,) and calls back with the place of each and its verdict.
+Verify: TypeAlias = Callable[[Array, Sequence[int], Callable[[int, Verdict], None]], object]
 #: Files of a score.
 CARD_JSON, CARD_TEXT, CARD_PICTURE, VERDICTS = "card.json", "card.md", "card.png", "verdicts.jsonl"
 
@@ -89,6 +88,7 @@ class Request:
         config: Of the verification.
         overridden: Paths of the keys that the caller sets; a row's own friction gives way to them.
         again: The command that makes the card again.
+        protocol: Name, source, numbers and versions of a protocol in place of the lift.
     """
 
     data: GraspDataset
@@ -100,6 +100,7 @@ class Request:
     config: Config
     overridden: tuple[str, ...]
     again: str
+    protocol: Mapping[str, Any] | None = None
 
 
 def score(request: Request, verify: Verify, folder: Path | None) -> Score:
@@ -130,6 +131,7 @@ def score(request: Request, verify: Verify, folder: Path | None) -> Score:
         "config": request.config.to_dict(),
         "overridden": sorted(request.overridden),
         "versions": versions,
+        **({} if request.protocol is None else {"protocol": request.protocol}),
     }
     verdicts = _verdicts([r for _, each in sets for r in each], request, settings, verify, folder)
     judged, start = [], 0
@@ -266,7 +268,7 @@ def _verdicts(
             verify(
                 np.array([grasp for _, (grasp, _) in ordered]),
                 [row for _, (_, row) in ordered],
-                lambda index, result: known.add(names[index], verdict_of(result)),
+                lambda index, verdict: known.add(names[index], verdict),
             )
         finally:
             known.close()

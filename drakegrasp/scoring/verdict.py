@@ -17,8 +17,10 @@ from typing import Any, TextIO
 import numpy as np
 
 from drakegrasp.frames import Array
+from drakegrasp.protocols.protocol import PostureVerdict
 from drakegrasp.runtime.json_text import parse_json
 from drakegrasp.verification.result import Verification
+from drakegrasp.verification.verify import PlacedGrasp
 
 #: Decimals of lengths [m] and angles [rad]: those to which contacts are rounded, and two more.
 _DIGITS = 6
@@ -78,6 +80,24 @@ def verdict_of(result: Verification) -> Verdict:
         contacts=_tuple(result.p_OQ),
         posture=() if closed is None or first is None else _posture(first.trial.X_OG, closed.q),
         seconds=sum(result.seconds.values()),
+    )
+
+
+def protocol_verdict(grasp: PlacedGrasp, found: PostureVerdict) -> Verdict:
+    """Return what a score keeps of a prediction that a protocol has tried in MuJoCo.
+
+    A protocol knows success alone, which then stands for all measures.
+    """
+    outcome = found.reason.partition(":")[0] or "success"
+    measures = ("success", "held", "precision", "stable", "sample", "held_any")
+    return Verdict(
+        outcome=outcome,
+        **dict.fromkeys(measures, found.success),
+        contact_error=None,
+        penetration=_rounded(found.penetration) if math.isfinite(found.penetration) else None,
+        contacts=_tuple(grasp.p_OQ),
+        posture=(),
+        seconds=0.0,
     )
 
 

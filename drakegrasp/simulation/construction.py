@@ -26,6 +26,7 @@ from pydrake.geometry import (
     AddContactMaterial,
     AddRigidHydroelasticProperties,
     CollisionFilterDeclaration,
+    CollisionFilterManager,
     GeometryId,
     GeometrySet,
     InMemoryMesh,
@@ -153,7 +154,8 @@ def build_object_scene(
     physics = model.own_physics(physics)
     draft = _draft(model, physics, resting_surface or model.resting_surface, meshcat)
     draft.plant.Finalize()
-    _part_surfaces(draft, [])
+    manager = draft.scene_graph.collision_filter_manager()
+    _part_surfaces(draft.plant, manager, (draft.object, draft.table), [])
     return ObjectScene(**draft.scene_fields())
 
 
@@ -234,7 +236,9 @@ def _build(
     plant.Finalize()
 
     # What needs the finalized plant: collision filters and the wrist's input.
-    _part_surfaces(draft, [geometry for geometry, _ in parts_of_hand["parts"]])
+    parts = [geometry for geometry, _ in parts_of_hand["parts"]]
+    manager = scene_graph.collision_filter_manager()
+    _part_surfaces(plant, manager, (draft.object, draft.table), parts)
     _filter_within_hand(plant, scene_graph, instance, fingertips)
     draft.builder.Connect(
         trajectory.get_output_port(),
@@ -269,12 +273,59 @@ def _add_surface(
     plant: MultibodyPlant, body: RigidBody, name: str, surface: Solid, physics: PhysicsConfig
 ) -> GeometryId:
     """Add a rigid hydroelastic surface in {O} to the object, named after what it meets."""
-    text = obj_text(surface.vertices, surface.faces, normals=False)
     properties = ProximityProperties()
     AddRigidHydroelasticProperties(properties)
     _add_material(properties, object_friction(physics), physics)
-    mesh = Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", name)))
+    mesh = _surface_mesh(surface, name)
     return plant.RegisterCollisionGeometry(body, RigidTransform(), mesh, name, properties)
+
+
+def _surface_mesh(surface: Solid, name: str) -> Mesh:
+    text = obj_text(surface.vertices, surface.faces, normals=False)
+    return Mesh(InMemoryMesh(mesh_file=MemoryFile(text, ".obj", name)))
+
+
+def swap_object(scene: Scene, model: ObjectModel, physics: PhysicsConfig) -> Scene:
+    """Return a scene of another object that shares its diagram with a scene that is built.
+
+    Hand and table take nine tenths of the time of building a scene. The new scene has a context of
+    its own, in which the object has other surfaces and another inertia; an attempt in it gives the
+    same bits as in a scene that is built. One of the two is simulated at a time: the wrist's path
+    and the limits of joints belong to the diagram.
+
+    Args:
+        scene: Of the same hand, without Meshcat.
+        model: The other object.
+        physics: That of the scene, but for friction.
+    """
+    context = scene.simulator.get_context().Clone()
+    graph_context = scene.scene_graph.GetMyMutableContextFromRoot(context)
+    surfaces = {"hand": model.collision_solid, "table": model.resting_surface}
+    ids = scene.plant.GetCollisionGeometriesForBody(scene.object)
+    for geometry, (name, surface) in zip(ids, surfaces.items(), strict=True):
+        mesh = _surface_mesh(surface, name)
+        scene.scene_graph.ChangeShape(graph_context, scene.plant.get_source_id(), geometry, mesh)
+    # A new shape meets everything.
+    _part_surfaces(
+        scene.plant,
+        scene.scene_graph.collision_filter_manager(graph_context),
+        (scene.object, scene.table),
+        [geometry for geometry, _ in scene.parts],
+    )
+    scene.object.SetSpatialInertiaInBodyFrame(
+        scene.plant.GetMyMutableContextFromRoot(context), object_inertia(model, model.mass)
+    )
+
+    # So do the scenes with coarse steps and with a motor for each joint, when they are needed.
+    others = {"coarse_scene": scene.coarse_scene, "own_motors": scene.own_motors}
+    swapped: dict[str, Any] = {
+        name: cache(lambda known=known: swap_object(known(), model, physics))
+        for name, known in others.items()
+        if known is not None
+    }
+    simulator = Simulator(scene.simulator.get_system(), context)
+    physics = physics.model_copy(update={"time_step": scene.physics.time_step})
+    return replace(scene, model=model, physics=physics, simulator=simulator, **swapped)
 
 
 def object_inertia(model: ObjectModel, mass: float) -> SpatialInertia:
@@ -528,13 +579,20 @@ def _make_compliant_hand(
         _assign_proximity(plant, scene_graph, plant.get_body(index), properties)
 
 
-def _part_surfaces(draft: _Draft, parts: Sequence[GeometryId]) -> None:
+def _part_surfaces(
+    plant: MultibodyPlant,
+    manager: CollisionFilterManager,
+    bodies: tuple[RigidBody, RigidBody],
+    parts: Sequence[GeometryId],
+) -> None:
     """Let the hand's parts meet one surface of the object alone, the table the other one alone."""
-    slab = draft.plant.GetCollisionGeometriesForBody(draft.table)
+    (hand_side, table_side), slab = map(plant.GetCollisionGeometriesForBody, bodies)
     declare = CollisionFilterDeclaration()
-    declare.ExcludeBetween(GeometrySet(draft.hand_side), GeometrySet(slab))
-    declare.ExcludeBetween(GeometrySet(draft.table_side), GeometrySet(parts))
-    draft.scene_graph.collision_filter_manager().Apply(declare)
+    declare.ExcludeBetween(GeometrySet(hand_side), GeometrySet(slab))
+    declare.ExcludeBetween(GeometrySet(table_side), GeometrySet(parts))
+    # Drake does this for a body's first shapes, but not for those that replace them.
+    declare.ExcludeWithin(GeometrySet([hand_side, table_side]))
+    manager.Apply(declare)
 
 
 def _filter_within_hand(

@@ -1,9 +1,9 @@
-"""The diagrams that a process keeps: building one costs as much as simulating an attempt.
+"""The scenes and renderers that a process keeps: building one costs as much as an attempt.
 
 In: an object, and what to simulate or draw it with. Out: its scene or its renderer, built now or
-kept from before. Diagrams are known by a digest of what they hold, so a copy of an object shares
-its diagrams. A scene that is reset gives the same bits as a new one, so earlier use changes
-nothing.
+kept from before. They are known by a digest of what they hold, so a copy of an object shares
+them. Objects under the same physics and hand share a diagram, too, see `swap_object`. A scene that
+is reset gives the same bits as a new one, so earlier use changes nothing.
 """
 
 from __future__ import annotations
@@ -18,36 +18,49 @@ from typing import TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
+from pydrake.multibody.plant import MultibodyPlant
 
 from drakegrasp.config import CameraConfig, HandSource, PhysicsConfig
-from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.construction import build_scene, swap_object
 from drakegrasp.simulation.scene import Scene
 from drakegrasp.vision.rendering import Renderer, build_renderer
 
-#: How many diagrams are kept: a build needs the scene and the renderer of two objects.
+#: How many scenes and renderers are kept: a build needs those of two objects.
 KEPT = 4
+#: How many diagrams of scenes are kept, each for one hand and one physics but for its friction.
+DIAGRAMS, FRICTIONS = 2, ("friction_hand", "friction_table")
 
-_Diagram = TypeVar("_Diagram", Scene, Renderer)
+_Kept = TypeVar("_Kept", Scene, Renderer)
 
 #: The last in order is the last used.
 _kept: dict[Hashable, Scene | Renderer] = {}
+_diagrams: dict[Hashable, Scene] = {}
 _lock = threading.Lock()
 
 
 def cached_scene(model: ObjectModel, physics: PhysicsConfig, source: HandSource) -> Scene:
     """Return the scene of an object with a hand, see `load_hand`."""
     # A hand whose files have changed is loaded anew, and is then another key.
-    hand = load_hand(source)
-    return _cached((*_scene_key(model, physics), hand), lambda: build_scene(model, physics, hand))
-
-
-def _scene_key(model: ObjectModel, physics: PhysicsConfig) -> tuple[Hashable, ...]:
-    """Return what a scene is known by, but for its hand."""
+    physics, hand = model.own_physics(physics), load_hand(source)
     shape = (model.collision_vertices, model.collision_faces, model.half_extents)
     mass = (model.p_OOcm, model.I_OOcm_O, np.float64(model.mass))
-    return "scene", _digest(model.name, *shape, *mass), model.own_physics(physics)
+    key = "scene", _digest(model.name, *shape, *mass), physics, hand
+    return _cached(key, lambda: _make_scene(model, physics, hand))
+
+
+def _make_scene(model: ObjectModel, physics: PhysicsConfig, hand: Hand) -> Scene:
+    """Return the scene of an object, on a diagram that is kept or on a new one."""
+    # An attempt sets friction in the context, so a diagram serves any.
+    key = physics.model_copy(update=dict.fromkeys(FRICTIONS)), hand
+    known = _diagrams.pop(key, None)
+    if known is not None:
+        _diagrams[key] = known
+        return swap_object(known, model, physics)
+    while len(_diagrams) >= DIAGRAMS:
+        _forget(_diagrams.pop(next(iter(_diagrams))).plant)
+    return _diagrams.setdefault(key, build_scene(model, physics, hand))
 
 
 def cached_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
@@ -59,22 +72,30 @@ def cached_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
 def forget_scenes() -> None:
     """Drop every scene: one in which Drake failed must not be used again."""
     with _lock:
-        for key in [key for key, diagram in _kept.items() if isinstance(diagram, Scene)]:
-            del _kept[key]
-        gc.collect()
+        _diagrams.clear()
+        _forget()
 
 
-def _cached(key: Hashable, build: Callable[[], _Diagram]) -> _Diagram:
+def _cached(key: Hashable, build: Callable[[], _Kept]) -> _Kept:
     with _lock:
-        diagram = _kept.pop(key, None)
-        if diagram is None:
+        kept = _kept.pop(key, None)
+        if kept is None:
             while len(_kept) >= KEPT:
-                del _kept[next(iter(_kept))]
-                # Diagrams sit in reference cycles and own memory that Python does not count.
-                gc.collect()
-            diagram = build()
-        _kept[key] = diagram
-        return cast(_Diagram, diagram)
+                # The diagram of a scene stays, and its context goes by itself.
+                if isinstance(_kept.pop(next(iter(_kept))), Renderer):
+                    gc.collect()
+            kept = build()
+        _kept[key] = kept
+        return cast(_Kept, kept)
+
+
+def _forget(plant: MultibodyPlant | None = None) -> None:
+    """Drop the scenes of a plant, or all."""
+    for key, kept in list(_kept.items()):
+        if isinstance(kept, Scene) and plant in (None, kept.plant):
+            del _kept[key]
+    # Diagrams sit in reference cycles and own memory that Python does not count.
+    gc.collect()
 
 
 def _digest(name: str, *arrays: npt.NDArray[np.generic] | np.float64) -> str:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from drakegrasp.config import LARGEST
 from drakegrasp.dataset.hdf5 import open_hdf5
-from drakegrasp.errors import GraspError, first_line
+from drakegrasp.errors import GraspError, MachineError, first_line
 from drakegrasp.foreign_files import read_text, refuse_irregular
 from drakegrasp.frames import Array, as_numbers, invert_pose
 
@@ -32,9 +32,9 @@ SHORTEST_NORMAL = 1e-6
 FARTHEST = 1e3
 #: Suffixes of files with grasps.
 HDF5_SUFFIXES = (".h5", ".hdf5")
-SUFFIXES = (".npy", ".csv", *HDF5_SUFFIXES)
-#: Names of the arrays in an HDF5 file.
-GRASPS, ROWS = "grasps", "rows"
+SUFFIXES = (".npy", ".csv", *HDF5_SUFFIXES, ".parquet")
+#: Names of the arrays in an HDF5 file, and of the columns in a Parquet file.
+GRASPS, ROWS, CONFIDENCE = "grasps", "rows", "confidence"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -168,26 +168,31 @@ class Predictions:
     """The contents of a file of grasps.
 
     Attributes:
-        grasps: (n, m) with n at least 1.
+        grasps: (n, m), or (n, j, m) for j per row, with n at least 1.
         rows: (n,), the row of a dataset's split that each is for; None if the file has none.
+        confidence: As stated, numbers of any kind; None if the file has none.
     """
 
     grasps: Array
     rows: npt.NDArray[np.int64] | None = None
+    confidence: Any = None
 
 
-def read_predictions(path: Path, *, split: str | None = None) -> Predictions:
+def read_predictions(path: Path, *, split: str | None = None, axes: int = 2) -> Predictions:
     """Return the grasps of a file.
 
     Args:
         path: A `.npy` file, (n, m) or (m,); a `.csv` file with a line per grasp and optionally a
-            header; or an HDF5 file (`.h5`, `.hdf5`) with an array `grasps`, and optionally `rows`
-            beside it, at the root or in a group.
+            header; an HDF5 file (`.h5`, `.hdf5`) with an array `grasps`, and optionally `rows` and
+            `confidence` beside it, at the root or in a group; or a Parquet file with a line per
+            entry and these as columns, `grasps` of lists.
         split: Name of the group of an HDF5 file. If it is None or there is no such group, the
             root is read; if it is None and the root has no grasps, the only group that has.
+        axes: Most axes of the array of grasps: 3 for several per row.
 
     Raises:
         GraspError: If the file cannot be read as one of these; the message names the file.
+        MachineError: If a Parquet file is given and pyarrow is not installed.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -195,9 +200,26 @@ def read_predictions(path: Path, *, split: str | None = None) -> Predictions:
     if not path.is_file():
         raise GraspError(f"{path}: must be a file of grasps, got none")
     if suffix in HDF5_SUFFIXES:
-        return _read_hdf5(path, split)
-    array = read_numbers(path) if suffix == ".npy" else _read_csv(path)
-    return Predictions(grasps=_grasps(array, str(path)))
+        arrays, where = _read_hdf5(path, split)
+    elif suffix == ".parquet":
+        arrays, where = _read_parquet(path), str(path)
+    else:
+        read = read_numbers if suffix == ".npy" else _read_csv
+        arrays, where = {GRASPS: read(path)}, str(path)
+
+    # One row per grasp.
+    name = f"{where}/{GRASPS}" if suffix in HDF5_SUFFIXES else where
+    numbers = as_numbers(arrays[GRASPS], f"{name}: must hold real numbers")
+    grasps, rows = _grasps(numbers, name, axes), arrays.get(ROWS)
+    if rows is not None:
+        rows = np.asarray(rows)
+        if rows.dtype.kind not in "iu" or rows.shape != (len(grasps),):
+            raise GraspError(
+                f"{where}/{ROWS} must hold one whole number for each of the {len(grasps)} grasps, "
+                f"got {rows.dtype} of shape {rows.shape}"
+            )
+        rows = rows.astype(np.int64)
+    return Predictions(grasps=grasps, rows=rows, confidence=arrays.get(CONFIDENCE))
 
 
 def read_numbers(path: Path) -> Array:
@@ -253,31 +275,41 @@ def _read_csv(path: Path) -> Array:
     return np.array([[float(cell) for cell in cells] for _, cells in rows])
 
 
-def _read_hdf5(path: Path, split: str | None) -> Predictions:
-    """Return the grasps of an HDF5 file, and their rows if it has them."""
-    # Read both arrays.
+def _read_hdf5(path: Path, split: str | None) -> tuple[dict[str, Any], str]:
+    """Return the arrays of an HDF5 file that it has, and where they are."""
     try:
         with open_hdf5(path) as file:
             group = _choose_group(path, file, split)
-            where = f"{path}: {_place(group, GRASPS)}"
-            numbers = as_numbers(group[GRASPS][()], f"{where}: must hold real numbers")
-            grasps = _grasps(numbers, where)
-            if not isinstance(group.get(ROWS), h5py.Dataset):
-                return Predictions(grasps=grasps)
-            rows = np.asarray(group[ROWS][()])
-            place = _place(group, ROWS)
+            names = [
+                n for n in (GRASPS, ROWS, CONFIDENCE) if isinstance(group.get(n), h5py.Dataset)
+            ]
+            return {n: group[n][()] for n in names}, f"{path}: {group.name.rstrip('/')}"
     except (OSError, KeyError, RuntimeError, MemoryError) as error:
         raise GraspError(
             f"{path}: must be an HDF5 file with grasps, got none ({first_line(error)})"
         ) from None
 
-    # One row per grasp.
-    if rows.dtype.kind not in "iu" or rows.shape != (len(grasps),):
+
+def _read_parquet(path: Path) -> dict[str, Any]:
+    """Return the columns of a Parquet file that it has."""
+    try:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    except ModuleNotFoundError:
+        raise MachineError(
+            f"{path}: Parquet needs pyarrow, got none: pip install 'drakegrasp[hub]'"
+        ) from None
+    try:
+        table = pq.read_table(path)
+        names = [name for name in (GRASPS, ROWS, CONFIDENCE) if name in table.column_names]
+        found = {name: table.column(name).to_pylist() for name in names}
+        found[GRASPS] = np.array(found[GRASPS], dtype=float)
+    except (OSError, KeyError, TypeError, ValueError, pa.ArrowException) as error:
         raise GraspError(
-            f"{path}: {place} must hold one whole number for each of the {len(grasps)} grasps, "
-            f"got {rows.dtype} of shape {rows.shape}"
-        )
-    return Predictions(grasps=grasps, rows=rows.astype(np.int64))
+            f"{path}: must be a Parquet file with a column {GRASPS!r} of equally long lists of "
+            f"numbers, got none ({first_line(error)})"
+        ) from None
+    return found
 
 
 def _choose_group(path: Path, file: h5py.File, split: str | None) -> h5py.Group:
@@ -302,11 +334,11 @@ def _choose_group(path: Path, file: h5py.File, split: str | None) -> h5py.Group:
     )
 
 
-def _grasps(array: Array, where: str) -> Array:
+def _grasps(array: Array, where: str, axes: int) -> Array:
     """Return an array with a row per grasp, from such an array or from a single grasp."""
     if array.size == 0:
         raise GraspError(f"{where}: must hold at least one grasp, got none")
-    if array.ndim not in (1, 2):
+    if not 1 <= array.ndim <= axes:
         raise GraspError(
             f"{where}: must be an array with a row per grasp, or one grasp, "
             f"got an array of shape {array.shape}"
@@ -321,11 +353,6 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _place(group: h5py.Group, name: str) -> str:
-    """Return the full name of an array of a group."""
-    return f"{group.name.rstrip('/')}/{name}"
 
 
 def _listed(names: tuple[str, ...]) -> str:

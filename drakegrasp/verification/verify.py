@@ -127,12 +127,30 @@ def verify_placed(grasp: PlacedGrasp) -> Verification:
     return replace(result, hints=hints)
 
 
-def _on_surface(base: Verification, grasp: PlacedGrasp) -> Verification:
-    """Return the verdict with rounded contacts, on the surface if that is asked for."""
+def first_fit(grasp: PlacedGrasp) -> WristFit:
+    """Return the wrist pose by which a grasp that is none of the invalid is judged."""
+    p_OQ, nhat_Q_O = _rounded(grasp)
+    return _fits(grasp.placed, p_OQ, nhat_Q_O, grasp.config)[0]
+
+
+def _fits(placed: PlacedObject, p_OQ: Array, nhat_Q_O: Array, config: Config) -> list[WristFit]:
+    X_TO = placed.X_TO_simulated
+    return fit_wrist(
+        load_hand(config.hand_source), p_OQ, nhat_Q_O, up_O=X_TO[2, :3], height=float(X_TO[2, 3])
+    )
+
+
+def _rounded(grasp: PlacedGrasp) -> tuple[Array, Array]:
+    """Return the points and unit normals (k, 3) of a grasp, rounded."""
     # Adding zero turns -0.0 into 0.0.
     p_OQ = np.round(grasp.p_OQ, POINT_DIGITS) + 0.0
     nhat_Q_O = np.round(grasp.nhat_Q_O, NORMAL_DIGITS) + 0.0
-    nhat_Q_O /= np.linalg.norm(nhat_Q_O, axis=1, keepdims=True)
+    return p_OQ, nhat_Q_O / np.linalg.norm(nhat_Q_O, axis=1, keepdims=True)
+
+
+def _on_surface(base: Verification, grasp: PlacedGrasp) -> Verification:
+    """Return the verdict with rounded contacts, on the surface if that is asked for."""
+    p_OQ, nhat_Q_O = _rounded(grasp)
     with timed(base.seconds, "surface"):
         fit = fit_surface(base.placed.model, p_OQ, nhat_Q_O)
     snapped = np.round(fit.nearest, POINT_DIGITS) + 0.0
@@ -148,10 +166,9 @@ def _on_surface(base: Verification, grasp: PlacedGrasp) -> Verification:
 def _lift_by_hand(base: Verification) -> Verification:
     """Find palm poses for the contacts, and try them until one holds the object."""
     # Palm poses that bring the fingertips to the contacts, the best first.
-    config, X_TO = base.config, base.placed.X_TO_simulated
-    hand = load_hand(config.hand_source)
+    hand = load_hand(base.config.hand_source)
     with timed(base.seconds, "fit"):
-        fits = fit_wrist(hand, base.p_OQ, base.nhat_Q_O, up_O=X_TO[2, :3], height=float(X_TO[2, 3]))
+        fits = _fits(base.placed, base.p_OQ, base.nhat_Q_O, base.config)
     with timed(base.seconds, "simulate"):
         # Two contacts leave the palm's turn about their line open, and most of these poses are
         # within the object or the table: the first that is clear is the first pose.

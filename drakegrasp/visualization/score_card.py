@@ -20,21 +20,25 @@ _COLOURS = ("#000000", "#D55E00", "#999999", "#B9B9B9", "#009E73", "#CC79A7", "#
 _OWN = (PREDICTED, "#56B4E9")
 #: Longest name of a set in the picture [characters].
 LONGEST = 28
+#: Width that the caption needs [in].
+NARROWEST = 7.6
 
 
 def card_picture(card: Mapping[str, Any], *, dpi: int = 150) -> bytes:
     """Return a card as PNG, at a resolution [pixels per inch]."""
     calibrated = {n: s["calibration"] for n, s in card["sets"].items() if s["calibration"]}
-    columns = 3 if calibrated else 2
-    size = (4.6 * columns, 1.6 + 0.36 * max(len(card["sets"]), 6))
+    protocol = card["settings"].get("protocol")
+    columns = 1 + (protocol is None) + bool(calibrated)
+    size = (max(4.6 * columns, NARROWEST), 1.6 + 0.36 * max(len(card["sets"]), 6))
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(1, columns, squeeze=False)[0]
     colours = _colours(card)
 
     _draw_headline(axes[0], card, colours)
-    _draw_curves(axes[1], card, colours)
+    if protocol is None:
+        _draw_curves(axes[1], card, colours)
     if calibrated:
-        _draw_calibration(axes[2], calibrated, colours)
+        _draw_calibration(axes[-1], calibrated, colours)
     for panel in axes:
         for side in ("top", "right"):
             panel.spines[side].set_visible(False)
@@ -58,8 +62,11 @@ def _draw_headline(axes: Axes, card: Mapping[str, Any], colours: Mapping[str, st
         value, low, high = (100.0 * each["measures"]["headline"][k] for k in _ENDS)
         axes.plot([low, high], [i, i], color=colours[name], linewidth=2.2, solid_capstyle="round")
         axes.plot(value, i, "o", color=colours[name], markersize=7)
-        held = 100.0 * each["measures"]["held"]["value"]
-        axes.plot(held, i, "|", color=colours[name], markersize=11, markeredgewidth=1.4)
+        if "held" in card["measures"]:
+            held = 100.0 * each["measures"]["held"]["value"]
+            axes.plot(held, i, "|", color=colours[name], markersize=11, markeredgewidth=1.4)
+
+    # The names of the sets, in their colours.
     axes.set_yticks(range(len(card["sets"])), [shortened(name, LONGEST) for name in card["sets"]])
     for label, name in zip(axes.get_yticklabels(), card["sets"], strict=True):
         label.set_color(colours[name])
@@ -68,10 +75,11 @@ def _draw_headline(axes: Axes, card: Mapping[str, Any], colours: Mapping[str, st
     axes.grid(axis="x", color="#E3E6EA")
     axes.set_axisbelow(True)
     axes.set_xlabel("per cent of rows, mean over objects", color=INK)
-    axes.set_title(
-        f"Sample within {card['limit_mm']:g} mm, 95 % interval\n(tick: held anywhere)",
-        fontsize="medium", color=INK,
-    )  # fmt: skip
+    protocol = card["settings"].get("protocol")
+    title = f"Sample within {card['limit_mm']:g} mm, 95 % interval\n(tick: held anywhere)"
+    if protocol is not None:
+        title = f"Success by {protocol['protocol']}, 95 % interval"
+    axes.set_title(title, fontsize="medium", color=INK)
 
 
 _ENDS = ("value", "low", "high")
@@ -113,11 +121,13 @@ def _draw_calibration(
 
 def _caption(figure: Figure, card: Mapping[str, Any]) -> None:
     """Write what was scored under the picture."""
-    where = card["dataset"]
+    where, protocol = card["dataset"], card["settings"].get("protocol")
+    simulator = f"Drake {card['settings']['versions']['drake']}"
+    if protocol is not None:
+        simulator = f"MuJoCo {protocol['versions']['mujoco']}"
     text = (
         f"{card['rows']} rows, {card['objects']} objects, {card['classes']} classes of "
         f"{where['file']} ({where['split']}, {where['rows_sha256'][:8]}); "
-        f"drakegrasp {card['settings']['versions']['drakegrasp']}, "
-        f"Drake {card['settings']['versions']['drake']}"
+        f"drakegrasp {card['settings']['versions']['drakegrasp']}, {simulator}"
     )
     figure.supxlabel(text, fontsize="small", color=INK)

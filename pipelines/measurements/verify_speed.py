@@ -1,59 +1,84 @@
-"""Measure how fast grasps are verified, and what a second worker gains.
+"""Measure how much a verdict costs over mixed objects, by how many grasps an object has.
 
 \b
-    python pipelines/measurements/verify_speed.py OUT --grasps 500 > speed.json
+    python pipelines/measurements/verify_speed.py OUT [OUT]... > speed.json
 
-The script verifies the samples of a dataset's test split by method `hand`, with one worker and
-then with two. It repeats them until there are as many as asked for. Prints JSON.
+The script verifies samples of the datasets by method `hand` in this process: one of each object,
+then the others of each, at most six. A quarter of them are moved by 8 mm (standard deviation), so
+that some fail. Prints JSON.
 """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
 
 from __future__ import annotations
 
 import json
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import click
 import numpy as np
 
-from drakegrasp.api.verifying import verify_rows
-from drakegrasp.cluster.connect import connect
 from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.reader import GraspDataset
+from drakegrasp.dataset.schema import SPLITS
+from drakegrasp.verification.placed_grasp import place_on_rows
+from drakegrasp.verification.verify import PlacedGrasp, verify_placed
+
+#: Most grasps of an object in the second measurement.
+SEVERAL = 6
+#: Share of the grasps that are moved, and by how much [m].
+MOVED, SIGMA = 0.25, 0.008
 
 
 @click.command(help=__doc__)
-@click.argument("out", type=click.Path(path_type=Path, exists=True))
-@click.option("--grasps", type=int, default=500, show_default=True)
-def main(out: Path, grasps: int) -> None:
+@click.argument("outs", type=click.Path(path_type=Path, exists=True), nargs=-1, required=True)
+def main(outs: tuple[Path, ...]) -> None:
     """Run the script."""
-    data = GraspDataset(out / DATA_FILES["oto"], split="test")
-    rows = [i % len(data) for i in range(grasps)]
-    vectors = data.column("grasps")[rows].astype(float)
+    one = list(_grasps(outs, lambda rows: rows[:1]))
+    several = list(_grasps(outs, lambda rows: rows[1 : 1 + SEVERAL]))
 
-    # The batch by the wall clock; the stages of a grasp where no other worker disturbs them.
-    seconds, by_stage = {}, {}
-    for workers in (1, 2):
-        with connect(workers) as client:
-            # The first grasps of each worker also pay for imports and tables.
-            verify_rows(data, vectors[:8], rows[:8], client=client)
-
-            start = time.perf_counter()
-            verdicts = verify_rows(data, vectors, rows, client=client, show=True)
-            seconds[workers] = time.perf_counter() - start
-        if workers == 1:
-            for stage in ("surface", "margin", "fit", "simulate"):
-                spent = [v.seconds[stage] for v in verdicts if stage in v.seconds]
-                by_stage[stage] = float(np.median(spent))
-            by_stage["in all"] = float(np.median([sum(v.seconds.values()) for v in verdicts]))
-
-    result = {
-        "grasps": grasps,
-        "median seconds of a verification, one worker": by_stage,
-        "seconds of the batch by number of workers": seconds,
-        "two workers over one": seconds[1] / seconds[2],
-    }
+    # The first grasp also pays for imports and tables.
+    verify_placed(several[-1])
+    result = {"one grasp of each object": _measure(one), "several of each": _measure(several)}
     click.echo(json.dumps(result, indent=1))
+
+
+def _grasps(
+    outs: tuple[Path, ...], choose: Callable[[list[int]], list[int]]
+) -> Iterator[PlacedGrasp]:
+    """Yield grasps of all objects, those of an object together."""
+    generator = np.random.default_rng(0)
+    for out in outs:
+        for split in SPLITS:
+            data = GraspDataset(out / DATA_FILES["oto"], split=split)
+            names = data.column("object_props/object_name") if len(data) else np.zeros(0)
+            rows = [
+                row
+                for name in dict.fromkeys(names.tolist())
+                for row in choose(np.flatnonzero(names == name).tolist())
+            ]
+            grasps = data.column("grasps")[rows].astype(float)
+            moved = generator.random(len(rows)) < MOVED
+            points = slice(grasps.shape[1] // 2)
+            noise = generator.normal(0.0, SIGMA, grasps[:, points].shape)
+            grasps[moved, points] += noise[moved]
+            yield from place_on_rows(grasps, data, rows)
+
+
+def _measure(grasps: list[PlacedGrasp]) -> dict[str, object]:
+    """Return the CPU seconds of verdicts, and how many grasps succeed."""
+    seconds, success = [], 0
+    for grasp in grasps:
+        start = time.process_time()
+        success += verify_placed(grasp).success
+        seconds.append(time.process_time() - start)
+    return {
+        "grasps": len(grasps),
+        "objects": len({grasp.placed.model.name for grasp in grasps}),
+        "succeed": success,
+        "median CPU seconds": round(float(np.median(seconds)), 3),
+        "mean CPU seconds": round(float(np.mean(seconds)), 3),
+    }
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import pytest
 from helpers.datasets import OTO, make_dataset
 from helpers.hands import write_with_optional_fingers
 
-from drakegrasp.cli.verify_request import VerifyRequest, place_requested
+from drakegrasp.cli.verify.request import VerifyRequest, place_requested
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import HandError

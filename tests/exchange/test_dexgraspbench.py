@@ -22,7 +22,7 @@ from drakegrasp.frames import Array, multiply  # noqa: E402
 from drakegrasp.hand.description import load_hand  # noqa: E402
 from drakegrasp.hand.kinematics import fingertip_poses  # noqa: E402
 from drakegrasp.mjcf.hand_model import make_hand_model  # noqa: E402
-from drakegrasp.protocols.grasp_file import read_grasp_file  # noqa: E402
+from drakegrasp.protocols.grasp_file import one_motion, read_grasp_file  # noqa: E402
 from drakegrasp.protocols.object_folder import read_object_folder  # noqa: E402
 from drakegrasp.visualization.still_scene import StillScene  # noqa: E402
 
@@ -145,5 +145,5 @@ def test_own_reader_reads_what_is_exported(folder: Path, grasps: list[ClosedGras
     path = data / grasps[0].object_name / f"{grasps[0].trial_id}.npy"
     stored = read_grasp_file(path)
     exported = content_of(folder, grasps[0])["grasp_qpos"]
-    np.testing.assert_allclose(stored.motion.grasp, exported, rtol=0, atol=1e-15)
-    assert read_object_folder(folder / stored.object_path, stored.object_scale).volume > 1e-5
+    np.testing.assert_allclose(one_motion(stored).grasp, exported, rtol=0, atol=1e-15)
+    assert read_object_folder(folder / stored.object_path, 1.0).volume > 1e-5

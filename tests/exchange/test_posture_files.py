@@ -14,7 +14,9 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from drakegrasp.errors import GraspError
+from drakegrasp.exchange import posture_files
 from drakegrasp.exchange.posture_files import read_postures
+from drakegrasp.exchange.posture_rows import quaternion_poses
 from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
 from drakegrasp.simulation.postures.posture import joint_order
@@ -121,6 +123,32 @@ def test_joints_that_the_hand_file_moves_may_be_left_out(tmp_path):
     assert q["index_pip_joint"] == pytest.approx(0.7)
     assert q["thumb_ip_joint"] == pytest.approx(0.175)
     assert q["thumb_opposition_joint"] == HAND.preshape["thumb_opposition_joint"]
+
+
+def test_degrees_are_refused_and_one_wild_row_is_not(tmp_path):
+    np.savez(tmp_path / "p.npz", **{**arrays(), "q_grasp": np.rad2deg(GRASP + 1.0)})
+    with pytest.raises(GraspError, match=r"grasp joints must be in radians, .* look like degrees"):
+        read_postures(tmp_path / "p.npz", HAND)
+
+    wild = np.concatenate([GRASP, GRASP[:1]])
+    wild[0, 0] = 50.0
+    rows = {name: np.concatenate([v, v[:1]]) for name, v in arrays().items() if len(v) == 2}
+    np.savez(tmp_path / "w.npz", **{**arrays(), **rows, "q_grasp": wild})
+    assert read_postures(tmp_path / "w.npz", HAND).q_grasp[0].max() == 50.0
+
+
+@pytest.mark.parametrize("write", [write_npz, write_hdf5])
+def test_arrays_larger_than_any_postures_are_refused(tmp_path, write, monkeypatch):
+    monkeypatch.setattr(posture_files, "MOST_BYTES", 100)
+    with pytest.raises(GraspError, match=r"arrays must be at most 1e\+02 bytes, got"):
+        read_postures(write(tmp_path), HAND)
+
+
+def test_quaternion_of_another_length_is_refused_and_a_rounded_one_is_not():
+    with pytest.raises(GraspError, match="row 1: position and quaternion must be finite"):
+        quaternion_poses(np.zeros((2, 3)), [[1.0, 0.0, 0.0, 0.0], [1.002, 0.0, 0.0, 0.0]])
+    (X,) = quaternion_poses([[1.0, 2.0, 3.0]], [[0.9995, 0.0, 0.0, 0.0]])
+    np.testing.assert_allclose(X, make_pose(np.eye(3), [1.0, 2.0, 3.0]), atol=1e-15)
 
 
 # Formats of others
@@ -269,10 +297,10 @@ def test_arrays_that_are_no_postures_are_refused_in_a_line(tmp_path, changes, wo
         ({"grasp_qpos": "a"}, "grasp_qpos must be numbers"),
         ({"grasp_qpos": np.zeros(23)}, "row 0: position and quaternion"),
         ({"joint_names": [1, 2]}, "joint_names must be a list of texts"),
-        ({"obj_pose": np.zeros(3)}, "obj_pose must be rows of a pose"),
+        ({"obj_pose": np.zeros(3)}, "obj_pose must be rows of 7 numbers or more"),
         ({"obj_pose": np.zeros(8)}, r"obj_pose must be 7 numbers for 1 or 1, got \(1, 8\)"),
         ({"obj_pose": np.zeros((3, 7))}, r"obj_pose must be 7 numbers .*, got \(3, 7\)"),
-        ({"squeeze_qpos": np.zeros((2, 23))}, "squeeze_qpos must be of 1 rows, got 2"),
+        ({"squeeze_qpos": np.zeros((2, 23))}, "the postures must have equal lengths"),
     ],
 )
 def test_dictionaries_that_are_no_grasps_are_refused_in_a_line(tmp_path, changes, words):

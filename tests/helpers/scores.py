@@ -10,7 +10,7 @@ import numpy as np
 
 from drakegrasp.scoring.measures import Grouping, Judged
 from drakegrasp.scoring.ranked import rank
-from drakegrasp.scoring.verdict import Verdict
+from drakegrasp.scoring.verdict import Verdict, verdict_of
 
 FAILS = Verdict(
     outcome="dropped",
@@ -70,19 +70,17 @@ class FakeVerify:
                 raise KeyboardInterrupt
             self.asked += 1
             held = self.holds(grasp)
-            on_result(
-                index,
-                SimpleNamespace(
-                    outcome=SimpleNamespace(label="success" if held else "dropped"),
-                    success=held,
-                    held=held,
-                    precision=held,
-                    stable=held,
-                    sample=held,
-                    held_any=held,
-                    first=None,
-                    farthest_contact=0.001 if held else np.nan,
-                    p_OQ=np.zeros((3, 3)),
-                    seconds={"simulate": 0.5},
-                ),
+            found: Any = SimpleNamespace(
+                outcome=SimpleNamespace(label="success" if held else "dropped"),
+                success=held,
+                held=held,
+                precision=held,
+                stable=held,
+                sample=held,
+                held_any=held,
+                first=None,
+                farthest_contact=0.001 if held else np.nan,
+                p_OQ=np.zeros((3, 3)),
+                seconds={"simulate": 0.5},
             )
+            on_result(index, verdict_of(found))

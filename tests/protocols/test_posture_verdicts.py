@@ -19,7 +19,7 @@ from helpers.jaws import HERE, jaws
 from drakegrasp.errors import ConfigError, DataError, HandError, MachineError
 from drakegrasp.exchange.dexgraspbench import write_object
 from drakegrasp.protocols.catalog import find_protocol
-from drakegrasp.protocols.grasp_file import read_grasp_file
+from drakegrasp.protocols.grasp_file import one_motion, read_grasp_file
 from drakegrasp.protocols.object_folder import read_object_folder
 from drakegrasp.protocols.postures import (
     PostureTrials,
@@ -125,9 +125,13 @@ def test_line_names_protocol_numbers_versions_and_digests(
     ("changes", "why"),
     [
         ({"grasp_qpos": np.full(9, np.nan)}, "grasp_qpos must be finite numbers"),
-        ({"grasp_qpos": np.zeros((2, 9))}, "grasp_qpos must be a vector"),
+        ({"grasp_qpos": np.zeros((2, 9))}, "the postures must have equal lengths"),
+        (
+            {f"{name}_qpos": np.ones((2, 9)) for name in ("pregrasp", "grasp", "squeeze")},
+            "grasp_qpos must be a vector, got 2 of them",
+        ),
         ({"grasp_qpos": np.zeros(9)}, "grasp_qpos must have a quaternion"),
-        ({"grasp_qpos": np.ones(8)}, "the three postures must have equal lengths"),
+        ({"grasp_qpos": np.ones(8)}, "the postures must have equal lengths"),
         ({"grasp_qpos": np.array([1e6, 0, 0, 1, 0, 0, 0, 0, 0])}, "within 10 m of the object"),
         ({"grasp_qpos": "text"}, "grasp_qpos must be numbers"),
         ({"obj_pose": np.ones(8)}, "obj_pose must be 7 numbers"),
@@ -184,7 +188,7 @@ def test_file_without_a_posture_names_it(write: Write) -> None:
     del content["squeeze_qpos"]
     np.save(path, content)
     with pytest.raises(DataError, match="must have squeeze_qpos, got none"):
-        read_grasp_file(path)
+        one_motion(read_grasp_file(path))
 
 
 def test_own_protocol_decides_and_its_digest_is_in_the_result(

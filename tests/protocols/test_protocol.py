@@ -188,3 +188,8 @@ def test_protocols_have_a_name_a_source_and_words_for_a_paper(name: str) -> None
     assert protocol.name == name
     assert protocol.source
     assert type(protocol).__doc__ and len(type(protocol).__doc__) > 80
+
+
+def test_a_simulation_that_diverges_is_no_success(judge: Judge) -> None:
+    verdict = judge(acceleration=1e12)
+    assert (verdict.success, verdict.reason) == (False, "diverged")

@@ -160,7 +160,7 @@ def _absurd(path: Path) -> Path:
     [
         (_missing, r"grasps\.npy: must be a file of grasps, got none"),
         (_folder, r"grasps\.h5: must be a file of grasps, got none"),
-        (_other_suffix, r"must be a file \.npy, \.csv, \.h5 or \.hdf5, got '\.txt'"),
+        (_other_suffix, r"must be a file \.npy, \.csv, \.h5, \.hdf5 or \.parquet, got '\.txt'"),
         (_of("a.npy", b""), r"a\.npy: must be a \.npy file of numbers, got none"),
         (_of("a.npy", b"PK\x03\x04 zip"), r"a\.npy: must be a \.npy file of numbers, got none"),
         (_cut_off, "must be a .npy file of numbers, got none"),

@@ -23,7 +23,6 @@ from drakegrasp.verification.forces.contact_forces import (
     ForceProgram,
     GraspContacts,
     grasp_map,
-    hardest_forces,
 )
 
 #: Edges of the pyramid that approximates a friction cone from inside. With 16, epsilon is about
@@ -149,7 +148,8 @@ def smallest_friction(contacts: GraspContacts, wrenches_O: npt.ArrayLike) -> flo
     """
 
     def holds(friction: float) -> bool:
-        return hardest_forces(ForceProgram(contacts, friction), wrenches_O).share <= 1.0
+        program = ForceProgram(contacts, friction)
+        return all(program.smallest(wrench).share <= 1.0 for wrench in np.asarray(wrenches_O))
 
     low, high = 0.0, MAX_FRICTION
     if not holds(high):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from contextlib import nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,22 +11,17 @@ import click
 
 from drakegrasp.cli.errors import say
 from drakegrasp.cli.options import PATH, shared
+from drakegrasp.cli.verify.protocol import (
+    PLACES,
+    ProtocolRequest,
+    is_lift,
+    refuse_options,
+    verify_by_protocol,
+)
+from drakegrasp.cli.verify.request import VerifyRequest
 
 if TYPE_CHECKING:
     from drakegrasp.verification.result import Verification
-
-
-@dataclass(frozen=True, kw_only=True)
-class PostureRequest:
-    """The options of the command for a protocol that runs in MuJoCo."""
-
-    grasps: Path
-    protocol: str
-    hand: str | None
-    assets: Path
-    out: Path | None
-    as_json: bool
-    workers: int | None
 
 
 @click.command()
@@ -83,7 +77,7 @@ class PostureRequest:
     default="lift",
     show_default=True,
     help="The rule of the verdict: lift, dexgraspbench, dexgraspbench-tabletop, dexonomy-hard, or "
-    "a class of your own. All but lift take GRASPS as files of DexGraspBench, and --hand as MJCF.",
+    "a class of your own. All but lift run in MuJoCo.",
 )
 @click.option(
     "--simulator",
@@ -137,8 +131,9 @@ def verify(
     points in metres, then the unit normals out of the object, in the order of the hand's
     fingers.
 
-    With another protocol than lift, GRASPS is a .npy file of DexGraspBench, with pregrasp, grasp
-    and squeeze, or a folder of such files; --hand is an MJCF, whose world is the hand's root.
+    With another protocol than lift, GRASPS may also be a file of postures as `build --postures`
+    reads it; of contacts the first wrist pose that fits them is tried. Or GRASPS is a .npy file of
+    DexGraspBench or a folder of such files, and --hand an MJCF, whose world is the hand's root.
 
     If GRASPS is a data file of a dataset, and neither --object nor --dataset is given, the
     command tries the grasps of that dataset.
@@ -147,26 +142,24 @@ def verify(
     standard error. A row that is no grasp has the outcome `invalid`. Exit code: 0 if every grasp
     has a verdict, whatever it is; 2 for input that cannot be used.
     """
-    if not _is_lift(protocol, simulator):
-        _refuse_options(protocol, scheduler=scheduler, scheduler_file=scheduler_file, **options)
-        _verify_postures(
-            PostureRequest(
-                grasps=options["grasps"],
-                protocol=protocol,
-                hand=options["hand"],
-                assets=assets or Path(),
-                out=out,
-                as_json=as_json,
-                workers=workers,
-            ),
-            show=not (quiet or as_json),
-        )
-        return
-    if assets is not None:
+    if not is_lift(protocol, simulator):
+        grasps = {name: options.pop(name) for name in PLACES}
+        refuse_options(protocol, scheduler=scheduler, scheduler_file=scheduler_file, **options)
+        request = ProtocolRequest(protocol=protocol, assets=assets, **grasps)
+        verify_by_protocol(request, out, workers, as_json=as_json, quiet=quiet)
+    elif assets is not None:
         raise click.UsageError("--assets must be used with another --protocol than lift")
+    else:
+        connected = {"workers": workers, "scheduler": scheduler, "scheduler_file": scheduler_file}
+        _verify_by_lift(VerifyRequest(**options, out=out), connected, as_json, quiet or as_json)
+
+
+def _verify_by_lift(
+    request: VerifyRequest, workers: dict[str, Any], as_json: bool, quiet: bool
+) -> None:
     from drakegrasp.api.verifying import run_verification
     from drakegrasp.cli.tables import make_console, verdict_table
-    from drakegrasp.cli.verify_request import VerifyRequest, place_requested, requested_rows
+    from drakegrasp.cli.verify.request import place_requested, requested_rows
     from drakegrasp.verification.hints import count_hints
     from drakegrasp.verification.result_files import (
         json_lines,
@@ -177,7 +170,7 @@ def verify(
     )
 
     # All input is read and checked before anything is simulated.
-    request = VerifyRequest(**options, out=out)
+    out = request.out
     grasps, config = place_requested(request)
     rows = None if out is None else requested_rows(request, len(grasps))
 
@@ -190,17 +183,9 @@ def verify(
             print_line(index, result)
 
     # Lines are written as verdicts arrive, so an interrupted run leaves those that are done.
-    quiet = quiet or as_json
     try:
         with nullcontext(print_line) if out is None else json_lines(out) as write:
-            results = run_verification(
-                grasps,
-                workers=workers,
-                scheduler=scheduler,
-                scheduler_file=scheduler_file,
-                on_result=deliver,
-                show=not quiet,
-            )
+            results = run_verification(grasps, **workers, on_result=deliver, show=not quiet)
             if out is not None:
                 write_results(results, result_paths(out)[1], config, rows)
     except BaseException:
@@ -214,84 +199,3 @@ def verify(
         make_console(stderr=True).print(verdict_table(results))
         for hint, count in count_hints(result.hints for result in results):
             say(f"{count} of {len(results)} grasps would fit much better: {hint}", err=True)
-
-
-def _is_lift(name: str, simulator: str | None) -> bool:
-    """Return whether a protocol is the lift in Drake.
-
-    Raises:
-        ConfigError: If there is no such protocol.
-        click.UsageError: If it does not run in the simulator.
-    """
-    from drakegrasp.protocols.catalog import find_protocol
-
-    protocol, stored = find_protocol(name)
-    if simulator not in (None, protocol.simulator):
-        raise click.UsageError(
-            f"--simulator of protocol {stored} must be {protocol.simulator}, got {simulator}"
-        )
-    return protocol.simulator == "drake"
-
-
-def _refuse_options(protocol: str, **options: Any) -> None:
-    """Refuse options that grasps of DexGraspBench's format answer by themselves.
-
-    Raises:
-        click.UsageError: If one is given.
-    """
-    usual = {"method": "hand", "overrides": (), "snap_points": False}
-    for name, value in options.items():
-        if name not in ("grasps", "hand") and value is not None and value != usual.get(name):
-            option = {"mesh": "object", "overrides": "set"}.get(name, name.replace("_", "-"))
-            raise click.UsageError(f"--{option} must not be used with protocol {protocol}")
-
-
-def _verify_postures(request: PostureRequest, *, show: bool) -> None:
-    """Write the verdicts on files of DexGraspBench, and how many hold.
-
-    Raises:
-        DataError: If there are no files, or the results cannot be written.
-        HandError, ConfigError, MachineError: As `prepare_trials`.
-    """
-    from drakegrasp.errors import DataError, HandError
-    from drakegrasp.protocols.postures import json_line, prepare_trials, verify_postures
-    from drakegrasp.runtime.executor import processes
-    from drakegrasp.runtime.progress import progress_bar
-    from drakegrasp.verification.result_files import refuse_unwritable, result_paths, text_lines
-
-    # All files, and what they have in common.
-    path, hand, out = request.grasps, Path(request.hand or ""), request.out
-    if out is not None:
-        refuse_unwritable(out)
-    files = [path] if path.is_file() else sorted(path.rglob("*.npy"))
-    if not files:
-        raise DataError(f"{path}: must be a .npy file or a folder of them, got none")
-    if hand.suffix != ".xml":
-        raise HandError(
-            f"--hand must be an MJCF (.xml) with --protocol {request.protocol}, got {request.hand}"
-        )
-    trials = prepare_trials(request.protocol, hand, request.assets)
-
-    # A line per verdict as it comes.
-    held = 0
-    with (
-        nullcontext(_print_line) if out is None else text_lines(out) as write,
-        processes(request.workers) as execute,
-        progress_bar("verify", "grasps", show=show) as report,
-    ):
-        for index, result in enumerate(verify_postures(files, trials, execute)):
-            line = json_line(index, result, trials)
-            write(line)
-            if request.as_json and out is not None:
-                _print_line(line)
-            held += result.verdict.success
-            report(index + 1, len(files), holding=held)
-    if out is not None and not request.as_json:
-        say(str(result_paths(out)[0]))
-    if show:
-        say(f"{held:,} of {len(files):,} grasps hold by {trials.protocol}", err=True)
-
-
-def _print_line(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()

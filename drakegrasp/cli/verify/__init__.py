@@ -1,0 +1,1 @@
+"""`drakegrasp verify`."""

@@ -1,0 +1,193 @@
+"""`drakegrasp verify --protocol NAME`: grasps under the rules of a protocol that runs in MuJoCo."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import click
+import numpy as np
+
+from drakegrasp.cli.errors import say
+
+if TYPE_CHECKING:
+    from drakegrasp.exchange.protocol_grasps import PlacedPosture
+    from drakegrasp.hand.description import Hand
+
+#: Options that say what the grasps are and where.
+PLACES = ("grasps", "mesh", "units", "dataset", "split", "frame", "camera", "hand")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProtocolRequest:
+    """The options of the command that count with a protocol; None for those not given."""
+
+    grasps: Path
+    protocol: str
+    hand: str | None
+    assets: Path | None
+    mesh: Path | None
+    units: str | None
+    dataset: Path | None
+    split: str | None
+    frame: str | None
+    camera: Path | None
+
+    @property
+    def is_foreign(self) -> bool:
+        """Whether the grasps are files of DexGraspBench."""
+        path = self.grasps
+        if Path(self.hand or "").suffix == ".xml" or self.assets is not None or path.is_dir():
+            return True
+        try:
+            return path.suffix == ".npy" and np.load(path, mmap_mode="r") is None
+        except ValueError:  # an array of Python objects
+            return True
+        except OSError:
+            return False
+
+
+def is_lift(name: str, simulator: str | None) -> bool:
+    """Return whether a protocol is the lift in Drake.
+
+    Raises:
+        ConfigError: If there is no such protocol.
+        click.UsageError: If it does not run in the simulator.
+    """
+    from drakegrasp.protocols.catalog import find_protocol
+
+    protocol, stored = find_protocol(name)
+    if simulator not in (None, protocol.simulator):
+        raise click.UsageError(
+            f"--simulator of protocol {stored} must be {protocol.simulator}, got {simulator}"
+        )
+    return protocol.simulator == "drake"
+
+
+def refuse_options(protocol: str, **options: Any) -> None:
+    """Refuse options that the protocol answers by itself.
+
+    Raises:
+        click.UsageError: If one is given.
+    """
+    usual = {"method": "hand", "overrides": (), "snap_points": False}
+    for name, value in options.items():
+        if value is not None and value != usual.get(name):
+            option = {"mesh": "object", "overrides": "set"}.get(name, name.replace("_", "-"))
+            raise click.UsageError(f"--{option} must not be used with protocol {protocol}")
+
+
+def verify_by_protocol(
+    request: ProtocolRequest, out: Path | None, workers: int | None, *, as_json: bool, quiet: bool
+) -> None:
+    """Write the verdicts, and how many hold.
+
+    Raises:
+        GraspError, DataError: If grasps or objects cannot be used, or the results not be written.
+        HandError, ConfigError, MachineError: As `prepare_trials`.
+    """
+    from drakegrasp.protocols.postures import json_line, prepare_trials, verify_postures
+    from drakegrasp.runtime.executor import processes
+    from drakegrasp.runtime.progress import progress_bar
+    from drakegrasp.verification.result_files import refuse_unwritable, result_paths, text_lines
+
+    if out is not None:
+        refuse_unwritable(out)
+    with TemporaryDirectory() as folder:
+        hand, assets, files, names = _grasp_files(request, Path(folder))
+        trials = prepare_trials(request.protocol, hand, assets)
+
+        # A line per verdict as it comes.
+        held, show = 0, not (quiet or as_json)
+        with (
+            nullcontext(_print_line) if out is None else text_lines(out) as write,
+            processes(workers) as execute,
+            progress_bar("verify", "grasps", show=show) as report,
+        ):
+            for index, result in enumerate(verify_postures(files, trials, execute)):
+                line = json_line(index, replace(result, file=names[index]), trials)
+                write(line)
+                if as_json and out is not None:
+                    _print_line(line)
+                held += result.verdict.success
+                report(index + 1, len(files), holding=held)
+    if out is not None and not as_json:
+        say(str(result_paths(out)[0]))
+    if show:
+        say(f"{held:,} of {len(files):,} grasps hold by {trials.protocol}", err=True)
+
+
+def _grasp_files(
+    request: ProtocolRequest, folder: Path
+) -> tuple[Path, Path, list[Path | str], list[Path]]:
+    """Return the MJCF of the hand, the folder of objects, and of each grasp its file and name."""
+    from drakegrasp.errors import DataError, HandError
+    from drakegrasp.exchange.protocol_grasps import write_grasps
+
+    # Files of DexGraspBench.
+    path = request.grasps
+    if request.is_foreign:
+        given = {n: getattr(request, n) for n in PLACES if n not in ("grasps", "hand")}
+        refuse_options(f"{request.protocol} and files of DexGraspBench", **given)
+        if Path(request.hand or "").suffix != ".xml":
+            raise HandError(
+                f"--hand must be an MJCF (.xml) with files of DexGraspBench, got {request.hand}"
+            )
+        files = [path] if path.is_file() else sorted(path.rglob("*.npy"))
+        if not files:
+            raise DataError(f"{path}: must be a .npy file or a folder of them, got none")
+        return Path(request.hand or ""), request.assets or Path(), list(files), files
+
+    # Our own grasps are written as such files.
+    hand, grasps = _own_grasps(request)
+    hand_path, found = write_grasps(grasps, hand, folder)
+    return hand_path, folder, found, [path] * len(found)
+
+
+def _own_grasps(request: ProtocolRequest) -> tuple[Hand, list[PlacedPosture]]:
+    """Return postures of a file, or those that predictions of contacts mean, and their hand."""
+    from drakegrasp.cli.verify.request import VerifyRequest, place_requested
+    from drakegrasp.dataset.manifest import read_manifest
+    from drakegrasp.errors import GraspError
+    from drakegrasp.exchange.posture_files import holds_postures, read_postures
+    from drakegrasp.exchange.protocol_grasps import (
+        fitted_postures,
+        postures_on_dataset,
+        postures_on_object,
+    )
+    from drakegrasp.hand.description import load_hand
+    from drakegrasp.hand.settings import load_config, override_config
+    from drakegrasp.simulation.placement import place_object
+
+    if not holds_postures(request.grasps):
+        options = {name: getattr(request, name) for name in PLACES}
+        placed, config = place_requested(VerifyRequest(**options))
+        return load_hand(config.hand_source), list(fitted_postures(placed))
+
+    # Postures say their frame and their object themselves.
+    said = {name: getattr(request, name) for name in ("split", "frame", "camera")}
+    refuse_options(f"{request.protocol} and postures", **said)
+    if (request.mesh is None) == (request.dataset is None):
+        raise GraspError("--object MESH or --dataset FILE must be given with postures, one of them")
+    if request.dataset is not None:
+        out = request.dataset.parent if request.dataset.is_file() else request.dataset
+        config = read_manifest(out).config
+    else:
+        config = load_config()
+    if request.hand is not None:
+        config = override_config(config, [], hand=request.hand)
+    hand = load_hand(config.hand_source)
+    table = read_postures(request.grasps, hand)
+    if request.mesh is None:
+        return hand, postures_on_dataset(table, out)
+    placed_object = place_object(request.mesh, units=request.units, config=config)
+    return hand, postures_on_object(table, placed_object)
+
+
+def _print_line(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()

@@ -1,0 +1,134 @@
+"""Our own grasps under a protocol of MuJoCo: postures of a file, and predicted contacts."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.commands import error_line, run
+from helpers.objects import CUBE, STANDOFF, box_model, from_above, standing
+
+pytest.importorskip("mujoco")
+pytest.importorskip("coacd")
+
+from drakegrasp.exchange.closed_grasps import ClosedGrasp
+from drakegrasp.exchange.posture_files import holds_postures
+from drakegrasp.exchange.posture_rows import quaternion_poses
+from drakegrasp.exchange.protocol_grasps import PlacedPosture, write_grasps
+from drakegrasp.frames import invert_pose
+from drakegrasp.grasp import pack_grasp
+from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.settings import load_config
+from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.placement import PlacedObject
+from drakegrasp.simulation.postures.posture import Posture
+from drakegrasp.simulation.trial import TrialRecord, run_attempt
+
+HAND = load_hand()
+
+
+@pytest.fixture(scope="module")
+def closed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrialRecord]:
+    """A cube, and the trial of a grasp that holds it."""
+    folder, config = tmp_path_factory.mktemp("cube"), load_config()
+    model = box_model(folder, [CUBE] * 3)
+    scene = build_scene(model, config.physics, HAND)
+    record = run_attempt(scene, standing(model), from_above(model, STANDOFF), config)
+    assert record.lift is not None
+    return next(folder.glob("*.obj")), record
+
+
+def lines_of(grasps: Path, *options: Any) -> list[dict[str, Any]]:
+    result = run("verify", grasps, "--protocol", "dexgraspbench", "--workers", 1, *options)
+    assert result.exit_code == 0, result.output
+    return [json.loads(line) for line in result.stdout.splitlines()]
+
+
+def test_postures_and_contacts_are_tried_and_a_bad_row_is_invalid(
+    closed: tuple[Path, TrialRecord], tmp_path: Path
+) -> None:
+    mesh, record = closed
+    end = record.closed
+    assert end is not None
+    far = record.X_OG.copy()
+    far[2, 3] += 0.3
+    np.savez(
+        tmp_path / "own.npz",
+        object=np.array(["a", "a"]),
+        X_FG=np.array([record.X_OG, far]),
+        q_grasp=np.array([end.q, end.q]),
+    )
+    held, lost = lines_of(tmp_path / "own.npz", "--object", mesh)
+    assert held["success"] and held["file"].endswith("own.npz")
+    assert lost["reason"] == "moved"
+
+    grasp = pack_grasp(end.contacts.p_OQ, end.contacts.nhat_Q_O)
+    np.save(tmp_path / "18.npy", np.array([np.full(18, np.nan), grasp]))
+    bad, fitted = lines_of(tmp_path / "18.npy", "--object", mesh)
+    assert bad["reason"].startswith("invalid: number 1 is nan")
+    assert fitted["success"]
+
+
+def test_files_say_what_the_posture_says(tmp_path: Path, grasps: list[ClosedGrasp]) -> None:
+    grasp = grasps[0]
+    model = box_model(tmp_path, [0.06, 0.05, 0.10])
+    X_OG = invert_pose(grasp.X_TO) @ grasp.X_TG
+    squeeze = grasp.q + 0.05
+    posture = Posture(X_OG, grasp.q, q_squeeze=squeeze)
+    each = PlacedPosture(placed=PlacedObject(model=model, X_TO=grasp.X_TO), posture=posture)
+    _, (path, why) = write_grasps(
+        [each, PlacedPosture(placed=each.placed, posture="it is none")], HAND, tmp_path / "to"
+    )
+    assert why == "it is none" and isinstance(path, Path)
+
+    content = np.load(path, allow_pickle=True).item()
+    place, root = (
+        quaternion_poses(v[None, :3], v[None, 3:7])[0]
+        for v in (content["obj_pose"], content["grasp_qpos"])
+    )
+    np.testing.assert_allclose(invert_pose(place) @ root @ HAND.X_BG, X_OG, atol=1e-12)
+    assert sorted(content["grasp_qpos"][7:]) == sorted(grasp.q)
+    np.testing.assert_allclose(content["squeeze_qpos"][7:] - content["grasp_qpos"][7:], 0.05)
+    assert (content["pregrasp_qpos"][7:] <= content["grasp_qpos"][7:]).all()
+
+
+def test_what_a_file_holds_is_told_from_its_content(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.zeros((1, 18)))
+    (tmp_path / "a.csv").write_text("1,2,3\n")
+    (tmp_path / "b.csv").write_text("object,x\nmug,1\n")
+    found = [holds_postures(tmp_path / name) for name in ("a.npy", "a.csv", "b.csv", "b.npz")]
+    assert found == [False, False, True, True]
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        ([], "--object MESH or --dataset FILE must be given with postures"),
+        (["--frame", "camera"], "--frame must not be used with protocol dexgraspbench and post"),
+    ],
+)
+def test_options_that_postures_answer(tmp_path: Path, options: list[str], why: str) -> None:
+    np.savez(tmp_path / "own.npz", object=np.array(["a"]))
+    result = run("verify", tmp_path / "own.npz", "--protocol", "dexgraspbench", *options)
+    assert result.exit_code == 2
+    assert why in error_line(result)
+
+
+def test_score_by_a_protocol_says_so_on_the_card(dataset: Path, tmp_path: Path) -> None:
+    given = ("score", "--dataset", dataset / "grasping_oto.hdf5", "--reference", "constant")
+    result = run(
+        *(*given, "--protocol", "dexgraspbench", "--per-object", 1, "--workers", 1),
+        *("--out", tmp_path / "card", "--json", "--quiet"),
+    )
+    assert result.exit_code == 0, result.output
+    card = json.loads(result.stdout)
+    assert card["settings"]["protocol"]["protocol"] == "dexgraspbench"
+    assert set(card["measures"]) == {"headline", "objects"}
+    known = {"penetration", "moved", "turned", "success"}
+    assert set(card["sets"]["constant"]["outcomes"]) <= known
+    assert card["again"].endswith("--protocol dexgraspbench")
+    text = (tmp_path / "card" / "card.md").read_text()
+    assert "held(d)" not in text and "JYChen18/DexGraspBench" in text
