@@ -128,7 +128,7 @@ def check_efforts(hand: Hand, config: Config) -> Finding:
         hand.fingers, hand.closing_speed, limits, units, strict=True
     ):
         stalled = FINGER_DAMPING * speed / unit**2
-        if stalled < finger.effort_limit:
+        if finger.driven_by is None and stalled < finger.effort_limit:
             faults.append(
                 f"finger {finger.name!r} must close fast enough for its motor: at its speed a "
                 f"stalled one gives {stalled:.3g} of {finger.effort_limit:g} {finger.effort_unit}"

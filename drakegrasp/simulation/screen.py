@@ -14,7 +14,7 @@ point, so a prediction depends on its attempt alone, not on those that are predi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,7 @@ from drakegrasp.config import ScreenConfig
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.finger_sweep import GAP_STRIDE, FingerPath, HandPaths, Points, hand_paths
+from drakegrasp.hand.kinematics import open_together
 from drakegrasp.mesh.distance_field import DistanceField
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
@@ -96,8 +97,10 @@ def predict(
         X_OG = np.stack([attempts[row].X_OG for row in rows])
         lookup = _PointLookup(model.field, np.asarray(X_TO, dtype=float), X_OG)
         screened = _screen(lookup, paths, _widened(config, model.field))
-        for row, prediction in zip(rows, screened, strict=True):
-            predictions[row] = prediction
+        for row, found in zip(rows, screened, strict=True):
+            # Fingers of one motor start together.
+            starts = open_together(hand, found.closing) if found.outcome is None else found.closing
+            predictions[row] = replace(found, closing=starts)
     return predictions
 
 
