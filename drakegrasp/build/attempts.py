@@ -29,6 +29,7 @@ from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import release_memory
 from drakegrasp.simulation.candidates import Attempt, children, family_member, make_attempts
+from drakegrasp.simulation.centring import centred
 from drakegrasp.simulation.postures.table import posture_attempts
 from drakegrasp.simulation.randomization.conditions import usual_conditions
 from drakegrasp.simulation.randomization.draws import draw_conditions
@@ -116,6 +117,7 @@ def list_attempts(prepared: PreparedObject, indices: range, config: Config) -> l
         made = make_attempts(drawn, indices, config.candidates, **place)
     else:
         made = posture_attempts(drawn, indices, load_hand(config.hand), **place)
+    made = centred(model, load_hand(config.hand), list(made))
     return [_with_conditions(attempt, model, config) for attempt in made]
 
 
@@ -123,6 +125,7 @@ def list_children(prepared: PreparedObject, parent: Attempt, config: Config) -> 
     """Return the attempts about that of a grasp that holds, with their conditions."""
     model = prepared.model
     made = children(parent, config.refine, name=model.name, seed=config.seed)
+    made = centred(model, load_hand(config.hand), made)
     return [_with_conditions(attempt, model, config) for attempt in made]
 
 
@@ -138,9 +141,16 @@ def find_attempt(
     if not 0 <= child <= most:
         raise DataError(f"child must be 0 to {most}, got {child}")
     first = list_attempts(prepared, range(candidate, candidate + 1), config)[standoff_index]
-    name, seed = prepared.model.name, config.seed
-    member = family_member(first, child, config.refine, name=name, seed=seed)
-    return _with_conditions(member, prepared.model, config)
+    model, hand = prepared.model, load_hand(config.hand)
+    member = family_member(
+        first,
+        child,
+        config.refine,
+        name=model.name,
+        seed=config.seed,
+        place=lambda attempt: centred(model, hand, [attempt])[0],
+    )
+    return _with_conditions(member, model, config)
 
 
 def _with_conditions(attempt: Attempt, model: ObjectModel, config: Config) -> Attempt:

@@ -6,8 +6,8 @@ and stores the joints of each finger as constants, which is all that `kinematics
 
 The coordinates of a hand with k fingers are c = (spread [rad], closing of finger 1..k [rad, or m
 where it slides]). Its m motors are those of the fingers that no other finger drives: closing
-positions are `closing_ratio` times those of these fingers. Frames: B palm link, G palm, Fi distal (fingertip) link of finger i, P a point on
-it, J a joint.
+positions are `closing_ratio` times those of these fingers. Frames: B palm link, G palm, Fi distal
+(fingertip) link of finger i, P a point on it, J a joint.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ from drakegrasp.hand.chains import (
 )
 from drakegrasp.hand.file_format import (
     Coupling,
-    DrivenBy,
     Drive,
+    DrivenBy,
     Finger,
     HandFile,
     Spread,
