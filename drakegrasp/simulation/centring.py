@@ -72,10 +72,8 @@ def _move(model: ObjectModel, X_OG: Array, paths: Sequence[FingerPath], ratio: A
     # Positions of the motor at which each finger meets the object, and the motion of its pad there.
     lookup = PointLookup(model.field, np.eye(4), X_OG)
     ends = [_meeting(lookup, path) for path in paths]
-    at = (
-        np.stack([_closing(path, end) for path, end in zip(paths, ends, strict=True)])
-        / ratio[:, None]
-    )
+    closing = [path.angles[1] * end for path, end in zip(paths, ends, strict=True)]
+    at = np.stack(closing) / ratio[:, None]
     motion = np.stack([_pad_motion(path, end) for path, end in zip(paths, ends, strict=True)])
     motion *= ratio[:, None, None]
 
@@ -120,11 +118,6 @@ def _points(path: FingerPath, place: Array) -> npt.NDArray[np.float32]:
     share = (place - before).astype(np.float32)[:, None, None]
     points = path.points[before] * (np.float32(1.0) - share)
     return np.asarray(points + path.points[before + 1] * share)
-
-
-def _closing(path: FingerPath, place: Array) -> Array:
-    """Return closing positions (n,) [rad or m] of places on a path."""
-    return np.asarray(path.angles[1] * place)
 
 
 def _pad_motion(path: FingerPath, place: Array) -> Array:

@@ -464,7 +464,8 @@ def _add_own_motors(
         K = τ_max / (`SOFT` u), D = K `LAG`,
 
     with effort limit, holding effort, rotor and gear of the finger's closing joint; fingers of one
-    motor have equal shares of its efforts. A joint that slides where this one turns, or turns where it slides, has no motor.
+    motor have equal shares of its efforts. A joint that slides where this one turns, or turns where
+    it slides, has no motor.
 
     Returns:
         The attributes of `Scene` that say of the motors.
