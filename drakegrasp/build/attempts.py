@@ -29,10 +29,10 @@ from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.environment import release_memory
 from drakegrasp.simulation.candidates import Attempt, children, family_member, make_attempts
-from drakegrasp.simulation.centring import centred
 from drakegrasp.simulation.postures.table import posture_attempts
 from drakegrasp.simulation.randomization.conditions import usual_conditions
 from drakegrasp.simulation.randomization.draws import draw_conditions
+from drakegrasp.simulation.sampling.centring import centred
 from drakegrasp.simulation.scene import Scene
 from drakegrasp.simulation.scene_cache import cached_renderer, cached_scene, forget_scenes
 from drakegrasp.simulation.screen import Prediction, predict

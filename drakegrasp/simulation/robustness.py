@@ -20,9 +20,9 @@ from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
 from drakegrasp.seeding import Stream
 from drakegrasp.simulation.candidates import Attempt, palm_motion
-from drakegrasp.simulation.centring import centred
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.randomization.conditions import Conditions, usual_conditions
+from drakegrasp.simulation.sampling.centring import centred
 from drakegrasp.simulation.screen import Prediction, predict
 from drakegrasp.simulation.trial import run_attempt
 

@@ -45,6 +45,7 @@ def centred(model: ObjectModel, hand: Hand, attempts: Sequence[_A]) -> list[_A]:
         hand: The hand.
         attempts: At the object.
     """
+    # Attempts of one spread are centred together, for the paths of the fingers depend on it.
     found = list(attempts)
     shared = [np.flatnonzero(row) for row in hand.closing_ratio.T > 0.0]
     shared = [fingers for fingers in shared if len(fingers) > 1]
@@ -52,6 +53,8 @@ def centred(model: ObjectModel, hand: Hand, attempts: Sequence[_A]) -> list[_A]:
     for row, attempt in enumerate(found):
         if shared and attempt.ray_hits and attempt.closing is None:
             rows_by_spread.setdefault(attempt.spread, []).append(row)
+
+    # Move the palms for each motor that moves several fingers.
     for spread, rows in rows_by_spread.items():
         paths = hand_paths(hand, spread)
         if paths is None:
