@@ -114,10 +114,10 @@ def list_attempts(prepared: PreparedObject, indices: range, config: Config) -> l
     model, drawn = prepared.model, prepared.candidates
     place: Any = {"name": model.name, "seed": config.seed}
     if drawn.postures is None:
-        made = make_attempts(drawn, indices, config.candidates, **place)
+        made = list(make_attempts(drawn, indices, config.candidates, **place))
     else:
-        made = posture_attempts(drawn, indices, load_hand(config.hand), **place)
-    made = centred(model, load_hand(config.hand), list(made))
+        made = list(posture_attempts(drawn, indices, load_hand(config.hand), **place))
+    made = centred(model, load_hand(config.hand), made)
     return [_with_conditions(attempt, model, config) for attempt in made]
 
 

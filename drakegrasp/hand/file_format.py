@@ -297,24 +297,34 @@ class HandFile(BaseModel):
 
     def closing_speeds(self) -> Array:
         """Return the speed (k,) of each closing joint [rad/s or m/s]."""
-        sliding, turning = self.closing_speed, np.deg2rad(self.closing_speed_deg or 0.0)
-        return np.array(
-            [
-                (sliding if f.slides else turning) * (f.driven_by.ratio if f.driven_by else 1.0)
-                for f in self.driven_fingers()
-            ],
-            dtype=float,
-        )
+        sliding, turning = self.closing_speed or 0.0, np.deg2rad(self.closing_speed_deg or 0.0)
+        speeds = [
+            (sliding if f.slides else float(turning)) * (f.driven_by.ratio if f.driven_by else 1.0)
+            for f in self.driven_fingers()
+        ]
+        return np.array(speeds)
 
 
 def _as_driven(finger: Finger, driver: Finger, by: DrivenBy) -> Finger:
     """Return a finger that closes by `ratio` times its driver, with the limits that this leaves."""
     # By virtual work a torque T at the driver is T / ratio at the finger.
-    of_motor = {
-        key: None if (limit := getattr(driver, key)) is None else limit / by.ratio
-        for key in ("torque_limit", "force_limit", "holding_torque", "holding_force")
-    }
-    return replace(finger, **of_motor)
+    limit, holding = driver.effort_limit / by.ratio, driver.holding_effort
+    holding = None if holding is None else holding / by.ratio
+    return with_efforts(finger, limit, holding, slides=driver.slides)
+
+
+def with_efforts(finger: Finger, limit: float, holding: float | None, *, slides: bool) -> Finger:
+    """Return a finger with another effort limit and holding effort, of a joint that slides or not.
+
+    Args:
+        finger: The finger.
+        limit: Torque [N m] or force [N] of its motor.
+        holding: What its worm holds; None if it is not known.
+        slides: Whether its closing joint slides.
+    """
+    if slides:
+        return replace(finger, force_limit=limit, holding_force=holding)
+    return replace(finger, torque_limit=limit, holding_torque=holding)
 
 
 def read_hand_file(path: Path) -> HandFile:

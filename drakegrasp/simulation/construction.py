@@ -62,7 +62,7 @@ from pydrake.trajectories import PiecewisePolynomial
 from drakegrasp.config import PhysicsConfig
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.description import Hand
-from drakegrasp.hand.file_format import Finger
+from drakegrasp.hand.file_format import Finger, with_efforts
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.parsing import add_model, make_parser
 from drakegrasp.hand.shapes import hull_corners
@@ -495,13 +495,8 @@ def _with_share(hand: Hand, i: int) -> Finger:
     """Return a finger with the efforts that it has where all fingers of its motor press equally."""
     ratio = hand.closing_ratio[:, hand.motor_of[i]]
     share, finger = float(ratio[i] / ratio.sum()), hand.fingers[i]
-    kind = "force" if finger.slides else "torque"
-    holding = finger.holding_effort
-    efforts = {
-        f"{kind}_limit": share * finger.effort_limit,
-        f"holding_{kind}": None if holding is None else share * holding,
-    }
-    return replace(finger, **efforts)
+    holding = None if finger.holding_effort is None else share * finger.holding_effort
+    return with_efforts(finger, share * finger.effort_limit, holding, slides=finger.slides)
 
 
 def _add_motor(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers.hands import SLIDER, slider_fingers, write_slider
 
+from drakegrasp.commissioning.model_checks import check_couplings
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import closed_positions, coordinate_limits, open_together
@@ -102,3 +103,14 @@ def test_a_wrist_brings_both_fingers_to_their_points(tmp_path: Path) -> None:
     best = fit_wrist(hand, p_OQ, outward, up_O=np.array([0.0, 0.0, 1.0]), height=0.5)[0]
     assert best.closing[0] == best.closing[1] == pytest.approx(0.02, abs=1e-3)
     assert best.residual.max() < 5e-4
+
+
+def test_hand_check_asks_for_the_motor_that_the_model_shares(tmp_path: Path) -> None:
+    """Its fingers mimic each other in the URDF."""
+    finding = check_couplings(load_hand(write_slider(tmp_path)))
+    assert not finding.ok
+    assert "fingers.1.driven_by must be {finger: left, ratio: 1}" in finding.text
+    assert check_couplings(shared(tmp_path)).ok
+    other = check_couplings(shared(tmp_path, ratio=2.0))
+    assert not other.ok
+    assert "ratio: 1}" in other.text
