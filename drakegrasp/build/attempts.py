@@ -60,6 +60,13 @@ class TrialSetup:
     scene: Scene
     _renderer: Renderer | None = None
 
+    def scene_of(self, attempt: Attempt) -> Scene:
+        """Return the scene of an attempt: the hand may be in a preshape."""
+        if attempt.preshape is None:
+            return self.scene
+        model, config = self.prepared.model, self.config
+        return cached_scene(model, config.physics, config.hand, attempt.preshape)
+
     @property
     def renderer(self) -> Renderer:
         """The object's renderer, built when it is first needed."""
@@ -113,11 +120,14 @@ def list_attempts(prepared: PreparedObject, indices: range, config: Config) -> l
     """Return the attempts of a range of an object's candidates, with their conditions."""
     model, drawn = prepared.model, prepared.candidates
     place: Any = {"name": model.name, "seed": config.seed}
+    hand = load_hand(config.hand)
     if drawn.postures is None:
-        made = list(make_attempts(drawn, indices, config.candidates, **place))
+        count = len(hand.preshapes)
+        made = list(make_attempts(drawn, indices, config.candidates, **place, preshapes=count))
     else:
-        made = list(posture_attempts(drawn, indices, load_hand(config.hand), **place))
-    made = centred(model, load_hand(config.hand), made)
+        made = list(posture_attempts(drawn, indices, hand, **place))
+    made = [replace(a, unused=hand.unused_in(a.preshape)) for a in made] if hand.preshapes else made
+    made = centred(model, hand, made)
     return [_with_conditions(attempt, model, config) for attempt in made]
 
 
@@ -163,14 +173,19 @@ def predict_attempts(setup: TrialSetup, attempts: Sequence[Attempt]) -> list[Pre
     config, prepared = setup.config, setup.prepared
     hand = load_hand(config.hand)
 
-    # A call is about one resting pose.
+    # A call is about one resting pose and preshape.
     found: list[Prediction | None] = [None] * len(attempts)
     for k, X_TO in enumerate(prepared.resting_poses):
-        rows = [row for row, attempt in enumerate(attempts) if attempt.resting == k]
-        own = [attempts[row] for row in rows]
-        predictions = predict(prepared.model, hand, X_TO, own, config.screen)
-        for row, prediction in zip(rows, predictions, strict=True):
-            found[row] = prediction
+        for preshape in sorted({attempt.preshape for attempt in attempts}, key=str):
+            rows = [
+                row
+                for row, attempt in enumerate(attempts)
+                if (attempt.resting, attempt.preshape) == (k, preshape)
+            ]
+            own, shaped = [attempts[row] for row in rows], hand.at(preshape)
+            predictions = predict(prepared.model, shaped, X_TO, own, config.screen)
+            for row, prediction in zip(rows, predictions, strict=True):
+                found[row] = prediction
     return found
 
 
@@ -181,7 +196,7 @@ def try_attempt(
     X_TO = setup.prepared.resting_poses[attempt.resting]
     is_visible = partial(_is_visible, setup, attempt, X_TO)
     record = run_attempt(
-        setup.scene, X_TO, attempt, setup.config, prediction, is_visible=is_visible
+        setup.scene_of(attempt), X_TO, attempt, setup.config, prediction, is_visible=is_visible
     )
     if record.outcome is Outcome.SOLVER_ERROR:
         forget_scenes()

@@ -77,11 +77,22 @@ class Hand:
     chains: tuple[Chain, ...]  # one per finger, to its fingertip
     link_chains: dict[str, Chain]  # one per link that the palm carries, including the palm
     lift_chance: LiftChance | None  # of a sample, when it has closed; most hands have none
+    #: The hand in each of its preshapes, with the fingers that close in it alone.
+    preshapes: tuple[Hand, ...] = ()
 
     @property
     def num_fingers(self) -> int:
         """Number of fingers, k."""
         return len(self.fingers)
+
+    def at(self, preshape: int | None) -> Hand:
+        """Return the hand in a preshape of the given index; this one if None or if it has none."""
+        return self.preshapes[preshape] if self.preshapes and preshape is not None else self
+
+    def unused_in(self, preshape: int | None) -> int:
+        """Return the fingers that a preshape leaves out, as bits: 1 for the first finger."""
+        used = {finger.name for finger in self.at(preshape).fingers}
+        return sum(1 << i for i, finger in enumerate(self.fingers) if finger.name not in used)
 
     @property
     def fingertip_links(self) -> tuple[str, ...]:
@@ -170,7 +181,9 @@ def load_hand(name_or_yaml: str | Path = "barrett") -> Hand:
     try:
         packages = find_packages(folder, described.model, described.packages)
         model = ModelFile(folder / described.model, tuple(sorted(packages.items())), stamp)
-        hand = _build_hand(path.stem.removesuffix("_hand"), described, model)
+        name = path.stem.removesuffix("_hand")
+        hand = _build_hand(name, described, model)
+        hand = replace(hand, preshapes=_in_preshapes(name, described, model))
         hand = replace(hand, lift_chance=read_lift_chance(path))
         _refuse_empty_pads(hand)
     except HandError as error:
@@ -246,6 +259,17 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
         },
         lift_chance=None,
     )
+
+
+def _in_preshapes(name: str, described: HandFile, model: ModelFile) -> tuple[Hand, ...]:
+    """Return the hand in each of its preshapes."""
+    hands = []
+    for i, preshape in enumerate(described.preshapes):
+        try:
+            hands.append(_build_hand(name, described.in_preshape(preshape), model))
+        except HandError as error:
+            raise HandError(f"preshapes.{i}: {error}") from None
+    return tuple(hands)
 
 
 def _refuse_other_kinds(described: HandFile, joints: dict[str, Any]) -> None:

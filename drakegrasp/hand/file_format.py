@@ -193,6 +193,15 @@ class Spread:
     joints: tuple[Name, ...] = ()
 
 
+class Preshape(BaseModel):
+    """A way to grasp: which fingers close, and where the other joints stand."""
+
+    model_config = _STRICT
+    name: Name
+    fingers: Annotated[tuple[Name, ...], Field(min_length=1)]
+    joints: dict[Name, Finite] = {}  # joints that keep one position in it [rad or m]
+
+
 class Palm(BaseModel):
     """The palm frame G in the palm link's frame B."""
 
@@ -214,6 +223,7 @@ class HandFile(BaseModel):
     drive: Literal["worm", "torque"] = "torque"
     spread: Spread = Spread()
     preshape: dict[Name, Finite] = {}  # joints that keep one position [rad or m]
+    preshapes: tuple[Preshape, ...] = ()  # one is drawn per attempt; none: all fingers close
     closing_speed_deg: Positive | None = None  # of turning closing joints [deg/s]
     closing_speed: Positive | None = None  # of sliding closing joints [m/s]
     standoffs: Annotated[tuple[Positive, ...], Field(min_length=1)]  # palm to surface [m]
@@ -229,6 +239,29 @@ class HandFile(BaseModel):
         if len(set(names)) < len(names):
             raise ValueError(f"fingers must have a name each, got {', '.join(names)}")
         return self
+
+    @model_validator(mode="after")
+    def _check_preshapes(self) -> HandFile:
+        """Demand that preshapes have a name each, and fingers of the hand with their motors."""
+        names, drivers = [preshape.name for preshape in self.preshapes], self._drivers()
+        if len(set(names)) < len(names):
+            raise ValueError(f"preshapes must have a name each, got {', '.join(names)}")
+        for i, preshape in enumerate(self.preshapes):
+            for finger in preshape.fingers:
+                if finger not in drivers:
+                    raise ValueError(
+                        f"preshapes.{i}.fingers must be of {', '.join(drivers)}, got {finger!r}"
+                    )
+                if drivers[finger] not in preshape.fingers:
+                    raise ValueError(
+                        f"preshapes.{i}.fingers must include {drivers[finger]!r}, whose motor "
+                        f"drives {finger!r}"
+                    )
+        return self
+
+    def _drivers(self) -> dict[str, str]:
+        """Return the finger whose motor moves each finger, by name."""
+        return {f.name: f.driven_by.finger if f.driven_by else f.name for f in self.fingers}
 
     @model_validator(mode="after")
     def _check_drivers(self) -> HandFile:
@@ -286,6 +319,23 @@ class HandFile(BaseModel):
                 f"spreads_deg must be [0] without spread.joints, got {list(self.spreads_deg)}"
             )
         return self
+
+    def in_preshape(self, preshape: Preshape) -> HandFile:
+        """Return the file of a hand that has the fingers of a preshape alone.
+
+        Joints of the other fingers keep the positions that the preshape gives, else those of the
+        open hand.
+        """
+        still, fingers = dict(self.preshape), list[Finger]()
+        for finger in self.fingers:
+            if finger.name in preshape.fingers:
+                fingers.append(finger)
+                continue
+            still[finger.closing_joint] = 0.0
+            still.update({c.joint: c.offset for c in finger.coupled})
+        still.update(preshape.joints)
+        changes = {"fingers": tuple(fingers), "preshape": still, "preshapes": ()}
+        return self.model_copy(update=changes)
 
     def driven_fingers(self) -> tuple[Finger, ...]:
         """Return the fingers; one that another drives with the limits of that one's motor."""

@@ -139,6 +139,8 @@ class Pregrasp:
         conditions: Friction, mass, looks and cameras; None are the usual ones.
         audited: Whether the closed hand is lifted in any case, whatever its chance and its image.
         path: Of a posture that spread and closing cannot say: the positions of all joints.
+        preshape: Index of the hand's preshape; None if all fingers close.
+        unused: Fingers that the preshape leaves out, see `Hand.unused_in`.
     """
 
     X_OG: Array
@@ -148,6 +150,8 @@ class Pregrasp:
     conditions: Conditions | None = None
     audited: bool = False
     path: JointPath | None = None
+    preshape: int | None = None
+    unused: int = 0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -389,6 +393,7 @@ def make_attempts(
     *,
     name: str,
     seed: int,
+    preshapes: int = 0,
 ) -> Iterator[Attempt]:
     """Yield the attempts of a range of an object's candidates; each is a row of the dataset.
 
@@ -397,13 +402,15 @@ def make_attempts(
         indices: The range.
         config: Stand-offs and spreads.
         name: The object's name.
-        seed: Of the dataset; with name and candidate it decides the spreads.
+        seed: Of the dataset; with name and candidate it decides spreads and preshapes.
+        preshapes: Number of the hand's preshapes.
     """
     spreads, standoffs = np.deg2rad(config.spreads_deg), config.standoffs
     for i in indices:
         # Each candidate has its own stream, so ranges do not depend on each other.
         stream = Stream(seed, object_key(name), i)
         drawn = stream.integers(len(spreads), len(standoffs))
+        shapes = stream.integers(preshapes, len(standoffs)) if preshapes else None
 
         # Move the palm along its ray to each stand-off from the surface.
         distance = candidates.distance[i]
@@ -423,6 +430,7 @@ def make_attempts(
                 source=Source(candidates.source[i]),
                 log_density=float(candidates.log_density[i]),
                 audited=is_audited(seed, object_key(name), i, j, 0),
+                preshape=None if shapes is None else int(shapes[j]),
             )
 
 

@@ -36,10 +36,19 @@ _kept: dict[Hashable, Scene | Renderer] = {}
 _lock = threading.Lock()
 
 
-def cached_scene(model: ObjectModel, physics: PhysicsConfig, hand_name: str) -> Scene:
-    """Return the scene of an object with a hand, by its name or YAML file."""
+def cached_scene(
+    model: ObjectModel, physics: PhysicsConfig, hand_name: str, preshape: int | None = None
+) -> Scene:
+    """Return the scene of an object with a hand, by its name or YAML file.
+
+    Args:
+        model: The object.
+        physics: See `build_scene`.
+        hand_name: See `load_hand`.
+        preshape: Index of a preshape, see `Hand.at`.
+    """
     # A hand whose files have changed is loaded anew, and is then another key.
-    hand = load_hand(hand_name)
+    hand = load_hand(hand_name).at(preshape)
     return _cached((*_scene_key(model, physics), hand), lambda: build_scene(model, physics, hand))
 
 

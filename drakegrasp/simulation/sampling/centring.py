@@ -45,24 +45,25 @@ def centred(model: ObjectModel, hand: Hand, attempts: Sequence[_A]) -> list[_A]:
         hand: The hand.
         attempts: At the object.
     """
-    # Attempts of one spread are centred together, for the paths of the fingers depend on it.
+    # The paths of the fingers depend on preshape and spread.
     found = list(attempts)
-    shared = [np.flatnonzero(row) for row in hand.closing_ratio.T > 0.0]
-    shared = [fingers for fingers in shared if len(fingers) > 1]
-    rows_by_spread: dict[float, list[int]] = {}
+    groups: dict[tuple[int | None, float], list[int]] = {}
     for row, attempt in enumerate(found):
-        if shared and attempt.ray_hits and attempt.closing is None:
-            rows_by_spread.setdefault(attempt.spread, []).append(row)
+        if attempt.ray_hits and attempt.closing is None:
+            groups.setdefault((attempt.preshape, attempt.spread), []).append(row)
 
     # Move the palms for each motor that moves several fingers.
-    for spread, rows in rows_by_spread.items():
-        paths = hand_paths(hand, spread)
+    for (preshape, spread), rows in groups.items():
+        shaped = hand.at(preshape)
+        shared = [np.flatnonzero(row) for row in shaped.closing_ratio.T > 0.0]
+        shared = [fingers for fingers in shared if len(fingers) > 1]
+        paths = hand_paths(shaped, spread) if shared else None
         if paths is None:
             continue
         X_OG = np.stack([found[row].X_OG for row in rows])
         for fingers in shared:
             own = [paths.fingers[i] for i in fingers]
-            ratio = hand.closing_ratio[fingers].max(axis=1)
+            ratio = shaped.closing_ratio[fingers].max(axis=1)
             for _ in range(MOVES):
                 X_OG[:, :3, 3] += _move(model, X_OG, own, ratio)
         for row, X in zip(rows, X_OG, strict=True):
