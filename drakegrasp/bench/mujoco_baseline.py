@@ -17,7 +17,7 @@ import numpy as np
 from drakegrasp.bench.mujoco_drive import FingerDrive
 from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, Array, invert_pose, make_pose, rotation_angle
-from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.description import load_plain_hand
 from drakegrasp.mjcf.links import TIME_STEP, pair_friction, quaternion
 from drakegrasp.mjcf.scene import IMMOVABLE, build_mujoco_scene
 from drakegrasp.objects.model import ObjectModel
@@ -85,8 +85,10 @@ class MujocoBaseline:
 
         Raises:
             ConfigError: See `drive_of`.
+            HandError: If the hand has preshapes.
         """
-        self._config, self._hand = config, load_hand(config.hand)
+        self._config = config
+        self._hand = load_plain_hand(config.hand, "attempts in MuJoCo")
         self._usual = usual_materials(model, config.physics)
         self.place(X_TO)
         scene = build_mujoco_scene(model, self._hand, config)

@@ -192,6 +192,22 @@ def load_hand(name_or_yaml: str | Path = "barrett") -> Hand:
     return hand
 
 
+def load_plain_hand(name_or_yaml: str | Path, where: str) -> Hand:
+    """Return a hand for what knows one preshape only.
+
+    Args:
+        name_or_yaml: See `load_hand`.
+        where: What that is, in words.
+
+    Raises:
+        HandError: If it has preshapes, or see `load_hand`.
+    """
+    hand = load_hand(name_or_yaml)
+    if hand.preshapes:
+        raise HandError(f"hand must be one without preshapes for {where}, got {name_or_yaml}")
+    return hand
+
+
 #: Loaded hands with their files: parsing takes 40 ms.
 _loaded: dict[Path, tuple[Hand, list[Path]]] = {}
 

@@ -14,7 +14,7 @@ from drakegrasp.config import CandidateConfig, FilterConfig
 from drakegrasp.dataset.filters import judge_successes
 from drakegrasp.errors import HandError
 from drakegrasp.grasp import unused_fingers
-from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.description import Hand, load_hand, load_plain_hand
 from drakegrasp.hand.files import hand_file
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.outcomes import Removal
@@ -134,3 +134,10 @@ def test_filters_do_not_miss_what_a_preshape_leaves_out() -> None:
     assert np.flatnonzero(removal).tolist() == [3, 30]
     assert removal[3] == Removal.OFF_SURFACE
     assert removal[30] == Removal.OUTLIER
+
+
+def test_what_knows_one_preshape_refuses_several(tmp_path: Path) -> None:
+    allegro(tmp_path, PINCH)
+    with pytest.raises(HandError, match="hand must be one without preshapes for MuJoCo, got "):
+        load_plain_hand(tmp_path / "shaped_hand.yaml", "MuJoCo")
+    assert load_plain_hand("allegro_four", "MuJoCo") is load_hand("allegro_four")
