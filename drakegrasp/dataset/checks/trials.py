@@ -130,18 +130,18 @@ def verdicts(
         rules: When lifts end, if known.
     """
     # What the contacts of each stage say.
-    required = required_of(batch, required)
+    own = required_of(batch, required)
     closed = judge_closed(
         batch["closed_touching"],
         batch["closed_other_links"],
         batch["closed_hand_on_table"],
-        required=required,
+        required=own,
     )
     lifted = judge_lifted(
         batch["lifted_touching"],
         batch["lifted_other_links"],
         batch["lifted_object_on_table"],
-        required=required,
+        required=own,
     )
 
     # A lift that was ended has no verdict, but a reason.
