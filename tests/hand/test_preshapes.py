@@ -140,4 +140,4 @@ def test_what_knows_one_preshape_refuses_several(tmp_path: Path) -> None:
     allegro(tmp_path, PINCH)
     with pytest.raises(HandError, match="hand must be one without preshapes for MuJoCo, got "):
         load_plain_hand(tmp_path / "shaped_hand.yaml", "MuJoCo")
-    assert load_plain_hand("allegro_four", "MuJoCo") is load_hand("allegro_four")
+    assert load_plain_hand("allegro", "MuJoCo") is load_hand("allegro")
