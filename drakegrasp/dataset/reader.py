@@ -108,8 +108,9 @@ class GraspDataset:
             fewer = 0 if unused is None else np.count_nonzero(unused[:])
         if fewer and not fewer_fingers:
             raise DataError(
-                f"{self.path}: fewer_fingers must be True to read {split}: {fewer} of "
-                f"{self._length} grasps leave fingers out, whose contacts are NaN"
+                f"{self.path}: {split} must have contacts of all fingers, got {fewer} of "
+                f"{self._length} grasps that leave some out, whose contacts are NaN; "
+                "GraspDataset(..., fewer_fingers=True) reads them"
             )
 
     def __len__(self) -> int:
