@@ -98,6 +98,8 @@ class GraspDataset:
         self._file: h5py.File | None = None
         self._fields: dict[str, h5py.Dataset | ImageRows | npt.NDArray[Any]] = {}
         self._process = -1
+
+        # What the file says of the split.
         with open_samples(self.path) as file:
             self._length = len(file[split]["grasps"])
             self.image_size = int(file[split]["images"].shape[-1])
@@ -106,6 +108,8 @@ class GraspDataset:
             self.content = _content(file, split)
             unused = file[split].get("grasp_props/unused")
             fewer = 0 if unused is None else np.count_nonzero(unused[:])
+
+        # NaN must be asked for.
         if fewer and not fewer_fingers:
             raise DataError(
                 f"{self.path}: {split} must have contacts of all fingers, got {fewer} of "
