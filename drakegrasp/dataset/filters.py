@@ -129,8 +129,8 @@ def judge_successes(
         groups = np.column_stack([successes.object, successes.unused])
         for group in np.unique(groups[kept], axis=0):
             rows = np.flatnonzero(kept & (groups == group).all(axis=1))
-            grasps = np.ascontiguousarray(successes.grasp_T[rows][:, ~unused[rows[0]]])
-            removal[rows[is_outlier(grasps, config.outlier_sigma)]] = Removal.OUTLIER
+            outside = is_outlier(successes.grasp_T[rows], config.outlier_sigma)
+            removal[rows[outside]] = Removal.OUTLIER
 
     # The inspection comes last: it only sees samples.
     listed = np.isin(successes.trial_id, np.asarray(rejected, dtype=np.int64))

@@ -128,12 +128,12 @@ def test_filters_do_not_miss_what_a_preshape_leaves_out() -> None:
     grasp, held = grasps.grasp_T.copy(), grasps.held_O.copy()
     grasp[lacking] = held[lacking] = np.nan
     grasp[3, 4] = np.nan
-    grasp[30, 0] = 50.0
+    grasp[6, 4] = grasp[30, 0] = 50.0
     shaped = replace(grasps, grasp_T=grasp, held_O=held, unused=unused)
     removal = judge_successes(shaped, FilterConfig())
-    assert np.flatnonzero(removal).tolist() == [3, 30]
+    assert np.flatnonzero(removal).tolist() == [3, 6, 30]
     assert removal[3] == Removal.OFF_SURFACE
-    assert removal[30] == Removal.OUTLIER
+    assert removal[6] == removal[30] == Removal.OUTLIER
 
 
 def test_what_knows_one_preshape_refuses_several(tmp_path: Path) -> None:
