@@ -43,6 +43,12 @@ def unpack_grasp(grasp: npt.ArrayLike) -> tuple[Array, Array]:
     return vector[:half].reshape(-1, 3), vector[half:].reshape(-1, 3)
 
 
+def unused_fingers(bits: npt.ArrayLike, fingers: int) -> npt.NDArray[np.bool_]:
+    """Return which fingers (..., k) grasps leave out, of bits (...): 1 for the first finger."""
+    place = np.arange(fingers, dtype=np.int64)
+    return np.asarray(np.asarray(bits, dtype=np.int64)[..., None] >> place & 1, dtype=np.bool_)
+
+
 def transform_grasp(X_AB: npt.ArrayLike, grasp_B: npt.ArrayLike) -> Array:
     """Return the grasp vector (6k,) in frame A of one in frame B, under X_AB (4, 4).
 

@@ -17,7 +17,7 @@ import numpy as np
 from drakegrasp.bench.mujoco_drive import FingerDrive
 from drakegrasp.config import Config
 from drakegrasp.frames import X_WT, Array, invert_pose, make_pose, rotation_angle
-from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.description import load_plain_hand
 from drakegrasp.mjcf.links import TIME_STEP, pair_friction, quaternion
 from drakegrasp.mjcf.scene import IMMOVABLE, build_mujoco_scene
 from drakegrasp.objects.model import ObjectModel
@@ -85,8 +85,10 @@ class MujocoBaseline:
 
         Raises:
             ConfigError: See `drive_of`.
+            HandError: If the hand has preshapes.
         """
-        self._config, self._hand = config, load_hand(config.hand_source)
+        self._config = config
+        self._hand = load_plain_hand(config.hand_source, "attempts in MuJoCo")
         self._usual = usual_materials(model, config.physics)
         self.place(X_TO)
         scene = build_mujoco_scene(model, self._hand, config)
@@ -107,9 +109,9 @@ class MujocoBaseline:
         self._object_q, self._object_v = slice(q, q + 7), slice(v, v + 6)
         self._object_inertia = m.dof_M0[self._object_v].copy()
         self._weights = {name: getattr(m, name)[at].copy() for name, at in self._weighed()}
-        closing = [finger.closing_joint for finger in hand.fingers]
+        closing = [hand.fingers[i].closing_joint for i in hand.motor_fingers]
         self._closing_v = [m.joint(name).dofadr[0] for name in closing]
-        coupled = [coupling for finger in hand.fingers for coupling in finger.coupled]
+        coupled = [coupling for i in hand.motor_fingers for coupling in hand.followers(i)]
         self._followers = {m.joint(c.joint).qposadr[0]: c.offset for c in coupled}
 
     def _weighed(self) -> Iterator[tuple[str, int | slice]]:
@@ -207,14 +209,15 @@ class MujocoBaseline:
     def _close(self) -> None:
         """Close the fingers on the object, which is held in place, until they stop."""
         d = self._data
-        d.ctrl[:] = self._hand.closing_speed
+        motors = self._hand.motor_fingers
+        d.ctrl[:], unit = self._hand.closing_speed[motors], self._hand.closing_unit[motors]
         resting, palm, step = d.qpos[self._object_q].copy(), d.qpos[self._wrist_q].copy(), 0
         while d.time < self._config.close.max_time:
             self._step(palm)
             d.qpos[self._object_q], d.qvel[self._object_v] = resting, 0.0
             step += 1
             if step % CLOSING_STRIDE == 0 and d.time > STARTING:
-                speed = np.abs(d.qvel[self._closing_v] / self._hand.closing_unit).max()
+                speed = np.abs(d.qvel[self._closing_v] / unit).max()
                 if speed < self._config.close.stop_speed:
                     return
 

@@ -32,6 +32,7 @@ from drakegrasp.simulation.candidates import Attempt, children, family_member, m
 from drakegrasp.simulation.postures.table import posture_attempts
 from drakegrasp.simulation.randomization.conditions import usual_conditions
 from drakegrasp.simulation.randomization.draws import draw_conditions
+from drakegrasp.simulation.sampling.centring import centred
 from drakegrasp.simulation.scene import Scene
 from drakegrasp.simulation.scene_cache import cached_renderer, cached_scene, forget_scenes
 from drakegrasp.simulation.screen import Prediction, predict
@@ -58,6 +59,13 @@ class TrialSetup:
     config: Config
     scene: Scene
     _renderer: Renderer | None = None
+
+    def scene_of(self, attempt: Attempt) -> Scene:
+        """Return the scene of an attempt: the hand may be in a preshape."""
+        if attempt.preshape is None:
+            return self.scene
+        model, config = self.prepared.model, self.config
+        return cached_scene(model, config.physics, config.hand_source, attempt.preshape)
 
     @property
     def renderer(self) -> Renderer:
@@ -112,10 +120,14 @@ def list_attempts(prepared: PreparedObject, indices: range, config: Config) -> l
     """Return the attempts of a range of an object's candidates, with their conditions."""
     model, drawn = prepared.model, prepared.candidates
     place: Any = {"name": model.name, "seed": config.seed}
+    hand = load_hand(config.hand_source)
     if drawn.postures is None:
-        made = make_attempts(drawn, indices, config.candidates, **place)
+        count = len(hand.preshapes)
+        made = list(make_attempts(drawn, indices, config.candidates, **place, preshapes=count))
     else:
-        made = posture_attempts(drawn, indices, load_hand(config.hand_source), **place)
+        made = list(posture_attempts(drawn, indices, hand, **place))
+    made = [replace(a, unused=hand.unused_in(a.preshape)) for a in made] if hand.preshapes else made
+    made = centred(model, hand, made)
     return [_with_conditions(attempt, model, config) for attempt in made]
 
 
@@ -123,6 +135,7 @@ def list_children(prepared: PreparedObject, parent: Attempt, config: Config) -> 
     """Return the attempts about that of a grasp that holds, with their conditions."""
     model = prepared.model
     made = children(parent, config.refine, name=model.name, seed=config.seed)
+    made = centred(model, load_hand(config.hand_source), made)
     return [_with_conditions(attempt, model, config) for attempt in made]
 
 
@@ -138,9 +151,16 @@ def find_attempt(
     if not 0 <= child <= most:
         raise DataError(f"child must be 0 to {most}, got {child}")
     first = list_attempts(prepared, range(candidate, candidate + 1), config)[standoff_index]
-    name, seed = prepared.model.name, config.seed
-    member = family_member(first, child, config.refine, name=name, seed=seed)
-    return _with_conditions(member, prepared.model, config)
+    model, hand = prepared.model, load_hand(config.hand_source)
+    member = family_member(
+        first,
+        child,
+        config.refine,
+        name=model.name,
+        seed=config.seed,
+        place=lambda attempt: centred(model, hand, [attempt])[0],
+    )
+    return _with_conditions(member, model, config)
 
 
 def _with_conditions(attempt: Attempt, model: ObjectModel, config: Config) -> Attempt:
@@ -153,14 +173,19 @@ def predict_attempts(setup: TrialSetup, attempts: Sequence[Attempt]) -> list[Pre
     config, prepared = setup.config, setup.prepared
     hand = load_hand(config.hand_source)
 
-    # A call is about one resting pose.
+    # A call is about one resting pose and preshape.
     found: list[Prediction | None] = [None] * len(attempts)
     for k, X_TO in enumerate(prepared.resting_poses):
-        rows = [row for row, attempt in enumerate(attempts) if attempt.resting == k]
-        own = [attempts[row] for row in rows]
-        predictions = predict(prepared.model, hand, X_TO, own, config.screen)
-        for row, prediction in zip(rows, predictions, strict=True):
-            found[row] = prediction
+        for preshape in sorted({attempt.preshape for attempt in attempts}, key=str):
+            rows = [
+                row
+                for row, attempt in enumerate(attempts)
+                if (attempt.resting, attempt.preshape) == (k, preshape)
+            ]
+            own, shaped = [attempts[row] for row in rows], hand.at(preshape)
+            predictions = predict(prepared.model, shaped, X_TO, own, config.screen)
+            for row, prediction in zip(rows, predictions, strict=True):
+                found[row] = prediction
     return found
 
 
@@ -171,7 +196,7 @@ def try_attempt(
     X_TO = setup.prepared.resting_poses[attempt.resting]
     is_visible = partial(_is_visible, setup, attempt, X_TO)
     record = run_attempt(
-        setup.scene, X_TO, attempt, setup.config, prediction, is_visible=is_visible
+        setup.scene_of(attempt), X_TO, attempt, setup.config, prediction, is_visible=is_visible
     )
     if record.outcome is Outcome.SOLVER_ERROR:
         forget_scenes()

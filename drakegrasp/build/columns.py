@@ -9,11 +9,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from drakegrasp.build.attempts import TrialSetup, View
 from drakegrasp.dataset.hdf5 import AnyArray
 from drakegrasp.dataset.schema import LOOK_FIELDS, sizes
 from drakegrasp.dataset.shards import trial_columns
 from drakegrasp.frames import pack_pose
+from drakegrasp.grasp import unused_fingers
 from drakegrasp.objects.contact_fit import ContactFit
 from drakegrasp.simulation.candidates import Attempt
 from drakegrasp.simulation.randomization.conditions import Conditions, usual_conditions
@@ -54,12 +57,20 @@ def trial_rows(
     fields, shape = trial_columns(), array_sizes(setup)
     columns = {field.name: field.empty(len(records), shape) for field in fields}
     usual = usual_conditions(setup.prepared.model, setup.config.physics)
+    hand = setup.scene.hand
     for i, (attempt, record, fit) in enumerate(zip(attempts, records, fits, strict=True)):
         row = TrialRow(attempt, attempt.conditions or usual, record, fit)
+        used = ~unused_fingers(attempt.unused, hand.num_fingers)
         for field in fields:
             # What a stage did not reach keeps the column's fill value.
             value = field.value_of(row)
-            if value is not None:
+            if value is None:
+                continue
+            if field.shape.startswith("k"):
+                # A finger that a preshape does not use has no contact, and no force.
+                columns[field.name][i] = np.nan if field.per_finger else 0
+                columns[field.name][i][used] = value
+            else:
                 columns[field.name][i] = pack_pose(value) if field.shape == "12" else value
     return columns
 

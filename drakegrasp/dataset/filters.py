@@ -33,7 +33,9 @@ class Successes:
         X_OG: (n, 4, 4), pose of the palm at the start.
         grasp_T: (n, 6k), grasps in the table-top frame [m, -].
         held_O: (n, 6k), contacts at the end of the lift in {O} [m, -].
-        complete: (n,) bool, whether every fingertip touches, after closing and after the lift.
+        complete: (n,) bool, whether every fingertip that is used touches, after closing and after
+            the lift.
+        unused: (n, k) bool, the fingers that the preshape leaves out: their contacts are NaN.
         other_links: (n,), number of other links that touch the object after the lift.
         slip, turn: (n,), how far the object moved [m] and turned [rad] in the hand.
         seen: (n,) bool, whether both masks have object pixels.
@@ -57,6 +59,7 @@ class Successes:
     grasp_T: Array
     held_O: Array
     complete: npt.NDArray[np.bool_]
+    unused: npt.NDArray[np.bool_]
     other_links: npt.NDArray[np.integer]
     slip: Array
     turn: Array
@@ -94,10 +97,11 @@ def judge_successes(
     if removed_by_own is None:
         removed_by_own = _removed_by_own(config, successes)
 
-    # Filters that judge a grasp alone.
+    # Filters that judge a grasp alone. Of a finger that is not used a contact is NaN.
+    unused = np.tile(np.repeat(successes.unused, 3, axis=1), 2)
     removal = np.full(len(successes.trial_id), Removal.KEPT, dtype=np.uint8)
     for reason, bad in (
-        # A grasp vector has a contact of every finger.
+        # A grasp vector has a contact of every finger that its preshape uses.
         (Removal.MISSING_FINGER, ~successes.complete),
         *breaks_hold(config, successes.other_links, successes.slip, successes.turn),
         (Removal.NOT_SEEN, ~successes.seen),
@@ -105,8 +109,8 @@ def judge_successes(
         (Removal.BISECTS_TABLE, successes.camera_height < config.min_camera_height),
         (Removal.FLAT_DEPTH, successes.depth_variance < config.min_depth_variance),
         # The mean normal of opposed patches has length zero: normalised it is NaN.
-        (Removal.OFF_SURFACE, ~np.isfinite(successes.grasp_T).all(axis=1)),
-        (Removal.OFF_SURFACE, ~np.isfinite(successes.held_O).all(axis=1)),
+        (Removal.OFF_SURFACE, ~(np.isfinite(successes.grasp_T) | unused).all(axis=1)),
+        (Removal.OFF_SURFACE, ~(np.isfinite(successes.held_O) | unused).all(axis=1)),
         *_beyond(
             (Removal.OFF_SURFACE, successes.surface_distance, config.max_surface_distance),
             (Removal.NORMAL_OFF, np.degrees(successes.normal_angle), config.max_normal_angle_deg),
@@ -119,11 +123,12 @@ def judge_successes(
     ):
         removal[bad & (removal == Removal.KEPT)] = reason
 
-    # Outliers among the grasps of an object that are left.
+    # Outliers among the grasps of an object that are left, with the same fingers.
     kept = removal == Removal.KEPT
     if config.outlier_sigma > 0.0:
-        for index in np.unique(successes.object[kept]):
-            rows = np.flatnonzero(kept & (successes.object == index))
+        groups = np.column_stack([successes.object, successes.unused])
+        for group in np.unique(groups[kept], axis=0):
+            rows = np.flatnonzero(kept & (groups == group).all(axis=1))
             outside = is_outlier(successes.grasp_T[rows], config.outlier_sigma)
             removal[rows[outside]] = Removal.OUTLIER
 

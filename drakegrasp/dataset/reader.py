@@ -25,6 +25,7 @@ from drakegrasp.dataset.hdf5 import ImageRows, open_hdf5, says_damage
 from drakegrasp.dataset.layout.opening import open_samples
 from drakegrasp.dataset.schema import DATA_FIELDS, SPLITS
 from drakegrasp.errors import DataError, MachineError, first_line
+from drakegrasp.grasp import unused_fingers
 
 if TYPE_CHECKING:
     from drakegrasp.dataset.loaders.torch_samples import TorchSamples
@@ -44,6 +45,7 @@ class Sample:
             after closing.
         grasp_held: (6k,) float32, the same where the fingertips hold the object after the lift, on
             the object in its resting pose.
+        fingers: (k,) bool, those that the grasp uses; contacts of others are NaN.
         trial_id: Row of /trials in trials.hdf5.
         grasp_props: Fields of `grasp_props` by name: how well it holds, forces, palm, joints.
         props: Fields of `object_props` by name: names, mass properties, frames.
@@ -54,6 +56,7 @@ class Sample:
     mask: npt.NDArray[np.uint8]
     grasp: npt.NDArray[np.float32]
     grasp_held: npt.NDArray[np.float32]
+    fingers: npt.NDArray[np.bool_]
     trial_id: int
     grasp_props: dict[str, Any]
     props: dict[str, Any]
@@ -70,6 +73,9 @@ class GraspDataset:
     Args:
         path: `grasping_oto.hdf5` or `grasping_otm.hdf5`.
         split: `train`, `valid` or `test`.
+        fewer_fingers: Whether to read a split in which some grasps leave fingers out. The contacts
+            of these are NaN, which must not come into training unnoticed: without this such a
+            split is refused. `Sample.fingers` says which are there.
 
     Attributes:
         path, split: As given.
@@ -79,23 +85,37 @@ class GraspDataset:
         content: Hash that says which samples the split holds, and of which dataset.
 
     Raises:
-        DataError: If the file is missing, damaged or differs from the schema, or the split is
-            unknown.
+        DataError: If the file is missing, damaged or differs from the schema, the split is
+            unknown, or it has grasps of fewer fingers that were not asked for.
     """
 
-    def __init__(self, path: str | Path, *, split: str = "train") -> None:
+    def __init__(
+        self, path: str | Path, *, split: str = "train", fewer_fingers: bool = False
+    ) -> None:
         if split not in SPLITS:
             raise DataError(f"split must be one of {', '.join(SPLITS)}, got {split!r}")
         self.path, self.split = Path(path), split
         self._file: h5py.File | None = None
         self._fields: dict[str, h5py.Dataset | ImageRows | npt.NDArray[Any]] = {}
         self._process = -1
+
+        # What the file says of the split.
         with open_samples(self.path) as file:
             self._length = len(file[split]["grasps"])
             self.image_size = int(file[split]["images"].shape[-1])
             self.K = np.array(file.attrs["K"])
             self.camera = str(file.attrs["camera"])
             self.content = _content(file, split)
+            unused = file[split].get("grasp_props/unused")
+            fewer = 0 if unused is None else np.count_nonzero(unused[:])
+
+        # NaN must be asked for.
+        if fewer and not fewer_fingers:
+            raise DataError(
+                f"{self.path}: {split} must have contacts of all fingers, got {fewer} of "
+                f"{self._length} grasps that leave some out, whose contacts are NaN; "
+                "GraspDataset(..., fewer_fingers=True) reads them"
+            )
 
     def __len__(self) -> int:
         return self._length
@@ -108,6 +128,7 @@ class GraspDataset:
             mask=values["masks"],
             grasp=values["grasps"],
             grasp_held=values["grasps_held"],
+            fingers=~unused_fingers(values["grasp_props/unused"], len(values["grasps"]) // 6),
             trial_id=int(values["trial_id"]),
             grasp_props=_group(values, "grasp_props/"),
             props=_group(values, "object_props/"),

@@ -287,6 +287,13 @@ _LINEAGE = _new(
           "file says, NaN if nothing", some=True),
 )
 # Fields of several tables.
+_PRESHAPE = _new(
+    Field("preshape", "", "uint8", "-", "-",
+          "index of the hand file's preshape; 0 if it has none", optional=True),
+    Field("unused", "", "uint32", "-", "-",
+          "fingers that the preshape leaves out, as bits: 1 for the first finger. They have no "
+          "contact", optional=True),
+)
 _SPREAD = Field("spread", "", "float64", "rad", "-", "angle of the spread joints",
                 shown=Shown("spread", "°"))
 _X_TO = Field("X_TO", "12", "float64", "m, -", "T", "resting pose of the object")
@@ -362,7 +369,7 @@ DATA_FIELDS: tuple[Field, ...] = (
     Field("grasps_held", "6k", "float32", "m, -", "C",
           "the same where the fingertips hold the object after the lift, on the resting object"),
     Field("trial_id", "", "int64", "-", "-", "row of trials.hdf5"),
-    *_copied("grasp_props", *_WORDS, *_LINEAGE),
+    *_copied("grasp_props", *_WORDS, *_LINEAGE, *_PRESHAPE),
     *_new(Field("grasp_props/weight", "", "float32", "-", "-",
                 "1 / number of samples, itself included, of the same object and resting pose whose "
                 "palm is within 10 mm and 15 deg")),
@@ -424,6 +431,7 @@ TRIAL_FIELDS: tuple[Field, ...] = (
         Field("own_motors", "", "bool", "-", "-",
               "whether each joint had a motor of its own, because the posture does not follow the "
               "couplings of the hand file", since=4, optional=True),
+        *_PRESHAPE,
         _SPREAD,
         Field("seed", "", "uint64", "-", "-",
               "state of the candidate's random stream, from which the spread was drawn, or of the "

@@ -52,7 +52,9 @@ def export_dataset(
     if form not in FORMATS:
         raise DataError(f"format must be one of {', '.join(FORMATS)}, got {form!r}")
     for path in DATA_FILES.values():
-        if not any(len(GraspDataset(out / path, split=split)) for split in SPLITS):
+        if not any(
+            len(GraspDataset(out / path, split=split, fewer_fingers=True)) for split in SPLITS
+        ):
             raise DataError(f"{out / path}: must have samples to export, got none")
     if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
         raise DataError(f"{directory}: must be a new or empty directory, got one that holds files")

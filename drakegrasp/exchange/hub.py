@@ -77,7 +77,7 @@ def write_hub(out: Path, folder: Path, progress: Report, *, licence: str) -> int
 
     # The Parquet files of each camera and split.
     splits = {
-        (camera, split): GraspDataset(out / DATA_FILES[camera], split=split)
+        (camera, split): GraspDataset(out / DATA_FILES[camera], split=split, fewer_fingers=True)
         for camera in CAMERAS
         for split in SPLITS
     }

@@ -21,7 +21,7 @@ from drakegrasp.dataset.paths import model_path
 from drakegrasp.exchange.closed_grasps import ClosedGrasp, read_closed_grasps
 from drakegrasp.exchange.dexgraspbench import pose_vector
 from drakegrasp.frames import invert_pose
-from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.description import Hand, load_plain_hand
 from drakegrasp.mesh.wavefront import hull_text
 from drakegrasp.mjcf.convex_parts import convex_parts
 from drakegrasp.mjcf.hand_model import HandModel, make_hand_model
@@ -39,7 +39,7 @@ MESHES, HAND = "meshes", "hand"
 def write_mjcf(out: Path, folder: Path, progress: Report) -> int:
     """Write a scene per sample and return their number; see `export.export_dataset`."""
     config = read_manifest(out).config
-    hand = load_hand(config.hand_source)
+    hand = load_plain_hand(config.hand_source, "scenes of MuJoCo")
     posed, grasps = StillScene(hand), list(read_closed_grasps(out))
     progress(0, len(grasps))
     done = 0

@@ -139,6 +139,8 @@ class Pregrasp:
         conditions: Friction, mass, looks and cameras; None are the usual ones.
         audited: Whether the closed hand is lifted in any case, whatever its chance and its image.
         path: Of a posture that spread and closing cannot say: the positions of all joints.
+        preshape: Index of the hand's preshape; None if all fingers close.
+        unused: Fingers that the preshape leaves out, see `Hand.unused_in`.
     """
 
     X_OG: Array
@@ -148,6 +150,8 @@ class Pregrasp:
     conditions: Conditions | None = None
     audited: bool = False
     path: JointPath | None = None
+    preshape: int | None = None
+    unused: int = 0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -389,6 +393,7 @@ def make_attempts(
     *,
     name: str,
     seed: int,
+    preshapes: int = 0,
 ) -> Iterator[Attempt]:
     """Yield the attempts of a range of an object's candidates; each is a row of the dataset.
 
@@ -397,13 +402,15 @@ def make_attempts(
         indices: The range.
         config: Stand-offs and spreads.
         name: The object's name.
-        seed: Of the dataset; with name and candidate it decides the spreads.
+        seed: Of the dataset; with name and candidate it decides spreads and preshapes.
+        preshapes: Number of the hand's preshapes.
     """
     spreads, standoffs = np.deg2rad(config.spreads_deg), config.standoffs
     for i in indices:
         # Each candidate has its own stream, so ranges do not depend on each other.
         stream = Stream(seed, object_key(name), i)
         drawn = stream.integers(len(spreads), len(standoffs))
+        shapes = stream.integers(preshapes, len(standoffs)) if preshapes else None
 
         # Move the palm along its ray to each stand-off from the surface.
         distance = candidates.distance[i]
@@ -423,6 +430,7 @@ def make_attempts(
                 source=Source(candidates.source[i]),
                 log_density=float(candidates.log_density[i]),
                 audited=is_audited(seed, object_key(name), i, j, 0),
+                preshape=None if shapes is None else int(shapes[j]),
             )
 
 
@@ -445,14 +453,30 @@ def children(parent: Attempt, config: RefineConfig, *, name: str, seed: int) -> 
 
 
 def family_member(
-    first: Attempt, child: int, config: RefineConfig, *, name: str, seed: int
+    first: Attempt,
+    child: int,
+    config: RefineConfig,
+    *,
+    name: str,
+    seed: int,
+    place: Callable[[Attempt], Attempt] = lambda attempt: attempt,
 ) -> Attempt:
-    """Return an attempt by its number in the family of a first-round attempt, see `children`."""
+    """Return an attempt by its number in the family of a first-round attempt, see `children`.
+
+    Args:
+        first: The attempt of the first round.
+        child: The number.
+        config: How many, and how far away.
+        name: The object's name.
+        seed: Of the dataset.
+        place: What becomes of each attempt before it is tried, and before it has children.
+    """
     # From the first through the numbers of its ancestors.
     if child == 0:
         return first
-    parent = family_member(first, (child - 1) // config.children, config, name=name, seed=seed)
-    return _child(parent, child, config, name=name, seed=seed)
+    number = (child - 1) // config.children
+    parent = family_member(first, number, config, name=name, seed=seed, place=place)
+    return place(_child(parent, child, config, name=name, seed=seed))
 
 
 def _child(parent: Attempt, number: int, config: RefineConfig, *, name: str, seed: int) -> Attempt:

@@ -22,6 +22,7 @@ from drakegrasp.seeding import Stream
 from drakegrasp.simulation.candidates import Attempt, palm_motion
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.randomization.conditions import Conditions, usual_conditions
+from drakegrasp.simulation.sampling.centring import centred
 from drakegrasp.simulation.screen import Prediction, predict
 from drakegrasp.simulation.trial import run_attempt
 
@@ -64,7 +65,7 @@ def certify(model: ObjectModel, X_TO: Array, attempt: Attempt, config: Config) -
     """
     # Repeat the attempt with noise; inconclusive repeats do not count.
     known = attempt.conditions or usual_conditions(model, config.physics)
-    repeater = _Repeater(model, X_TO, config)
+    repeater = _Repeater(model, X_TO, config, attempt.preshape)
     stream = Stream(attempt.seed, attempt.standoff_index)
     repeats = [repeater.holds(each) for each in _noisy(stream, attempt, known, config.certify)]
     conclusive = [holds for holds in repeats if holds is not None]
@@ -136,19 +137,25 @@ def _noise_factor(stream: Stream, deviation: float) -> float:
 class _Repeater:
     """Runs attempts at half the time step."""
 
-    def __init__(self, model: ObjectModel, X_TO: Array, config: Config) -> None:
-        """Take an object, its resting pose (4, 4) and the rules of the attempts."""
+    def __init__(
+        self, model: ObjectModel, X_TO: Array, config: Config, preshape: int | None
+    ) -> None:
+        """Take an object, its resting pose (4, 4), the rules of the attempts, and the preshape."""
         step = STEP_RATIO * config.physics.time_step
         physics = config.physics.model_copy(update={"time_step": step, "coarse_steps": 1})
         # Whether a grasp holds is the verdict of a whole lift.
         self._config = with_whole_lifts(config).model_copy(update={"physics": physics})
-        self._model, self._X_TO, self._hand = model, X_TO, load_hand(config.hand_source)
-        self._scene = build_scene(model, physics, self._hand)
+        self._model, self._X_TO, self._preshape = model, X_TO, preshape
+        self._hand = load_hand(config.hand_source)
+        self._scene = build_scene(model, physics, self._hand.at(preshape))
 
     def predict(self, attempt: Attempt) -> Prediction | None:
         """Return what geometry says of an attempt."""
         rules = self._config.screen
-        (prediction,) = predict(self._model, self._hand, self._X_TO, [attempt], rules)
+        placed = centred(self._model, self._hand, [attempt])
+        (prediction,) = predict(
+            self._model, self._hand.at(self._preshape), self._X_TO, placed, rules
+        )
         return prediction
 
     def holds(self, attempt: Attempt, prediction: Prediction | None = None) -> bool | None:
@@ -158,9 +165,11 @@ class _Repeater:
             attempt: What to try.
             prediction: What `predict` returns for it, where the caller has it already.
         """
+        (attempt,) = centred(self._model, self._hand, [attempt])
         record = run_attempt(self._scene, self._X_TO, attempt, self._config, prediction)
         if not record.outcome.inconclusive:
             return record.outcome is Outcome.SUCCESS
         # A scene in which Drake failed must not be used again.
-        self._scene = build_scene(self._model, self._config.physics, self._hand)
+        hand = self._hand.at(self._preshape)
+        self._scene = build_scene(self._model, self._config.physics, hand)
         return None

@@ -40,10 +40,19 @@ _diagrams: dict[Hashable, Scene] = {}
 _lock = threading.Lock()
 
 
-def cached_scene(model: ObjectModel, physics: PhysicsConfig, source: HandSource) -> Scene:
-    """Return the scene of an object with a hand, see `load_hand`."""
+def cached_scene(
+    model: ObjectModel, physics: PhysicsConfig, source: HandSource, preshape: int | None = None
+) -> Scene:
+    """Return the scene of an object with a hand.
+
+    Args:
+        model: The object.
+        physics: See `build_scene`.
+        source: See `load_hand`.
+        preshape: Index of a preshape, see `Hand.at`.
+    """
     # A hand whose files have changed is loaded anew, and is then another key.
-    physics, hand = model.own_physics(physics), load_hand(source)
+    physics, hand = model.own_physics(physics), load_hand(source).at(preshape)
     shape = (model.collision_vertices, model.collision_faces, model.half_extents)
     mass = (model.p_OOcm, model.I_OOcm_O, np.float64(model.mass))
     key = "scene", _digest(model.name, *shape, *mass), physics, hand

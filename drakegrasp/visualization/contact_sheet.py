@@ -48,7 +48,8 @@ def contact_sheet(path: Path, png: Path, *, rows: int = 8, split: str | None = N
         DataError: If the file is not a data file or holds no sample.
     """
     # All samples of the file.
-    parts = [GraspDataset(path, split=name) for name in (SPLITS if split is None else (split,))]
+    splits = SPLITS if split is None else (split,)
+    parts = [GraspDataset(path, split=each, fewer_fingers=True) for each in splits]
     places = [(part, row) for part in parts for row in range(len(part))]
     if not places:
         raise DataError(f"{path}: must hold at least one sample to draw, got none")

@@ -82,7 +82,8 @@ def record_attempt(
     """
 
     def run(meshcat: Meshcat) -> TrialRecord:
-        scene = build_scene(model, config.physics, load_hand(config.hand_source), meshcat=meshcat)
+        hand = load_hand(config.hand_source).at(attempt.preshape)
+        scene = build_scene(model, config.physics, hand, meshcat=meshcat)
         # An attempt that fails before it is simulated is shown at its start.
         q = None if attempt.path is None else attempt.path.start
         pose = attempt.X_OG, attempt.spread, attempt.closing

@@ -77,6 +77,9 @@ def draw_contacts(axes: Axes, sample: Sample, K: Array, *, scale: float = 1.0) -
     size = np.array(sample.mask.shape[::-1])
 
     for i, (dot, end) in enumerate(zip(dots, ends, strict=True)):
+        # A finger that the grasp leaves out has no contact.
+        if not sample.fingers[i]:
+            continue
         colour = FINGER_COLOURS[i % len(FINGER_COLOURS)]
         # Something nearer than the contact, at its pixel, hides it.
         column, row = np.clip(np.rint(dot), 0, size - 1).astype(int)

@@ -208,13 +208,13 @@ def test_camera_height_is_above_the_table(out: Path) -> None:
 def test_contact_is_in_view_within_the_image_and_before_the_camera(
     p_CQ: list[float], seen: bool
 ) -> None:
-    """A camera of 33 pixels that sees 45 degrees to each side."""
+    """A camera of 33 pixels that sees 45 degrees to each side; one finger is left out."""
     K = np.array([[16.0, 0.0, 16.0], [0.0, 16.0, 16.0], [0.0, 0.0, 1.0]])
     X_TC = make_pose(rotation_about([1.0, 0.0, 0.0], 2.0), [0.1, 0.2, 0.7])
-    p_TQ = transform_points(X_TC, np.array([[0.0, 0.0, 0.4], p_CQ]))
-    grasp_T = pack_grasp(p_TQ, np.tile([0.0, 0.0, 1.0], (2, 1)))
-    mask = np.zeros((33, 33))
-    assert survey._in_view(K, mask, pack_pose(X_TC), grasp_T) is seen
+    p_TQ = transform_points(X_TC, np.array([[0.0, 0.0, 0.4], p_CQ, [np.nan] * 3]))
+    grasp_T = pack_grasp(p_TQ, np.tile([0.0, 0.0, 1.0], (3, 1)))
+    mask, unused = np.zeros((33, 33)), np.array([False, False, True])
+    assert survey._in_view(K, mask, pack_pose(X_TC), grasp_T, unused) is seen
 
 
 def test_limits_of_the_hold_change_without_a_simulation(out: Path) -> None:

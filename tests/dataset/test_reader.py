@@ -21,8 +21,11 @@ from drakegrasp.errors import DataError, MachineError
 LETTERS = sizes(fingers=3, joints=8, image=16)
 
 
-def write_data_file(path: Path, trial_ids: range) -> Path:
-    """Write a data file whose train split has its trial's id in every value of a sample."""
+def write_data_file(path: Path, trial_ids: range, unused: int = 0) -> Path:
+    """Write a data file whose train split has its trial's id in every value of a sample.
+
+    All grasps leave out the fingers of the bits `unused`.
+    """
     with h5py.File(path, "w") as file:
         file.attrs["schema_version"] = SCHEMA_VERSION
         file.attrs["K"] = np.eye(3)
@@ -39,6 +42,9 @@ def write_data_file(path: Path, trial_ids: range) -> Path:
                 dataset = create_field(group, field, shape)
                 dataset.resize(len(ids), axis=0)
                 for row, number in enumerate(ids):
+                    if field.name == "grasp_props/unused":
+                        dataset[row] = unused
+                        continue
                     dataset[row] = (
                         f"object {number} ü" if field.dtype == "str" else np.full(shape, number)
                     )
@@ -100,6 +106,19 @@ def test_other_things_are_refused(data_file: Path, tmp_path: Path) -> None:
     (tmp_path / "text.hdf5").write_text("text")
     with pytest.raises(DataError, match="must be a data file"):
         GraspDataset(tmp_path / "text.hdf5")
+
+
+def test_grasps_of_fewer_fingers_are_read_by_who_asks_for_them(tmp_path: Path) -> None:
+    """NaN does not come into training unnoticed; the other splits have none."""
+    path = write_data_file(tmp_path / "grasping_oto.hdf5", range(2), unused=0b010)
+    with pytest.raises(
+        DataError,
+        match=r"train must have contacts of all fingers, got 2 of 2 .* fewer_fingers=True",
+    ):
+        GraspDataset(path, split="train")
+    assert len(GraspDataset(path, split="test")) == 0
+    sample = GraspDataset(path, split="train", fewer_fingers=True)[1]
+    assert sample.fingers.tolist() == [True, False, True]
 
 
 def _trial_id(task: tuple[GraspDataset, int]) -> int:

@@ -21,6 +21,7 @@ def good(count: int) -> Successes:
         grasp_T=rng.normal(size=(count, 18)),
         held_O=rng.normal(size=(count, 18)),
         complete=np.ones(count, dtype=bool),
+        unused=np.zeros((count, 3), dtype=bool),
         other_links=np.zeros(count, dtype=np.uint8),
         slip=np.full(count, 0.010),
         turn=np.full(count, np.deg2rad(9.9)),

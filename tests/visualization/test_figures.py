@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -13,6 +14,7 @@ from doc_figures import find_sample, frames_figure, hero_figure
 from helpers.datasets import MISSING
 from helpers.machine import needs_egl
 from helpers.scripts import PIPELINES
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from drakegrasp.config import CameraConfig
@@ -24,6 +26,7 @@ from drakegrasp.frames import Array, make_pose, pack_pose
 from drakegrasp.grasp import pack_grasp
 from drakegrasp.vision.camera import intrinsics, project
 from drakegrasp.visualization.contact_sheet import contact_sheet, draw_sheet, spread_over_objects
+from drakegrasp.visualization.style import draw_contacts
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 CAMERA = CameraConfig()
@@ -238,3 +241,18 @@ def test_figures_import_no_drake() -> None:
         cwd=PIPELINES / "docs",
     )
     assert found.stdout.strip() == "set()"
+
+
+def test_a_finger_that_a_grasp_leaves_out_is_not_drawn() -> None:
+    """Its contact is NaN."""
+    points = np.array([[0.0, 0.0, 0.3], [np.nan] * 3, [0.01, 0.0, 0.3]])
+    sample = SimpleNamespace(
+        image=np.ones((4, 16, 16), np.float32),
+        mask=np.ones((16, 16), np.uint8),
+        grasp=pack_grasp(points, np.where(np.isnan(points), np.nan, [0.0, 1.0, 0.0])),
+        fingers=np.array([True, False, True]),
+    )
+    axes = Figure().add_subplot()
+    draw_contacts(axes, sample, np.diag([20.0, 20.0, 1.0]))
+    assert {line.get_gid() for line in axes.lines} - {None} >= {"contact 0", "contact 2"}
+    assert "contact 1" not in {line.get_gid() for line in axes.lines}

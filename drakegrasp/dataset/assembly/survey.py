@@ -22,7 +22,7 @@ from drakegrasp.dataset.schema import CAMERAS, CERTIFICATE_FIELDS, sizes
 from drakegrasp.dataset.shards import ShardHeader, open_shard, read_trials
 from drakegrasp.dataset.suspicion import COLUMNS, suspicion
 from drakegrasp.frames import Array, invert_pose, transform_points, unpack_pose
-from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp
+from drakegrasp.grasp import pack_grasp, transform_grasp, unpack_grasp, unused_fingers
 from drakegrasp.outcomes import Outcome, Removal
 from drakegrasp.runtime.executor import Executor, run_here
 from drakegrasp.runtime.files import read_seal
@@ -32,7 +32,7 @@ from drakegrasp.vision.camera import intrinsics, project
 SURVEYED = (
     *COLUMNS,
     *("candidate", "standoff_index", "child", "resting", "X_TO", "X_OG", "closed_p_OQ"),
-    *("lifted_p_OQ", "lifted_nhat_Q_O", "lifted_touching"),
+    *("lifted_p_OQ", "lifted_nhat_Q_O", "lifted_touching", "unused"),
 )
 #: Columns of `/looks`, besides the depths of the otm image.
 _LOOKS = (
@@ -215,9 +215,13 @@ def successes_of(
         transform_grasp(X, pack_grasp(p, n))
         for X, p, n in zip(X_TO, trials["closed_p_OQ"], trials["closed_nhat_Q_O"], strict=True)
     ]
-    length = 6 * trials["closed_touching"].shape[1]
+    fingers = trials["closed_touching"].shape[1]
+    length, unused = 6 * fingers, unused_fingers(trials["unused"], fingers)
     in_view = [
-        all(_in_view(K, looks[f"mask_{c}"][i], looks[f"X_TC_{c}"][i], grasp) for c in CAMERAS)
+        all(
+            _in_view(K, looks[f"mask_{c}"][i], looks[f"X_TC_{c}"][i], grasp, unused[i])
+            for c in CAMERAS
+        )
         for i, grasp in enumerate(grasps)
     ]
 
@@ -238,7 +242,8 @@ def successes_of(
             ],
             axis=1,
         ),
-        complete=np.all(trials["closed_touching"] & trials["lifted_touching"], axis=1),
+        complete=np.all(trials["closed_touching"] & trials["lifted_touching"] | unused, axis=1),
+        unused=unused,
         other_links=trials["lifted_other_links"],
         slip=trials["slip"],
         turn=trials["turn"],
@@ -247,17 +252,22 @@ def successes_of(
         # Both cameras are at the same point.
         camera_height=unpack_pose(looks["X_TC_otm"])[:, 2, 3],
         depth_variance=depths.astype(float).var(axis=(1, 2)),
-        surface_distance=trials["surface_distance"].max(axis=1, initial=0.0),
-        normal_angle=trials["normal_angle"].max(axis=1, initial=0.0),
+        surface_distance=_largest(trials["surface_distance"], unused),
+        normal_angle=_largest(trials["normal_angle"], unused),
         suspicion=doubts.score,
         **{name: doubts.values[name] for name in ("penetration", "imbalance", "normal_sum")},
         **{field.name: looks[field.name] for field in CERTIFICATE_FIELDS},
     )
 
 
-def _in_view(K: Array, mask: AnyArray, X_TC: Array, grasp_T: Array) -> bool:
+def _largest(values: Array, unused: AnyArray) -> Array:
+    """Return the largest value (n,) of the fingers (n, k) that are used."""
+    return np.asarray(np.where(unused, 0.0, values).max(axis=1, initial=0.0))
+
+
+def _in_view(K: Array, mask: AnyArray, X_TC: Array, grasp_T: Array, unused: AnyArray) -> bool:
     """Return whether all contacts of a grasp are before a camera and within its image."""
     p_TQ, _ = unpack_grasp(grasp_T)
-    p_CQ = transform_points(invert_pose(unpack_pose(X_TC)), p_TQ)
+    p_CQ = transform_points(invert_pose(unpack_pose(X_TC)), p_TQ[~unused])
     uv = project(K, p_CQ)
     return bool(np.all(p_CQ[:, 2] > 0.0) and np.all(uv >= 0.0) and np.all(uv <= len(mask) - 1))

@@ -16,6 +16,7 @@ import numpy as np
 from drakegrasp.config import RandomizeConfig
 from drakegrasp.dataset.checks.findings import Violation
 from drakegrasp.dataset.checks.rows import POSITION_TOLERANCE, AnyArray, Batch
+from drakegrasp.dataset.checks.trials import required_of
 from drakegrasp.dataset.manifest import Manifest
 from drakegrasp.dataset.paths import FILE_NAME, model_path
 from drakegrasp.dataset.schema import CONDITION_FIELDS
@@ -115,7 +116,7 @@ def chances(
 
     # A hand that was never closed has no `time_close`.
     fields = ("closed_touching", "closed_other_links", "closed_hand_on_table")
-    verdict = judge_closed(*(batch[name] for name in fields), required=required)
+    verdict = judge_closed(*(batch[name] for name in fields), required=required_of(batch, required))
     lifts = np.isfinite(batch["time_close"]) & (verdict == Outcome.SUCCESS)
     due = np.where(lifts & (chance is not None), batch["chance"], np.nan)
     for _, known, rows in _by_object(batch, manifest, model):

@@ -24,6 +24,7 @@ from drakegrasp.dataset.checks.rows import (
 from drakegrasp.dataset.filters import breaks_hold
 from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS
 from drakegrasp.frames import P_WT, X_WT, Array, invert_pose
+from drakegrasp.grasp import unused_fingers
 from drakegrasp.objects.contact_fit import fit_contacts
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
@@ -34,6 +35,7 @@ from drakegrasp.vision.camera import LOOKS_VERTICALLY
 RELATIVE_TOLERANCE = 1e-5
 #: float32 rounds slip [m] and turn [rad] by 2e-7 at most.
 MOTION_TOLERANCE = 1e-6
+GRASPS = ("grasps", "grasps_held")
 POSES = (
     *(f.name for f in DATA_FIELDS if f.name.startswith("object_props/frame_")),
     *("grasp_props/X_CG", "grasp_props/X_CG_held"),
@@ -44,11 +46,16 @@ POSES = (
 
 
 def finite(batch: Batch) -> Iterator[Violation]:
-    """No number of a sample is NaN or infinite."""
+    """No number of a sample is NaN or infinite but the contacts of fingers that it leaves out."""
     for f in DATA_FIELDS:
         # What a row may lack is compared with its trial.
         if f.dtype.startswith("float") and not f.some:
-            bad = ~all_per_row(np.isfinite(batch[f.name]))
+            sound = np.isfinite(batch[f.name])
+            if f.name in GRASPS:
+                # A contact of a finger that its preshape leaves out is NaN.
+                unused = unused_fingers(batch["grasp_props/unused"], sound.shape[1] // 6)
+                sound = sound ^ np.tile(np.repeat(unused, 3, axis=1), 2)
+            bad = ~all_per_row(sound)
             yield from batch.broken(
                 f"{f.name} must be finite", bad, lambda i: "NaN or an infinite value"
             )
@@ -57,7 +64,9 @@ def finite(batch: Batch) -> Iterator[Violation]:
 def directions(batch: Batch) -> Iterator[Violation]:
     """Normals have length one, and the rotation of every pose is one."""
     for name, what in (("grasps", "normal of finger"), ("grasps_held", "normal held by finger")):
-        yield from unit_length(batch, np.linalg.norm(batch.contacts(name)[1], axis=2), what)
+        lengths = np.linalg.norm(batch.contacts(name)[1], axis=2)
+        unused = unused_fingers(batch["grasp_props/unused"], lengths.shape[1])
+        yield from unit_length(batch, np.where(unused, 1.0, lengths), what)
     for name in POSES:
         yield from rotation(batch, name)
 

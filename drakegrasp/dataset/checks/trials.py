@@ -16,6 +16,7 @@ from drakegrasp.dataset.checks.findings import Violation
 from drakegrasp.dataset.checks.rows import AnyArray, Batch, all_per_row, rotation, unit_length
 from drakegrasp.dataset.schema import TRIAL_FIELDS
 from drakegrasp.frames import invert_pose
+from drakegrasp.grasp import unused_fingers
 from drakegrasp.outcomes import Outcome, Stage
 from drakegrasp.simulation.candidates import Source
 from drakegrasp.simulation.verdict import (
@@ -129,17 +130,18 @@ def verdicts(
         rules: When lifts end, if known.
     """
     # What the contacts of each stage say.
+    own = required_of(batch, required)
     closed = judge_closed(
         batch["closed_touching"],
         batch["closed_other_links"],
         batch["closed_hand_on_table"],
-        required=required,
+        required=own,
     )
     lifted = judge_lifted(
         batch["lifted_touching"],
         batch["lifted_other_links"],
         batch["lifted_object_on_table"],
-        required=required,
+        required=own,
     )
 
     # A lift that was ended has no verdict, but a reason.
@@ -185,6 +187,11 @@ def verdicts(
             f"{Outcome(int(expected[i])).label}"
         ),
     )
+
+
+def required_of(batch: Batch, required: Sequence[bool]) -> AnyArray:
+    """Return whether the grasp of each row needs each fingertip, (n, k): those of its preshape."""
+    return np.asarray(required) & ~unused_fingers(batch["unused"], len(required))
 
 
 def contacts(batch: Batch) -> Iterator[Violation]:

@@ -34,7 +34,7 @@ def class_sheets(path: Path) -> tuple[list[Figure], dict[str, int]]:
     # The first sample of each class.
     first: dict[str, tuple[int, GraspDataset, int]] = {}
     for split in SPLITS:
-        data = GraspDataset(path, split=split)
+        data = GraspDataset(path, split=split, fewer_fingers=True)
         ids, classes = data.column("trial_id"), data.column("object_props/class_name")
         for row, (trial, name) in enumerate(zip(ids.tolist(), classes.tolist(), strict=True)):
             if name not in first or trial < first[name][0]:

@@ -1,0 +1,143 @@
+"""Preshapes of a hand: which fingers close, where the others stand, and what is stored of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from helpers.successes import good
+
+from drakegrasp.config import CandidateConfig, FilterConfig
+from drakegrasp.dataset.filters import judge_successes
+from drakegrasp.errors import HandError
+from drakegrasp.grasp import unused_fingers
+from drakegrasp.hand.description import Hand, load_hand, load_plain_hand
+from drakegrasp.hand.files import hand_file
+from drakegrasp.hand.kinematics import joint_positions
+from drakegrasp.outcomes import Removal
+from drakegrasp.simulation.candidates import Candidates, make_attempts
+
+PINCH = {
+    "name": "pinch",
+    "fingers": ["index", "thumb"],
+    "joints": {"middle_mcp_joint": -0.19, "middle_pip_joint": 0.0, "ring_roll_joint": 0.1},
+}
+ALL = {"name": "all", "fingers": ["index", "middle", "ring", "thumb"]}
+REFUSALS = {
+    "no such finger": (
+        [{**PINCH, "fingers": ["index", "little"]}],
+        r"preshapes.0.fingers must be of index, middle, ring, thumb, got 'little'",
+    ),
+    "one name twice": ([PINCH, PINCH], "preshapes must have a name each, got pinch, pinch"),
+    "a joint that closes": (
+        [ALL, {**PINCH, "joints": {"index_mcp_joint": 0.3}}],
+        r"preshapes.1: fingers.0.closing_joint: must be a joint that nothing else drives",
+    ),
+    "a joint beyond its limits": (
+        [{**PINCH, "joints": {"ring_mcp_joint": 3.0}}],
+        r"preshapes.0: preshape.ring_mcp_joint: must be -0.196..1.61, .* got 3",
+    ),
+    "a joint of another hand": (
+        [{**PINCH, "joints": {"little_joint": 0.0}}],
+        r"preshapes.0: preshape.little_joint: must be a revolute or prismatic joint",
+    ),
+}
+
+
+def allegro(folder: Path, *preshapes: dict) -> Hand:
+    tree = yaml.safe_load(hand_file("allegro_four").read_text())
+    tree |= {"model": str(load_hand("allegro_four").model.path), "preshapes": list(preshapes)}
+    path = folder / "shaped_hand.yaml"
+    path.write_text(yaml.safe_dump(tree))
+    return load_hand(path)
+
+
+@pytest.mark.parametrize("case", REFUSALS)
+def test_a_preshape_that_a_hand_cannot_have_is_refused(tmp_path: Path, case: str) -> None:
+    preshapes, message = REFUSALS[case]
+    with pytest.raises(HandError, match=message):
+        allegro(tmp_path, *preshapes)
+
+
+def test_fingers_that_a_preshape_leaves_out_keep_their_joints(tmp_path: Path) -> None:
+    """As the preshape says, else as in the open hand; the common preshape holds as well."""
+    hand = allegro(tmp_path, ALL, PINCH)
+    pinch = hand.at(1)
+    assert [finger.name for finger in pinch.fingers] == ["index", "thumb"]
+    assert (hand.unused_in(0), hand.unused_in(1), hand.unused_in(None)) == (0, 0b0110, 0)
+    q = joint_positions(pinch, 0.0, [0.5, 0.4])
+    assert (q["index_mcp_joint"], q["thumb_mcp_joint"]) == (0.5, 0.4)
+    assert (q["middle_mcp_joint"], q["middle_pip_joint"], q["ring_roll_joint"]) == (-0.19, 0.0, 0.1)
+    assert (q["ring_mcp_joint"], q["ring_pip_joint"]) == (0.0, 0.2)
+    assert q["thumb_opposition_joint"] == 1.396
+    assert hand.at(0).num_fingers == hand.at(None).num_fingers == 4
+
+
+def test_a_preshape_includes_the_finger_whose_motor_drives_its_own(tmp_path: Path) -> None:
+    tree = yaml.safe_load(hand_file("franka").read_text())
+    tree |= {"model": str(load_hand("franka").model.path)}
+    tree["preshapes"] = [{"name": "half", "fingers": ["right"]}]
+    path = tmp_path / "half_hand.yaml"
+    path.write_text(yaml.safe_dump(tree))
+    with pytest.raises(HandError, match=r"preshapes.0.fingers must include 'left', whose motor"):
+        load_hand(path)
+
+
+def test_preshapes_are_drawn_after_the_spreads() -> None:
+    """So spreads are the same with and without them, whatever the number of either."""
+    count = 40
+    drawn = Candidates(
+        X_OG=np.tile(np.eye(4), (count, 1, 1)),
+        distance=np.ones(count),
+        resting=np.zeros(count, dtype=np.int64),
+        source=np.zeros(count, dtype=np.int64),
+        log_density=np.zeros(count),
+        combinations=count,
+        valid=count,
+        distinct=count,
+    )
+    rules = CandidateConfig(standoffs=(0.05, 0.07), spreads_deg=(0.0, 10.0, 20.0))
+
+    def attempts(preshapes: int) -> list:
+        made = make_attempts(drawn, range(count), rules, name="x", seed=3, preshapes=preshapes)
+        return list(made)
+
+    without, shaped = attempts(0), attempts(3)
+    assert [a.spread for a in without] == [a.spread for a in shaped]
+    assert {a.preshape for a in without} == {None}
+    assert sorted({a.preshape for a in shaped}) == [0, 1, 2]
+    assert [a.preshape for a in attempts(3)] == [a.preshape for a in shaped]
+
+
+def test_bits_say_which_fingers_are_left_out() -> None:
+    np.testing.assert_array_equal(
+        unused_fingers([0, 1, 6], 3),
+        [[False, False, False], [True, False, False], [False, True, True]],
+    )
+
+
+def test_filters_do_not_miss_what_a_preshape_leaves_out() -> None:
+    """A NaN of another finger is off the surface; outliers are sought among the same fingers."""
+    grasps = good(40)
+    unused = np.zeros((40, 3), dtype=bool)
+    unused[20:, 1] = True
+    lacking = np.tile(np.repeat(unused, 3, axis=1), 2)
+    grasp, held = grasps.grasp_T.copy(), grasps.held_O.copy()
+    grasp[lacking] = held[lacking] = np.nan
+    grasp[3, 4] = np.nan
+    grasp[6, 4] = grasp[30, 0] = 50.0
+    shaped = replace(grasps, grasp_T=grasp, held_O=held, unused=unused)
+    removal = judge_successes(shaped, FilterConfig())
+    assert np.flatnonzero(removal).tolist() == [3, 6, 30]
+    assert removal[3] == Removal.OFF_SURFACE
+    assert removal[6] == removal[30] == Removal.OUTLIER
+
+
+def test_what_knows_one_preshape_refuses_several(tmp_path: Path) -> None:
+    allegro(tmp_path, PINCH)
+    with pytest.raises(HandError, match="hand must be one without preshapes for MuJoCo, got "):
+        load_plain_hand(tmp_path / "shaped_hand.yaml", "MuJoCo")
+    assert load_plain_hand("allegro", "MuJoCo") is load_hand("allegro")
