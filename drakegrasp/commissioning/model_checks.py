@@ -9,10 +9,10 @@ import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 
 from drakegrasp.commissioning.finding import Finding, judge
-from drakegrasp.commissioning.model_text import Mimic, declared_masses, declared_mimics
 from drakegrasp.config import Config
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import coordinate_limits
+from drakegrasp.hand.model_text import Mimic, declared_masses, declared_mimics, read_xml
 from drakegrasp.hand.parsing import add_model
 from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.simulation.construction import FINGER_DAMPING
@@ -27,7 +27,7 @@ SAME = 1e-3
 def check_masses(hand: Hand) -> Finding:
     """Return whether every link has a mass, and an inertia that a body can have."""
     # Drake parses the inertias; the masses are those that the file gives.
-    masses = declared_masses(hand.model.path)
+    masses = declared_masses(read_xml(hand.model.path))
     plant = MultibodyPlant(0.0)
     instance = add_model(plant, hand.model)
     faults = []
@@ -84,7 +84,7 @@ def check_couplings(hand: Hand) -> Finding:
     # Position of each joint by closing joint, as the hand file has it.
     own = {c.joint: (f.closing_joint, c) for f in hand.fingers for c in f.coupled}
     faults = []
-    for mimic in declared_mimics(hand.model.path):
+    for mimic in declared_mimics(read_xml(hand.model.path)):
         if _moves_as(hand, mimic):
             continue
         if mimic.joint not in own:

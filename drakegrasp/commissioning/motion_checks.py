@@ -19,10 +19,12 @@ from drakegrasp.commissioning.pinch import (
     find_opposition,
     find_pinch,
     pad_fronts,
+    reach,
 )
 from drakegrasp.frames import Array, transform_points
 from drakegrasp.hand.chains import Chain
 from drakegrasp.hand.description import Hand
+from drakegrasp.hand.file_format import Finger
 from drakegrasp.hand.finger_sweep import pad_points
 from drakegrasp.hand.kinematics import (
     closed_positions,
@@ -41,6 +43,10 @@ RAY = 0.3
 PARALLEL = 1e-9
 #: A pad point lies on its fingertip within this distance, and pads that come so close meet [m].
 ON_SURFACE, MEETING = 0.003, 0.008
+#: Room behind a pad's face [m], and the cosine from which a border is parallel to it.
+LEEWAY, FACING = 0.003, 0.95
+#: The hand may reach so far beyond its pinch along +Gz [m]: farther, the palm cannot face a table.
+BEYOND_PINCH = 0.1
 #: Postures on the way from the open to the closed hand, and of each of two fingers that meet.
 POSTURES, MEETING_STEPS = 40, 40
 #: Links of different fingers may overlap by so much before their fingertips meet [m].
@@ -86,7 +92,7 @@ def check_palm(hand: Hand) -> Finding:
             continue
         X_GL = link_poses(hand, link, spread=0.0, closing=closing)
         for corners in shapes:
-            depth = _ray_end(transform_points(X_GL, corners))
+            depth = ray_end(transform_points(X_GL, corners))
             if depth > worst:
                 worst, blocked = depth, link
     faults = []
@@ -108,9 +114,19 @@ def check_palm(hand: Hand) -> Finding:
             f"+Gz must point to where the fingertips close, got them {-1e3 * height:.0f} mm behind "
             "the palm: check palm.rpy_deg"
         )
-    return judge(
-        "palm", faults, f"its ray is free; half-closed fingertips {1e3 * height:.0f} mm ahead"
-    )
+    text = f"its ray is free; half-closed fingertips {1e3 * height:.0f} mm ahead"
+    pinch = None if faults else find_pinch(hand, WIDTH)
+    if pinch is not None:
+        # What is beyond the pinch meets the table before the fingertips meet the object.
+        beyond = reach(hand, np.array([0.0, 0.0, 1.0])) - float(pinch.p_GM[2])
+        text += f"; it reaches {1e3 * beyond:.0f} mm beyond what it pinches"
+        if beyond > BEYOND_PINCH:
+            faults.append(
+                "the palm must be able to face a table, but the hand reaches "
+                f"{1e3 * beyond:.0f} mm beyond what it pinches along +Gz: turn "
+                "palm.rpy_deg, or keep fingers that do not grasp away with preshape"
+            )
+    return judge("palm", faults, text)
 
 
 def check_pads(hand: Hand) -> Finding:
@@ -133,14 +149,54 @@ def check_pads(hand: Hand) -> Finding:
             faults.append(f"fingers.{i}.pad_region must hold a part of the surface, got none of it")
             continue
 
-        # The pad must face the way that it moves.
+        # The pad must face the way that it moves, and have room behind its face.
         if facing[i] <= 0.0:
             faults.append(
                 f"the pad of finger {finger.name!r} must face where the finger closes, got its "
-                "back: check the pad_region, and the axis of the closing joint"
+                f"back: {_turned_round(hand, i)}"
             )
+        faults += _tight_borders(i, finger, pad)
         areas.append(1e6 * float(trimesh.triangles.area(pad).sum()))
     return judge("pads", faults, f"{', '.join(f'{area:.0f}' for area in areas)} mm²")
+
+
+def _turned_round(hand: Hand, i: int) -> str:
+    """Return how to mend a finger that moves away from its pad's side."""
+    # A joint that opens moves the pad away from those of the other fingers.
+    start = _pad_points(hand, np.zeros(hand.num_fingers))
+    moved = _pad_points(hand, 0.1 * closed_positions(hand))
+    others = np.delete(start, i, axis=0).mean(axis=0)
+    finger = hand.fingers[i]
+    if np.linalg.norm(moved[i] - others) <= np.linalg.norm(start[i] - others):
+        return "check the pad_region, and the axis of the closing joint"
+    lower, upper = hand.joint_limits[hand.joint_names.index(finger.closing_joint)]
+    return (
+        f"a positive position of joint {finger.closing_joint!r} opens the hand; reverse its axis, "
+        f"limits ({-upper + 0.0:g}..{-lower + 0.0:g}) and origin, or take `drakegrasp hand new`"
+    )
+
+
+def _tight_borders(i: int, finger: Finger, pad: Array) -> list[str]:
+    """Return the borders of a pad region that lie on the pad's face, and how to mend them.
+
+    What is pressed sinks in, by a millimetre or two; behind the border it is no contact of the pad.
+    """
+    areas = trimesh.triangles.area(pad)
+    normals = np.cross(pad[:, 1] - pad[:, 0], pad[:, 2] - pad[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    faults = []
+    for n, (*direction, offset) in enumerate(finger.pad_region):
+        length = float(np.linalg.norm(direction))
+        along = np.array(direction) / length
+        depth = pad.mean(axis=1) @ along - offset / length
+        on_face = (np.abs(normals @ along) > FACING) & (depth < LEEWAY / 2.0)
+        if areas[on_face].sum() > 0.5 * areas.sum():
+            mended = [round(float(x), 5) for x in (*direction, offset - LEEWAY * length)]
+            faults.append(
+                f"fingers.{i}.pad_region.{n} must leave room behind the pad's face, into which "
+                f"objects sink, got none: {1e3 * LEEWAY:.0f} mm are in {mended}"
+            )
+    return faults
 
 
 def check_meeting(hand: Hand) -> Finding:
@@ -245,7 +301,7 @@ def _facing(hand: Hand) -> Array:
     return np.array(cosines)
 
 
-def _ray_end(corners: Array) -> float:
+def ray_end(corners: Array) -> float:
     """Return where the ray along +Gz leaves a hull of corners (n, 3) in {G} [m]; 0 if it misses."""
     # On the ray p = t z each plane n.p + d <= 0 of the hull is a limit of t.
     equations = ConvexHull(corners).equations

@@ -80,6 +80,11 @@ def pad_surfaces(hand: Hand) -> tuple[Array, ...]:
     return tuple(surfaces)
 
 
+def hull_planes(corners: Array) -> Array:
+    """Return the planes (m, 4) of the convex hull of corners (n, 3) [m]: n.p + d <= 0 within."""
+    return np.asarray(ConvexHull(corners).equations)
+
+
 def hull_triangles(corners: Array) -> Array:
     """Return the triangles (t, 3, 3) [m] of the convex hull of corners (n, 3) [m]."""
     hull = ConvexHull(corners)
@@ -122,15 +127,15 @@ def _corners(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
     if hull is not None:
         corners = hull
     elif isinstance(shape, Box):
-        corners = _box(shape.size() / 2.0)
+        corners = box_corners(shape.size() / 2.0)
     elif isinstance(shape, Cylinder):
-        corners = _prism(shape.radius(), shape.length() / 2.0)
+        corners = prism_corners(shape.radius(), shape.length() / 2.0)
     elif isinstance(shape, Capsule):
-        ball = _ball(shape.radius())
+        ball = ball_corners(shape.radius())
         ends = np.array([[0.0, 0.0, shape.length() / 2.0]])
         corners = np.concatenate([ball + ends, ball - ends])
     elif isinstance(shape, Sphere):
-        corners = _ball(shape.radius())
+        corners = ball_corners(shape.radius())
     else:
         raise HandError(
             f"{inspector.GetName(geometry)}: must be a box, cylinder, capsule, sphere or convex "
@@ -141,12 +146,14 @@ def _corners(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
     return transform_points(X_BS, corners)
 
 
-def _box(half: Array) -> Array:
+def box_corners(half: Array) -> Array:
+    """Return the corners (8, 3) of a box about the origin from its half edges (3,) [m]."""
     signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     return np.asarray(signs * half)
 
 
-def _prism(radius: float, half_length: float) -> Array:
+def prism_corners(radius: float, half_length: float) -> Array:
+    """Return the corners (n, 3) of a prism around a cylinder about the origin, along z [m]."""
     angles = 2.0 * np.pi * np.arange(CIRCLE) / CIRCLE
     sine, cosine = sin_cos(angles)
     ring = radius / sin_cos(np.pi / CIRCLE)[1] * np.column_stack([cosine, sine])
@@ -154,11 +161,11 @@ def _prism(radius: float, half_length: float) -> Array:
     return np.concatenate(ends)
 
 
-def _ball(radius: float) -> Array:
-    """Return points on a sphere about the origin."""
+def ball_corners(radius: float, count: int = CIRCLE**2) -> Array:
+    """Return points (count, 3) on a sphere about the origin [m]."""
     # A Fibonacci lattice: even spacing without poles.
-    i = np.arange(CIRCLE**2) + 0.5
-    z, turn = 1.0 - 2.0 * i / CIRCLE**2, np.pi * (1.0 + np.sqrt(5.0)) * i
+    i = np.arange(count) + 0.5
+    z, turn = 1.0 - 2.0 * i / count, np.pi * (1.0 + np.sqrt(5.0)) * i
     across = np.sqrt(1.0 - z**2)
     sine, cosine = sin_cos(turn)
     return radius * np.column_stack([across * cosine, across * sine, z])
