@@ -1,4 +1,4 @@
-"""What a model file says of masses and of joints that follow others.
+"""What a model file says of masses, of efforts, and of joints that follow others.
 
 In: the XML of a URDF, SDFormat or MJCF file. Out: its own figures. Drake does not tell them: it
 replaces a mass of zero by one of its own, and couples joints by constraints or not at all.
@@ -40,6 +40,16 @@ def declared_masses(root: Element) -> dict[str, float]:
         text = None if found is None else found.get("value", found.text)
         masses[name] = _number(text or "0", f"mass of link {name!r}")
     return masses
+
+
+def declared_efforts(root: Element) -> dict[str, float]:
+    """Return the largest effort [N m or N] of each joint that the <limit>s of a model give one."""
+    efforts = {}
+    for joint in root.iter("joint"):
+        for limit in joint.iter("limit"):
+            name, text = joint.get("name", ""), _value(limit, "effort", "0")
+            efforts[name] = abs(_number(text, f"effort of joint {name!r}"))
+    return {name: effort for name, effort in efforts.items() if effort > 0.0}
 
 
 def declared_mimics(root: Element) -> list[Mimic]:

@@ -17,6 +17,7 @@ from pydrake.geometry import (
     GeometryId,
     SceneGraph,
     SceneGraphInspector,
+    Shape,
     Sphere,
 )
 from pydrake.multibody.plant import MultibodyPlant
@@ -122,38 +123,37 @@ def hull_corners(inspector: SceneGraphInspector, geometry: GeometryId) -> Array 
 
 def _corners(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
     """Return the corners of a shape in its body's frame."""
-    # Corners in the shape's own frame.
-    shape, hull = inspector.GetShape(geometry), hull_corners(inspector, geometry)
-    if hull is not None:
-        corners = hull
-    elif isinstance(shape, Box):
-        corners = box_corners(shape.size() / 2.0)
-    elif isinstance(shape, Cylinder):
-        corners = prism_corners(shape.radius(), shape.length() / 2.0)
-    elif isinstance(shape, Capsule):
-        ball = ball_corners(shape.radius())
-        ends = np.array([[0.0, 0.0, shape.length() / 2.0]])
-        corners = np.concatenate([ball + ends, ball - ends])
-    elif isinstance(shape, Sphere):
-        corners = ball_corners(shape.radius())
-    else:
+    # A mesh has a hull.
+    shape, corners = inspector.GetShape(geometry), hull_corners(inspector, geometry)
+    if corners is None:
+        corners = primitive_corners(shape)
+    if corners is None:
         raise HandError(
             f"{inspector.GetName(geometry)}: must be a box, cylinder, capsule, sphere or convex "
             f"mesh, got {type(shape).__name__}"
         )
-
     X_BS = inspector.GetPoseInFrame(geometry).GetAsMatrix4()
     return transform_points(X_BS, corners)
 
 
-def box_corners(half: Array) -> Array:
-    """Return the corners (8, 3) of a box about the origin from its half edges (3,) [m]."""
+def primitive_corners(shape: Shape) -> Array | None:
+    """Return points (n, 3) around a shape, in its frame [m]; None if it is no primitive."""
+    if isinstance(shape, Box):
+        return _box(shape.size() / 2.0)
+    if isinstance(shape, Cylinder):
+        return _prism(shape.radius(), shape.length() / 2.0)
+    if isinstance(shape, Capsule):
+        ball, end = ball_corners(shape.radius()), np.array([[0.0, 0.0, shape.length() / 2.0]])
+        return np.concatenate([ball + end, ball - end])
+    return ball_corners(shape.radius()) if isinstance(shape, Sphere) else None
+
+
+def _box(half: Array) -> Array:
     signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     return np.asarray(signs * half)
 
 
-def prism_corners(radius: float, half_length: float) -> Array:
-    """Return the corners (n, 3) of a prism around a cylinder about the origin, along z [m]."""
+def _prism(radius: float, half_length: float) -> Array:
     angles = 2.0 * np.pi * np.arange(CIRCLE) / CIRCLE
     sine, cosine = sin_cos(angles)
     ring = radius / sin_cos(np.pi / CIRCLE)[1] * np.column_stack([cosine, sine])

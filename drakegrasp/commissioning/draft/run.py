@@ -29,7 +29,8 @@ from drakegrasp.config import Config
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
-from drakegrasp.hand.vendor.model import VendorModel, read_model
+from drakegrasp.hand.vendor.model import VendorModel
+from drakegrasp.hand.vendor.parsing import read_model
 from drakegrasp.hand.vendor.source import read_source
 from drakegrasp.hand.vendor.writing import write_urdf
 from drakegrasp.runtime.blas import one_thread

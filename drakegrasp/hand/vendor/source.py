@@ -1,22 +1,21 @@
-"""The text of a vendor's model, and the mesh files that it names.
+"""The text of a vendor's model.
 
-In: a URDF, SDFormat or MJCF file and the folders that it may use. Out: its XML, in which every mesh
-is a Wavefront file of a scratch folder, and notes of what was left out. Nothing is fetched, and no
-file outside of the folders is read.
+In: a URDF, SDFormat or MJCF file. Out: its XML, complete by itself but for meshes. A file that asks
+for too much (entities, depth, includes without end) is refused before anything else reads it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 from drakegrasp.errors import HandError, one_line
 from drakegrasp.hand.files import find_packages
+from drakegrasp.hand.vendor.folders import Folders
 
 #: Formats by the tag of the root.
 FORMATS = {"robot": "urdf", "sdf": "sdf", "mujoco": "xml"}
@@ -30,71 +29,14 @@ _ELSEWHERE = {"robot": ("drake:include",), "sdf": ("include",), "mujoco": ("hfie
 
 
 @dataclass(frozen=True, kw_only=True)
-class Folders:
-    """The folders whose files a model may use.
-
-    Attributes:
-        model: That of the model.
-        packages: Of package:// URIs, by name.
-        given: Those that the user named.
-    """
-
-    model: Path
-    packages: Mapping[str, Path]
-    given: tuple[Path, ...]
-
-    def find(self, uri: str, base: Path) -> Path:
-        """Return the file of a URI or path; relative ones start at `base`.
-
-        Raises:
-            HandError: If it is a URI of another kind, or lies outside of the folders.
-        """
-        scheme, separator, rest = uri.partition("://")
-        if separator and scheme not in ("package", "file", "model"):
-            raise HandError(
-                f"model: mesh {uri!r} must be a file, got an address: nothing is fetched"
-            )
-        if separator and scheme != "file":
-            name, _, rest = rest.partition("/")
-            folder = self.packages.get(name) or self._above(name)
-            if folder is None:
-                raise HandError(
-                    f"model: mesh {uri!r} must lie in a known package: say where it is with "
-                    f"--package {name}=FOLDER"
-                )
-            path, allowed = folder / unquote(rest), [folder]
-        else:
-            path, allowed = base / unquote(rest if separator else uri), [self.model]
-
-        # What a link or `..` leads to is what counts.
-        try:
-            real = path.resolve()
-        except (OSError, RuntimeError, ValueError):
-            raise HandError(f"model: mesh {uri!r} must be a path, got none") from None
-        allowed += [*self.given, *self.packages.values()]
-        if not any(real.is_relative_to(folder.resolve()) for folder in allowed):
-            raise HandError(
-                f"model: mesh {uri!r} must lie in the model's folder, got {str(real)!r}: allow "
-                f"its folder with --root FOLDER"
-            )
-        return real
-
-    def _above(self, name: str) -> Path | None:
-        """Return the folder of a name in which the model lies; None if there is none."""
-        return next((f for f in (self.model, *self.model.parents) if f.name == name), None)
-
-
-@dataclass(frozen=True, kw_only=True)
 class Source:
     """A vendor's model, read.
 
     Attributes:
-        path: The file.
         root: Its XML, with what it includes.
         folders: Of its meshes.
     """
 
-    path: Path
     root: Element
     folders: Folders
 
@@ -110,6 +52,7 @@ def read_source(path: Path, packages: Mapping[str, Path], given: Sequence[Path] 
     Raises:
         HandError: If it cannot be read, in one line that says how to mend it.
     """
+    # What it is.
     path = Path(path)
     if path.suffix.lower() == ".xacro":
         raise HandError(f"{path}: must be URDF, got xacro: run `xacro {path.name} > hand.urdf`")
@@ -123,26 +66,25 @@ def read_source(path: Path, packages: Mapping[str, Path], given: Sequence[Path] 
         raise HandError(
             f"{path}: must be a model in URDF, SDFormat or MJCF, got XML of <{root.tag}>"
         )
+
+    # What it is made of.
     folder = path.resolve().parent
     known = {**find_packages(folder, path.name, {}), **packages}
-    source = Source(
-        path=path,
-        root=root,
-        folders=Folders(model=folder, packages=known, given=tuple(given)),
-    )
+    folders = Folders(model=folder, packages=known, given=tuple(given))
     if root.tag == "mujoco":
-        _include(root, folder, source.folders, [0])
+        _include(root, folders, [0])
     for element in root.iter():
         if element.tag in _ELSEWHERE[root.tag] and (element.get("file") or len(element)):
             raise HandError(
                 f"{path}: must be complete by itself, got <{element.tag}>: put what it names into "
                 "the file"
             )
-    return source
+    return Source(root=root, folders=folders)
 
 
 def _parse(path: Path) -> Element:
     """Return the root of an XML file that defines no entities and is not nested too deeply."""
+    # Entities come with a document type.
     try:
         if path.stat().st_size > LONGEST:
             raise HandError(f"{path}: must be a model of at most {LONGEST // 10**6} MB, got more")
@@ -170,80 +112,15 @@ def _parse(path: Path) -> Element:
     return root
 
 
-def _include(root: Element, base: Path, folders: Folders, count: list[int]) -> None:
+def _include(root: Element, folders: Folders, count: list[int]) -> None:
     """Put the content of included MJCF files in place of their <include>."""
     for parent in list(root.iter()):
         for child in [c for c in parent if c.tag == "include"]:
             count[0] += 1
             if count[0] > MOST_INCLUDES:
                 raise HandError("model: must include other files once each, got a loop of them")
-            path = folders.find(child.get("file", ""), base)
-            included = _parse(path)
-            _include(included, base, folders, count)
+            included = _parse(folders.find(child.get("file", ""), folders.model))
+            _include(included, folders, count)
             place = list(parent).index(child)
             parent.remove(child)
             parent[place:place] = list(included)
-
-
-#: Turns a mesh file into a Wavefront file of the scratch folder, whose path it returns.
-Convert = Callable[[Path], Path]
-
-
-def replace_meshes(source: Source, convert: Convert) -> list[str]:
-    """Replace every mesh in the XML by its conversion, and return notes of what was left out.
-
-    A picture of a link that cannot be read is left out: its collision shapes are drawn instead.
-
-    Raises:
-        HandError: If a mesh of a collision shape cannot be read.
-    """
-    if source.root.tag == "mujoco":
-        _replace_assets(source, convert)
-        return []
-    notes: list[str] = []
-    for link in source.root.iter("link"):
-        for tag in ("collision", "visual"):
-            for element in link.findall(tag):
-                for mesh in element.iter("mesh"):
-                    try:
-                        _replace(mesh, source, convert)
-                    except HandError as error:
-                        if tag == "collision":
-                            raise
-                        notes.append(f"not drawn: {str(error).removeprefix('model: ')}")
-                        link.remove(element)
-                        break
-    return notes
-
-
-def _replace(mesh: Element, source: Source, convert: Convert) -> None:
-    """Replace the file of a mesh in URDF or SDFormat."""
-    if source.root.tag == "robot":
-        path = source.folders.find(mesh.get("filename", ""), source.folders.model)
-        mesh.set("filename", convert(path).name)
-        return
-    uri = mesh.find("uri")
-    if uri is None or mesh.find("submesh") is not None:
-        raise HandError("model: a mesh must be a whole file, got <submesh> or no <uri>")
-    path = source.folders.find((uri.text or "").strip(), source.folders.model)
-    uri.text = convert(path).name
-
-
-def _replace_assets(source: Source, convert: Convert) -> None:
-    """Replace the files of an MJCF model's meshes, and leave out its textures."""
-    folder = source.folders.model
-    for compiler in source.root.iter("compiler"):
-        place = compiler.attrib.pop("meshdir", None) or compiler.attrib.pop("assetdir", None)
-        folder = folder / place if place else folder
-        for key in ("assetdir", "texturedir", "strippath"):
-            compiler.attrib.pop(key, None)
-    for assets in source.root.iter("asset"):
-        for element in list(assets):
-            if element.tag == "texture":
-                assets.remove(element)
-            elif element.tag == "material":
-                element.attrib.pop("texture", None)
-            elif element.tag == "mesh" and element.get("file"):
-                name = element.get("file", "")
-                element.attrib.setdefault("name", Path(name).stem)
-                element.set("file", convert(source.folders.find(name, folder)).name)

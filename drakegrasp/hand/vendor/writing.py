@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
+from pydrake.geometry import Box, Capsule, Cylinder, Sphere
 from pydrake.math import RotationMatrix
 
 from drakegrasp.frames import Array
@@ -21,6 +22,8 @@ from drakegrasp.mesh.wavefront import obj_text
 
 #: Folder of the meshes.
 MESHES = "meshes"
+#: Velocity limit of a joint that has none [rad/s or m/s].
+FAST = 10.0
 _DRAKE = "drake:"
 
 
@@ -46,11 +49,14 @@ def write_urdf(model: VendorModel, path: Path, comments: Sequence[str]) -> None:
 
 
 def _link(link: Link, stem: str, folder: Path) -> Element:
+    """Return a link; its meshes become files whose names start with a stem."""
+    # Inertia about the centre of mass.
     element = Element("link", {"name": link.name})
     inertial = SubElement(element, "inertial")
-    SubElement(inertial, "origin", {"xyz": _numbers(link.inertia.p_LLcm)})
-    SubElement(inertial, "mass", {"value": _number(link.inertia.mass)})
-    tensor = link.inertia.I_LLcm
+    p_LLcm = link.inertia.get_com()
+    tensor = link.inertia.Shift(p_LLcm).CalcRotationalInertia().CopyToFullMatrix3()
+    SubElement(inertial, "origin", {"xyz": _numbers(p_LLcm)})
+    SubElement(inertial, "mass", {"value": _number(link.inertia.get_mass())})
     entries = {
         f"i{'xyz'[a]}{'xyz'[b]}": _number(tensor[a, b]) for a in range(3) for b in range(a, 3)
     }
@@ -64,16 +70,17 @@ def _link(link: Link, stem: str, folder: Path) -> Element:
 
 
 def _shape(tag: str, shape: Shape, name: str, folder: Path) -> Element:
+    """Return a shape; a mesh becomes a file."""
     element = Element(tag, {"name": name})
     element.append(_origin(shape.X_LS))
-    geometry = SubElement(element, "geometry")
-    if shape.kind == "box":
-        SubElement(geometry, "box", {"size": _numbers(shape.size)})
-    elif shape.kind == "sphere":
-        SubElement(geometry, "sphere", {"radius": _number(shape.size[0])})
-    elif shape.kind in ("cylinder", "capsule"):
-        kind = shape.kind if shape.kind == "cylinder" else f"{_DRAKE}capsule"
-        size = {"radius": _number(shape.size[0]), "length": _number(shape.size[1])}
+    geometry, own = SubElement(element, "geometry"), shape.primitive
+    if isinstance(own, Box):
+        SubElement(geometry, "box", {"size": _numbers(own.size())})
+    elif isinstance(own, Sphere):
+        SubElement(geometry, "sphere", {"radius": _number(own.radius())})
+    elif isinstance(own, Cylinder | Capsule):
+        kind = "cylinder" if isinstance(own, Cylinder) else f"{_DRAKE}capsule"
+        size = {"radius": _number(own.radius()), "length": _number(own.length())}
         SubElement(geometry, kind, size)
     else:
         assert shape.vertices is not None and shape.faces is not None
@@ -83,6 +90,8 @@ def _shape(tag: str, shape: Shape, name: str, folder: Path) -> Element:
         mesh = SubElement(geometry, "mesh", {"filename": f"{MESHES}/{file.name}"})
         if tag == "collision":
             SubElement(mesh, f"{_DRAKE}declare_convex")
+
+    # Only what is drawn has a colour.
     if tag == "visual" and shape.colour is not None:
         material = SubElement(element, "material", {"name": f"{name}_colour"})
         SubElement(material, "color", {"rgba": f"{_numbers(shape.colour)} 1"})
@@ -90,27 +99,24 @@ def _shape(tag: str, shape: Shape, name: str, folder: Path) -> Element:
 
 
 def _joint(joint: VendorJoint, mimic: Mimic | None) -> Element:
-    kind = "prismatic" if joint.slides else "revolute"
-    unlimited = not np.isfinite(joint.limits).all()
-    kind = "continuous" if unlimited and not joint.slides else kind
+    """Return a joint, with what it follows."""
+    limited = bool(np.isfinite(joint.limits).all())
+    turns = "revolute" if limited else "continuous"
+    kind = "prismatic" if joint.slides else turns
     element = Element("joint", {"name": joint.name, "type": kind})
     SubElement(element, "parent", {"link": joint.parent})
     SubElement(element, "child", {"link": joint.child})
     element.append(_origin(joint.X_PJ))
     SubElement(element, "axis", {"xyz": _numbers(joint.axis)})
-    limits = (
-        {} if unlimited else dict(zip(("lower", "upper"), map(_number, joint.limits), strict=True))
-    )
-    speed = joint.velocity if np.isfinite(joint.velocity) else 10.0
-    extra = {"effort": _number(joint.effort), "velocity": _number(speed)}
-    SubElement(element, "limit", {**limits, **extra})
+
+    # Limits, and the joint that leads it.
+    lower, upper = (_number(limit) for limit in joint.limits)
+    speed = joint.velocity if np.isfinite(joint.velocity) else FAST
+    most = {"effort": _number(joint.effort), "velocity": _number(speed)}
+    SubElement(element, "limit", {"lower": lower, "upper": upper, **most} if limited else most)
     if mimic is not None:
-        follows = {
-            "joint": mimic.leader,
-            "multiplier": _number(mimic.ratio),
-            "offset": _number(mimic.offset),
-        }
-        SubElement(element, "mimic", follows)
+        line = {"multiplier": _number(mimic.ratio), "offset": _number(mimic.offset)}
+        SubElement(element, "mimic", {"joint": mimic.leader, **line})
     return element
 
 
