@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from drakegrasp.commissioning import model_checks, motion_checks
+from drakegrasp.commissioning import model_checks, motion_checks, pad_checks
 from drakegrasp.commissioning.finding import Finding
 from drakegrasp.commissioning.trial_grasps import GRASPS, check_grasp
 from drakegrasp.config import Config
@@ -86,7 +86,7 @@ def check_geometry(hand: Hand) -> Iterator[Finding]:
     if not palm.ok:
         return
     yield motion_checks.check_order(hand)
-    pads = motion_checks.check_pads(hand)
+    pads = pad_checks.check_pads(hand)
     yield pads
     if pads.ok:
         yield motion_checks.check_meeting(hand)

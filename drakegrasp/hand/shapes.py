@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 #: Corners of the polygon that replaces a circle and encloses it.
 CIRCLE = 16
+#: A plane whose normal has less of a line's direction than this is parallel to it.
+PARALLEL = 1e-9
 #: Twice the area of a triangle that counts as a line [m^2].
 SLIVER = 1e-12
 
@@ -84,6 +86,24 @@ def pad_surfaces(hand: Hand) -> tuple[Array, ...]:
 def hull_planes(corners: Array) -> Array:
     """Return the planes (m, 4) of the convex hull of corners (n, 3) [m]: n.p + d <= 0 within."""
     return np.asarray(ConvexHull(corners).equations)
+
+
+def ray_span(corners: Array, start: Array, direction: Array) -> tuple[float, float] | None:
+    """Return where a line enters and leaves the convex hull of corners; None if it misses.
+
+    Args:
+        corners: (n, 3) [m].
+        start: (3,), a point of the line [m].
+        direction: (3,), its unit of length; before the start, positions are negative.
+    """
+    # On the line p = start + t direction each plane n.p + d <= 0 of the hull is a limit of t.
+    planes = hull_planes(corners)
+    slope, offset = planes[:, :3] @ direction, planes[:, :3] @ start + planes[:, 3]
+    if (offset[np.abs(slope) < PARALLEL] > 0.0).any():
+        return None
+    out, into = slope >= PARALLEL, slope <= -PARALLEL
+    leaves, enters = (-offset[out] / slope[out]).min(), (-offset[into] / slope[into]).max()
+    return (float(enters), float(leaves)) if enters <= leaves else None
 
 
 def hull_triangles(corners: Array) -> Array:

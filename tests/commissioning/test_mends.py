@@ -13,7 +13,8 @@ from helpers.hands import write_tongs
 from helpers.vendors import box, fixed, link
 
 from drakegrasp.commissioning.finding import Finding
-from drakegrasp.commissioning.motion_checks import check_pads, check_palm
+from drakegrasp.commissioning.motion_checks import check_palm
+from drakegrasp.commissioning.pad_checks import check_pads
 from drakegrasp.commissioning.trial_grasps import LINES, check_grasp, trial_grasps
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.files import MODELS

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from drakegrasp.commissioning.draft.answers import Answers
 from drakegrasp.commissioning.draft.opposition import Grip, Member
 from drakegrasp.commissioning.draft.palm import PalmFrame
 from drakegrasp.commissioning.draft.strength import closing_limits
+from drakegrasp.commissioning.draft.wording import finger_names, reasons_of
 from drakegrasp.config import Config, apply_override
 from drakegrasp.errors import ConfigError, HandError
 from drakegrasp.frames import Array, invert_pose, transform_points
@@ -33,9 +33,6 @@ HOLDING = 2.0
 STANDOFFS = (0.45, 0.65, 0.8)
 #: Share of what friction carries that is the payload.
 PAYLOAD = 0.5
-#: Names of fingers, by what the names of their links contain.
-NAMES = ("thumb", "index", "middle", "ring", "pinky", "little")
-SIDES = ("left", "right")
 #: Spreads that are tried if two joints spread fingers [deg], and how far they must turn [rad].
 SPREADS_DEG, SPREADING = [0.0, 11.25, 22.5], 0.9
 
@@ -66,8 +63,8 @@ def positions(model: VendorModel, grip: Grip, share: float) -> dict[str, float]:
         led |= {n: q for n, q in _closed(member, share).items() if n in led}
     found = {}
     for name, joint in model.joints.items():
-        mimic = model.mimics.get(name)
-        at = led[name] if mimic is None else mimic.ratio * led[mimic.leader] + mimic.offset
+        mimic = model.mimic(name)
+        at = mimic.ratio * led[mimic.leader] + mimic.offset
         found[name] = float(np.clip(at, *joint.limits))
     for member in grip.members:
         found |= _closed(member, share)
@@ -75,6 +72,7 @@ def positions(model: VendorModel, grip: Grip, share: float) -> dict[str, float]:
 
 
 def _closed(member: Member, share: float) -> dict[str, float]:
+    """Return the positions of the joints that bend a finger, at a share of its way."""
     q = member.closing.q0 + member.closing.gain * share * member.closing.limit
     moves = member.closing.gain != 0.0
     names = [joint.name for joint in member.chain.joints]
@@ -91,44 +89,20 @@ def draft_tree(
     """
     grip = _in_order(grip, frame)
     limits, forces = closing_limits(model, grip, answers.effort)
-    reasons = _reasons(model, grip, frame, answers)
+    reasons = reasons_of(model, grip, frame, answers)
     tree: dict[str, Any] = {"version": VERSION, "model": ""}
     tree["palm"] = {"link": palm, "p_BG": frame.p_BG.tolist(), "rpy_deg": frame.rpy_deg.tolist()}
 
     # The fingers; joints that nothing else drives keep a position.
-    coupled = _couplings(model, grip)
-    names = _names(grip)
-    fingers = []
-    for i, member in enumerate(grip.members):
-        joint = _closing(member)
-        kind = "force" if joint.slides else "torque"
-        limit = float(f"{limits[i]:.3g}")
-        finger: dict[str, Any] = {
-            "name": names[i],
-            "fingertip": member.chain.tip,
-            "closing_joint": joint.name,
-            f"{kind}_limit": limit,
-            f"holding_{kind}": float(f"{HOLDING * limit:.3g}"),
-        }
-        if coupled[i]:
-            finger["coupled"] = [
-                {"joint": j, "ratio": round(r, 5), "offset": round(o, 5)}
-                for j, (r, o) in coupled[i].items()
-            ]
-        finger["pad_region"] = member.pad.region()
-        finger["pad_point"] = member.pad.point.tolist()
-        fingers.append(finger)
-    tree["fingers"] = fingers
-    driven = {_closing(m).name for m in grip.members} | {j for own in coupled for j in own}
-    spread = _spread(model, grip, frame, driven)
-    kept = {
-        name: round(q, 5)
-        for name, q in positions(model, grip, 0.0).items()
-        if name not in driven and name not in spread
-    }
+    coupled, names = _couplings(model, grip), finger_names(grip)
+    rows = zip(grip.members, names, limits.tolist(), coupled, strict=True)
+    tree["fingers"] = [_finger(*row) for row in rows]
+    driven = {m.joint.name for m in grip.members} | {j for own in coupled for j in own}
+    spread = _spread(grip, frame, driven)
+    opened = positions(model, grip, 0.0)
+    kept = {n: round(q, 5) for n, q in opened.items() if n not in driven and n not in spread}
     if spread:
-        tree["spread"] = {"joints": list(spread)}
-        tree["spreads_deg"] = SPREADS_DEG
+        tree |= {"spread": {"joints": list(spread)}, "spreads_deg": SPREADS_DEG}
     if kept:
         tree["preshape"] = kept
 
@@ -144,32 +118,35 @@ def draft_tree(
         except ConfigError as error:
             raise HandError(str(error)) from None
         reasons[setting.partition("=")[0]] = "given"
-    return Draft(
-        model=_rebased(model, grip, coupled, spread),
-        tree=tree,
-        reasons=reasons,
-        changed=[
-            f"joint {_closing(m).name}: position is {_sign(m):+g} * (the vendor's - {_zero(m):g})"
-            for m in grip.members
-            if _sign(m) != 1.0 or _zero(m) != 0.0
-        ],
-    )
+
+    # What is not as the vendor has it.
+    changed = [
+        f"joint {m.joint.name}: position is {m.sign:+g} * (the vendor's - {m.zero:g})"
+        for m in grip.members
+        if m.sign != 1.0 or m.zero != 0.0
+    ]
+    rebased = _rebased(model, grip, coupled, spread)
+    return Draft(model=rebased, tree=tree, reasons=reasons, changed=changed)
 
 
-def _closing(member: Member) -> Any:
-    return member.chain.joints[_first(member)]
-
-
-def _first(member: Member) -> int:
-    return int(np.flatnonzero(member.closing.gain)[0])
-
-
-def _sign(member: Member) -> float:
-    return float(np.sign(member.closing.gain[_first(member)]))
-
-
-def _zero(member: Member) -> float:
-    return float(member.closing.q0[_first(member)])
+def _finger(
+    member: Member, name: str, limit: float, coupled: dict[str, tuple[float, float]]
+) -> dict[str, Any]:
+    """Return the keys of a finger, from its effort limit [N m or N] and what follows its joint."""
+    kind, limit = "force" if member.joint.slides else "torque", float(f"{limit:.3g}")
+    finger: dict[str, Any] = {
+        "name": name,
+        "fingertip": member.chain.tip,
+        "closing_joint": member.joint.name,
+        f"{kind}_limit": limit,
+        f"holding_{kind}": float(f"{HOLDING * limit:.3g}"),
+    }
+    if coupled:
+        finger["coupled"] = [
+            {"joint": joint, "ratio": round(ratio, 5), "offset": round(offset, 5)}
+            for joint, (ratio, offset) in coupled.items()
+        ]
+    return finger | {"pad_region": member.pad.region(), "pad_point": member.pad.point.tolist()}
 
 
 def _in_order(grip: Grip, frame: PalmFrame) -> Grip:
@@ -190,30 +167,16 @@ def _in_order(grip: Grip, frame: PalmFrame) -> Grip:
 
 def _couplings(model: VendorModel, grip: Grip) -> list[dict[str, tuple[float, float]]]:
     """Return what follows each closing joint: ratio and offset by joint, in its new positions."""
-    found: list[dict[str, tuple[float, float]]] = []
-    taken: set[str] = set()
-    for member in grip.members:
-        own = {}
-        for j, joint in enumerate(member.chain.joints):
-            gain, q0 = float(member.closing.gain[j]), float(member.closing.q0[j])
-            if gain != 0.0 and j != _first(member):
-                own[joint.name] = gain, q0
-            taken |= {joint.name} if gain != 0.0 else set()
-        found.append(own)
+    found = [member.followers() for member in grip.members]
+    taken = {member.joint.name for member in grip.members} | {j for own in found for j in own}
 
     # Bars of linkages beside the fingers follow the motor that their model names.
     for member, own in zip(grip.members, found, strict=True):
-        names = [joint.name for joint in member.chain.joints]
+        leads = member.followers() | {member.joint.name: (member.sign, member.zero)}
         for name, mimic in model.mimics.items():
-            if name in taken or mimic.leader not in names:
-                continue
-            j = names.index(mimic.leader)
-            gain = float(member.closing.gain[j])
-            if gain != 0.0:
-                own[name] = (
-                    mimic.ratio * gain,
-                    mimic.ratio * float(member.closing.q0[j]) + mimic.offset,
-                )
+            if name not in taken and mimic.leader in leads:
+                ratio, offset = leads[mimic.leader]
+                own[name] = mimic.ratio * ratio, mimic.ratio * offset + mimic.offset
                 taken.add(name)
     return found
 
@@ -227,8 +190,8 @@ def _rebased(
     """Return the model in which closing joints close from 0 on, and spreads open from 0 on."""
     joints, mimics = dict(model.joints), {}
     for member, own in zip(grip.members, coupled, strict=True):
-        joint = _closing(member)
-        joints[joint.name] = joint.rebased(_sign(member), _zero(member))
+        joint = member.joint
+        joints[joint.name] = joint.rebased(member.sign, member.zero)
         for name, (ratio, offset) in own.items():
             if name in model.mimics or joint.name in model.mimics:
                 mimics[name] = Mimic(joint=name, leader=joint.name, ratio=ratio, offset=offset)
@@ -237,25 +200,7 @@ def _rebased(
     return replace(model, joints=joints, mimics=mimics)
 
 
-def _names(grip: Grip) -> list[str]:
-    """Return a name for each finger: a usual one, a side, or what tells its link from others."""
-    tips = [member.chain.tip for member in grip.members]
-    for words in (NAMES, SIDES):
-        found = []
-        for member in grip.members:
-            texts = [member.chain.tip, *(joint.name for joint in reversed(member.chain.joints))]
-            texts += [joint.child for joint in member.chain.joints]
-            found += [word for text in texts for word in words if word in text.lower()][:1]
-        if len(set(found)) == len(tips):
-            return found
-    # What is the same at the end of all names says nothing.
-    alike = (len(set(letters)) == 1 for letters in zip(*(tip[::-1] for tip in tips), strict=False))
-    end = sum(1 for _ in takewhile(bool, alike))
-    short = [tip[: len(tip) - end].rstrip("_-.") for tip in tips]
-    return short if all(short) else tips
-
-
-def _spread(model: VendorModel, grip: Grip, frame: PalmFrame, driven: set[str]) -> dict[str, float]:
+def _spread(grip: Grip, frame: PalmFrame, driven: set[str]) -> dict[str, float]:
     """Return the sign of each of two joints that spread fingers about Gz; none if not so."""
     found: dict[str, float] = {}
     for member in grip.members:
@@ -274,7 +219,7 @@ def _speeds(grip: Grip, limits: Array, config: Config) -> dict[str, float]:
     """Return the closing speeds: usual ones, at which motors reach their limits in time."""
     speeds: dict[str, float] = {}
     for member, limit in zip(grip.members, limits, strict=True):
-        joint = _closing(member)
+        joint = member.joint
         unit, key, usual = (
             (0.1, "closing_speed", SLIDING)
             if joint.slides
@@ -288,46 +233,3 @@ def _speeds(grip: Grip, limits: Array, config: Config) -> dict[str, float]:
         shown = speed if joint.slides else float(np.rad2deg(speed))
         speeds[key] = max(speeds.get(key, 0.0), float(f"{shown:.3g}"))
     return speeds
-
-
-def _reasons(model: VendorModel, grip: Grip, frame: PalmFrame, answers: Answers) -> dict[str, str]:
-    """Return why the values are so, by the paths of their keys."""
-    reasons = {
-        "palm.link": "given" if answers.palm else "the link from which the fingers branch",
-        "palm.p_BG": "on the palm's surface, where a line to the pinch leaves it [m]",
-        "palm.rpy_deg": f"{'given' if answers.approach is not None else 'guessed'}: Gz square to "
-        f"the closing line, pinch {1e3 * frame.height:.0f} mm ahead; Gy to the last finger",
-        "fingers": "counter-clockwise about Gz; the last one opposes the others",
-        "spread.joints": "they turn two fingers about Gz, both by the same angle",
-        "spreads_deg": "usual ones",
-        "drive": "guessed: most gears cannot be pushed open; else `torque`",
-        "closing_speed_deg": "usual, or what the motors need",
-        "closing_speed": "usual, or what the motors need [m/s]",
-        "standoffs": "shares of the height of the pinch above the palm [m]",
-        "payload": "half of what friction carries at these efforts [kg]",
-    }
-    for i, member in enumerate(grip.members):
-        key = f"fingers.{i}"
-        flipped = _sign(member) != 1.0 or _zero(member) != 0.0
-        reasons |= {
-            f"{key}.fingertip": "the last link with shapes",
-            f"{key}.closing_joint": "the first that bends the finger"
-            + ("; made to close from 0 on, see the model's head" if flipped else ""),
-            f"{key}.coupled": "as in the model"
-            if any(j.name in model.mimics for j in member.chain.joints)
-            else "guessed: the joints behind it bend along",
-            f"{key}.pad_region": "the side that faces the closing motion, near the end",
-            f"{key}.pad_point": "on that side [m]",
-        }
-        effort = f"effort of {answers.effort:g} (given)" if answers.effort else "the model's effort"
-        for kind in ("torque", "force"):
-            reasons[f"{key}.{kind}_limit"] = f"from {effort}; no side presses more than the other"
-            reasons[f"{key}.holding_{kind}"] = "guessed: twice that"
-    closed = {j.name for m in grip.members for j in m.chain.joints}
-    for name in model.joints:
-        reasons[f"preshape.{name}"] = (
-            "given" if name in answers.joints
-            else "where the fingers oppose best" if name in closed
-            else "out of the way"
-        )  # fmt: skip
-    return reasons

@@ -11,16 +11,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drakegrasp.commissioning.draft.fingers import STEPS, Chain, Closing
+from drakegrasp.commissioning.draft.closings import Closing
+from drakegrasp.commissioning.draft.fingers import STEPS, Chain
 from drakegrasp.commissioning.draft.pads import Pad, end_of, find_pad, snapped, surface_points
 from drakegrasp.frames import Array
-from drakegrasp.hand.vendor.model import VendorModel
+from drakegrasp.hand.vendor.model import VendorJoint, VendorModel
 
 #: Width of what is pinched [m], and how far from it costs nothing.
 WIDTH, TOLERANCE = 0.04, 0.01
 #: What it costs if one finger has closed fully and the other not at all, if pads come no nearer
 #: than they should [1/m], and if they pinch at another width [1/m].
 UNEVEN, APART, OFF_WIDTH = 0.5, 20.0, 40.0
+#: What it costs that a pad passes the other one instead of coming towards it.
+PASSING = 0.5
 #: What it costs to pinch near the end of the way, from this share on, and to open less far [1/m].
 LATE, LATE_COST, OPENING, NARROW = 0.75, 2.0, 0.06, 10.0
 #: Pads that come so close meet [m].
@@ -43,6 +46,7 @@ class Reach:
         chain: The finger.
         closings: The ways.
         points: Where the pad is, for each of c ways to close.
+        moves: Unit directions in which it moves.
         normals: (r, c, s, 3), where it faces: a fingertip's end is round.
         pads: The pad of each way.
     """
@@ -50,6 +54,7 @@ class Reach:
     chain: Chain
     closings: list[Closing]
     points: Array
+    moves: Array
     normals: Array
     pads: list[Pad]
 
@@ -60,6 +65,7 @@ class Reach:
             self,
             closings=[self.closings[i] for i in kept],
             points=self.points[kept],
+            moves=self.moves[kept],
             normals=self.normals[:, kept],
             pads=[self.pads[i] for i in kept],
         )
@@ -77,6 +83,31 @@ class Member:
     closing: Closing
     pad: Pad
     points: Array  # (s, 3), of the pad in the palm link, from open to closed
+
+    @property
+    def first(self) -> int:
+        """The number of the joint that the motor drives: the first that closes."""
+        return int(np.flatnonzero(self.closing.gain)[0])
+
+    @property
+    def joint(self) -> VendorJoint:
+        """That joint, in the vendor's positions."""
+        return self.chain.joints[self.first]
+
+    @property
+    def sign(self) -> float:
+        """Sense of that joint's positions in which it closes."""
+        return float(np.sign(self.closing.gain[self.first]))
+
+    @property
+    def zero(self) -> float:
+        """That joint's position in the open hand [rad or m]."""
+        return float(self.closing.q0[self.first])
+
+    def followers(self) -> dict[str, tuple[float, float]]:
+        """Return ratio and offset, to the driven joint, of the finger's joints that follow it."""
+        rows = zip(self.chain.joints, self.closing.gain, self.closing.q0, strict=True)
+        return {j.name: (float(g), float(q)) for j, g, q in rows if g != 0.0 and j != self.joint}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -133,10 +164,13 @@ def find_reach(model: VendorModel, palm: str, chain: Chain) -> Reach:
     points = np.array([pad.point for pad in pads])[:, None, :, None]
     directions = [np.array([getattr(p, name) for p in pads]) for name in ("normal", "along")]
     normals, alongs = ((X[..., :3, :3] @ d[:, None, :, None])[..., 0] for d in directions)
+    places = (X[..., :3, :3] @ points)[..., 0] + X[..., :3, 3]
+    moves = np.gradient(places, axis=1)
     return Reach(
         chain=chain,
         closings=chain.closings,
-        points=(X[..., :3, :3] @ points)[..., 0] + X[..., :3, 3],
+        points=places,
+        moves=moves / np.linalg.norm(moves, axis=-1, keepdims=True),
         normals=np.stack([np.cos(r) * normals + np.sin(r) * alongs for r in ROUND]),
         pads=pads,
     )
@@ -226,6 +260,8 @@ def _costs(last: Reach, b: int, other: Reach) -> Array:
     toll = ROUND_COST * ROUND[:, None, None, None]
     facing = (np.einsum("rasi,asti->rast", other.normals, unit) - toll).max(axis=0)
     faced = (-np.einsum("rti,asti->rast", last.normals[:, b], unit) - toll).max(axis=0)
+    nearing = np.einsum("asi,asti->ast", other.moves, unit)
+    neared = -np.einsum("ti,asti->ast", last.moves[b], unit)
     share = np.linspace(0.0, 1.0, STEPS)
     uneven = np.abs(share[:, None] - share[None])
     off = np.maximum(np.abs(gap - WIDTH) - TOLERANCE, 0.0)
@@ -235,7 +271,7 @@ def _costs(last: Reach, b: int, other: Reach) -> Array:
     narrow = np.maximum(OPENING - gap[:, 0, 0], 0.0)
     late = np.maximum(share - LATE, 0.0)
     cost = 2.0 - facing - faced + UNEVEN * uneven + OFF_WIDTH * off
-    cost = cost + LATE_COST * (late[:, None] + late[None])
+    cost = cost + LATE_COST * (late[:, None] + late[None]) + PASSING * (2.0 - nearing - neared)
     return np.asarray(cost + (APART * apart + NARROW * narrow)[:, None, None])
 
 

@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from drakegrasp.frames import Array
 from drakegrasp.hand.finger_sweep import even_points
+from drakegrasp.hand.shapes import ray_span
 
 #: A direction this near to an axis of the link is taken for the axis [rad].
 SNAP = np.deg2rad(12.0)
@@ -102,9 +102,9 @@ def find_pad(parts: Sequence[Array], points: Array, normal: Array, along: Array)
 
     # The surface there: a ray along the normal leaves the last of the parts.
     start = level * along + middle * across + (points @ normal).min() * normal
-    reached = [_leaves(part, start, normal) for part in parts]
-    found = [r for r in reached if r is not None]
-    height = max(found) if found else float((at @ normal).max() - start @ normal)
+    spans = [ray_span(part, start, normal) for part in parts]
+    leaves = [span[1] for span in spans if span is not None and span[1] >= 0.0]
+    height = max(leaves) if leaves else float((at @ normal).max() - start @ normal)
     depth = float(np.clip(DEPTH * thickness, *DEEP))
     point = start + height * normal
     return Pad(
@@ -123,14 +123,3 @@ def snapped(direction: Array) -> Array:
     if np.arccos(min(abs(direction[axis]), 1.0)) < SNAP:
         return np.asarray(np.sign(direction[axis]) * np.eye(3)[axis])
     return np.asarray(direction)
-
-
-def _leaves(corners: Array, start: Array, direction: Array) -> float | None:
-    """Return how far along a ray it leaves a hull of corners (n, 3) [m]; None if it misses."""
-    equations = ConvexHull(corners).equations
-    slope, offset = equations[:, :3] @ direction, equations[:, :3] @ start + equations[:, 3]
-    if (offset[np.abs(slope) < 1e-9] > 1e-9).any():
-        return None
-    leaves = float((-offset[slope > 1e-9] / slope[slope > 1e-9]).min())
-    enters = float((-offset[slope < -1e-9] / slope[slope < -1e-9]).max())
-    return leaves if enters <= leaves and leaves >= 0.0 else None

@@ -15,7 +15,7 @@ from pydrake.math import RollPitchYaw, RotationMatrix
 from drakegrasp.commissioning.draft.opposition import Grip
 from drakegrasp.commissioning.motion_checks import PALM_DEPTH, ray_end
 from drakegrasp.frames import Array, invert_pose, make_pose, transform_points
-from drakegrasp.hand.shapes import hull_planes
+from drakegrasp.hand.shapes import ray_span
 from drakegrasp.hand.vendor.model import VendorModel
 
 #: Directions that are tried: their steps [deg], and how near an axis of the palm counts as one.
@@ -132,23 +132,14 @@ def _directions(grip: Grip, centre: Array, approach: Array | None) -> list[tuple
 def _frame(grip: Grip, direction: Array, parts: list[Array]) -> tuple[Array, bool] | None:
     """Return the origin (3,) of G on the palm below the pinch, and whether the palm is beside."""
     # Where the ray to the pinch leaves the palm, or else its foremost point.
-    middle, top = grip.middle, float(grip.middle @ direction)
-    leaves = []
-    for corners in parts:
-        planes = hull_planes(corners)
-        slope, offset = planes[:, :3] @ direction, planes[:, :3] @ middle + planes[:, 3]
-        if (offset[np.abs(slope) < 1e-9] > 0.0).any():
-            continue
-        out = float((-offset[slope > 1e-9] / slope[slope > 1e-9]).min())
-        enters = float((-offset[slope < -1e-9] / slope[slope < -1e-9]).max())
-        if enters <= out:
-            leaves.append(out)
+    spans = [ray_span(corners, grip.middle, direction) for corners in parts]
+    leaves = [span[1] for span in spans if span is not None]
     if leaves:
         back = max(leaves)
     else:
-        back = max(float((corners @ direction).max()) for corners in parts) - top
-        back = min(back, -2.0 * AHEAD)
-    return (middle + back * direction, not leaves) if back <= -AHEAD else None
+        ahead = max(float((corners @ direction).max()) for corners in parts)
+        back = min(ahead - float(grip.middle @ direction), -2.0 * AHEAD)
+    return (grip.middle + back * direction, not leaves) if back <= -AHEAD else None
 
 
 def _pose(grip: Grip, direction: Array, p_BG: Array) -> Array:

@@ -88,12 +88,7 @@ def _levers(model: VendorModel, member: Member, step: int) -> tuple[float, dict[
     for joint, gain, column in zip(chain.joints, closing.gain, columns, strict=True):
         if gain == 0.0:
             continue
-        leader = _leader(model, joint.name)
+        leader = model.mimic(joint.name).leader
         rate = rates.setdefault(leader, abs(float(gain)))
         motors[leader] = motors.get(leader, np.zeros(3)) + gain / rate * column
     return float(np.linalg.norm(motion)), {m: abs(float(v @ along)) for m, v in motors.items()}
-
-
-def _leader(model: VendorModel, joint: str) -> str:
-    mimic = model.mimics.get(joint)
-    return joint if mimic is None else mimic.leader
