@@ -28,7 +28,7 @@ from drakegrasp.hand.strength import fingertip_forces
 def no_simulation(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     """Geometry decides, but in tests that are marked."""
     if "sim" not in request.keywords:
-        monkeypatch.setattr("drakegrasp.commissioning.draft.run.SHAPES", ())
+        monkeypatch.setattr("drakegrasp.commissioning.draft.run.GRASPS", ())
 
 
 def draft(folder: Path, text: str, name: str = "hand.urdf", **answers: object) -> NewHand:

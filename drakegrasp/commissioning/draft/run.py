@@ -2,7 +2,7 @@
 
 In: a URDF, SDFormat or MJCF file, and what a person says of the hand. Out: a folder that is
 complete by itself: hand file, model, meshes. Of several ways to grasp, the first is taken that
-passes the checks of its geometry and holds three objects, else the one that fails the fewest.
+passes `hand check`, else the one that fails the fewest of its checks.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from drakegrasp.commissioning.draft.palm import find_palm_frames
 from drakegrasp.commissioning.finding import Finding
 from drakegrasp.commissioning.model_checks import check_couplings, check_efforts, check_limits
 from drakegrasp.commissioning.run import check_geometry
-from drakegrasp.commissioning.trial_grasps import check_grasp
+from drakegrasp.commissioning.trial_grasps import GRASPS, check_grasp
 from drakegrasp.config import Config
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import load_hand
@@ -40,8 +40,6 @@ from drakegrasp.runtime.files import atomic_folder
 GRIPS, FRAMES, SHARES = 6, 2, (0.0, 0.25, 0.5, 0.75, 1.0)
 #: Postures at which links of different fingers are compared.
 POSTURES = 24
-#: Objects that it must hold.
-SHAPES = ("box", "sphere", "cylinder")
 #: A pinch that costs more than this is none: fingers that pass each other.
 WORST = 2.4
 #: Files of a vendor that say what may be done with the model.
@@ -91,7 +89,25 @@ def draft_hand(
     model = read_model(read_source(path, packages or {}, roots))
     _refuse_unknown(model, answers)
 
-    # The first that passes, or the one with the fewest faults.
+    best, findings = _find_best(model, path, answers, config)
+    if out.exists():
+        out.rmdir()
+    with atomic_folder(out) as folder:
+        written = _write(best, folder, path)
+        licences = chain.from_iterable(path.resolve().parent.glob(name) for name in LICENCES)
+        for licence in filter(Path.is_file, licences):
+            shutil.copyfile(licence, folder / licence.name)
+    return NewHand(path=out / written.name, notes=model.notes, findings=findings)
+
+
+def _find_best(
+    model: VendorModel, path: Path, answers: Answers, config: Config
+) -> tuple[Draft, tuple[Finding, ...]]:
+    """Return the first draft that passes all checks, or that which passes most, and its findings.
+
+    Raises:
+        HandError: If there is none.
+    """
     best: tuple[int, Draft, tuple[Finding, ...]] | None = None
     with tempfile.TemporaryDirectory() as scratch:
         folders = (Path(scratch) / str(n) for n in count())
@@ -103,27 +119,19 @@ def draft_hand(
                 sound = all(finding.ok for finding in findings)
                 if sound:
                     findings = (*findings, *_grasps(file, config))
-                faults = sum(not finding.ok for finding in findings) + (not sound)
-                if best is None or faults < best[0]:
-                    best = faults, draft, findings
+                passed = sum(finding.ok for finding in findings)
+                if best is None or passed > best[0]:
+                    best = passed, draft, findings
                 if sound:
                     break
-            if best is not None and best[0] == 0:
+            if best is not None and best[0] == len(best[2]):
                 break
     if best is None:
         raise HandError(
             "model: no direction in which the palm faces the pinch is free: say it with --approach "
             "X,Y,Z in the palm link, or which fingers grasp with --fingers LINK,LINK"
         )
-    if out.exists():
-        out.rmdir()
-    with atomic_folder(out) as folder:
-        written = _write(best[1], folder, path)
-        for pattern in LICENCES:
-            for licence in path.resolve().parent.glob(pattern):
-                if licence.is_file():
-                    shutil.copyfile(licence, folder / licence.name)
-    return NewHand(path=out / written.name, notes=model.notes, findings=best[2])
+    return best[1:]
 
 
 def _refuse_unknown(model: VendorModel, answers: Answers) -> None:
@@ -194,23 +202,17 @@ def _findings(file: Path, config: Config) -> tuple[Finding, ...]:
     try:
         hand = load_hand(file)
     except HandError as error:
-        text = str(error).removeprefix(f"{file}: ")
-        return (*(Finding(name="files", ok=False, text=text),) * 9,)
+        return (Finding(name="files", ok=False, text=str(error).removeprefix(f"{file}: ")),)
     limits = check_limits(hand)
     if not limits.ok:
-        return (*(limits,) * 8,)
-    return (
-        limits,
-        check_couplings(hand),
-        check_efforts(hand, config),
-        *check_geometry(hand),
-    )
+        return (limits,)
+    return limits, check_couplings(hand), check_efforts(hand, config), *check_geometry(hand)
 
 
 def _grasps(file: Path, config: Config) -> Iterator[Finding]:
     """Yield what trial grasps say, up to the first that fails."""
-    for shape in SHAPES:
-        finding = check_grasp(load_hand(file), config, shape)
+    for shape, line in GRASPS:
+        finding = check_grasp(load_hand(file), config, shape, line)
         yield finding
         if not finding.ok:
             return
