@@ -107,9 +107,9 @@ class MujocoBaseline:
         self._object_q, self._object_v = slice(q, q + 7), slice(v, v + 6)
         self._object_inertia = m.dof_M0[self._object_v].copy()
         self._weights = {name: getattr(m, name)[at].copy() for name, at in self._weighed()}
-        closing = [finger.closing_joint for finger in hand.fingers]
+        closing = [hand.fingers[i].closing_joint for i in hand.motor_fingers]
         self._closing_v = [m.joint(name).dofadr[0] for name in closing]
-        coupled = [coupling for finger in hand.fingers for coupling in finger.coupled]
+        coupled = [coupling for i in hand.motor_fingers for coupling in hand.followers(i)]
         self._followers = {m.joint(c.joint).qposadr[0]: c.offset for c in coupled}
 
     def _weighed(self) -> Iterator[tuple[str, int | slice]]:
@@ -207,14 +207,15 @@ class MujocoBaseline:
     def _close(self) -> None:
         """Close the fingers on the object, which is held in place, until they stop."""
         d = self._data
-        d.ctrl[:] = self._hand.closing_speed
+        motors = self._hand.motor_fingers
+        d.ctrl[:], unit = self._hand.closing_speed[motors], self._hand.closing_unit[motors]
         resting, palm, step = d.qpos[self._object_q].copy(), d.qpos[self._wrist_q].copy(), 0
         while d.time < self._config.close.max_time:
             self._step(palm)
             d.qpos[self._object_q], d.qvel[self._object_v] = resting, 0.0
             step += 1
             if step % CLOSING_STRIDE == 0 and d.time > STARTING:
-                speed = np.abs(d.qvel[self._closing_v] / self._hand.closing_unit).max()
+                speed = np.abs(d.qvel[self._closing_v] / unit).max()
                 if speed < self._config.close.stop_speed:
                     return
 

@@ -25,18 +25,19 @@ class FingerDrive:
             drive: What holds the closing joints, see `drakegrasp.simulation.drive`.
         """
         self._model, self._drive = model, drive
-        self._joints = np.array([model.joint(f.closing_joint).id for f in hand.fingers])
-        self._motors = np.array([model.actuator(f.name).id for f in hand.fingers])
+        fingers = [hand.fingers[i] for i in hand.motor_fingers]
+        self._joints = np.array([model.joint(f.closing_joint).id for f in fingers])
+        self._motors = np.array([model.actuator(f.name).id for f in fingers])
         self._q, self._v = model.jnt_qposadr[self._joints], model.jnt_dofadr[self._joints]
         # A motor turns its joints at fixed ratios, so it carries their torques by the same ratios.
         self._gain = np.zeros((len(self._joints), model.nv))
-        for i, finger in enumerate(hand.fingers):
+        for i, finger in enumerate(hand.motor_fingers):
             self._gain[i, self._v[i]] = 1.0
-            for coupling in finger.coupled:
+            for coupling in hand.followers(finger):
                 self._gain[i, model.joint(coupling.joint).dofadr[0]] = coupling.ratio
         self._range = model.jnt_range[self._joints].copy()
-        self._torque = np.array([finger.effort_limit for finger in hand.fingers])
-        self._holding = np.array([finger.holding_effort or np.inf for finger in hand.fingers])
+        self._torque = np.array([finger.effort_limit for finger in fingers])
+        self._holding = np.array([finger.holding_effort or np.inf for finger in fingers])
         self._yields = np.zeros(len(self._joints), dtype=np.bool_)
 
     def disengage(self) -> None:
@@ -74,7 +75,7 @@ class FingerDrive:
         self._set_torques()
 
     def loads(self, data: mujoco.MjData) -> Array:
-        """Return by how much contacts pushed each finger open in the last step, (k,) [N m or N].
+        """Return by how much contacts pushed each motor open in the last step, (m,) [N m or N].
 
         Torques that a caller applies to joints count as contacts. Reactions of motors and limits do
         not: where a finger runs into its limit they are larger for a step.

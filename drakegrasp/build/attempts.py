@@ -32,6 +32,7 @@ from drakegrasp.simulation.candidates import Attempt, children, family_member, m
 from drakegrasp.simulation.postures.table import posture_attempts
 from drakegrasp.simulation.randomization.conditions import usual_conditions
 from drakegrasp.simulation.randomization.draws import draw_conditions
+from drakegrasp.simulation.sampling.centring import centred
 from drakegrasp.simulation.scene import Scene
 from drakegrasp.simulation.scene_cache import cached_renderer, cached_scene, forget_scenes
 from drakegrasp.simulation.screen import Prediction, predict
@@ -113,9 +114,10 @@ def list_attempts(prepared: PreparedObject, indices: range, config: Config) -> l
     model, drawn = prepared.model, prepared.candidates
     place: Any = {"name": model.name, "seed": config.seed}
     if drawn.postures is None:
-        made = make_attempts(drawn, indices, config.candidates, **place)
+        made = list(make_attempts(drawn, indices, config.candidates, **place))
     else:
-        made = posture_attempts(drawn, indices, load_hand(config.hand), **place)
+        made = list(posture_attempts(drawn, indices, load_hand(config.hand), **place))
+    made = centred(model, load_hand(config.hand), made)
     return [_with_conditions(attempt, model, config) for attempt in made]
 
 
@@ -123,6 +125,7 @@ def list_children(prepared: PreparedObject, parent: Attempt, config: Config) -> 
     """Return the attempts about that of a grasp that holds, with their conditions."""
     model = prepared.model
     made = children(parent, config.refine, name=model.name, seed=config.seed)
+    made = centred(model, load_hand(config.hand), made)
     return [_with_conditions(attempt, model, config) for attempt in made]
 
 
@@ -138,9 +141,16 @@ def find_attempt(
     if not 0 <= child <= most:
         raise DataError(f"child must be 0 to {most}, got {child}")
     first = list_attempts(prepared, range(candidate, candidate + 1), config)[standoff_index]
-    name, seed = prepared.model.name, config.seed
-    member = family_member(first, child, config.refine, name=name, seed=seed)
-    return _with_conditions(member, prepared.model, config)
+    model, hand = prepared.model, load_hand(config.hand)
+    member = family_member(
+        first,
+        child,
+        config.refine,
+        name=model.name,
+        seed=config.seed,
+        place=lambda attempt: centred(model, hand, [attempt])[0],
+    )
+    return _with_conditions(member, model, config)
 
 
 def _with_conditions(attempt: Attempt, model: ObjectModel, config: Config) -> Attempt:

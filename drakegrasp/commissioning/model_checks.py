@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
+from scipy.linalg import block_diag
 
 from drakegrasp.commissioning.finding import Finding, judge
 from drakegrasp.config import Config
@@ -84,8 +85,13 @@ def check_couplings(hand: Hand) -> Finding:
     # Position of each joint by closing joint, as the hand file has it.
     own = {c.joint: (f.closing_joint, c) for f in hand.fingers for c in f.coupled}
     faults = []
+
+    # The model's own couplings.
     for mimic in declared_mimics(read_xml(hand.model.path)):
         if _moves_as(hand, mimic):
+            continue
+        if (driver := _driver(hand, mimic)) is not None:
+            faults.append(driver)
             continue
         if mimic.joint not in own:
             faults.append(
@@ -103,18 +109,27 @@ def check_couplings(hand: Hand) -> Finding:
     return judge("couplings", faults, joints or "none")
 
 
+def _driver(hand: Hand, mimic: Mimic) -> str | None:
+    """Return what to write where one motor moves two fingers in the model; None elsewhere."""
+    closes = {finger.closing_joint: finger.name for finger in hand.fingers}
+    if not {mimic.joint, mimic.leader} <= set(closes) or mimic.ratio <= 0.0:
+        return None
+    i, leader = list(closes).index(mimic.joint), closes[mimic.leader]
+    return (
+        f"fingers.{i}.driven_by must be {{finger: {leader}, ratio: {mimic.ratio:g}}} in place of a "
+        "motor of its own: in the model one moves both"
+    )
+
+
 def _moves_as(hand: Hand, mimic: Mimic) -> bool:
     """Return whether two joints of a hand move as a coupling of its model says."""
-    # Two fingers that the model moves together may each have a motor here.
-    closing = {finger.closing_joint for finger in hand.fingers}
-    if mimic.joint in closing and mimic.leader in closing and mimic.ratio > 0.0:
-        return True
     if not {mimic.joint, mimic.leader} <= set(hand.joint_names):
         return False
 
-    # Positions are linear in the coordinates: those of the spread, of a finger, or of none.
+    # Positions are linear in the coordinates: those of the spread, of a motor, or of none.
     j, i = (hand.joint_names.index(name) for name in (mimic.joint, mimic.leader))
-    gain = hand.joint_gain[j] - mimic.ratio * hand.joint_gain[i]
+    gains = hand.joint_gain @ block_diag(1.0, hand.closing_ratio)
+    gain = gains[j] - mimic.ratio * gains[i]
     offset = hand.joint_offset[j] - mimic.ratio * hand.joint_offset[i] - mimic.offset
     return bool(np.abs(gain).max() <= SAME and abs(offset) <= SAME)
 
@@ -128,7 +143,7 @@ def check_efforts(hand: Hand, config: Config) -> Finding:
         hand.fingers, hand.closing_speed, limits, units, strict=True
     ):
         stalled = FINGER_DAMPING * speed / unit**2
-        if stalled < finger.effort_limit:
+        if finger.driven_by is None and stalled < finger.effort_limit:
             faults.append(
                 f"finger {finger.name!r} must close fast enough for its motor: at its speed a "
                 f"stalled one gives {stalled:.3g} of {finger.effort_limit:g} {finger.effort_unit}"

@@ -96,6 +96,10 @@ def find_pinch(hand: Hand, width: float) -> Pinch | None:
     share = np.linspace(0.0, 1.0, STEPS)
     cost = tilt + UNEVEN * np.abs(share[:, None] - share)
     cost[np.abs(gap - width) > WIDTH_ERROR] = np.inf
+    motors = hand.motor_of
+    if set(motors[opposition.group]) & set(motors[~opposition.group]):
+        # Groups that share a motor close together.
+        cost[~np.eye(STEPS, dtype=np.bool_)] = np.inf
     cost[(first[..., 2].min(axis=1) <= 0.0)] = np.inf
     cost[:, second[..., 2].min(axis=1) <= 0.0] = np.inf
     i, j = np.unravel_index(np.argmin(cost), cost.shape)

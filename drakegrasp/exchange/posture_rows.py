@@ -126,9 +126,9 @@ def _in_order(hand: Hand, part: Rows) -> dict[str, Array]:
 
     # Joints that the hand file moves or keeps may be left out.
     followers = {
-        c.joint: (finger.closing_joint, c.ratio, c.offset)
-        for finger in hand.fingers
-        for c in finger.coupled
+        c.joint: (hand.fingers[i].closing_joint, c.ratio, c.offset)
+        for i in hand.motor_fingers
+        for c in hand.followers(i)
     }
     known = {*joints, *hand.preshape, *followers}
     if missing := [name for name in order if name not in known]:

@@ -5,8 +5,9 @@ fingers. `load_hand` reads the YAML, lets Drake parse the model once, checks one
 and stores the joints of each finger as constants, which is all that `kinematics` needs.
 
 The coordinates of a hand with k fingers are c = (spread [rad], closing of finger 1..k [rad, or m
-where it slides]). Frames: B palm link, G palm, Fi distal (fingertip) link of finger i, P a point on
-it, J a joint.
+where it slides]). Its m motors are those of the fingers that no other finger drives: closing
+positions are `closing_ratio` times those of these fingers. Frames: B palm link, G palm, Fi distal
+(fingertip) link of finger i, P a point on it, J a joint.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from pydrake.math import RollPitchYaw
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 
+from drakegrasp.arithmetic import multiply
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, invert_pose, make_pose
 from drakegrasp.hand.chains import (
@@ -33,7 +35,15 @@ from drakegrasp.hand.chains import (
     make_chain,
     moving_joint,
 )
-from drakegrasp.hand.file_format import Drive, Finger, HandFile, Spread, read_hand_file
+from drakegrasp.hand.file_format import (
+    Coupling,
+    Drive,
+    DrivenBy,
+    Finger,
+    HandFile,
+    Spread,
+    read_hand_file,
+)
 from drakegrasp.hand.files import find_packages, hand_file, hand_files
 from drakegrasp.hand.lift_chance import LiftChance, read_lift_chance
 from drakegrasp.hand.parsing import ModelFile, add_model
@@ -84,9 +94,44 @@ class Hand:
         return (*self.spread.joints, *self.preshape)
 
     @property
+    def motor_fingers(self) -> list[int]:
+        """(m,), the fingers that have a motor of their own."""
+        return [i for i, finger in enumerate(self.fingers) if finger.driven_by is None]
+
+    @property
+    def motor_of(self) -> npt.NDArray[np.int64]:
+        """(k,), the motor that moves each finger."""
+        return np.argmax(self.closing_ratio > 0.0, axis=1)
+
+    @property
+    def closing_ratio(self) -> Array:
+        """(k, m), closing of each finger per closing of each finger that has a motor."""
+        names = [self.fingers[i].name for i in self.motor_fingers]
+        ratio = np.zeros((self.num_fingers, len(names)))
+        for i, finger in enumerate(self.fingers):
+            by = finger.driven_by or DrivenBy(finger=finger.name)
+            ratio[i, names.index(by.finger)] = by.ratio
+        return ratio
+
+    def followers(self, finger: int) -> list[Coupling]:
+        """Return the joints that follow the closing joint of a finger that has a motor."""
+        own = self.fingers[finger]
+        found = list(own.coupled)
+        for other in self.fingers:
+            if other.driven_by is not None and other.driven_by.finger == own.name:
+                ratio = other.driven_by.ratio
+                found.append(Coupling(joint=other.closing_joint, ratio=ratio))
+                found += [replace(c, ratio=c.ratio * ratio) for c in other.coupled]
+        return found
+
+    @property
     def closing_unit(self) -> Array:
-        """(k,), how far each closing joint moves for what counts as a radian [rad or m]."""
-        return np.array([SLIDE if finger.slides else 1.0 for finger in self.fingers])
+        """(k,), how far each closing joint moves for what counts as a radian [rad or m].
+
+        Of a finger that another drives: by its ratio of what counts for that one.
+        """
+        units = [SLIDE if self.fingers[i].slides else 1.0 for i in self.motor_fingers]
+        return multiply(self.closing_ratio, np.array(units))
 
     @property
     def joint_units(self) -> dict[str, str]:
@@ -181,7 +226,7 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
         model=model,
         palm_link=palm.link,
         X_BG=X_BG,
-        fingers=described.fingers,
+        fingers=described.driven_fingers(),
         drive=described.drive,
         spread=described.spread,
         preshape=described.preshape,
@@ -205,8 +250,14 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
 
 def _refuse_other_kinds(described: HandFile, joints: dict[str, Any]) -> None:
     """Refuse a closing joint that slides without a force limit, or turns without a torque limit."""
-    for i, finger in enumerate(described.fingers):
+    for i, finger in enumerate(described.driven_fingers()):
         slides = joint_slides(joints[finger.closing_joint])
+        if slides != finger.slides and finger.driven_by is not None:
+            raise HandError(
+                f"fingers.{i}.driven_by: must be a finger whose closing joint "
+                f"{'slides' if slides else 'turns'}, as {finger.closing_joint!r}, "
+                f"got {finger.driven_by.finger!r}"
+            )
         if slides != finger.slides:
             key, how = ("force_limit", "slides") if slides else ("torque_limit", "turns")
             raise HandError(

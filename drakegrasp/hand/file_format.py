@@ -8,7 +8,7 @@ A joint turns, and its positions are angles [rad], or it slides, and they are le
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import sqrt
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -65,10 +65,32 @@ class Coupling:
 
 @with_config(_STRICT)
 @dataclass(frozen=True, kw_only=True)
+class DrivenBy:
+    """Whose motor moves a finger: its closing position is ratio times that of the other finger."""
+
+    finger: Name
+    ratio: Positive = 1.0
+
+
+#: Keys of a motor, with their values where a finger has none of its own.
+_OF_MOTOR = {
+    "torque_limit": None,
+    "force_limit": None,
+    "holding_torque": None,
+    "holding_force": None,
+    "rotor_inertia": 0.0,
+    "gear_ratio": 1.0,
+}
+
+
+@with_config(_STRICT)
+@dataclass(frozen=True, kw_only=True)
 class Finger:
     """A finger; its kinematics is its `chains.Chain`.
 
-    A finger with a `torque_limit` closes by turning, one with a `force_limit` by sliding.
+    A finger with a `torque_limit` closes by turning, one with a `force_limit` by sliding. One that
+    another finger's motor drives has neither in the file; in a `Hand` its limits are what that
+    motor gives, and its worm holds, where this finger alone is loaded.
     """
 
     name: Name
@@ -81,28 +103,20 @@ class Finger:
     holding_torque: Positive | None = None  # what a stalled worm holds, turning [N m]
     holding_force: Positive | None = None  # what it holds, sliding [N]
     coupled: tuple[Coupling, ...] = ()
+    driven_by: DrivenBy | None = None  # None: by a motor of its own
     pad_region: tuple[HalfSpace, ...] = ()  # in Fi [m]; elsewhere contact is another link's
     pad_point: Vector  # usual contact point, in Fi [m]
     required: bool = True  # whether a grasp needs this fingertip on the object
 
     def __post_init__(self) -> None:
-        # A finger either turns or slides.
-        if (self.torque_limit is None) == (self.force_limit is None):
+        # A finger either turns or slides; one that another drives does as that one.
+        limits = self.torque_limit, self.force_limit
+        if limits.count(None) != 1 and not (self.driven_by and limits.count(None) == 2):
             raise ValueError(
                 "torque_limit must be given if the closing joint turns, else force_limit, "
                 f"got {'none' if self.torque_limit is None else 'both'}"
             )
-        key, wrong = ("force", "torque") if self.slides else ("torque", "force")
-        if getattr(self, f"holding_{wrong}") is not None:
-            raise ValueError(f"holding_{wrong} must be holding_{key} beside {key}_limit")
-
-        # A worm holds at least what its motor gives.
-        holding = self.holding_effort
-        if holding is not None and holding < self.effort_limit:
-            raise ValueError(
-                f"holding_{key} must be at least the {key}_limit of {self.effort_limit:g} "
-                f"{self.effort_unit}, got {holding:g}"
-            )
+        self._check_worm()
 
         # The pad.
         for i, (*normal, _) in enumerate(self.pad_region):
@@ -110,6 +124,19 @@ class Finger:
                 raise ValueError(f"pad_region.{i} must have a normal that is not zero, got zero")
         if self.beside_pad(self.p_FiP) > 0.0:
             raise ValueError(f"pad_point must lie in the pad_region, got {list(self.pad_point)}")
+
+    def _check_worm(self) -> None:
+        """Refuse a worm of another kind of joint, or one that is weaker than its motor."""
+        key, wrong = ("force", "torque") if self.slides else ("torque", "force")
+        if getattr(self, f"holding_{wrong}") is not None:
+            raise ValueError(f"holding_{wrong} must be holding_{key} beside {key}_limit")
+
+        holding = self.holding_effort
+        if holding is not None and holding < self.effort_limit:
+            raise ValueError(
+                f"holding_{key} must be at least the {key}_limit of {self.effort_limit:g} "
+                f"{self.effort_unit}, got {holding:g}"
+            )
 
     @property
     def slides(self) -> bool:
@@ -204,9 +231,31 @@ class HandFile(BaseModel):
         return self
 
     @model_validator(mode="after")
+    def _check_drivers(self) -> HandFile:
+        """Demand that a finger that is driven by another has no motor, and that one has one."""
+        motors = [finger.name for finger in self.fingers if finger.driven_by is None]
+        for i, finger in enumerate(self.fingers):
+            if finger.driven_by is None:
+                continue
+            if finger.driven_by.finger not in motors:
+                raise ValueError(
+                    f"fingers.{i}.driven_by.finger must be a finger with a motor of its own "
+                    f"({', '.join(motors) or 'there is none'}), got {finger.driven_by.finger!r}"
+                )
+            for key, none in _OF_MOTOR.items():
+                if getattr(finger, key) != none:
+                    raise ValueError(
+                        f"fingers.{i}.{key} must be left out beside driven_by: the motor is that "
+                        f"of finger {finger.driven_by.finger!r}"
+                    )
+        return self
+
+    @model_validator(mode="after")
     def _check_worms(self) -> HandFile:
         """Refuse worms of unknown strength."""
         for i, finger in enumerate(self.fingers):
+            if finger.driven_by is not None:
+                continue
             if self.drive == "worm" and finger.holding_effort is None:
                 key = "holding_force" if finger.slides else "holding_torque"
                 raise ValueError(f"fingers.{i}.{key} must be given where drive is worm, got none")
@@ -219,7 +268,7 @@ class HandFile(BaseModel):
             ("closing_speed_deg", False, "turns"),
             ("closing_speed", True, "slides"),
         ):
-            used = any(finger.slides == slides for finger in self.fingers)
+            used = any(f.slides == slides for f in self.fingers if f.driven_by is None)
             if used != (getattr(self, key) is not None):
                 must = f"be given where a closing joint {how}, got none"
                 raise ValueError(
@@ -238,13 +287,44 @@ class HandFile(BaseModel):
             )
         return self
 
+    def driven_fingers(self) -> tuple[Finger, ...]:
+        """Return the fingers; one that another drives with the limits of that one's motor."""
+        named = {finger.name: finger for finger in self.fingers}
+        return tuple(
+            f if f.driven_by is None else _as_driven(f, named[f.driven_by.finger], f.driven_by)
+            for f in self.fingers
+        )
+
     def closing_speeds(self) -> Array:
         """Return the speed (k,) of each closing joint [rad/s or m/s]."""
-        turning, sliding = self.closing_speed_deg, self.closing_speed
-        return np.array(
-            [sliding if f.slides else np.deg2rad(turning or 0.0) for f in self.fingers],
-            dtype=float,
-        )
+        sliding, turning = self.closing_speed or 0.0, np.deg2rad(self.closing_speed_deg or 0.0)
+        speeds = [
+            (sliding if f.slides else float(turning)) * (f.driven_by.ratio if f.driven_by else 1.0)
+            for f in self.driven_fingers()
+        ]
+        return np.array(speeds)
+
+
+def _as_driven(finger: Finger, driver: Finger, by: DrivenBy) -> Finger:
+    """Return a finger that closes by `ratio` times its driver, with the limits that this leaves."""
+    # By virtual work a torque T at the driver is T / ratio at the finger.
+    limit, holding = driver.effort_limit / by.ratio, driver.holding_effort
+    holding = None if holding is None else holding / by.ratio
+    return with_efforts(finger, limit, holding, slides=driver.slides)
+
+
+def with_efforts(finger: Finger, limit: float, holding: float | None, *, slides: bool) -> Finger:
+    """Return a finger with another effort limit and holding effort, of a joint that slides or not.
+
+    Args:
+        finger: The finger.
+        limit: Torque [N m] or force [N] of its motor.
+        holding: What its worm holds; None if it is not known.
+        slides: Whether its closing joint slides.
+    """
+    if slides:
+        return replace(finger, force_limit=limit, holding_force=holding)
+    return replace(finger, torque_limit=limit, holding_torque=holding)
 
 
 def read_hand_file(path: Path) -> HandFile:

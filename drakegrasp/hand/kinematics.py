@@ -20,7 +20,8 @@ def coordinate_limits(hand: Hand) -> Array:
     """Return the lower and upper limit of each coordinate, (1 + k, 2) [rad or m].
 
     Row 0 is the spread, row 1 + i the closing of finger i. A coordinate keeps the limits of all
-    joints that it drives, coupled joints included. Without spread joints row 0 is 0, 0.
+    joints that it drives, coupled joints included, and of all fingers that its motor drives.
+    Without spread joints row 0 is 0, 0.
     """
     limits = np.tile([-np.inf, np.inf], (1 + hand.num_fingers, 1))
     joints = zip(hand.joint_gain, hand.joint_offset, hand.joint_limits, strict=True)
@@ -31,7 +32,25 @@ def coordinate_limits(hand: Hand) -> Array:
             limits[column] = max(limits[column, 0], lower), min(limits[column, 1], upper)
     if not hand.spread.joints:
         limits[0] = 0.0
+
+    # Fingers of one motor stop together.
+    limits[1:, 0] = -open_together(hand, -limits[1:, 0])
+    limits[1:, 1] = open_together(hand, limits[1:, 1])
     return limits
+
+
+def open_together(hand: Hand, closing: npt.ArrayLike) -> Array:
+    """Return closing positions (k,) [rad or m] in which fingers of one motor have closed alike.
+
+    They are as open as the most open one of them.
+    """
+    positions, ratio = np.array(closing, dtype=float), hand.closing_ratio
+    for motor in range(ratio.shape[1]):
+        own = ratio[:, motor] > 0.0
+        if np.count_nonzero(own) > 1:
+            own_ratio = ratio[own, motor]
+            positions[own] = own_ratio * (positions[own] / own_ratio).min()
+    return positions
 
 
 def closed_positions(hand: Hand) -> Array:

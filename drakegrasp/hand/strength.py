@@ -31,6 +31,9 @@ def fingertip_forces(hand: Hand, drive: Drive) -> Array:
         N_i = τ_i / l_i                                                     (torque)
         N_i = min(max(τ_i / l_i, Σ_{j≠i} τ_j / l_j), `holding_effort` / l_i)   (worm, locked)
 
+    Fingers that share a motor share its effort: then τ_i is the motor's, and l_i the sum of
+    `Hand.closing_ratio` times the levers of all of them, as if they pressed equally.
+
     Args:
         hand: Of k fingers.
         drive: What keeps the closing joints from being pushed open. A motor alone carries its
@@ -40,13 +43,14 @@ def fingertip_forces(hand: Hand, drive: Drive) -> Array:
     # A joint without a limit counts as limited by 0, the open hand.
     limits = coordinate_limits(hand)[1:]
     middle = np.where(np.isfinite(limits), limits, 0.0).mean(axis=1)
-    levers = closing_levers(hand, middle)
-    motors = np.array([finger.effort_limit for finger in hand.fingers]) / levers
+    levers = multiply(hand.closing_ratio.T, closing_levers(hand, middle))[hand.motor_of]
+    own = [hand.fingers[hand.motor_fingers[motor]] for motor in hand.motor_of]
+    motors = np.array([finger.effort_limit for finger in own]) / levers
     if drive == "torque":
         return motors
 
     # The other motors' forces, up to what the finger can hold.
-    strongest = [np.inf if f.holding_effort is None else f.holding_effort for f in hand.fingers]
+    strongest = [np.inf if f.holding_effort is None else f.holding_effort for f in own]
     return np.minimum(np.maximum(motors, motors.sum() - motors), np.array(strongest) / levers)
 
 

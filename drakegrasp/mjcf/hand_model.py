@@ -55,7 +55,7 @@ def make_hand_model(hand: Hand, friction: float = _FRICTION) -> HandModel:
     spec.modelname = hand.name
     spec.compiler.degree = False
     spec.compiler.balanceinertia = True
-    coupled = {c.joint for finger in hand.fingers for c in finger.coupled}
+    coupled = {c.joint for i in hand.motor_fingers for c in hand.followers(i)}
     for joint in add_links(spec, hand, spec.worldbody, friction, touches=_TOUCHES):
         unit = SLIDE if joint.slides else 1.0
         joint.add(damping=DAMPING / unit**2, armature=ARMATURE / unit**2)

@@ -147,14 +147,14 @@ def _fixed_motion(joint: Joint, hand: Hand) -> RigidTransform:
 
 
 def add_couplings(spec: mujoco.MjSpec, hand: Hand) -> None:
-    """Let each coupled joint follow the closing joint of its finger."""
-    for finger in hand.fingers:
-        for coupling in finger.coupled:
+    """Let each coupled joint follow the closing joint of the finger whose motor moves it."""
+    for i in hand.motor_fingers:
+        for coupling in hand.followers(i):
             spec.add_equality(
                 type=mujoco.mjtEq.mjEQ_JOINT,
                 objtype=mujoco.mjtObj.mjOBJ_JOINT,
                 name1=coupling.joint,
-                name2=finger.closing_joint,
+                name2=hand.fingers[i].closing_joint,
                 data=[coupling.offset, coupling.ratio, *np.zeros(mujoco.mjNEQDATA - 2)],
                 solref=STIFF,
                 solimp=RIGID,

@@ -182,8 +182,9 @@ def _add_wrist(spec: mujoco.MjSpec) -> mujoco.MjsBody:
 
 
 def _add_drives(spec: mujoco.MjSpec, hand: Hand) -> None:
-    """Give each finger its motor, with a limited torque, and its coupled joints."""
-    for finger, unit in zip(hand.fingers, hand.closing_unit.tolist(), strict=True):
+    """Add each motor, with a limited torque, and the joints that follow it."""
+    for i in hand.motor_fingers:
+        finger, unit = hand.fingers[i], float(hand.closing_unit[i])
         spec.joint(finger.closing_joint).armature = finger.rotor_inertia * finger.gear_ratio**2
         limit = finger.effort_limit
         motor = spec.add_actuator(

@@ -445,14 +445,30 @@ def children(parent: Attempt, config: RefineConfig, *, name: str, seed: int) -> 
 
 
 def family_member(
-    first: Attempt, child: int, config: RefineConfig, *, name: str, seed: int
+    first: Attempt,
+    child: int,
+    config: RefineConfig,
+    *,
+    name: str,
+    seed: int,
+    place: Callable[[Attempt], Attempt] = lambda attempt: attempt,
 ) -> Attempt:
-    """Return an attempt by its number in the family of a first-round attempt, see `children`."""
+    """Return an attempt by its number in the family of a first-round attempt, see `children`.
+
+    Args:
+        first: The attempt of the first round.
+        child: The number.
+        config: How many, and how far away.
+        name: The object's name.
+        seed: Of the dataset.
+        place: What becomes of each attempt before it is tried, and before it has children.
+    """
     # From the first through the numbers of its ancestors.
     if child == 0:
         return first
-    parent = family_member(first, (child - 1) // config.children, config, name=name, seed=seed)
-    return _child(parent, child, config, name=name, seed=seed)
+    number = (child - 1) // config.children
+    parent = family_member(first, number, config, name=name, seed=seed, place=place)
+    return place(_child(parent, child, config, name=name, seed=seed))
 
 
 def _child(parent: Attempt, number: int, config: RefineConfig, *, name: str, seed: int) -> Attempt:

@@ -62,14 +62,14 @@ from pydrake.trajectories import PiecewisePolynomial
 from drakegrasp.config import PhysicsConfig
 from drakegrasp.frames import X_WT, Array
 from drakegrasp.hand.description import Hand
-from drakegrasp.hand.file_format import Finger
+from drakegrasp.hand.file_format import Finger, with_efforts
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.parsing import add_model, make_parser
 from drakegrasp.hand.shapes import hull_corners
 from drakegrasp.mesh.surfaces import Solid
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import ObjectModel, object_colour
-from drakegrasp.simulation.scene import ObjectScene, Scene, joint_limits
+from drakegrasp.simulation.scene import Motor, ObjectScene, Scene, joint_limits
 
 #: Mass of each of the three bodies that carry the wrist [kg]; small compared to the hand's.
 WRIST_BODY_MASS = 0.02
@@ -422,22 +422,35 @@ def _add_actuation(
 
     where u = 1 rad, or the slide that counts as 1 rad (`Hand.closing_unit`). A rotor of inertia I
     behind a gear of ratio n adds n² I to the joint. A coupled joint is at r q + q₀, with the ratio
-    and the offset of the hand file.
+    and the offset of the hand file; so are the joints of a finger that this one drives.
 
     Returns:
         The attributes of `Scene` that say of the motors.
     """
-    motors, driven = [], []
-    for finger, unit in zip(hand.fingers, hand.closing_unit.tolist(), strict=True):
+    # Fingers of one motor push equally, so that the couplings carry no more than what is uneven:
+    # in Drake they are stiff, but not rigid.
+    actuators = []
+    for i, unit in enumerate(hand.closing_unit.tolist()):
+        finger = _with_share(hand, i)
         joint = plant.GetJointByName(finger.closing_joint, instance)
         gains = PdControllerGains(p=FINGER_STIFFNESS / unit**2, d=FINGER_DAMPING / unit**2)
-        motors.append(_add_motor(plant, finger.name, joint, finger, gains))
+        actuators.append(_add_motor(plant, finger.name, joint, finger, gains))
+
+    # Each motor moves the closing joint of its finger, and what follows it.
+    motors, driven = [], []
+    for m, i in enumerate(hand.motor_fingers):
+        own = [i, *(j for j in np.flatnonzero(hand.motor_of == m).tolist() if j != i)]
+        ratio = float(hand.closing_ratio[:, m].sum())
+        motors.append(Motor(actuators=tuple(actuators[j] for j in own), ratio=ratio))
+        joint = actuators[i].joint()
         driven.append({joint: 1.0})
-        for coupling in finger.coupled:
+        for coupling in hand.followers(i):
             follower = plant.GetJointByName(coupling.joint, instance)
             plant.AddCouplerConstraint(follower, joint, coupling.ratio, coupling.offset)
             driven[-1][follower] = coupling.ratio
-    return _of_motors(motors, driven, hand.fingers, hand.closing_unit, hand.locked_joints)
+    fingers = [hand.fingers[i] for i in hand.motor_fingers]
+    units = hand.closing_unit[hand.motor_fingers]
+    return _of_motors(motors, driven, fingers, units, hand.locked_joints)
 
 
 def _add_own_motors(
@@ -450,29 +463,40 @@ def _add_own_motors(
         τ = K (q_d − q) + D (dq_d/dt − dq/dt), cut off at ± the effort limit τ_max,
         K = τ_max / (`SOFT` u), D = K `LAG`,
 
-    with effort limit, holding effort, rotor and gear of the finger's closing joint. A joint that
-    slides where this one turns, or turns where it slides, has no motor.
+    with effort limit, holding effort, rotor and gear of the finger's closing joint; fingers of one
+    motor have equal shares of its efforts. A joint that slides where this one turns, or turns where
+    it slides, has no motor.
 
     Returns:
         The attributes of `Scene` that say of the motors.
     """
-    motors: list[JointActuator] = []
+    motors: list[Motor] = []
     fingers, units = list[Finger](), list[float]()
-    for i, (finger, chain) in enumerate(zip(hand.fingers, hand.chains, strict=True)):
+    for i, chain in enumerate(hand.chains):
+        finger = _with_share(hand, i)
         for name, slides in zip(chain.joints, chain.slides.tolist(), strict=True):
             joint = plant.GetJointByName(name, instance)
-            taken = any(motor.joint() is joint for motor in motors)
+            taken = any(motor.actuators[0].joint() is joint for motor in motors)
             if taken or name in hand.spread.joints or slides != finger.slides:
                 continue
             p = finger.effort_limit / (SOFT * hand.closing_unit[i])
             gains = PdControllerGains(p=p, d=LAG * p)
-            motors.append(_add_motor(plant, f"{finger.name}/{name}", joint, finger, gains))
+            actuator = _add_motor(plant, f"{finger.name}/{name}", joint, finger, gains)
+            motors.append(Motor(actuators=(actuator,)))
             fingers.append(finger)
             units.append(hand.closing_unit[i])
-    moved = {motor.joint().name() for motor in motors}
+    moved = {motor.actuators[0].joint().name() for motor in motors}
     still = tuple(name for name in hand.joint_names if name not in moved)
-    driven = [{motor.joint(): 1.0} for motor in motors]
+    driven = [{motor.actuators[0].joint(): 1.0} for motor in motors]
     return _of_motors(motors, driven, fingers, np.array(units), still)
+
+
+def _with_share(hand: Hand, i: int) -> Finger:
+    """Return a finger with the efforts that it has where all fingers of its motor press equally."""
+    ratio = hand.closing_ratio[:, hand.motor_of[i]]
+    share, finger = float(ratio[i] / ratio.sum()), hand.fingers[i]
+    holding = None if finger.holding_effort is None else share * finger.holding_effort
+    return with_efforts(finger, share * finger.effort_limit, holding, slides=finger.slides)
 
 
 def _add_motor(
@@ -486,19 +510,19 @@ def _add_motor(
 
 
 def _of_motors(
-    motors: Sequence[JointActuator],
+    motors: Sequence[Motor],
     driven: Sequence[dict[Any, float]],
     fingers: Sequence[Finger],
     units: Array,
     still: tuple[str, ...],
 ) -> dict[str, Any]:
-    joints = tuple(motor.joint() for motor in motors)
+    joints = tuple(motor.actuators[0].joint() for motor in motors)
     return {
         "motors": tuple(motors),
         "closing_joints": joints,
         "closing_limits": tuple(joint_limits(joint) for joint in joints),
         "closing_units": units,
-        "effort_limits": np.array([finger.effort_limit for finger in fingers]),
+        "effort_limits": np.array([motor.effort_limit() for motor in motors]),
         "holding_efforts": tuple(finger.holding_effort for finger in fingers),
         "driven": tuple(driven),
         "still_joints": still,

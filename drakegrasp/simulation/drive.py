@@ -39,6 +39,8 @@ from drakegrasp.simulation.scene import (
 
 #: A finger that opens more slowly than this stands, in the unit of its closing joint [1/s].
 STANDING = 1e-4
+#: Efforts that differ by less than this share are the same.
+ROUNDING = 1e-9
 
 
 def drive_of(hand: Hand, config: LiftConfig) -> Drive:
@@ -171,7 +173,7 @@ def _turn_worms(scene: Scene, _: Context) -> EventStatus:
     for i, effort_limit in enumerate(scene.effort_limits.tolist()):
         joint, motor = scene.closing_joints[i], scene.motors[i]
         lower, upper = _signed(joint_limits(joint), signs[i])
-        yields = motor.effort_limit() > effort_limit
+        yields = motor.effort_limit() > effort_limit * (1.0 + ROUNDING)
         if yields and rates[i] >= -STANDING:
             # A finger that yielded stands again: from now on the worm holds it here.
             motor.set_effort_limit(effort_limit)
@@ -184,7 +186,8 @@ def _turn_worms(scene: Scene, _: Context) -> EventStatus:
     for i, holding_effort in enumerate(scene.holding_efforts):
         assert holding_effort is not None
         motor = scene.motors[i]
-        if loads[i] > holding_effort and motor.effort_limit() <= scene.effort_limits[i]:
+        yields = motor.effort_limit() > scene.effort_limits[i] * (1.0 + ROUNDING)
+        if loads[i] > holding_effort and not yields:
             _set_limits(scene.closing_joints[i], *scene.closing_limits[i])
             motor.set_effort_limit(holding_effort)
             overloaded = True

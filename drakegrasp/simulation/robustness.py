@@ -22,6 +22,7 @@ from drakegrasp.seeding import Stream
 from drakegrasp.simulation.candidates import Attempt, palm_motion
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.randomization.conditions import Conditions, usual_conditions
+from drakegrasp.simulation.sampling.centring import centred
 from drakegrasp.simulation.screen import Prediction, predict
 from drakegrasp.simulation.trial import run_attempt
 
@@ -148,7 +149,8 @@ class _Repeater:
     def predict(self, attempt: Attempt) -> Prediction | None:
         """Return what geometry says of an attempt."""
         rules = self._config.screen
-        (prediction,) = predict(self._model, self._hand, self._X_TO, [attempt], rules)
+        placed = centred(self._model, self._hand, [attempt])
+        (prediction,) = predict(self._model, self._hand, self._X_TO, placed, rules)
         return prediction
 
     def holds(self, attempt: Attempt, prediction: Prediction | None = None) -> bool | None:
@@ -158,6 +160,7 @@ class _Repeater:
             attempt: What to try.
             prediction: What `predict` returns for it, where the caller has it already.
         """
+        (attempt,) = centred(self._model, self._hand, [attempt])
         record = run_attempt(self._scene, self._X_TO, attempt, self._config, prediction)
         if not record.outcome.inconclusive:
             return record.outcome is Outcome.SUCCESS

@@ -47,6 +47,28 @@ def joint_limits(joint: ClosingJoint) -> tuple[float, float]:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Motor:
+    """A motor: an actuator at the closing joint of each finger that it moves.
+
+    Attributes:
+        actuators: The first is at the joint at which the motor's effort is told. They push equally.
+        ratio: Sum of the fingers' positions per position of this joint.
+    """
+
+    actuators: tuple[JointActuator, ...]
+    ratio: float = 1.0
+
+    def effort_limit(self) -> float:
+        """Return the motor's largest torque or force now [N m or N], at its joint."""
+        return float(self.actuators[0].effort_limit()) * self.ratio
+
+    def set_effort_limit(self, limit: float) -> None:
+        """Set it; by virtual work each actuator gives limit / ratio."""
+        for actuator in self.actuators:
+            actuator.set_effort_limit(limit / self.ratio)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectScene:
     """An object on the table: a built diagram with its one context.
 
@@ -95,7 +117,7 @@ class Scene(ObjectScene):
         wrist_trajectory: The path that the wrist follows.
         fingertips: The k links.
         closing_joints, motors: The joints that a motor drives, and the motors: the closing joint of
-            each finger, or every joint of the fingers, see `own_motors`.
+            each finger that no other one drives, or every joint of the fingers, see `own_motors`.
         closing_limits: Of the closing joints [rad or m].
         closing_units: (m,), how far each moves for what counts as a radian [rad or m].
         effort_limits: (m,), largest torque or force of each motor [N m or N].
@@ -123,7 +145,7 @@ class Scene(ObjectScene):
     effort_limits: Array
     holding_efforts: tuple[float | None, ...]
     driven: tuple[dict[ClosingJoint, float], ...]
-    motors: tuple[JointActuator, ...]
+    motors: tuple[Motor, ...]
     still_joints: tuple[str, ...]
     parts: tuple[tuple[GeometryId, Array], ...]
     joint_trajectory: TrajectorySource | None = None

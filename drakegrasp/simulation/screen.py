@@ -14,7 +14,7 @@ point, so a prediction depends on its attempt alone, not on those that are predi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,7 @@ from drakegrasp.config import ScreenConfig
 from drakegrasp.frames import Array
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.finger_sweep import GAP_STRIDE, FingerPath, HandPaths, Points, hand_paths
+from drakegrasp.hand.kinematics import open_together
 from drakegrasp.mesh.distance_field import DistanceField
 from drakegrasp.objects.model import ObjectModel
 from drakegrasp.outcomes import Outcome
@@ -94,10 +95,12 @@ def predict(
         if paths is None:
             continue
         X_OG = np.stack([attempts[row].X_OG for row in rows])
-        lookup = _PointLookup(model.field, np.asarray(X_TO, dtype=float), X_OG)
+        lookup = PointLookup(model.field, np.asarray(X_TO, dtype=float), X_OG)
         screened = _screen(lookup, paths, _widened(config, model.field))
-        for row, prediction in zip(rows, screened, strict=True):
-            predictions[row] = prediction
+        for row, found in zip(rows, screened, strict=True):
+            # Fingers of one motor start together.
+            starts = open_together(hand, found.closing) if found.outcome is None else found.closing
+            predictions[row] = replace(found, closing=starts)
     return predictions
 
 
@@ -113,7 +116,7 @@ def _widened(config: ScreenConfig, field: DistanceField) -> ScreenConfig:
     return config.model_copy(update={name: getattr(config, name) + extra for name in names})
 
 
-class _PointLookup:
+class PointLookup:
     """Looks up points of the palm frame for n attempts at once."""
 
     def __init__(self, field: DistanceField, X_TO: Array, X_OG: Array) -> None:
@@ -164,7 +167,7 @@ def _affine(row: Points, p: Points) -> Points:
     return np.asarray(values)
 
 
-def _screen(lookup: _PointLookup, paths: HandPaths, config: ScreenConfig) -> list[Prediction]:
+def _screen(lookup: PointLookup, paths: HandPaths, config: ScreenConfig) -> list[Prediction]:
     """Return the predictions for attempts of one spread."""
     # Drop attempts whose open hand is certainly in collision. A subset of the points suffices to
     # reject: the full minimum can only be smaller.
@@ -197,7 +200,7 @@ _NO_ANGLES = np.zeros(0)
 
 
 def _closing_angles(
-    lookup: _PointLookup, paths: HandPaths, rows: Counts, config: ScreenConfig
+    lookup: PointLookup, paths: HandPaths, rows: Counts, config: ScreenConfig
 ) -> dict[int, tuple[Array, Array]]:
     """Return `Prediction.closing` and `last` by attempt, where all fingertips may arrive."""
     # One required finger that does not arrive decides, so the next finger skips these attempts.
@@ -227,7 +230,7 @@ def _angles(paths: HandPaths, indices: Counts) -> Array:
     return np.array([path.angles[k] for path, k in zip(paths.fingers, indices, strict=True)])
 
 
-def _open_distance(lookup: _PointLookup, rows: Counts, opened: Points, margin: float) -> Points:
+def _open_distance(lookup: PointLookup, rows: Counts, opened: Points, margin: float) -> Points:
     """Return the distance (a,) of the open hand from object and table, exact below the margin."""
     distance = np.zeros(len(rows), dtype=np.float32)
     for at in _chunks(np.arange(len(rows)), START_CHUNK):
@@ -255,7 +258,7 @@ class _Sweep:
 
 
 def _sweep_finger(
-    lookup: _PointLookup, path: FingerPath, rows: Counts, config: ScreenConfig
+    lookup: PointLookup, path: FingerPath, rows: Counts, config: ScreenConfig
 ) -> _Sweep:
     """Close one finger from the open hand until it is blocked or at its limit.
 

@@ -246,7 +246,8 @@ def _close(
     while end - scene.time > ROUNDING:
         limits.advance(scene, min(config.close.check_period, end - scene.time))
         stopped = finger_speed(scene) < config.close.stop_speed
-        if stopped or np.any(closing_angles(scene) > last):
+        closing = multiply(scene.hand.closing_ratio, closing_angles(scene))
+        if stopped or np.any(closing > last):
             break
 
 

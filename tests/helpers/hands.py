@@ -113,6 +113,26 @@ def write_slider(folder: Path, urdf: str = SLIDER, **changes: object) -> Path:
     return path
 
 
+def slider_fingers(force: float, **driven_by: object) -> list[object]:
+    """Return the sliding gripper's fingers that press with a force each [N].
+
+    With `driven_by` of the second finger the first one's motor moves both.
+    """
+    left, right = (
+        {
+            "name": side,
+            "fingertip": side,
+            "closing_joint": f"{side}_slide",
+            "pad_point": [0.0, 0.0, 0.09],
+        }
+        for side in ("left", "right")
+    )
+    if not driven_by:
+        return [{**left, "force_limit": force}, {**right, "force_limit": force}]
+    # One motor gives what both press with.
+    return [{**left, "force_limit": 2.0 * force}, {**right, "driven_by": driven_by}]
+
+
 def drake_fingertip_poses(hand: Hand, spread: float, closing: Array) -> Array:
     """Return the poses X_GFi (k, 4, 4) of the fingertips as Drake computes them."""
     scene = StillScene(hand)

@@ -94,9 +94,15 @@ def draft_tree(
     tree["palm"] = {"link": palm, "p_BG": frame.p_BG.tolist(), "rpy_deg": frame.rpy_deg.tolist()}
 
     # The fingers; joints that nothing else drives keep a position.
-    coupled, names = _couplings(model, grip), finger_names(grip)
+    coupled, names, drivers = _couplings(model, grip), finger_names(grip), _drivers(model, grip)
+    for i, (driver, ratio) in drivers.items():
+        limits[driver] += ratio * limits[i]
     rows = zip(grip.members, names, limits.tolist(), coupled, strict=True)
     tree["fingers"] = [_finger(*row) for row in rows]
+    for i, (driver, ratio) in drivers.items():
+        by = {"finger": names[driver], "ratio": round(ratio, 5)}
+        finger = tree["fingers"][i]
+        kept_keys = {k: v for k, v in finger.items() if not k.endswith(("torque", "force", "limit"))}
     driven = {m.joint.name for m in grip.members} | {j for own in coupled for j in own}
     spread = _spread(grip, frame, driven)
     opened = positions(model, grip, 0.0)

@@ -21,7 +21,7 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.errors import GraspError
 from drakegrasp.frames import X_WT, Array, as_numbers, invert_pose, read_pose
 from drakegrasp.hand.description import Hand
-from drakegrasp.hand.kinematics import coordinate_limits
+from drakegrasp.hand.kinematics import coordinate_limits, open_together
 from drakegrasp.hand.parsing import ModelFile, add_model
 from drakegrasp.simulation.candidates import JointPath, Pregrasp
 
@@ -185,7 +185,7 @@ def start_of(posture: Posture, hand: Hand) -> Pregrasp:
     spread = float(posture.q_grasp[index[hand.spread.joints[0]]]) if hand.spread.joints else 0.0
     spread = float(np.clip(spread, *coordinate_limits(hand)[0]))
     closing = np.array([start[index[finger.closing_joint]] for finger in hand.fingers])
-    closing = np.clip(closing, *coordinate_limits(hand)[1:].T)
+    closing = open_together(hand, np.clip(closing, *coordinate_limits(hand)[1:].T))
 
     # A posture that the hand file can say is an attempt like any other.
     still = [abs(posture.q_grasp[index[n]] - at) <= OPEN for n, at in hand.preshape.items()]
@@ -231,9 +231,9 @@ def follows_couplings(q: Array, hand: Hand) -> bool:
     spreads = [q[index[name]] for name in hand.spread.joints]
     if spreads and np.ptp(spreads) > COUPLED:
         return False
-    for finger, unit in zip(hand.fingers, hand.closing_unit.tolist(), strict=True):
-        closing = q[index[finger.closing_joint]]
-        for c in finger.coupled:
+    for i in hand.motor_fingers:
+        closing, unit = q[index[hand.fingers[i].closing_joint]], float(hand.closing_unit[i])
+        for c in hand.followers(i):
             if abs(q[index[c.joint]] - (c.ratio * closing + c.offset)) > COUPLED * unit:
                 return False
     return True

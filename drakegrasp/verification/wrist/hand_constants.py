@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import numpy.typing as npt
+from scipy.linalg import block_diag
 
 from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, transform_points
@@ -40,9 +42,12 @@ class HandConstants:
         X_JFi: (k, 4, 4), pose of the fingertip link in the moving frame of the last joint.
         pads: The fingertips' surfaces.
         pad_points: (k, 3), nominal contact points in {Fi} [m].
-        limits: (1 + k, 2), of the coordinates [rad or m].
-        units: (1 + k,), what counts as a radian of each coordinate [rad or m].
+        limits: (1 + m, 2), of the coordinates: the spread, and the closing of each finger that has
+            a motor [rad or m].
+        units: (1 + m,), what counts as a radian of each coordinate [rad or m].
         fingertips: (k, n, 3), corners of the fingertips in {Fi} [m].
+        closing_ratio: (k, m), see `Hand.closing_ratio`.
+        motor_of: (k,), the motor that moves each finger.
         palm: (n, 3), corners of the palm and of what is fixed to it, in {G} [m].
     """
 
@@ -63,6 +68,8 @@ class HandConstants:
     units: Array
     fingertips: Array
     palm: Array
+    closing_ratio: Array
+    motor_of: npt.NDArray[np.int64]
 
 
 @lru_cache(maxsize=4)
@@ -100,12 +107,15 @@ def hand_constants(hand: Hand) -> HandConstants:
     )
 
     chains = _stack_chains(hand)
+    moved = [0, *(1 + i for i in hand.motor_fingers)]
     return HandConstants(
         **chains,
         pads=make_pads(corners, [finger.pad_region for finger in hand.fingers], pad_surfaces(hand)),
         pad_points=np.array([finger.p_FiP for finger in hand.fingers]),
-        limits=coordinate_limits(hand),
-        units=np.r_[1.0, hand.closing_unit],
+        limits=coordinate_limits(hand)[moved],
+        units=np.r_[1.0, hand.closing_unit][moved],
+        closing_ratio=hand.closing_ratio,
+        motor_of=hand.motor_of,
         fingertips=padded,
         palm=palm,
     )
@@ -130,6 +140,7 @@ def _stack_chains(hand: Hand) -> dict[str, Array]:
     turn = np.where(sliding[..., None], 0.0, along)
     slide = np.where(sliding[..., None], along, 0.0)
     k = len(hand.chains)
+    by_motor = block_diag(1.0, hand.closing_ratio)
     twist = np.zeros((m, k, 4, 4))
     twist[..., :3, :3] = skew(turn)
     twist[..., :3, 3] = slide
@@ -141,9 +152,9 @@ def _stack_chains(hand: Hand) -> dict[str, Array]:
         "slides": sliding,
         "twist": twist,
         "twist2": twist @ twist,
-        "gain": np.stack(gain, axis=1),
+        "gain": np.stack(gain, axis=1) @ by_motor,
         "offset": np.stack(offset, axis=1),
-        "finger_gain": np.stack(gain),
+        "finger_gain": np.stack(gain) @ by_motor,
         "closing_gain": np.stack(gain, axis=1)[:, range(k), 1 + np.arange(k)],
         "X_JFi": np.stack([chain.X_JFi for chain in hand.chains]),
     }

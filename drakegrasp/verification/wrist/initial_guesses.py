@@ -17,9 +17,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
+from drakegrasp.arithmetic import multiply
 from drakegrasp.frames import Array, make_pose, rotation_about
 from drakegrasp.hand.description import Hand
-from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses
+from drakegrasp.hand.kinematics import fingertip_poses
 from drakegrasp.verification.wrist.hand_constants import hand_constants
 from drakegrasp.verification.wrist.pads import signed_distance
 
@@ -48,7 +49,7 @@ class Start:
 
     Attributes:
         X_OG: (4, 4), palm pose.
-        coordinates: (1 + k,), spread and closing positions [rad, or m where a finger slides].
+        coordinates: (1 + m,), see `HandConstants.limits` [rad or m].
     """
 
     X_OG: Array
@@ -60,10 +61,10 @@ class Postures:
     """N postures of a hand.
 
     Attributes:
-        coordinates: (N, 1 + k), spread and closing positions [rad or m].
+        coordinates: (N, 1 + m), see `HandConstants.limits` [rad or m].
         p_GP: (N, k, 3), nominal contact points in {G} [m].
         n_G: (N, k, 3), outward pad normals there, in {G}.
-        units: (1 + k,), what counts as a radian of each coordinate [rad or m].
+        units: (1 + m,), what counts as a radian of each coordinate [rad or m].
         tree: Of their features, see `_features`.
     """
 
@@ -79,17 +80,19 @@ def make_postures(hand: Hand) -> Postures:
     """Return the table of a hand's postures."""
     # A grid of coordinates.
     constants = hand_constants(hand)
-    lower, upper = coordinate_limits(hand).T
-    most = np.r_[MAX_SPREAD, MAX_CLOSING * hand.closing_unit]
+    lower, upper = constants.limits.T
+    most, motors = MAX_CLOSING * constants.units, len(upper) - 1
+    most[0] = MAX_SPREAD
     upper = np.minimum(upper, most)
-    fewest = MAX_CLOSINGS ** (1.0 / hand.num_fingers) - 1.0
-    step = np.r_[SPREAD_STEP, max(CLOSING_STEP, MAX_CLOSING / fewest) * hand.closing_unit]
+    fewest = MAX_CLOSINGS ** (1.0 / motors) - 1.0
+    step = max(CLOSING_STEP, MAX_CLOSING / fewest) * constants.units
+    step[0] = SPREAD_STEP
     step[1:] = np.minimum(step[1:], (upper - lower)[1:] / min(LEAST_STEPS, fewest))
     axes = [np.arange(low, high + 1e-9, s) for low, high, s in zip(lower, upper, step, strict=True)]
-    c = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 1 + hand.num_fingers)
+    c = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 1 + motors)
 
     # The contacts of each posture: the points of the pads next to the pad points.
-    X_GF = fingertip_poses(hand, spread=c[:, 0], closing=c[:, 1:])
+    X_GF = fingertip_poses(hand, spread=c[:, 0], closing=multiply(c[:, 1:], hand.closing_ratio.T))
     contact = signed_distance(constants.pads, constants.pad_points)
     on_pad = constants.pad_points - contact.distance[:, None] * contact.normal
     p_GP = np.einsum("nkab,kb->nka", X_GF[..., :3, :3], on_pad) + X_GF[..., :3, 3]

@@ -50,7 +50,7 @@ class WristProblem:
         up_O: (3,), the table's upward normal in {O}.
         height: Height of the origin of {O} above the table [m].
         X_OS: (4, 4), palm pose of the start: that of zero angles and translations.
-        posture: (1 + k,), coordinates of the start, which the solution stays near to where the
+        posture: (1 + m,), coordinates of the start, which the solution stays near to where the
             contacts leave them open [rad, or m where a finger slides].
     """
 
@@ -65,7 +65,7 @@ class WristProblem:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Evaluation:
-    """The problem at one point x of its n = 7 + k unknowns; see `evaluate`.
+    """The problem at one point x of its n = 7 + m unknowns; see `evaluate`.
 
     Attributes:
         X_OG: (4, 4), palm pose.
@@ -94,11 +94,11 @@ class Evaluation:
 def evaluate(problem: WristProblem, x: Array) -> Evaluation:
     """Return residuals, clearances and their exact derivatives.
 
-    The unknowns are x = (alpha, beta, gamma, t, c), n = 7 + k. With the start X_OS the palm is at
+    The unknowns are x = (alpha, beta, gamma, t, c), n = 7 + m. With the start X_OS the palm is at
 
         X_OG = X_OS X(Rx(alpha) Ry(beta) Rz(gamma), t),
 
-    and c = (spread, closing 1..k) are the hand's coordinates. The objective is
+    and c = (spread, closing of each of the m fingers that have a motor). The objective is
 
         sum_i  phi_i^2 + w_n^2 |m_i + n_i|^2 + w_v^2 |v_i + n_i|^2 + w_p^2 |p_FiQi - p_FiP|^2
         + w_c^2 |c - c_S|^2 + |o_i|^2
@@ -314,7 +314,7 @@ def _clearance(
     p_tips = np.matmul(X_GF[:, :3, :3], p_F[:, :, None])[..., 0] + X_GF[:, :3, 3]
 
     # Derivatives of the corners' heights, weighted as in the smooth minimum.
-    jacobian = np.zeros((1 + len(tips), POSE + len(tips) + 1))
+    jacobian = np.zeros((1 + len(tips), POSE + constants.gain.shape[-1]))
     jacobian[:, :3] = _cross(np.concatenate([p_palm, p_tips]), up_G) @ spin_G
     jacobian[:, 3:POSE] = R_SG @ up_G
     axes, slides, origins = joints

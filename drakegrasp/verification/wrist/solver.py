@@ -128,7 +128,7 @@ def solve(problem: WristProblem) -> WristFit:
     return WristFit(
         X_OG=solution.X_OG,
         spread=float(c[0]),
-        closing=c[1:],
+        closing=problem.constants.closing_ratio @ c[1:],
         objective=float(solution.residuals @ solution.residuals),
         residual=np.linalg.norm(nearest_on_pads(problem.constants.pads, p_FiQ) - p_FiQ, axis=1),
         normal_error=np.arccos(np.clip(facing, -1.0, 1.0)),
@@ -143,25 +143,28 @@ def _refine(problem: WristProblem, coordinates: Array) -> tuple[Evaluation, Arra
     """Close or open each finger until its pad meets its point; the palm does not move.
 
     Newton's method on the distance φ_i of each finger from its point, by its own closing position:
-    c_i ← c_i − φ_i / (∂φ_i/∂c_i), within the limits, as long as Σ |φ_i| falls.
+    c_i ← c_i − φ_i / (∂φ_i/∂c_i), within the limits, as long as Σ |φ_i| falls. Fingers that share a
+    motor take the mean of their steps.
 
     Args:
         problem: With its start at the palm's pose.
-        coordinates: (1 + k,), spread and closing positions to begin with [rad or m].
+        coordinates: (1 + m,), of the start, see `HandConstants.limits` [rad or m].
 
     Returns:
         The problem at the refined coordinates, and these.
     """
     lower, upper = problem.constants.limits.T
     pose, own = np.zeros(POSE), np.arange(len(problem.p_OQ))
+    motor = problem.constants.motor_of
     c = np.clip(coordinates, lower, upper)
     best = evaluate(problem, np.concatenate([pose, c]))
     for _ in range(REFINEMENTS):
         # A step of each closing angle, within the limits.
         distance = best.contact.distance
-        slope = best.jacobian[own, POSE + 1 + own]
-        moves = np.abs(slope) * problem.constants.units[1:] > MIN_SLOPE
+        slope = best.jacobian[own, POSE + 1 + motor]
+        moves = np.abs(slope) * problem.constants.units[1 + motor] > MIN_SLOPE
         step = np.where(moves, distance / np.where(moves, slope, 1.0), 0.0)
+        step = np.bincount(motor, step) / np.bincount(motor)
         trial = np.clip(c - np.concatenate([[0.0], step]), lower, upper)
 
         # Stop when it brings the fingers no nearer.
