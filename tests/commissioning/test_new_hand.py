@@ -19,6 +19,7 @@ from drakegrasp.commissioning.draft.run import NewHand, draft_hand
 from drakegrasp.errors import HandError
 from drakegrasp.frames import transform_points
 from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.file_format import DrivenBy
 from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.kinematics import closed_positions, fingertip_poses
 from drakegrasp.hand.strength import fingertip_forces
@@ -58,8 +59,9 @@ def test_jaws_that_open_at_positive_positions_are_turned_round(
     gaps = [np.linalg.norm(np.diff(pads(hand, share), axis=0)) for share in (0.0, 1.0)]
     np.testing.assert_allclose(gaps, [0.1, 0.0], atol=1e-6)
     assert all(p[2] > 0.04 for p in pads(hand, 0.5))
-    # The motor of the left jaw is that of the right one, too.
-    assert [finger.force_limit for finger in hand.fingers] == [60.0, 60.0]
+    # One motor moves both jaws with 60 N each.
+    driver, driven = hand.fingers
+    assert (driver.force_limit, driven.driven_by) == (120.0, DrivenBy(finger=driver.name))
 
 
 def test_fingers_oppose_a_thumb_whose_base_is_turned(tmp_path: Path) -> None:

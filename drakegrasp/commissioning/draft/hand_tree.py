@@ -6,7 +6,7 @@ closing joint closes, from 0, the open hand; and the keys of a hand file, each w
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 from drakegrasp.commissioning.draft.answers import Answers
 from drakegrasp.commissioning.draft.opposition import Grip, Member
 from drakegrasp.commissioning.draft.palm import PalmFrame
-from drakegrasp.commissioning.draft.strength import closing_limits
+from drakegrasp.commissioning.draft.strength import Driver, closing_limits, shared_motors
 from drakegrasp.commissioning.draft.wording import finger_names, reasons_of
 from drakegrasp.config import Config, apply_override
 from drakegrasp.errors import ConfigError, HandError
@@ -94,15 +94,14 @@ def draft_tree(
     tree["palm"] = {"link": palm, "p_BG": frame.p_BG.tolist(), "rpy_deg": frame.rpy_deg.tolist()}
 
     # The fingers; joints that nothing else drives keep a position.
-    coupled, names, drivers = _couplings(model, grip), finger_names(grip), _drivers(model, grip)
-    for i, (driver, ratio) in drivers.items():
-        limits[driver] += ratio * limits[i]
-    rows = zip(grip.members, names, limits.tolist(), coupled, strict=True)
+    coupled, names, drivers = (
+        _couplings(model, grip),
+        finger_names(grip),
+        shared_motors(model, grip),
+    )
+    motors = [_motor(i, grip, limits, names, drivers) for i in range(len(names))]
+    rows = zip(grip.members, names, motors, coupled, strict=True)
     tree["fingers"] = [_finger(*row) for row in rows]
-    for i, (driver, ratio) in drivers.items():
-        by = {"finger": names[driver], "ratio": round(ratio, 5)}
-        finger = tree["fingers"][i]
-        kept_keys = {k: v for k, v in finger.items() if not k.endswith(("torque", "force", "limit"))}
     driven = {m.joint.name for m in grip.members} | {j for own in coupled for j in own}
     spread = _spread(grip, frame, driven)
     opened = positions(model, grip, 0.0)
@@ -131,26 +130,37 @@ def draft_tree(
         for m in grip.members
         if m.sign != 1.0 or m.zero != 0.0
     ]
-    rebased = _rebased(model, grip, coupled, spread)
+    rebased = _rebased(model, grip, coupled, drivers, spread)
     return Draft(model=rebased, tree=tree, reasons=reasons, changed=changed)
 
 
-def _finger(
-    member: Member, name: str, limit: float, coupled: dict[str, tuple[float, float]]
+def _motor(
+    i: int, grip: Grip, limits: Array, names: Sequence[str], drivers: Mapping[int, Driver]
 ) -> dict[str, Any]:
-    """Return the keys of a finger, from its effort limit [N m or N] and what follows its joint."""
-    kind, limit = "force" if member.joint.slides else "torque", float(f"{limit:.3g}")
+    """Return the keys of a finger's motor, or the finger whose motor moves it."""
+    if i in drivers:
+        driver = drivers[i]
+        return {"driven_by": {"finger": names[driver.finger], "ratio": round(driver.ratio, 5)}}
+    kind = "force" if grip.members[i].joint.slides else "torque"
+    shared = sum(by.ratio * limits[n] for n, by in drivers.items() if by.finger == i)
+    limit = float(f"{limits[i] + shared:.3g}")
+    return {f"{kind}_limit": limit, f"holding_{kind}": float(f"{HOLDING * limit:.3g}")}
+
+
+def _finger(
+    member: Member, name: str, motor: dict[str, Any], coupled: dict[str, tuple[float, float]]
+) -> dict[str, Any]:
+    """Return the keys of a finger, from those of its motor and what follows its joint."""
     finger: dict[str, Any] = {
         "name": name,
         "fingertip": member.chain.tip,
         "closing_joint": member.joint.name,
-        f"{kind}_limit": limit,
-        f"holding_{kind}": float(f"{HOLDING * limit:.3g}"),
     }
+    finger |= motor
     if coupled:
         finger["coupled"] = [
-            {"joint": joint, "ratio": round(ratio, 5), "offset": round(offset, 5)}
-            for joint, (ratio, offset) in coupled.items()
+            {"joint": follower, "ratio": round(ratio, 5), "offset": round(offset, 5)}
+            for follower, (ratio, offset) in coupled.items()
         ]
     return finger | {"pad_region": member.pad.region(), "pad_point": member.pad.point.tolist()}
 
@@ -191,6 +201,7 @@ def _rebased(
     model: VendorModel,
     grip: Grip,
     coupled: Sequence[dict[str, tuple[float, float]]],
+    drivers: Mapping[int, Driver],
     spread: dict[str, float],
 ) -> VendorModel:
     """Return the model in which closing joints close from 0 on, and spreads open from 0 on."""
@@ -201,6 +212,9 @@ def _rebased(
         for name, (ratio, offset) in own.items():
             if name in model.mimics or joint.name in model.mimics:
                 mimics[name] = Mimic(joint=name, leader=joint.name, ratio=ratio, offset=offset)
+    for i, by in drivers.items():
+        name, leader = grip.members[i].joint.name, grip.members[by.finger].joint.name
+        mimics[name] = Mimic(joint=name, leader=leader, ratio=by.ratio, offset=0.0)
     for name, sign in spread.items():
         joints[name] = joints[name].rebased(sign, 0.0)
     return replace(model, joints=joints, mimics=mimics)

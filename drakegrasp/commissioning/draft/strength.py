@@ -1,4 +1,4 @@
-"""Efforts of the motors of a grip, from those of the model's joints.
+"""Motors of a grip: their efforts, from those of the model's joints, and which fingers share one.
 
 A fingertip presses with what its weakest motor gives. With the motion dp/dc of the pad point as the
 finger closes, u = dp/dc / |dp/dc|, and the lever l_m of motor m, the motion of the pad point along
@@ -12,6 +12,8 @@ taken off: one motor cannot press harder than those opposite resist.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from drakegrasp.commissioning.draft.opposition import Grip, Member
@@ -21,6 +23,8 @@ from drakegrasp.hand.vendor.model import VendorModel
 
 #: Efforts that a finger's motor can have: turning [N m], sliding [N]. Others are placeholders.
 POSSIBLE = {False: (0.005, 20.0), True: (0.5, 1000.0)}
+#: Fingers that share a motor are open together, within so much [rad or m].
+SAME = 1e-6
 #: A motor whose lever is shorter than this does not bear on the grasp [m/rad].
 LEVER = 1e-3
 
@@ -53,6 +57,34 @@ def closing_limits(model: VendorModel, grip: Grip, effort: float | None) -> tupl
     share[:-1] *= min(1.0, sides[1] / sides[0])
     share[-1] *= min(1.0, sides[0] / sides[1])
     return found * share, force * share
+
+
+@dataclass(frozen=True)
+class Driver:
+    """The finger whose motor moves another one too, and that one's closing per its closing."""
+
+    finger: int
+    ratio: float
+
+
+def shared_motors(model: VendorModel, grip: Grip) -> dict[int, Driver]:
+    """Return by which finger's motor others are closed, as mimics of the model say."""
+    found, first = {}, dict[str, int]()
+    for i, member in enumerate(grip.members):
+        mimic = model.mimic(member.joint.name)
+        d = first.setdefault(mimic.leader, i)
+        if d == i:
+            continue
+
+        # Positions of both by that of the joint that leads them, then of one by the other's.
+        driver = grip.members[d]
+        ahead = model.mimic(driver.joint.name)
+        ratio = mimic.ratio / ahead.ratio
+        zero = ratio * (driver.zero - ahead.offset) + mimic.offset
+        own = member.sign * driver.sign * ratio
+        if own > 0.0 and abs(zero - member.zero) < SAME:
+            found[i] = Driver(d, own)
+    return found
 
 
 def _effort(model: VendorModel, leader: str, effort: float | None) -> float:

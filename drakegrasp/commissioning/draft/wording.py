@@ -67,6 +67,7 @@ def reasons_of(
         for kind in ("torque", "force"):
             reasons[f"{key}.{kind}_limit"] = f"from {effort}; no side presses more than the other"
             reasons[f"{key}.holding_{kind}"] = "guessed: twice that"
+        reasons[f"{key}.driven_by"] = "in the model one motor moves both; its limit is that of both"
     closed = {j.name for m in grip.members for j in m.chain.joints}
     for name in model.joints:
         reasons[f"preshape.{name}"] = (
