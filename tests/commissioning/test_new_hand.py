@@ -91,6 +91,19 @@ def test_bars_of_a_linkage_are_no_fingers(tmp_path: Path) -> None:
     assert any(c.joint == "bar_slide" for finger in hand.fingers for c in finger.coupled)
 
 
+def test_a_bar_may_be_the_joint_that_leads(tmp_path: Path) -> None:
+    """As in grippers whose fingers follow a knuckle beside them."""
+    bar = link("bar", 0.01, box("0.01 0.01 0.02", "0 0 0.01")) + joint(
+        "knuckle", "prismatic", "body", "bar", "0.02 0 0", "0 1 0", "0 0.05 60"
+    )
+    text = JAWS.replace('"left_slide"/>', '"knuckle"/>').replace("</robot>", bar + "</robot>")
+    slide = text.index("</joint>", text.index('name="left_slide"'))
+    hand = load_hand(draft(tmp_path, text[:slide] + '<mimic joint="knuckle"/>' + text[slide:]).path)
+    driver, driven = hand.fingers
+    assert (driver.force_limit, driven.driven_by) == (120.0, DrivenBy(finger=driver.name))
+    assert any(c.joint == "knuckle" for finger in hand.fingers for c in finger.coupled)
+
+
 def test_both_sides_press_equally(tmp_path: Path) -> None:
     """Two fingers of 1 N m would press harder than the thumb resists, or the other way round."""
     index, middle, thumb = fingertip_forces(load_hand(draft(tmp_path, MITTEN).path), "torque")
@@ -167,6 +180,13 @@ def test_answers_override_guesses(tmp_path: Path) -> None:
     assert max(limits) <= 0.5 * 1.6
     assert "middle_1" in tree["preshape"]
     assert "middle_1" not in whole.get("preshape", {})
+
+
+def test_a_joint_that_is_given_a_position_does_not_close(tmp_path: Path) -> None:
+    drafted = draft(tmp_path, MITTEN, joints={"thumb_2": 0.4})
+    hand = load_hand(drafted.path)
+    assert hand.preshape["thumb_2"] == 0.4
+    assert hand.fingers[-1].coupled == ()
 
 
 def test_fingers_that_close_side_by_side_are_no_hand(tmp_path: Path) -> None:

@@ -94,7 +94,10 @@ def find_closings(
     """Return the ways in which a finger may close."""
     # Which motors bend it, and what the others may be at.
     motors, axes = _motors(model, joints), _axes(joints)
-    bending = [motor for motor in motors if _bends_finger(motor, joints, axes)]
+    free = [motor for motor in motors if motor.leader not in answers.joints]
+    bending = [motor for motor in free if _bends_finger(motor, joints, axes)]
+    if not bending:
+        return []
     kept = [motor for motor in motors if motor not in bending]
     choices = [_positions(model, motor.leader, answers) for motor in kept]
     rests = tuple(positions[0] for positions in choices)

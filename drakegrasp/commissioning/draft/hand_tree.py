@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,12 @@ import numpy as np
 from drakegrasp.commissioning.draft.answers import Answers
 from drakegrasp.commissioning.draft.opposition import Grip, Member
 from drakegrasp.commissioning.draft.palm import PalmFrame
-from drakegrasp.commissioning.draft.strength import Driver, closing_limits, shared_motors
+from drakegrasp.commissioning.draft.strength import (
+    Driver,
+    closing_limits,
+    motor_limits,
+    shared_motors,
+)
 from drakegrasp.commissioning.draft.wording import finger_names, reasons_of
 from drakegrasp.config import Config, apply_override
 from drakegrasp.errors import ConfigError, HandError
@@ -99,6 +105,7 @@ def draft_tree(
         finger_names(grip),
         shared_motors(model, grip),
     )
+    limits = motor_limits(limits, drivers)
     motors = [_motor(i, grip, limits, names, drivers) for i in range(len(names))]
     rows = zip(grip.members, names, motors, coupled, strict=True)
     tree["fingers"] = [_finger(*row) for row in rows]
@@ -142,8 +149,7 @@ def _motor(
         driver = drivers[i]
         return {"driven_by": {"finger": names[driver.finger], "ratio": round(driver.ratio, 5)}}
     kind = "force" if grip.members[i].joint.slides else "torque"
-    shared = sum(by.ratio * limits[n] for n, by in drivers.items() if by.finger == i)
-    limit = float(f"{limits[i] + shared:.3g}")
+    limit = float(f"{limits[i]:.3g}")
     return {f"{kind}_limit": limit, f"holding_{kind}": float(f"{HOLDING * limit:.3g}")}
 
 
@@ -188,11 +194,11 @@ def _couplings(model: VendorModel, grip: Grip) -> list[dict[str, tuple[float, fl
 
     # Bars of linkages beside the fingers follow the motor that their model names.
     for member, own in zip(grip.members, found, strict=True):
-        leads = member.followers() | {member.joint.name: (member.sign, member.zero)}
-        for name, mimic in model.mimics.items():
-            if name not in taken and mimic.leader in leads:
-                ratio, offset = leads[mimic.leader]
-                own[name] = mimic.ratio * ratio, mimic.ratio * offset + mimic.offset
+        moved = {member.joint.name: (member.sign, member.zero), **member.followers()}
+        for name, (joint, (gain, zero)) in product(model.joints, moved.items()):
+            relation = model.relation(name, joint)
+            if name not in taken and relation is not None:
+                own[name] = relation[0] * gain, relation[0] * zero + relation[1]
                 taken.add(name)
     return found
 

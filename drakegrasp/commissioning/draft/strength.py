@@ -12,7 +12,9 @@ taken off: one motor cannot press harder than those opposite resist.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -69,22 +71,29 @@ class Driver:
 
 def shared_motors(model: VendorModel, grip: Grip) -> dict[int, Driver]:
     """Return by which finger's motor others are closed, as mimics of the model say."""
-    found, first = {}, dict[str, int]()
-    for i, member in enumerate(grip.members):
-        mimic = model.mimic(member.joint.name)
-        d = first.setdefault(mimic.leader, i)
-        if d == i:
+    found: dict[int, Driver] = {}
+    for d, i in combinations(range(len(grip.members)), 2):
+        driver, member = grip.members[d], grip.members[i]
+        relation = model.relation(member.joint.name, driver.joint.name)
+        if relation is None or d in found or i in found:
             continue
 
-        # Positions of both by that of the joint that leads them, then of one by the other's.
-        driver = grip.members[d]
-        ahead = model.mimic(driver.joint.name)
-        ratio = mimic.ratio / ahead.ratio
-        zero = ratio * (driver.zero - ahead.offset) + mimic.offset
-        own = member.sign * driver.sign * ratio
-        if own > 0.0 and abs(zero - member.zero) < SAME:
-            found[i] = Driver(d, own)
+        # Both must close together, from where both are open.
+        ratio = member.sign * driver.sign * relation[0]
+        if ratio > 0.0 and abs(relation[0] * driver.zero + relation[1] - member.zero) < SAME:
+            found[i] = Driver(d, ratio)
     return found
+
+
+def motor_limits(limits: Array, drivers: Mapping[int, Driver]) -> Array:
+    """Return the effort limit (k,) of each finger's motor at its closing joint; 0 without one.
+
+    By virtual work it is what the fingers that it moves press with, each by its ratio.
+    """
+    own = np.array([0.0 if i in drivers else limit for i, limit in enumerate(limits)])
+    for i, by in drivers.items():
+        own[by.finger] += by.ratio * limits[i]
+    return own
 
 
 def _effort(model: VendorModel, leader: str, effort: float | None) -> float:

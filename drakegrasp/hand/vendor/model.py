@@ -121,3 +121,9 @@ class VendorModel:
     def mimic(self, joint: str) -> Mimic:
         """Return what a joint follows: itself, if nothing else."""
         return self.mimics.get(joint, Mimic(joint=joint, leader=joint, ratio=1.0, offset=0.0))
+
+    def relation(self, joint: str, to: str) -> tuple[float, float] | None:
+        """Return ratio and offset of a joint's position to another's; None if none leads both."""
+        own, other = self.mimic(joint), self.mimic(to)
+        ratio = own.ratio / other.ratio
+        return (ratio, own.offset - ratio * other.offset) if own.leader == other.leader else None
