@@ -14,6 +14,7 @@ from drakegrasp.cli.main import main
 
 MIMIC = '<mimic joint="left_slide"/>'
 JAW = '<geometry><box size="0.02 0.012 0.06"/></geometry>'
+EMPTY = '<model name="{}"><link name="x"/></model>'
 BOMB = '<!DOCTYPE r [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;&a;&a;">]>'
 
 
@@ -124,6 +125,116 @@ SPOILT: dict[str, tuple[str, str, str]] = {
         "hand.xml",
         "polycoef of joint 'right_slide' must be a line, got a curve",
     ),
+    "mass without a value": (
+        changed('<mass value="0.05"/>', '<mass value="nan"/>', count=1),
+        "hand.urdf",
+        "link 'left_jaw' must have a mass of 0 kg or more, got nan",
+    ),
+    "effort that is no number": (
+        changed('effort="60"', 'effort="strong"', count=1),
+        "hand.urdf",
+        "effort of joint 'left_slide' must be a number, got 'strong'",
+    ),
+    "multiplier that is no number": (
+        changed(MIMIC, '<mimic joint="left_slide" multiplier="twice"/>'),
+        "hand.urdf",
+        "multiplier of a mimic must be a number, got 'twice'",
+    ),
+    "mimic without motion": (
+        changed(MIMIC, '<mimic joint="left_slide" multiplier="0"/>'),
+        "hand.urdf",
+        "joint 'right_slide' must follow 'left_slide' by a ratio, got 0",
+    ),
+    "equality with nothing": (
+        changed('joint2="left_slide"', 'joint2="lost"', text=JAWS_MJCF),
+        "hand.xml",
+        "joint 'right_slide' must follow a joint that moves, got 'lost'",
+    ),
+    "axis of no length": (
+        changed('<axis xyz="0 1 0"/>', '<axis xyz="0 0 0"/>', count=1),
+        "hand.urdf",
+        "'left_slide' axis is zero",
+    ),
+    "origin that is no number": (
+        changed('xyz="0 0 0.1"', 'xyz="0 0 nan"'),
+        "hand.urdf",
+        "Expected 3 values for attribute xyz got 0 0 nan",
+    ),
+    "size below zero": (
+        changed(JAW, '<geometry><box size="-0.02 0.012 0.06"/></geometry>', count=1),
+        "hand.urdf",
+        "width = -0.02",
+    ),
+    "missing link": (
+        changed('<child link="left_jaw"/>', '<child link="lost"/>'),
+        "hand.urdf",
+        "Could not find link named 'lost'",
+    ),
+    "link without a name": (
+        changed('<link name="left_end"/>', "<link/>"),
+        "hand.urdf",
+        "link tag is missing name attribute",
+    ),
+    "two links of a name": (
+        changed("</robot>", link("left_jaw", 0.1, JAW) + "</robot>"),
+        "hand.urdf",
+        "already contains a body named 'left_jaw'",
+    ),
+    "link that carries itself": (
+        changed(
+            '<parent link="body"/><child link="left_jaw"/>',
+            '<parent link="left_jaw"/><child link="left_jaw"/>',
+        ),
+        "hand.urdf",
+        "connect body left_jaw to itself",
+    ),
+    "joints without limits": (
+        changed('<limit lower="0" upper="0.05" effort="60" velocity="1"/>', ""),
+        "hand.urdf",
+        "no fingers of left_jaw, right_jaw close against each other: .* --reverse JOINT",
+    ),
+    "joint without a range": (
+        changed('upper="0.05"', 'upper="0"'),
+        "hand.urdf",
+        "must have two fingers that can close from the palm 'body', got 0: .* --fingers",
+    ),
+    "no joints": (
+        f'<robot name="block">{link("body", 0.5, JAW)}</robot>',
+        "hand.urdf",
+        r"must have two fingers or more, got one chain of links: .* --palm LINK \(body\)",
+    ),
+    "mesh outside": (
+        mesh("../broken.glb"),
+        "hand.urdf",
+        "'../broken.glb' must lie in the model's folder, got .* --root FOLDER",
+    ),
+    "mesh of an unknown package": (
+        mesh("package://other/jaw.stl"),
+        "hand.urdf",
+        "must lie in a known package: .* --package other=FOLDER",
+    ),
+    "mesh without triangles": (
+        mesh("empty.obj"),
+        "hand.urdf",
+        "'empty.obj' must hold triangles with finite corners",
+    ),
+    "mesh of no name": (mesh(""), "hand.urdf", r"must be one of \.obj, .* got ''"),
+    "missing mesh of MJCF": (
+        '<mujoco><asset><mesh file="lost.stl"/></asset></mujoco>',
+        "hand.xml",
+        "lost.stl' must be a file, got none",
+    ),
+    "two models": (
+        f'<sdf version="1.7">{"".join(map(EMPTY.format, "ab"))}</sdf>',
+        "hand.sdf",
+        "can only contain one model",
+    ),
+    "other files": (
+        '<sdf version="1.7"><model name="a"><include><uri>model://b</uri></include></model></sdf>',
+        "hand.sdf",
+        "must be complete by itself, got <include>",
+    ),
+    "bytes": ("\x00\x01\x02", "hand.urdf", "must be XML, got text that is not"),
 }
 
 
@@ -133,6 +244,7 @@ def test_a_spoilt_model_is_refused_in_one_line(tmp_path: Path, fault: str) -> No
     text, name, message = SPOILT[fault]
     path = write_model(tmp_path, text, name)
     (tmp_path / "broken.glb").write_bytes(bytes(range(256)))
+    (tmp_path / "empty.obj").write_text("v 0 0 0\n")
     out = tmp_path / "out"
     result = CliRunner().invoke(main, ["hand", "new", str(path), "--out", str(out)])
     assert result.exit_code == 2, result.output
@@ -144,6 +256,7 @@ def test_a_spoilt_model_is_refused_in_one_line(tmp_path: Path, fault: str) -> No
 def test_a_sound_model_is_not_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the faults were planted in."""
     drawn: list[Callable[..., None]] = []
+    monkeypatch.setattr("drakegrasp.commissioning.draft.run.GRASPS", ())
     monkeypatch.setattr("drakegrasp.cli.hand._draw", lambda *files: drawn.append(files))
     for n, (text, name) in enumerate(((JAWS, "hand.urdf"), (JAWS_MJCF, "hand.xml"))):
         path, out = write_model(tmp_path / str(n), text, name), tmp_path / f"out{n}"

@@ -36,6 +36,7 @@ def reasons_of(
     model: VendorModel, grip: Grip, frame: PalmFrame, answers: Answers
 ) -> dict[str, str]:
     """Return why the values are so, by the paths of their keys."""
+    # Of the whole hand.
     reasons = {
         "palm.link": "given" if answers.palm else "the link from which the fingers branch",
         "palm.p_BG": "on the palm's surface, where a line to the pinch leaves it [m]",
@@ -50,6 +51,8 @@ def reasons_of(
         "standoffs": "shares of the height of the pinch above the palm [m]",
         "payload": "half of what friction carries at these efforts [kg]",
     }
+
+    # Of each finger.
     for i, member in enumerate(grip.members):
         key = f"fingers.{i}"
         flipped = member.sign != 1.0 or member.zero != 0.0
@@ -68,6 +71,8 @@ def reasons_of(
             reasons[f"{key}.{kind}_limit"] = f"from {effort}; no side presses more than the other"
             reasons[f"{key}.holding_{kind}"] = "guessed: twice that"
         reasons[f"{key}.driven_by"] = "in the model one motor moves both; its limit is that of both"
+
+    # Of the joints that keep a position.
     closed = {j.name for m in grip.members for j in m.chain.joints}
     for name in model.joints:
         reasons[f"preshape.{name}"] = (

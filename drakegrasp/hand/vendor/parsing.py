@@ -292,6 +292,8 @@ def _joints(
                 f"model: joint {joint.name()!r} must have a lower limit below its upper one, got "
                 f"{limits[0]:g}..{limits[1]:g}"
             )
+
+        # Efforts without end say nothing.
         effort = efforts.get(joint.name(), 0.0)
         found[joint.name()] = VendorJoint(
             name=joint.name(),

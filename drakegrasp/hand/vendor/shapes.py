@@ -60,6 +60,7 @@ class Shape:
     def corners(self) -> Array:
         """Return points (n, 3) whose hull is that of the shape, in the link's frame [m]."""
         own = self.vertices if self.primitive is None else primitive_corners(self.primitive)
+        assert own is not None
         return transform_points(self.X_LS, own)
 
     def carried(self, X_AL: Array) -> Shape:
@@ -95,7 +96,7 @@ def read_shape(
         role: Whether it is seen or collides.
         meshes: What the mesh files hold, by their names.
     """
-    # Its colour, then the triangles of what is no primitive.
+    # What it is, and the colour that the model gives it.
     shape, colour = inspector.GetShape(geometry), None
     properties = inspector.GetProperties(geometry, role)
     if properties is not None and properties.HasProperty("phong", "diffuse"):
@@ -104,6 +105,8 @@ def read_shape(
     found = Shape(X_LS=inspector.GetPoseInFrame(geometry).GetAsMatrix4(), colour=colour)
     if isinstance(shape, Box | Cylinder | Capsule | Sphere):
         return replace(found, primitive=shape)
+
+    # Else triangles: of its file, or of its hull.
     if isinstance(shape, Mesh | Convex) and shape.source().is_path():
         mesh = meshes[shape.source().path().name]
         vertices = mesh.vertices * np.asarray(shape.scale3())
