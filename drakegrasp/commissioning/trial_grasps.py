@@ -37,6 +37,8 @@ MASS = 0.3
 ABOVE_TABLE, BEFORE_PALM, AROUND_PADS = 0.1, 0.008, 0.012
 #: Least size of an object in any direction [m].
 LEAST_SIZE = 0.03
+#: Fingers farther beside the middle than this share of a ball's width meet only its sides.
+WIDEST = 0.7
 #: The line along which the fingers close, by its angle above the horizontal [rad]. Where it is
 #: level, the palm faces the table.
 LINES = {"level": 0.0, "tilted": np.deg2rad(45.0), "upright": np.deg2rad(90.0)}
@@ -77,8 +79,11 @@ def check_grasp(hand: Hand, config: Config, shape: str, line: str = "level") -> 
         shape: "box", "cylinder" or "sphere".
         line: On which the fingers close, one of `LINES`.
     """
-    # Try until one holds, which a whole lift shows.
     name = f"{shape}, {line}"
+    if shape == "sphere" and _stands_wide(hand):
+        return Finding(name=name, ok=True, text="left out: the fingers stand too wide for a ball")
+
+    # Try until one holds, which a whole lift shows.
     config = with_whole_lifts(config)
     drive = drive_of(hand, config.lift)
     rules = _with_drive(config, "locked" if drive == "torque" else drive)
@@ -107,6 +112,16 @@ def check_grasp(hand: Hand, config: Config, shape: str, line: str = "level") -> 
     tried = ", ".join(f"{count} {label}" for label, count in outcomes.items())
     text = f"a {shape} must be held, got {tried or 'no posture that holds one'}"
     return Finding(name=name, ok=False, text=text + _mend(outcomes, missing))
+
+
+def _stands_wide(hand: Hand) -> bool:
+    """Return whether the fingers stand too far beside each other to hold a ball."""
+    pinch = find_pinch(hand, max(WIDTHS))
+    if pinch is None:
+        return False
+    across = np.cross([0.0, 0.0, 1.0], find_opposition(hand).axis)
+    aside = np.abs((pinch.p_GQ - pinch.p_GM) @ across).max()
+    return bool(aside > WIDEST * pinch.width)
 
 
 #: What is held, but moves more in the hand than a sample may.

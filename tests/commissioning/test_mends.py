@@ -92,6 +92,11 @@ def test_objects_hang_with_the_line_at_its_angle_and_the_hand_above_the_table() 
             assert X_TG[2, 3] > 0.1
 
 
+def test_a_ball_is_left_out_if_the_fingers_stand_wider_than_it() -> None:
+    found = check_grasp(load_hand("allegro_four"), load_config(), "sphere")
+    assert (found.ok, found.text) == (True, "left out: the fingers stand too wide for a ball")
+
+
 def outcome(monkeypatch: pytest.MonkeyPatch, record: Callable[..., TrialRecord]) -> Finding:
     module = "drakegrasp.commissioning.trial_grasps"
     monkeypatch.setattr(f"{module}.build_scene", lambda *_: None)

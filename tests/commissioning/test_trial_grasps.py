@@ -35,7 +35,7 @@ def test_a_pinch_is_where_the_pads_leave_its_width(tmp_path) -> None:
 
 @pytest.mark.sim
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["allegro", "franka"])
+@pytest.mark.parametrize("name", ["allegro", "franka", "leap"])
 @pytest.mark.parametrize("drive", ["worm", "locked"])
 def test_a_pinched_box_slips_by_less_than_a_millimetre(name: str, drive: str) -> None:
     """Within the payload; joints of the preshape keep their positions."""
