@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -127,9 +126,18 @@ def test_a_grasp_that_fails_says_what_may_mend_it(
 
 @pytest.mark.sim
 @pytest.mark.slow
-def test_two_motors_that_push_against_each_other_hold_nothing_along_their_line() -> None:
+def test_two_motors_that_push_against_each_other_hold_nothing_along_their_line(
+    tmp_path: Path,
+) -> None:
     """On a level line friction carries; on an upright one the stronger side gives way."""
-    hand = replace(load_hand("franka"), drive="torque")
+
+    def with_two_motors(tree: dict) -> None:
+        tree["drive"] = "torque"
+        for finger in tree["fingers"]:
+            finger.pop("driven_by", None)
+            finger["force_limit"] = 70.0
+
+    hand = changed_franka(tmp_path, with_two_motors)
     level, upright = (
         check_grasp(hand, load_config(), "box", line) for line in ("level", "upright")
     )
