@@ -161,6 +161,8 @@ def _read_body(
             (Role.kIllustration, plant.GetVisualGeometriesForBody(body)),
         )
     )
+
+    # Shapes without bounds are no part of a hand.
     return _Body(
         name=body.name(),
         inertia=None if massless else body.default_spatial_inertia(),
@@ -188,6 +190,8 @@ def _carriers(plant: MultibodyPlant, instance: Any, bodies: Mapping[Any, _Body])
                 f"{found[child.index()].name()!r} and {joint.name()!r}: cut the closed loop"
             )
         found[child.index()] = joint
+
+    # One body is left that nothing carries.
     roots = [body.name for index, body in bodies.items() if index not in found]
     if len(roots) != 1:
         got = f"{len(roots)} ({', '.join(roots)})" if roots else "none: its joints form a loop"
