@@ -43,6 +43,7 @@ NOT_RUN = {
     "drakegrasp merge ": "wants two datasets; tests/build/test_merge.py",
     "drakegrasp score ": "tries hundreds of grasps; tests/cli/test_score_command.py",
     "drakegrasp bench-set ": "simulates for hours; tests/scoring/test_benchmark.py",
+    "drakegrasp hand new ": "a model that may not be shipped; tests/commissioning/test_new_hand.py",
     "drakegrasp hand check ": "tests/commissioning/test_tutorial_hand.py runs it",
     "drakegrasp verify GRASPS --protocol ": "wants an MJCF; tests/protocols",
 }

@@ -10,10 +10,10 @@ from pydrake.multibody.plant import MultibodyPlant
 from scipy.linalg import block_diag
 
 from drakegrasp.commissioning.finding import Finding, judge
-from drakegrasp.commissioning.model_text import Mimic, declared_masses, declared_mimics
 from drakegrasp.config import Config
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import coordinate_limits
+from drakegrasp.hand.model_text import Mimic, declared_masses, declared_mimics, read_xml
 from drakegrasp.hand.parsing import add_model
 from drakegrasp.hand.strength import fingertip_forces
 from drakegrasp.simulation.construction import FINGER_DAMPING
@@ -28,7 +28,7 @@ SAME = 1e-3
 def check_masses(hand: Hand) -> Finding:
     """Return whether every link has a mass, and an inertia that a body can have."""
     # Drake parses the inertias; the masses are those that the file gives.
-    masses = declared_masses(hand.model.path)
+    masses = declared_masses(read_xml(hand.model.path))
     plant = MultibodyPlant(0.0)
     instance = add_model(plant, hand.model)
     faults = []
@@ -87,7 +87,7 @@ def check_couplings(hand: Hand) -> Finding:
     faults = []
 
     # The model's own couplings.
-    for mimic in declared_mimics(hand.model.path):
+    for mimic in declared_mimics(read_xml(hand.model.path)):
         if _moves_as(hand, mimic):
             continue
         if (driver := _driver(hand, mimic)) is not None:

@@ -1,4 +1,4 @@
-"""Checks of a hand's geometry: finger order, palm, pads, and what meets when it closes.
+"""Checks of a hand's geometry: finger order, palm, and what meets when it closes.
 
 In: a hand that was loaded. Out: a `Finding` per check. Nothing is simulated.
 """
@@ -9,8 +9,6 @@ from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
-import trimesh
-from scipy.spatial import ConvexHull
 
 from drakegrasp.commissioning.finding import Finding, judge
 from drakegrasp.commissioning.pinch import (
@@ -19,6 +17,8 @@ from drakegrasp.commissioning.pinch import (
     find_opposition,
     find_pinch,
     pad_fronts,
+    pad_points_at,
+    reach,
 )
 from drakegrasp.frames import Array, transform_points
 from drakegrasp.hand.chains import Chain
@@ -30,17 +30,17 @@ from drakegrasp.hand.kinematics import (
     link_poses,
     still_links,
 )
-from drakegrasp.hand.shapes import hull_triangles, link_shapes, pad_surfaces
+from drakegrasp.hand.shapes import link_shapes, ray_span
 from drakegrasp.visualization.still_scene import Poses, StillScene
 
 #: The origin of {G} may lie this deep in the hand [m]: in the Barrett Hand it is 1.35 mm deep.
 PALM_DEPTH = 0.005
 #: Length of the palm ray that must be free [m].
 RAY = 0.3
-#: A plane whose normal has less of Gz than this is parallel to it.
-PARALLEL = 1e-9
-#: A pad point lies on its fingertip within this distance, and pads that come so close meet [m].
-ON_SURFACE, MEETING = 0.003, 0.008
+#: Pads that come so close meet [m].
+MEETING = 0.008
+#: The hand may reach so far beyond its pinch along +Gz [m]: farther, the palm cannot face a table.
+BEYOND_PINCH = 0.1
 #: Postures on the way from the open to the closed hand, and of each of two fingers that meet.
 POSTURES, MEETING_STEPS = 40, 40
 #: Links of different fingers may overlap by so much before their fingertips meet [m].
@@ -59,7 +59,7 @@ def check_order(hand: Hand) -> Finding:
     names = [finger.name for finger in hand.fingers]
     if hand.num_fingers < 3:
         return Finding(name="finger order", ok=True, text=", ".join(names))
-    points = _pad_points(hand, np.zeros(hand.num_fingers))
+    points = pad_points_at(hand, np.zeros(hand.num_fingers))
     centred = points[:, :2] - points[:, :2].mean(axis=0)
     angles = np.arctan2(centred[:, 1], centred[:, 0])
 
@@ -86,7 +86,7 @@ def check_palm(hand: Hand) -> Finding:
             continue
         X_GL = link_poses(hand, link, spread=0.0, closing=closing)
         for corners in shapes:
-            depth = _ray_end(transform_points(X_GL, corners))
+            depth = ray_end(transform_points(X_GL, corners))
             if depth > worst:
                 worst, blocked = depth, link
     faults = []
@@ -102,45 +102,25 @@ def check_palm(hand: Hand) -> Finding:
         )
 
     # The fingertips close in front of the palm.
-    height = float(_pad_points(hand, 0.5 * closed_positions(hand))[:, 2].mean())
+    height = float(pad_points_at(hand, 0.5 * closed_positions(hand))[:, 2].mean())
     if height <= 0.0:
         faults.append(
             f"+Gz must point to where the fingertips close, got them {-1e3 * height:.0f} mm behind "
             "the palm: check palm.rpy_deg"
         )
-    return judge(
-        "palm", faults, f"its ray is free; half-closed fingertips {1e3 * height:.0f} mm ahead"
-    )
-
-
-def check_pads(hand: Hand) -> Finding:
-    """Return whether each pad lies on its fingertip's surface and faces where the finger closes."""
-    # Distance of the pad points from the surface.
-    shapes, faults, areas = link_shapes(hand), [], []
-    facing = _facing(hand)
-    for i, (finger, pad) in enumerate(zip(hand.fingers, pad_surfaces(hand), strict=True)):
-        parts = [hull_triangles(corners) for corners in shapes[finger.fingertip]]
-        if not parts:
-            faults.append(f"link {finger.fingertip!r} must have a collision shape, got none")
-            continue
-        distance = min(_surface_distance(triangles, finger.p_FiP) for triangles in parts)
-        if distance > ON_SURFACE:
+    text = f"its ray is free; half-closed fingertips {1e3 * height:.0f} mm ahead"
+    pinch = None if faults else find_pinch(hand, WIDTH)
+    if pinch is not None:
+        # What is beyond the pinch meets the table before the fingertips meet the object.
+        beyond = reach(hand, np.array([0.0, 0.0, 1.0])) - float(pinch.p_GM[2])
+        text += f"; it reaches {1e3 * beyond:.0f} mm beyond what it pinches"
+        if beyond > BEYOND_PINCH:
             faults.append(
-                f"fingers.{i}.pad_point must lie on the surface of link {finger.fingertip!r}, "
-                f"got one {1e3 * distance:.1f} mm away"
+                "the palm must be able to face a table, but the hand reaches "
+                f"{1e3 * beyond:.0f} mm beyond what it pinches along +Gz: turn "
+                "palm.rpy_deg, or keep fingers that do not grasp away with preshape"
             )
-        if not len(pad):
-            faults.append(f"fingers.{i}.pad_region must hold a part of the surface, got none of it")
-            continue
-
-        # The pad must face the way that it moves.
-        if facing[i] <= 0.0:
-            faults.append(
-                f"the pad of finger {finger.name!r} must face where the finger closes, got its "
-                "back: check the pad_region, and the axis of the closing joint"
-            )
-        areas.append(1e6 * float(trimesh.triangles.area(pad).sum()))
-    return judge("pads", faults, f"{', '.join(f'{area:.0f}' for area in areas)} mm²")
+    return judge("palm", faults, text)
 
 
 def check_meeting(hand: Hand) -> Finding:
@@ -215,52 +195,10 @@ def _mover(chain: Chain) -> int | None:
     return int(found[0]) if len(found) else None
 
 
-def _pad_points(hand: Hand, closing: Array) -> Array:
-    """Return the pad points (k, 3) in {G} at closing positions (k,) [m]."""
-    X_GF = fingertip_poses(hand, spread=0.0, closing=closing)
-    points = [finger.p_FiP[None] for finger in hand.fingers]
-    return np.concatenate([transform_points(X, p) for X, p in zip(X_GF, points, strict=True)])
-
-
-def _facing(hand: Hand) -> Array:
-    """Return the cosine (k,) of the angle between each pad's normal and its motion, halfway."""
-    # Motion of the pad points as the fingers close.
-    half, step = 0.5 * closed_positions(hand), 1e-4 * hand.closing_unit
-    motion = _pad_points(hand, half + step) - _pad_points(hand, half)
-
-    # Mean normal of each pad's surface, out of the fingertip.
-    X_GF, shapes, cosines = fingertip_poses(hand, spread=0.0, closing=half), link_shapes(hand), []
-    for i, pad in enumerate(pad_surfaces(hand)):
-        corners = shapes[hand.fingers[i].fingertip]
-        if not len(pad) or not corners:
-            cosines.append(0.0)
-            continue
-        normals = np.cross(pad[:, 1] - pad[:, 0], pad[:, 2] - pad[:, 0])
-        centre = np.concatenate(corners).mean(axis=0)
-        inward = np.einsum("ij,ij->i", normals, pad.mean(axis=1) - centre) < 0.0
-        normals[inward] *= -1.0
-        normal = X_GF[i, :3, :3] @ normals.sum(axis=0)
-        length = np.linalg.norm(normal) * np.linalg.norm(motion[i])
-        cosines.append(float(normal @ motion[i] / length) if length > 0.0 else 0.0)
-    return np.array(cosines)
-
-
-def _ray_end(corners: Array) -> float:
+def ray_end(corners: Array) -> float:
     """Return where the ray along +Gz leaves a hull of corners (n, 3) in {G} [m]; 0 if it misses."""
-    # On the ray p = t z each plane n.p + d <= 0 of the hull is a limit of t.
-    equations = ConvexHull(corners).equations
-    slope, offset = equations[:, 2], equations[:, 3]
-    if (offset[np.abs(slope) < PARALLEL] > 0.0).any():
-        return 0.0
-    leaves, enters = slope >= PARALLEL, slope <= -PARALLEL
-    end = float((-offset[leaves] / slope[leaves]).min())
-    start = max(0.0, float((-offset[enters] / slope[enters]).max()))
-    return end if start <= end and start <= RAY else 0.0
-
-
-def _surface_distance(triangles: Array, point: Array) -> float:
-    near = trimesh.triangles.closest_point(triangles, np.tile(point, (len(triangles), 1)))
-    return float(np.linalg.norm(near - point, axis=1).min())
+    span = ray_span(corners, np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    return 0.0 if span is None or span[0] > RAY else max(span[1], 0.0)
 
 
 def _least_gap(hand: Hand, group: npt.NDArray[np.bool_]) -> float:

@@ -138,6 +138,13 @@ def closing_path(hand: Hand, steps: int) -> Array:
     return np.linspace(0.0, 1.0, steps)[:, None] * closed_positions(hand)
 
 
+def pad_points_at(hand: Hand, closing: Array) -> Array:
+    """Return the pad points (k, 3) in {G} at closing positions (k,) [m]."""
+    X_GF = fingertip_poses(hand, spread=0.0, closing=closing)
+    points = [finger.p_FiP[None] for finger in hand.fingers]
+    return np.concatenate([transform_points(X, p) for X, p in zip(X_GF, points, strict=True)])
+
+
 def _pad_point_paths(hand: Hand) -> Array:
     """Return the pad points (steps, k, 3) in {G} from the open hand to the limits [m]."""
     X_GF = fingertip_poses(hand, spread=0.0, closing=closing_path(hand, STEPS))

@@ -9,18 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from drakegrasp.commissioning import model_checks, motion_checks
+from drakegrasp.commissioning import model_checks, motion_checks, pad_checks
 from drakegrasp.commissioning.finding import Finding
-from drakegrasp.commissioning.trial_grasps import check_grasp
+from drakegrasp.commissioning.trial_grasps import GRASPS, check_grasp
 from drakegrasp.config import Config
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.runtime.blas import one_thread
-
-#: Objects that the hand must grasp.
-SHAPES = ("box", "cylinder")
 
 
 @one_thread
@@ -73,22 +70,23 @@ def _findings(name_or_yaml: str | Path, config: Config) -> Iterator[Finding]:
 
     # Geometry, then grasps.
     sound = True
-    for finding in _geometry(hand):
+    for finding in check_geometry(hand):
         sound = sound and finding.ok
         yield finding
     if sound:
-        for shape in SHAPES:
-            yield check_grasp(hand, config, shape)
+        for shape, line in GRASPS:
+            yield check_grasp(hand, config, shape, line)
 
 
-def _geometry(hand: Hand) -> Iterator[Finding]:
+def check_geometry(hand: Hand) -> Iterator[Finding]:
+    """Yield what is right and wrong about a hand's geometry; nothing is simulated."""
     # Seen from behind, fingers run the other way round.
     palm = motion_checks.check_palm(hand)
     yield palm
     if not palm.ok:
         return
     yield motion_checks.check_order(hand)
-    pads = motion_checks.check_pads(hand)
+    pads = pad_checks.check_pads(hand)
     yield pads
     if pads.ok:
         yield motion_checks.check_meeting(hand)

@@ -194,7 +194,7 @@ def link_points(hand: Hand) -> dict[str, Array]:
     points = {}
     for link, shapes in link_shapes(hand).items():
         spacing = TIP_SPACING if link in hand.fingertip_links else LINK_SPACING
-        found = [_thinned_points(corners, spacing) for corners in shapes]
+        found = [even_points(corners, spacing) for corners in shapes]
         points[link] = np.concatenate([np.zeros((0, 3)), *found])
     return points
 
@@ -225,8 +225,8 @@ def _triangles(corners: Array) -> Array:
     return triangles
 
 
-def _thinned_points(corners: Array, spacing: float) -> Array:
-    """Return the corners of a convex shape and evenly spread points of its surface."""
+def even_points(corners: Array, spacing: float) -> Array:
+    """Return the corners (n, 3) of a convex shape and evenly spread points of its surface [m]."""
     points, owner = cover_triangles(_triangles(corners), spacing / 2.0)
     dense = np.concatenate([corners, points[np.argsort(owner, kind="stable")]])
 

@@ -17,6 +17,7 @@ from pydrake.geometry import (
     GeometryId,
     SceneGraph,
     SceneGraphInspector,
+    Shape,
     Sphere,
 )
 from pydrake.multibody.plant import MultibodyPlant
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 
 #: Corners of the polygon that replaces a circle and encloses it.
 CIRCLE = 16
+#: A plane whose normal has less of a line's direction than this is parallel to it.
+PARALLEL = 1e-9
 #: Twice the area of a triangle that counts as a line [m^2].
 SLIVER = 1e-12
 
@@ -80,6 +83,29 @@ def pad_surfaces(hand: Hand) -> tuple[Array, ...]:
     return tuple(surfaces)
 
 
+def hull_planes(corners: Array) -> Array:
+    """Return the planes (m, 4) of the convex hull of corners (n, 3) [m]: n.p + d <= 0 within."""
+    return np.asarray(ConvexHull(corners).equations)
+
+
+def ray_span(corners: Array, start: Array, direction: Array) -> tuple[float, float] | None:
+    """Return where a line enters and leaves the convex hull of corners; None if it misses.
+
+    Args:
+        corners: (n, 3) [m].
+        start: (3,), a point of the line [m].
+        direction: (3,), its unit of length; before the start, positions are negative.
+    """
+    # On the line p = start + t direction each plane n.p + d <= 0 of the hull is a limit of t.
+    planes = hull_planes(corners)
+    slope, offset = planes[:, :3] @ direction, planes[:, :3] @ start + planes[:, 3]
+    if (offset[np.abs(slope) < PARALLEL] > 0.0).any():
+        return None
+    out, into = slope >= PARALLEL, slope <= -PARALLEL
+    leaves, enters = (-offset[out] / slope[out]).min(), (-offset[into] / slope[into]).max()
+    return (float(enters), float(leaves)) if enters <= leaves else None
+
+
 def hull_triangles(corners: Array) -> Array:
     """Return the triangles (t, 3, 3) [m] of the convex hull of corners (n, 3) [m]."""
     hull = ConvexHull(corners)
@@ -117,28 +143,29 @@ def hull_corners(inspector: SceneGraphInspector, geometry: GeometryId) -> Array 
 
 def _corners(inspector: SceneGraphInspector, geometry: GeometryId) -> Array:
     """Return the corners of a shape in its body's frame."""
-    # Corners in the shape's own frame.
-    shape, hull = inspector.GetShape(geometry), hull_corners(inspector, geometry)
-    if hull is not None:
-        corners = hull
-    elif isinstance(shape, Box):
-        corners = _box(shape.size() / 2.0)
-    elif isinstance(shape, Cylinder):
-        corners = _prism(shape.radius(), shape.length() / 2.0)
-    elif isinstance(shape, Capsule):
-        ball = _ball(shape.radius())
-        ends = np.array([[0.0, 0.0, shape.length() / 2.0]])
-        corners = np.concatenate([ball + ends, ball - ends])
-    elif isinstance(shape, Sphere):
-        corners = _ball(shape.radius())
-    else:
+    # A mesh has a hull.
+    shape, corners = inspector.GetShape(geometry), hull_corners(inspector, geometry)
+    if corners is None:
+        corners = primitive_corners(shape)
+    if corners is None:
         raise HandError(
             f"{inspector.GetName(geometry)}: must be a box, cylinder, capsule, sphere or convex "
             f"mesh, got {type(shape).__name__}"
         )
-
     X_BS = inspector.GetPoseInFrame(geometry).GetAsMatrix4()
     return transform_points(X_BS, corners)
+
+
+def primitive_corners(shape: Shape) -> Array | None:
+    """Return points (n, 3) around a shape, in its frame [m]; None if it is no primitive."""
+    if isinstance(shape, Box):
+        return _box(shape.size() / 2.0)
+    if isinstance(shape, Cylinder):
+        return _prism(shape.radius(), shape.length() / 2.0)
+    if isinstance(shape, Capsule):
+        ball, end = ball_corners(shape.radius()), np.array([[0.0, 0.0, shape.length() / 2.0]])
+        return np.concatenate([ball + end, ball - end])
+    return ball_corners(shape.radius()) if isinstance(shape, Sphere) else None
 
 
 def _box(half: Array) -> Array:
@@ -154,11 +181,11 @@ def _prism(radius: float, half_length: float) -> Array:
     return np.concatenate(ends)
 
 
-def _ball(radius: float) -> Array:
-    """Return points on a sphere about the origin."""
+def ball_corners(radius: float, count: int = CIRCLE**2) -> Array:
+    """Return points (count, 3) on a sphere about the origin [m]."""
     # A Fibonacci lattice: even spacing without poles.
-    i = np.arange(CIRCLE**2) + 0.5
-    z, turn = 1.0 - 2.0 * i / CIRCLE**2, np.pi * (1.0 + np.sqrt(5.0)) * i
+    i = np.arange(count) + 0.5
+    z, turn = 1.0 - 2.0 * i / count, np.pi * (1.0 + np.sqrt(5.0)) * i
     across = np.sqrt(1.0 - z**2)
     sine, cosine = sin_cos(turn)
     return radius * np.column_stack([across * cosine, across * sine, z])

@@ -45,6 +45,8 @@ LIGHTING = Lighting(
 )
 #: Edge of a panel [px] and its size in the figure [inch].
 PIXELS, INCHES = 480, 2.4
+#: Room for the sign and the gap of a label in the legend [letters].
+SPACE = 5
 #: Where the camera stands: beside the line along which fingers close, and above [rad].
 AZIMUTH, ELEVATION = np.deg2rad(25.0), np.deg2rad(20.0)
 
@@ -79,8 +81,9 @@ def picture_hand(hand: Hand, png: Path, *, across: float) -> None:
         hide_ticks(axes)
     entries = [(f"pad of {finger.name}", _colour(i)) for i, finger in enumerate(hand.fingers)]
     entries += list(AXIS_COLOURS.items())
+    letters = [len(label) + SPACE for label, _ in entries]
     for i, (label, colour) in enumerate(entries):
-        left = 0.1 + i * (width - 0.2) / len(entries)
+        left = 0.1 + sum(letters[:i]) * (width - 0.2) / sum(letters)
         text = f"\N{BLACK SQUARE} {label}"
         figure.text(left / width, 0.16 / height, text, color=colour, fontsize=8)
     save_figure(figure, png, dpi=200)

@@ -189,7 +189,7 @@ def test_a_spoilt_hand_fails_with_a_message_that_names_the_fault(
     tmp_path: Path, fault: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No other check fails, and none of these needs a simulation to be seen."""
-    monkeypatch.setattr("drakegrasp.commissioning.run.SHAPES", ())
+    monkeypatch.setattr("drakegrasp.commissioning.run.GRASPS", ())
     name, spoil, check, message = FAULTS[fault]
     path = write_tongs(tmp_path) if name == "tongs" else copied(tmp_path, name)
     spoil(path if name != "tongs" else tmp_path / "tongs.yaml")
@@ -237,7 +237,7 @@ SOUND: dict[str, tuple[str, tuple[Callable[[Path], None], ...]]] = {
 def test_a_sound_hand_passes_whatever_else_its_model_has(
     tmp_path: Path, change: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("drakegrasp.commissioning.run.SHAPES", ())
+    monkeypatch.setattr("drakegrasp.commissioning.run.GRASPS", ())
     name, changes = SOUND[change]
     path = write_tongs(tmp_path) if name == "tongs" else copied(tmp_path, name)
     for edit in changes:
@@ -256,4 +256,7 @@ def test_every_hand_of_the_package_passes(name: str) -> None:
     findings = check_hand(name, report=reported.append)
     assert [finding.text for finding in findings if not finding.ok] == []
     assert reported == findings
-    assert [finding.name for finding in findings[-2:]] == ["grasp of a box", "grasp of a cylinder"]
+    assert [finding.name for finding in findings[-2:]] == [
+        "cylinder, level",
+        "sphere, level",
+    ]

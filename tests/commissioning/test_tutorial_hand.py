@@ -12,6 +12,7 @@ from helpers.hands import write_tongs
 from helpers.machine import needs_egl
 
 from drakegrasp.cli.main import main
+from drakegrasp.commissioning import trial_grasps
 from drakegrasp.hand.file_format import Coupling, Finger, HandFile, Palm, Spread
 
 PAGE = PATH.read_text()
@@ -38,7 +39,7 @@ def test_the_tutorial_hand_passes_every_check_of_the_page(tongs: Path) -> None:
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-GRASPS = ("grasp of a box", "grasp of a cylinder")
+GRASPS = [f"{shape}, {line}" for shape, line in trial_grasps.GRASPS]
 
 
 def test_a_fault_ends_the_command_with_one(tongs: Path) -> None:

@@ -223,7 +223,7 @@ def test_a_hand_whose_files_have_changed_is_another(tmp_path: Path) -> None:
 
 def test_an_unknown_hand_is_refused_with_the_hands_there_are() -> None:
     with pytest.raises(
-        HandError, match=r"hand must be one of allegro, .*franka or a YAML file, got 'shadow'"
+        HandError, match=r"hand must be one of allegro, .*leap or a YAML file, got 'shadow'"
     ):
         load_hand("shadow")
 

@@ -10,7 +10,7 @@ from helpers.hands import write_pincer
 
 from drakegrasp.frames import invert_pose, transform_points
 from drakegrasp.hand.description import load_hand
-from drakegrasp.hand.finger_sweep import _thinned_points, hand_paths, pad_points
+from drakegrasp.hand.finger_sweep import even_points, hand_paths, pad_points
 from drakegrasp.hand.kinematics import coordinate_limits, fingertip_poses, link_poses
 from drakegrasp.hand.shapes import link_shapes
 
@@ -59,7 +59,7 @@ def test_points_leave_no_gap_on_a_surface():
     """On a box: all corners, and one point in each cell of the grid that it crosses."""
     half, spacing = np.array([0.051, 0.033, 0.021]), 0.004
     corners = np.array(list(itertools.product(*zip(-half, half, strict=True))))
-    points = _thinned_points(corners, spacing)
+    points = even_points(corners, spacing)
     np.testing.assert_array_equal(points[:8], corners)
     assert len(np.unique(np.floor(points[8:] / spacing), axis=0)) == len(points) - 8
     rng = np.random.default_rng(0)

@@ -30,7 +30,19 @@ ALLEGRO = """
 #: @c11f000 and franka_description @b299b39.
 FRANKA = ((0.0, 40.0), (0.01, 30.0), (0.02, 20.0), (0.03, 10.0), (0.035, 5.0), (0.04, 0.0))
 #: Number of fingers and of numbers in a grasp.
-FINGERS = {"allegro": (3, 18), "allegro_four": (4, 24), "barrett": (3, 18), "franka": (2, 12)}
+FINGERS = {
+    "allegro": (3, 18), "allegro_four": (4, 24), "barrett": (3, 18), "franka": (2, 12),
+    "leap": (3, 18),
+}  # fmt: skip
+#: Points of the tips in the fingertip links [m]; closing angle [rad], and where they are in {G}
+#: [mm], from the joint table of dex-urdf @93505db and LEAP_Hand_Sim @150bc3d.
+LEAP_TIPS = np.array([[0.0, -0.038, 0.0145], [0.0, -0.038, 0.0145], [0.0, -0.050, -0.0145]])
+LEAP = """
+0.0  -23.1 -128.7 -0.3   22.3 -128.6 -0.3   2.3 86.7 112.9
+0.2  -23.1 -113.7 40.4   22.3 -113.6 40.4   2.4 65.0 113.7
+0.5  -23.1  -66.9 81.7   22.3  -66.8 81.7   1.4 33.5 105.7
+0.7  -23.1  -28.0 90.4   22.3  -27.9 90.4   0.0 14.8  94.7
+"""
 
 
 def points(X_GF: Array, p_FP: Array) -> Array:
@@ -46,13 +58,15 @@ def test_these_hands_come_with_the_package() -> None:
         assert hand.payload is not None
 
 
-@pytest.mark.parametrize("row", ALLEGRO.strip().splitlines())
-def test_allegro_is_where_its_joint_table_puts_it(row: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "p_FP", "row"),
+    [("allegro", ALLEGRO_TIPS, row) for row in ALLEGRO.strip().splitlines()]
+    + [("leap", LEAP_TIPS, row) for row in LEAP.strip().splitlines()],
+)
+def test_a_hand_is_where_its_joint_table_puts_it(name: str, p_FP: Array, row: str) -> None:
     closing, *numbers = map(float, row.split())
-    X_GF = fingertip_poses(load_hand("allegro"), spread=0.0, closing=[closing] * 3)
-    np.testing.assert_allclose(
-        1e3 * points(X_GF, ALLEGRO_TIPS), np.reshape(numbers, (3, 3)), atol=0.1
-    )
+    X_GF = fingertip_poses(load_hand(name), spread=0.0, closing=[closing] * 3)
+    np.testing.assert_allclose(1e3 * points(X_GF, p_FP), np.reshape(numbers, (3, 3)), atol=0.1)
 
 
 def test_four_fingers_are_those_of_the_same_model() -> None:

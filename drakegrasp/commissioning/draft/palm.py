@@ -1,0 +1,149 @@
+"""The palm frame G of a grip: where the palm's surface is, and which way it faces.
+
+In: a model and a `Grip`. Out: poses X_BG, the best first. Gz is square to the line along which the
+fingers close, and its ray from the palm to the pinch is free; Gy points to the finger that opposes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.math import RollPitchYaw, RotationMatrix
+
+from drakegrasp.commissioning.draft.opposition import Grip
+from drakegrasp.commissioning.motion_checks import PALM_DEPTH, ray_end
+from drakegrasp.frames import Array, invert_pose, make_pose, transform_points
+from drakegrasp.hand.shapes import ray_span
+from drakegrasp.hand.vendor.model import VendorModel
+
+#: Directions that are tried: their steps [deg], and how near an axis of the palm counts as one.
+STEP_DEG, ALIGNED = 15, np.deg2rad(15.0)
+#: The pinch is at least so far in front of the palm [m].
+AHEAD = 0.015
+#: What it costs to face aside of the line from the palm to the pinch [1/rad], that a link reaches
+#: farther than `BEYOND` beyond the pinch [1/m], to face no axis of the palm, and that the palm is
+#: beside the ray.
+ASIDE, BEYOND, FAR, OBLIQUE, BESIDE = 0.5, 0.03, 12.0, 0.15, 0.3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PalmFrame:
+    """A palm frame.
+
+    Attributes:
+        p_BG: (3,) [m].
+        rpy_deg: (3,) [deg].
+        height: Of the pinch above the palm [m].
+        cost: How unusual it is.
+    """
+
+    p_BG: Array
+    rpy_deg: Array
+    height: float
+    cost: float
+
+    @property
+    def X_BG(self) -> Array:
+        """The pose (4, 4)."""
+        R = RollPitchYaw(np.deg2rad(self.rpy_deg)).ToRotationMatrix().matrix()
+        return make_pose(R, self.p_BG)
+
+
+def find_palm_frames(
+    model: VendorModel,
+    palm: str,
+    grip: Grip,
+    postures: Sequence[Mapping[str, float]],
+    approach: Array | None,
+) -> list[PalmFrame]:
+    """Return the palm frames of a grip, the best first; none if the palm faces no pinch.
+
+    Args:
+        model: The model.
+        palm: Link B.
+        grip: The fingers.
+        postures: Positions of all joints, from the open to the closed hand.
+        approach: (3,), +Gz in B, if it is known.
+    """
+
+    # The corners of each shape in B, in the open hand, and of all links on the way.
+    def placed(posture: Mapping[str, float]) -> list[Array]:
+        return [
+            transform_points(model.pose(name, posture, palm), shape.corners())
+            for name, link in model.links.items()
+            if name == palm or (model.chain(name, palm)[:1] and _carried(model, name, palm))
+            for shape in link.collisions
+        ]
+
+    opened = placed(postures[0])
+    cloud = np.concatenate([c for posture in postures for c in placed(posture)])
+    parts = [shape.corners() for shape in model.links[palm].collisions] or opened
+    frames = []
+    centre = np.concatenate(parts).mean(axis=0)
+    for direction, aside in _directions(grip, centre, approach):
+        frame = _frame(grip, direction, parts)
+        if frame is None:
+            continue
+        p_BG, beside = frame
+        X_BG = _pose(grip, direction, p_BG)
+        inside = [transform_points(invert_pose(X_BG), corners) for corners in opened]
+        if max(map(ray_end, inside)) > PALM_DEPTH:
+            continue
+        beyond = float((cloud @ direction).max() - grip.middle @ direction)
+        oblique = np.arccos(min(float(np.abs(direction).max()), 1.0)) > 1e-3
+        rpy = RotationMatrix.ProjectToRotationMatrix(X_BG[:3, :3]).ToRollPitchYaw().vector()
+        frames.append(
+            PalmFrame(
+                p_BG=np.round(X_BG[:3, 3], 4) + 0.0,
+                rpy_deg=np.round(np.rad2deg(rpy), 1) + 0.0,
+                height=float((grip.middle - p_BG) @ direction),
+                cost=ASIDE * aside
+                + FAR * max(beyond - BEYOND, 0.0)
+                + OBLIQUE * oblique
+                + BESIDE * beside,
+            )
+        )
+    return sorted(frames, key=lambda frame: frame.cost)
+
+
+def _carried(model: VendorModel, link: str, palm: str) -> bool:
+    return model.chain(link, palm)[0].parent == palm
+
+
+def _directions(grip: Grip, centre: Array, approach: Array | None) -> list[tuple[Array, float]]:
+    """Return unit directions (3,) that Gz may have, and how far they are aside [rad]."""
+    if approach is not None:
+        return [(approach / np.linalg.norm(approach), 0.0)]
+    axis = grip.axis
+    line = grip.middle - centre
+    line = line - (line @ axis) * axis
+    if np.linalg.norm(line) < 1e-6:
+        line = np.cross(axis, np.roll(axis, 1))
+    line /= np.linalg.norm(line)
+    third = np.cross(axis, line)
+    turns = np.deg2rad(np.arange(-165, 181, STEP_DEG))
+    found = [np.cos(t) * line + np.sin(t) * third for t in turns]
+    found += [own for own in (*np.eye(3), *-np.eye(3)) if abs(own @ axis) < np.sin(ALIGNED)]
+    return [(d, float(np.arccos(np.clip(d @ line, -1.0, 1.0)))) for d in found]
+
+
+def _frame(grip: Grip, direction: Array, parts: list[Array]) -> tuple[Array, bool] | None:
+    """Return the origin (3,) of G on the palm below the pinch, and whether the palm is beside."""
+    # Where the ray to the pinch leaves the palm, or else its foremost point.
+    spans = [ray_span(corners, grip.middle, direction) for corners in parts]
+    leaves = [span[1] for span in spans if span is not None]
+    if leaves:
+        back = max(leaves)
+    else:
+        ahead = max(float((corners @ direction).max()) for corners in parts)
+        back = min(ahead - float(grip.middle @ direction), -2.0 * AHEAD)
+    return (grip.middle + back * direction, not leaves) if back <= -AHEAD else None
+
+
+def _pose(grip: Grip, direction: Array, p_BG: Array) -> Array:
+    """Return X_BG (4, 4): Gz along a direction, Gy towards the finger that opposes."""
+    y = grip.axis - (grip.axis @ direction) * direction
+    y /= np.linalg.norm(y)
+    return make_pose(np.column_stack([np.cross(y, direction), y, direction]), p_BG)

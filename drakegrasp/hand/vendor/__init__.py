@@ -1,0 +1,1 @@
+"""Models of hands as vendors ship them, made into models that the package can use."""

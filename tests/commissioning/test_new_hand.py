@@ -1,0 +1,234 @@
+"""`drakegrasp hand new`: what is guessed of a hand, and what overrides it."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner
+from helpers.machine import needs_egl
+from helpers.vendors import JAWS, JAWS_MJCF, MITTEN, box, joint, link, write_model
+
+from drakegrasp.cli.main import main
+from drakegrasp.commissioning.draft.answers import Answers
+from drakegrasp.commissioning.draft.run import NewHand, draft_hand
+from drakegrasp.errors import HandError
+from drakegrasp.frames import transform_points
+from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.file_format import DrivenBy
+from drakegrasp.hand.files import MODELS
+from drakegrasp.hand.kinematics import closed_positions, fingertip_poses
+from drakegrasp.hand.strength import fingertip_forces
+
+
+@pytest.fixture(autouse=True)
+def no_simulation(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+    """Geometry decides, but in tests that are marked."""
+    if "sim" not in request.keywords:
+        monkeypatch.setattr("drakegrasp.commissioning.draft.run.GRASPS", ())
+
+
+def draft(folder: Path, text: str, name: str = "hand.urdf", **answers: object) -> NewHand:
+    path = write_model(folder / "vendor", text, name)
+    return draft_hand(path, folder / "out", answers=Answers(**answers))  # type: ignore[arg-type]
+
+
+def pads(hand: Hand, share: float) -> np.ndarray:
+    """Return the pad points (k, 3) in {G} when the hand has closed by a share."""
+    X_GF = fingertip_poses(hand, spread=0.0, closing=share * closed_positions(hand))
+    points = [
+        transform_points(X, f.p_FiP[None])[0] for X, f in zip(X_GF, hand.fingers, strict=True)
+    ]
+    return np.array(points)
+
+
+@pytest.mark.parametrize(("text", "name"), [(JAWS, "jaws.urdf"), (JAWS_MJCF, "jaws.xml")])
+def test_jaws_that_open_at_positive_positions_are_turned_round(
+    tmp_path: Path, text: str, name: str
+) -> None:
+    drafted = draft(tmp_path, text, name)
+    assert [finding.text for finding in drafted.findings if not finding.ok] == []
+    hand = load_hand(drafted.path)
+    assert hand.palm_link == "body"
+    np.testing.assert_allclose(hand.X_BG[:3, 2], [0.0, 0.0, 1.0], atol=1e-9)
+    # 100 mm apart at zero, closed at the limit; the pads are at the ends of the jaws.
+    gaps = [np.linalg.norm(np.diff(pads(hand, share), axis=0)) for share in (0.0, 1.0)]
+    np.testing.assert_allclose(gaps, [0.1, 0.0], atol=1e-6)
+    assert all(p[2] > 0.04 for p in pads(hand, 0.5))
+    # One motor moves both jaws with 60 N each.
+    driver, driven = hand.fingers
+    assert (driver.force_limit, driven.driven_by) == (120.0, DrivenBy(finger=driver.name))
+
+
+def test_fingers_oppose_a_thumb_whose_base_is_turned(tmp_path: Path) -> None:
+    """Counter-clockwise, the thumb last; couplings are the model's."""
+    drafted = draft(tmp_path, MITTEN)
+    assert [finding.text for finding in drafted.findings if not finding.ok] == []
+    hand = load_hand(drafted.path)
+    names = [finger.name for finger in hand.fingers]
+    assert names[-1] == "thumb"
+    assert sorted(names) == ["index", "middle", "thumb"]
+    for finger in hand.fingers[:-1]:
+        (coupling,) = finger.coupled
+        assert coupling.ratio == pytest.approx(0.8)
+    assert set(hand.preshape) == {"thumb_turn"}
+    # The palm faces +x of its link.
+    assert hand.X_BG[0, 2] > 0.9
+
+
+def test_bars_of_a_linkage_are_no_fingers(tmp_path: Path) -> None:
+    """A bar of the jaws' motor, which reaches less far than they do."""
+    bar = link("bar", 0.01, box("0.01 0.01 0.02", "0 0 0.01")) + joint(
+        "bar_slide", "prismatic", "body", "bar", "0.02 0 0", "0 1 0", "0 0.05 60",
+        '<mimic joint="left_slide"/>',
+    )  # fmt: skip
+    hand = load_hand(draft(tmp_path, JAWS.replace("</robot>", bar + "</robot>")).path)
+    assert set(hand.fingertip_links) == {"left_jaw", "right_jaw"}
+    assert any(c.joint == "bar_slide" for finger in hand.fingers for c in finger.coupled)
+
+
+def test_a_bar_may_be_the_joint_that_leads(tmp_path: Path) -> None:
+    """As in grippers whose fingers follow a knuckle beside them."""
+    bar = link("bar", 0.01, box("0.01 0.01 0.02", "0 0 0.01")) + joint(
+        "knuckle", "prismatic", "body", "bar", "0.02 0 0", "0 1 0", "0 0.05 60"
+    )
+    text = JAWS.replace('"left_slide"/>', '"knuckle"/>').replace("</robot>", bar + "</robot>")
+    slide = text.index("</joint>", text.index('name="left_slide"'))
+    hand = load_hand(draft(tmp_path, text[:slide] + '<mimic joint="knuckle"/>' + text[slide:]).path)
+    driver, driven = hand.fingers
+    assert (driver.force_limit, driven.driven_by) == (120.0, DrivenBy(finger=driver.name))
+    assert any(c.joint == "knuckle" for finger in hand.fingers for c in finger.coupled)
+
+
+def test_both_sides_press_equally(tmp_path: Path) -> None:
+    """Two fingers of 1 N m would press harder than the thumb resists, or the other way round."""
+    index, middle, thumb = fingertip_forces(load_hand(draft(tmp_path, MITTEN).path), "torque")
+    assert index + middle == pytest.approx(thumb, rel=0.15)
+
+
+def test_an_effort_is_that_of_the_weakest_joint(tmp_path: Path) -> None:
+    """A thumb whose last joint has a tenth of the torque presses less."""
+    weak = MITTEN.replace(
+        'name="thumb_2" type="revolute"><parent link="thumb_near"/><child link="thumb_far"/>'
+        '<origin xyz="0.04 0 0"/><axis xyz="0 -1 0"/><limit lower="0" upper="1.2" effort="1.0"',
+        'name="thumb_2" type="revolute"><parent link="thumb_near"/><child link="thumb_far"/>'
+        '<origin xyz="0.04 0 0"/><axis xyz="0 -1 0"/><limit lower="0" upper="1.2" effort="0.1"',
+    )
+    assert weak != MITTEN
+    limits = []
+    for n, text in enumerate((MITTEN, weak)):
+        hand = load_hand(draft(tmp_path / str(n), text).path)
+        limits.append(hand.fingers[-1].torque_limit)
+    assert limits[1] < 0.5 * limits[0]
+
+
+def test_spread_joints_are_told_from_those_that_close(tmp_path: Path) -> None:
+    """From SDFormat, with meshes, of the package's own hand."""
+    drafted = draft_hand(MODELS / "barrett_hand.sdf", tmp_path / "out", answers=Answers(effort=2.0))
+    assert [finding.text for finding in drafted.findings if not finding.ok] == []
+    hand, own = load_hand(drafted.path), load_hand("barrett")
+    assert set(hand.spread.joints) == set(own.spread.joints)
+    assert {f.closing_joint for f in hand.fingers} == {f.closing_joint for f in own.fingers}
+    assert {f.fingertip for f in hand.fingers} == set(own.fingertip_links)
+    np.testing.assert_allclose(hand.X_BG[:3, 2], own.X_BG[:3, 2], atol=0.02)
+    np.testing.assert_allclose(hand.X_BG[2, 3], own.X_BG[2, 3], atol=0.005)
+
+
+def test_the_folder_is_complete_by_itself(tmp_path: Path) -> None:
+    """With the vendor's licence."""
+    vendor = tmp_path / "vendor"
+    write_model(vendor, "MIT", "LICENSE.txt")
+    drafted = draft(tmp_path, MITTEN)
+    shutil.rmtree(vendor)
+    moved = tmp_path / "moved"
+    drafted.path.parent.rename(moved)
+    assert load_hand(moved / drafted.path.name).num_fingers == 3
+    assert (moved / "LICENSE.txt").read_text() == "MIT"
+
+
+def test_each_guess_has_a_comment(tmp_path: Path) -> None:
+    text = draft(tmp_path, MITTEN).path.read_text()
+    told = r"\s*(#.*|version:.*|model:.*|palm:|preshape:|- name:.*|- \{joint.*)?"
+    bare = [line for line in text.splitlines() if "#" not in line]
+    assert [line for line in bare if not re.fullmatch(told, line)] == []
+    # And a head that says what to do.
+    assert text.startswith("# Drafted from hand.urdf by `drakegrasp hand new`.")
+
+
+def test_answers_override_guesses(tmp_path: Path) -> None:
+    drafted = draft(
+        tmp_path,
+        MITTEN,
+        palm="palm",
+        approach=np.array([1.0, 0.0, 0.0]),
+        fingers=("index_far", "thumb_far"),
+        joints={"thumb_turn": 0.3},
+        effort=0.5,
+        settings=("drive=torque", "payload=0.2"),
+    )
+    tree = yaml.safe_load(drafted.path.read_text())
+    assert {finger["fingertip"] for finger in tree["fingers"]} == {"index_far", "thumb_far"}
+    assert tree["preshape"]["thumb_turn"] == 0.3
+    assert (tree["drive"], tree["payload"]) == ("torque", 0.2)
+    np.testing.assert_allclose(load_hand(drafted.path).X_BG[:3, 2], [1.0, 0.0, 0.0], atol=2e-3)
+    limits = [finger["torque_limit"] for finger in tree["fingers"]]
+    whole = yaml.safe_load(draft(tmp_path / "whole", MITTEN).path.read_text())
+    assert max(limits) <= 0.5 * 1.6
+    assert "middle_1" in tree["preshape"]
+    assert "middle_1" not in whole.get("preshape", {})
+
+
+def test_a_joint_that_is_given_a_position_does_not_close(tmp_path: Path) -> None:
+    drafted = draft(tmp_path, MITTEN, joints={"thumb_2": 0.4})
+    hand = load_hand(drafted.path)
+    assert hand.preshape["thumb_2"] == 0.4
+    assert hand.fingers[-1].coupled == ()
+
+
+def test_fingers_that_close_side_by_side_are_no_hand(tmp_path: Path) -> None:
+    """The message says what may be answered."""
+    with pytest.raises(HandError, match=r"close against each other: .* --joint NAME=POSITION"):
+        draft(tmp_path, MITTEN, fingers=("index_far", "middle_far"))
+
+
+@pytest.mark.parametrize(
+    ("answers", "message"),
+    [
+        ({"palm": "wrist"}, r"--palm must be one of body, .* got 'wrist'"),
+        ({"fingers": ("left_jaw", "thumb")}, r"--fingers must be of .* got 'thumb'"),
+        ({"joints": {"thumb": 0.0}}, r"--joint must name one of left_slide, .* got 'thumb'"),
+        ({"joints": {"left_slide": 1.0}}, r"--joint left_slide must be 0..0.05, got 1"),
+        ({"reverse": ("thumb",)}, r"--reverse must name one of .* got 'thumb'"),
+        ({"settings": ("drive",)}, r"--set must be KEY=VALUE"),
+    ],
+)
+def test_an_answer_that_cannot_be_used_is_refused(
+    tmp_path: Path, answers: dict[str, object], message: str
+) -> None:
+    with pytest.raises(HandError, match=message):
+        draft(tmp_path, JAWS, **answers)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_with_files_is_not_written_over(tmp_path: Path) -> None:
+    write_model(tmp_path / "out", "mine", "notes.txt")
+    with pytest.raises(HandError, match="--out must be a new or empty folder"):
+        draft(tmp_path, JAWS)
+    assert (tmp_path / "out" / "notes.txt").read_text() == "mine"
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+@needs_egl
+def test_a_drafted_gripper_passes_every_check(tmp_path: Path) -> None:
+    """Two commands, and no answer."""
+    path, out = write_model(tmp_path, JAWS, "jaws.urdf"), tmp_path / "out"
+    result = CliRunner().invoke(main, ["hand", "new", str(path), "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    assert (out / "jaws_hand.png").read_bytes().startswith(b"\x89PNG")
+    result = CliRunner().invoke(main, ["hand", "check", str(out / "jaws_hand.yaml")])
+    assert result.exit_code == 0, result.output

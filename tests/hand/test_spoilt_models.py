@@ -1,0 +1,266 @@
+"""Spoilt models of hands: each is refused in one line that names the fault."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from helpers.vendors import JAWS, JAWS_MJCF, fixed, link, write_model
+
+from drakegrasp.cli.main import main
+
+MIMIC = '<mimic joint="left_slide"/>'
+JAW = '<geometry><box size="0.02 0.012 0.06"/></geometry>'
+EMPTY = '<model name="{}"><link name="x"/></model>'
+BOMB = '<!DOCTYPE r [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;&a;&a;">]>'
+
+
+def changed(old: str, new: str, *, text: str = JAWS, count: int = -1) -> str:
+    assert old in text
+    return text.replace(old, new, count)
+
+
+def mesh(uri: str) -> str:
+    return changed(JAW, f'<geometry><mesh filename="{uri}"/></geometry>', count=1)
+
+
+#: A model, the name of its file, and what is said of it.
+SPOILT: dict[str, tuple[str, str, str]] = {
+    "not XML": ("<robot", "hand.urdf", "must be XML, got text that is not"),
+    "empty": ("", "hand.urdf", "must be XML, got text that is not"),
+    "another language": ("<html/>", "hand.urdf", "must be a model in URDF, SDFormat or MJCF"),
+    "xacro": (JAWS, "hand.xacro", "must be URDF, got xacro: run `xacro hand.xacro"),
+    "another suffix": (JAWS, "hand.step", r"must end in \.urdf, \.sdf or \.xml"),
+    "XML bomb": (BOMB + changed('name="jaws"', 'name="&b;"'), "hand.urdf", "document type"),
+    "deep": ("<robot>" + "<a>" * 5000 + "</a>" * 5000 + "</robot>", "hand.urdf", "200 levels"),
+    "missing mesh": (mesh("lost.stl"), "hand.urdf", "lost.stl' must be a file, got none"),
+    "mesh of the web": (mesh("https://x.org/a.stl"), "hand.urdf", "nothing is fetched"),
+    "mesh of another format": (mesh("jaw.step"), "hand.urdf", r"one of \.obj, .* got '\.step'"),
+    "broken mesh": (mesh("broken.glb"), "hand.urdf", "broken.glb' must be readable, got"),
+    "loop": (
+        changed("</robot>", fixed("bridge", "right_jaw", "left_jaw") + "</robot>"),
+        "hand.urdf",
+        "link 'left_jaw'|loop",
+    ),
+    "links in a circle": (
+        changed("</robot>", fixed("bridge", "left_jaw", "mount") + "</robot>"),
+        "hand.urdf",
+        "one tree of links|loop",
+    ),
+    "two trees": (
+        changed("</robot>", link("other", 0.1, JAW) + "</robot>"),
+        "hand.urdf",
+        r"must be one tree of links, with one root, got 2 \(.*other\)",
+    ),
+    "negative mass": (
+        changed('<mass value="0.05"/>', '<mass value="-0.05"/>', count=1),
+        "hand.urdf",
+        "link 'left_jaw' must have a mass of 0 kg or more, got -0.05",
+    ),
+    "mass that is no number": (
+        changed('<mass value="0.05"/>', '<mass value="heavy"/>', count=1),
+        "hand.urdf",
+        "mass of link 'left_jaw' must be a number, got 'heavy'",
+    ),
+    "units in mm": (
+        changed(JAW, '<geometry><box size="20 12 60"/></geometry>'),
+        "hand.urdf",
+        "must be a hand in metres, got one of 6[0-9] m",
+    ),
+    "circle of mimics": (
+        changed(
+            '<limit lower="0" upper="0.05" effort="60" velocity="1"/></joint>',
+            '<limit lower="0" upper="0.05" effort="60" velocity="1"/>'
+            '<mimic joint="right_slide"/></joint>',
+            count=1,
+        ),
+        "hand.urdf",
+        "joint '(left|right)_slide' must follow a joint that leads, got a circle of mimics",
+    ),
+    "mimic of nothing": (
+        changed(MIMIC, '<mimic joint="thumb"/>'),
+        "hand.urdf",
+        "thumb",
+    ),
+    "no shapes": (
+        re.sub(r"<(collision|visual)>.*?</\1>", "", JAWS),
+        "hand.urdf",
+        "must have shapes, got links without any",
+    ),
+    "joint that floats": (
+        changed(MIMIC, "").replace(
+            'name="right_slide" type="prismatic"', 'name="right_slide" type="planar"'
+        ),
+        "hand.urdf",
+        "joint 'right_slide' must be revolute, prismatic or fixed",
+    ),
+    "limits the wrong way": (
+        changed('lower="0" upper="0.05"', 'lower="0.05" upper="0"', count=1),
+        "hand.urdf",
+        "lower|limit",
+    ),
+    "effort of a placeholder": (
+        changed('effort="60"', 'effort="0"'),
+        "hand.urdf",
+        r"the effort of joint '\w+_slide' must be 0.5..1000 N, got 0 in the model: .* --effort N",
+    ),
+    "one finger": (
+        re.sub(r'<link name="right_jaw">.*?</link>\n', "", JAWS, flags=re.DOTALL).replace(
+            JAWS[JAWS.index('<joint name="right_slide"') : JAWS.index('<joint name="left_end_')],
+            "",
+        ),
+        "hand.urdf",
+        r"must have two fingers or more, got one chain of links: .* --palm LINK",
+    ),
+    "includes itself": (
+        changed("<worldbody>", '<include file="hand.xml"/><worldbody>', text=JAWS_MJCF),
+        "hand.xml",
+        "got a loop of them",
+    ),
+    "curve in place of a line": (
+        changed('"0 1 0 0 0"', '"0 1 2 0 0"', text=JAWS_MJCF),
+        "hand.xml",
+        "polycoef of joint 'right_slide' must be a line, got a curve",
+    ),
+    "mass without a value": (
+        changed('<mass value="0.05"/>', '<mass value="nan"/>', count=1),
+        "hand.urdf",
+        "link 'left_jaw' must have a mass of 0 kg or more, got nan",
+    ),
+    "effort that is no number": (
+        changed('effort="60"', 'effort="strong"', count=1),
+        "hand.urdf",
+        "effort of joint 'left_slide' must be a number, got 'strong'",
+    ),
+    "multiplier that is no number": (
+        changed(MIMIC, '<mimic joint="left_slide" multiplier="twice"/>'),
+        "hand.urdf",
+        "multiplier of a mimic must be a number, got 'twice'",
+    ),
+    "mimic without motion": (
+        changed(MIMIC, '<mimic joint="left_slide" multiplier="0"/>'),
+        "hand.urdf",
+        "joint 'right_slide' must follow 'left_slide' by a ratio, got 0",
+    ),
+    "equality with nothing": (
+        changed('joint2="left_slide"', 'joint2="lost"', text=JAWS_MJCF),
+        "hand.xml",
+        "joint 'right_slide' must follow a joint that moves, got 'lost'",
+    ),
+    "axis of no length": (
+        changed('<axis xyz="0 1 0"/>', '<axis xyz="0 0 0"/>', count=1),
+        "hand.urdf",
+        "'left_slide' axis is zero",
+    ),
+    "origin that is no number": (
+        changed('xyz="0 0 0.1"', 'xyz="0 0 nan"'),
+        "hand.urdf",
+        "Expected 3 values for attribute xyz got 0 0 nan",
+    ),
+    "size below zero": (
+        changed(JAW, '<geometry><box size="-0.02 0.012 0.06"/></geometry>', count=1),
+        "hand.urdf",
+        "width = -0.02",
+    ),
+    "missing link": (
+        changed('<child link="left_jaw"/>', '<child link="lost"/>'),
+        "hand.urdf",
+        "Could not find link named 'lost'",
+    ),
+    "link without a name": (
+        changed('<link name="left_end"/>', "<link/>"),
+        "hand.urdf",
+        "link tag is missing name attribute",
+    ),
+    "two links of a name": (
+        changed("</robot>", link("left_jaw", 0.1, JAW) + "</robot>"),
+        "hand.urdf",
+        "already contains a body named 'left_jaw'",
+    ),
+    "link that carries itself": (
+        changed(
+            '<parent link="body"/><child link="left_jaw"/>',
+            '<parent link="left_jaw"/><child link="left_jaw"/>',
+        ),
+        "hand.urdf",
+        "connect body left_jaw to itself",
+    ),
+    "joints without limits": (
+        changed('<limit lower="0" upper="0.05" effort="60" velocity="1"/>', ""),
+        "hand.urdf",
+        "no fingers of left_jaw, right_jaw close against each other: .* --reverse JOINT",
+    ),
+    "joint without a range": (
+        changed('upper="0.05"', 'upper="0"'),
+        "hand.urdf",
+        "must have two fingers that can close from the palm 'body', got 0: .* --fingers",
+    ),
+    "no joints": (
+        f'<robot name="block">{link("body", 0.5, JAW)}</robot>',
+        "hand.urdf",
+        r"must have two fingers or more, got one chain of links: .* --palm LINK \(body\)",
+    ),
+    "mesh outside": (
+        mesh("../broken.glb"),
+        "hand.urdf",
+        "'../broken.glb' must lie in the model's folder, got .* --root FOLDER",
+    ),
+    "mesh of an unknown package": (
+        mesh("package://other/jaw.stl"),
+        "hand.urdf",
+        "must lie in a known package: .* --package other=FOLDER",
+    ),
+    "mesh without triangles": (
+        mesh("empty.obj"),
+        "hand.urdf",
+        "'empty.obj' must hold triangles with finite corners",
+    ),
+    "mesh of no name": (mesh(""), "hand.urdf", r"must be one of \.obj, .* got ''"),
+    "missing mesh of MJCF": (
+        '<mujoco><asset><mesh file="lost.stl"/></asset></mujoco>',
+        "hand.xml",
+        "lost.stl' must be a file, got none",
+    ),
+    "two models": (
+        f'<sdf version="1.7">{"".join(map(EMPTY.format, "ab"))}</sdf>',
+        "hand.sdf",
+        "can only contain one model",
+    ),
+    "other files": (
+        '<sdf version="1.7"><model name="a"><include><uri>model://b</uri></include></model></sdf>',
+        "hand.sdf",
+        "must be complete by itself, got <include>",
+    ),
+    "bytes": ("\x00\x01\x02", "hand.urdf", "must be XML, got text that is not"),
+}
+
+
+@pytest.mark.parametrize("fault", SPOILT)
+def test_a_spoilt_model_is_refused_in_one_line(tmp_path: Path, fault: str) -> None:
+    """Nothing is left behind."""
+    text, name, message = SPOILT[fault]
+    path = write_model(tmp_path, text, name)
+    (tmp_path / "broken.glb").write_bytes(bytes(range(256)))
+    (tmp_path / "empty.obj").write_text("v 0 0 0\n")
+    out = tmp_path / "out"
+    result = CliRunner().invoke(main, ["hand", "new", str(path), "--out", str(out)])
+    assert result.exit_code == 2, result.output
+    assert len(result.output.strip().splitlines()) == 1, result.output
+    assert re.search(message, result.output), result.output
+    assert not out.exists()
+
+
+def test_a_sound_model_is_not_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the faults were planted in."""
+    drawn: list[Callable[..., None]] = []
+    monkeypatch.setattr("drakegrasp.commissioning.draft.run.GRASPS", ())
+    monkeypatch.setattr("drakegrasp.cli.hand._draw", lambda *files: drawn.append(files))
+    for n, (text, name) in enumerate(((JAWS, "hand.urdf"), (JAWS_MJCF, "hand.xml"))):
+        path, out = write_model(tmp_path / str(n), text, name), tmp_path / f"out{n}"
+        result = CliRunner().invoke(main, ["hand", "new", str(path), "--out", str(out)])
+        assert result.exit_code == 0, result.output
+        assert len(list(out.glob("*.urdf"))) == 1
+    assert len(drawn) == 2

@@ -1,0 +1,175 @@
+"""Models as vendors ship them: what becomes of frames, mimics, formats and meshes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.vendors import JAWS, JAWS_MJCF, write_mesh, write_model
+
+from drakegrasp.errors import HandError
+from drakegrasp.hand.vendor.model import VendorModel
+from drakegrasp.hand.vendor.parsing import read_model
+from drakegrasp.hand.vendor.source import read_source
+from drakegrasp.hand.vendor.writing import write_urdf
+
+JAW_BOX = '<geometry><box size="0.02 0.012 0.06"/></geometry>'
+MESH = '<geometry><mesh filename="{}"/></geometry>'
+
+
+def read(path: Path, **folders: object) -> VendorModel:
+    return read_model(read_source(path, folders.pop("packages", {}), **folders))
+
+
+def with_mesh(uri: str, tag: str = "visual") -> str:
+    """Return the jaws, the left one's collision shape or picture a mesh."""
+    old = f'<{tag}><origin xyz="0 0.006 0.03"/>{JAW_BOX}</{tag}>'
+    assert old in JAWS
+    return JAWS.replace(old, f'<{tag}><origin xyz="0 0.006 0.03"/>{MESH.format(uri)}</{tag}>')
+
+
+def test_frames_without_mass_become_part_of_their_parents(tmp_path: Path) -> None:
+    model = read(write_model(tmp_path, JAWS))
+    assert model.root == "body"
+    assert set(model.links) == {"body", "left_jaw", "right_jaw"}
+    assert [joint.name for joint in model.joints.values()] == ["left_slide", "right_slide"]
+    # The body keeps its own frame, not that of the mount.
+    np.testing.assert_allclose(model.links["body"].corners().max(axis=0), [0.03, 0.07, 0.0])
+
+
+def test_masses_of_welded_links_add_up(tmp_path: Path) -> None:
+    """By Huygens and Steiner."""
+    heavy = '<link name="left_end"><inertial><mass value="0.15"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>'  # noqa: E501
+    model = read(write_model(tmp_path, JAWS.replace('<link name="left_end"/>', heavy)))
+    # The heavier link names both; the frame stays that of the joint.
+    inertia = model.links["left_end"].inertia
+    assert inertia.get_mass() == pytest.approx(0.2)
+    np.testing.assert_allclose(inertia.get_com(), [0.0, 0.0, 0.045])
+    about = inertia.Shift(inertia.get_com()).CalcRotationalInertia().get_moments()
+    reduced = 0.05 * 0.15 / 0.2 * 0.06**2
+    np.testing.assert_allclose(about, 2e-4 + np.array([reduced, reduced, 0.0]))
+
+
+def test_a_mimic_leads_to_the_joint_that_leads_it(tmp_path: Path) -> None:
+    """Through all joints in between."""
+    chained = JAWS.replace(
+        '<mimic joint="left_slide"/>', '<mimic joint="third" multiplier="2" offset="0.01"/>'
+    ).replace(
+        "</robot>",
+        '<link name="bar"/><joint name="third" type="prismatic"><parent link="body"/><child '
+        'link="bar"/><axis xyz="0 1 0"/><limit lower="0" upper="0.05" effort="1" velocity="1"/>'
+        '<mimic joint="left_slide" multiplier="-3" offset="0.1"/></joint></robot>',
+    )
+    mimic = read(write_model(tmp_path, chained)).mimics["right_slide"]
+    assert (mimic.leader, mimic.ratio) == ("left_slide", -6.0)
+    assert mimic.offset == pytest.approx(0.21)
+
+
+def test_limits_that_bar_the_way_of_a_mimic_are_its_leaders(tmp_path: Path) -> None:
+    """Vendors give a joint that turns the other way the limits of its leader."""
+    model = read(write_model(tmp_path, JAWS.replace('slide"/>', 'slide" multiplier="-1"/>')))
+    np.testing.assert_allclose(model.joints["right_slide"].limits, [-0.05, 0.0])
+    assert any("joint right_slide: its limits 0..0.05 bar the way" in n for n in model.notes)
+    assert read(write_model(tmp_path / "sound", JAWS)).notes == ()
+
+
+def test_mjcf_says_the_same_as_urdf(tmp_path: Path) -> None:
+    """Equalities of joints are its mimics, ranges of force its efforts."""
+    urdf = read(write_model(tmp_path, JAWS))
+    mjcf = read(write_model(tmp_path, JAWS_MJCF, "hand.xml"))
+    assert mjcf.mimics == urdf.mimics
+    for name, joint in urdf.joints.items():
+        np.testing.assert_allclose(mjcf.joints[name].axis, joint.axis)
+        np.testing.assert_allclose(mjcf.joints[name].limits, joint.limits)
+    assert mjcf.joints["left_slide"].effort == 60.0
+    for name, link in urdf.links.items():
+        np.testing.assert_allclose(
+            np.sort(mjcf.links[name].corners(), axis=0), np.sort(link.corners(), axis=0), atol=1e-12
+        )
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".stl", ".glb"])
+def test_meshes_of_many_formats_are_drawn(tmp_path: Path, suffix: str) -> None:
+    """Their triangles are written beside the model, with the colour of their material."""
+    write_mesh(tmp_path / "in" / "meshes" / f"jaw{suffix}")
+    model = read(write_model(tmp_path / "in", with_mesh(f"meshes/jaw{suffix}")))
+    (shape,) = model.links["left_jaw"].visuals
+    np.testing.assert_allclose(shape.corners().max(axis=0), [0.01, 0.012, 0.06], atol=1e-6)
+    out = tmp_path / "out" / "hand.urdf"
+    write_urdf(model, out, [])
+    assert len(list((out.parent / "meshes").glob("*visual*.obj"))) == 1
+    again = read(out)
+    assert len(again.links["left_jaw"].visuals) == 1
+    if suffix == ".glb":
+        np.testing.assert_allclose(again.links["left_jaw"].visuals[0].colour, [1.0, 0.15, 0.15])
+
+
+def test_a_picture_that_cannot_be_read_is_left_out_and_said(tmp_path: Path) -> None:
+    """Collision shapes are drawn in its place."""
+    model = read(write_model(tmp_path, with_mesh("meshes/lost.stl")))
+    assert model.links["left_jaw"].visuals == ()
+    assert len(model.links["left_jaw"].collisions) == 1
+    (note,) = model.notes
+    assert note.startswith("not drawn: mesh")
+    assert "lost.stl" in note
+
+
+def test_a_collision_mesh_is_a_hull_of_few_corners(tmp_path: Path) -> None:
+    import trimesh
+
+    ball = trimesh.creation.icosphere(4, 0.02)
+    ball.export(tmp_path / "ball.stl")
+    model = read(write_model(tmp_path, with_mesh("ball.stl", "collision")))
+    (shape,) = model.links["left_jaw"].collisions
+    assert shape.vertices is not None
+    assert len(shape.vertices) <= 70
+    np.testing.assert_allclose(np.linalg.norm(shape.vertices, axis=1), 0.02, atol=1e-6)
+    assert trimesh.Trimesh(shape.vertices, shape.faces).volume > 0.9 * ball.volume
+
+
+def test_a_link_without_collision_shapes_gets_those_of_its_pictures(tmp_path: Path) -> None:
+    text = JAWS.replace(f'<collision><origin xyz="0 0.006 0.03"/>{JAW_BOX}</collision>', "")
+    model = read(write_model(tmp_path, text))
+    assert len(model.links["left_jaw"].collisions) == 1
+    assert "link left_jaw: the model has no collision shapes; hulls of its pictures" in model.notes
+
+
+def test_a_link_without_a_mass_gets_one_by_its_size(tmp_path: Path) -> None:
+    text = JAWS.replace('<mass value="0.05"/>', '<mass value="0"/>', 1)
+    model = read(write_model(tmp_path, text))
+    # A box of 14 cm^3, a little thicker.
+    assert model.links["left_jaw"].inertia.get_mass() == pytest.approx(0.02, rel=0.1)
+    assert any(note.startswith("link left_jaw: the model gives no mass") for note in model.notes)
+
+
+def test_packages_are_folders_above_or_given_ones(tmp_path: Path) -> None:
+    write_mesh(tmp_path / "pkg" / "meshes" / "jaw.stl")
+    text = with_mesh("package://pkg/meshes/jaw.stl", "collision")
+    inside = write_model(tmp_path / "pkg" / "urdf", text)
+    assert read(inside).links["left_jaw"].collisions[0].vertices is not None
+    outside = write_model(tmp_path / "elsewhere", text)
+    with pytest.raises(HandError, match=r"must lie in a known package: .* --package pkg=FOLDER"):
+        read(outside)
+    assert read(outside, packages={"pkg": tmp_path / "pkg"}).links["left_jaw"].collisions
+
+
+@pytest.mark.parametrize("way", ["..", "link", "absolute"])
+def test_a_mesh_outside_of_the_folder_is_refused_unless_given(tmp_path: Path, way: str) -> None:
+    mesh = write_mesh(tmp_path / "private" / "jaw.stl")
+    folder = tmp_path / "hand"
+    folder.mkdir()
+    (folder / "jaw.stl").symlink_to(mesh)
+    uri = {"..": "../private/jaw.stl", "link": "jaw.stl", "absolute": str(mesh)}[way]
+    path = write_model(folder, with_mesh(uri, "collision"))
+    with pytest.raises(HandError, match=r"must lie in the model's folder, got .* --root FOLDER"):
+        read(path)
+    assert read(path, given=[mesh.parent]).links["left_jaw"].collisions
+
+
+def test_a_joint_turned_round_moves_its_link_alike(tmp_path: Path) -> None:
+    joint = read(write_model(tmp_path, JAWS)).joints["left_slide"]
+    closing = joint.rebased(-1.0, 0.05)
+    np.testing.assert_allclose(closing.limits, [0.0, 0.05])
+    for position in (0.0, 0.02, 0.05):
+        np.testing.assert_allclose(closing.pose(position), joint.pose(0.05 - position), atol=1e-12)
