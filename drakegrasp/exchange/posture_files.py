@@ -150,7 +150,7 @@ def _of_arrays(arrays: Mapping[str, Any]) -> Rows:
     return Rows(
         objects=texts["object"],
         X_FL=X_FG,
-        link=_only(texts.get("link"), "link"),
+        link=_link(texts.get("link")),
         frame=_only(texts.get("frame"), "frame") or "object",
         q={
             name: arrays[f"q_{name}"]
@@ -179,6 +179,12 @@ def _only(values: Sequence[str | None] | None, name: str) -> str | None:
     if len(different) > 1:
         raise GraspError(f"{name} must be the same in all rows, got {', '.join(sorted(different))}")
     return different.pop() if different else None
+
+
+def _link(values: Sequence[str | None] | None) -> str | None:
+    """Return the link of a column; None for the palm frame, whose name is "palm" in our files."""
+    name = _only(values, "link")
+    return None if name in (None, "", "palm") else name
 
 
 def _stacked(value: Any, name: str) -> Array:
@@ -254,7 +260,7 @@ def _of_columns(columns: Mapping[str, list[Any]]) -> Rows:
     return Rows(
         objects=[str(name) for name in columns["object"]],
         X_FL=quaternion_poses(numbers[:, :3], numbers[:, 3:]),
-        link=_only(columns.get("link"), "link"),
+        link=_link(columns.get("link")),
         frame=_only(columns.get("frame"), "frame") or "object",
         q=q,
         joints=joints,

@@ -32,7 +32,7 @@ class Rows:
     Attributes:
         objects: (n,), names of the objects.
         X_FL: (n, 4, 4), pose of a link in the frame.
-        link: Name of the palm link, whose pose it is; None or "palm": the palm frame G.
+        link: Name of the palm link, whose pose it is; None: the palm frame G.
         frame: One of `TABLE_FRAMES`.
         q: Joint positions (n, m) [rad or m] by "grasp", "pregrasp" and "squeeze".
         joints: (m,), names of the joints; None: all, in the plant's order. A joint that the hand
@@ -104,7 +104,7 @@ def table_of(hand: Hand, parts: Sequence[Rows]) -> PostureTable:
 
 def _palm_poses(hand: Hand, part: Rows) -> Array:
     """Return the poses (n, 4, 4) of the palm frame."""
-    if part.link in (None, "", "palm"):
+    if part.link is None:
         return part.X_FL
     if part.link != hand.palm_link:
         raise GraspError(

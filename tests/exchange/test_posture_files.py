@@ -224,6 +224,23 @@ def test_isaac_grasp_is_of_the_object_that_its_file_is_named_after(tmp_path):
     assert table.said[0] == "grasp_0, confidence 0.5"
 
 
+def test_palm_link_named_palm_is_no_palm_frame_in_files_of_others(tmp_path):
+    leap = load_hand("leap")
+    order, X = joint_order(leap), POSES[0]
+    assert leap.palm_link == "palm" and not np.allclose(leap.X_BG, np.eye(4))
+    w, *xyz = quaternion(X).tolist()
+    grasp = {
+        "confidence": 0.5,
+        "position": X[:3, 3].tolist(),
+        "orientation": {"w": w, "xyz": xyz},
+        "cspace_position": dict.fromkeys(order, 0.1),
+    }
+    tree = {"format": "isaac_grasp", "format_version": 1.0, "grasps": {"grasp_0": grasp}}
+    (tmp_path / "mug.yaml").write_text(yaml.safe_dump(tree), encoding="utf-8")
+    table = read_postures(tmp_path / "mug.yaml", leap)
+    np.testing.assert_allclose(table.X_FG[0], X @ leap.X_BG, atol=1e-9)
+
+
 # Refusals
 
 
