@@ -43,9 +43,12 @@ def export(out: Path, directory: Path | None, form: str, licence: str, quiet: bo
     mjcf           the same for MuJoCo, with the table; needs drakegrasp[peer]
     """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
     from drakegrasp.exchange.export import export_dataset
+    from drakegrasp.foreign_files import refuse_link
     from drakegrasp.runtime.progress import progress_bar
 
-    directory = out / f"export_{form}" if directory is None else directory
+    if directory is None:
+        directory = out / f"export_{form}"
+        refuse_link(directory)
     with progress_bar("export", "sample", show=not quiet) as progress:
         count = export_dataset(out, directory, form, licence=licence, progress=progress)  # type: ignore[arg-type]
     say(f"{count:,} samples in {directory}")

@@ -74,12 +74,16 @@ def test_folder_that_is_a_link_is_neither_written_nor_swept(
     assert mine.read_text() == "mine\n"
 
 
-def test_folder_of_figures_that_is_a_link_is_not_written_to(out: Path, tmp_path: Path) -> None:
-    (out / "figures").symlink_to(tmp_path, target_is_directory=True)
+@pytest.mark.parametrize(
+    ("folder", "command"), [("figures", ["figures"]), ("export_glb", ["export", "--to", "glb"])]
+)
+def test_folder_of_pictures_that_is_a_link_is_not_written_to(
+    out: Path, tmp_path: Path, folder: str, command: list[str]
+) -> None:
+    (out / folder).symlink_to(tmp_path, target_is_directory=True)
     before = sorted(tmp_path.iterdir())
-    assert "figures: must be a folder of the dataset to write to, got a link" in refusal(
-        "figures", out
-    )
+    said = f"{folder}: must be a folder of the dataset to write to, got a link"
+    assert said in refusal(*command, out)
     assert sorted(tmp_path.iterdir()) == before
 
 
