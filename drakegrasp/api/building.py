@@ -158,8 +158,8 @@ def build_on(
         before = claim_directory(out, config)
 
         # Workers read the hand in the directory.
-        stack.callback(_release_unused, out)
         config = carry_hand(out, config, before.config.hand if before else None)
+        stack.callback(_release_unused, out)
         client = stack.enter_context(cluster)
         stack.enter_context(admitted_workers(client, config))
 

@@ -29,6 +29,7 @@ class ClosedGrasp:
         X_TO, X_TG: Poses (4, 4) of the object and of the palm over the table.
         q: (n,), positions of the hand's joints [rad or m], in the plant's order.
         spread: Angle of the spread joints [rad].
+        unused: Fingers that its preshape leaves out, as bits: 1 for the first finger.
     """
 
     trial_id: int
@@ -38,6 +39,7 @@ class ClosedGrasp:
     X_TG: Array
     q: Array
     spread: float
+    unused: int = 0
 
 
 def read_closed_grasps(out: Path) -> Iterator[ClosedGrasp]:
@@ -54,7 +56,8 @@ def read_closed_grasps(out: Path) -> Iterator[ClosedGrasp]:
     refuse_other_codes(out / DATA_FILES["oto"], "trial_id", rows, len(trials))
 
     # Their postures.
-    samples = trials[rows].columns(("object_name", "X_TO", "X_OG", "closed_q", "spread"))
+    names = ("object_name", "X_TO", "X_OG", "closed_q", "spread", "unused")
+    samples = trials[rows].columns(names)
     X_TO, X_OG = (unpack_pose(samples[name]) for name in ("X_TO", "X_OG"))
     for i, row in enumerate(rows.tolist()):
         yield ClosedGrasp(
@@ -65,4 +68,5 @@ def read_closed_grasps(out: Path) -> Iterator[ClosedGrasp]:
             X_TG=X_TO[i] @ X_OG[i],
             q=samples["closed_q"][i],
             spread=float(samples["spread"][i]),
+            unused=int(samples["unused"][i]),
         )

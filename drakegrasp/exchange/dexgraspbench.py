@@ -34,6 +34,7 @@ from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.paths import model_path
 from drakegrasp.exchange.closed_grasps import ClosedGrasp, read_closed_grasps
 from drakegrasp.frames import Array, invert_pose
+from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.mesh.wavefront import hull_text
 from drakegrasp.objects.model import ObjectModel, load_object
@@ -158,10 +159,12 @@ def grasp_dictionary(
         joints: Names of the joints in the order of the file.
         grasp: The sample.
     """
-    # The palm link's pose, and how far each joint moves: in proportion to its finger's closing.
+    # The palm link's pose, and how far each joint moves: in proportion to its finger's closing,
+    # if the grasp uses it.
     X_TB = pose_vector(multiply(grasp.X_TG, invert_pose(hand.X_BG)))
     step = dict.fromkeys(hand.joint_names, 0.0)
     closing = APART * hand.closing_unit
+    closing[unused_fingers(grasp.unused, hand.num_fingers)] = 0.0
     for name, gain in zip(hand.joint_names, hand.joint_gain[:, 1:], strict=True):
         step[name] = float(gain @ closing)
     open_at = dict(zip(posed.joints, posed.positions(grasp.spread), strict=True))

@@ -19,6 +19,7 @@ from drakegrasp.exchange.closed_grasps import ClosedGrasp, read_closed_grasps
 from drakegrasp.exchange.dexgraspbench import pose_vector
 from drakegrasp.exchange.foreign_postures import CREATED_WITH
 from drakegrasp.frames import invert_pose
+from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.mesh.wavefront import obj_text
@@ -59,11 +60,16 @@ def grasp_entry(hand: Hand, grasp: ClosedGrasp) -> dict[str, Any]:
     order = joint_order(hand)
     X_OB = multiply(multiply(invert_pose(grasp.X_TO), grasp.X_TG), invert_pose(hand.X_BG))
     x, y, z, w, *xyz = pose_vector(X_OB).tolist()
+    closed = dict(zip(order, grasp.q.tolist(), strict=True))
+
+    # Fingers that the grasp uses are open before it; the other joints stay where they are.
+    used = ~unused_fingers(grasp.unused, hand.num_fingers)
+    moves = dict(zip(hand.joint_names, hand.joint_gain[:, 1:][:, used].any(axis=1), strict=True))
     opened = joint_positions(hand, grasp.spread, [0.0] * hand.num_fingers)
     return {
         "confidence": 1.0,
         "position": [x, y, z],
         "orientation": {"w": w, "xyz": xyz},
-        "cspace_position": dict(zip(order, grasp.q.tolist(), strict=True)),
-        "pregrasp_cspace_position": {name: opened[name] for name in order},
+        "cspace_position": closed,
+        "pregrasp_cspace_position": {n: opened[n] if moves[n] else closed[n] for n in order},
     }

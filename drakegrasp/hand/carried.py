@@ -12,7 +12,7 @@ import shutil
 from pathlib import Path, PurePath
 
 from drakegrasp.config import CarriedHand, Config
-from drakegrasp.errors import HandError
+from drakegrasp.errors import DataError, HandError
 from drakegrasp.hand.folder import HandFolder, hand_digest, hand_folder
 from drakegrasp.runtime.files import atomic_folder, disk_full_named, sync
 
@@ -47,6 +47,7 @@ def carry_hand(out: Path, config: Config, known: str | None = None) -> Config:
 
     Raises:
         HandError: If the hand's files cannot be read, or are too large.
+        DataError: If the directory is a new dataset's, and has files of somebody in that place.
         DiskFullError: If there is no room for them.
     """
     # A hand of the package keeps its name; the name of a hand file is in the hash of every shard.
@@ -56,6 +57,8 @@ def carry_hand(out: Path, config: Config, known: str | None = None) -> Config:
     path = out.absolute() / HAND_FOLDER / _file_name(name)
     content = hand_folder(config.hand_source, path.name)
     carried = CarriedHand(path=path, digest=content.digest)
+    if known is None and not isinstance(config.hand_source, CarriedHand):
+        _refuse_other_files(content, path.parent)
     if not _is_there(carried):
         with disk_full_named(out):
             _write(content, path.parent)
@@ -73,6 +76,24 @@ def _is_there(carried: CarriedHand) -> bool:
         return hand_digest(carried) == carried.digest
     except HandError:
         return False
+
+
+def _refuse_other_files(content: HandFolder, folder: Path) -> None:
+    """Refuse a folder that may be somebody's own: a build replaces and removes what is in its own.
+
+    Raises:
+        DataError: If it is there, and no copy of the hand that a build left when it was killed.
+    """
+    if not os.path.lexists(folder):
+        return
+    there = {path for path in folder.rglob("*") if not path.is_dir()}
+    copies = {folder / place: content.content(place) for place in (*content.texts, *content.files)}
+    is_source = any(path.resolve().is_relative_to(folder.resolve()) for path in content.sources)
+    if is_source or there != copies.keys() or any(p.read_bytes() != copies[p] for p in there):
+        raise DataError(
+            f"{folder}: must not be there before a build, which puts the hand's files there, "
+            "got a folder; choose another --out"
+        )
 
 
 def _write(content: HandFolder, folder: Path) -> None:

@@ -27,9 +27,11 @@ from drakegrasp.simulation.construction import build_scene, swap_object
 from drakegrasp.simulation.scene import Scene
 from drakegrasp.vision.rendering import Renderer, build_renderer
 
-#: How many scenes and renderers are kept: a build needs those of two objects.
+#: How many scenes and renderers are kept: a build needs those of two objects. With those of a hand
+#: in its preshapes, which attempts take in turns, there are as many more.
 KEPT = 4
-#: How many diagrams of scenes are kept, each for one hand and one physics but for its friction.
+#: How many diagrams of scenes are kept, each for one hand and one physics but for its friction; as
+#: many more for preshapes.
 DIAGRAMS, FRICTIONS = 2, ("friction_hand", "friction_table")
 
 _Kept = TypeVar("_Kept", Scene, Renderer)
@@ -52,22 +54,23 @@ def cached_scene(
         preshape: Index of a preshape, see `Hand.at`.
     """
     # A hand whose files have changed is loaded anew, and is then another key.
-    physics, hand = model.own_physics(physics), load_hand(source).at(preshape)
+    physics, known = model.own_physics(physics), load_hand(source)
+    hand, more = known.at(preshape), len(known.preshapes)
     shape = (model.collision_vertices, model.collision_faces, model.half_extents)
     mass = (model.p_OOcm, model.I_OOcm_O, np.float64(model.mass))
     key = "scene", _digest(model.name, *shape, *mass), physics, hand
-    return _cached(key, lambda: _make_scene(model, physics, hand))
+    return _cached(key, lambda: _make_scene(model, physics, hand, DIAGRAMS + more), KEPT + more)
 
 
-def _make_scene(model: ObjectModel, physics: PhysicsConfig, hand: Hand) -> Scene:
-    """Return the scene of an object, on a diagram that is kept or on a new one."""
+def _make_scene(model: ObjectModel, physics: PhysicsConfig, hand: Hand, most: int) -> Scene:
+    """Return the scene of an object, on a diagram that is kept or on a new one of so many."""
     # An attempt sets friction in the context, so a diagram serves any.
     key = physics.model_copy(update=dict.fromkeys(FRICTIONS)), hand
     known = _diagrams.pop(key, None)
     if known is not None:
         _diagrams[key] = known
         return swap_object(known, model, physics)
-    while len(_diagrams) >= DIAGRAMS:
+    while len(_diagrams) >= most:
         _forget(_diagrams.pop(next(iter(_diagrams))).plant)
     return _diagrams.setdefault(key, build_scene(model, physics, hand))
 
@@ -85,11 +88,11 @@ def forget_scenes() -> None:
         _forget()
 
 
-def _cached(key: Hashable, build: Callable[[], _Kept]) -> _Kept:
+def _cached(key: Hashable, build: Callable[[], _Kept], most: int = KEPT) -> _Kept:
     with _lock:
         kept = _kept.pop(key, None)
         if kept is None:
-            while len(_kept) >= KEPT:
+            while len(_kept) >= most:
                 # The diagram of a scene stays, and its context goes by itself.
                 if isinstance(_kept.pop(next(iter(_kept))), Renderer):
                     gc.collect()

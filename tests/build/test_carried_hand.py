@@ -150,6 +150,19 @@ def hand_path(out: Path) -> Path:
     return out / "hand" / "tongs_hand.yaml"
 
 
+@pytest.mark.parametrize("hand", ["own", "barrett"])
+def test_a_folder_of_somebody_where_the_hand_goes_stays(tmp_path: Path, hand: str) -> None:
+    own = write_hand(tmp_path / "robot" / "hand")
+    before = {path: path.read_bytes() for path in own.parent.iterdir()}
+    result = run(
+        *("build", "--objects", "builtin", "--only", "6_can_1", "--out", tmp_path / "robot"),
+        *("--set", f"hand={own if hand == 'own' else hand}", "--workers", "1", "--quiet"),
+    )
+    assert result.exit_code != 0
+    assert "must not be there before a build" in error_line(result)
+    assert {path: path.read_bytes() for path in own.parent.iterdir()} == before
+
+
 def test_a_build_goes_on_with_the_same_hand_from_elsewhere(copy: Path, tmp_path: Path) -> None:
     """Its name does not matter either."""
     before = (copy / TRIALS_FILE).read_bytes()

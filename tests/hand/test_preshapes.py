@@ -13,12 +13,16 @@ from helpers.successes import good
 from drakegrasp.config import CandidateConfig, FilterConfig
 from drakegrasp.dataset.filters import judge_successes
 from drakegrasp.errors import HandError
+from drakegrasp.exchange.closed_grasps import ClosedGrasp
+from drakegrasp.exchange.dexgraspbench import grasp_dictionary
+from drakegrasp.exchange.isaac_grasp import grasp_entry
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand, load_plain_hand
 from drakegrasp.hand.files import hand_file
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.outcomes import Removal
 from drakegrasp.simulation.candidates import Candidates, make_attempts
+from drakegrasp.visualization.still_scene import StillScene
 
 PINCH = {
     "name": "pinch",
@@ -141,3 +145,35 @@ def test_what_knows_one_preshape_refuses_several(tmp_path: Path) -> None:
     with pytest.raises(HandError, match="hand must be one without preshapes for MuJoCo, got "):
         load_plain_hand(tmp_path / "shaped_hand.yaml", "MuJoCo")
     assert load_plain_hand("allegro", "MuJoCo") is load_hand("allegro")
+
+
+def test_exports_leave_the_fingers_that_a_grasp_does_not_use_where_they_are(
+    tmp_path: Path,
+) -> None:
+    """Neither before the grasp nor in the squeeze; joints of the preshape keep its positions."""
+    hand = allegro(tmp_path, ALL, PINCH)
+    posed = StillScene(hand)
+    q = joint_positions(hand.at(1), 0.0, [0.5, 0.4])
+    grasp = ClosedGrasp(
+        trial_id=0,
+        split="train",
+        object_name="ball",
+        X_TO=np.eye(4),
+        X_TG=np.eye(4),
+        q=np.array([q[name] for name in posed.joints]),
+        spread=0.0,
+        unused=hand.unused_in(1),
+    )
+    moving = {
+        "index_mcp_joint", "index_pip_joint", "index_dip_joint",
+        "thumb_mcp_joint", "thumb_ip_joint",
+    }  # fmt: skip
+
+    entry = grasp_entry(hand, grasp)
+    before, closed = entry["pregrasp_cspace_position"], entry["cspace_position"]
+    assert {name for name in closed if before[name] != closed[name]} == moving
+
+    stages = grasp_dictionary(hand, posed, posed.joints, grasp)
+    for stage in ("pregrasp_qpos", "squeeze_qpos"):
+        differs = stages[stage][7:] != stages["grasp_qpos"][7:]
+        assert {n for n, d in zip(posed.joints, differs, strict=True) if d} == moving

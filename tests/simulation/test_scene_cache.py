@@ -103,3 +103,13 @@ def test_few_diagrams_are_kept_and_scenes_go_with_theirs(cube: ObjectModel, conf
         cached_scene(cube, physics, config.hand)
     plants = {id(scene.plant) for scene in scene_cache._kept.values()}
     assert len(plants) == len(scene_cache._diagrams) == DIAGRAMS
+
+
+def test_scenes_of_all_preshapes_are_kept(cube: ObjectModel, config: Config) -> None:
+    """Attempts take them in turns: each would be built again."""
+    count = len(load_hand("allegro_four").preshapes)
+    every = (None, *range(count))
+    first = [cached_scene(cube, config.physics, "allegro_four", i) for i in every]
+    again = [cached_scene(cube, config.physics, "allegro_four", i) for i in every]
+    assert count == 3
+    assert all(one is other for one, other in zip(first, again, strict=True))

@@ -17,7 +17,7 @@ from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.model import ObjectModel, make_object
 from drakegrasp.simulation import drive as drive_module
-from drakegrasp.simulation.candidates import Pregrasp
+from drakegrasp.simulation.candidates import Attempt, Pregrasp, Source
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.drive import disengage, drive_of, engage, opening_torques
 from drakegrasp.simulation.sampling.centring import centred
@@ -131,4 +131,19 @@ def test_jaws_with_motors_of_their_own_are_not_centred(tmp_path: Path) -> None:
     X_OG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.01, 0.08])
     attempt = Pregrasp(X_OG=X_OG, spread=0.0)
     (found,) = centred(box(), gripper(tmp_path, one_motor=False), [attempt])
+    assert found is attempt
+
+
+def test_a_posture_is_not_centred(tmp_path: Path) -> None:
+    """One whose fingers start open is an attempt like any other, but the palm pose is given."""
+    attempt = Attempt(
+        candidate=0,
+        standoff_index=0,
+        standoff=np.nan,
+        spread=0.0,
+        X_OG=make_pose(np.diag([1.0, -1.0, -1.0]), [0.002, 0.004, 0.08]),
+        seed=0,
+        source=Source.POSTURES,
+    )
+    (found,) = centred(box(), gripper(tmp_path, one_motor=True), [attempt])
     assert found is attempt

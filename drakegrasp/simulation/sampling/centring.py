@@ -21,7 +21,7 @@ from drakegrasp.frames import Array
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.finger_sweep import FingerPath, hand_paths
 from drakegrasp.objects.model import ObjectModel
-from drakegrasp.simulation.candidates import Pregrasp
+from drakegrasp.simulation.candidates import Attempt, Pregrasp, Source
 from drakegrasp.simulation.screen import PointLookup
 
 #: Moves of the palm; after the first one sliding jaws are centred.
@@ -38,7 +38,8 @@ def centred(model: ObjectModel, hand: Hand, attempts: Sequence[_A]) -> list[_A]:
     """Return attempts whose fingers of one motor meet the object together, where they can.
 
     An attempt is as it was if its palm ray misses, its fingers start closed, one side of the
-    fingers does not meet the object, or no motor of the hand drives opposed fingers.
+    fingers does not meet the object, or no motor of the hand drives opposed fingers. So is one of
+    a posture, which is tried as it is given.
 
     Args:
         model: The object.
@@ -49,7 +50,8 @@ def centred(model: ObjectModel, hand: Hand, attempts: Sequence[_A]) -> list[_A]:
     found = list(attempts)
     groups: dict[tuple[int | None, float], list[int]] = {}
     for row, attempt in enumerate(found):
-        if attempt.ray_hits and attempt.closing is None:
+        given = isinstance(attempt, Attempt) and attempt.source is Source.POSTURES
+        if attempt.ray_hits and attempt.closing is None and not given:
             groups.setdefault((attempt.preshape, attempt.spread), []).append(row)
 
     # Move the palms for each motor that moves several fingers.
