@@ -151,10 +151,11 @@ def test_the_arm_carries_the_hand(scene: Scene, cube: ObjectModel, config: Confi
 
 def test_motors_are_those_of_the_hand_file(scene: Scene, hand: Hand) -> None:
     for motor, joint, finger in zip(scene.motors, scene.closing_joints, hand.fingers, strict=True):
-        assert motor.joint().name() == joint.name() == finger.closing_joint
-        assert motor.effort_limit() == finger.effort_limit
-        assert motor.default_rotor_inertia() == finger.rotor_inertia
-        assert motor.default_gear_ratio() == finger.gear_ratio
+        (actuator,) = motor.actuators
+        assert actuator.joint().name() == joint.name() == finger.closing_joint
+        assert motor.effort_limit() == actuator.effort_limit() == finger.effort_limit
+        assert actuator.default_rotor_inertia() == finger.rotor_inertia
+        assert actuator.default_gear_ratio() == finger.gear_ratio
     for driven, finger in zip(scene.driven, hand.fingers, strict=True):
         ratios = {joint.name(): ratio for joint, ratio in driven.items()}
         coupled = {coupling.joint: coupling.ratio for coupling in finger.coupled}

@@ -231,9 +231,9 @@ def test_no_field_is_made_where_nobody_asks(cube, hand):
 # The sweep and the margins, against brute force
 
 
-def lookup_of(model: ObjectModel, attempts: list[Attempt]) -> screen._PointLookup:
+def lookup_of(model: ObjectModel, attempts: list[Attempt]) -> screen.PointLookup:
     X_OG = np.stack([attempt.X_OG for attempt in attempts])
-    return screen._PointLookup(model.field, standing(model), X_OG)
+    return screen.PointLookup(model.field, standing(model), X_OG)
 
 
 def brute_sweep(lookup, path, row: int, config: ScreenConfig) -> tuple[int, bool, int]:
@@ -381,7 +381,7 @@ def test_one_finger_that_is_not_required_screens_nothing(cube, hand):
 def test_heights_and_distances_are_those_of_the_points(cube, hand):
     """Lower bounds of the distances from the cube's faces; the least is exact where it matters."""
     X_OG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.01, -0.02, 0.2])
-    lookup = screen._PointLookup(cube.field, standing(cube), X_OG[None])
+    lookup = screen.PointLookup(cube.field, standing(cube), X_OG[None])
     p_GQ = np.array([[0.0, 0.0, 0.16], [0.028, 0.0, 0.2], [0.0, 0.016, 0.163]], dtype=np.float32)
     p_OQ = p_GQ @ X_OG[:3, :3].T + X_OG[:3, 3]
     rows = np.array([0])
