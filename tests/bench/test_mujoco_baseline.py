@@ -187,7 +187,9 @@ def weak(monkeypatch: pytest.MonkeyPatch, **changes: object) -> None:
     """Let the hand of the next peers have other fingers."""
     hand = load_hand()
     fingers = tuple(replace(finger, **changes) for finger in hand.fingers)  # type: ignore[arg-type]
-    monkeypatch.setattr(mujoco_baseline, "load_hand", lambda name: replace(hand, fingers=fingers))
+    monkeypatch.setattr(
+        mujoco_baseline, "load_plain_hand", lambda *_: replace(hand, fingers=fingers)
+    )
 
 
 def test_worm_yields_beyond_its_strength(

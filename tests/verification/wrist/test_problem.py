@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from drakegrasp.frames import Array, invert_pose, make_pose, rotate_vectors, transform_points
 from drakegrasp.hand.description import Hand, load_hand
 from drakegrasp.hand.kinematics import (
-    coordinate_limits,
     fingertip_poses,
     link_poses,
     still_links,
@@ -67,9 +66,9 @@ def random_problem(name: str, seed: int) -> tuple[WristProblem, Array]:
     """Return contacts some centimetres off a hand's fingertips, and an x away from the start."""
     rng = np.random.default_rng(seed)
     hand, X_OS = hand_of(name), random_pose(rng)
-    k, (lower, upper) = hand.num_fingers, coordinate_limits(hand).T
+    k, (lower, upper) = hand.num_fingers, hand_constants(hand).limits.T
     c = rng.uniform(lower, upper)
-    X_GF = fingertip_poses(hand, spread=c[0], closing=c[1:])
+    X_GF = fingertip_poses(hand, spread=c[0], closing=hand.closing_ratio @ c[1:])
     pads = np.array([finger.p_FiP for finger in hand.fingers])
     p_GQ = np.einsum("kab,kb->ka", X_GF[:, :3, :3], pads) + X_GF[:, :3, 3]
     problem = WristProblem(
@@ -82,7 +81,7 @@ def random_problem(name: str, seed: int) -> tuple[WristProblem, Array]:
         posture=rng.uniform(lower, upper),
     )
     pose = np.concatenate([rng.uniform(-1.2, 1.2, 3), rng.normal(scale=0.03, size=3)])
-    return problem, np.concatenate([pose, c + rng.normal(scale=0.2, size=1 + k)])
+    return problem, np.concatenate([pose, c + rng.normal(scale=0.2, size=len(c))])
 
 
 def differences(function: Callable[[Array], Array], x: Array, h: float = 1e-6) -> Array:
@@ -98,7 +97,8 @@ def test_palm_and_fingertips_are_where_kinematics_puts_them(name: str, seed: int
     R_SG = Rotation.from_euler("XYZ", x[:3]).as_matrix()
     X_OG = problem.X_OS @ make_pose(R_SG, x[3:POSE])
     np.testing.assert_allclose(at.X_OG, X_OG, atol=1e-12)
-    X_GF = fingertip_poses(hand_of(name), spread=x[POSE], closing=x[POSE + 1 :])
+    hand = hand_of(name)
+    X_GF = fingertip_poses(hand, spread=x[POSE], closing=hand.closing_ratio @ x[POSE + 1 :])
     X_FO = invert_pose(X_OG @ X_GF)
     p_FQ = np.array(
         [transform_points(X, p[None])[0] for X, p in zip(X_FO, problem.p_OQ, strict=True)]
@@ -131,22 +131,25 @@ def test_slope_of_the_objective_is_that_of_finite_differences(name: str, seed: i
     )
 
 
-def terms(k: int) -> dict[str, slice]:
-    """Return which residuals of k fingers are of which term."""
-    ends = np.cumsum([0, k, 3 * k, 3 * k, 3 * k, 1 + k, 2 * k])
-    names = ("distance", "normal", "closing", "pad", "posture", "region")
-    return {t: slice(a, b) for t, a, b in zip(names, ends[:-1], ends[1:], strict=True)}
+TERMS = ("distance", "normal", "closing", "pad", "posture", "region")
 
 
-@pytest.mark.parametrize("term", terms(1))
+def terms(hand: Hand) -> dict[str, slice]:
+    """Return which residuals of a hand's k fingers and m motors are of which term."""
+    k, m = hand.closing_ratio.shape
+    ends = np.cumsum([0, k, 3 * k, 3 * k, 3 * k, 1 + m, 2 * k])
+    return {t: slice(a, b) for t, a, b in zip(TERMS, ends[:-1], ends[1:], strict=True)}
+
+
+@pytest.mark.parametrize("term", TERMS)
 def test_slope_of_each_term_is_that_of_finite_differences(name: str, term: str) -> None:
     """A term with a small weight could hide an error behind the others."""
     problem, x = random_problem(name, 90)
     at = evaluate(problem, x)
-    k = len(problem.p_OQ)
+    hand = hand_of(name)
     assert at.contact.outside.max() > 1e-3
-    rows = terms(k)[term]
-    assert terms(k)["region"].stop == len(at.residuals)
+    rows = terms(hand)[term]
+    assert terms(hand)["region"].stop == len(at.residuals)
 
     def share(x: Array) -> Array:
         residuals = evaluate(problem, x).residuals[rows]
@@ -160,9 +163,9 @@ def test_slope_of_each_term_is_that_of_finite_differences(name: str, term: str) 
 @pytest.mark.parametrize("seed", SEEDS[:4])
 def test_rows_of_scalars_are_plain_derivatives(name: str, seed: int) -> None:
     problem, x = random_problem(name, seed)
-    k = len(problem.p_OQ)
+    hand = hand_of(name)
     for term in ("distance", "posture", "pad"):
-        rows = terms(k)[term]
+        rows = terms(hand)[term]
         slope = differences(lambda x, rows=rows: evaluate(problem, x).residuals[rows], x)  # type: ignore[misc]
         at = evaluate(problem, x)
         np.testing.assert_allclose(at.jacobian[rows], slope, atol=1e-7)
@@ -173,14 +176,14 @@ def test_closing_direction_is_how_the_fingertip_moves_at_the_point(name: str, se
     problem, x = random_problem(name, seed)
     at, hand, h = evaluate(problem, x), hand_of(name), 1e-6
     k = hand.num_fingers
-    residual = at.residuals[terms(k)["closing"]].reshape(k, 3) / CLOSING_WEIGHT
+    residual = at.residuals[terms(hand)["closing"]].reshape(k, 3) / CLOSING_WEIGHT
     direction = residual - problem.nhat_Q_O @ at.X_OG[:3, :3]
 
     def material_points(closing: Array) -> Array:
         X_GF = fingertip_poses(hand, spread=x[POSE], closing=closing)
         return np.asarray(np.einsum("kab,kb->ka", X_GF[:, :3, :3], at.p_FiQ) + X_GF[:, :3, 3])
 
-    closing = x[POSE + 1 :]
+    closing = hand.closing_ratio @ x[POSE + 1 :]
     moved = material_points(closing + h) - material_points(closing - h)
     np.testing.assert_allclose(direction, unit(moved), atol=1e-6)
 
@@ -190,7 +193,7 @@ def test_clearance_is_the_lowest_corners_height_within_the_rounding(name: str, s
     problem, x = random_problem(name, seed)
     at, hand = evaluate(problem, x), hand_of(name)
     shapes = link_shapes(hand)
-    X_GF = fingertip_poses(hand, spread=x[POSE], closing=x[POSE + 1 :])
+    X_GF = fingertip_poses(hand, spread=x[POSE], closing=hand.closing_ratio @ x[POSE + 1 :])
     # The palm is all that no finger and no spread moves.
     still = [link for link in still_links(hand) if shapes[link]]
     assert hand.palm_link in still
@@ -240,8 +243,9 @@ def test_where_the_object_is_does_not_matter(name: str, seed: int) -> None:
 def test_a_finger_closed_against_its_contact_leaves_little(name: str) -> None:
     """Contacts on the nominal points, normals against the pads: only rounding is left."""
     hand, constants = hand_of(name), hand_constants(hand_of(name))
-    c = coordinate_limits(hand).mean(axis=1) * [0.2, *[0.8] * hand.num_fingers]
-    X_GF = fingertip_poses(hand, spread=c[0], closing=c[1:])
+    c = constants.limits.mean(axis=1)
+    c *= np.where(np.arange(len(c)) == 0, 0.2, 0.8)
+    X_GF = fingertip_poses(hand, spread=c[0], closing=hand.closing_ratio @ c[1:])
     contact = signed_distance(constants.pads, constants.pad_points)
     on_pad = constants.pad_points - contact.distance[:, None] * contact.normal
     turn = partial(np.einsum, "kab,kb->ka", X_GF[:, :3, :3])
@@ -255,7 +259,7 @@ def test_a_finger_closed_against_its_contact_leaves_little(name: str) -> None:
         posture=c,
     )
     x = np.concatenate([np.zeros(POSE), c])
-    at, rows = evaluate(problem, x), terms(hand.num_fingers)
+    at, rows = evaluate(problem, x), terms(hand)
     assert np.abs(at.residuals[rows["distance"]]).max() < 1e-4
     assert np.abs(at.residuals[rows["normal"]]).max() < 0.05 * NORMAL_WEIGHT
     np.testing.assert_array_equal(at.residuals[rows["posture"]], 0.0)

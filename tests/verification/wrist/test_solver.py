@@ -59,14 +59,14 @@ def touched(
     """
     rng = np.random.default_rng(seed)
     hand, constants = hand_of(name), hand_constants(hand_of(name))
-    k, (lower, upper) = hand.num_fingers, coordinate_limits(hand).T
+    k, (lower, upper) = hand.num_fingers, constants.limits.T
     first, last = np.deg2rad(closing_deg)
-    low = np.maximum(lower, [0.0, *[first] * k])
-    c = rng.uniform(low, np.minimum(upper, [np.deg2rad(40.0), *[last] * k]))
+    low = np.maximum(lower, [0.0, *[first] * (len(lower) - 1)])
+    c = rng.uniform(low, np.minimum(upper, [np.deg2rad(40.0), *[last] * (len(lower) - 1)]))
     p_FQ = constants.pad_points + scatter * rng.uniform(-1.0, 1.0, (k, 3))
     p_FQ = nearest_on_pads(constants.pads, p_FQ)
     X_OG = make_pose(Rotation.random(random_state=rng).as_matrix(), rng.uniform(-0.2, 0.2, 3))
-    X_OF = X_OG @ fingertip_poses(hand, spread=c[0], closing=c[1:])
+    X_OF = X_OG @ fingertip_poses(hand, spread=c[0], closing=hand.closing_ratio @ c[1:])
     contact = signed_distance(constants.pads, p_FQ)
     return Touch(
         X_OG=X_OG,
@@ -335,7 +335,7 @@ def test_postures_are_within_the_limits_and_where_kinematics_puts_them(pincer: s
 def misfit(name: str, X_OG: Array, c: Array, made: Touch) -> float:
     """Return what is left between a posture's contacts, as arrows of length `LEVER`, and others."""
     hand, constants = hand_of(name), hand_constants(hand_of(name))
-    X_OF = X_OG @ fingertip_poses(hand, spread=c[0], closing=c[1:])
+    X_OF = X_OG @ fingertip_poses(hand, spread=c[0], closing=hand.closing_ratio @ c[1:])
     contact = signed_distance(constants.pads, constants.pad_points)
     on_pad = constants.pad_points - contact.distance[:, None] * contact.normal
     p = np.einsum("kab,kb->ka", X_OF[:, :3, :3], on_pad) + X_OF[:, :3, 3] - made.p_OQ
