@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @click.group()
 def hand() -> None:
-    """List the hands, draft a hand file from a model, or check a hand before it is used."""
+    """List the hands, draft a hand file, or check a hand."""
 
 
 @hand.command("list")

@@ -138,7 +138,7 @@ def other_kind(path: Path, draw: random.Random) -> str:
     kinds: dict[str, Callable[[], Any]] = {
         "a pipe": lambda: os.mkfifo(path),
         "a folder": path.mkdir,
-        "a socket": lambda: socket.socket(socket.AF_UNIX).bind(_short(path)),
+        "a socket": lambda: _listen(path),
         "a link to /dev/zero": lambda: path.symlink_to("/dev/zero"),
         "a link to itself": lambda: path.symlink_to(path),
         "a link to nothing": lambda: path.symlink_to(path.with_name("nothing")),
@@ -151,9 +151,10 @@ def other_kind(path: Path, draw: random.Random) -> str:
     return f"replaced by {kind}"
 
 
-def _short(path: Path) -> str:
-    """Return a path relative to the working directory: names of sockets are short."""
-    return os.path.relpath(path)
+def _listen(path: Path) -> None:
+    """Make a socket; by a relative path, because names of sockets are short."""
+    with socket.socket(socket.AF_UNIX) as connection:
+        connection.bind(os.path.relpath(path))
 
 
 def _sparse(path: Path) -> None:

@@ -18,9 +18,9 @@ from drakegrasp.cli.verify.protocol import (
     refuse_options,
     verify_by_protocol,
 )
-from drakegrasp.cli.verify.request import VerifyRequest
 
 if TYPE_CHECKING:
+    from drakegrasp.cli.verify.request import VerifyRequest
     from drakegrasp.verification.result import Verification
 
 
@@ -142,6 +142,8 @@ def verify(
     standard error. A row that is no grasp has the outcome `invalid`. Exit code: 0 if every grasp
     has a verdict, whatever it is; 2 for input that cannot be used.
     """
+    from drakegrasp.cli.verify.request import VerifyRequest
+
     if not is_lift(protocol, simulator):
         grasps = {name: options.pop(name) for name in PLACES}
         refuse_options(protocol, scheduler=scheduler, scheduler_file=scheduler_file, **options)

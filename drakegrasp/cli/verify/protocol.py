@@ -10,7 +10,6 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
 
 from drakegrasp.cli.errors import say
 
@@ -40,6 +39,8 @@ class ProtocolRequest:
     @property
     def is_foreign(self) -> bool:
         """Whether the grasps are files of DexGraspBench."""
+        import numpy as np
+
         path = self.grasps
         if Path(self.hand or "").suffix == ".xml" or self.assets is not None or path.is_dir():
             return True

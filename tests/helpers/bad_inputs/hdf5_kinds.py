@@ -103,6 +103,8 @@ def field_kinds(group: str, fields: Iterable[Field], ways: Sequence[str]) -> Ite
     """Yield a kind for each field, the ways in turn; texts cannot be spoilt by texts."""
     for field, turn in zip(fields, cycle(ways), strict=False):
         way = "missing" if (field.dtype, turn) == ("str", "of texts") else turn
+        # A file may lack an optional field.
+        way = "of another type" if field.optional and way == "missing" else way
         yield dataset_kind(f"{group}/{field.name}", way)
 
 
