@@ -18,7 +18,7 @@ from drakegrasp.build.pipeline import (
     refuse_missing,
     refuse_unusable,
 )
-from drakegrasp.build.request import BUILTIN
+from drakegrasp.build.request import BUILTIN, refuse_unknown
 from drakegrasp.cluster.admission import admitted_workers
 from drakegrasp.cluster.certificates import security_of
 from drakegrasp.cluster.connect import connect
@@ -28,7 +28,7 @@ from drakegrasp.dataset.lock import build_lock
 from drakegrasp.dataset.manifest import claim_directory, release_directory
 from drakegrasp.dataset.paths import BUILTIN_FOLDER
 from drakegrasp.dataset.paths import FILE_NAME as MANIFEST
-from drakegrasp.errors import DataError, GraspError, MeshError, listed
+from drakegrasp.errors import DataError, GraspError
 from drakegrasp.exchange.posture_files import read_postures
 from drakegrasp.hand.carried import carry_hand
 from drakegrasp.hand.description import load_hand
@@ -147,7 +147,7 @@ def build_on(
     refuse_unusable(config)
     config = posture_config(config, postures)
     known = draw_builtin(config.builtin) if sources is None else sources
-    _refuse_unknown(only, [each.name for each in known])
+    refuse_unknown(only, [each.name for each in known])
     if postures is not None:
         refuse_unknown_objects(postures, [each.name for each in known])
         only = [name for name in dict.fromkeys(postures.objects) if not only or name in only]
@@ -186,18 +186,6 @@ def _release_unused(out: Path) -> None:
     """Remove what a build that did not begin has put into a directory."""
     if not (out / MANIFEST).exists():
         release_directory(out)
-
-
-def _refuse_unknown(only: Sequence[str], names: Sequence[str]) -> None:
-    """Refuse names that no object has.
-
-    Raises:
-        MeshError: If there is one.
-    """
-    unknown = [name for name in only if name not in names]
-    if unknown:
-        known = listed(names)
-        raise MeshError(f"only must be names of objects ({known}), got {unknown[0]!r}")
 
 
 def make_benchmark(

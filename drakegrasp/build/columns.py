@@ -13,7 +13,7 @@ import numpy as np
 
 from drakegrasp.build.attempts import TrialSetup, View
 from drakegrasp.dataset.hdf5 import AnyArray
-from drakegrasp.dataset.schema import LOOK_FIELDS, sizes
+from drakegrasp.dataset.schema import LOOK_FIELDS, NO_PRESHAPE, sizes
 from drakegrasp.dataset.shards import trial_columns
 from drakegrasp.frames import pack_pose
 from drakegrasp.grasp import unused_fingers
@@ -58,6 +58,8 @@ def trial_rows(
     columns = {field.name: field.empty(len(records), shape) for field in fields}
     usual = usual_conditions(setup.prepared.model, setup.config.physics)
     hand = setup.scene.hand
+    # The index of a preshape, of which a posture has none.
+    columns["preshape"][:] = NO_PRESHAPE if hand.preshapes else 0
     for i, (attempt, record, fit) in enumerate(zip(attempts, records, fits, strict=True)):
         row = TrialRow(attempt, attempt.conditions or usual, record, fit)
         used = ~unused_fingers(attempt.unused, hand.num_fingers)

@@ -9,14 +9,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from drakegrasp.build.request import BUILTIN, BuildRequest
+from drakegrasp.build.request import BUILTIN, BuildRequest, refuse_unknown
 from drakegrasp.build.stage_times import MEASURED, StageTimes
 from drakegrasp.config import Config
 from drakegrasp.dataset.assembly.pack import TASK_ROWS
 from drakegrasp.errors import ConfigError
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.runtime.environment import available_cores
-from drakegrasp.shapes.classes import CLASSES
+from drakegrasp.shapes.catalog import draw_builtin
 
 #: Time that the scheduler and the client spend on a task, one after the other [s]; measured
 #: with distributed 2026.8 on two cores.
@@ -139,14 +139,16 @@ def plan_request(
         times: Of the stages; `MEASURED` if None.
 
     Raises:
-        MeshError: If there is no mesh.
+        MeshError: If there is no mesh, or `only` names no object.
         ConfigError: If there is no worker.
     """
     if request.objects == BUILTIN:
-        objects = len(CLASSES) * request.config.builtin.per_class
+        names = [each.name for each in draw_builtin(request.config.builtin)]
     else:
         meshes = find_meshes(request.objects, units=request.units, manifest=request.manifest)
-        objects = len(meshes)
+        names = [mesh.name for mesh in meshes]
+    refuse_unknown(request.only, names)
+    objects = len(set(request.only or names))
     count = available_cores() if workers is None else workers
     return plan_build(objects, request.config, count, times or MEASURED)
 

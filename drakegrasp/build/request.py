@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from drakegrasp.errors import MeshError, listed
 
 if TYPE_CHECKING:
     from drakegrasp.config import Config
@@ -37,3 +40,15 @@ class BuildRequest:
     only: tuple[str, ...]
     postures: Path | None
     show: bool
+
+
+def refuse_unknown(only: Sequence[str], names: Sequence[str]) -> None:
+    """Refuse names that no object has.
+
+    Raises:
+        MeshError: If there is one.
+    """
+    unknown = [name for name in only if name not in names]
+    if unknown:
+        known = listed(names)
+        raise MeshError(f"only must be names of objects ({known}), got {unknown[0]!r}")

@@ -113,8 +113,9 @@ class GraspDataset:
         if fewer and not fewer_fingers:
             raise DataError(
                 f"{self.path}: {split} must have contacts of all fingers, got {fewer} of "
-                f"{self._length} grasps that leave some out, whose contacts are NaN; "
-                "GraspDataset(..., fewer_fingers=True) reads them"
+                f"{self._length} grasps that leave some out, whose contacts are NaN: commands need "
+                "a split of a hand whose preshapes close all fingers; in Python "
+                "GraspDataset(..., fewer_fingers=True) reads these"
             )
 
     def __len__(self) -> int:

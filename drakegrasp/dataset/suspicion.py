@@ -27,6 +27,7 @@ import numpy.typing as npt
 from drakegrasp.arithmetic import Array, multiply, norm
 from drakegrasp.dataset.schema import TRIAL_FIELDS, Shown
 from drakegrasp.frames import unpack_pose
+from drakegrasp.grasp import unused_fingers
 from drakegrasp.outcomes import Outcome, Stage
 
 #: Drake's gravity [m/s^2], as in `simulation.settle`, which loads Drake.
@@ -107,7 +108,7 @@ PARTS = (
         "normal_sum",
         0.54,
         Shown("sum of normals", digits=2),
-        "length of the sum of the contact normals after closing, per finger",
+        "length of the sum of the contact normals after closing, per finger that grasps",
         Stage.CLOSED,
     ),
 )
@@ -115,6 +116,7 @@ PARTS = (
 #: Columns of `/trials` that `suspicion` reads.
 COLUMNS = (
     "outcome",
+    "unused",
     "closed_touching",
     "closed_penetration",
     "lifted_penetration",
@@ -201,6 +203,8 @@ def _values(columns: Mapping[str, npt.NDArray[Any]]) -> dict[str, Array]:
     normals = np.asarray(columns["closed_nhat_Q_O"], dtype=float)
     normals = np.where(judged[..., None], normals, np.nan_to_num(normals))
 
+    used = (~unused_fingers(columns["unused"], normals.shape[1])).sum(axis=1)
+
     return {
         "penetration": depths,
         **fits,
@@ -208,5 +212,5 @@ def _values(columns: Mapping[str, npt.NDArray[Any]]) -> dict[str, Array]:
         "turn": np.asarray(columns["turn"], dtype=float),
         "other_links": np.asarray(columns["lifted_other_links"], dtype=float),
         "imbalance": norm(rest_T) / weight,
-        "normal_sum": norm(normals.sum(axis=1)) / normals.shape[1],
+        "normal_sum": norm(normals.sum(axis=1)) / used,
     }

@@ -14,6 +14,7 @@ from typing import Any
 from drakegrasp.config import (
     DEFAULT_HAND,
     Config,
+    HandSource,
     apply_override,
     is_own_class,
     parse_config,
@@ -85,10 +86,12 @@ def override_config(config: Config, overrides: Sequence[str], **values: Any) -> 
     if tree["hand"] != config.hand and isinstance(candidates, dict):
         same = [key for key in HAND_KEYS if candidates.get(key) == known["candidates"][key]]
         tree["candidates"] = {**candidates, **dict.fromkeys(same)}
-    changed = _completed(tree, config.code)
     named = {key for key, value in values.items() if value is not None}
     named |= {text.partition("=")[0].strip() for text in overrides}
-    return changed if "hand" in named else changed.with_hand(config.hand, config.hand_source)
+    if "hand" in named:
+        return _completed(tree, config.code)
+    changed = _completed(tree, config.code, config.hand_source)
+    return changed.with_hand(config.hand, config.hand_source)
 
 
 def _with_absolute_hand(tree: dict[str, Any]) -> dict[str, Any]:
@@ -130,12 +133,17 @@ def _read_classes(tree: dict[str, Any]) -> tuple[dict[str, Any], dict[str, str]]
     return tree, code
 
 
-def _completed(tree: dict[str, Any], known: Mapping[str, str] | None = None) -> Config:
+def _completed(
+    tree: dict[str, Any],
+    known: Mapping[str, str] | None = None,
+    source: HandSource | None = None,
+) -> Config:
     """Return the configuration of a tree of values, where those of the hand may be missing.
 
     Args:
         tree: The values.
         known: Text of the files of classes that the tree names with their digests.
+        source: The hand, if it is not found by the name that the tree has.
     """
     tree, code = _read_classes(tree)
     hand, candidates = tree.get("hand", DEFAULT_HAND), tree.get("candidates", {})
@@ -144,7 +152,8 @@ def _completed(tree: dict[str, Any], known: Mapping[str, str] | None = None) -> 
     missing = [key for key in HAND_KEYS if candidates.get(key) is None]
     if missing:
         # A hand that is no text is refused by `parse_config`, too.
-        described = read_hand_file(hand_file(hand if isinstance(hand, str) else DEFAULT_HAND))
+        source = source or (hand if isinstance(hand, str) else DEFAULT_HAND)
+        described = read_hand_file(hand_file(source))
         filled = {key: getattr(described, key) for key in missing}
         tree = {**tree, "candidates": {**candidates, **filled}}
     return parse_config(tree).with_code({**(known or {}), **code})

@@ -165,7 +165,6 @@ class _Draft:
 
     Attributes:
         builder: Of the diagram.
-        hand_side: The object's surface that a hand meets.
     """
 
     builder: DiagramBuilder
@@ -174,7 +173,6 @@ class _Draft:
     plant: MultibodyPlant
     scene_graph: SceneGraph
     object: RigidBody
-    hand_side: GeometryId
     table_side: GeometryId
     table: RigidBody
 
@@ -195,7 +193,7 @@ def _draft(
     object_body = plant.AddRigidBody(
         "object", plant.AddModelInstance("object"), object_inertia(model, model.mass)
     )
-    hand_side = _add_surface(plant, object_body, "hand", model.collision_solid, physics)
+    _add_surface(plant, object_body, "hand", model.collision_solid, physics)
     table_side = _add_surface(plant, object_body, "table", resting_surface, physics)
     table = _add_table(plant, scene_graph, physics)
 
@@ -211,7 +209,6 @@ def _draft(
         plant=plant,
         scene_graph=scene_graph,
         object=object_body,
-        hand_side=hand_side,
         table_side=table_side,
         table=table,
     )

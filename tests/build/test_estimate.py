@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
-from helpers.commands import run
+from helpers.commands import error_line, run
 from helpers.scripts import load_script
 from hypothesis import given
 from hypothesis import strategies as st
@@ -63,6 +63,15 @@ def test_certificates_cost_their_trials() -> None:
     certified = override_config(SMALL, ["certify.repeats=2"])
     seconds = [plan_build(1, c, 1, times).stages["simulate"] for c in (SMALL, certified)]
     assert seconds[1] - seconds[0] == pytest.approx(2 * (2 + 5) * CERTIFY_SECONDS)
+
+
+def test_a_plan_is_of_the_objects_that_are_named(tmp_path: Path) -> None:
+    words = ("build", "--objects", "builtin", "--out", tmp_path / "out", "--plan", "--only")
+    result = run(*words, "1_mug_1", "--only", "1_mug_1")
+    assert result.stdout.startswith("from the beginning: 1 objects, "), result.output
+    result = run(*words, "1_jug_1")
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert error_line(result).endswith("got '1_jug_1'")
 
 
 @pytest.mark.parametrize(("workers", "scenes"), [(1, 2), (2, 2), (4, 1)])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from helpers.datasets import OTO, make_dataset
@@ -12,7 +13,7 @@ from helpers.hands import write_with_optional_fingers
 from drakegrasp.cli.verify.request import VerifyRequest, place_requested
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.errors import HandError
+from drakegrasp.errors import GraspError, HandError
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.settings import load_config
 
@@ -101,3 +102,18 @@ def test_a_hand_of_the_package_keeps_its_name(
     (tmp_path / "franka").write_text("a file of that name")
     monkeypatch.chdir(tmp_path)
     assert load_config(hand="franka").hand == "franka"
+
+
+def test_grasps_of_others_are_tried_on_rows_that_leave_fingers_out(tmp_path: Path) -> None:
+    """Only their objects and cameras are needed; the rows' own grasps are refused."""
+    out = make_dataset(tmp_path / "out", tmp_path)
+    with h5py.File(out / OTO, "r+") as file:
+        file["test/grasp_props/unused"][:] = 0b001
+        predicted = file["test/grasps"][:]
+    np.save(tmp_path / "predicted.npy", predicted)
+    grasps, _ = place_requested(
+        request(out, grasps=tmp_path / "predicted.npy", dataset=out / OTO, split="test")
+    )
+    assert len(grasps) == len(predicted) > 0
+    with pytest.raises(GraspError, match="test must have contacts of all fingers, got "):
+        place_requested(request(out, split="test"))

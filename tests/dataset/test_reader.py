@@ -113,7 +113,8 @@ def test_grasps_of_fewer_fingers_are_read_by_who_asks_for_them(tmp_path: Path) -
     path = write_data_file(tmp_path / "grasping_oto.hdf5", range(2), unused=0b010)
     with pytest.raises(
         DataError,
-        match=r"train must have contacts of all fingers, got 2 of 2 .* fewer_fingers=True",
+        match=r"train must have contacts of all fingers, got 2 of 2 .*: commands need a split "
+        r"of a hand whose preshapes close all fingers; in Python .* fewer_fingers=True",
     ):
         GraspDataset(path, split="train")
     assert len(GraspDataset(path, split="test")) == 0

@@ -25,6 +25,7 @@ def firm(count: int = 2, mass: float = 1.0) -> dict[str, npt.NDArray[Any]]:
     pull_T = np.array([[3.0, 0.0, 0.0], [-3.0, 0.0, 0.0], [0.0, 0.0, mass * module.GRAVITY]])
     rows: dict[str, Any] = {
         "outcome": np.uint8(Outcome.SUCCESS),
+        "unused": np.uint32(0),
         "closed_touching": np.ones(3, dtype=bool),
         "closed_penetration": np.zeros(3),
         "lifted_penetration": np.zeros(3),
@@ -136,6 +137,14 @@ def test_a_success_without_a_normal_is_most_suspicious_by_it() -> None:
     found = suspicion(columns)
     assert found.shares["normal_sum"][1] == found.shares["normal_angle"][1] == CAP
     assert found.score[1] == pytest.approx(np.sqrt(2.0) * CAP)
+
+
+def test_normals_are_of_the_fingers_that_a_preshape_uses() -> None:
+    columns = firm()
+    columns["closed_nhat_Q_O"][:] = [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [np.nan] * 3]
+    columns["closed_touching"][:, 2] = False
+    columns["unused"][1] = 0b100
+    np.testing.assert_allclose(suspicion(columns).values["normal_sum"], [2.0 / 3.0, 1.0])
 
 
 def test_gravity_is_the_simulators() -> None:

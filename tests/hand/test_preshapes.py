@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import yaml
 from helpers.successes import good
 
-from drakegrasp.config import CandidateConfig, FilterConfig
+from drakegrasp.build.columns import trial_rows
+from drakegrasp.config import CandidateConfig, Config, FilterConfig
 from drakegrasp.dataset.filters import judge_successes
 from drakegrasp.errors import HandError
 from drakegrasp.exchange.closed_grasps import ClosedGrasp
@@ -20,8 +22,11 @@ from drakegrasp.grasp import unused_fingers
 from drakegrasp.hand.description import Hand, load_hand, load_plain_hand
 from drakegrasp.hand.files import hand_file
 from drakegrasp.hand.kinematics import joint_positions
-from drakegrasp.outcomes import Removal
-from drakegrasp.simulation.candidates import Candidates, make_attempts
+from drakegrasp.objects.model import ObjectModel
+from drakegrasp.outcomes import Outcome, Removal
+from drakegrasp.simulation.candidates import Attempt, Candidates, Source, make_attempts
+from drakegrasp.simulation.construction import build_scene
+from drakegrasp.simulation.trial import TrialRecord
 from drakegrasp.visualization.still_scene import StillScene
 
 PINCH = {
@@ -114,6 +119,23 @@ def test_preshapes_are_drawn_after_the_spreads() -> None:
     assert {a.preshape for a in without} == {None}
     assert sorted({a.preshape for a in shaped}) == [0, 1, 2]
     assert [a.preshape for a in attempts(3)] == [a.preshape for a in shaped]
+
+
+@pytest.mark.parametrize(("name", "none"), [("allegro_four", 255), ("allegro", 0)])
+def test_a_posture_is_not_stored_as_of_the_first_preshape(
+    name: str, none: int, cube: ObjectModel, config: Config
+) -> None:
+    hand, X = load_hand(name), np.eye(4)
+    prepared = SimpleNamespace(model=cube)
+    setup = SimpleNamespace(
+        scene=build_scene(cube, config.physics, hand), prepared=prepared, config=config
+    )
+    place = {"candidate": 0, "standoff_index": 0, "standoff": np.nan, "spread": 0.0, "seed": 0}
+    posture = Attempt(X_OG=X, source=Source.POSTURES, **place)
+    drawn = replace(posture, source=Source.NORMALS, preshape=0 if hand.preshapes else None)
+    record = TrialRecord(outcome=Outcome.START_COLLISION, X_TO=X, X_OG=X)
+    rows = trial_rows(setup, [posture, drawn], [record] * 2, [None] * 2)
+    assert rows["preshape"].tolist() == [none, 0]
 
 
 def test_bits_say_which_fingers_are_left_out() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from helpers.hands import write_pincer
 
+from drakegrasp.config import CarriedHand
 from drakegrasp.errors import HandError
 from drakegrasp.hand.settings import load_config, override_config
 
@@ -27,6 +28,15 @@ def test_null_is_the_hands_own() -> None:
     assert config.candidates.standoffs == (0.04, 0.07, 0.10)
     own = override_config(config, ["candidates.standoffs=null"])
     assert own.candidates.standoffs == load_config().candidates.standoffs
+
+
+def test_null_is_that_of_the_hand_that_a_dataset_carries(tmp_path: Path) -> None:
+    """Its name says where it lies in the dataset."""
+    carried = CarriedHand(path=write_pincer(tmp_path), digest="")
+    config = load_config().with_hand("hand/pincer_hand.yaml", carried)
+    own = override_config(config, ["candidates.standoffs=null"])
+    assert own.candidates.standoffs == (0.03, 0.05)
+    assert own.hand_source == carried
 
 
 def test_another_hand_brings_its_own_unless_they_are_overridden(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from drakegrasp.simulation import drive as drive_module
 from drakegrasp.simulation.candidates import Attempt, Pregrasp, Source
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.drive import disengage, drive_of, engage, opening_torques
+from drakegrasp.simulation.sampling import centring
 from drakegrasp.simulation.sampling.centring import centred
 from drakegrasp.simulation.scene import (
     Scene,
@@ -124,6 +126,19 @@ def test_a_palm_stays_where_nothing_is_between_its_jaws(tmp_path: Path) -> None:
     hand, model = gripper(tmp_path, one_motor=True), box()
     X_OG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.2, 0.01, 0.08])
     (found,) = centred(model, hand, [Pregrasp(X_OG=X_OG, spread=0.0)])
+    np.testing.assert_array_equal(found.X_OG, X_OG)
+
+
+@pytest.mark.parametrize("still", [{0}, {1}, {0, 1}])
+def test_a_palm_stays_where_a_pad_does_not_move(
+    still: set[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As at the ends of a linkage: there is no direction in which to move."""
+    hand, sides = gripper(tmp_path, one_motor=True), itertools.cycle((0, 1))
+    moved = centring._pad_motion
+    monkeypatch.setattr(centring, "_pad_motion", lambda *a: moved(*a) * (next(sides) not in still))
+    X_OG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.002, 0.004, 0.08])
+    (found,) = centred(box(), hand, [Pregrasp(X_OG=X_OG, spread=0.0)])
     np.testing.assert_array_equal(found.X_OG, X_OG)
 
 

@@ -91,7 +91,11 @@ def _place(request: VerifyRequest) -> tuple[list[PlacedGrasp], Config]:
 
     # A dataset has a default split. An HDF5 file of grasps may have no groups at all.
     split = request.split if path is None else request.split or DEFAULT_SPLIT
-    data = None if path is None else GraspDataset(path, split=split or DEFAULT_SPLIT)
+    data = None
+    if path is not None:
+        # Of rows for the grasps of others only objects and cameras are needed.
+        others = path != request.grasps
+        data = GraspDataset(path, split=split or DEFAULT_SPLIT, fewer_fingers=others)
     predicted = read_predictions(request.grasps, split=split)
 
     # Without a dataset all grasps are for the one mesh.

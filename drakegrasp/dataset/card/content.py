@@ -28,9 +28,9 @@ from drakegrasp.dataset.statistics import (
 )
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import HandError, printable
-from drakegrasp.hand.file_format import read_hand_file
+from drakegrasp.hand.file_format import HandFile, read_hand_file
 from drakegrasp.hand.files import hand_file, hand_names
-from drakegrasp.hand.folder import hand_folder
+from drakegrasp.hand.folder import HandFolder, hand_folder
 from drakegrasp.outcomes import Outcome, Removal
 
 #: What the licence is called of meshes for which none is stated.
@@ -157,27 +157,27 @@ def _settings(config: Config) -> dict[str, Any]:
 
     # Labels depend on the drive. The file of an older dataset's hand may be elsewhere now.
     if config.lift.drive is None:
-        path = _known_hand_file(config)
-        own = "that of the hand file" if path is None else read_hand_file(path).drive
-        settings["lift.drive"] = own
+        known = _known_hand(config)
+        settings["lift.drive"] = known[0].drive if known else "that of the hand file"
     return settings
 
 
-def _known_hand_file(config: Config) -> Path | None:
-    """Return the hand file of the dataset or of the package; None if it is neither's."""
+def _known_hand(config: Config) -> tuple[HandFile, HandFolder] | None:
+    """Return the hand of the dataset or the package; None if it is neither's, or damaged."""
     if not isinstance(config.hand_source, CarriedHand) and config.hand not in hand_names():
         return None
     try:
-        return hand_file(config.hand_source)
+        source = config.hand_source
+        return read_hand_file(hand_file(source)), hand_folder(source)
     except HandError:
         return None
 
 
 def _hand_licences(config: Config) -> dict[str, str]:
     """Return the first line of each licence of a hand, by the name of its file."""
-    if _known_hand_file(config) is None:
+    if (known := _known_hand(config)) is None:
         return {}
-    folder = hand_folder(config.hand_source)
+    folder = known[1]
     found = {place: _first_line(folder.content(place)) for place in folder.licences}
     return found or ({"LICENSE": OWN_LICENCE} if config.hand in hand_names() else {})
 

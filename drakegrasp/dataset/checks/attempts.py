@@ -120,7 +120,8 @@ def chances(
     lifts = np.isfinite(batch["time_close"]) & (verdict == Outcome.SUCCESS)
     due = np.where(lifts & (chance is not None), batch["chance"], np.nan)
     for _, known, rows in _by_object(batch, manifest, model):
-        own = rows[lifts[rows]]
+        # That of fewer fingers is of their contacts alone.
+        own = rows[lifts[rows] & (batch["unused"][rows] == 0)]
         if chance is not None and len(own):
             due[own] = _chance(chance, batch.where(np.isin(np.arange(len(batch)), own)), known)
     yield from batch.follows("chance", due, "the contacts after closing", CHANCE_TOLERANCE)

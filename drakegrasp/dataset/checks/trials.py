@@ -14,7 +14,7 @@ import numpy as np
 from drakegrasp.config import LiftConfig
 from drakegrasp.dataset.checks.findings import Violation
 from drakegrasp.dataset.checks.rows import AnyArray, Batch, all_per_row, rotation, unit_length
-from drakegrasp.dataset.schema import TRIAL_FIELDS
+from drakegrasp.dataset.schema import NO_PRESHAPE, TRIAL_FIELDS
 from drakegrasp.frames import invert_pose
 from drakegrasp.grasp import unused_fingers
 from drakegrasp.outcomes import Outcome, Stage
@@ -86,6 +86,10 @@ def numbers(
     # Only of a posture from outside may the density be unknown.
     what, density = "log_density must be finite but for postures", batch["log_density"]
     yield from batch.broken(what, ~np.isfinite(density) & (source != Source.POSTURES), density)
+    what = "preshape must be 255 of postures only, which use all fingers"
+    bad = (source != Source.POSTURES) | (batch["unused"] > 0)
+    bad &= batch["preshape"] == NO_PRESHAPE
+    yield from batch.broken(what, bad, batch["preshape"])
     if children is not None:
         parent = np.where(refined, (child - 1) // max(children, 1), 0)
         yield from batch.follows("parent", parent, "child")

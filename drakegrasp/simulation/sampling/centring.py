@@ -84,7 +84,8 @@ def _move(model: ObjectModel, X_OG: Array, paths: Sequence[FingerPath], ratio: A
     motion *= ratio[:, None, None]
 
     # One side is what moves with the first finger, and its first finger to touch counts.
-    u = motion[0] / norm(motion[0])[:, None]
+    # A pad that stays where it is has no direction, and nothing is on a side.
+    u = motion[0] / np.maximum(norm(motion[0]), np.finfo(float).tiny)[:, None]
     speed = dot(motion, u)
     first, rate = [], []
     for side in (speed > 0.0, speed < 0.0):
@@ -92,7 +93,7 @@ def _move(model: ObjectModel, X_OG: Array, paths: Sequence[FingerPath], ratio: A
         nearest = where.argmin(axis=0)[None]
         first.append(np.take_along_axis(where, nearest, axis=0)[0])
         rate.append(np.abs(np.take_along_axis(speed, nearest, axis=0)[0]))
-    with np.errstate(invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
         distance = (first[0] - first[1]) / (1.0 / rate[0] + 1.0 / rate[1])
     distance = np.where(np.isfinite(distance), distance, 0.0)
     along = (X_OG[:, :3, :3] * u[:, None, :]).sum(axis=2)

@@ -8,8 +8,10 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import pytest
 from helpers.datasets import SLIPPED, end_lift
 
+from drakegrasp.config import CarriedHand
 from drakegrasp.dataset.assemble import assemble
 from drakegrasp.dataset.card.content import card_content, content_of
 from drakegrasp.dataset.card.text import card_text
@@ -144,3 +146,17 @@ def test_check_finds_the_card_of_other_files(out: Path) -> None:
         )
     path.unlink()
     assert check_dataset(out) == []
+
+
+@pytest.mark.parametrize("text", ["version: 1\nfingers: 3\n", "model: ../../elsewhere.sdf\n"])
+def test_a_damaged_hand_of_a_dataset_leaves_out_what_the_card_says_of_it(
+    out: Path, text: str
+) -> None:
+    manifest, path = read_manifest(out), out / "hand" / "own_hand.yaml"
+    path.parent.mkdir()
+    path.write_text(text)
+    config = manifest.config.with_hand("hand/own_hand.yaml", CarriedHand(path=path, digest=""))
+    files = (out / "trials.hdf5", out / "grasping_oto.hdf5")
+    content = content_of(replace(manifest, config=config), *files)
+    assert content["settings"]["lift.drive"] == "that of the hand file"
+    assert content["hand_licences"] == {}

@@ -12,6 +12,8 @@ from helpers.datasets import (
     BELOW,
     HAND,
     MISSING,
+    OTM,
+    OTO,
     SLIPPED,
     SUCCESS,
     TRIALS,
@@ -92,6 +94,7 @@ TRIAL_CASES: Mapping[str, tuple[str, int, Edit, str]] = {
     "chance": ("chance", SUCCESS, lambda c: c - 0.01, "chance must follow from the contacts aft"),
     "chance of none": ("chance", HAND, lambda _: 0.5, "chance must follow from the contacts after"),
     "early chance": ("chance", BELOW, lambda _: 0.5, "chance must be NaN before the stage closed"),
+    "preshape": ("preshape", SUCCESS, lambda _: 255, "preshape must be 255 of postures only"),
     "verdict": ("outcome", SLIPPED, lambda _: Outcome.DROPPED, "outcome must follow from the"),
 }
 
@@ -230,3 +233,11 @@ def test_force_that_pulls_at_a_mean_normal_is_wrong_where_friction_is_usual(
     change(out, TRIALS, "trials/lifted_f_Q_O", SUCCESS, lambda f: -f)
     said = [what for *_, what in found(out / TRIALS)]
     assert any("must push into the object" in what for what in said) == reported
+
+
+def test_chance_of_fewer_fingers_is_not_derived_from_contacts_of_all(out: Path) -> None:
+    """It is a chance of theirs."""
+    change(out, TRIALS, "trials/chance", SUCCESS, lambda c: c - 0.01)
+    change(out, TRIALS, "trials/unused", SUCCESS, lambda _: 0b001)
+    what = "grasp_props/unused must follow from its trial"
+    must_find_without_shards(out, *((name, "/valid", 0, what) for name in (OTO, OTM)))
