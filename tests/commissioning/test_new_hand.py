@@ -126,6 +126,21 @@ def test_an_effort_is_that_of_the_weakest_joint(tmp_path: Path) -> None:
     assert limits[1] < 0.5 * limits[0]
 
 
+@pytest.mark.parametrize(
+    ("in_model", "answer", "message"),
+    [
+        ("60", 2000.0, r"^--effort must be 0\.5\.\.1000 N for joint 'left_slide', got 2000$"),
+        ("2000", None, r"joint 'left_slide' must be .* got 2000 in the model"),
+    ],
+)
+def test_an_effort_that_no_motor_has_is_named_with_its_source(
+    tmp_path: Path, in_model: str, answer: float | None, message: str
+) -> None:
+    text = JAWS.replace('effort="60"', f'effort="{in_model}"')
+    with pytest.raises(HandError, match=message):
+        draft(tmp_path, text, effort=answer)
+
+
 def test_spread_joints_are_told_from_those_that_close(tmp_path: Path) -> None:
     """From SDFormat, with meshes, of the package's own hand."""
     drafted = draft_hand(MODELS / "barrett_hand.sdf", tmp_path / "out", answers=Answers(effort=2.0))
