@@ -48,6 +48,12 @@ def _refuse_tiny(value: float) -> float:
     return value
 
 
+def _refuse_millimetres(value: float) -> float:
+    if value > 1.0:
+        raise ValueError(f"must be at most 1 m, got {value:g} m")
+    return value
+
+
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 Positive = Annotated[
     float, Field(gt=0.0, le=LARGEST, allow_inf_nan=False), AfterValidator(_refuse_tiny)
@@ -57,6 +63,10 @@ Count = Annotated[int, Field(ge=1, le=MOST)]
 NonNegativeCount = Annotated[int, Field(ge=0, le=MOST)]
 Seed = Annotated[int, Field(ge=0, le=MOST_SEED)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
+#: Distances of the palm from the object [m].
+Standoffs = Annotated[
+    tuple[Annotated[Positive, AfterValidator(_refuse_millimetres)], ...], Field(min_length=1)
+]
 Angles = Annotated[tuple[Number, ...], Field(min_length=1)]
 #: Identifier of a licence: a line of printable ASCII.
 Licence = Annotated[str, Field(pattern=r"^[ -~]*[!-~][ -~]*$", max_length=200)]
@@ -216,7 +226,7 @@ class CandidateConfig(_ExtensibleSection):
     # Digest of the postures that are tried instead of palm poses of samplers; `--postures` sets it.
     postures: Annotated[str, Field(pattern="^[0-9a-f]{16}$")] | None = None
     # [m] of the palm from the surface, an attempt each (paper); not given: the hand's own.
-    standoffs: Annotated[tuple[Positive, ...], Field(min_length=1)]
+    standoffs: Standoffs
     # One is drawn per attempt (released code); not given: the hand's own.
     spreads_deg: Annotated[
         tuple[Annotated[float, Field(ge=0.0, le=180.0)], ...], Field(min_length=1)

@@ -369,6 +369,7 @@ def test_number_may_be_written_as_people_do(text: str, value: float) -> None:
         ("camera.fov_y_deg=180", r"camera\.fov_y_deg: must be less than 180, got 180"),
         ("camera.size.width=3", r"camera\.size: must be a valid integer, got \{'width': 3\}"),
         ("candidates.standoffs=[]", r"candidates\.standoffs: must be a list of at least 1, got \["),
+        ("candidates.standoffs=[60]", r"^candidates\.standoffs\.0: must be at most 1 m, got 60 m$"),
         ("candidates.standoffs=[0.1, -1]", r"standoffs\.1: must be greater than 0, got -1"),
         ("candidates.global_x_deg=[.inf]", r"global_x_deg\.0: must be a finite number, got inf"),
         ("candidates.spreads_deg=[.nan]", r"candidates\.spreads_deg\.0: must be .*, got nan"),
@@ -547,8 +548,8 @@ def test_simulation_hash_does_not_depend_on_the_order_of_keys(tmp_path: Path) ->
 
 
 def test_simulation_hash_is_that_of_the_value_not_of_its_spelling() -> None:
-    one = load_config(overrides=["objects.mass=2", "candidates.standoffs=[1, 2]"])
-    two = load_config(overrides=["objects.mass=2.0", "candidates.standoffs=[1.0, 2e0]"])
+    one = load_config(overrides=["objects.mass=2", "candidates.standoffs=[1, 0.5]"])
+    two = load_config(overrides=["objects.mass=2.0", "candidates.standoffs=[1.0, 5e-1]"])
     assert one.simulation_hash() == two.simulation_hash()
     assert re.fullmatch(r"[0-9a-f]{16}", one.simulation_hash())
 

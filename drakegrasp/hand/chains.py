@@ -192,3 +192,25 @@ def make_chain(
         offset=np.array([drives[joint.name()].offset for joint in moving], dtype=float),
         X_JFi=X,
     )
+
+
+def refuse_joints_of_others(described: HandFile, chains: Sequence[Chain]) -> None:
+    """Refuse a finger that moves a joint of another one alone; bars beside all fingers may follow.
+
+    Raises:
+        HandError: If one does.
+    """
+    owners = {
+        joint: finger.name
+        for finger, chain in zip(described.fingers, chains, strict=True)
+        for joint in chain.joints
+    }
+    for i, (finger, chain) in enumerate(zip(described.fingers, chains, strict=True)):
+        moved = {"closing_joint": finger.closing_joint}
+        moved |= {f"coupled.{n}.joint": c.joint for n, c in enumerate(finger.coupled)}
+        for key, joint in moved.items():
+            if joint in owners and joint not in chain.joints:
+                raise HandError(
+                    f"fingers.{i}.{key}: must lie between the palm link and the fingertip "
+                    f"{finger.fingertip!r}, got {joint!r} of finger {owners[joint]!r}"
+                )

@@ -35,6 +35,7 @@ from drakegrasp.hand.chains import (
     joint_slides,
     make_chain,
     moving_joint,
+    refuse_joints_of_others,
 )
 from drakegrasp.hand.file_format import (
     Coupling,
@@ -261,6 +262,7 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
                 f"got {finger.closing_joint!r}"
             )
         chains.append(chain)
+    refuse_joints_of_others(described, chains)
 
     return Hand(
         name=name,

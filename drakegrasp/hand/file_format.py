@@ -25,7 +25,7 @@ from pydantic import (
     with_config,
 )
 
-from drakegrasp.config import describe_mistake
+from drakegrasp.config import Standoffs, describe_mistake
 from drakegrasp.errors import HandError, one_line
 from drakegrasp.foreign_files import read_text
 from drakegrasp.frames import Array
@@ -227,7 +227,7 @@ class HandFile(BaseModel):
     preshapes: tuple[Preshape, ...] = ()  # one is drawn per attempt; none: all fingers close
     closing_speed_deg: Positive | None = None  # of turning closing joints [deg/s]
     closing_speed: Positive | None = None  # of sliding closing joints [m/s]
-    standoffs: Annotated[tuple[Positive, ...], Field(min_length=1)]  # palm to surface [m]
+    standoffs: Standoffs  # palm to surface [m]
     spreads_deg: Annotated[
         tuple[Annotated[float, Field(ge=0.0, le=180.0)], ...], Field(min_length=1)
     ] = (0.0,)
@@ -398,8 +398,12 @@ def read_hand_file(path: Path) -> HandFile:
     try:
         return HandFile.model_validate(tree)
     except ValidationError as error:
+        # A bad item of a list also makes the list too short: leave out what follows from it.
+        mistakes = error.errors()
+        below = {m["loc"][:n] for m in mistakes for n in range(1, len(m["loc"]))}
         lines = [
             describe_mistake(mistake, whole="hand", legal="a key of a hand file")
-            for mistake in error.errors()
+            for mistake in mistakes
+            if mistake["loc"] not in below
         ]
         raise HandError(f"{path}: {'; '.join(lines)}") from None

@@ -126,6 +126,44 @@ def test_an_effort_is_that_of_the_weakest_joint(tmp_path: Path) -> None:
     assert limits[1] < 0.5 * limits[0]
 
 
+@pytest.mark.parametrize(
+    ("in_model", "answer", "message"),
+    [
+        ("60", 2000.0, r"^--effort must be 0\.5\.\.1000 N for joint 'left_slide', got 2000$"),
+        ("2000", None, r"joint 'left_slide' must be .* got 2000 in the model"),
+    ],
+)
+def test_an_effort_that_no_motor_has_is_named_with_its_source(
+    tmp_path: Path, in_model: str, answer: float | None, message: str
+) -> None:
+    text = JAWS.replace('effort="60"', f'effort="{in_model}"')
+    with pytest.raises(HandError, match=message):
+        draft(tmp_path, text, effort=answer)
+
+
+def test_what_of_a_joints_range_is_not_used_is_noted(tmp_path: Path) -> None:
+    """Jaws whose zero is neither their open nor their closed end."""
+    assert draft(tmp_path / "whole", JAWS).notes == ()
+    text = JAWS.replace('lower="0" upper="0.05"', 'lower="-0.045" upper="0.005"')
+    text = text.replace('xyz="0 0 0"/><axis xyz="0 1', 'xyz="0 0.045 0"/><axis xyz="0 1')
+    text = text.replace('xyz="0 0 0"/><axis xyz="0 -1', 'xyz="0 -0.045 0"/><axis xyz="0 -1')
+    for side, note in zip(("left", "right"), sorted(draft(tmp_path, text).notes), strict=True):
+        assert note.startswith(
+            f"joint {side}_slide: the hand is open at 0 of -0.045..0.005 m, so 0.005 m are not used"
+        )
+
+
+def test_a_finger_that_an_answer_drops_is_noted(tmp_path: Path) -> None:
+    """Reversed it no longer closes as the others do."""
+    text = MITTEN.replace('<mimic joint="middle_1" multiplier="0.8"/>', "")
+    drafted = draft(tmp_path, text, reverse=("middle_1",))
+    tips = {finger.fingertip for finger in load_hand(drafted.path).fingers}
+    assert tips == {"index_far", "thumb_far"}
+    assert [note for note in drafted.notes if note.startswith("finger")] == [
+        "finger middle_far is not used: with middle_1 reversed none of its joints closes it"
+    ]
+
+
 def test_spread_joints_are_told_from_those_that_close(tmp_path: Path) -> None:
     """From SDFormat, with meshes, of the package's own hand."""
     drafted = draft_hand(MODELS / "barrett_hand.sdf", tmp_path / "out", answers=Answers(effort=2.0))

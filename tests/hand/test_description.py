@@ -8,7 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from helpers.hands import PINCER, PINCER_SDF, changed_finger, drake_fingertip_poses, write_pincer
+import yaml
+from helpers.hands import (
+    PINCER,
+    PINCER_SDF,
+    changed_finger,
+    drake_fingertip_poses,
+    write_pincer,
+    write_tongs,
+)
 from pydrake.geometry import Box, Convex, Cylinder, SceneGraph
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.framework import DiagramBuilder
@@ -311,6 +319,20 @@ def test_a_bad_description_is_refused_in_one_line(tmp_path: Path, case: str) -> 
         load_hand(write_pincer(tmp_path, **changes))
     assert "\n" not in str(info.value)
     assert str(tmp_path / "pincer_hand.yaml") in str(info.value)
+
+
+@pytest.mark.parametrize("key", ["closing_joint", "coupled"])
+def test_a_joint_of_another_finger_is_refused(tmp_path: Path, key: str) -> None:
+    """Though the finger's other joint is its own."""
+    path = write_tongs(tmp_path)
+    tree = yaml.safe_load(path.read_text())
+    left, right = tree["fingers"]
+    left[key], right[key] = right[key], left[key]
+    path.write_text(yaml.safe_dump(tree))
+    with pytest.raises(
+        HandError, match=rf"fingers\.0\.{key}.*: must lie .* 'left_tip', got 'right_.*' of finger"
+    ):
+        load_hand(path)
 
 
 def test_a_joint_that_is_neither_of_both_kinds_is_refused(tmp_path: Path) -> None:

@@ -39,7 +39,7 @@ REFUSALS = {
     "another version": ({"version": 2}, r"version: must be 1, .* got 2"),
     "no effort": (
         {"fingers": [{k: v for k, v in LEFT.items() if k != "torque_limit"}]},
-        r"fingers\.0: torque_limit must be given if the closing joint turns, else force_limit",
+        r"fingers\.0: torque_limit must be given if .* turns, else force_limit, got none$",
     ),
     "two efforts": (
         {"fingers": changed_finger(force_limit=1.0)},
@@ -58,6 +58,10 @@ REFUSALS = {
         r"closing_speed must be left out: no closing joint slides",
     ),
     "no stand-off": ({"standoffs": []}, r"standoffs: must be a list of at least 1"),
+    "stand-offs in millimetres": (
+        {"standoffs": [0.03, 44]},
+        r"hand\.yaml: standoffs\.1: must be at most 1 m, got 44 m$",
+    ),
     "spreads without a spread": (
         {"spreads_deg": [0, 10]},
         r"spreads_deg must be \[0\] without spread\.joints, got \[0\.0, 10\.0\]",

@@ -73,12 +73,8 @@ def find_chains(model: VendorModel, palm: str, answers: Answers) -> list[Chain]:
     Raises:
         HandError: If there are fewer than two, or an answer names none of them.
     """
-    leaves = [name for name in model.links if name != palm and _is_leaf(model, name, palm)]
-    if unknown := [name for name in answers.fingers if name not in model.links]:
-        raise HandError(f"--fingers must be of {', '.join(leaves)}, got {unknown[0]!r}")
-    chosen = list(answers.fingers) or _without_linkages(model, palm, leaves)
     chains = []
-    for tip in chosen:
+    for tip in find_tips(model, palm, answers):
         joints = model.chain(tip, palm)
         if not joints or joints[0].parent != palm:
             raise HandError(f"--fingers must be links beyond the palm {palm!r}, got {tip!r}")
@@ -91,6 +87,18 @@ def find_chains(model: VendorModel, palm: str, answers: Answers) -> list[Chain]:
             f"{len(chains)}: name the palm with --palm LINK, fingertips with --fingers LINK,LINK"
         )
     return chains
+
+
+def find_tips(model: VendorModel, palm: str, answers: Answers) -> list[str]:
+    """Return the last links of fingers.
+
+    Raises:
+        HandError: If an answer is no link.
+    """
+    leaves = [name for name in model.links if name != palm and _is_leaf(model, name, palm)]
+    if unknown := [name for name in answers.fingers if name not in model.links]:
+        raise HandError(f"--fingers must be of {', '.join(leaves)}, got {unknown[0]!r}")
+    return list(answers.fingers) or _without_linkages(model, palm, leaves)
 
 
 def _has_shapes(model: VendorModel, link: str) -> bool:

@@ -52,12 +52,14 @@ class Draft:
         tree: Its keys.
         reasons: Why a value is so, by the path of its key, as in "palm.p_BG".
         changed: Lines for the head of the model: joints whose positions are not the vendor's.
+        grip: Its fingers, in the vendor's positions.
     """
 
     model: VendorModel
     tree: dict[str, Any]
     reasons: dict[str, str]
     changed: list[str]
+    grip: Grip
 
 
 def positions(model: VendorModel, grip: Grip, share: float) -> dict[str, float]:
@@ -138,7 +140,7 @@ def draft_tree(
         if m.sign != 1.0 or m.zero != 0.0
     ]
     rebased = _rebased(model, grip, coupled, drivers, spread)
-    return Draft(model=rebased, tree=tree, reasons=reasons, changed=changed)
+    return Draft(model=rebased, tree=tree, reasons=reasons, changed=changed, grip=grip)
 
 
 def _motor(

@@ -19,6 +19,7 @@ from drakegrasp.commissioning.draft.clearance import Clearance
 from drakegrasp.commissioning.draft.fingers import find_chains, find_palm
 from drakegrasp.commissioning.draft.hand_text import hand_text
 from drakegrasp.commissioning.draft.hand_tree import Draft, draft_tree, positions
+from drakegrasp.commissioning.draft.notes import unused_parts
 from drakegrasp.commissioning.draft.opposition import Grip, find_grips, find_reach
 from drakegrasp.commissioning.draft.palm import find_palm_frames
 from drakegrasp.commissioning.finding import Finding
@@ -52,7 +53,7 @@ class NewHand:
 
     Attributes:
         path: Its hand file.
-        notes: What was left out of the model, or put in.
+        notes: What was left out of the model, put in, or is not used.
         findings: What the checks of its files and geometry say.
     """
 
@@ -97,7 +98,8 @@ def draft_hand(
         licences = chain.from_iterable(path.resolve().parent.glob(name) for name in LICENCES)
         for licence in filter(Path.is_file, licences):
             shutil.copyfile(licence, folder / licence.name)
-    return NewHand(path=out / written.name, notes=model.notes, findings=findings)
+    notes = (*model.notes, *unused_parts(model, best.grip, answers))
+    return NewHand(path=out / written.name, notes=notes, findings=findings)
 
 
 def _find_best(

@@ -100,13 +100,19 @@ def _effort(model: VendorModel, leader: str, effort: float | None) -> float:
     joint = model.joints[leader]
     given = joint.effort if effort is None else effort
     least, most = POSSIBLE[joint.slides]
-    if not least <= given <= most:
-        unit = "N" if joint.slides else "N m"
-        raise HandError(
-            f"the effort of joint {leader!r} must be {least:g}..{most:g} {unit}, got {given:g} in "
-            f"the model: say what its motor gives with --effort {unit.replace(' ', '')}"
-        )
-    return given
+    if least <= given <= most:
+        return given
+
+    # Say where it is from.
+    unit = "N" if joint.slides else "N m"
+    must = f"must be {least:g}..{most:g} {unit}"
+    if effort is not None:
+        raise HandError(f"--effort {must} for joint {leader!r}, got {given:g}")
+    got = f"{given:g} in the model" if given else "none in the model"
+    raise HandError(
+        f"the effort of joint {leader!r} {must}, got {got}: say what its motor gives with "
+        f"--effort {unit.replace(' ', '')}"
+    )
 
 
 def _levers(model: VendorModel, member: Member, step: int) -> tuple[float, dict[str, float]]:
