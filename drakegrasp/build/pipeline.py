@@ -212,6 +212,8 @@ def build_locked(
             with suppress(OSError, DataError):
                 if (out / "manifest.json").exists():
                     events.stopped(error)
+                else:
+                    release_directory(out)
             raise
 
 
