@@ -10,6 +10,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from drakegrasp.arithmetic import multiply
@@ -64,7 +65,8 @@ def grasp_entry(hand: Hand, grasp: ClosedGrasp) -> dict[str, Any]:
 
     # Fingers that the grasp uses are open before it; the other joints stay where they are.
     used = ~unused_fingers(grasp.unused, hand.num_fingers)
-    moves = dict(zip(hand.joint_names, hand.joint_gain[:, 1:][:, used].any(axis=1), strict=True))
+    moved = np.asarray(hand.joint_gain[:, 1:][:, used].any(axis=1))
+    moves = dict(zip(hand.joint_names, moved.tolist(), strict=True))
     opened = joint_positions(hand, grasp.spread, [0.0] * hand.num_fingers)
     return {
         "confidence": 1.0,
