@@ -117,10 +117,14 @@ def croissant(
 
 def _responsibility(card: Mapping[str, Any]) -> dict[str, Any]:
     """Return the fields of Croissant's RAI vocabulary, all from the data card."""
+    # How many, of what, by which programs.
     counts = card["counts"]
-    everything, removed = counts["all"], sum(counts["removed"].values())
+    everything, removals = counts["all"], counts["removed"]
     samples = [row["samples"] for row in counts["classes"].values()]
     versions = ", ".join(f"{name} {card['versions'][name]}" for name in ("drakegrasp", "drake"))
+    reasons = ", ".join(f"{count} {reason}" for reason, count in removals.items()) or "none"
+
+    # Only what is known of every dataset that drakegrasp makes.
     return {
         "rai:dataCollection": (
             f"Simulated with {versions}, hand {card['hand']}: {everything['attempts']} attempts to "
@@ -128,8 +132,7 @@ def _responsibility(card: Mapping[str, Any]) -> dict[str, Any]:
         ),
         "rai:dataCollectionType": "Software Collection",
         "rai:dataPreprocessingProtocol": (
-            f"Filters removed {removed} held grasps: "
-            f"{', '.join(f'{n} {reason}' for reason, n in counts['removed'].items()) or 'none'}."
+            f"Filters removed {sum(removals.values())} held grasps: {reasons}."
         ),
         "rai:dataAnnotationProtocol": (
             "Each label is the outcome of a simulated lift; no network made or corrected one."
