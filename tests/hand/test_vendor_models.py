@@ -89,6 +89,28 @@ def test_mjcf_says_the_same_as_urdf(tmp_path: Path) -> None:
         )
 
 
+def test_a_class_of_mjcf_has_what_all_classes_around_it_say(tmp_path: Path) -> None:
+    """Also where one in between says nothing of the tag, and by `childclass` from bodies above."""
+    classes = """<default><joint type="slide"/><default class="jaw">
+      <joint axis="0 1 0" range="0 0.05"/><motor forcerange="-60 60"/>
+      <default class="between"><geom mass="0.05"/>
+        <default class="right"><joint axis="0 -1 0"/></default>
+        <default class="left"><joint damping="1"/></default></default></default></default>"""
+    text = JAWS_MJCF.replace("<worldbody>", f"{classes}<worldbody>")
+    text = text.replace('<body name="body">', '<body name="body" childclass="left">')
+    text = text.replace('type="slide" axis="0 1 0" range="0 0.05"', "")
+    text = text.replace('type="slide" axis="0 -1 0" range="0 0.05"', 'class="right"')
+    text = text.replace('<motor joint="left_slide" forcerange="-60 60"/>',
+                        '<motor joint="left_slide" class="right"/>')  # fmt: skip
+    assert text.count("range=") == 2
+    plain = read(write_model(tmp_path, JAWS_MJCF, "plain.xml"))
+    for name, joint in read(write_model(tmp_path, text, "hand.xml")).joints.items():
+        assert joint.slides
+        np.testing.assert_allclose(joint.axis, plain.joints[name].axis)
+        np.testing.assert_allclose(joint.limits, plain.joints[name].limits)
+        assert joint.effort == plain.joints[name].effort
+
+
 @pytest.mark.parametrize("suffix", [".obj", ".stl", ".glb"])
 def test_meshes_of_many_formats_are_drawn(tmp_path: Path, suffix: str) -> None:
     """Their triangles are written beside the model, with the colour of their material."""

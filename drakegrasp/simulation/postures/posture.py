@@ -10,19 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
-from pydrake.multibody.plant import MultibodyPlant
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.errors import GraspError
 from drakegrasp.frames import X_WT, Array, as_numbers, invert_pose, read_pose
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import coordinate_limits, open_together
-from drakegrasp.hand.parsing import ModelFile, add_model
+from drakegrasp.hand.parsing import position_order
 from drakegrasp.simulation.candidates import JointPath, Pregrasp
 
 Frame = Literal["object", "table", "camera", "world"]
@@ -143,16 +141,7 @@ def exact_pose(X: npt.ArrayLike, name: str) -> Array:
 
 def joint_order(hand: Hand) -> tuple[str, ...]:
     """Return the names of a hand's joints in the plant's order, that of the stored `closed_q`."""
-    return _joint_order(hand.model, hand.palm_link)
-
-
-@lru_cache
-def _joint_order(model: ModelFile, palm_link: str) -> tuple[str, ...]:
-    plant = MultibodyPlant(0.0)
-    instance = add_model(plant, model)
-    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(palm_link, instance))
-    plant.Finalize()
-    return tuple(plant.GetPositionNames(instance, False, False))
+    return position_order(hand.model, hand.palm_link)
 
 
 def _places(order: Sequence[str], joints: Sequence[str]) -> list[int]:
