@@ -100,7 +100,7 @@ def try_fault(folder: Path, fault: dict[str, Any], timeout: float) -> dict[str, 
         "fault": fault["fault"],
         "file": fault["file"],
         "found": code != PASSED,
-        "by": failed[0] if failed else "",
+        "by": failed[0] if failed else "killed" if code == KILLED else "",
         "seconds": round(time.monotonic() - began, 1),
     }
 
