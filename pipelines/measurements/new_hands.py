@@ -4,7 +4,7 @@ In: a checkout of dexsuite/dex-urdf and a folder of meshes in metres. Out: a tab
 the first palm poses and those about samples give, and how many samples hold again when their palm
 and joints are given back as postures. What is there already is not done again.
 
-    python pipelines/measurements/new_hands.py DEX_URDF MESHES --out FOLDER [--candidates N] [HAND...]
+    python pipelines/measurements/new_hands.py DEX_URDF MESHES --out FOLDER [HAND...]
 """
 
 from __future__ import annotations
