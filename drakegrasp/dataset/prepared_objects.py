@@ -11,6 +11,7 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
+import h5py
 import numpy as np
 import numpy.typing as npt
 
@@ -109,13 +110,18 @@ def save_prepared(prepared: PreparedObject, out: Path, config: Config) -> None:
         for name, (dtype, _) in ARRAYS.items():
             file.create_dataset(name, data=arrays[name], dtype=dtype)
         if candidates.postures is not None:
-            for name, (dtype, _) in POSTURE_ARRAYS.items():
-                data = getattr(candidates.postures, name)
-                if name == "preshape" and not any(data):
-                    continue
-                if isinstance(data, tuple):
-                    data = np.frombuffer(json.dumps(data).encode(), dtype=np.uint8)
-                file.create_dataset(name, data=data, dtype=dtype)
+            _save_postures(candidates.postures, file)
+
+
+def _save_postures(postures: GivenPostures, file: h5py.File) -> None:
+    """Write the arrays of postures; texts are JSON."""
+    for name, (dtype, _) in POSTURE_ARRAYS.items():
+        data = getattr(postures, name)
+        if name == "preshape" and not any(data):
+            continue
+        if isinstance(data, tuple):
+            data = np.frombuffer(json.dumps(data).encode(), dtype=np.uint8)
+        file.create_dataset(name, data=data, dtype=dtype)
 
 
 def load_prepared(out: Path, name: str, config: Config) -> PreparedObject:
