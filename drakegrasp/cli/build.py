@@ -155,15 +155,18 @@ def print_stats(out: Path) -> None:
         funnel_table,
         hold_table,
         make_console,
+        preshape_table,
         split_line,
         split_table,
         unfinished_line,
     )
+    from drakegrasp.dataset.manifest import read_manifest
     from drakegrasp.dataset.paths import DATA_FILES
     from drakegrasp.dataset.statistics import (
         count_funnel,
         count_splits,
         count_unfinished,
+        preshapes_of,
         split_rule_of,
     )
 
@@ -176,6 +179,8 @@ def print_stats(out: Path) -> None:
         table = funnel_table(funnel, compact=True)
     console.print(table)
     console.print(hold_table(funnel))
+    if preshapes := preshapes_of(funnel, read_manifest(out).config):
+        console.print(preshape_table(preshapes))
     console.print()
     if unfinished is None:
         splits = count_splits(out)

@@ -29,7 +29,7 @@ ARRAYS, TABLES, YAMLS = (".npz", ".h5", ".hdf5"), (".csv", ".parquet"), (".yaml"
 #: Arrays are smaller, all together [bytes]: two million postures of a hand with 16 joints.
 MOST_BYTES = 1_000_000_000
 #: The arrays of our own layout that are neither poses nor joints.
-_TEXTS = ("object", "joints", "source", "frame", "link")
+_TEXTS = ("object", "joints", "source", "frame", "link", "preshape")
 _KNOWN = (
     *_TEXTS,
     *("X_FG", "position", "quaternion", "q_grasp", "q_pregrasp", "q_squeeze", "resting"),
@@ -161,6 +161,7 @@ def _of_arrays(arrays: Mapping[str, Any]) -> Rows:
         X_TC=None if "X_TC" not in arrays else _stacked(arrays["X_TC"], "X_TC"),
         numbers={n: arrays[n] for n in ("resting", "log_density", "scale") if n in arrays},
         said=texts.get("source"),
+        preshape=texts.get("preshape"),
     )
 
 
@@ -268,6 +269,7 @@ def _of_columns(columns: Mapping[str, list[Any]]) -> Rows:
             n: _floats(columns, n) for n in ("resting", "log_density", "scale") if n in columns
         },
         said=None if "source" not in columns else [str(text) for text in columns["source"]],
+        preshape=[str(name or "") for name in columns.get("preshape", ())] or None,
     )
 
 

@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 from helpers.assertions import assert_same_arrays
+from helpers.hands import write_with_preshapes
 from helpers.objects import CUBE, STANDOFF, box_model, from_above, standing
 
 from drakegrasp.build.pipeline import build, posture_config
@@ -18,6 +19,8 @@ from drakegrasp.build.replay import replay_trial
 from drakegrasp.config import Config
 from drakegrasp.dataset.checks.run import check_dataset
 from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.dataset.schema import NO_PRESHAPE
+from drakegrasp.dataset.statistics import NO_NAME, counts_as_dict
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import ConfigError, DataError, GraspError
 from drakegrasp.frames import make_pose
@@ -158,6 +161,56 @@ def test_row_of_another_pose_or_scale_is_refused(meshes, table, tmp_path, change
 def test_row_of_an_unknown_object_is_refused(table):
     with pytest.raises(GraspError, match="row 0: object must be one of cup, got '1_box_a'"):
         refuse_unknown_objects(table, ["cup"])
+
+
+@pytest.fixture(scope="module")
+def of_preshapes(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
+    """The cube held by two fingers of three, given back once as of their preshape, once not."""
+    folder = tmp_path_factory.mktemp("shaped")
+    config = load_config(
+        overrides=[f"hand={write_with_preshapes(folder, all='F1 F2 F3', pair='F1 F3')}"]
+    )
+    hand, model = load_hand(config.hand), box_model(folder, [CUBE] * 3, NAME)
+    attempt, pair = from_above(model, STANDOFF), hand.at(1)
+    held = run_attempt(build_scene(model, config.physics, pair), standing(model), attempt, config)
+    assert held.outcome is Outcome.SUCCESS
+    start = joint_positions(pair, 0.0, np.zeros(2))
+    table = make_table(
+        hand,
+        [NAME] * 2,
+        [attempt.X_OG] * 2,
+        [held.closed.q] * 2,
+        q_pregrasp=[[start[name] for name in joint_order(hand)]] * 2,
+        preshape=["pair", ""],
+    )
+    return built(meshes, folder / "out", table, config), held.closed.q
+
+
+def test_a_posture_of_a_preshape_is_the_attempt_that_it_was(of_preshapes):
+    """Without one, the third finger closes as well."""
+    out, q = of_preshapes
+    trials = Trials(out)
+    assert trials["preshape"].tolist() == [1, NO_PRESHAPE]
+    assert trials["unused"].tolist() == [0b010, 0]
+    assert trials["outcome"].tolist() == [Outcome.SUCCESS] * 2
+    assert trials["closed_touching"].tolist() == [[True, False, True], [True] * 3]
+    np.testing.assert_allclose(trials["closed_q"][0], q, atol=1e-9)
+    assert not trials["own_motors"][0]
+
+
+def test_a_dataset_of_postures_of_preshapes_is_sound_and_replayed(of_preshapes):
+    out, _ = of_preshapes
+    assert check_dataset(out) == []
+    assert replay_trial(out, 0).same
+    counts = [(each["preshape"], each["held"]) for each in counts_as_dict(out)["preshapes"]]
+    assert counts == [("all", 0), ("pair", 1), (NO_NAME, 1)]
+
+
+def test_the_hash_of_postures_without_preshapes_is_as_before_there_were_any(table):
+    """Else no build of an older version went on."""
+    plain = make_table(HAND, ["cup"], [np.eye(4)], np.zeros((1, 8)))
+    assert plain.digest() == "553c8cce98b13896"
+    assert replace(plain, preshape=("pair",)).digest() != plain.digest()
 
 
 def test_settings_that_name_other_postures_are_refused(table):

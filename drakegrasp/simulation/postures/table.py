@@ -30,7 +30,7 @@ from drakegrasp.simulation.candidates import (
     Source,
     is_audited,
 )
-from drakegrasp.simulation.postures.posture import Posture, exact_pose, start_of
+from drakegrasp.simulation.postures.posture import Posture, exact_pose, preshape_index, start_of
 
 #: Frames of a table: those of a posture, and {M}, the axes and the origin of the mesh file.
 TableFrame = Literal["object", "table", "camera", "world", "mesh"]
@@ -52,6 +52,7 @@ class PostureTable:
         scale: (n,), metres per unit of length of the mesh file that the posture is for; NaN: any.
         log_density: (n,), logarithm of the density of the draw; NaN: not known.
         said: (n,), where it comes from, in words.
+        preshape: (n,), name of the hand's preshape; empty: all fingers close.
         row: (n,), row in the file.
     """
 
@@ -66,6 +67,7 @@ class PostureTable:
     scale: Array
     log_density: Array
     said: tuple[str, ...]
+    preshape: tuple[str, ...]
     row: npt.NDArray[np.int64]
 
     def __len__(self) -> int:
@@ -86,6 +88,8 @@ class PostureTable:
         digest = hashlib.sha256()
         for f in fields(self):
             value = getattr(self, f.name)
+            if f.name == "preshape" and not any(value):
+                continue  # of a table as it was before there were preshapes
             is_array = isinstance(value, np.ndarray)
             digest.update(value.tobytes() if is_array else json.dumps(value).encode())
         return digest.hexdigest()[:16]
@@ -105,6 +109,7 @@ def make_table(
     scale: npt.ArrayLike | None = None,
     log_density: npt.ArrayLike | None = None,
     said: Sequence[str] | None = None,
+    preshape: Sequence[str] | None = None,
 ) -> PostureTable:
     """Return a table of postures, after checking every row.
 
@@ -121,6 +126,7 @@ def make_table(
         scale: (n,), metres per unit of length of the mesh file.
         log_density: (n,), of the draws.
         said: (n,), where each comes from.
+        preshape: (n,), names of the hand's preshapes; empty: all fingers close.
 
     Raises:
         GraspError: If there is no row, the arrays differ in length, or a row is no posture; the
@@ -154,6 +160,7 @@ def make_table(
         scale=_numbers(scale, (count,), "scale", some=True),
         log_density=_numbers(log_density, (count,), "log_density", some=True),
         said=("",) * count if said is None else tuple(said),
+        preshape=("",) * count if preshape is None else known_preshapes(preshape, count, hand),
         row=np.arange(count, dtype=np.int64),
     )
 
@@ -175,6 +182,22 @@ def _numbers(
     if bad.any():
         raise GraspError(f"row {int(np.argmax(bad))}: {name} must be finite numbers, got others")
     return np.ascontiguousarray(array)
+
+
+def known_preshapes(names: Sequence[str | None], count: int, hand: Hand) -> tuple[str, ...]:
+    """Return the names of the preshapes of a number of rows, empty where there is none.
+
+    Raises:
+        GraspError: If they are of another number of rows, or the hand lacks one of them.
+    """
+    if len(names) != count:
+        raise GraspError(f"preshape must be of {count} rows, got {len(names)}")
+    for i, name in enumerate(names):
+        try:
+            preshape_index(hand, name or None)
+        except GraspError as error:
+            raise GraspError(f"row {i}: {error}") from None
+    return tuple(name or "" for name in names)
 
 
 def _poses(value: npt.ArrayLike, count: int, name: str) -> Array:
@@ -245,6 +268,7 @@ def given_candidates(
             q_squeeze=table.q_squeeze[:count],
             row=table.row[:count],
             said=table.said[:count],
+            preshape=table.preshape[:count],
         ),
     )
 
@@ -283,6 +307,7 @@ def posture_attempts(
             given.q_grasp[i],
             None if np.isnan(given.q_pregrasp[i]).any() else given.q_pregrasp[i],
             None if np.isnan(given.q_squeeze[i]).any() else given.q_squeeze[i],
+            given.preshape[i] or None,
         )
         start = start_of(posture, hand)
         yield Attempt(
@@ -292,6 +317,8 @@ def posture_attempts(
             spread=start.spread,
             closing=start.closing,
             path=start.path,
+            preshape=start.preshape,
+            unused=start.unused,
             X_OG=posture.X_OG,
             seed=Stream(seed, object_key(name), i).key,
             resting=int(candidates.resting[i]),
