@@ -6,7 +6,7 @@ from pathlib import Path
 
 import h5py
 import pytest
-from helpers.datasets import MISSING, SLIPPED, SUCCESS, TRIALS, change
+from helpers.datasets import MISSING, SLIPPED, SUCCESS, TRIALS, change, make_dataset
 from helpers.hands import write_with_preshapes
 
 from drakegrasp.dataset.assemble import assemble
@@ -127,3 +127,11 @@ def test_object_without_samples_says_how_far_it_came(
         counts[1, list(row)] = list(row.values())
     assert list(why_no_samples(funnel)) == [funnel.names[1]]
     assert why_no_samples(funnel)[funnel.names[1]].startswith(why)
+
+
+def test_objects_of_one_class_are_one_class(tmp_path: Path) -> None:
+    """Two objects of three are boxes, and all three train."""
+    shares = ("split.by=object", "split.test_fraction=0", "split.valid_fraction=0")
+    out = make_dataset(tmp_path / "out", tmp_path / "meshes", *shares)
+    (train,) = (count for count in count_splits(out) if count.split == "train")
+    assert (train.samples, train.objects, train.classes) == (9, 3, 2)

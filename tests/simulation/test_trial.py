@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -562,3 +563,12 @@ def test_closing_ends_at_the_first_look_at_which_the_fingers_stand(
     known = prediction(None, clear=True)
     record = run_attempt(scene, standing(cube), from_above(cube, 0.3), patient, known)
     assert record.closed.duration == pytest.approx(looks * config.close.check_period, abs=8e-3)
+
+
+def test_limit_is_of_the_threads_own_computing_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the clocks on the wall say meanwhile."""
+    clocks = dict.fromkeys(("time", "monotonic", "perf_counter", "process_time"), 1e9)
+    others = {name: lambda value=value: value for name, value in clocks.items()}
+    monkeypatch.setattr(stepping, "time", SimpleNamespace(thread_time=lambda: 5.0, **others))
+    limits = stepping.start_limits(load_config(overrides=["attempt_seconds=3"]))
+    assert limits.deadline == pytest.approx(8.0)
