@@ -12,11 +12,11 @@ from drakegrasp.cli.options import (
     FILE,
     PATH,
     build_options,
+    chosen_workers,
+    connection_options,
     dataset_argument,
     parse_request,
     shared,
-    tls_files,
-    tls_options,
 )
 
 if TYPE_CHECKING:
@@ -26,20 +26,12 @@ if TYPE_CHECKING:
 
 @click.command()
 @build_options
-@shared("--workers", "--scheduler", "--scheduler-file")
-@tls_options
+@connection_options
 @click.option(
     "--plan", is_flag=True, help="Only print the hours and bytes that the build would take."
 )
 @shared("--times")
-def build(
-    workers: int | None,
-    scheduler: str | None,
-    scheduler_file: Path | None,
-    plan: bool,
-    times: Path | None,
-    **options: Any,
-) -> None:
+def build(plan: bool, times: Path | None, **options: Any) -> None:
     """Build a dataset from a directory of meshes.
 
     The command simulates grasps of every object and writes trials.hdf5,
@@ -47,12 +39,12 @@ def build(
     """
     from drakegrasp.api.building import build_dataset
 
-    files = tls_files(options)
+    workers = chosen_workers(options)
     request = parse_request(options)
     if plan and request.postures is not None:
         raise click.UsageError("--plan must be used without --postures: a row is an attempt")
     if plan:
-        print_plan(request, workers, times)
+        print_plan(request, workers["workers"], times)
         return
     report = build_dataset(
         request.objects,
@@ -62,10 +54,7 @@ def build(
         manifest=request.manifest,
         only=request.only,
         postures=request.postures,
-        workers=workers,
-        scheduler=scheduler,
-        scheduler_file=scheduler_file,
-        tls_files=files,
+        **workers,
         show=request.show,
     )
     print_report(report)
