@@ -112,7 +112,10 @@ def test_dataset_is_sound(dataset):
 
 @pytest.mark.parametrize("row", range(4))
 def test_trial_of_a_posture_is_replayed_from_the_dataset_alone(dataset, row):
-    assert replay_trial(dataset, row).same
+    again = replay_trial(dataset, row)
+    assert again.same
+    # The fingers of the third begin in the table.
+    assert list(again.meetings) == (["table"] if row == 2 else [])
 
 
 def test_plan_keeps_what_the_file_said(dataset, table):

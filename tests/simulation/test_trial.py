@@ -46,7 +46,7 @@ from drakegrasp.simulation.scene import (
 from drakegrasp.simulation.screen import Prediction
 from drakegrasp.simulation.settle import settle
 from drakegrasp.simulation.trajectory import lift_duration
-from drakegrasp.simulation.trial import TrialRecord, run_attempt
+from drakegrasp.simulation.trial import TrialRecord, run_attempt, start_meetings
 from drakegrasp.vision.camera import camera_pose_oto
 
 pytestmark = pytest.mark.sim
@@ -206,6 +206,18 @@ def test_open_hand_that_meets_the_object_collides(scene, cube, config):
     record = run_attempt(scene, standing(cube), from_above(cube, 0.001), config)
     assert record.outcome is Outcome.START_COLLISION
     assert record.closed is None
+
+
+def test_it_can_be_told_which_links_meet_what_where_an_attempt_starts(scene, cube, config):
+    """The palm on the cube, the fingers beside it in the air; beside the cube, all on the table."""
+    X_TO, attempt = standing(cube), from_above(cube, 0.001)
+    assert start_meetings(scene, X_TO, attempt) == {"object": ["base"]}
+    beside = attempt.X_OG.copy()
+    beside[0, 3], beside[2, 3] = 0.4, 0.0
+    met = start_meetings(scene, X_TO, replace(attempt, X_OG=beside))
+    assert list(met) == ["table"]
+    assert {"finger1_distal", "finger3_distal"} <= set(met["table"])
+    assert start_meetings(scene, X_TO, from_above(cube, 0.25)) == {}
 
 
 @pytest.mark.parametrize("mode", ["on", "off"])
