@@ -7,7 +7,7 @@ in one line that names the file and what is wrong. docs/how-to/postures.md lists
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile, ZipFile
@@ -22,7 +22,7 @@ from drakegrasp.exchange.foreign_postures import read_dexgraspbench, read_isaac_
 from drakegrasp.exchange.posture_rows import Rows, quaternion_poses, table_of
 from drakegrasp.frames import Array, unpack_pose
 from drakegrasp.hand.description import Hand
-from drakegrasp.simulation.postures.table import PostureTable
+from drakegrasp.simulation.postures.table import PostureTable, join_tables
 
 #: Suffixes of the layouts.
 ARRAYS, TABLES, YAMLS = (".npz", ".h5", ".hdf5"), (".csv", ".parquet"), (".yaml", ".yml")
@@ -40,6 +40,8 @@ _KNOWN = (
 def read_postures(path: Path, hand: Hand) -> PostureTable:
     """Return the postures of a file, or of all files of a folder.
 
+    A row that is none stays in the table, with the reason; in a folder a file may be none.
+
     Raises:
         GraspError: If it is no file of postures of this hand.
         MachineError: If a package is missing that the format needs.
@@ -51,13 +53,13 @@ def read_postures(path: Path, hand: Hand) -> PostureTable:
         raise GraspError(f"postures must be a file or a folder of files, got {str(path)!r}")
     try:
         if suffix in ARRAYS:
-            return table_of(hand, [_of_arrays(_read_arrays(path))])
+            return table_of(hand, _of_arrays(_read_arrays(path)))
         if suffix in TABLES:
-            return table_of(hand, [_of_columns(_read_columns(path))])
+            return table_of(hand, _of_columns(*_read_columns(path)))
         if suffix == ".npy":
-            return table_of(hand, [read_dexgraspbench(path, hand)])
+            return table_of(hand, read_dexgraspbench(path, hand))
         if suffix in YAMLS:
-            return table_of(hand, [read_isaac_grasp(path, hand)])
+            return table_of(hand, read_isaac_grasp(path, hand))
     except GraspError as error:
         text = str(error)
         raise GraspError(text if text.startswith(str(path)) else f"{path}: {text}") from None
@@ -77,7 +79,7 @@ def holds_postures(path: Path) -> bool:
             with open_hdf5(path) as file:
                 return "q_grasp" in file
         if suffix in TABLES and path.is_file():
-            return "object" in _read_columns(path)
+            return "object" in _read_columns(path)[0]
     except (OSError, DataError, GraspError) as error:
         raise GraspError(f"{path}: {one_line(error)}") from None
     return suffix == ARRAYS[0] or suffix in YAMLS
@@ -86,16 +88,18 @@ def holds_postures(path: Path) -> bool:
 def _of_folder(folder: Path, hand: Hand) -> PostureTable:
     """Return the postures of all files of one foreign layout in a folder and those below."""
     for pattern, read in (("*.npy", read_dexgraspbench), ("*.y*ml", read_isaac_grasp)):
-        paths = sorted(folder.rglob(pattern))
-        if paths:
-            try:
-                return table_of(hand, [read(path, hand) for path in paths])
-            except GraspError as error:
-                text = str(error)
-                raise GraspError(
-                    text if text.startswith(str(folder)) else f"{folder}: {text}"
-                ) from None
+        if paths := sorted(folder.rglob(pattern)):
+            return join_tables([_of_file(path, hand, read) for path in paths])
     raise GraspError(f"{folder}: must hold .npy or .yaml files of grasps, got none")
+
+
+def _of_file(path: Path, hand: Hand, read: Callable[[Path, Hand], Rows]) -> PostureTable | str:
+    """Return the postures of a file in a folder, or why it is none."""
+    try:
+        return table_of(hand, read(path, hand))
+    except GraspError as error:
+        text = str(error)
+        return text if text.startswith(str(path)) else f"{path}: {text}"
 
 
 # Arrays
@@ -140,10 +144,11 @@ def _of_arrays(arrays: Mapping[str, Any]) -> Rows:
     texts = {name: _texts(arrays[name], name) for name in _TEXTS if name in arrays}
 
     # The palm's poses, in either form.
+    invalid = None
     if "X_FG" in arrays:
         X_FG = _stacked(arrays["X_FG"], "X_FG")
     elif {"position", "quaternion"} <= set(arrays):
-        X_FG = quaternion_poses(arrays["position"], arrays["quaternion"])
+        X_FG, invalid = quaternion_poses(arrays["position"], arrays["quaternion"])
     else:
         raise GraspError("X_FG, or position and quaternion, must be there, got none")
 
@@ -161,6 +166,7 @@ def _of_arrays(arrays: Mapping[str, Any]) -> Rows:
         X_TC=None if "X_TC" not in arrays else _stacked(arrays["X_TC"], "X_TC"),
         numbers={n: arrays[n] for n in ("resting", "log_density", "scale") if n in arrays},
         said=texts.get("source"),
+        invalid=invalid,
     )
 
 
@@ -205,14 +211,16 @@ def _stacked(value: Any, name: str) -> Array:
 # Tables
 
 
-def _read_columns(path: Path) -> dict[str, list[Any]]:
+def _read_columns(path: Path) -> tuple[dict[str, list[Any]], list[str]]:
+    """Return the columns of a table, and for each row why it is none, or an empty text."""
     if path.suffix.lower() == ".parquet":
         try:
             from pyarrow import parquet
         except ImportError:
             raise MachineError("Parquet needs pyarrow: pip install 'drakegrasp[hub]'") from None
         try:
-            return dict(parquet.read_table(path).to_pydict())
+            table = parquet.read_table(path)
+            return dict(table.to_pydict()), [""] * table.num_rows
         except (OSError, ValueError) as error:
             raise GraspError(f"must be a Parquet file, got: {one_line(error)}") from None
 
@@ -220,28 +228,27 @@ def _read_columns(path: Path) -> dict[str, list[Any]]:
     try:
         with path.open(encoding="utf-8", newline="") as file:
             header, *rows = csv.reader(file)
-            if twice := [name for name in header if header.count(name) > 1]:
-                raise GraspError(f"columns must have different names, got {twice[0]} twice")
-            return {
-                name: list(column)
-                for name, column in zip(header, _columns(header, rows), strict=True)
-            }
     except (OSError, ValueError, csv.Error) as error:
         raise GraspError(f"must be a table with a header, got: {one_line(error)}") from None
+    if twice := [name for name in header if header.count(name) > 1]:
+        raise GraspError(f"columns must have different names, got {twice[0]} twice")
+    size = len(header)
+    invalid = [
+        "" if len(row) == size else f"the row must have {size} values, got {len(row)}"
+        for row in rows
+    ]
+    cells = [[*row, *[""] * size][:size] for row in rows]
+    return {name: [row[i] for row in cells] for i, name in enumerate(header)}, invalid
 
 
-def _columns(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[Sequence[str]]:
-    for i, row in enumerate(rows):
-        if len(row) != len(header):
-            raise ValueError(f"row {i} of {len(row)} values under a header of {len(header)}")
-    yield from zip(*rows, strict=True) if rows else ([] for _ in header)
-
-
-def _of_columns(columns: Mapping[str, list[Any]]) -> Rows:
+def _of_columns(columns: Mapping[str, list[Any]], invalid: list[str]) -> Rows:
     """Return the rows of a plain table, with a column for each number."""
     place = [*("x", "y", "z"), *("qw", "qx", "qy", "qz")]
     if missing := [name for name in ("object", *place) if name not in columns]:
         raise GraspError(f"columns must include {missing[0]}, got {listed(list(columns))}")
+
+    def told(name: str) -> list[str | None]:
+        return [v for v, none in zip(columns.get(name, ()), invalid, strict=False) if not none]
 
     # The joints of each stage, in the order of the grasp.
     q: dict[str, Any] = {}
@@ -252,31 +259,35 @@ def _of_columns(columns: Mapping[str, list[Any]]) -> Rows:
             joints = joints or names
             if set(names) != set(joints):
                 raise GraspError(f"{stage}_ columns must be of the joints of grasp_, got others")
-            q[stage] = np.column_stack([_floats(columns, f"{stage}_{n}") for n in joints])
+            q[stage] = np.column_stack([_floats(columns, f"{stage}_{n}", invalid) for n in joints])
     if "grasp" not in q:
         raise GraspError("columns must include one grasp_JOINT for each joint, got none")
 
-    numbers = np.column_stack([_floats(columns, name) for name in place])
+    numbers = np.column_stack([_floats(columns, name, invalid) for name in place])
+    scalars = [n for n in ("resting", "log_density", "scale") if n in columns]
+    known = {n: _floats(columns, n, invalid) for n in scalars}
+    X_FL, reasons = quaternion_poses(numbers[:, :3], numbers[:, 3:])
     return Rows(
         objects=[str(name) for name in columns["object"]],
-        X_FL=quaternion_poses(numbers[:, :3], numbers[:, 3:]),
-        link=_link(columns.get("link")),
-        frame=_only(columns.get("frame"), "frame") or "object",
+        X_FL=X_FL,
+        link=_link(told("link")),
+        frame=_only(told("frame"), "frame") or "object",
         q=q,
         joints=joints,
-        numbers={
-            n: _floats(columns, n) for n in ("resting", "log_density", "scale") if n in columns
-        },
+        numbers=known,
         said=None if "source" not in columns else [str(text) for text in columns["source"]],
+        invalid=[one or other for one, other in zip(invalid, reasons, strict=True)],
     )
 
 
-def _floats(columns: Mapping[str, list[Any]], name: str) -> npt.NDArray[np.float64]:
-    """Return a column as numbers; an empty cell is NaN."""
-    values = []
+def _floats(
+    columns: Mapping[str, list[Any]], name: str, invalid: list[str]
+) -> npt.NDArray[np.float64]:
+    """Return a column as numbers; an empty cell is NaN, and `invalid` says which are none."""
+    values = np.full(len(columns[name]), np.nan)
     for i, cell in enumerate(columns[name]):
         try:
-            values.append(np.nan if cell in (None, "") else float(cell))
+            values[i] = np.nan if cell in (None, "") else float(cell)
         except (TypeError, ValueError):
-            raise GraspError(f"row {i}: {name} must be a number, got {cell!r}") from None
-    return np.array(values)
+            invalid[i] = invalid[i] or f"{name} must be a number, got {cell!r}"
+    return values

@@ -57,12 +57,13 @@ def test_postures_and_contacts_are_tried_and_a_bad_row_is_invalid(
     far[2, 3] += 0.3
     np.savez(
         tmp_path / "own.npz",
-        object=np.array(["a", "a"]),
-        X_FG=np.array([record.X_OG, far]),
-        q_grasp=np.array([end.q, end.q]),
+        object=np.array(["a", "a", "a"]),
+        X_FG=np.array([record.X_OG, 0.0 * far, far]),
+        q_grasp=np.array([end.q, end.q, end.q]),
     )
-    held, lost = lines_of(tmp_path / "own.npz", "--object", mesh)
+    held, none, lost = lines_of(tmp_path / "own.npz", "--object", mesh)
     assert held["success"] and held["file"].endswith("own.npz")
+    assert none["reason"].startswith("invalid: the palm's pose must have 0 0 0 1")
     assert lost["reason"] == "moved"
 
     grasp = pack_grasp(end.contacts.p_OQ, end.contacts.nhat_Q_O)
@@ -86,7 +87,7 @@ def test_files_say_what_the_posture_says(tmp_path: Path, grasps: list[ClosedGras
 
     content = np.load(path, allow_pickle=True).item()
     place, root = (
-        quaternion_poses(v[None, :3], v[None, 3:7])[0]
+        quaternion_poses(v[None, :3], v[None, 3:7])[0][0]
         for v in (content["obj_pose"], content["grasp_qpos"])
     )
     np.testing.assert_allclose(invert_pose(place) @ root @ HAND.X_BG, X_OG, atol=1e-12)

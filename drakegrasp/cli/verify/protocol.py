@@ -155,14 +155,14 @@ def _own_grasps(request: ProtocolRequest) -> tuple[Hand, list[PlacedPosture]]:
     from drakegrasp.dataset.manifest import read_manifest
     from drakegrasp.errors import GraspError
     from drakegrasp.exchange.posture_files import holds_postures, read_postures
-    from drakegrasp.exchange.protocol_grasps import (
-        fitted_postures,
-        postures_on_dataset,
-        postures_on_object,
-    )
+    from drakegrasp.exchange.protocol_grasps import fitted_postures
     from drakegrasp.hand.description import load_hand
     from drakegrasp.hand.settings import load_config, override_config
     from drakegrasp.simulation.placement import place_object
+    from drakegrasp.verification.placed_postures import (
+        place_postures_on_dataset,
+        place_postures_on_object,
+    )
 
     if not holds_postures(request.grasps):
         options = {name: getattr(request, name) for name in PLACES}
@@ -184,9 +184,11 @@ def _own_grasps(request: ProtocolRequest) -> tuple[Hand, list[PlacedPosture]]:
     hand = load_hand(config.hand_source)
     table = read_postures(request.grasps, hand)
     if request.mesh is None:
-        return hand, postures_on_dataset(table, out)
-    placed_object = place_object(request.mesh, units=request.units, config=config)
-    return hand, postures_on_object(table, placed_object)
+        placed = place_postures_on_dataset(table, out)
+    else:
+        thing = place_object(request.mesh, units=request.units, config=config)
+        placed = place_postures_on_object(table, thing)
+    return hand, list(fitted_postures(sorted(placed, key=lambda grasp: grasp.index)))
 
 
 def _print_line(line: str) -> None:
