@@ -7,7 +7,8 @@ in one line that names the file and what is wrong. docs/how-to/postures.md lists
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile, ZipFile
@@ -33,7 +34,7 @@ _TEXTS = ("object", "joints", "source", "frame", "link")
 _KNOWN = (
     *_TEXTS,
     *("X_FG", "position", "quaternion", "q_grasp", "q_pregrasp", "q_squeeze", "resting"),
-    *("log_density", "X_TC", "scale"),
+    *("log_density", "X_TC", "scale", "row", "confidence"),
 )
 
 
@@ -46,25 +47,46 @@ def read_postures(path: Path, hand: Hand) -> PostureTable:
         GraspError: If it is no file of postures of this hand.
         MachineError: If a package is missing that the format needs.
     """
-    suffix = path.suffix.lower()
     if path.is_dir():
         return _of_folder(path, hand)
+    with named(path):
+        rows = read_rows(path, hand)
+        if rows.of_row is not None:
+            raise GraspError("row must be left out here, it is for predictions of a score; got it")
+        return table_of(hand, rows)
+
+
+def read_rows(path: Path, hand: Hand) -> Rows:
+    """Return what a file says of its postures, before it is compared with the hand.
+
+    Raises:
+        GraspError: If it is no file of postures.
+        MachineError: If a package is missing that the format needs.
+    """
+    suffix = path.suffix.lower()
     if not path.is_file():
         raise GraspError(f"postures must be a file or a folder of files, got {str(path)!r}")
-    try:
+    with named(path):
         if suffix in ARRAYS:
-            return table_of(hand, _of_arrays(_read_arrays(path)))
+            return _of_arrays(_read_arrays(path))
         if suffix in TABLES:
-            return table_of(hand, _of_columns(*_read_columns(path)))
+            return _of_columns(*_read_columns(path))
         if suffix == ".npy":
-            return table_of(hand, read_dexgraspbench(path, hand))
+            return read_dexgraspbench(path, hand)
         if suffix in YAMLS:
-            return table_of(hand, read_isaac_grasp(path, hand))
+            return read_isaac_grasp(path, hand)
+        known = ", ".join((*ARRAYS, *TABLES, ".npy", *YAMLS))
+        raise GraspError(f"must be a file of postures ({known}), got another")
+
+
+@contextmanager
+def named(path: Path) -> Iterator[None]:
+    """Put the name of a file before errors about its postures, unless it is there."""
+    try:
+        yield
     except GraspError as error:
         text = str(error)
         raise GraspError(text if text.startswith(str(path)) else f"{path}: {text}") from None
-    known = ", ".join((*ARRAYS, *TABLES, ".npy", *YAMLS))
-    raise GraspError(f"{path}: must be a file of postures ({known}), got another")
 
 
 def holds_postures(path: Path) -> bool:
@@ -79,8 +101,8 @@ def holds_postures(path: Path) -> bool:
             with open_hdf5(path) as file:
                 return "q_grasp" in file
         if suffix in TABLES and path.is_file():
-            return "object" in _read_columns(path)[0]
-    except (OSError, DataError, GraspError) as error:
+            return bool({"object", "qw"} & set(_column_names(path)))
+    except (OSError, ValueError, csv.Error, DataError, GraspError) as error:
         raise GraspError(f"{path}: {one_line(error)}") from None
     return suffix == ARRAYS[0] or suffix in YAMLS
 
@@ -96,10 +118,10 @@ def _of_folder(folder: Path, hand: Hand) -> PostureTable:
 def _of_file(path: Path, hand: Hand, read: Callable[[Path, Hand], Rows]) -> PostureTable | str:
     """Return the postures of a file in a folder, or why it is none."""
     try:
-        return table_of(hand, read(path, hand))
+        with named(path):
+            return table_of(hand, read(path, hand))
     except GraspError as error:
-        text = str(error)
-        return text if text.startswith(str(path)) else f"{path}: {text}"
+        return str(error)
 
 
 # Arrays
@@ -139,7 +161,7 @@ def _of_arrays(arrays: Mapping[str, Any]) -> Rows:
     if unknown := [name for name in arrays if name not in _KNOWN]:
         raise GraspError(f"arrays must be some of {', '.join(_KNOWN)}, got {unknown[0]!r}")
     for name in ("object", "q_grasp"):
-        if name not in arrays:
+        if name not in arrays and not (name == "object" and "row" in arrays):
             raise GraspError(f"{name} must be there, got only {listed(sorted(arrays))}")
     texts = {name: _texts(arrays[name], name) for name in _TEXTS if name in arrays}
 
@@ -153,7 +175,7 @@ def _of_arrays(arrays: Mapping[str, Any]) -> Rows:
         raise GraspError("X_FG, or position and quaternion, must be there, got none")
 
     return Rows(
-        objects=texts["object"],
+        objects=texts["object"] if "object" in texts else [""] * len(X_FG),
         X_FL=X_FG,
         link=_link(texts.get("link")),
         frame=_only(texts.get("frame"), "frame") or "object",
@@ -167,6 +189,8 @@ def _of_arrays(arrays: Mapping[str, Any]) -> Rows:
         numbers={n: arrays[n] for n in ("resting", "log_density", "scale") if n in arrays},
         said=texts.get("source"),
         invalid=invalid,
+        of_row=arrays.get("row"),
+        confidence=arrays.get("confidence"),
     )
 
 
@@ -211,15 +235,27 @@ def _stacked(value: Any, name: str) -> Array:
 # Tables
 
 
+def _column_names(path: Path) -> list[str]:
+    """Return the names of a table's columns; the first line of a CSV file, whatever it is."""
+    if path.suffix.lower() == ".parquet":
+        return list(_parquet().read_schema(path).names)
+    with path.open(encoding="utf-8", newline="") as file:
+        return next(csv.reader(file), [])
+
+
+def _parquet() -> Any:
+    try:
+        from pyarrow import parquet
+    except ImportError:
+        raise MachineError("Parquet needs pyarrow: pip install 'drakegrasp[hub]'") from None
+    return parquet
+
+
 def _read_columns(path: Path) -> tuple[dict[str, list[Any]], list[str]]:
     """Return the columns of a table, and for each row why it is none, or an empty text."""
     if path.suffix.lower() == ".parquet":
         try:
-            from pyarrow import parquet
-        except ImportError:
-            raise MachineError("Parquet needs pyarrow: pip install 'drakegrasp[hub]'") from None
-        try:
-            table = parquet.read_table(path)
+            table = _parquet().read_table(path)
             return dict(table.to_pydict()), [""] * table.num_rows
         except (OSError, ValueError) as error:
             raise GraspError(f"must be a Parquet file, got: {one_line(error)}") from None
@@ -244,7 +280,8 @@ def _read_columns(path: Path) -> tuple[dict[str, list[Any]], list[str]]:
 def _of_columns(columns: Mapping[str, list[Any]], invalid: list[str]) -> Rows:
     """Return the rows of a plain table, with a column for each number."""
     place = [*("x", "y", "z"), *("qw", "qx", "qy", "qz")]
-    if missing := [name for name in ("object", *place) if name not in columns]:
+    needed = place if "row" in columns else ["object", *place]
+    if missing := [name for name in needed if name not in columns]:
         raise GraspError(f"columns must include {missing[0]}, got {listed(list(columns))}")
 
     def told(name: str) -> list[str | None]:
@@ -267,8 +304,10 @@ def _of_columns(columns: Mapping[str, list[Any]], invalid: list[str]) -> Rows:
     scalars = [n for n in ("resting", "log_density", "scale") if n in columns]
     known = {n: _floats(columns, n, invalid) for n in scalars}
     X_FL, reasons = quaternion_poses(numbers[:, :3], numbers[:, 3:])
+    said = {n: _floats(columns, n, invalid) for n in ("row", "confidence") if n in columns}
+    whole = "row" in said and np.array_equal(said["row"], np.floor(said["row"]))
     return Rows(
-        objects=[str(name) for name in columns["object"]],
+        objects=[str(name) for name in columns.get("object", [""] * len(numbers))],
         X_FL=X_FL,
         link=_link(told("link")),
         frame=_only(told("frame"), "frame") or "object",
@@ -276,6 +315,8 @@ def _of_columns(columns: Mapping[str, list[Any]], invalid: list[str]) -> Rows:
         joints=joints,
         numbers=known,
         said=None if "source" not in columns else [str(text) for text in columns["source"]],
+        of_row=said["row"].astype(np.int64) if whole else said.get("row"),
+        confidence=said.get("confidence"),
         invalid=[one or other for one, other in zip(invalid, reasons, strict=True)],
     )
 

@@ -30,7 +30,7 @@ class Rows:
     """The n postures of one file.
 
     Attributes:
-        objects: (n,), names of the objects.
+        objects: (n,), names of the objects; empty where only `of_row` says it.
         X_FL: (n, 4, 4), pose of a link in the frame.
         link: Name of the palm link, whose pose it is; None: the palm frame G.
         frame: One of `TABLE_FRAMES`.
@@ -41,6 +41,8 @@ class Rows:
         numbers: `resting`, `log_density` and `scale`, (n,) each, as far as they are known.
         said: (n,), where each comes from.
         invalid: (n,), why a row is known to be none; None: no row is.
+        of_row: (n,), of predictions: the row of a dataset's split that each is for.
+        confidence: (n,), of predictions: greater is better.
     """
 
     objects: Sequence[str]
@@ -53,6 +55,8 @@ class Rows:
     numbers: Mapping[str, Any] = field(default_factory=dict)
     said: Sequence[str] | None = None
     invalid: Sequence[str] | None = None
+    of_row: Any = None
+    confidence: Any = None
 
 
 def table_of(hand: Hand, rows: Rows) -> PostureTable:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,12 @@ import numpy.typing as npt
 
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError
-from drakegrasp.frames import Array, as_numbers
+from drakegrasp.exchange.posture_files import holds_postures, named, read_rows
+from drakegrasp.exchange.posture_rows import table_of
+from drakegrasp.frames import Array, as_numbers, unpack_pose
+from drakegrasp.hand.description import load_hand
+from drakegrasp.simulation.postures.table import PostureTable
+from drakegrasp.verification.placed_grasp import dataset_config
 from drakegrasp.verification.prediction import ROWS, read_predictions
 
 Rows = npt.NDArray[np.int64]
@@ -29,11 +34,12 @@ class Ranked:
 
     Attributes:
         name: Of the file, or of what made them.
-        grasps: (N, 6k), in the camera's frame.
+        grasps: (N, 6k), in the camera's frame; of postures (N, m) all their numbers.
         rows: (N,), the row of each.
         ranks: (N,), 0 for the best of a row.
         confidence: (N,), as stated, -inf for what is no finite number; None if it is not.
         sha256: Of the file, or of the numbers.
+        table: The postures; None for grasps of contacts.
     """
 
     name: str
@@ -42,6 +48,7 @@ class Ranked:
     ranks: Rows
     confidence: Array | None = None
     sha256: str
+    table: PostureTable | None = None
 
     def of_rows(self, rows: Sequence[int]) -> Ranked:
         """Return the predictions for some rows."""
@@ -53,6 +60,7 @@ class Ranked:
             ranks=self.ranks[kept],
             confidence=None if self.confidence is None else self.confidence[kept],
             sha256=self.sha256,
+            table=None if self.table is None else self.table.at(kept.tolist()),
         )
 
 
@@ -64,6 +72,7 @@ def rank(
     rows: npt.ArrayLike | None = None,
     confidence: npt.ArrayLike | None = None,
     sha256: str | None = None,
+    table: PostureTable | None = None,
 ) -> Ranked:
     """Return predictions in the order of rows and ranks.
 
@@ -76,6 +85,7 @@ def rank(
             the split in order if None.
         confidence: (n,) or (n, m), greater is better.
         sha256: Of the file; that of the numbers if None.
+        table: The postures (n,) whose numbers the grasps are.
 
     Raises:
         GraspError: If shapes do not fit each other, or a row does not exist.
@@ -88,7 +98,7 @@ def rank(
         )
     count, each = array.shape[0], 1 if array.ndim == 2 else array.shape[1]
     flat = array.reshape(count * each, array.shape[-1])
-    line_rows = np.repeat(_rows_of(name, rows, count, length), each)
+    line_rows = np.repeat(rows_of(name, rows, count, length), each)
 
     # The best first; of equals the one that was given first.
     stated = None
@@ -110,10 +120,11 @@ def rank(
         ranks=np.arange(len(flat)) - np.repeat(starts, counts),
         confidence=None if stated is None else stated[order],
         sha256=sha256 or hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest(),
+        table=None if table is None else table.at(order.tolist()),
     )
 
 
-def _rows_of(name: str, rows: npt.ArrayLike | None, count: int, length: int) -> Rows:
+def rows_of(name: str, rows: npt.ArrayLike | None, count: int, length: int) -> Rows:
     """Return the row (n,) of each entry of an array of predictions."""
     if rows is None and count != length:
         raise GraspError(
@@ -155,6 +166,58 @@ def read_ranked(path: Path, *, length: int, split: str) -> Ranked:
     )
 
 
+def rank_postures(path: Path, data: GraspDataset) -> Ranked:
+    """Return the predicted postures of a file.
+
+    A posture is one of the object of its row, as it lies there; the frame "camera" is that of the
+    row's camera.
+
+    Args:
+        path: As `exchange.posture_files` reads it, with `row`, or one posture for each row of the
+            split; `confidence` ranks those of a row.
+        data: The split.
+
+    Raises:
+        GraspError: If the file holds anything else; the message names it.
+        ConfigError, HandError, DataError, MachineError: If dataset or hand cannot be used.
+    """
+    hand = load_hand(dataset_config(data).hand_source)
+    with named(path):
+        read = read_rows(path, hand)
+        if read.X_TC is not None:
+            raise GraspError("X_TC must be left out: the camera is that of the row; got it")
+        rows = rows_of(str(path), read.of_row, len(read.objects), len(data))
+
+        # What the rows say of object and camera.
+        objects = data.column("object_props/object_name")[rows].tolist()
+        X_TC = unpack_pose(data.column(f"object_props/frame_work2cam_{data.camera}")[rows])
+        other = [
+            f"object must be that of row {row}, {true}, got {told}"
+            if told not in ("", true)
+            else ""
+            for row, told, true in zip(rows.tolist(), read.objects, objects, strict=True)
+        ]
+        numbers = {n: v for n, v in read.numbers.items() if n != "resting"}
+        table = table_of(
+            hand,
+            replace(
+                read,
+                objects=objects,
+                X_TC=X_TC if read.frame == "camera" else None,
+                numbers=numbers | {"resting": data.column("grasp_props/resting")[rows]},
+            ),
+        ).refuse(other)
+    return rank(
+        str(path),
+        table.numbers(),
+        length=len(data),
+        rows=rows,
+        confidence=read.confidence,
+        sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
+        table=table,
+    )
+
+
 def ranked_sets(
     predictions: Any,
     data: GraspDataset,
@@ -189,7 +252,12 @@ def ranked_sets(
     # Files, each of a training seed.
     if rows is not None or confidence is not None:
         raise GraspError("rows and confidence must be in the files if files are given, got them")
-    found = tuple(read_ranked(Path(path), length=len(data), split=data.split) for path in paths)
+    found = tuple(
+        rank_postures(Path(path), data)
+        if holds_postures(Path(path))
+        else read_ranked(Path(path), length=len(data), split=data.split)
+        for path in paths
+    )
     names = [Path(path).name for path in paths]
     if len(found) < 2:
         return (names or [""])[0], found

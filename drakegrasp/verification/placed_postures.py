@@ -116,7 +116,7 @@ def _placed(
         thing = things[0 if reason else int(table.resting[i])]
         found.append(
             PlacedGrasp(
-                index=int(table.row[i]),
+                index=i,
                 placed=thing,
                 p_OQ=nothing,
                 nhat_Q_O=nothing,

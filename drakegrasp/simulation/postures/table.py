@@ -121,6 +121,12 @@ class PostureTable:
             return X_OT
         return multiply(X_OT, invert_pose(X_WT) if self.X_TC is None else self.X_TC[i])
 
+    def numbers(self) -> Array:
+        """Return all numbers (n, m) that say what each posture is, NaN where it lacks some."""
+        X = [X for X in (self.X_FG, self.X_TC) if X is not None]
+        q = [self.q_grasp, self.q_pregrasp, self.q_squeeze]
+        return np.column_stack([*(each.reshape(len(self), 16) for each in X), *q])
+
     def refuse(self, reasons: Sequence[str]) -> PostureTable:
         """Return the table with more reasons (n,) why rows are no postures."""
         both = (one or other for one, other in zip(self.invalid, reasons, strict=True))
