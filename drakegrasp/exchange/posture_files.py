@@ -107,6 +107,18 @@ def holds_postures(path: Path) -> bool:
     return suffix == ARRAYS[0] or suffix in YAMLS
 
 
+def has_rows(path: Path) -> bool:
+    """Return whether a file of postures says for which rows of a dataset they are.
+
+    Raises:
+        GraspError: If it cannot be read.
+    """
+    with named(path):
+        if path.suffix.lower() in ARRAYS:
+            return "row" in _read_arrays(path)
+        return path.suffix.lower() in TABLES and "row" in _column_names(path)
+
+
 def _of_folder(folder: Path, hand: Hand) -> PostureTable:
     """Return the postures of all files of one foreign layout in a folder and those below."""
     for pattern, read in (("*.npy", read_dexgraspbench), ("*.y*ml", read_isaac_grasp)):

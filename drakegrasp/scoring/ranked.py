@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +17,10 @@ import numpy.typing as npt
 
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.errors import GraspError
-from drakegrasp.exchange.posture_files import holds_postures, named, read_rows
-from drakegrasp.exchange.posture_rows import table_of
-from drakegrasp.frames import Array, as_numbers, unpack_pose
-from drakegrasp.hand.description import load_hand
+from drakegrasp.exchange.posture_files import holds_postures
+from drakegrasp.exchange.predicted_postures import read_predicted_postures
+from drakegrasp.frames import Array, as_numbers
 from drakegrasp.simulation.postures.table import PostureTable
-from drakegrasp.verification.placed_grasp import dataset_config
 from drakegrasp.verification.prediction import ROWS, read_predictions
 
 Rows = npt.NDArray[np.int64]
@@ -98,7 +96,7 @@ def rank(
         )
     count, each = array.shape[0], 1 if array.ndim == 2 else array.shape[1]
     flat = array.reshape(count * each, array.shape[-1])
-    line_rows = np.repeat(rows_of(name, rows, count, length), each)
+    line_rows = np.repeat(_rows_of(name, rows, count, length), each)
 
     # The best first; of equals the one that was given first.
     stated = None
@@ -124,7 +122,7 @@ def rank(
     )
 
 
-def rows_of(name: str, rows: npt.ArrayLike | None, count: int, length: int) -> Rows:
+def _rows_of(name: str, rows: npt.ArrayLike | None, count: int, length: int) -> Rows:
     """Return the row (n,) of each entry of an array of predictions."""
     if rows is None and count != length:
         raise GraspError(
@@ -169,50 +167,21 @@ def read_ranked(path: Path, *, length: int, split: str) -> Ranked:
 def rank_postures(path: Path, data: GraspDataset) -> Ranked:
     """Return the predicted postures of a file.
 
-    A posture is one of the object of its row, as it lies there; the frame "camera" is that of the
-    row's camera.
-
     Args:
-        path: As `exchange.posture_files` reads it, with `row`, or one posture for each row of the
-            split; `confidence` ranks those of a row.
+        path: See `read_predicted_postures`; `confidence` ranks those of a row.
         data: The split.
 
     Raises:
         GraspError: If the file holds anything else; the message names it.
         ConfigError, HandError, DataError, MachineError: If dataset or hand cannot be used.
     """
-    hand = load_hand(dataset_config(data).hand_source)
-    with named(path):
-        read = read_rows(path, hand)
-        if read.X_TC is not None:
-            raise GraspError("X_TC must be left out: the camera is that of the row; got it")
-        rows = rows_of(str(path), read.of_row, len(read.objects), len(data))
-
-        # What the rows say of object and camera.
-        objects = data.column("object_props/object_name")[rows].tolist()
-        X_TC = unpack_pose(data.column(f"object_props/frame_work2cam_{data.camera}")[rows])
-        other = [
-            f"object must be that of row {row}, {true}, got {told}"
-            if told not in ("", true)
-            else ""
-            for row, told, true in zip(rows.tolist(), read.objects, objects, strict=True)
-        ]
-        numbers = {n: v for n, v in read.numbers.items() if n != "resting"}
-        table = table_of(
-            hand,
-            replace(
-                read,
-                objects=objects,
-                X_TC=X_TC if read.frame == "camera" else None,
-                numbers=numbers | {"resting": data.column("grasp_props/resting")[rows]},
-            ),
-        ).refuse(other)
+    table, rows, confidence = read_predicted_postures(path, data)
     return rank(
         str(path),
         table.numbers(),
         length=len(data),
         rows=rows,
-        confidence=read.confidence,
+        confidence=confidence,
         sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
         table=table,
     )

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from helpers.commands import error_line, run
@@ -66,6 +67,20 @@ def test_postures_and_contacts_are_tried_and_a_bad_row_is_invalid(
     assert none["reason"].startswith("invalid: the palm's pose must have 0 0 0 1")
     assert lost["reason"] == "moved"
 
+    # The same by the lift in Drake, in files.
+    given = ("verify", tmp_path / "own.npz", "--object", mesh, "--workers", 1)
+    result = run(*given, "--out", tmp_path / "lift", "--json")
+    assert result.exit_code == 0, result.output
+    held, none, lost = map(json.loads, result.stdout.splitlines())
+    assert held["held"] and held["success"] and held["method"] == "posture"
+    np.testing.assert_allclose(held["closed"]["q"], end.q, atol=1e-3)
+    np.testing.assert_allclose(held["X_OG"], np.asarray(record.X_OG), atol=1e-5)
+    assert none["outcome"] == "invalid"
+    assert none["reason"].startswith("the palm's pose must have 0 0 0 1")
+    assert lost["outcome"] == "missing_fingertip"
+    with h5py.File(tmp_path / "lift.h5") as file:
+        assert file["grasps/success"][:].tolist() == [True, False, False]
+
     grasp = pack_grasp(end.contacts.p_OQ, end.contacts.nhat_Q_O)
     np.save(tmp_path / "18.npy", np.array([np.full(18, np.nan), grasp]))
     bad, fitted = lines_of(tmp_path / "18.npy", "--object", mesh)
@@ -108,7 +123,7 @@ def test_what_a_file_holds_is_told_from_its_content(tmp_path: Path) -> None:
     ("options", "why"),
     [
         ([], "--object MESH or --dataset FILE must be given with postures"),
-        (["--frame", "camera"], "--frame must not be used with protocol dexgraspbench and post"),
+        (["--frame", "camera"], "--frame must be left out with postures, got camera"),
     ],
 )
 def test_options_that_postures_answer(tmp_path: Path, options: list[str], why: str) -> None:

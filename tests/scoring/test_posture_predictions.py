@@ -96,7 +96,7 @@ def test_posture_in_the_frame_of_the_rows_camera_is_that_in_the_objects(
     ("changes", "words"),
     [
         ({"row": np.array([0, 99])}, "rows must be 0 to .*, got 99"),
-        ({"row": np.array([0.5, 1.0])}, "rows must be one whole number per entry"),
+        ({"row": np.array([0.5, 1.0])}, "rows must be whole numbers"),
         ({"X_TC": np.tile(np.eye(4), (2, 1, 1))}, "X_TC must be left out: the camera is that of"),
         ({"confidence": np.zeros(3)}, r"confidence must be \(2,\), one per grasp"),
     ],
