@@ -36,7 +36,7 @@ from drakegrasp.runtime.progress import progress_bar
 from drakegrasp.scoring.benchmark import FILE_NAME, NAME, PRESET, write_objects
 from drakegrasp.shapes.catalog import builtin_sources, draw_builtin
 from drakegrasp.simulation.drive import drive_of
-from drakegrasp.simulation.postures.table import PostureTable, refuse_unknown_objects
+from drakegrasp.simulation.postures.table import PostureTable, unknown_objects
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -71,7 +71,7 @@ def build_dataset(
         manifest: YAML file with units and classes per mesh, if it is not beside the meshes.
         only: Names of the objects to build; all if empty.
         postures: Instead of drawn palm poses: a file of postures, or a table of them. Only the
-            objects that it names are built.
+            objects that it names are built; rows that are no posture are told, and left out.
         workers: Processes on this machine; one per core if None.
         scheduler: Address of a running Dask scheduler to use instead.
         scheduler_file: Its JSON file, instead of the address.
@@ -81,7 +81,7 @@ def build_dataset(
 
     Raises:
         MeshError: If there is no mesh.
-        GraspError: If a row of the postures is none, or of an object that is not there.
+        GraspError: If no row of the postures is one of an object that is there.
         ConfigError: If both workers and a scheduler are given, the address is empty, or the
             scheduler wants no certificate although `tls` says so.
         DataError: If `out` cannot be used, another process builds there, or no mesh can be
@@ -151,10 +151,14 @@ def build_on(
     known = draw_builtin(config.builtin) if sources is None else sources
     refuse_unknown(only, [each.name for each in known])
     if postures is not None:
-        refuse_unknown_objects(postures, [each.name for each in known])
-        only = [name for name in dict.fromkeys(postures.objects) if not only or name in only]
+        postures = postures.refuse(unknown_objects(postures, [each.name for each in known]))
+        named = dict.fromkeys(
+            name for name, bad in zip(postures.objects, postures.invalid, strict=True) if not bad
+        )
+        only = [name for name in named if not only or name in only]
         if not only:
-            raise GraspError("postures must be of an object that is built, got none of them")
+            why = f": {postures.refused}" if postures.refused else ", got none of them"
+            raise GraspError(f"postures must be of an object that is built{why}")
     with build_lock(out) as dead, ExitStack() as stack:
         # A directory that cannot be used is refused before workers start.
         before = claim_directory(out, config)

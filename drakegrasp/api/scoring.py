@@ -24,7 +24,9 @@ from drakegrasp.scoring.references import REFERENCES
 from drakegrasp.scoring.run import Request, Score
 from drakegrasp.scoring.run import score as score_request
 from drakegrasp.scoring.verdict import Verdict, protocol_verdict, verdict_of
+from drakegrasp.simulation.postures.table import PostureTable
 from drakegrasp.verification.placed_grasp import dataset_config, overridden_keys, place_on_rows
+from drakegrasp.verification.placed_postures import place_postures_on_rows
 from drakegrasp.verification.verify import PlacedGrasp
 
 #: Receives verdicts as they come: called with the place of a grasp and its verdict.
@@ -55,7 +57,8 @@ def score(
 
     Args:
         predictions: In the frame of the rows' camera: (n, 6k), one per row, or (n, m, 6k), m per
-            row; or a file of them, or several files of one method that was trained several times.
+            row; or a file of them or of postures, or several files of one method that was trained
+            several times.
             An empty list scores the reference rows alone.
         dataset: The split whose rows the predictions are for.
         rows: With an array: (n,), the row of each; all rows, in order, if None.
@@ -105,8 +108,11 @@ def score(
     )
 
     # Its verdicts, by this process or workers, and the card.
-    def try_all(grasps: Array, chosen: Sequence[int], deliver: Deliver) -> None:
-        placed = place_on_rows(grasps, dataset, chosen, overrides=settings)
+    def try_all(grasps: Array | PostureTable, chosen: Sequence[int], deliver: Deliver) -> None:
+        if isinstance(grasps, PostureTable):
+            placed = place_postures_on_rows(grasps, dataset, chosen, overrides=settings)
+        else:
+            placed = place_on_rows(grasps, dataset, chosen, overrides=settings)
         if peer:
             _try_by_protocol(placed, protocol, deliver, workers=workers, show=show)
             return

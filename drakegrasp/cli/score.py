@@ -89,8 +89,9 @@ def score(
     """Score predicted grasps beside reference rows, and write a card.
 
     Each of PREDICTIONS is a .npy, HDF5 or Parquet file: (n, 6k) numbers, one grasp per row of the
-    split, or (n, m, 6k), m per row, in the camera's frame. Several files are of one method that
-    was trained several times. Without any, the reference rows are scored alone.
+    split, or (n, m, 6k), m per row, in the camera's frame; or a file of postures with the `row`
+    that each is for. Several files are of one method that was trained several times. Without any,
+    the reference rows are scored alone.
 
     DIR gets card.json, card.md, card.png, and the verdicts, so that an interrupted score goes on.
     """

@@ -546,7 +546,7 @@ OBJECT_FIELDS: tuple[Field, ...] = (
 #: joints, contacts and lift are those of the first wrist pose.
 VERIFICATION_FIELDS: tuple[Field, ...] = (
     Field("object", "", "str", "-", "-", "name of the object", of="placed.model.name"),
-    Field("method", "", "str", "-", "-", "how it was verified: hand, or forces alone",
+    Field("method", "", "str", "-", "-", "how it was verified: hand, forces alone, or posture",
           of="method"),
     _verdict("outcome", [outcome for outcome in Outcome if not outcome.dataset_only]),
     Field("success", "", "bool", "-", "-",
@@ -589,12 +589,13 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
           "least friction coefficient at which forces within the hand's limit at the predicted "
           "contacts hold the object; inf if none does", of="smallest_friction"),
     *_measured(
-        "fit",
-        Field("X_OG", "12", "float64", "m, -", "O", "pose of the palm that was found"),
+        "pregrasp",
+        Field("X_OG", "12", "float64", "m, -", "O", "pose of the palm that was found, or given"),
         _SPREAD,
-        Field("closing", "k", "float64", "rad or m", "-",
-              "closing positions at which the fingertips meet the predicted points"),
     ),
+    Field("closing", "k", "float64", "rad or m", "-",
+          "closing positions at which the fingertips meet the predicted points",
+          of="fit.closing"),
     Field("fit_residual", "k", "float64", "m", "-",
           "distance of the predicted points from the fingertips then", of="fit.residual"),
     Field("fit_normal_error", "k", "float64", "rad", "-",

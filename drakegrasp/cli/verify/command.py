@@ -128,9 +128,12 @@ def verify(
     points in metres, then the unit normals out of the object, in the order of the hand's
     fingers.
 
-    With another protocol than lift, GRASPS may also be a file of postures as `build --postures`
-    reads it; of contacts the first wrist pose that fits them is tried. Or GRASPS is a .npy file of
-    DexGraspBench or a folder of such files, and --hand an MJCF, whose world is the hand's root.
+    GRASPS may also be a file of postures as `build --postures` reads it, on --object or on the
+    objects of --dataset that it names, or that its `row` says.
+
+    With another protocol than lift, the first wrist pose that fits contacts is tried. There GRASPS
+    may be a .npy file of DexGraspBench or a folder of such files, and --hand an MJCF, whose world
+    is the hand's root.
 
     If GRASPS is a data file of a dataset, and neither --object nor --dataset is given, the
     command tries the grasps of that dataset.
