@@ -256,7 +256,7 @@ def _continued_in_coarse_steps(scene: Scene, config: Config) -> Scene:
 
 
 def _pushed(scene: Scene, force: float, *, steps: int) -> np.ndarray:
-    """Return the closing angles (steps + 1, k) [rad] while a force pulls the object along Oy [N]."""
+    """Return the closing angles (steps + 1, k) [rad] while a force [N] pulls along y of {O}."""
     R_WO = scene.pose(scene.object)[:3, :3]
     applied = ExternallyAppliedSpatialForce()
     applied.body_index = scene.object.index()
