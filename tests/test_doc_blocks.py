@@ -68,6 +68,7 @@ NO_CODE = {
 PY_NOT_RUN = {
     "dg.build_dataset(": "simulates for hours; tests/test_api.py",
     "datasets.load_dataset(": "tests/exchange/test_hub.py reads a folder so",
+    "dg.SceneDataset(": "wants scenes and torch; tests/dataset/scenes",
     'dg.place_object("mug.obj"': "tests/verification/test_verify.py",
 }
 #: Commands that simulate, which want a dataset that was simulated.
