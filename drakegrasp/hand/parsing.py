@@ -6,6 +6,7 @@ and couplings come from the hand file.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -16,6 +17,14 @@ from pydrake.multibody.tree import ModelInstanceIndex
 
 from drakegrasp.errors import HandError, first_line
 from drakegrasp.runtime.environment import allow_network
+
+
+def _is_no_twin(record: logging.LogRecord) -> bool:
+    """Return whether a message of Drake says what no exception says again."""
+    return not record.getMessage().startswith("SDFormat Error")
+
+
+logging.getLogger("drake").addFilter(_is_no_twin)
 
 
 @dataclass(frozen=True)
