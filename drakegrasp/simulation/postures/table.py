@@ -258,9 +258,13 @@ def join_tables(parts: Sequence[PostureTable | str]) -> PostureTable:
 
 
 def _numbers(
-    value: npt.ArrayLike | None, shape: tuple[int, ...], name: str, bad: list[str], *,
+    value: npt.ArrayLike | None,
+    shape: tuple[int, ...],
+    name: str,
+    bad: list[str],
+    *,
     some: bool = False,
-) -> Array:  # fmt: skip
+) -> Array:
     """Return an array of a shape; `bad` gets the reason for each row of it that is not finite.
 
     Where `some` are enough, a row may be all NaN.
