@@ -21,6 +21,7 @@ from helpers.meshes import write_fixed
 from drakegrasp.cli.main import main
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.rejections import Decisions, write_decisions
+from drakegrasp.exchange.publication import not_said, read_publication
 from drakegrasp.hand.settings import load_config
 from drakegrasp.objects.sources import find_meshes
 
@@ -160,7 +161,7 @@ def test_lists_name_nothing_that_is_gone() -> None:
 
 
 def test_yaml_blocks_are_read(tmp_path: Path) -> None:
-    """As a configuration or as an objects.yaml; the hand file is the tutorial's."""
+    """As what each is; the hand file is the tutorial's."""
     kinds = []
     for block in BLOCKS:
         if block.language != "yaml":
@@ -178,12 +179,16 @@ def test_yaml_blocks_are_read(tmp_path: Path) -> None:
             )
         elif "fingers" in content:
             kinds.append("hand")
+        elif "creators" in content:
+            kinds.append("publication")
+            (tmp_path / "about.yaml").write_text(block.text, encoding="utf-8")
+            assert not_said(read_publication(tmp_path / "about.yaml")) == []
         else:
             kinds.append("config")
             path = tmp_path / "mine.yaml"
             path.write_text(block.text, encoding="utf-8")
             assert load_config(str(path)).to_dict() != load_config().to_dict()
-    assert sorted(kinds) == ["config", "hand", "objects"]
+    assert sorted(kinds) == ["config", "hand", "objects", "publication"]
 
 
 def meshes(folder: Path) -> Path:

@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drakegrasp.api.workers import announced, refuse_workers
+from drakegrasp.api.workers import announced, connection, end_imported_script
 from drakegrasp.build.pipeline import (
     BuildReport,
     build_locked,
@@ -20,8 +20,6 @@ from drakegrasp.build.pipeline import (
 )
 from drakegrasp.build.request import BUILTIN, refuse_unknown
 from drakegrasp.cluster.admission import admitted_workers
-from drakegrasp.cluster.certificates import security_of
-from drakegrasp.cluster.connect import connect
 from drakegrasp.cluster.executor import RESUBMISSIONS, DaskExecutor
 from drakegrasp.config import Config
 from drakegrasp.dataset.lock import build_lock
@@ -56,6 +54,7 @@ def build_dataset(
     workers: int | None = None,
     scheduler: str | None = None,
     scheduler_file: str | Path | None = None,
+    tls: bool = True,
     tls_files: tuple[Path, Path, Path] | None = None,
     show: bool = True,
 ) -> BuildReport:
@@ -76,28 +75,31 @@ def build_dataset(
         workers: Processes on this machine; one per core if None.
         scheduler: Address of a running Dask scheduler to use instead.
         scheduler_file: Its JSON file, instead of the address.
-        tls_files: To encrypt: certificate authority, certificate and private key (PEM).
+        tls: Whether the scheduler must want a certificate.
+        tls_files: Certificate authority, certificate and private key (PEM) for it.
         show: Whether to show progress on standard error.
 
     Raises:
         MeshError: If there is no mesh.
         GraspError: If no row of the postures is one of an object that is there.
-        ConfigError: If both workers and a scheduler are given, or the address is empty.
+        ConfigError: If both workers and a scheduler are given, the address is empty, or the
+            scheduler wants no certificate although `tls` says so.
         DataError: If `out` cannot be used, another process builds there, or no mesh can be
             simulated.
         MachineError: If there is no scheduler, the workers cannot do the work, or no room is
             left; the same call continues when that is fixed.
     """
-    refuse_workers(workers, scheduler, scheduler_file)
+    end_imported_script()
+    cluster = connection(workers, scheduler, scheduler_file, tls, tls_files)
     out, config = Path(out).absolute(), config or load_config()
     hand = load_hand(config.hand_source)
     drive_of(hand, config.lift)
     if isinstance(postures, str | Path):
         postures = read_postures(Path(postures), hand)
     sources = find_sources(objects, units, manifest)
-    security = None if tls_files is None else security_of(tls_files)
-    cluster = announced(connect(workers, scheduler, scheduler_file, security=security), show)
-    return build_on(cluster, sources, out, config, only=only, postures=postures, show=show)
+    return build_on(
+        announced(cluster, show), sources, out, config, only=only, postures=postures, show=show
+    )
 
 
 def find_sources(
@@ -200,6 +202,8 @@ def make_benchmark(
     workers: int | None = None,
     scheduler: str | None = None,
     scheduler_file: str | Path | None = None,
+    tls: bool = True,
+    tls_files: tuple[Path, Path, Path] | None = None,
     show: bool = True,
 ) -> BuildReport:
     """Make the frozen benchmark `drakegrasp-bench-1`; the same as `drakegrasp bench-set`.
@@ -211,6 +215,8 @@ def make_benchmark(
         workers: Processes on this machine; one per core if None.
         scheduler: Address of a running Dask scheduler to use instead.
         scheduler_file: Its JSON file, instead of the address.
+        tls: Whether the scheduler must want a certificate.
+        tls_files: Certificate authority, certificate and private key (PEM) for it.
         show: Whether to show progress on standard error.
 
     Raises:
@@ -231,6 +237,8 @@ def make_benchmark(
         workers=workers,
         scheduler=scheduler,
         scheduler_file=scheduler_file,
+        tls=tls,
+        tls_files=tls_files,
         show=show,
     )
 

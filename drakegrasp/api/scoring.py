@@ -49,6 +49,8 @@ def score(
     workers: int | None = None,
     scheduler: str | None = None,
     scheduler_file: str | Path | None = None,
+    tls: bool = True,
+    tls_files: tuple[Path, Path, Path] | None = None,
     show: bool = False,
 ) -> Score:
     """Return the score of predicted grasps beside reference rows; see docs/how-to/score.md.
@@ -73,6 +75,8 @@ def score(
         workers: Processes on this machine; one per core if None.
         scheduler: Address of a running Dask scheduler to use instead.
         scheduler_file: Its JSON file, instead of the address.
+        tls: Whether the scheduler must want a certificate.
+        tls_files: Certificate authority, certificate and private key (PEM) for it.
         show: Whether to show progress on standard error.
 
     Raises:
@@ -117,6 +121,8 @@ def score(
             workers=workers,
             scheduler=scheduler,
             scheduler_file=scheduler_file,
+            tls=tls,
+            tls_files=tls_files,
             on_result=lambda index, result: deliver(index, verdict_of(result)),
             show=show,
         )

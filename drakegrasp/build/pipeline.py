@@ -231,7 +231,8 @@ def _build(
     # The manifest comes first: without one a directory holds no dataset.
     hand, versions = load_hand(config.hand_source), installed_versions(config)
     new = Manifest(config=config, versions=versions, fingers=finger_names(config))
-    manifest = replace(known or new, config=config, joints=position_order(hand.model))
+    joints = position_order(hand.model, hand.palm_link)
+    manifest = replace(known or new, config=config, joints=joints)
     manifest = replace(manifest, versions={**manifest.versions, "hand": versions["hand"]})
     write_manifest(manifest, out)
     job.events.started(manifest, notices)

@@ -21,12 +21,23 @@ FORMATS = ("hf", "original", "dexgraspbench", "isaac_grasp", "glb", "mjcf")
     "--licence",
     "--license",
     metavar="ID",
-    default="unknown",
-    show_default=True,
     help="Licence that the card of format hf names, e.g. cc-by-4.0.",
 )
+@click.option(
+    "--about",
+    type=PATH,
+    metavar="YAML",
+    help="For format hf: name, version, url, creators, published, licence, citation.",
+)
 @shared("--quiet")
-def export(out: Path, directory: Path | None, form: str, licence: str, quiet: bool) -> None:
+def export(
+    out: Path,
+    directory: Path | None,
+    form: str,
+    licence: str | None,
+    about: Path | None,
+    quiet: bool,
+) -> None:
     """Write the samples of a dataset in another format.
 
     DIRECTORY must be new or empty.  [default: OUT/export_FORMAT]
@@ -43,12 +54,22 @@ def export(out: Path, directory: Path | None, form: str, licence: str, quiet: bo
     mjcf           the same for MuJoCo, with the table; needs drakegrasp[peer]
     """  # noqa: D301  (click keeps the lines of a paragraph that begins with this character)
     from drakegrasp.exchange.export import export_dataset
+    from drakegrasp.exchange.publication import Publication, not_said, read_publication
     from drakegrasp.foreign_files import refuse_link
     from drakegrasp.runtime.progress import progress_bar
+
+    # What is said of the publishers; the option is stronger than the file.
+    if form != "hf" and about:
+        raise click.UsageError(f"--about is for --to hf, got --to {form}")
+    publication = Publication() if about is None else read_publication(about)
+    if licence:
+        publication = publication.model_copy(update={"licence": licence})
 
     if directory is None:
         directory = out / f"export_{form}"
         refuse_link(directory)
     with progress_bar("export", "sample", show=not quiet) as progress:
-        count = export_dataset(out, directory, form, licence=licence, progress=progress)  # type: ignore[arg-type]
+        count = export_dataset(out, directory, form, publication=publication, progress=progress)  # type: ignore[arg-type]
     say(f"{count:,} samples in {directory}")
+    if form == "hf" and (missing := not_said(publication)):
+        say(f"before it is published, --about should say: {', '.join(missing)}")

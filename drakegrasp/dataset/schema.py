@@ -286,12 +286,12 @@ _LINEAGE = _new(
           "m^2 of surface and rad of roll; per m^3 rad^3 about the parent's; of a posture what its "
           "file says, NaN if nothing", some=True),
 )
-#: What `preshape` says of a posture, in which all fingers of a hand with preshapes close.
+#: What `preshape` says of a posture that is of none: all fingers of a hand with preshapes close.
 NO_PRESHAPE = 255
 # Fields of several tables.
 _PRESHAPE = _new(
     Field("preshape", "", "uint8", "-", "-",
-          "index of the hand file's preshape, 255 of a posture; 0 if the file has none",
+          "index of the hand file's preshape, 255 of a posture of none; 0 if the file has none",
           optional=True),
     Field("unused", "", "uint32", "-", "-",
           "fingers that the preshape leaves out, as bits: 1 for the first finger. They have no "
@@ -606,7 +606,7 @@ VERIFICATION_FIELDS: tuple[Field, ...] = (
     Field("tries", "", "uint16", "-", "-", "number of wrist poses that were tried",
           of="num_tries"),
     Field("closing_start", "k", "float64", "rad or m", "-",
-          "closing positions from which the simulated fingers close", of="pregrasp.closing"),
+          "closing positions from which the simulated fingers close", of="closing_start"),
     *_since(
         Stage.CLOSED,
         _TIME_CLOSE,

@@ -1,6 +1,7 @@
-"""Croissant metadata of a folder for the Hub (version 1.0 of mlcommons.org/croissant).
+"""Croissant metadata of a folder for the Hub (version 1.1 of mlcommons.org/croissant).
 
-In: the Parquet files of the folder and their columns. Out: the content of `croissant.json`.
+In: the Parquet files of the folder, their columns, the data card, and what the publishers say.
+Out: the content of `croissant.json`, with the fields of Croissant's RAI vocabulary 1.0.
 """
 
 from __future__ import annotations
@@ -14,14 +15,16 @@ from typing import Any
 import numpy as np
 
 from drakegrasp.dataset.schema import Field
+from drakegrasp.exchange.publication import Publication
 
 #: Types of Croissant by NumPy's letter of a kind.
 _TYPES = {"f": "sc:Float", "i": "sc:Integer", "u": "sc:Integer", "b": "sc:Boolean"}
 #: Terms of Croissant that mean what its vocabulary says.
 _TERMS = (
-    *("citeAs", "column", "extract", "field", "fileProperty", "fileObject", "fileSet", "format"),
-    *("includes", "isLiveDataset", "jsonPath", "key", "md5", "parentField", "path", "recordSet"),
-    *("references", "regex", "repeated", "replace", "separator", "source", "subField", "transform"),
+    *("arrayShape", "citeAs", "column", "containedIn", "equivalentProperty", "extract", "field"),
+    *("fileProperty", "fileObject", "fileSet", "format", "includes", "isArray", "isLiveDataset"),
+    *("jsonPath", "key", "md5", "parentField", "path", "recordSet", "references", "regex"),
+    *("repeated", "replace", "samplingRate", "separator", "source", "subField", "transform"),
 )
 #: The context that the specification prescribes.
 _CONTEXT: dict[str, Any] = {
@@ -35,6 +38,8 @@ _CONTEXT: dict[str, Any] = {
     "data": {"@id": "cr:data", "@type": "@json"},
     "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
     "examples": {"@id": "cr:examples", "@type": "@json"},
+    "description": {"@container": "@language"},
+    "name": {"@container": "@language"},
     **{term: f"cr:{term}" for term in _TERMS},
 }
 
@@ -60,8 +65,8 @@ def croissant(
     folder: Path,
     files: Sequence[ParquetFile],
     columns: Mapping[str, Field | None],
-    *,
-    licence: str,
+    card: Mapping[str, Any],
+    publication: Publication,
 ) -> dict[str, Any]:
     """Return the content of `croissant.json`.
 
@@ -69,7 +74,8 @@ def croissant(
         folder: With the files.
         files: The files that were written.
         columns: Fields by the columns' names; None for an image.
-        licence: Identifier of the licence.
+        card: Content of the data card (`card_content`).
+        publication: What the publishers say; keys that they do not say are left out.
     """
     # Each file with its hash, so that a damaged download shows.
     distribution = [
@@ -85,16 +91,59 @@ def croissant(
     ]
 
     # The dataset, with the columns of each file.
+    said = {
+        "license": publication.licence,
+        "version": publication.version,
+        "url": publication.url,
+        "creator": [{"@type": "sc:Organization", "name": name} for name in publication.creators],
+        "datePublished": publication.published and publication.published.isoformat(),
+        "citeAs": publication.citation,
+    }
     return {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",
-        "name": "drakegrasp",
+        "name": publication.name or card["title"],
         "description": "Simulated multi-finger grasps, each with the images of its camera.",
-        "conformsTo": "http://mlcommons.org/croissant/1.0",
-        "license": licence,
-        "version": "1.0.0",
+        "conformsTo": [
+            "http://mlcommons.org/croissant/1.1",
+            "http://mlcommons.org/croissant/RAI/1.0",
+        ],
+        **{key: value for key, value in said.items() if value},
+        **_responsibility(card),
         "distribution": distribution,
         "recordSet": [_record_set(file, columns) for file in files],
+    }
+
+
+def _responsibility(card: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of Croissant's RAI vocabulary, all from the data card."""
+    # How many, of what, by which programs.
+    counts = card["counts"]
+    everything, removals = counts["all"], counts["removed"]
+    samples = [row["samples"] for row in counts["classes"].values()]
+    versions = ", ".join(f"{name} {card['versions'][name]}" for name in ("drakegrasp", "drake"))
+    reasons = ", ".join(f"{count} {reason}" for reason, count in removals.items()) or "none"
+
+    # Only what is known of every dataset that drakegrasp makes.
+    return {
+        "rai:dataCollection": (
+            f"Simulated with {versions}, hand {card['hand']}: {everything['attempts']} attempts to "
+            f"grasp, of which {everything['held']} hold. No people and no robot took part."
+        ),
+        "rai:dataCollectionType": "Software Collection",
+        "rai:dataPreprocessingProtocol": (
+            f"Filters removed {sum(removals.values())} held grasps: {reasons}."
+        ),
+        "rai:dataAnnotationProtocol": (
+            "Each label is the outcome of a simulated lift; no network made or corrected one."
+        ),
+        "rai:dataBiases": [
+            f"{len(counts['objects'])} objects of {len(counts['classes'])} classes, with "
+            f"{min(samples)} to {max(samples)} samples each."
+        ],
+        "rai:dataLimitations": [entry["limit"] for entry in card["limits"]],
+        "rai:dataUseCases": ["Training and testing of networks that predict grasps from images."],
+        "rai:personalSensitiveInformation": ["None."],
     }
 
 

@@ -15,6 +15,7 @@ from drakegrasp.dataset.paths import DATA_FILES
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import SPLITS
 from drakegrasp.errors import DataError
+from drakegrasp.exchange.publication import Publication
 from drakegrasp.runtime.environment import require_mujoco
 from drakegrasp.runtime.files import atomic_folder
 from drakegrasp.runtime.progress import Report, silent
@@ -29,7 +30,7 @@ def export_dataset(
     directory: str | Path,
     form: Format,
     *,
-    licence: str = "unknown",
+    publication: Publication | None = None,
     progress: Report = silent,
 ) -> int:
     """Write the samples of a dataset in another format and return their number.
@@ -38,7 +39,7 @@ def export_dataset(
         out: Directory of the dataset.
         directory: Where to write; it must be new or empty, and appears when it is complete.
         form: One of `FORMATS`.
-        licence: Identifier of the licence in the card of format `hf`.
+        publication: What the card and the metadata of format `hf` say of the publishers.
         progress: Called with the number of samples done and of all.
 
     Raises:
@@ -59,17 +60,17 @@ def export_dataset(
     if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
         raise DataError(f"{directory}: must be a new or empty directory, got one that holds files")
 
-    write = _writer(form, licence)
+    write = _writer(form, publication or Publication())
     with atomic_folder(directory) as folder:
         return write(out, folder, progress)
 
 
-def _writer(form: Format, licence: str) -> Callable[[Path, Path, Report], int]:
+def _writer(form: Format, publication: Publication) -> Callable[[Path, Path, Report], int]:
     """Return the function that writes a format; its libraries are loaded when it is asked for."""
     if form == "hf":
         from drakegrasp.exchange.hub import write_hub
 
-        return partial(write_hub, licence=licence)
+        return partial(write_hub, publication=publication)
     if form == "original":
         from drakegrasp.exchange.original import write_original
 

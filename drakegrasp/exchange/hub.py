@@ -29,6 +29,7 @@ from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.schema import CAMERAS, DATA_FIELDS, SPLITS, Field
 from drakegrasp.errors import MachineError
 from drakegrasp.exchange.croissant import ParquetFile, croissant
+from drakegrasp.exchange.publication import Publication
 from drakegrasp.runtime.progress import Report
 
 if TYPE_CHECKING:
@@ -62,7 +63,7 @@ NAMES = {"grasps": "grasp", "grasps_held": "grasp_held"}
 Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
 
-def write_hub(out: Path, folder: Path, progress: Report, *, licence: str) -> int:
+def write_hub(out: Path, folder: Path, progress: Report, *, publication: Publication) -> int:
     """Write the folder and return the number of samples; see `export.export_dataset`.
 
     Raises:
@@ -94,9 +95,10 @@ def write_hub(out: Path, folder: Path, progress: Report, *, licence: str) -> int
             progress(done, total)
 
     # What they are, for people and for programs.
-    text = _card(out, written, licence)
+    content = card_content(out)
+    text = _card(out, written, content, publication)
     (folder / "README.md").write_text(text, encoding="utf-8")
-    description = croissant(folder, written, columns(), licence=licence)
+    description = croissant(folder, written, columns(), content, publication)
     (folder / "croissant.json").write_text(json.dumps(description, indent=1), encoding="utf-8")
     return total // len(CAMERAS)
 
@@ -110,9 +112,12 @@ def columns() -> dict[str, Field | None]:
     return found
 
 
-def _card(out: Path, files: Sequence[ParquetFile], licence: str) -> str:
+def _card(
+    out: Path, files: Sequence[ParquetFile], card: Mapping[str, Any], publication: Publication
+) -> str:
     """Return the text of the dataset card: that of the dataset, its files and its columns."""
-    content = card_content(out) | {"files": FILES, "depth_unit": DEPTH_UNIT}
+    content = {**card, "files": FILES, "depth_unit": DEPTH_UNIT}
+    content["title"] = publication.name or card["title"]
     content["conventions"] = {**content["conventions"], **CONVENTIONS}
     rows: Counter[tuple[str, str]] = Counter()
     for file in files:
@@ -140,7 +145,7 @@ def _card(out: Path, files: Sequence[ParquetFile], licence: str) -> str:
         for camera in CAMERAS
     ]
     head = {
-        "license": licence,
+        "license": publication.licence or "unknown",
         "pretty_name": content["title"],
         "task_categories": ["robotics"],
         "tags": ["robotics", "grasping", "simulation", "croissant"],

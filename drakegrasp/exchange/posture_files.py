@@ -30,7 +30,7 @@ ARRAYS, TABLES, YAMLS = (".npz", ".h5", ".hdf5"), (".csv", ".parquet"), (".yaml"
 #: Arrays are smaller, all together [bytes]: two million postures of a hand with 16 joints.
 MOST_BYTES = 1_000_000_000
 #: The arrays of our own layout that are neither poses nor joints.
-_TEXTS = ("object", "joints", "source", "frame", "link")
+_TEXTS = ("object", "joints", "source", "frame", "link", "preshape")
 _KNOWN = (
     *_TEXTS,
     *("X_FG", "position", "quaternion", "q_grasp", "q_pregrasp", "q_squeeze", "resting"),
@@ -203,6 +203,7 @@ def _of_arrays(arrays: Mapping[str, Any]) -> Rows:
         invalid=invalid,
         of_row=arrays.get("row"),
         confidence=arrays.get("confidence"),
+        preshape=texts.get("preshape"),
     )
 
 
@@ -330,6 +331,7 @@ def _of_columns(columns: Mapping[str, list[Any]], invalid: list[str]) -> Rows:
         of_row=said["row"].astype(np.int64) if whole else said.get("row"),
         confidence=said.get("confidence"),
         invalid=[one or other for one, other in zip(invalid, reasons, strict=True)],
+        preshape=[str(name or "") for name in columns.get("preshape", ())] or None,
     )
 
 

@@ -18,8 +18,8 @@ from drakegrasp.arithmetic import multiply
 from drakegrasp.errors import GraspError, listed, one_line
 from drakegrasp.frames import Array, make_pose
 from drakegrasp.hand.description import Hand
-from drakegrasp.simulation.postures.posture import joint_order
-from drakegrasp.simulation.postures.table import PostureTable, make_table
+from drakegrasp.simulation.postures.posture import joint_order, preshape_index
+from drakegrasp.simulation.postures.table import PostureTable, known_preshapes, make_table
 
 #: How far the length of a quaternion may be from one.
 UNIT_TOLERANCE = 1e-3
@@ -36,13 +36,14 @@ class Rows:
         frame: One of `TABLE_FRAMES`.
         q: Joint positions (n, m) [rad or m] by "grasp", "pregrasp" and "squeeze".
         joints: (m,), names of the joints; None: all, in the plant's order. A joint that the hand
-            file couples or keeps in its preshape may be missing.
+            file couples, or that the preshapes of all rows keep, may be missing.
         X_TC: (n, 4, 4), for the frame "camera".
         numbers: `resting`, `log_density` and `scale`, (n,) each, as far as they are known.
         said: (n,), where each comes from.
         invalid: (n,), why a row is known to be none; None: no row is.
         of_row: (n,), of predictions: the row of a dataset's split that each is for.
         confidence: (n,), of predictions: greater is better.
+        preshape: (n,), name of the hand's preshape; empty or None: all fingers close.
     """
 
     objects: Sequence[str]
@@ -57,6 +58,7 @@ class Rows:
     invalid: Sequence[str] | None = None
     of_row: Any = None
     confidence: Any = None
+    preshape: Sequence[str | None] | None = None
 
 
 def table_of(hand: Hand, rows: Rows) -> PostureTable:
@@ -78,6 +80,7 @@ def table_of(hand: Hand, rows: Rows) -> PostureTable:
             X_TC=rows.X_TC,
             said=rows.said,
             invalid=rows.invalid,
+            preshape=rows.preshape,
             **rows.numbers,
         )
     except (TypeError, ValueError) as error:
@@ -112,18 +115,28 @@ def _in_order(hand: Hand, part: Rows) -> dict[str, Array]:
         for i in hand.motor_fingers
         for c in hand.followers(i)
     }
-    known = {*joints, *hand.preshape, *followers}
+    count = len(part.objects)
+    bad = [""] * count
+    names = known_preshapes(part.preshape or [None] * count, count, hand, bad)
+    kept = [
+        dict.fromkeys(order, np.nan)
+        if none
+        else hand.at(preshape_index(hand, name or None)).preshape
+        for name, none in zip(names, bad, strict=True)
+    ]
+    still = set(order).intersection(*kept)
+    known = {*joints, *still, *followers}
     if missing := [name for name in order if name not in known]:
         raise GraspError(f"joints must include {listed(missing)}, got {listed(joints)}")
     found = {}
     turning = [hand.joint_units[name] == "rad" for name in joints]
     for stage, values in part.q.items():
-        rows = _rows(values, len(joints), stage)
+        rows = _rows(values, (count, len(joints)), stage)
         _refuse_degrees(rows[:, turning], stage)
         columns = dict(zip(joints, rows.T, strict=True))
-        for name in order:
-            if name not in columns and name in hand.preshape:
-                columns[name] = np.where(np.isnan(rows[:, 0]), np.nan, hand.preshape[name])
+        given = ~np.isnan(rows[:, 0])
+        for name in still - columns.keys():
+            columns[name] = np.where(given, [of_row[name] for of_row in kept], np.nan)
         for name, (leader, ratio, offset) in followers.items():
             if name not in columns:
                 columns[name] = ratio * columns[leader] + offset
@@ -131,13 +144,13 @@ def _in_order(hand: Hand, part: Rows) -> dict[str, Array]:
     return found
 
 
-def _rows(values: Any, count: int, stage: str) -> Array:
+def _rows(values: Any, shape: tuple[int, int], stage: str) -> Array:
     try:
         rows = np.asarray(values, dtype=float)
     except (TypeError, ValueError):
         raise GraspError(f"{stage} joints must be numbers, got something else") from None
-    if rows.ndim != 2 or rows.shape[1] != count:
-        raise GraspError(f"{stage} joints must be of shape (n, {count}), got {rows.shape}")
+    if rows.shape != shape:
+        raise GraspError(f"{stage} joints must be of shape {shape}, got {rows.shape}")
     return rows
 
 

@@ -82,6 +82,7 @@ class Hand:
     lift_chance: LiftChance | None  # of a sample, when it has closed; most hands have none
     #: The hand in each of its preshapes, with the fingers that close in it alone.
     preshapes: tuple[Hand, ...] = ()
+    preshape_names: tuple[str, ...] = ()
 
     @property
     def num_fingers(self) -> int:
@@ -210,7 +211,11 @@ def load_hand(source: HandSource = "barrett") -> Hand:
         model = ModelFile(place, tuple(sorted(packages.items())), stamp)
         name = path.stem.removesuffix("_hand")
         hand = _build_hand(name, described, model)
-        hand = replace(hand, preshapes=_in_preshapes(name, described, model))
+        hand = replace(
+            hand,
+            preshapes=_in_preshapes(name, described, model),
+            preshape_names=tuple(preshape.name for preshape in described.preshapes),
+        )
         hand = replace(hand, lift_chance=read_lift_chance(path))
         _refuse_empty_pads(hand)
     except HandError as error:

@@ -7,6 +7,7 @@ and couplings come from the hand file.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 from pydrake.multibody.parsing import Parser
@@ -75,18 +76,22 @@ def add_model(plant: MultibodyPlant, model: ModelFile) -> ModelInstanceIndex:
     return instance
 
 
-def position_order(model: ModelFile) -> tuple[str, ...]:
+@lru_cache
+def position_order(model: ModelFile, palm_link: str) -> tuple[str, ...]:
     """Return the names of a model's joints in the order of its positions, that of every `q`.
 
-    It is that of the tree of links, which may be another than that of the file.
+    It is that of the tree of links whose root is the palm, which need not be that of the file: a
+    wrist of the model hangs from its palm.
+
+    Args:
+        model: The file.
+        palm_link: The link by which the hand is held.
 
     Raises:
         HandError: As `add_model`.
     """
     plant = MultibodyPlant(0.0)
     instance = add_model(plant, model)
-    names = {plant.get_joint(index).name() for index in plant.GetJointIndices(instance)}
-    plant.Finalize()  # which adds a joint for the palm
-    joints = [plant.get_joint(index) for index in plant.GetJointIndices(instance)]
-    moving = [joint for joint in joints if joint.name() in names and joint.num_positions()]
-    return tuple(joint.name() for joint in sorted(moving, key=lambda joint: joint.position_start()))
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName(palm_link, instance))
+    plant.Finalize()
+    return tuple(plant.GetPositionNames(instance, False, False))

@@ -255,7 +255,8 @@ def write_results(
     shape = sizes(fingers=hand.num_fingers, joints=len(hand.joint_names), image=0)
     with atomic_hdf5(path) as file:
         versions, fingers = installed_versions(config), finger_names(config)
-        origin = origin_attributes(config, versions, fingers, position_order(hand.model))
+        joints = position_order(hand.model, hand.palm_link)
+        origin = origin_attributes(config, versions, fingers, joints)
         file.attrs.update(origin)
         group = file.create_group(GROUP)
         for field in VERIFICATION_FIELDS:

@@ -1,9 +1,11 @@
 """Draw faults in the rules that decide labels, as a table for `planted_faults.py`.
 
-A fault changes one operator, number, condition, call or result in a module of physics, screen,
-labels, filters or checks: `<` becomes `>=`, `+` becomes `-`, 0 becomes 1, `and` becomes `or`. Texts
-of messages and annotations are left alone. The same seed draws the same faults of the same source.
-Writes YAML. The tests of a fault are those of its module, the quickest first.
+A fault changes one operator, number, condition, call or result in a module of nine rooms: `<`
+becomes `>=`, `+` becomes `-`, 0 becomes 1, `and` becomes `or`. Half of the faults are in simulation
+and verification. Texts of messages and annotations are left alone, and so are the modules that
+only draw or tell. The same seed draws the same faults of the same source. Writes YAML. The tests
+of a fault are those of its module, then others of its room, then those that import it from other
+rooms. Faults that were looked at and change no result are named in `equivalent_faults.yaml`.
 """
 
 from __future__ import annotations
@@ -12,71 +14,28 @@ import argparse
 import ast
 import random
 import sys
+from collections import deque
 from collections.abc import Iterator, Sequence
+from functools import cache
 from pathlib import Path
 
 import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
-_SIM, _DATA, _CHECKS = (
-    "tests/simulation/test_",
-    "tests/dataset/test_",
-    "tests/dataset/checks/test_check_",
-)
-#: Tests of some modules that lie elsewhere.
-_BESIDE = {
-    "construction": ("tests/visualization/test_recording.py",),
-    "robustness": ("tests/test_equal_draws.py",),
+EQUIVALENT = Path(__file__).with_name("equivalent_faults.yaml")
+#: The rooms that half of the faults are drawn from, and the others.
+JUDGES = ("simulation", "verification")
+OTHERS = ("hand", "mesh", "objects", "vision", "dataset", "build", "scoring")
+#: Modules and folders that draw a picture or tell a story: they decide nothing.
+_TELLING = {
+    *(f"verification/{name}.py" for name in ("explanation", "figure", "recording", "views")),
+    *("dataset/card", "dataset/log.py", "hand/references.py", "scoring/card.py"),
+    *("vision/appearance.py", "vision/probe_image.py", "build/events.py", "build/warnings.py"),
 }
-#: The modules, and the tests that must notice.
-MODULES = {
-    **{
-        f"drakegrasp/simulation/{name}.py": [
-            *(f"{_SIM}{test}.py" for test in tests.split()),
-            *_BESIDE.get(name, ()),
-        ]
-        for name, tests in {
-            "verdict": "verdict trial",
-            "contacts": "contacts trial",
-            "lift": "lift trial",
-            "trial": "trial",
-            "stepping": "trial",
-            "drive": "drive",
-            "screen": "screen",
-            "scene": "lift trial construction",
-            "construction": "construction trial",
-            "settle": "settle",
-            "trajectory": "trajectory lift",
-            "robustness": "robustness",
-            "candidates": "candidates",
-        }.items()
-    },
-    "drakegrasp/hand/finger_sweep.py": ["tests/hand/test_finger_sweep.py", f"{_SIM}screen.py"],
-    "drakegrasp/dataset/filters.py": [f"{_DATA}filters.py", f"{_DATA}assemble.py"],
-    "drakegrasp/dataset/suspicion.py": [f"{_DATA}suspicion.py", f"{_DATA}assemble.py"],
-    "drakegrasp/dataset/assembly/samples.py": [f"{_DATA}assemble.py", f"{_CHECKS}samples.py"],
-    **{
-        f"drakegrasp/dataset/checks/{name}.py": [f"{_CHECKS}{test}.py" for test in tests.split()]
-        for name, tests in {
-            "trials": "trials",
-            "trials_file": "trials consistency",
-            "samples": "samples images",
-            "images": "images samples",
-            "assembled": "samples consistency trials",
-            "attempts": "conditions trials",
-            "data_file": "samples images consistency",
-            "layout": "layout run",
-            "object_files": "run",
-            "rows": "run trials samples",
-            "findings": "run",
-            "run": "run layout",
-        }.items()
-    },
-    "drakegrasp/verification/verify.py": ["tests/verification/test_verify.py"],
-    "drakegrasp/verification/forces/verdict.py": [
-        "tests/verification/forces/test_force_verdict.py"
-    ],
-}
+#: How many imports may lie between a module and a test, in its room and elsewhere.
+NEAR, NEAR_ELSEWHERE = 2, 1
+#: At most so many files of tests for a fault.
+MOST_TESTS = 8
 #: An option of pytest that leaves slow tests out.
 QUICK = "-mnot server and not slow"
 _OPERATORS: dict[type[ast.AST], str] = {
@@ -106,9 +65,61 @@ _NAMES = {"any": "all", "all": "any", "min": "max", "max": "min", "minimum": "ma
 _NAMES |= {"maximum": "minimum", "argmin": "argmax", "argmax": "argmin", "floor": "ceil"}
 
 
+def modules(rooms: Sequence[str]) -> list[str]:
+    """Return the modules of rooms in which faults are drawn, in the order of their paths."""
+    found = sorted(
+        path.relative_to(ROOT / "drakegrasp")
+        for room in rooms
+        for path in (ROOT / "drakegrasp" / room).rglob("*.py")
+        if path.name != "__init__.py"
+    )
+    telling = [p for p in found if {str(p), *map(str, p.parents)} & _TELLING]
+    return [f"drakegrasp/{path}" for path in found if path not in telling]
+
+
+@cache
+def _imports(name: str) -> frozenset[str]:
+    """Return the files of the package that a file imports itself."""
+    named: set[str] = set()
+    for node in ast.walk(ast.parse((ROOT / name).read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            named |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+        elif isinstance(node, ast.Import):
+            named |= {alias.name for alias in node.names}
+    own = (f"{n.replace('.', '/')}.py" for n in named if n.startswith("drakegrasp."))
+    return frozenset(path for path in own if (ROOT / path).is_file())
+
+
+@cache
+def _distances(test: str) -> dict[str, int]:
+    """Return how many modules lie between a test and each module that it needs."""
+    distances: dict[str, int] = {}
+    due = deque((path, 0) for path in sorted(_imports(test)))
+    while due:
+        path, distance = due.popleft()
+        if path not in distances:
+            distances[path] = distance
+            due.extend((below, distance + 1) for below in sorted(_imports(path)))
+    return distances
+
+
+def tests_of(name: str) -> list[str]:
+    """Return the files of tests that must notice a fault of a module, the nearest first."""
+    room, stem = name.split("/")[1], Path(name).stem
+    ranked = []
+    for path in sorted((ROOT / "tests").rglob("test_*.py")):
+        test = str(path.relative_to(ROOT))
+        distance = _distances(test).get(name, sys.maxsize)
+        inside = path.relative_to(ROOT).parts[1] == room
+        if distance <= (NEAR if inside else NEAR_ELSEWHERE):
+            ranked.append((stem not in path.stem, not inside, distance, test))
+    return [test for *_, test in sorted(ranked)][:MOST_TESTS]
+
+
 def faults_of(name: str) -> Iterator[dict[str, object]]:
     """Yield every fault of a module as an entry of a table, in the order of its text."""
     text = (ROOT / name).read_text(encoding="utf-8")
+    tests = tests_of(name)
     tree = ast.parse(text)
     lines = text.splitlines(keepends=True)
     for node in _deciding(tree):
@@ -122,7 +133,7 @@ def faults_of(name: str) -> Iterator[dict[str, object]]:
                 "line": node.lineno,
                 "old": "".join(lines[first : last + 1]),
                 "new": f"{head}{new}{tail}",
-                "tests": [*MODULES[name], QUICK],
+                "tests": [*tests, QUICK],
             }
 
 
@@ -174,15 +185,27 @@ def _changes(node: ast.AST, text: str) -> Iterator[str]:
             yield "pass"
 
 
+def name_equivalent(faults: Sequence[dict[str, object]]) -> None:
+    """Write into faults why they change no result, if someone looked and found that."""
+    known = {(e["file"], e["fault"]): e["why"] for e in yaml.safe_load(EQUIVALENT.read_text())}
+    for fault in faults:
+        change = str(fault["fault"]).partition(": ")[2]  # lines move, the text stays
+        if why := known.get((fault["file"], change)):
+            fault["equivalent"] = why
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the script; return its exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=150, help="number of faults (default: 150)")
     parser.add_argument("--seed", type=int, default=0, help="of the draw (default: 0)")
     arguments = parser.parse_args(argv)
-    every = [fault for name in MODULES for fault in faults_of(name)]
-    drawn = random.Random(arguments.seed).sample(every, arguments.count)
-    sys.stderr.write(f"{len(drawn)} of {len(every)} faults\n")
+    drawn, stream = [], random.Random(arguments.seed)
+    for rooms, count in ((JUDGES, (arguments.count + 1) // 2), (OTHERS, arguments.count // 2)):
+        every = [fault for name in modules(rooms) for fault in faults_of(name)]
+        drawn += stream.sample(every, count)
+        sys.stderr.write(f"{count} of {len(every)} faults in {', '.join(rooms)}\n")
+    name_equivalent(drawn)
     yaml.safe_dump(drawn, sys.stdout, sort_keys=False, allow_unicode=True)
     return 0
 

@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 import pytest
 from helpers.assertions import assert_same_arrays
+from helpers.hands import write_with_preshapes
 from helpers.objects import CUBE, STANDOFF, box_model, from_above, standing
 
 from drakegrasp.api.building import build_on
@@ -19,10 +20,13 @@ from drakegrasp.build.prepare import prepare
 from drakegrasp.build.replay import replay_trial
 from drakegrasp.config import Config
 from drakegrasp.dataset.checks.run import check_dataset
+from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.dataset.prepared_objects import load_prepared
+from drakegrasp.dataset.schema import NO_PRESHAPE
+from drakegrasp.dataset.statistics import NO_NAME, counts_as_dict
 from drakegrasp.dataset.trials import Trials
 from drakegrasp.errors import ConfigError, DataError, GraspError
-from drakegrasp.frames import make_pose
+from drakegrasp.frames import make_pose, unpack_pose
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.settings import load_config
@@ -30,6 +34,7 @@ from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.sources import find_meshes
 from drakegrasp.outcomes import Outcome
 from drakegrasp.runtime.executor import run_here
+from drakegrasp.scoring.verdict import verdict_of
 from drakegrasp.simulation.candidates import Source
 from drakegrasp.simulation.construction import build_scene
 from drakegrasp.simulation.postures.posture import joint_order
@@ -39,6 +44,9 @@ from drakegrasp.simulation.postures.table import (
     unknown_objects,
 )
 from drakegrasp.simulation.trial import run_attempt
+from drakegrasp.verification.placed_postures import place_postures_on_dataset
+from drakegrasp.verification.result_files import write_results
+from drakegrasp.verification.verify import verify_placed
 
 pytestmark = pytest.mark.sim
 
@@ -111,7 +119,10 @@ def test_dataset_is_sound(dataset):
 
 @pytest.mark.parametrize("row", range(4))
 def test_trial_of_a_posture_is_replayed_from_the_dataset_alone(dataset, row):
-    assert replay_trial(dataset, row).same
+    again = replay_trial(dataset, row)
+    assert again.same
+    # The fingers of the third begin in the table.
+    assert list(again.meetings) == (["table"] if row == 2 else [])
 
 
 def test_plan_keeps_what_the_file_said(dataset, table):
@@ -191,6 +202,77 @@ def test_file_without_any_posture_is_refused(meshes, table, tmp_path):
     ):
         build_on(nullcontext(None), find_meshes(meshes), tmp_path, load_config(),
                  postures=replace(table, objects=("cup",) * 4))  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def of_preshapes(meshes: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
+    """The cube held by two fingers of three, given back once as of their preshape, once not."""
+    folder = tmp_path_factory.mktemp("shaped")
+    config = load_config(
+        overrides=[f"hand={write_with_preshapes(folder, all='F1 F2 F3', pair='F1 F3')}"]
+    )
+    hand, model = load_hand(config.hand), box_model(folder, [CUBE] * 3, NAME)
+    attempt, pair = from_above(model, STANDOFF), hand.at(1)
+    held = run_attempt(build_scene(model, config.physics, pair), standing(model), attempt, config)
+    assert held.outcome is Outcome.SUCCESS
+    start = joint_positions(pair, 0.0, np.zeros(2))
+    table = make_table(
+        hand,
+        [NAME] * 2,
+        [attempt.X_OG] * 2,
+        [held.closed.q] * 2,
+        q_pregrasp=[[start[name] for name in joint_order(hand)]] * 2,
+        preshape=["pair", ""],
+    )
+    return built(meshes, folder / "out", table, config), held.closed.q
+
+
+def test_a_posture_of_a_preshape_is_the_attempt_that_it_was(of_preshapes):
+    """Without one, the third finger closes as well."""
+    out, q = of_preshapes
+    trials = Trials(out)
+    assert trials["preshape"].tolist() == [1, NO_PRESHAPE]
+    assert trials["unused"].tolist() == [0b010, 0]
+    assert trials["outcome"].tolist() == [Outcome.SUCCESS] * 2
+    assert trials["closed_touching"].tolist() == [[True, False, True], [True] * 3]
+    np.testing.assert_allclose(trials["closed_q"][0], q, atol=1e-9)
+    assert not trials["own_motors"][0]
+
+
+def test_verdict_on_a_posture_of_a_preshape_has_a_place_for_every_finger(of_preshapes, tmp_path):
+    out, q = of_preshapes
+    config = read_manifest(out).config
+    hand = load_hand(config.hand_source)
+    row = Trials(out)[[0]]
+    table = make_table(
+        *(hand, [NAME] * 2, [unpack_pose(row["X_OG"][0])] * 2, [q] * 2),
+        preshape=["pair", "fist"],
+    )
+    held, none = map(verify_placed, place_postures_on_dataset(table, out))
+    assert held.held
+    assert none.outcome is Outcome.INVALID
+    assert none.reason.startswith("preshape must be one of all, pair for the hand")
+    assert held.closed.touching.tolist() == [True, False, True]
+    assert (held.closed.f_Q_O[1] == 0.0).all()
+    np.testing.assert_allclose(held.closed.p_OQ, row["closed_p_OQ"][0], atol=1e-3)
+    assert np.isnan(held.closing_start).tolist() == [False, True, False]
+    write_results([held, none], tmp_path / "v.h5", config)
+    assert not verdict_of(held).contacts
+
+
+def test_a_dataset_of_postures_of_preshapes_is_sound_and_replayed(of_preshapes):
+    out, _ = of_preshapes
+    assert check_dataset(out) == []
+    assert replay_trial(out, 0).same
+    counts = [(each["preshape"], each["held"]) for each in counts_as_dict(out)["preshapes"]]
+    assert counts == [("all", 0), ("pair", 1), (NO_NAME, 1)]
+
+
+def test_the_hash_of_postures_without_preshapes_is_as_before_there_were_any(table):
+    """Else no build of an older version went on."""
+    plain = make_table(HAND, ["cup"], [np.eye(4)], np.zeros((1, 8)))
+    assert plain.digest() == "553c8cce98b13896"
+    assert replace(plain, preshape=("pair",)).digest() != plain.digest()
 
 
 def test_settings_that_name_other_postures_are_refused(table):

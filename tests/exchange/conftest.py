@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -11,6 +12,18 @@ from helpers.datasets import make_dataset
 
 from drakegrasp.exchange.closed_grasps import ClosedGrasp, read_closed_grasps
 from drakegrasp.exchange.export import Format, export_dataset
+from drakegrasp.exchange.publication import Publication
+
+#: What the publishers of the exported dataset say.
+PUBLICATION = Publication(
+    name="Two made-up boxes",
+    version="2.1.0",
+    url="https://example.org/boxes",
+    creators=("A. Author", "The Box Group"),
+    published=datetime.date(2026, 11, 25),
+    licence="cc-by-4.0",
+    citation="@misc{boxes}",
+)
 
 
 @pytest.fixture(scope="session")
@@ -32,7 +45,7 @@ def exported(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Callabl
     @cache
     def export(form: Format) -> Path:
         to = tmp_path_factory.mktemp(form) / "to"
-        export_dataset(dataset, to, form, licence="cc-by-4.0")
+        export_dataset(dataset, to, form, publication=PUBLICATION)
         return to
 
     return export

@@ -11,11 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from helpers.commands import run
 
+from drakegrasp.dataset.card.content import LIMITS, card_content
 from drakegrasp.dataset.reader import GraspDataset
-from drakegrasp.errors import MachineError
+from drakegrasp.errors import DataError, MachineError
 from drakegrasp.exchange import hub
 from drakegrasp.exchange.export import export_dataset
+from drakegrasp.exchange.publication import read_publication
 
 pytest.importorskip("pyarrow")
 
@@ -43,10 +46,12 @@ for camera in ("oto", "otm"):
             for row in rows
         ]
 records = mlcroissant.Dataset(f"{folder}/croissant.json")
+issues = records.metadata.ctx.issues
 counts = {
     each.uuid: sum(1 for _ in records.records(each.uuid)) for each in records.metadata.record_sets
 }
-print(json.dumps({"rows": found, "croissant": counts}))
+complaints = sorted(issues.errors | issues.warnings)
+print(json.dumps({"rows": found, "croissant": counts, "complaints": complaints}))
 """
 
 
@@ -61,15 +66,16 @@ def test_official_loaders_read_what_the_dataset_holds(
 ) -> None:
     pytest.importorskip("datasets")
     pytest.importorskip("mlcroissant")
-    run = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", LOADERS, str(folder), str(tmp_path)],
         capture_output=True,
         text=True,
         check=False,
         env={"PATH": "", "HOME": str(tmp_path), "HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path)},
     )
-    assert run.returncode == 0, run.stderr
-    found = json.loads(run.stdout.splitlines()[-1])
+    assert process.returncode == 0, process.stderr
+    found = json.loads(process.stdout.splitlines()[-1])
+    assert found["complaints"] == []
     for camera in ("oto", "otm"):
         for split in SPLITS:
             data = GraspDataset(dataset / f"grasping_{camera}.hdf5", split=split)
@@ -130,6 +136,47 @@ def test_card_says_what_the_folder_holds_and_nothing_else(dataset: Path, folder:
         rows = [line for line in text.splitlines() if line.startswith(f"| `{name}` |")]
         assert len(rows) == 1
         assert field is None or f"| {field.unit} | {field.frame} |" in rows[0]
+
+
+def test_croissant_says_who_published_it_and_how_it_was_made(dataset: Path, folder: Path) -> None:
+    said = json.loads((folder / "croissant.json").read_text(encoding="utf-8"))
+    assert (said["name"], said["version"]) == ("Two made-up boxes", "2.1.0")
+    assert (said["url"], said["datePublished"]) == ("https://example.org/boxes", "2026-11-25")
+    assert [each["name"] for each in said["creator"]] == ["A. Author", "The Box Group"]
+    assert (said["license"], said["citeAs"]) == ("cc-by-4.0", "@misc{boxes}")
+    counts = card_content(dataset)["counts"]["all"]
+    made = f"{counts['attempts']} attempts to grasp, of which {counts['held']} hold"
+    assert made in said["rai:dataCollection"]
+    assert LIMITS[0][0] in said["rai:dataLimitations"]
+
+
+def test_what_nobody_said_is_left_out_and_told(dataset: Path, tmp_path: Path) -> None:
+    about = tmp_path / "about.yaml"
+    about.write_text("name: Boxes\nlicence: cc0-1.0\n")
+    arguments = ("export", dataset, tmp_path / "to", "--to", "hf", "--about", about)
+    result = run(*arguments, "--licence", "mit")
+    assert "should say: url, creators, published" in result.output
+    said = json.loads((tmp_path / "to" / "croissant.json").read_text(encoding="utf-8"))
+    assert (said["name"], said["license"]) == ("Boxes", "mit")
+    assert not {"url", "creator", "datePublished", "version"} & set(said)
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("author: me", r"author: must be a known key \(name, version, url, creators, "),
+        ("version: one", r"version: must .*, got 'one'"),
+        ("url: ftp://here", "url: must .*, got 'ftp"),
+        ("published: 2026-13-01", "must be a readable YAML file"),
+        ("creators: me", "creators: must be a list, got 'me'"),
+        ("[", "must be a readable YAML file"),
+    ],
+)
+def test_bad_word_of_the_publishers_is_one_line(tmp_path: Path, text: str, line: str) -> None:
+    (tmp_path / "about.yaml").write_text(text)
+    with pytest.raises(DataError, match=line) as error:
+        read_publication(tmp_path / "about.yaml")
+    assert "\n" not in str(error.value)
 
 
 def test_long_splits_are_cut_into_files(

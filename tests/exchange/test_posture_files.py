@@ -19,6 +19,7 @@ from drakegrasp.exchange.posture_files import read_postures
 from drakegrasp.exchange.posture_rows import quaternion_poses
 from drakegrasp.frames import make_pose, rotation_about
 from drakegrasp.hand.description import load_hand
+from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.simulation.postures.posture import joint_order
 from drakegrasp.simulation.postures.table import PostureTable
 
@@ -72,6 +73,34 @@ def columns() -> dict[str, list[Any]]:
         for joint, values in zip(ORDER, q.T, strict=True):
             table[f"{stage}_{joint}"] = values.tolist()
     return table | {"resting": [0, 2], "log_density": [-1.0, None], "source": ["net 7", ""]}
+
+
+@pytest.mark.parametrize("suffix", ["npz", "h5", "csv"])
+def test_rows_of_a_preshape_need_not_name_the_joints_that_it_keeps(tmp_path, suffix):
+    """Those of fingers that it leaves out; an empty name is no preshape."""
+    hand = load_hand("allegro_four")
+    tripod = hand.at(hand.preshape_names.index("tripod"))
+    joints = [f.closing_joint for f in tripod.fingers]
+    path, objects = tmp_path / f"p.{suffix}", ["mug", "can"]
+    if suffix == "csv":
+        heads = ["object", *"xyz", "qw", "qx", "qy", "qz", *(f"grasp_{j}" for j in joints)]
+        lines = [f"{name},0,0,0,1,0,0,0,.1,.2,.3,tripod" for name in objects]
+        path.write_text("\n".join([",".join([*heads, "preshape"]), *lines]))
+    else:
+        content = {
+            "object": objects, "X_FG": [np.eye(4)] * 2, "joints": joints,
+            "q_grasp": [[0.1, 0.2, 0.3]] * 2, "preshape": ["tripod"] * 2,
+        }  # fmt: skip
+        if suffix == "npz":
+            np.savez(path, **content)
+        else:
+            with h5py.File(path, "w") as file:
+                for name, value in content.items():
+                    file[name] = value
+    table = read_postures(path, hand)
+    assert table.preshape == ("tripod", "tripod")
+    expected = joint_positions(tripod, 0.0, [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(table.q_grasp[1], [expected[name] for name in joint_order(hand)])
 
 
 def write_csv(folder: Path) -> Path:
@@ -303,7 +332,7 @@ def test_file_in_a_folder_that_is_no_grasp_is_a_row_of_its_own(tmp_path):
     assert [bool(reason) for reason in table.invalid] == [False, True, True, True, False]
     assert table.invalid[1].startswith(f"{tmp_path / '1.npy'}: must be a .npy file")
     assert "position and quaternion" in table.invalid[2]
-    assert "grasp joints must be of shape (n, 16), got (1, 3)" in table.invalid[3]
+    assert "grasp joints must be of shape (1, 16), got (1, 3)" in table.invalid[3]
     assert_both(table.at([0, 4]))
 
 
@@ -370,7 +399,7 @@ def test_pickles_of_every_protocol_are_read(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"q_grasp": GRASP[:, :3]}, r"grasp joints must be of shape \(n, 16\), got \(2, 3\)"),
+        ({"q_grasp": GRASP[:, :3]}, r"grasp joints must be of shape \(2, 16\), got \(2, 3\)"),
         ({"X_FG": POSES[:1]}, r"must be of shape \(2, 4, 4\)"),
         ({"frame": np.array("palm")}, "frame must be one of object, table, camera, world, mesh"),
         ({"frame": np.array("camera")}, "X_TC must be given with the frame camera"),

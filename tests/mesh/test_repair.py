@@ -266,3 +266,17 @@ def test_welding_in_parts_changes_no_bit(monkeypatch, limit):
     for one, other in zip(whole, parts, strict=True):
         np.testing.assert_array_equal(one, other)
         assert one.dtype == other.dtype
+
+
+def test_share_of_a_solid_that_changed_is_of_its_volume():
+    """A quarter of a box far from the origin is cut off."""
+    low, size = np.array([0.3, -0.7, 0.2]), np.array([0.1, 0.2, 0.4])
+
+    def share(height: float) -> float:
+        solid = trimesh.creation.box(bounds=[low, low + size * [1.0, 1.0, height]])
+        whole = trimesh.creation.box(bounds=[low, low + size])
+        candidate = solid.vertices, solid.faces
+        return drakegrasp.mesh.union._changed_share(candidate, whole.vertices, whole.faces)
+
+    assert share(1.0) == 0.0
+    assert share(0.75) == pytest.approx(0.25, abs=0.01)

@@ -245,6 +245,25 @@ def test_positions_have_an_order_that_is_not_that_of_the_file(
     text = re.sub(r"  <joint .*?</joint>\n", "", model.read_text(), flags=re.DOTALL)
     model.write_text(text.replace("</robot>", "".join([*reversed(joints), "</robot>"])))
     hand = load_hand(path)
-    scene = build_scene(cube, config.physics, hand)
-    assert list(position_order(hand.model)) == hand_joint_names(scene)
-    assert hand_joint_names(scene) != list(hand.joint_names)
+    names = hand_joint_names(build_scene(cube, config.physics, hand))
+    assert names == list(position_order(hand.model, hand.palm_link)) != list(hand.joint_names)
+
+
+def test_positions_are_in_the_order_of_a_tree_that_the_palm_is_the_root_of(
+    tmp_path: Path, cube: ObjectModel, config: Config
+) -> None:
+    """Not the arm that carries it: its wrist comes where the file has it, after the fingers."""
+    path = write_tongs(tmp_path)
+    model = tmp_path / "tongs.urdf"
+    box = '<link name="arm"><inertial><mass value="1"/><inertia ixx="1e-3" iyy="1e-3" izz="1e-3" '
+    wrist = (
+        f'{box}ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="wrist" type="revolute">'
+        '<parent link="arm"/><child link="palm"/><axis xyz="1 0 0"/>'
+        '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
+    )
+    model.write_text(model.read_text().replace("</robot>", f"{wrist}</robot>"))
+    path.write_text(f"{path.read_text()}preshape: {{wrist: 0.0}}\n")
+    hand = load_hand(path)
+    names = hand_joint_names(build_scene(cube, config.physics, hand))
+    assert names == list(position_order(hand.model, hand.palm_link))
+    assert names[-1] == "wrist"

@@ -75,10 +75,11 @@ def refuse_options(protocol: str, **options: Any) -> None:
     Raises:
         click.UsageError: If one is given.
     """
-    usual = {"method": "hand", "overrides": (), "snap_points": False}
+    usual = {"method": "hand", "overrides": (), "snap_points": False, "tls": True}
+    names = {"mesh": "object", "overrides": "set", "tls": "no-tls", "tls_files": "tls-ca-file"}
     for name, value in options.items():
         if value is not None and value != usual.get(name):
-            option = {"mesh": "object", "overrides": "set"}.get(name, name.replace("_", "-"))
+            option = names.get(name, name.replace("_", "-"))
             raise click.UsageError(f"--{option} must not be used with protocol {protocol}")
 
 

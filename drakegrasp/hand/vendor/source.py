@@ -24,6 +24,8 @@ SUFFIXES = (".urdf", ".sdf", ".xml", ".mjcf")
 LONGEST, DEEPEST, MOST_INCLUDES = 20_000_000, 200, 50
 #: Bytes that are parsed at a time.
 BITE = 65_536
+#: Attributes that a class of MJCF gives to the elements of each tag.
+_Defaults = dict[str, dict[str, str]]
 #: What an element of a model may not lead to: Drake would look for the file itself.
 _ELSEWHERE = {"robot": ("drake:include",), "sdf": ("include",), "mujoco": ("hfield", "plugin")}
 
@@ -73,6 +75,9 @@ def read_source(path: Path, packages: Mapping[str, Path], given: Sequence[Path] 
     folders = Folders(model=folder, packages=known, given=tuple(given))
     if root.tag == "mujoco":
         _include(root, folders, [0])
+        main: _Defaults = {}
+        for default in root.findall("default"):
+            main = _inherit(default, main)
     for element in root.iter():
         if element.tag in _ELSEWHERE[root.tag] and (element.get("file") or len(element)):
             raise HandError(
@@ -124,3 +129,20 @@ def _include(root: Element, folders: Folders, count: list[int]) -> None:
             place = list(parent).index(child)
             parent.remove(child)
             parent[place:place] = list(included)
+
+
+def _inherit(default: Element, above: _Defaults) -> _Defaults:
+    """Write what a class of MJCF has from the classes around it into it; return what it gives.
+
+    Drake looks only as far as the next class: what that one does not name would be lost.
+    """
+    given = {tag: dict(attributes) for tag, attributes in above.items()}
+    own = [element for element in default if element.tag != "default"]
+    for element in own:
+        given.setdefault(element.tag, {}).update(element.attrib)
+        element.attrib.update(given[element.tag])
+    present = {element.tag for element in own}
+    default.extend(Element(tag, given[tag]) for tag in given if tag not in present)
+    for nested in default.findall("default"):
+        _inherit(nested, given)
+    return given

@@ -30,7 +30,7 @@ from drakegrasp.simulation.candidates import (
     Source,
     is_audited,
 )
-from drakegrasp.simulation.postures.posture import Posture, exact_pose, start_of
+from drakegrasp.simulation.postures.posture import Posture, exact_pose, preshape_index, start_of
 
 #: Frames of a table: those of a posture, and {M}, the axes and the origin of the mesh file.
 TableFrame = Literal["object", "table", "camera", "world", "mesh"]
@@ -54,6 +54,7 @@ class PostureTable:
         scale: (n,), metres per unit of length of the mesh file that the posture is for; NaN: any.
         log_density: (n,), logarithm of the density of the draw; NaN: not known.
         said: (n,), where it comes from, in words.
+        preshape: (n,), name of the hand's preshape; empty: all fingers close.
         row: (n,), row in the file.
         invalid: (n,), why a row is no posture; empty where it is one.
     """
@@ -69,6 +70,7 @@ class PostureTable:
     scale: Array
     log_density: Array
     said: tuple[str, ...]
+    preshape: tuple[str, ...]
     row: npt.NDArray[np.int64]
     invalid: tuple[str, ...]
 
@@ -106,7 +108,7 @@ class PostureTable:
         """
         X_OG = multiply(self._frame_in_object(i, X_TO, X_OM), self.X_FG[i])
         before, after = _given(self.q_pregrasp[i]), _given(self.q_squeeze[i])
-        return Posture(X_OG, self.q_grasp[i], before, after)
+        return Posture(X_OG, self.q_grasp[i], before, after, self.preshape[i] or None)
 
     def _frame_in_object(self, i: int, X_TO: Array, X_OM: Array | None) -> Array:
         """Return the pose (4, 4) of the frame of a row in {O}."""
@@ -151,11 +153,13 @@ class PostureTable:
         """Return a hash (16 hex digits) of all that the table says."""
         digest = hashlib.sha256()
         for f in fields(self):
-            # Why a row is none follows from the others, and from the meshes.
-            if f.name != "invalid":
-                value = getattr(self, f.name)
-                is_array = isinstance(value, np.ndarray)
-                digest.update(value.tobytes() if is_array else json.dumps(value).encode())
+            # Why a row is none follows from the others, and from the meshes; a table without
+            # preshapes is as before there were any.
+            value = getattr(self, f.name)
+            if f.name == "invalid" or (f.name == "preshape" and not any(value)):
+                continue
+            is_array = isinstance(value, np.ndarray)
+            digest.update(value.tobytes() if is_array else json.dumps(value).encode())
         return digest.hexdigest()[:16]
 
 
@@ -174,6 +178,7 @@ def make_table(
     log_density: npt.ArrayLike | None = None,
     said: Sequence[str] | None = None,
     invalid: Sequence[str] | None = None,
+    preshape: Sequence[str | None] | None = None,
 ) -> PostureTable:
     """Return a table of postures, after checking every row by itself.
 
@@ -191,6 +196,7 @@ def make_table(
         log_density: (n,), of the draws.
         said: (n,), where each comes from.
         invalid: (n,), why a row is known to be no posture; empty where it may be one.
+        preshape: (n,), names of the hand's preshapes; empty: all fingers close.
 
     Raises:
         GraspError: If there is no row, or the arrays differ in length.
@@ -223,6 +229,7 @@ def make_table(
         scale=_numbers(scale, (count,), "scale", bad, some=True),
         log_density=_numbers(log_density, (count,), "log_density", bad, some=True),
         said=("",) * count if said is None else tuple(said),
+        preshape=("",) * count if preshape is None else known_preshapes(preshape, count, hand, bad),
         row=np.arange(count, dtype=np.int64),
         resting=np.where([not reason for reason in bad], where, 0).astype(np.int64),
         invalid=tuple(bad),
@@ -281,6 +288,26 @@ def _numbers(
     for i in np.flatnonzero(~np.isfinite(rows).all(axis=1) & ~(some & np.isnan(rows).all(axis=1))):
         bad[i] = bad[i] or f"{name} must be finite numbers, got others"
     return np.ascontiguousarray(array)
+
+
+def known_preshapes(
+    names: Sequence[str | None], count: int, hand: Hand, bad: list[str]
+) -> tuple[str, ...]:
+    """Return the names of the preshapes of rows, empty where there is none.
+
+    `bad` gets the reason for each row whose preshape the hand lacks.
+
+    Raises:
+        GraspError: If they are of another number of rows.
+    """
+    if len(names) != count:
+        raise GraspError(f"preshape must be of {count} rows, got {len(names)}")
+    for i, name in enumerate(names):
+        try:
+            preshape_index(hand, name or None)
+        except GraspError as error:
+            bad[i] = bad[i] or str(error)
+    return tuple(name or "" for name in names)
 
 
 def _poses(value: npt.ArrayLike, count: int, name: str, bad: list[str]) -> Array:
@@ -365,6 +392,7 @@ def given_candidates(
             q_squeeze=table.q_squeeze[:count],
             row=table.row[:count],
             said=table.said[:count],
+            preshape=table.preshape[:count],
         ),
     )
 
@@ -391,7 +419,8 @@ def posture_attempts(
 
     for i in indices:
         before, after = _given(given.q_pregrasp[i]), _given(given.q_squeeze[i])
-        posture = Posture(candidates.X_OG[i], given.q_grasp[i], before, after)
+        shape = given.preshape[i] or None
+        posture = Posture(candidates.X_OG[i], given.q_grasp[i], before, after, shape)
         start = start_of(posture, hand)
         yield Attempt(
             candidate=i,
@@ -400,6 +429,8 @@ def posture_attempts(
             spread=start.spread,
             closing=start.closing,
             path=start.path,
+            preshape=start.preshape,
+            unused=start.unused,
             X_OG=posture.X_OG,
             seed=Stream(seed, object_key(name), i).key,
             resting=int(candidates.resting[i]),
