@@ -20,7 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from drakegrasp.dataset.manifest import Manifest, read_manifest
-from drakegrasp.dataset.paths import DATA_FILES
+from drakegrasp.dataset.paths import DATA_FILES, SCENES_FILE
 from drakegrasp.dataset.statistics import Funnel, count_funnel
 from drakegrasp.errors import DataError, MachineError
 from drakegrasp.outcomes import Outcome, Removal
@@ -41,6 +41,7 @@ from drakegrasp.visualization.figures.held_grasps import HeldGrasps, read_approa
 from drakegrasp.visualization.figures.palm_poses import caption, palm_poses_figure
 from drakegrasp.visualization.figures.phases import phases_figure
 from drakegrasp.visualization.figures.samplers import METHODS, compare_samplers, palm_rays
+from drakegrasp.visualization.figures.scene_views import scene_views
 
 #: Resolution of the pictures [pixels per inch].
 DPI = 150
@@ -116,6 +117,7 @@ def write_figures(
         "objects": lambda: _objects(data),
         "distributions": lambda: _distributions(data),
         "approaches": lambda: _approaches(data),
+        "views": lambda: _views(data),
     }
 
     # What was asked for by an option must be drawn; all else as far as there is something.
@@ -196,6 +198,13 @@ def _phases(data: _Dataset, trial_id: int | None) -> _Drawn:
 def _classes(data: _Dataset) -> _Drawn:
     pages, trials = class_sheets(data.out / DATA_FILES["oto"])
     return {f"classes_{i + 1}": page for i, page in enumerate(pages)}, {"trial_ids": trials}
+
+
+def _views(data: _Dataset) -> _Drawn:
+    if not (data.out / SCENES_FILE).exists():
+        raise DataError(f"there is no {SCENES_FILE}: `drakegrasp scenes` makes it")
+    figure, drawn = scene_views(data.out / SCENES_FILE)
+    return {"views": figure}, drawn
 
 
 def _outcomes(data: _Dataset) -> _Drawn:
