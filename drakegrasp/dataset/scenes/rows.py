@@ -83,7 +83,7 @@ class SceneRows(GraspDataset):
             own = data.grasp_of(view, Stream(0, _OWN, view))
             ids[i] = own["trial_id"][0]
             grasps.append(pack_grasp(own["p_AQ"][0], own["nhat_Q_A"][0]))
-        numbers = 6 * len(data.fingers)
+        numbers = 6 * data.tables["grasps"]["p_TQ"].shape[1]
         packed = np.array(grasps, dtype=np.float32).reshape(-1, numbers)
         if not np.isfinite(packed).all():
             raise DataError(

@@ -72,7 +72,7 @@ def scene_views(path: Path) -> tuple[Figure, list[dict[str, int]]]:
                 text = f"{shortened(name, 30).replace('_', ' ')}, {data.split}, trial {trial}"
                 axes.text(0.0, 1.03, text, transform=axes.transAxes, fontsize=7.0, color=INK,
                           parse_math=False)  # fmt: skip
-    fingers = len(lines[0][0].fingers)
+    fingers = lines[0][0].tables["grasps"]["p_TQ"].shape[1]
     draw_finger_legend(figure, fingers, (margin / width, 1.0 - 0.08 / height), 7.0)
     return figure, drawn
 
@@ -89,7 +89,7 @@ def _draw(axes: Axes, data: SceneDataset, view: int) -> tuple[int, str]:
 
     # The contacts, hollow where the file says that the camera does not see them.
     p_CQ, nhat = grasps["p_AQ"][row].astype(float), grasps["nhat_Q_A"][row].astype(float)
-    for i in np.flatnonzero(np.isfinite(p_CQ).all(axis=1)):
+    for i in np.flatnonzero(np.isfinite(p_CQ).all(axis=1)).tolist():
         dot, end = project(K, np.array([p_CQ[i], p_CQ[i] + ARROW * nhat[i]]))
         mark_contact(axes, i, dot, end, hidden=not grasps["visible"][row, i], scale=0.8)
     height, width = images["mask"].shape

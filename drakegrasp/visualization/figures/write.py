@@ -119,6 +119,9 @@ def write_figures(
         "approaches": lambda: _approaches(data),
         "views": lambda: _views(data),
     }
+    known = {*drawings}
+    if not (out / SCENES_FILE).exists():
+        del drawings["views"]  # most datasets have no scenes
 
     # What was asked for by an option must be drawn; all else as far as there is something.
     asked = {"palm_poses": compare is not None, "phases": trial_id is not None}
@@ -137,7 +140,7 @@ def write_figures(
         progress(i + 1, len(drawings))
 
     # Delete figures of an earlier run that this run did not draw; a sheet of classes has pages.
-    names = {*drawings, *(path.stem for path in folder.glob("classes_[0-9]*.*"))}
+    names = {*known, *(path.stem for path in folder.glob("classes_[0-9]*.*"))}
     for name in names.difference(written.names):
         for suffix in (".png", ".svg"):
             (folder / f"{name}{suffix}").unlink(missing_ok=True)
@@ -201,8 +204,6 @@ def _classes(data: _Dataset) -> _Drawn:
 
 
 def _views(data: _Dataset) -> _Drawn:
-    if not (data.out / SCENES_FILE).exists():
-        raise DataError(f"there is no {SCENES_FILE}: `drakegrasp scenes` makes it")
     figure, drawn = scene_views(data.out / SCENES_FILE)
     return {"views": figure}, drawn
 
