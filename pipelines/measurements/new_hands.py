@@ -2,7 +2,8 @@
 
 In: a checkout of dexsuite/dex-urdf and a folder of meshes in metres. Out: a table in Markdown: what
 the first palm poses and those about samples give, and how many samples hold again when their palm
-and joints are given back as postures. What is there already is not done again. HAND may also be a hand of the package.
+and joints are given back as postures. What is there already is not done again. HAND may also be a
+hand of the package.
 
     python pipelines/measurements/new_hands.py DEX_URDF MESHES --out FOLDER [HAND...]
 """
