@@ -5,7 +5,7 @@ the first palm poses and those about samples give, and how many samples hold aga
 and joints are given back as postures. What is there already is not done again. HAND may also be a
 hand of the package.
 
-    python pipelines/measurements/new_hands.py DEX_URDF MESHES --out FOLDER [HAND...]
+    python pipelines/measurements/new_hands.py DEX_URDF MESHES [HAND...] --out FOLDER
 """
 
 from __future__ import annotations
