@@ -74,6 +74,7 @@ class Hand:
     spreads_deg: tuple[float, ...]  # usual angles of the spread
     payload: float | None  # largest mass that the hand is made for [kg]
     joint_names: tuple[str, ...]  # the n joints that turn or slide
+    joint_slides: npt.NDArray[np.bool_]  # (n,), whether each slides
     joint_gain: Array  # (n, 1 + k), positions per coordinate; at most one non-zero in each row
     joint_offset: Array  # (n,), positions at zero coordinates [rad or m]
     joint_limits: Array  # (n, 2), lower and upper [rad or m]
@@ -165,9 +166,8 @@ class Hand:
     @property
     def joint_units(self) -> dict[str, str]:
         """Unit of each joint's positions, "rad" or "m", by the names of the joints."""
-        chains = self.link_chains.values()
-        slides = {n: s for chain in chains for n, s in zip(chain.joints, chain.slides, strict=True)}
-        return {name: "m" if slides[name] else "rad" for name in self.joint_names}
+        pairs = zip(self.joint_names, self.joint_slides.tolist(), strict=True)
+        return {name: "m" if slides else "rad" for name, slides in pairs}
 
     @property
     def required(self) -> npt.NDArray[np.bool_]:
@@ -300,6 +300,7 @@ def _build_hand(name: str, described: HandFile, model: ModelFile) -> Hand:
         spreads_deg=described.spreads_deg,
         payload=described.payload,
         joint_names=tuple(moving),
+        joint_slides=np.array([joint_slides(joint) for joint in moving.values()], dtype=np.bool_),
         joint_gain=np.array([drives[joint].gain for joint in moving]),
         joint_offset=np.array([drives[joint].offset for joint in moving]),
         joint_limits=limits,

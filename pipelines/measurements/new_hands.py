@@ -2,9 +2,10 @@
 
 In: a checkout of dexsuite/dex-urdf and a folder of meshes in metres. Out: a table in Markdown: what
 the first palm poses and those about samples give, and how many samples hold again when their palm
-and joints are given back as postures. What is there already is not done again.
+and joints are given back as postures. What is there already is not done again. HAND may also be a
+hand of the package.
 
-    python pipelines/measurements/new_hands.py DEX_URDF MESHES --out FOLDER [HAND...]
+    python pipelines/measurements/new_hands.py DEX_URDF MESHES [HAND...] --out FOLDER
 """
 
 from __future__ import annotations
@@ -63,13 +64,14 @@ def main() -> None:
 
 def measure(name: str, arguments: argparse.Namespace) -> list[str]:
     """Return the cells of a hand's row."""
-    model, answers = HANDS[name]
+    model, answers = HANDS.get(name, (name, ()))
     folder = arguments.out / model.split("/")[0]
     try:
-        if not (folder / "hand").is_dir():
+        if name in HANDS and not (folder / "hand").is_dir():
             path = arguments.models / "robots/hands" / model
             _run("hand", "new", str(path), "--out", str(folder / "hand"), *answers)
-        (hand,) = (folder / "hand").glob("*_hand.yaml")
+        # Those of the package need no draft.
+        (hand,) = (folder / "hand").glob("*_hand.yaml") if name in HANDS else [name]
         build = ["--objects", arguments.meshes, "--config", "fast", "--set", f"hand={hand}"]
         build += ["--set", f"objects.mass={MASS}", "--workers", arguments.workers, "--quiet"]
         _run("build", *build, "--candidates", arguments.candidates, "--out", folder / "data")
@@ -127,6 +129,8 @@ def write_postures(out: Path, path: Path) -> int:
         "joints": np.array(order),
         "resting": rows["resting"],
     }
+    if hand.preshapes:
+        arrays["preshape"] = np.array([hand.preshape_names[i] for i in rows["preshape"]])
     np.savez(path, **arrays)
     return len(chosen)
 

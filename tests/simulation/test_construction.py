@@ -267,3 +267,5 @@ def test_positions_are_in_the_order_of_a_tree_that_the_palm_is_the_root_of(
     names = hand_joint_names(build_scene(cube, config.physics, hand))
     assert names == list(position_order(hand.model, hand.palm_link))
     assert names[-1] == "wrist"
+    # It has a unit, too, though no chain of the palm's has it.
+    assert hand.joint_units == dict.fromkeys(hand.joint_names, "rad")
