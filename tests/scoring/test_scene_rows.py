@@ -52,7 +52,7 @@ def test_own_grasps_come_back_to_the_contacts_of_their_trials(path: Path) -> Non
 
 
 def test_images_show_the_object_where_the_grasp_is(path: Path) -> None:
-    rows = open_rows(path, split="test")
+    rows = SceneRows(path, split="test")
     scene = Scene(data=rows, rows=range(len(rows)), train=open_rows(path, split="train"))
     for row, contacts in enumerate(own_contacts(rows, scene.rows)):
         with h5py.File(path) as file:

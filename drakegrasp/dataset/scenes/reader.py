@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from drakegrasp.arithmetic import Array
 from drakegrasp.dataset.hdf5 import AnyArray, read_texts
-from drakegrasp.dataset.layout.opening import open_scenes, opened
+from drakegrasp.dataset.layout.opening import open_scenes, opened, refuse_other_codes
 from drakegrasp.dataset.layout.structure import SCENE_TABLES
 from drakegrasp.dataset.layout.trial_files import stamp
 from drakegrasp.dataset.schema import DEPTH_UNIT, SPLITS
@@ -257,6 +257,15 @@ class SceneDataset:
         """Number the rows of /grasps by scene and of /visible by view."""
         views, scenes = self._tables["views"], self._tables["scenes"]
         count = len(scenes["split"])
+        for name, values, codes in (
+            ("/scenes/split", scenes["split"], len(SPLITS)),
+            ("/scenes/object", scenes["object"][:, 0], len(self.names)),
+            ("/views/scene", views["scene"], count),
+            ("/grasps/scene", self._tables["grasps"]["scene"], count),
+        ):
+            refuse_other_codes(self.path, name, values, codes)
+
+        # Grasps of a scene and rows of a view stand together.
         grasps = np.bincount(self._tables["grasps"]["scene"], minlength=count)
         self._bounds = np.concatenate([[0], np.cumsum(grasps)])
         self._scene_of = views["scene"]

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drakegrasp.arithmetic import multiply
-from drakegrasp.dataset.layout.opening import opened
+from drakegrasp.dataset.layout.opening import opened, refuse_other_codes
 from drakegrasp.dataset.reader import GraspDataset
 from drakegrasp.dataset.scenes.reader import SceneDataset
 from drakegrasp.dataset.trials import Trials
@@ -83,6 +83,7 @@ class SceneRows(GraspDataset):
             own = data.grasp_of(view, Stream(0, _OWN, view))
             ids[i] = own["trial_id"][0]
             grasps.append(pack_grasp(own["p_AQ"][0], own["nhat_Q_A"][0]))
+        refuse_other_codes(self.path, "/grasps/trial_id", ids, len(trials))
         numbers = 6 * data.tables["grasps"]["p_TQ"].shape[1]
         packed = np.array(grasps, dtype=np.float32).reshape(-1, numbers)
         if not np.isfinite(packed).all():

@@ -8,6 +8,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 
@@ -131,6 +132,10 @@ def test_another_file_and_unknown_arguments_are_refused(path: Path, tmp_path: Pa
     copy.write_bytes(path.read_bytes())
     with pytest.raises(DataError, match="must stay while it is read"):
         data[1]
+    with h5py.File(copy, "r+") as file:
+        file["views/scene"][0] = 99
+    with pytest.raises(DataError, match=r"/views/scene must be 0 to 2, got 99 in row 0"):
+        SceneDataset(copy, points=32)
     with pytest.raises(DataError, match="frame must be one of table, camera, got 'palm'"):
         SceneDataset(path, frame="palm")  # type: ignore[arg-type]
     with pytest.raises(DataError, match="valid must have grasps to draw"):
