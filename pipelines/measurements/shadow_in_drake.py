@@ -8,7 +8,9 @@ A grasp is held if the object stays in the hand whichever of its six axes points
 hand is lifted by 10 cm six times, with an object of 0.1 kg and a friction of 0.6, and the object
 moves by less than 5 cm and turns by less than 15 degrees in the hand. As there any link may touch
 it, and it floats, here fixed while the hand closes. Motors are the benchmark's: 5 N m/rad, at most
-3 N m. Other than there the hand may overlap the object at the start, and contacts are Drake's.
+3 N m; the last two joints of a finger have 10 N m/rad each for those of their tendon. Other than
+there the hand may overlap the object at the start, and contacts are Drake's: a pair has no
+coefficient of torsion, it follows from the patch.
 
     python pipelines/measurements/shadow_in_drake.py HAND.xml GRASPS --assets DIR --out LINES.jsonl
         [--root DIR] [--mujoco VERDICTS.jsonl]
@@ -28,12 +30,14 @@ from typing import Any
 import numpy as np
 import trimesh
 import yaml
+from pydrake.multibody.tree import PdControllerGains
 
 from drakegrasp.arithmetic import multiply
 from drakegrasp.config import Config
 from drakegrasp.exchange.posture_rows import quaternion_poses
 from drakegrasp.frames import Array, invert_pose, make_pose
 from drakegrasp.hand.description import Hand, load_hand
+from drakegrasp.hand.file_format import Finger
 from drakegrasp.hand.settings import load_config
 from drakegrasp.hand.vendor.parsing import read_model
 from drakegrasp.hand.vendor.source import read_source
@@ -53,6 +57,8 @@ PALM, p_RB = "rh_palm", (0.0, 0.0, 0.034)
 FINGERS = {"ff": "FFJ3", "mf": "MFJ3", "rf": "RFJ3", "lf": "LFJ3", "th": "THJ2"}
 #: Motors [N m], [rad].
 EFFORT, SATURATED = 3.0, 0.6
+#: Joints of fingers that have one motor, whose torque turns both by what both are off together.
+TENDON = ("J1", "J2")
 #: By so much the object may move [m] and turn [rad]; the lift [m].
 MOVED, TURNED, LIFT = 0.05, np.deg2rad(15.0), 0.1
 SETTINGS = (
@@ -96,7 +102,14 @@ def _replace_rules() -> None:
     rules.open_hand_collides = lambda scene: False
     rules.judge_closed = rules.judge_lifted = lambda *_, **__: Outcome.SUCCESS
     motors: Any = construction
-    motors.SOFT = SATURATED
+    motors.SOFT, add_motor = SATURATED, motors._add_motor
+
+    def add_tendon(plant: Any, name: str, joint: Any, finger: Finger, gains: Any) -> Any:
+        if joint.name().endswith(TENDON) and finger.name != "th":
+            gains = PdControllerGains(p=2.0 * gains.p, d=2.0 * gains.d)
+        return add_motor(plant, name, joint, finger, gains)
+
+    motors._add_motor = add_tendon
 
 
 def make_hand(path: Path, roots: list[Path], folder: Path) -> tuple[Hand, list[str]]:
@@ -216,7 +229,7 @@ def _say(found: list[dict[str, Any]], mujoco: Path | None, grasps: Path) -> None
     if mujoco is None:
         return
     lines = map(json.loads, mujoco.read_text(encoding="utf-8").splitlines())
-    other = {str(Path(line["file"]).relative_to(grasps)): line["success"] for line in lines}
+    other = {line["file"].rpartition(f"{grasps.name}/")[2]: line["success"] for line in lines}
     both = [(each["held"], other[each["file"]]) for each in found if each["file"] in other]
     equal = sum(one == two for one, two in both)
     sys.stdout.write(f"MuJoCo: held {sum(b for _, b in both)}; equal {equal} of {len(both)}\n")

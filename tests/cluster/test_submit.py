@@ -202,6 +202,20 @@ def test_keys_are_private_and_removed(tmp_path: Path) -> None:
     assert not out.exists()
 
 
+def test_script_makes_certificates_in_a_new_folder_of_its_own(tmp_path: Path) -> None:
+    arguments = [str(tmp_path / "keys")]
+    result = CliRunner().invoke(load_script("make_certificates").main, arguments)
+    assert result.exit_code == 0, result.output
+    assert stat.S_IMODE((tmp_path / "keys").stat().st_mode) == 0o700
+    files = [Path(line) for line in result.stdout.splitlines()]
+    assert [path.name for path in files] == ["ca.pem", "cert.pem", "key.pem"]
+    assert {stat.S_IMODE(path.stat().st_mode) for path in files} == {0o600}
+    again = CliRunner().invoke(load_script("make_certificates").main, arguments)
+    assert again.exit_code == 1
+    (line,) = again.stderr.splitlines()
+    assert "keys: must be a folder that can be made: " in line
+
+
 def test_nothing_that_is_read_can_run() -> None:
     """No pickles from the disk, and YAML only by its safe loader."""
     package = Path(drakegrasp.__file__).parent
@@ -327,15 +341,22 @@ def test_running_scheduler_and_its_workers_are_set_up(tmp_path: Path) -> None:
     file = tmp_path / "scheduler.json"
     plain = {k: v for k, v in os.environ.items() if k not in worker_environment()}
     flags = ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
+    (tmp_path / "keys").mkdir()
+    files = make_certificates(tmp_path / "keys")
+    given = zip(("ca-file", "cert", "key"), map(str, files), strict=True)
+    tls = [word for name, path in given for word in (f"--tls-{name}", path)]
     scheduler = subprocess.Popen(
-        [*command, "distributed.cli.dask_scheduler", *flags, "--scheduler-file", str(file)],
+        [
+            *(*command, "distributed.cli.dask_scheduler", *flags, "--scheduler-file", str(file)),
+            *(*tls, "--protocol", "tls"),
+        ],
         env=plain,
         stderr=subprocess.DEVNULL,
     )
-    join = [*command, "distributed.cli.dask_worker", "--scheduler-file", str(file)]
+    join = [*command, "distributed.cli.dask_worker", *tls, "--scheduler-file", str(file)]
     worker = subprocess.Popen([*join, "--nthreads", "1"], env=plain, stderr=subprocess.DEVNULL)
     try:
-        request = ClusterRequest(kind="scheduler-file", where=(str(file),), tls=False)
+        request = ClusterRequest(kind="scheduler-file", where=(str(file),), tls_files=files)
         while not file.exists():
             scheduler.poll()
             assert scheduler.returncode is None

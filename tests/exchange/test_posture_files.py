@@ -103,6 +103,18 @@ def test_rows_of_a_preshape_need_not_name_the_joints_that_it_keeps(tmp_path, suf
     np.testing.assert_allclose(table.q_grasp[1], [expected[name] for name in joint_order(hand)])
 
 
+def test_a_row_of_a_preshape_that_the_hand_lacks_spoils_no_other(tmp_path):
+    hand = load_hand("allegro_four")
+    path, known = tmp_path / "p.npz", hand.preshape_names[0]
+    q = np.zeros((3, len(joint_order(hand))))
+    names = ["mug"] * 3
+    np.savez(path, object=names, X_FG=[np.eye(4)] * 3, q_grasp=q, preshape=[known, "fist", ""])
+    table = read_postures(path, hand)
+    assert table.preshape == (known, "fist", "")
+    assert [bool(reason) for reason in table.invalid] == [False, True, False]
+    assert f"preshape must be one of {known}" in table.invalid[1] and "'fist'" in table.invalid[1]
+
+
 def write_csv(folder: Path) -> Path:
     table = columns()
     lines = [",".join(table)]

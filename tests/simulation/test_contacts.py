@@ -9,7 +9,7 @@ import pytest
 from helpers.objects import CUBE, STANDOFF, from_above, standing
 
 from drakegrasp.config import Config
-from drakegrasp.frames import X_WT, invert_pose, make_pose, rotation_about, transform_points
+from drakegrasp.frames import X_WT, invert_pose, make_pose, transform_points
 from drakegrasp.hand.description import Hand
 from drakegrasp.hand.file_format import PAD_BAND, HalfSpace
 from drakegrasp.hand.shapes import link_shapes
@@ -30,8 +30,7 @@ EVERYWHERE: tuple[HalfSpace, ...] = ()
 @pytest.fixture(scope="module")
 def closed(cube: ObjectModel, config: Config, hand: Hand) -> Scene:
     """A scene of its own, which no test changes: the hand closed on the cube, which is yawed."""
-    yaw = make_pose(rotation_about([0, 0, 1], np.pi / 6.0), np.zeros(3))
-    scene, X_WO = build_scene(cube, config.physics, hand), X_WT @ yaw @ standing(cube)
+    scene, X_WO = build_scene(cube, config.physics, hand), X_WT @ standing(cube)
     reset_attempt(scene, X_WO, X_WO @ from_above(cube, STANDOFF).X_OG, spread=0.0)
     advance(scene, 2.4)
     return scene

@@ -488,7 +488,8 @@ def test_slip_and_turn_are_how_the_object_lags_behind_the_palm(cube, config, han
     p_TG = (standing(cube) @ from_above(cube, STANDOFF).X_OG)[:3, 3]
     carried = standing(cube)[:3, 3] + np.array(config.lift.p_TG) - p_TG
     slip = np.linalg.norm(record.lift.X_TO[:3, 3] - carried)
-    turn = np.arccos((np.trace(record.lift.X_TO[:3, :3]) - 1.0) / 2.0)
+    turned = standing(cube)[:3, :3].T @ record.lift.X_TO[:3, :3]
+    turn = np.arccos((np.trace(turned) - 1.0) / 2.0)
     assert slip > 1e-3 and turn > 1e-3
     assert record.lift.slip == pytest.approx(slip, abs=1e-4)
     assert record.lift.turn == pytest.approx(turn, abs=1e-3)
