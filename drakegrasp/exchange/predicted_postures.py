@@ -1,7 +1,7 @@
 """Files of postures that were predicted for rows of a dataset.
 
-In: a file of postures with `row`, and the split. Out: a `PostureTable` whose objects, resting poses
-and cameras are those of the rows, and the rows.
+In: a file of postures with `row`, and the split. Out: a `PostureTable` whose objects and cameras
+are those of the rows, and the rows.
 """
 
 from __future__ import annotations
@@ -56,11 +56,9 @@ def read_predicted_postures(
             else ""
             for row, told, true in zip(rows.tolist(), read.objects, objects, strict=True)
         ]
-        resting = data.column("grasp_props/resting")[rows]
         of_rows = replace(
             read,
             objects=objects,
             X_TC=X_TC if read.frame == "camera" else None,
-            numbers={**read.numbers, "resting": resting},
         )
         return table_of(hand, of_rows).refuse(other), rows, read.confidence

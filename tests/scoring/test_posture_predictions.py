@@ -81,12 +81,15 @@ def test_posture_in_the_frame_of_the_rows_camera_is_that_in_the_objects(
 ) -> None:
     rows = np.arange(len(data))
     given = own_postures(data, rows)
+    X_OGs = given["X_FG"]
     X_CG = invert_pose(camera_poses(data, rows)) @ given["X_FG"]
-    np.savez(tmp_path / "p.npz", **(given | {"X_FG": X_CG}), frame="camera")
+    # An object lies as in its row, whatever the file says.
+    given |= {"X_FG": X_CG, "resting": np.full(len(rows), 7)}
+    np.savez(tmp_path / "p.npz", **given, frame="camera")
     table = rank_postures(tmp_path / "p.npz", data).table
     assert table is not None
     placed = sorted(place_postures_on_rows(table, data, rows.tolist()), key=lambda g: g.index)
-    for grasp, X_OG, row in zip(placed, given["X_FG"], rows.tolist(), strict=True):
+    for grasp, X_OG, row in zip(placed, X_OGs, rows.tolist(), strict=True):
         assert grasp.posture is not None
         np.testing.assert_allclose(grasp.posture.X_OG, X_OG, atol=1e-5)
         assert grasp.placed.model.name == data.value("object_props/object_name", row)
@@ -119,10 +122,12 @@ def test_own_samples_given_back_as_postures_come_out_as_stored(
     rows = np.arange(min(len(data), 3))
     assert len(rows) > 1
     given = own_postures(data, rows)
+    given["X_FG"] = invert_pose(camera_poses(data, rows)) @ given["X_FG"]
     # A better one by its confidence is no posture, and there is another for the first row.
     bad = {name: np.concatenate([value, value[:1]]) for name, value in given.items()}
     bad["X_FG"][-1, :3, 3] = 1e6
-    np.savez(tmp_path / "net.npz", **bad, confidence=[*np.zeros(len(rows)), 1.0])
+    stated: dict[str, Any] = {"frame": "camera", "confidence": [*np.zeros(len(rows)), 1.0]}
+    np.savez(tmp_path / "net.npz", **bad, **stated)
     made = score(tmp_path / "net.npz", data, references=["own"], out=tmp_path / "card", workers=1)
     (judged, _) = made.sets
     first, *others = (verdict for verdict in judged.verdicts[0])
