@@ -300,3 +300,20 @@ def test_triangle_that_is_a_needle_is_collapsed_and_told():
     notes.clear()
     drakegrasp.mesh.union.unite([(solid.vertices, solid.faces)], 0.5, notes)
     assert notes == []
+
+
+@pytest.mark.parametrize(
+    ("share", "said"), [(0.0015, "kept"), (0.03, "noted"), (0.045, "noted"), (0.055, "refused")]
+)
+def test_what_passes_through_itself_is_kept_noted_or_refused(share, said, monkeypatch):
+    """By the share of its volume that is enclosed twice; untangling finds nothing better."""
+    monkeypatch.setattr(drakegrasp.mesh.union, "overlap_share", lambda *_, **__: share)
+    monkeypatch.setattr(drakegrasp.mesh.union, "_untangle", lambda solid, _: [solid])
+    box, notes = trimesh.creation.box([0.1, 0.2, 0.4]), []
+    surface = np.asarray(box.vertices), np.asarray(box.faces)
+    if said == "refused":
+        with pytest.raises(MeshError, match=r"must not pass through itself, got 5\.5%"):
+            drakegrasp.mesh.union.separate(*surface, notes)
+        return
+    drakegrasp.mesh.union.separate(*surface, notes)
+    assert any("still passes" in note for note in notes) is (said == "noted")
