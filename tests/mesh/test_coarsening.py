@@ -71,11 +71,3 @@ def test_open_scan_is_reduced_and_then_mended(tmp_path: Path) -> None:
 def test_same_surface_gives_the_same_bits() -> None:
     first, second = coarsen(*arrays(ball(5))), coarsen(*arrays(ball(5)))
     assert first[0].tobytes() == second[0].tobytes() and first[1].tobytes() == second[1].tobytes()
-
-
-def test_each_cell_of_a_grid_has_its_own_number() -> None:
-    i, j, k = np.meshgrid(range(4), range(5), range(6), indexing="ij")
-    points = 0.1 * np.stack([i, j, k], axis=-1).reshape(-1, 3)
-    numbers = coarsening._cells(np.concatenate([points + 0.01, points + 0.09]), 0.1)
-    assert len(np.unique(numbers)) == 120
-    np.testing.assert_array_equal(numbers[:120], numbers[120:])

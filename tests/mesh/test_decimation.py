@@ -9,7 +9,6 @@ from helpers.meshes import assert_sound, prepare, solid_of, write
 from helpers.scripts import load_script
 
 from drakegrasp.errors import MeshError
-from drakegrasp.mesh import decimation
 from drakegrasp.mesh.decimation import decimate
 from drakegrasp.mesh.surfaces import is_solid_surface
 
@@ -61,19 +60,3 @@ def test_thin_noisy_scan_keeps_its_shape(tmp_path):
     assert 0.0 < model.collision_error < 2e-3
     assert model.collision.volume == pytest.approx(model.volume, rel=0.05)
     assert "parted" in model.notes[0]
-
-
-def test_mildest_decimation_that_is_enough_wins(monkeypatch):
-    """From the mildest on each is tried, until the faces are few enough."""
-    solid, tried = solid_of(trimesh.creation.icosphere(2, radius=0.05)), []
-    few = solid_of(trimesh.creation.icosphere(1, radius=0.05))
-
-    def simplify(_, most, aggressiveness):
-        tried.append(aggressiveness)
-        found = few if len(tried) == 3 else solid
-        return found.vertices, found.faces
-
-    monkeypatch.setattr(decimation, "_simplify", simplify)
-    reduced = decimation._decimate_quadric(solid, len(few.faces))
-    assert reduced is not None and len(reduced.faces) == len(few.faces)
-    assert tried == sorted(set(tried)) and len(tried) == 3 and tried[0] <= 2.0
