@@ -246,6 +246,7 @@ def test_touching_edge_gets_a_vertex_for_each_side():
     assert not is_solid_surface(faces)
     parted, new_faces = part_touching_edges(vertices, faces)
     assert len(parted) == len(vertices) + 2 and len(new_faces) == len(faces) + 4
+    np.testing.assert_allclose(parted[-2:], [[0.01, 0.01, 0.0]] * 2, atol=1e-12)
     assert is_solid_surface(new_faces)
     assert signed_volume(parted, new_faces) == pytest.approx(2 * 0.02**3)
 
