@@ -187,10 +187,9 @@ def _changes(node: ast.AST, text: str) -> Iterator[str]:
 
 def name_equivalent(faults: Sequence[dict[str, object]]) -> None:
     """Write into faults why they change no result, if someone looked and found that."""
-    known = {(e["file"], e["fault"]): e["why"] for e in yaml.safe_load(EQUIVALENT.read_text())}
+    known = {(e["file"], e["new"]): e["why"] for e in yaml.safe_load(EQUIVALENT.read_text())}
     for fault in faults:
-        change = str(fault["fault"]).partition(": ")[2]  # lines move, the text stays
-        if why := known.get((fault["file"], change)):
+        if why := known.get((fault["file"], str(fault["new"]).strip())):
             fault["equivalent"] = why
 
 

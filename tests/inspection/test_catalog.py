@@ -45,7 +45,7 @@ def test_table_is_what_the_files_say(boxes: Path) -> None:
     assert (table.removal != NONE).sum() == (table.split != NONE).sum() == 9
     assert set(table.features) == set(FEATURES)
     np.testing.assert_allclose(table.feature("slip")[table.precision], SLIP)
-    assert table.value("force", 0) == 10.0
+    assert table.value("force", 0) == 12.5
     # The second attempt misses a finger, the third is below the table.
     assert np.isnan(table.feature("slip")[[1, 2]]).all()
     assert np.isnan(table.value("force", 2))

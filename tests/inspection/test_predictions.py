@@ -85,9 +85,10 @@ def test_page_of_a_prediction_has_both_hands_and_all_contacts(client: TestClient
     assert set(scene["states"]) == {"closed", "dataset's grasp"}
     contacts = scene["states"]["closed"]["contacts"]
     points = {kind: [c["p"] for c in contacts if c["kind"] == kind] for kind in ("asked", "true")}
-    # The first was asked 7 mm above the true one.
+    # The first was asked 7 mm from the true one along z of {O}, which lies in the table's plane.
     apart = np.subtract(points["asked"], points["true"])
-    assert apart == pytest.approx(np.array([[0, 0, 0.007], [0, 0, 0], [0, 0, 0]]))
+    z_T = np.array([0.5, -np.sqrt(0.75), 0.0])
+    np.testing.assert_allclose(apart, [0.007 * z_T, [0, 0, 0], [0, 0, 0]], atol=1e-9)
     assert set(_scene(client.get("/prediction/2").text)["states"]) == {"dataset's grasp"}
     for label in ("4", "x", "-1"):
         assert client.get(f"/prediction/{label}").status_code == 404

@@ -78,11 +78,11 @@ def test_any_sample_is_one_choice(snapshot: Snapshot) -> None:
 
 
 def test_ranges_are_in_the_units_that_are_shown(snapshot: Snapshot) -> None:
-    """All slip by 2 mm; a slipped attempt of two fingers pushes with 10 N, too."""
+    """All slip by 2 mm; a slipped attempt of two fingers pushes with 12.5 N, too."""
     assert len(chosen(snapshot, "min_slip=1.9&max_slip=2.1")) == 9
     assert chosen(snapshot, "max_slip=1.9") == []
-    assert len(chosen(snapshot, "min_force=9.9&max_force=10.1")) == 9
-    assert chosen(snapshot, "min_force=10.1&outcome=any") == []
+    assert len(chosen(snapshot, "min_force=12.4&max_force=12.6")) == 9
+    assert chosen(snapshot, "min_force=12.6&outcome=any") == []
     # What never closed has no penetration, so it is in no range.
     assert len(chosen(snapshot, "max_penetration=100&outcome=any")) < 36
 

@@ -28,21 +28,28 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_dataset(folder / "out", folder, *(f"randomize.{draw}" for draw in draws))
 
 
-def test_suspicion_is_of_the_drawn_mass(drawn: Path) -> None:
-    """The fingertips of every success push with 10 N along y, and nothing carries the weight."""
-    table = Catalog(drawn).current().table
-    with h5py.File(drawn / TRIALS) as file:
+def imbalance(out: Path) -> np.ndarray:
+    """Return that of every attempt; nothing carries the weight.
+
+    The fingertips of every success push with 12.5 N along -y of {O}.
+    """
+    with h5py.File(out / TRIALS) as file:
         weights = GRAVITY * file["trials/mass"][:]
+        y_T = unpack_pose(file["trials/X_TO_lifted"][:])[:, :3, 1]
+    rest_T = -12.5 * y_T - weights[:, None] * np.array([0.0, 0.0, 1.0])
+    return np.linalg.norm(rest_T, axis=1) / weights
+
+
+def test_suspicion_is_of_the_drawn_mass(drawn: Path) -> None:
+    table, expected = Catalog(drawn).current().table, imbalance(drawn)
     for i in (0, 3, 11):
-        expected = np.hypot(10.0, weights[i]) / weights[i]
-        assert table.value("imbalance", i) == pytest.approx(expected, rel=1e-6)
+        assert table.value("imbalance", i) == pytest.approx(expected[i], rel=1e-6)
 
 
 def test_the_filters_of_suspicion_are_of_the_drawn_mass(drawn: Path, tmp_path: Path) -> None:
     """A limit between the values of the drawn masses removes what is above, and only that."""
     with h5py.File(drawn / TRIALS) as file:
-        masses = file["trials/mass"][:][file["successes/trial_id"][:]]
-    values = np.hypot(10.0, GRAVITY * masses) / (GRAVITY * masses)
+        values = imbalance(drawn)[file["successes/trial_id"][:]]
     limit = float(np.median(values))
     draw = "randomize.mass=[0.5, 1.5]"
     out = make_dataset(tmp_path / "out", tmp_path, draw, f"filters.max_imbalance={limit}")

@@ -246,6 +246,7 @@ def test_touching_edge_gets_a_vertex_for_each_side():
     assert not is_solid_surface(faces)
     parted, new_faces = part_touching_edges(vertices, faces)
     assert len(parted) == len(vertices) + 2 and len(new_faces) == len(faces) + 4
+    np.testing.assert_allclose(parted[-2:], [[0.01, 0.01, 0.0]] * 2, atol=1e-12)
     assert is_solid_surface(new_faces)
     assert signed_volume(parted, new_faces) == pytest.approx(2 * 0.02**3)
 
@@ -300,3 +301,20 @@ def test_triangle_that_is_a_needle_is_collapsed_and_told():
     notes.clear()
     drakegrasp.mesh.union.unite([(solid.vertices, solid.faces)], 0.5, notes)
     assert notes == []
+
+
+@pytest.mark.parametrize(
+    ("share", "said"), [(0.0015, "kept"), (0.03, "noted"), (0.045, "noted"), (0.055, "refused")]
+)
+def test_what_passes_through_itself_is_kept_noted_or_refused(share, said, monkeypatch):
+    """By the share of its volume that is enclosed twice; untangling finds nothing better."""
+    monkeypatch.setattr(drakegrasp.mesh.union, "overlap_share", lambda *_, **__: share)
+    monkeypatch.setattr(drakegrasp.mesh.union, "_untangle", lambda solid, _: [solid])
+    box, notes = trimesh.creation.box([0.1, 0.2, 0.4]), []
+    surface = np.asarray(box.vertices), np.asarray(box.faces)
+    if said == "refused":
+        with pytest.raises(MeshError, match=r"must not pass through itself, got 5\.5%"):
+            drakegrasp.mesh.union.separate(*surface, notes)
+        return
+    drakegrasp.mesh.union.separate(*surface, notes)
+    assert any("still passes" in note for note in notes) is (said == "noted")

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from helpers.hands import write_pincer
+from helpers.hands import slider_fingers, write_pincer, write_slider
 from helpers.objects import (
     STANDOFF,
     box_model,
@@ -394,3 +394,17 @@ def test_heights_and_distances_are_those_of_the_points(cube, hand):
     error = 2.0 * cube.field.error
     assert np.all(found <= truth + 1e-4) and np.all(found >= truth - error - 1e-4)
     assert found.min() == pytest.approx(truth.min(), abs=1e-4)
+
+
+def test_fingers_of_one_motor_start_together(tmp_path):
+    """One jaw would meet a box that is off the middle later than the other; it starts with it."""
+    model = box_model(tmp_path, [0.03] * 3)
+    X_OG = make_pose(np.diag([1.0, -1.0, -1.0]), [0.0, 0.008, 0.09])
+    above = replace(from_above(model, STANDOFF), X_OG=X_OG)
+    own, shared = (
+        ask(model, load_hand(write_slider(tmp_path, fingers=slider_fingers(20.0, **by))), above)
+        for by in ({}, {"finger": "left", "ratio": 1.0})
+    )
+    assert own.outcome is shared.outcome is None
+    assert np.ptp(own.closing) > 0.01
+    np.testing.assert_allclose(shared.closing, own.closing.min())

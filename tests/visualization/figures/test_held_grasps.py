@@ -12,6 +12,7 @@ from helpers.datasets import SLIP, TRIALS, edit_file
 
 from drakegrasp.dataset.manifest import read_manifest
 from drakegrasp.errors import DataError
+from drakegrasp.frames import unpack_pose
 from drakegrasp.visualization.figures.held_grasps import read_approaches, read_held
 
 
@@ -21,8 +22,8 @@ def test_every_success_is_read_once(sound: Path) -> None:
     assert [int(group.sum()) for group in held.groups.values()] == [9, 9, 9]
     np.testing.assert_allclose(held.quantities["slip in the hand [mm]"], 1e3 * SLIP)
     np.testing.assert_allclose(held.quantities["turn in the hand [°]"], 1.0)
-    np.testing.assert_allclose(held.quantities["largest fingertip force after the lift [N]"], 10.0)
-    np.testing.assert_allclose(held.quantities["largest penetration after the lift [mm]"], 0.1)
+    np.testing.assert_allclose(held.quantities["largest fingertip force after the lift [N]"], 12.5)
+    np.testing.assert_allclose(held.quantities["largest penetration after the lift [mm]"], 0.125)
 
 
 def test_a_file_without_successes_has_none(sound: Path, tmp_path: Path) -> None:
@@ -46,8 +47,9 @@ def test_approaches_are_of_one_object(sound: Path, tmp_path: Path) -> None:
     # All palms are tilted by 0.25 rad; the one attempt whose ray misses, row 7, approached nothing.
     np.testing.assert_allclose(found.successes[:, 2], np.cos(0.25), atol=1e-9)
     with h5py.File(sound / TRIALS, "r") as file:
-        palms = file["trials/X_OG"][12:24][[1, 2, 4, 5, 6, 8, 9, 10]].reshape(-1, 3, 4)
-    np.testing.assert_allclose(found.directions, -palms[:, :, 2], atol=1e-9)
+        rows = [1, 2, 4, 5, 6, 8, 9, 10]
+        X_TO, X_OG = (unpack_pose(file[f"trials/{name}"][12:24][rows]) for name in ("X_TO", "X_OG"))
+    np.testing.assert_allclose(found.directions, -(X_TO @ X_OG)[:, :3, 2], atol=1e-9)
     with h5py.File(sound / TRIALS, "r") as file:
         standoffs = np.array(config.candidates.standoffs)
         rows = file["trials/standoff_index"][12:24][[0, 3, 11]]
