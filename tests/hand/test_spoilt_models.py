@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from drakegrasp.cli.main import main
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.files import MODELS
+from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.hand.vendor.parsing import read_model
 from drakegrasp.hand.vendor.source import read_source
 
@@ -130,6 +132,11 @@ SPOILT: dict[str, tuple[str, str, str]] = {
         changed('"0 1 0 0 0"', '"0 1 2 0 0"', text=JAWS_MJCF),
         "hand.xml",
         "polycoef of joint 'right_slide' must be a line, got a curve",
+    ),
+    "shape of a light second": (
+        changed("0 0.006 0.03", "0 0.006 4294967295", text=JAWS_MJCF, count=1),
+        "hand.xml",
+        r"must be a hand in metres, got a shape that reaches 4\.29e\+09 m from its link",
     ),
     "mass without a value": (
         changed('<mass value="0.05"/>', '<mass value="nan"/>', count=1),
@@ -284,3 +291,18 @@ def test_fault_of_an_sdformat_file_is_said_once(
     with pytest.raises(HandError, match="Error reading element <pose>"):
         read_model(read_source(model, {}))
     assert caplog.text == ""
+
+
+def test_pipe_in_place_of_a_model_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "hand.urdf")
+    with pytest.raises(HandError, match=r"hand\.urdf: must be a readable file, got: a pipe"):
+        read_source(tmp_path / "hand.urdf", {})
+
+
+def test_mesh_with_a_corner_far_away_is_refused(tmp_path: Path) -> None:
+    for path in MODELS.glob("barrett_*"):
+        shutil.copyfile(path, tmp_path / path.name)
+    mesh = tmp_path / "barrett_palm_plate.obj"
+    mesh.write_text(re.sub(r"(?m)^v \S+", "v 26.5", mesh.read_text(), count=1))
+    with pytest.raises(HandError, match=r"within 3 m of it, got one that reaches 26\.5 m"):
+        link_shapes(load_hand(tmp_path / "barrett_hand.yaml"))
