@@ -299,10 +299,34 @@ def test_pipe_in_place_of_a_model_is_not_waited_for(tmp_path: Path) -> None:
         read_source(tmp_path / "hand.urdf", {})
 
 
-def test_mesh_with_a_corner_far_away_is_refused(tmp_path: Path) -> None:
-    for path in MODELS.glob("barrett_*"):
+@pytest.mark.parametrize(
+    ("hand", "name", "spoil", "said"),
+    [
+        (
+            "barrett",
+            "barrett_palm_plate.obj",
+            lambda text: re.sub(r"(?m)^v \S+", "v 26.5", text, count=1),
+            r"within 3 m of it, got one that reaches 26\.5 m",
+        ),
+        (
+            "franka",
+            "franka_hand.urdf",
+            lambda text: re.sub(r'<box size="\S+', '<box size="-0.5', text, count=1),
+            r"must be a file of one model, got .*width = -0\.5",
+        ),
+        ("barrett", "barrett_palm_plate.obj", None, "plate.obj: must be a file, got a pipe, a s"),
+    ],
+)
+def test_spoilt_file_of_a_hand_is_refused(
+    tmp_path: Path, hand: str, name: str, spoil: Callable[[str], str] | None, said: str
+) -> None:
+    for path in MODELS.glob(f"{hand}_*"):
         shutil.copyfile(path, tmp_path / path.name)
-    mesh = tmp_path / "barrett_palm_plate.obj"
-    mesh.write_text(re.sub(r"(?m)^v \S+", "v 26.5", mesh.read_text(), count=1))
-    with pytest.raises(HandError, match=r"within 3 m of it, got one that reaches 26\.5 m"):
-        link_shapes(load_hand(tmp_path / "barrett_hand.yaml"))
+    text = (tmp_path / name).read_text()
+    (tmp_path / name).unlink()
+    if spoil is None:
+        (tmp_path / name).symlink_to("/dev/zero")
+    else:
+        (tmp_path / name).write_text(spoil(text))
+    with pytest.raises(HandError, match=said):
+        link_shapes(load_hand(tmp_path / f"{hand}_hand.yaml"))
