@@ -14,9 +14,11 @@ from drakegrasp.errors import DataError
 
 #: Most bytes of a text (JSON, YAML, CSV), and of arrays or a mesh that are read at once.
 LARGEST_TEXT, LARGEST_CONTENT = 2**28, 2**30
-#: Most bytes of a file that is read in parts, and of one that is hashed whole: a shard is built in
-#: memory.
-LARGEST_PARTS, LARGEST_SEALED = 2**40 - 1, 2**32
+#: Most bytes of a file that is hashed whole: a shard is built in memory.
+LARGEST_SEALED = 2**32
+#: A file that is read in parts has so many bytes, or more than this share of them is on the disk: a
+#: file of holes takes no room, but hours to read. File systems that compress save less.
+LARGE, SOLID = 2**36, 1e-3
 #: What a path may be instead of a file, in words.
 _KINDS = {
     stat.S_IFIFO: "a pipe",
@@ -27,8 +29,12 @@ _KINDS = {
 }
 
 
-def refuse_irregular(path: Path, largest: int = LARGEST_PARTS) -> None:
+def refuse_irregular(path: Path, largest: int | None = None) -> None:
     """Refuse what is no regular file, or is larger than such a file can be.
+
+    Args:
+        path: Of the file.
+        largest: Most bytes; None for a file that is read in parts, which must not consist of holes.
 
     Raises:
         OSError: If it is, or is not there.
@@ -36,8 +42,11 @@ def refuse_irregular(path: Path, largest: int = LARGEST_PARTS) -> None:
     status = path.stat()
     if not stat.S_ISREG(status.st_mode):
         raise _refusal(_KINDS.get(stat.S_IFMT(status.st_mode), "no regular file"))
-    if status.st_size > largest:
-        raise _refusal(f"a file of {status.st_size:,} byte, more than {largest:,}")
+    size, stored = status.st_size, 512 * status.st_blocks
+    if largest is not None and size > largest:
+        raise _refusal(f"a file of {size:,} byte, more than {largest:,}")
+    if largest is None and size > LARGE and stored < SOLID * size:
+        raise _refusal(f"a file of {size:,} byte, of which only {stored:,} are on the disk")
 
 
 def refuse_link(folder: Path) -> None:

@@ -182,7 +182,8 @@ class _Found:
         """Note a file, and return whether it is there.
 
         Raises:
-            HandError: If it is elsewhere, and the hand is a dataset's, or the files are too large.
+            HandError: If it is elsewhere, and the hand is a dataset's, it is a pipe or a device, or
+                the files are too large.
         """
         # A file counts once; that of a dataset must be in its folder.
         if path in self.sources:
@@ -193,6 +194,8 @@ class _Found:
             refuse_outside(path, self.within)
         self.sources[path] = path.is_file()
         if not self.sources[path]:
+            if path.exists() and not path.is_dir():  # Drake would read it without end
+                raise HandError(f"{path}: must be a file, got a pipe, a socket or a device")
             return False
 
         # A stranger's files must not fill the memory, and YAML takes many times its bytes.

@@ -77,7 +77,7 @@ def add_model(plant: MultibodyPlant, model: ModelFile) -> ModelInstanceIndex:
     constraints = set(plant.GetConstraintIds())
     try:
         (instance,) = parser.AddModels(model.path)
-    except (RuntimeError, ValueError) as error:
+    except (RuntimeError, ValueError, SystemExit) as error:  # of a failed assertion within Drake
         raise HandError(f"model: must be a file of one model, got {first_line(error)}") from None
 
     # Leave out its motors and couplings.

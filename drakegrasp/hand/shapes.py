@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 CIRCLE = 16
 #: A plane whose normal has less of a line's direction than this is parallel to it.
 PARALLEL = 1e-9
+#: Shapes do not reach farther from their link [m]: in metres, no hand's do.
+FARTHEST = 3.0
 #: Twice the area of a triangle that counts as a line [m^2].
 SLIVER = 1e-12
 
@@ -44,7 +46,7 @@ def link_shapes(hand: Hand) -> dict[str, tuple[Array, ...]]:
     """Return the corners (n, 3) [m] of each collision shape of each link, in the link's frame.
 
     Raises:
-        HandError: If a shape is not a box, cylinder, capsule, sphere or convex mesh.
+        HandError: If a shape is not a box, cylinder, capsule, sphere or convex mesh, or too large.
     """
     return _link_shapes(hand.model)
 
@@ -59,7 +61,14 @@ def _link_shapes(model: ModelFile) -> dict[str, tuple[Array, ...]]:
     for index in plant.GetBodyIndices(instance):
         body = plant.get_body(index)
         geometries = plant.GetCollisionGeometriesForBody(body)
-        shapes[body.name()] = tuple(_corners(inspector, geometry) for geometry in geometries)
+        found = tuple(_corners(inspector, geometry) for geometry in geometries)
+        reach = max((float(np.abs(corners).max()) for corners in found), default=0.0)
+        if not reach <= FARTHEST:
+            raise HandError(
+                f"shapes of link {body.name()!r} must be within {FARTHEST:g} m of it, got one that "
+                f"reaches {reach:.3g} m: check units and scales of its meshes"
+            )
+        shapes[body.name()] = found
     return shapes
 
 

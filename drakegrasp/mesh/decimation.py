@@ -125,6 +125,8 @@ def _decimate_quadric(solid: Solid, max_faces: int) -> Solid | None:
 def _decimate_parted(solid: Solid, max_faces: int) -> Solid | None:
     """Return the least aggressive decimation, parted where its surface touches itself."""
     target = int(PARTED * max_faces)
+    if len(solid.faces) <= target:
+        return solid  # fast_simplification refuses to aim at more faces than there are
     for aggressiveness in DECIMATION_STEPS:
         reduced = reduce_and_part(solid, target, aggressiveness)
         if 0 < len(reduced.faces) <= max_faces:

@@ -17,6 +17,8 @@ from drakegrasp.runtime.json_text import parse_json
 
 #: Mesh files that can be read; other files are ignored.
 SUFFIXES = (".obj", ".stl", ".ply", ".glb")
+#: Coordinates that are numbers, in any unit; beyond it, squares and single precision overflow.
+LARGEST = 1e9
 #: Faces from which what reading a file leaves behind is worth freeing at once: a scene of trimesh
 #: refers to itself, so it would wait for Python's collector.
 MANY_FACES = 100_000
@@ -138,10 +140,13 @@ def clean_triangles(vertices: Array, faces: Faces, name: str) -> trimesh.Trimesh
             f"{name}: faces must use vertices 0..{len(vertices) - 1}, "
             f"got {faces.min()}..{faces.max()}"
         )
-    infinite = np.asarray(~np.isfinite(vertices).all(axis=1))
+    infinite = np.asarray(~(np.abs(vertices) <= LARGEST).all(axis=1))
     if infinite.any() and infinite[faces].any():
         bad = int(infinite[faces].sum())
-        raise MeshError(f"{name}: vertices must be finite, got NaN or inf at {bad} corners")
+        raise MeshError(
+            f"{name}: vertices must be finite, got NaN, inf or more than {LARGEST:g} at {bad} "
+            "corners"
+        )
 
     # Merge equal vertices.
     vertices, faces = weld(vertices, faces)

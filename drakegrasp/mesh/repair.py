@@ -49,6 +49,8 @@ WELD = 1e-8
 WELD_PART = 300_000
 #: Number of vertices below which three indices of them go into one 64-bit integer.
 MOST_PACKED = 2**21
+#: Most pieces of a surface: each takes milliseconds, and no thing that a hand lifts has more.
+MOST_PIECES = 5_000
 #: Rims closer than this fraction of the diagonal are the two sides of one seam.
 STITCH = 1e-4
 #: A component whose mean thickness is below this fraction of its diagonal encloses nothing.
@@ -162,7 +164,13 @@ def _repair(vertices: Array, faces: Faces, notes: list[str]) -> Solid:
     # Close each component; those that enclose nothing are fragments.
     closed: list[tuple[Array, Faces]] = []
     holes, filled = 0, 0.0
-    for component in find_components(vertices, faces, notes):
+    components = find_components(vertices, faces, notes)
+    if len(components) > MOST_PIECES:
+        raise MeshError(
+            f"the surface must be of at most {MOST_PIECES:,} pieces, got {len(components):,}: keep "
+            "the large ones"
+        )
+    for component in components:
         new_faces, new_holes, new_area = component.faces, 0, 0.0
         if not component.is_closed:
             try:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
+import resource
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -25,6 +26,9 @@ TRIM_SECONDS = 5.0
 #: What jemalloc is told: forget what this thread keeps, and return the free pages of every arena
 #: (4096 is its MALLCTL_ARENAS_ALL).
 _PURGE = (b"thread.tcache.flush", b"arena.4096.purge")
+#: Least limit of virtual memory under which an image is rendered [byte]: with 1.0 GB OpenGL has a
+#: segmentation fault, 1.5 GB are enough for `figures`.
+RENDER_MEMORY = 1.5e9
 
 _trimmed = -TRIM_SECONDS
 _VARIABLE = "DRAKE_ALLOW_NETWORK"
@@ -49,6 +53,20 @@ def require_mujoco(*modules: str) -> None:
     for module in modules:
         if find_spec(module) is None:
             raise MachineError(f"{module} must be installed: pip install 'drakegrasp[peer]'")
+
+
+def require_render_memory() -> None:
+    """Refuse to render within a limit of memory at which OpenGL would end with a crash.
+
+    Raises:
+        MachineError: If it would.
+    """
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit != resource.RLIM_INFINITY and limit < RENDER_MEMORY:
+        raise MachineError(
+            f"the limit of memory must be at least {RENDER_MEMORY / 1e9:g} GB to render, got "
+            f"{limit / 1e9:.2g} GB: raise `ulimit -v`"
+        )
 
 
 def release_memory() -> None:

@@ -45,6 +45,7 @@ from drakegrasp.hand.files import MODELS
 from drakegrasp.hand.parsing import make_parser
 from drakegrasp.mesh.wavefront import obj_text
 from drakegrasp.objects.model import ObjectModel, object_colour
+from drakegrasp.runtime.environment import require_render_memory
 from drakegrasp.vision.appearance import Appearance, usual_appearance
 from drakegrasp.vision.camera import Lens
 
@@ -115,6 +116,7 @@ def build_renderer(model: ObjectModel, config: CameraConfig) -> Renderer:
     """Return a renderer of an object's full mesh on the table."""
     # Software OpenGL would start threads of its own beside the one process per core.
     os.environ.setdefault("LP_NUM_THREADS", "0")
+    require_render_memory()
 
     # The object, and the table of the simulation.
     builder, appearance = DiagramBuilder(), usual_appearance(model.name)

@@ -40,6 +40,7 @@ from drakegrasp.hand.description import Hand
 from drakegrasp.hand.kinematics import joint_positions
 from drakegrasp.hand.parsing import add_model
 from drakegrasp.objects.model import ObjectModel
+from drakegrasp.runtime.environment import require_render_memory
 from drakegrasp.vision.camera import Picture
 from drakegrasp.vision.rendering import BLANK, add_drawn_object
 
@@ -309,6 +310,7 @@ class StillScene:
         if not self._graph.HasRenderer(context, lighting.name):
             # Software OpenGL would start threads of its own.
             os.environ.setdefault("LP_NUM_THREADS", "0")
+            require_render_memory()
             parameters = RenderEngineVtkParams(
                 default_clear_color=BACKGROUND,
                 default_diffuse=GREY,

@@ -52,6 +52,8 @@ from drakegrasp.runtime.progress import progress_bar
 MEMORY, CPU_SECONDS, SECONDS = 2**31, 20, 120.0
 #: Files of a dataset that hold columns.
 COLUMNS = ("trials.hdf5", "grasping_oto.hdf5", "grasping_otm.hdf5")
+#: Files of which a dataset has several, that commands read one by one.
+PARTS = ("shards/*/*.h5", "objects/*.plan.h5")
 #: Rows that columns are made to claim.
 CLAIMS = (400_000_000, 2**50)
 #: Most lines of an error, and the code of a traceback.
@@ -143,19 +145,13 @@ def nest(path: Path, draw: random.Random) -> str:
 
 def other_kind(path: Path, draw: random.Random) -> str:
     """Put another kind of file in the place of one."""
-    kinds: dict[str, Callable[[], Any]] = {
-        "a pipe": lambda: os.mkfifo(path),
-        "a folder": path.mkdir,
-        "a socket": lambda: _listen(path),
-        "a link to /dev/zero": lambda: path.symlink_to("/dev/zero"),
-        "a link to itself": lambda: path.symlink_to(path),
-        "a link to nothing": lambda: path.symlink_to(path.with_name("nothing")),
-        "a file of 1 TB": lambda: _sparse(path),
-        "an empty file": path.touch,
-    }
-    kind = draw.choice(list(kinds))
-    path.unlink()
-    kinds[kind]()
+    return put(path, draw.choice(list(KINDS)))
+
+
+def put(path: Path, kind: str) -> str:
+    """Put a kind of file in the place of one, or where none is."""
+    path.unlink(missing_ok=True)
+    KINDS[kind](path)
     return f"replaced by {kind}"
 
 
@@ -170,6 +166,17 @@ def _sparse(path: Path) -> None:
     os.truncate(path, 2**40)
 
 
+#: What may be in the place of a file, and what makes it.
+KINDS: dict[str, Callable[[Path], Any]] = {
+    "a pipe": os.mkfifo,
+    "a folder": Path.mkdir,
+    "a socket": _listen,
+    "a link to /dev/zero": lambda path: path.symlink_to("/dev/zero"),
+    "a link to itself": lambda path: path.symlink_to(path),
+    "a link to nothing": lambda path: path.symlink_to(path.with_name("nothing")),
+    "a file of 1 TB": _sparse,
+    "an empty file": Path.touch,
+}
 SPOIL_HDF5 = (flip, flip, flip, flip, truncate, stretch, swap, other_kind)
 SPOIL_JSON = (flip, truncate, restructure, restructure, nest, other_kind)
 SPOIL_OTHERS = (flip, truncate, other_kind)
@@ -339,8 +346,28 @@ def files(out: Path) -> list[Path]:
     return main * 4 + others
 
 
+def every_kind(out: Path) -> list[tuple[Path, str]]:
+    """Return each file that commands read by itself, with each kind that may be in its place."""
+    parts = [next(iter(sorted(out.glob(name)))).relative_to(out) for name in PARTS]
+    named = map(Path, ("manifest.json", *COLUMNS[:2], "reject.json", "replacement.json"))
+    return [(name, kind) for name in (*named, *parts) for kind in KINDS]
+
+
+def assemble(out: Path) -> None:
+    """Assemble, with the rejections of a dataset if it has any."""
+    rejected = (
+        ["--reject", str(out / "reject.json")] if os.path.lexists(out / "reject.json") else []
+    )
+    command.main(["assemble", str(out), "--workers", "1", *rejected], prog_name="drakegrasp")
+
+
 def fuzz(
-    out: Path, count: int, seed: int, everything: bool = False, first: int = 0
+    out: Path,
+    count: int,
+    seed: int,
+    everything: bool = False,
+    first: int = 0,
+    kinds: bool = False,
 ) -> Iterator[dict[str, Any] | None]:
     """Yield for each case and reader what is wrong, or None.
 
@@ -350,8 +377,10 @@ def fuzz(
         seed: Of all draws.
         everything: Whether every command reads, or only the loaders, `stats` and `check`.
         first: Number of the first case.
+        kinds: Whether cases are those of `every_kind`, of all of which there are so many.
     """
-    readers = commands(everything)
+    readers = commands(everything) | ({"assemble": assemble} if kinds else {})
+    table = every_kind(out) if kinds else []
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "OUT"
         shutil.copytree(out, copy)
@@ -361,8 +390,12 @@ def fuzz(
             draw = random.Random(f"{seed}/{number}")
             shutil.rmtree(copy)
             shutil.copytree(out, copy)
-            name = draw.choice(files(copy))
-            how = draw.choice(ways(copy / name))(copy / name, draw)
+            if kinds:
+                name, kind = table[number]
+                how = put(copy / name, kind)
+            else:
+                name = draw.choice(files(copy))
+                how = draw.choice(ways(copy / name))(copy / name, draw)
             for reader, run in readers.items():
                 began = time.monotonic()
                 finding = {
@@ -395,10 +428,13 @@ def say_findings(cases: Iterator[dict[str, Any] | None], count: int) -> NoReturn
 @click.option("--first", default=0, show_default=True, help="Number of the first case.")
 @click.option("--seed", default=0, show_default=True, help="Of all draws.")
 @click.option("--all", "everything", is_flag=True, help="Read with every command.")
-def main(out: Path, count: int, first: int, seed: int, everything: bool) -> None:
+@click.option("--kinds", is_flag=True, help="Try all kinds of files instead, also on `assemble`.")
+def main(out: Path, count: int, first: int, seed: int, everything: bool, kinds: bool) -> None:
     """Run the script."""
-    cases = fuzz(out, count, seed, everything, first)
-    say_findings(cases, count * len(commands(everything)))
+    if kinds:
+        first, count = 0, len(every_kind(out))
+    cases = fuzz(out, count, seed, everything, first, kinds)
+    say_findings(cases, count * (len(commands(everything)) + kinds))
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from drakegrasp.cli.main import main
 from drakegrasp.errors import HandError
 from drakegrasp.hand.description import load_hand
 from drakegrasp.hand.files import MODELS
+from drakegrasp.hand.shapes import link_shapes
 from drakegrasp.hand.vendor.parsing import read_model
 from drakegrasp.hand.vendor.source import read_source
 
@@ -130,6 +132,11 @@ SPOILT: dict[str, tuple[str, str, str]] = {
         changed('"0 1 0 0 0"', '"0 1 2 0 0"', text=JAWS_MJCF),
         "hand.xml",
         "polycoef of joint 'right_slide' must be a line, got a curve",
+    ),
+    "shape of a light second": (
+        changed("0 0.006 0.03", "0 0.006 4294967295", text=JAWS_MJCF, count=1),
+        "hand.xml",
+        r"must be a hand in metres, got a shape that reaches 4\.29e\+09 m from its link",
     ),
     "mass without a value": (
         changed('<mass value="0.05"/>', '<mass value="nan"/>', count=1),
@@ -284,3 +291,42 @@ def test_fault_of_an_sdformat_file_is_said_once(
     with pytest.raises(HandError, match="Error reading element <pose>"):
         read_model(read_source(model, {}))
     assert caplog.text == ""
+
+
+def test_pipe_in_place_of_a_model_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "hand.urdf")
+    with pytest.raises(HandError, match=r"hand\.urdf: must be a readable file, got: a pipe"):
+        read_source(tmp_path / "hand.urdf", {})
+
+
+@pytest.mark.parametrize(
+    ("hand", "name", "spoil", "said"),
+    [
+        (
+            "barrett",
+            "barrett_palm_plate.obj",
+            lambda text: re.sub(r"(?m)^v \S+", "v 26.5", text, count=1),
+            r"within 3 m of it, got one that reaches 26\.5 m",
+        ),
+        (
+            "franka",
+            "franka_hand.urdf",
+            lambda text: re.sub(r'<box size="\S+', '<box size="-0.5', text, count=1),
+            r"must be a file of one model, got .*width = -0\.5",
+        ),
+        ("barrett", "barrett_palm_plate.obj", None, "plate.obj: must be a file, got a pipe, a s"),
+    ],
+)
+def test_spoilt_file_of_a_hand_is_refused(
+    tmp_path: Path, hand: str, name: str, spoil: Callable[[str], str] | None, said: str
+) -> None:
+    for path in MODELS.glob(f"{hand}_*"):
+        shutil.copyfile(path, tmp_path / path.name)
+    text = (tmp_path / name).read_text()
+    (tmp_path / name).unlink()
+    if spoil is None:
+        (tmp_path / name).symlink_to("/dev/zero")
+    else:
+        (tmp_path / name).write_text(spoil(text))
+    with pytest.raises(HandError, match=said):
+        link_shapes(load_hand(tmp_path / f"{hand}_hand.yaml"))

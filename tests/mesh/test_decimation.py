@@ -9,7 +9,7 @@ from helpers.meshes import assert_sound, prepare, solid_of, write
 from helpers.scripts import load_script
 
 from drakegrasp.errors import MeshError
-from drakegrasp.mesh.decimation import decimate
+from drakegrasp.mesh.decimation import _decimate_parted, decimate
 from drakegrasp.mesh.surfaces import is_solid_surface
 
 
@@ -47,6 +47,12 @@ def test_mesh_with_few_faces_too_many_is_not_decimated_twice(monkeypatch):
         monkeypatch.setattr(f"drakegrasp.mesh.decimation._{way}", lambda *_: None)
     with pytest.raises(MeshError, match="at most 4000 faces, got a broken one from 5120"):
         decimate(solid, 4000)
+
+
+def test_first_decimation_that_went_far_enough_is_parted_as_it_is():
+    """Of thousands of specks, few faces are left: there is nothing to aim at any more."""
+    few = solid_of(trimesh.creation.icosphere(1))
+    assert _decimate_parted(few, 1000) is few
 
 
 def test_thin_noisy_scan_keeps_its_shape(tmp_path):

@@ -224,6 +224,16 @@ def test_union_volume_is_inclusion_exclusion(tmp_path_factory, seed, shift):
 
 
 @needs_g3db
+def test_surface_of_too_many_pieces_is_refused(tmp_path, monkeypatch):
+    boxes = [box().apply_translation([0.3 * i, 0.0, 0.0]) for i in range(4)]
+    path = write(tmp_path / "1_boxes.obj", *boxes)
+    monkeypatch.setattr(drakegrasp.mesh.repair, "MOST_PIECES", 4)
+    assert_sound(prepare(path))
+    monkeypatch.setattr(drakegrasp.mesh.repair, "MOST_PIECES", 3)
+    with pytest.raises(MeshError, match="must be of at most 3 pieces, got 4: keep the large ones"):
+        prepare(path)
+
+
 def test_surface_that_passes_through_itself_too_much_is_refused(monkeypatch):
     monkeypatch.setattr(drakegrasp.mesh.union, "MAX_OVERLAP", 0.02)
     (source,) = (s for s in find_meshes(G3DB, units="cm") if "toaster" in s.name)

@@ -27,6 +27,7 @@ from pydrake.multibody.tree import CalcSpatialInertia, SpatialInertia, UnitInert
 from scipy.spatial import cKDTree
 
 from drakegrasp.arithmetic import dot
+from drakegrasp.errors import HandError
 from drakegrasp.frames import Array, transform_points
 from drakegrasp.hand.shapes import ball_corners, hull_corners, primitive_corners
 from drakegrasp.hand.vendor.meshes import MeshFile
@@ -141,7 +142,14 @@ def solid_inertia(shapes: Sequence[Shape]) -> SpatialInertia:
         # Flat shapes have no volume: half a millimetre around makes one.
         corners = shape.corners()
         solid = Convex(np.concatenate([corners - 5e-4, corners + 5e-4]).T, "hull")
-        total = added(total, CalcSpatialInertia(solid, DENSITY))
+        try:
+            total = added(total, CalcSpatialInertia(solid, DENSITY))
+        except (RuntimeError, ValueError):  # lengths whose powers are beyond arithmetic
+            reach = float(np.abs(corners).max())
+            raise HandError(
+                f"model: must be a hand in metres, got a shape that reaches {reach:.3g} m from its "
+                "link and has no inertia"
+            ) from None
     return total
 
 

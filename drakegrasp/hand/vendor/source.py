@@ -14,6 +14,7 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 from drakegrasp.errors import HandError, one_line
+from drakegrasp.foreign_files import read_content
 from drakegrasp.hand.files import find_packages
 from drakegrasp.hand.vendor.folders import Folders
 
@@ -91,9 +92,7 @@ def _parse(path: Path) -> Element:
     """Return the root of an XML file that defines no entities and is not nested too deeply."""
     # Entities come with a document type.
     try:
-        if path.stat().st_size > LONGEST:
-            raise HandError(f"{path}: must be a model of at most {LONGEST // 10**6} MB, got more")
-        text = path.read_bytes()
+        text = read_content(path, LONGEST)
     except OSError as error:
         raise HandError(f"{path}: must be a readable file, got: {error.strerror}") from None
     if b"<!DOCTYPE" in text or b"<!ENTITY" in text:

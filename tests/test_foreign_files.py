@@ -1,0 +1,27 @@
+"""What is refused before it is read."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from drakegrasp import foreign_files
+from drakegrasp.foreign_files import refuse_irregular
+
+
+def test_large_file_is_read_in_parts_unless_it_consists_of_holes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solid, holes = tmp_path / "solid", tmp_path / "holes"
+    solid.write_bytes(b"x" * 2**20)
+    holes.write_bytes(b"x")
+    os.truncate(holes, 2**40)
+    refuse_irregular(solid)
+    with pytest.raises(OSError, match=r"1,099,511,627,776 byte, of which only [0-9,]+ are on"):
+        refuse_irregular(holes)
+    monkeypatch.setattr(foreign_files, "LARGE", 2**10)
+    refuse_irregular(solid)
+    with pytest.raises(OSError, match="1,048,576 byte, more than 1,024"):
+        refuse_irregular(solid, 2**10)
